@@ -28,7 +28,7 @@ from bench.shortcuts import first_of_each
 from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.filmed_arms import arm_of
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.models.shortcut_rules import CUT_FRAMES, names_no_choices
+from traps_pipeline.models.shortcut_rules import CUT_FRAMES, has_no_choices
 from traps_pipeline.protocol.datasets import CROSSED, DATASETS, TWIN
 from traps_pipeline.scenes.picture.camera import Camera, Occluder
 from traps_pipeline.scenes.variants.arms import SHOWN_AGAIN_S
@@ -144,7 +144,7 @@ def one_line(items: pd.DataFrame) -> Decisions:
     cues = {
         "panel": items["f1"].to_numpy(float) > 0,  # one stands in the first frame
         "length": items["f0"].to_numpy(float) < CUT_FRAMES,
-        "wording": items["question"].map(names_no_choices).to_numpy(bool),
+        "wording": items["question"].map(has_no_choices).to_numpy(bool),
     }
     return cues | {"any": np.logical_or.reduce([*cues.values()])}
 

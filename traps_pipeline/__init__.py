@@ -1,1 +1,4 @@
-"""TRAPSBench: do vision-language models know when not to answer? One Dagster DAG from scene specs to a leaderboard."""
+"""Measure whether vision-language models know when not to answer (TRAPSBench).
+
+One Dagster DAG leads from scene specs to a leaderboard.
+"""

@@ -1,4 +1,4 @@
-"""The code location of Dagster: `dagster ... -m traps_pipeline.definitions`."""
+"""Define Dagster's code location: `dagster ... -m traps_pipeline.definitions`."""
 
 import dagster as dg
 

@@ -1,4 +1,6 @@
-"""For researchers: a study's states as arrays, its directions as context managers, its protocol for any probe.
+"""Give researchers a study's states, directions and protocol.
+
+States are arrays, directions are context managers, and the protocol takes any probe.
 
     from traps_pipeline import inside
 
@@ -83,7 +85,9 @@ def load(
     prompt: str = "standard",
     datasets: Sequence[str] | None = None,
 ) -> LoadedStates:
-    """Return the states of a study's items at one layer, joined with the verdicts of run 1.
+    """Return the states of a study's items at one layer.
+
+    They are joined with the verdicts of run 1.
 
     layer: 0 for embeddings; `normed`: the last one after the final norm. datasets: some of those with states; all by
     default.
@@ -135,7 +139,9 @@ def protocol(
     change: Callable[[np.ndarray], np.ndarray] = lambda states: states,
     features: LoadedStates | None = None,
 ) -> pd.DataFrame:
-    """Run the study's own protocol with another probe; return rows like those of `probe_baselines`.
+    """Run the study's own protocol with another probe.
+
+    Return rows like those of `probe_baselines`.
 
     They have the same items, folds, splits by scenario and intervals as the study's. fit: maps states (n, d) and void
     (n,) to an object with `scores` (`from_sklearn`, `mean_difference`, your own). change: transforms the states of a
@@ -178,8 +184,9 @@ def gate(
     prompt: str = "standard",
     without: Collection[str] = (),
 ) -> Gate:
-    """Return a gate for live use: `abstains(model, prompt)` and `answer(model, prompt)`, for a local model and its
-    prompt.
+    """Return a gate for live use.
+
+    It has `abstains(model, prompt)` and `answer(model, prompt)`, for a local model and its prompt.
 
     source: `one:DATASET`, `other datasets` (than the target) or `other families`. threshold: mid, J or conformal.
     layer: default: that of the gate stage. without: scenarios, or families as the gate stage names them
@@ -230,7 +237,9 @@ class Direction:
         change: Change = add,
         site: Site = "residual",
     ) -> Iterator[None]:
-        """Change a model's passes inside the context; the hook is always removed afterwards.
+        """Change a model's passes inside the context.
+
+        The hook is always removed afterwards.
 
         model: a transformers model, or one of ours. amount: in the model's own unit, or gaps: in class gaps. change:
         maps the states at a site (rows, T, d), the unit direction and the amount to new states; with a cache, T is 1
@@ -291,9 +300,11 @@ def direction(
     """
     directions: Mapping[str, Any] = saved_directions(_workspace(workspace), Extraction(get_model(model).id, prompt))
     if dataset not in directions or kind not in directions[dataset].vectors:
-        available = ", ".join(f"{name} ({', '.join(of.vectors)})" for name, of in directions.items())
+        available = ", ".join(
+            f"{name} ({', '.join(directions_of.vectors)})" for name, directions_of in directions.items()
+        )
         raise TrapsError(f"no {kind} direction of {dataset}; the study has {available or 'none'}")
-    of = directions[dataset]
-    if not 0 <= layer < of.n_layers or not 0 <= draw < len(of.vectors[kind]):
-        raise TrapsError(f"no draw {draw} at layer {layer}: layers are 0 to {of.n_layers - 1}")
-    return Direction(of.vectors[kind][draw][layer], layer, float(of.gaps[layer]))
+    directions_of = directions[dataset]
+    if not 0 <= layer < directions_of.n_layers or not 0 <= draw < len(directions_of.vectors[kind]):
+        raise TrapsError(f"no draw {draw} at layer {layer}: layers are 0 to {directions_of.n_layers - 1}")
+    return Direction(directions_of.vectors[kind][draw][layer], layer, float(directions_of.gaps[layer]))

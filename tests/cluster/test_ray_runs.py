@@ -27,7 +27,7 @@ from traps_pipeline.cluster.shared_history import HISTORY, LOGS, dagster_yaml
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.pipeline.graph import the_graph
 from traps_pipeline.pipeline.run import dagster_history
-from traps_pipeline.pipeline.runs import broke_off, range_tags
+from traps_pipeline.pipeline.runs import is_broken_off, range_tags
 from traps_pipeline.pipeline.schemes import DATASET
 from traps_pipeline.pipeline.stages import benchmark_stages
 from traps_pipeline.pipeline.step import RESUMED_ELSEWHERE, end_if_resumed
@@ -238,7 +238,7 @@ def test_a_run_that_says_why_it_failed_did_not_break_off(error: Exception) -> No
         run = instance.get_run_by_id(result.run_id)
         assert run is not None
         failures = [event for event in result.all_events if event.is_step_failure]
-        assert broke_off(run, failures) == isinstance(error, ConnectionError)
+        assert is_broken_off(run, failures) == isinstance(error, ConnectionError)
 
 
 def test_a_process_whose_run_was_resumed_elsewhere_ends_without_a_word(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from traps_pipeline.mechanism.baselines import noise_floor, raw_features, score_features
-from traps_pipeline.mechanism.margin import begins_abstention
+from traps_pipeline.mechanism.margin import is_abstention_start
 from traps_pipeline.mechanism.probing import ProbeRun
 from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed, taxonomy_of
 from traps_pipeline.storage.media import MediaSpec
@@ -97,4 +97,4 @@ def test_noise_shows_what_shared_controls_give_and_that_held_out_scenarios_take_
     ],
 )  # fmt: skip
 def test_tokens_that_begin_an_abstention_are_known_by_their_text(token: str, begins: bool) -> None:
-    assert begins_abstention(token) == begins
+    assert is_abstention_start(token) == begins

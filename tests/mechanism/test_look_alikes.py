@@ -26,7 +26,7 @@ from traps_pipeline.mechanism.gate import OTHER_DATASETS, THRESHOLDS, decide
 from traps_pipeline.mechanism.gating import UNTRAINED, gate_items, gate_rows, gate_table, read_states
 from traps_pipeline.mechanism.item_scores import item_score_rows
 from traps_pipeline.mechanism.lens import lens_rows
-from traps_pipeline.mechanism.margin import begins_abstention
+from traps_pipeline.mechanism.margin import is_abstention_start
 from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES, PROBE_ITEMS, PROBES
 from traps_pipeline.mechanism.probe_items import probe_items
 from traps_pipeline.mechanism.probing import ProbeRun
@@ -271,7 +271,7 @@ def test_the_lens_is_the_models_norm_and_head_on_each_layer_and_ends_at_the_outp
         logits = model.network.lm_head(model.network.model.language_model.norm(raw))
         logits[:, model.network.generation_config.suppress_tokens] = -torch.inf  # pictures' tokens are never answers
         chance = logits.softmax(-1)
-    begins = [t for t in range(chance.shape[1]) if begins_abstention(model.processor.tokenizer.decode([t]))]
+    begins = [t for t in range(chance.shape[1]) if is_abstention_start(model.processor.tokenizer.decode([t]))]
     told = chance[:, begins].sum(1)
     odds = torch.log(told / (1 - told)).numpy()
     assert rows.loc[("chaotic", 2), "voids"] == pytest.approx(odds[void].mean(), abs=1e-3)

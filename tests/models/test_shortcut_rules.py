@@ -17,7 +17,7 @@ from traps_pipeline.models.backends import make_backend
 from traps_pipeline.models.reference import ABSTENTION
 from traps_pipeline.models.registry import get_model
 from traps_pipeline.models.request import Request
-from traps_pipeline.models.shortcut_rules import CUES, CUT_FRAMES, OCCLUDER_PX, RULES, names_no_choices
+from traps_pipeline.models.shortcut_rules import CUES, CUT_FRAMES, OCCLUDER_PX, RULES, has_no_choices
 from traps_pipeline.scenes.parts.look import MATERIALS, OCCLUDERS, Look
 from traps_pipeline.scenes.parts.vision import largest_board
 from traps_pipeline.scenes.physics.kit import COLOURS
@@ -112,8 +112,8 @@ def test_a_rule_is_told_the_commonest_answer_and_nothing_of_the_item_besides() -
 
 def test_every_released_question_names_its_choices_and_most_ill_posed_ones_do_not() -> None:
     specs = load_released().values()
-    assert not any(names_no_choices(spec.question) for spec in specs)
-    caught = [names_no_choices(spec.ill_posed_question) for spec in specs]
+    assert not any(has_no_choices(spec.question) for spec in specs)
+    caught = [has_no_choices(spec.ill_posed_question) for spec in specs]
     assert np.mean(caught) > 0.7  # "Is the ramp hollow or solid?" names some all the same
 
 

@@ -1,1 +1,1 @@
-"""Shared helpers below every other room: errors, files, digests, paths, keys and terminal output."""
+"""Share errors, files, digests, paths, keys and terminal output with all rooms."""

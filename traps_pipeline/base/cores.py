@@ -1,4 +1,7 @@
-"""Count the cores that work may use: those of this process, or those that a cluster reserved for its run."""
+"""Count the cores that work may use.
+
+They are those of this process, or those that a cluster reserved for its run.
+"""
 
 from __future__ import annotations
 

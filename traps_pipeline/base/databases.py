@@ -1,4 +1,7 @@
-"""Translate a database's error into a reason and a remedy, without the text of SQLAlchemy or of a statement."""
+"""Translate a database's error into a reason and a remedy.
+
+Neither quotes SQLAlchemy's text or a statement.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,7 @@ _SERVER = r"connection to server|could not translate host name|server closed the
 
 
 def reason_and_remedy(error: BaseException) -> tuple[str, str, bool]:
-    """Return why a database cannot be used, a remedy, and whether the database is unwritable.
+    """Return why a database is unusable, a remedy, and whether it is unwritable.
 
     error: raised by its driver or by SQLAlchemy.
     """
@@ -34,7 +37,7 @@ def reason_and_remedy(error: BaseException) -> tuple[str, str, bool]:
 
 
 def database_error(error: BaseException) -> BaseException | None:
-    """Return the database error that an exception is or was raised from; None if there is none."""
+    """Return the database error that an exception is or was raised from, if any."""
     from sqlalchemy.exc import DBAPIError
 
     current: BaseException | None = error

@@ -1,4 +1,4 @@
-"""The one way to hash a value: SHA-256 of canonical JSON."""
+"""Hash values as SHA-256 of canonical JSON, everywhere in the same way."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ from typing import Any
 
 
 def canonical_json(value: Any) -> str:
-    """Return JSON with sorted keys, no spaces and no NaN: equal values give equal text."""
+    """Return JSON with sorted keys, no spaces and no NaN.
+
+    Equal values give equal text.
+    """
     return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 
 
@@ -20,7 +23,10 @@ def digest(value: Any) -> str:
 
 
 def digest_of_list(values: Iterable[Any]) -> str:
-    """Return `digest(list(values))` while holding one value at a time, so that a large table fits in memory."""
+    """Return `digest(list(values))` while holding one value at a time.
+
+    So a large table fits in memory.
+    """
     hasher, separator = hashlib.sha256(b"["), b""
     for value in values:
         hasher.update(separator + canonical_json(value).encode())

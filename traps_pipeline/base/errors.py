@@ -1,4 +1,7 @@
-"""The one exception that the command line shows as a sentence instead of a traceback."""
+"""Define the exception that the command line shows as a sentence.
+
+Any other is shown as a traceback.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,10 @@ from traps_pipeline.base.redaction import redact
 
 
 class TrapsError(Exception):
-    """Report bad input or a broken file. The message names file and record, says what to do, and holds no key."""
+    """Bad input or a broken file.
+
+    The message names file and record, says what to do, and holds no key.
+    """
 
     def __init__(self, message: object) -> None:
         super().__init__(redact(str(message)))

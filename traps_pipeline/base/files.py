@@ -39,7 +39,7 @@ def remedy(error: OSError) -> str:
 
 @contextmanager
 def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; when the block ends, that file replaces `path`.
+    """Yield a temporary path beside `path`, which replaces `path` after the block.
 
     Until then, and after an error, Ctrl-C or a kill, `path` keeps its former content. An unfinished file is removed;
     only a kill leaves one, hidden and named `*.part`, which nothing reads. Missing folders are created.
@@ -74,7 +74,10 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
 
 
 def sync_folder(folder: Path) -> None:
-    """Sync a folder's entries to disk: without it, a synced file can still lose its name in a power cut."""
+    """Sync a folder's entries to disk.
+
+    Without it, a synced file can still lose its name in a power cut.
+    """
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
@@ -83,7 +86,10 @@ def sync_folder(folder: Path) -> None:
 
 
 def is_in_place(descriptor: int, path: Path) -> bool:
-    """Return whether an open file still has its name: a lock on a removed file excludes nobody."""
+    """Return whether an open file still has its name.
+
+    A lock on a removed file excludes nobody.
+    """
     try:
         current, own = path.stat(), os.fstat(descriptor)
     except FileNotFoundError:
@@ -92,7 +98,7 @@ def is_in_place(descriptor: int, path: Path) -> bool:
 
 
 def try_lock(path: Path) -> int | None:
-    """Return the descriptor of a lock file that this process now holds; None if another process holds it.
+    """Lock a file and return its descriptor; None if another process holds it.
 
     The lock lasts until the descriptor is closed or the process ends. Missing folders are created. Raises OSError.
     """
@@ -117,7 +123,10 @@ def try_lock(path: Path) -> int | None:
 
 
 def require_in_place(descriptor: int, path: Path) -> None:
-    """Raise TrapsError if the file of a lock that this process holds was removed: another run may hold it too."""
+    """Raise TrapsError if the file of a lock that this process holds was removed.
+
+    Another run may then hold the same lock.
+    """
     if not is_in_place(descriptor, path):
         raise TrapsError(
             f"{path}: was removed while this run held it, so that another run may ask the same calls; nothing more is "
@@ -145,7 +154,10 @@ def is_same_file(one: Path, other: Path) -> bool:
 
 
 def link(existing: Path, path: Path) -> None:
-    """Hard-link an existing file to `path`, replacing any file there (files are only ever replaced as a whole)."""
+    """Hard-link an existing file to `path`, replacing any file there.
+
+    This is safe because files are only ever replaced as a whole.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     try:
@@ -156,7 +168,10 @@ def link(existing: Path, path: Path) -> None:
 
 
 def check_disk(folder: Path, least_gb: float) -> str:
-    """Return the free space at a folder (which need not exist yet) in words. Raises TrapsError if it is too small."""
+    """Return the free space at a folder in words.
+
+    The folder need not exist yet. Raises TrapsError if the space is too small.
+    """
     existing = next(path for path in (folder, *folder.parents) if path.exists())
     free = shutil.disk_usage(existing).free / 1e9
     if free < least_gb:

@@ -38,7 +38,10 @@ def read_key(variable: str) -> str:
 
 
 def optional_key(variable: str) -> str | None:
-    """Return the key in an environment variable; None if it is not set. Raises TrapsError as `read_key` does."""
+    """Return the key in an environment variable; None if it is not set.
+
+    Raises TrapsError as `read_key` does.
+    """
     value = os.environ.get(variable)
     if not value:
         return None
@@ -48,7 +51,9 @@ def optional_key(variable: str) -> str | None:
 
 
 def check_key(variable: str, value: str) -> None:
-    """Check that a key, or an address with a password, consists of printable ASCII characters without white space.
+    """Check that a key consists of printable ASCII characters without white space.
+
+    An address with a password is checked alike.
 
     White space is refused, not stripped, so that every program reads the same key from the variable. Raises TrapsError,
     which names the variable and never the value.
@@ -59,7 +64,10 @@ def check_key(variable: str, value: str) -> None:
 
 
 def check_parameters(params: Mapping[str, Any]) -> None:
-    """Raise ValueError if a call's parameters hold a key or an address at any depth. The error names no value."""
+    """Raise ValueError if a call's parameters hold a key or an address at any depth.
+
+    The error names no value.
+    """
     for name, value in params.items():
         if _NO_PARAMETER.search(str(name)):  # a token's number in `logit_bias`
             raise ValueError(
@@ -72,7 +80,10 @@ def check_parameters(params: Mapping[str, Any]) -> None:
 
 
 def check_address(address: str) -> str:
-    """Return the address unchanged. Raises ValueError, which does not repeat it, if it may hold a key."""
+    """Return the address unchanged if it holds no key.
+
+    Raises ValueError, which does not repeat it, if it may hold one.
+    """
     parts = urlsplit(address)
     if parts.username is not None or parts.query or parts.fragment:
         raise ValueError("holds more than scheme, host, port and path: export the key and name its variable as `key`")
@@ -80,7 +91,10 @@ def check_address(address: str) -> str:
 
 
 def check_variable(name: str) -> str:
-    """Return the variable's name unchanged. Raises ValueError, which does not repeat it, if it may be the key."""
+    """Return the variable's name unchanged if it is no key.
+
+    Raises ValueError, which does not repeat it, if it may be the key.
+    """
     if not re.fullmatch(r"[A-Z][A-Z0-9_]*", name):
         raise ValueError("is the name of the environment variable that holds a key, such as MY_KEY, not the key itself")
     return name
@@ -91,7 +105,7 @@ Variable = Annotated[str, AfterValidator(check_variable)]
 
 
 def _problem(value: str) -> str:
-    """Return what keeps a value from being a key, beginning with a verb; empty if nothing does."""
+    """Return why a value is no key, beginning with a verb; empty if it may be one."""
     if not value.strip():
         return "holds no key"
     for verb, character in (("ends with", value[-1]), ("begins with", value[0])):

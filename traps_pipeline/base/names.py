@@ -1,4 +1,7 @@
-"""Validate names that users choose: of models, judges, panels, accounts, experiments, benchmarks and submissions."""
+"""Validate names that users choose.
+
+They name models, judges, panels, accounts, experiments, benchmarks and submissions.
+"""
 
 from __future__ import annotations
 

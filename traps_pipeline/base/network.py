@@ -1,4 +1,4 @@
-"""Check the environment's proxy and certificate variables, and say what is wrong with them.
+"""Check the proxy and certificate variables of the environment.
 
 Client libraries read these variables on their own, and their errors do not name them.
 """
@@ -26,7 +26,10 @@ CERTIFICATES = (*TLS_VARIABLES, "REQUESTS_CA_BUNDLE", "CURL_CA_BUNDLE")  # read 
 
 @dataclass(frozen=True)
 class Proxy:
-    """A proxy that the environment configures. variable: the variable's name, or "the system's settings"."""
+    """A proxy that the environment configures.
+
+    variable: the variable's name, or "the system's settings".
+    """
 
     variable: str
     url: str
@@ -73,14 +76,20 @@ def is_loopback(host: str) -> bool:
 
 
 def proxy_of(url: str) -> Proxy | None:
-    """Return the proxy that the environment configures for a URL; None for loopback addresses in any case."""
+    """Return the proxy that the environment configures for a URL, if any.
+
+    Loopback addresses never have one.
+    """
     parts = urlsplit(url)
     return _proxy_of(parts.scheme, parts.hostname or "", tuple(os.environ.get(name) for name in _READ))
 
 
 @lru_cache(maxsize=256)
 def _proxy_of(scheme: str, host: str, _: tuple[str | None, ...]) -> Proxy | None:
-    """Return the proxy for a host, kept for as long as the variables have these values: each call asks."""
+    """Return the proxy for a host, cached while the variables keep their values.
+
+    Each call asks for it.
+    """
     proxies = urllib.request.getproxies()
     address = proxies.get(scheme) or proxies.get("all")
     if not address or is_loopback(host) or urllib.request.proxy_bypass(host):
@@ -110,7 +119,7 @@ def check_network() -> str:
 
 
 def certificate_problem(variables: Sequence[str]) -> str | None:
-    """Return the sentence about a variable that names no certificates; None if all are sound."""
+    """Return what is wrong with the variables that name certificates, if anything."""
     for variable in variables:
         value = os.environ.get(variable)
         if value and (problem := _certificates_problem(variable, value)):
@@ -120,8 +129,12 @@ def certificate_problem(variables: Sequence[str]) -> str | None:
 
 def _certificates_problem(variable: str, value: str) -> str:
     if variable == "SSL_CERT_DIR":
-        gone = [folder for folder in value.split(os.pathsep) if not Path(folder).is_dir()]
-        return f"{variable} names the folder {gone[0]}, which is not there: mend or unset it" if gone else ""
+        missing_folders = [folder for folder in value.split(os.pathsep) if not Path(folder).is_dir()]
+        return (
+            f"{variable} names the folder {missing_folders[0]}, which is not there: mend or unset it"
+            if missing_folders
+            else ""
+        )
     if not Path(value).exists():
         return f"{variable} names the file {value}, which is not there: mend or unset it"
     try:

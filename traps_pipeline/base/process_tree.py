@@ -1,4 +1,4 @@
-"""Start processes that end together: a command and all its descendants, however each of them ends.
+"""Start a command so that it and all its descendants end together.
 
 A command that starts servers runs as two processes: the second starts the servers and waits for them, the first waits
 for the second. Each adopts the orphans below it (PR_SET_CHILD_SUBREAPER), so that it finds and stops what the death of
@@ -55,7 +55,10 @@ def split(wait_s: float) -> int | None:
 
 
 def wait_for(children: Collection[int]) -> tuple[int, int]:
-    """Return process id and exit code (negative: a signal's) of the first child to end; reap orphans."""
+    """Return id and exit code of the first child process to end; reap orphans.
+
+    A negative exit code is a signal's.
+    """
     while True:
         pid, status = os.wait()
         if pid in children:
@@ -63,7 +66,10 @@ def wait_for(children: Collection[int]) -> tuple[int, int]:
 
 
 def stop_descendants(wait_s: float) -> None:
-    """Stop every process below this one by SIGTERM; after `wait_s` seconds or KeyboardInterrupt by SIGKILL."""
+    """Stop every process below this one: SIGTERM, then SIGKILL.
+
+    SIGKILL follows after `wait_s` seconds or KeyboardInterrupt.
+    """
     try:
         pids = descendants()
         for pid in pids:

@@ -1,4 +1,4 @@
-"""The state of a run, and the events that change it.
+"""Hold the state of a run, and the events that change it.
 
 Library code reports to `current()`. A command installs a subclass that prints (`cli/printed_progress.py`), and a
 Dagster step adds a listener (`Progress.heard_by`).
@@ -39,7 +39,10 @@ class Tally:
 
 @dataclass
 class Traffic:
-    """A stage's calls to one model or judge. Latencies are those of the last 500 calls, in seconds."""
+    """A stage's calls to one model or judge.
+
+    Latencies are those of the last 500 calls, in seconds.
+    """
 
     wanted: int = 0
     cached: int = 0
@@ -56,7 +59,10 @@ class Traffic:
         return self.done / max(time.monotonic() - self.began, 1e-9)
 
     def latency_s(self, share: float) -> float:
-        """Return the latency quantile of the last calls, in seconds. share: the quantile, from 0 to 1."""
+        """Return the latency quantile of the last calls, in seconds.
+
+        share: the quantile, from 0 to 1.
+        """
         ordered = sorted(self.latencies)
         return ordered[min(int(share * len(ordered)), len(ordered) - 1)] if ordered else 0.0
 
@@ -95,16 +101,20 @@ class StageProgress:
     def left_s(self) -> float | None:
         """Seconds until the stage ends at its pace so far; None before anything is known."""
         total = self.total()
-        begun = max(self.done + self.share, self.cells * total.done / total.wanted if total.wanted else 0.0)
-        return self.seconds / begun * max(self.partitions - begun, 0.0) if begun and self.partitions else None
+        begun_calls = max(self.done + self.share, self.cells * total.done / total.wanted if total.wanted else 0.0)
+        return (
+            self.seconds / begun_calls * max(self.partitions - begun_calls, 0.0)
+            if begun_calls and self.partitions
+            else None
+        )
 
     def total(self) -> Traffic:
         """Return the sum of all calls."""
         each = [*self.calls.values()]
-        total = Traffic(began=min((one.began for one in each), default=self.began))
-        total.latencies = deque(chain.from_iterable([*one.latencies] for one in each))
+        total = Traffic(began=min((traffic.began for traffic in each), default=self.began))
+        total.latencies = deque(chain.from_iterable([*traffic.latencies] for traffic in each))
         for name in ("wanted", "cached", "done", "errors", "retries", "dollars"):
-            setattr(total, name, sum(getattr(one, name) for one in each))
+            setattr(total, name, sum(getattr(traffic, name) for traffic in each))
         return total
 
     def work(self) -> list[str]:
@@ -153,13 +163,16 @@ class Progress:
         self.changed()
 
     def asking(self, stage: str, calls: Mapping[str, tuple[int, int]]) -> None:
-        """Count a cell's calls before they are sent: by model or judge, new calls and those in the ledger."""
+        """Count a cell's calls before they are sent.
+
+        By model or judge, new calls and those in the ledger.
+        """
         if self.current_stage is None:
             self.current_stage = StageProgress(stage, 0)
         self.current_stage.cells += 1
         self.current_stage.detail, self.current_stage.share = "", 0.0
-        for who, (missing, known) in calls.items():
-            traffic = self.current_stage.calls.setdefault(who, Traffic())
+        for participant, (missing, known) in calls.items():
+            traffic = self.current_stage.calls.setdefault(participant, Traffic())
             traffic.wanted, traffic.cached = traffic.wanted + missing, traffic.cached + known
         self.changed()
 
@@ -209,7 +222,10 @@ class Progress:
 
     @contextmanager
     def heard_by(self, listener: Callable[[str], None]) -> Iterator[None]:
-        """Send a listener a line about the running stage every 30 s and one at its end, within the block."""
+        """Send a listener progress lines about the running stage within the block.
+
+        One line every 30 s, and one at the stage's end.
+        """
         self._listeners.append(listener)
         try:
             yield
@@ -222,7 +238,7 @@ class Progress:
         if (now := self.current_stage) is None:
             return money
         times = {"seconds": round(now.seconds, 1), "left_s": None if now.left_s is None else round(now.left_s, 1)}
-        calls = {who: traffic.figures() for who, traffic in [*now.calls.items()]}
+        calls = {participant: traffic.figures() for participant, traffic in [*now.calls.items()]}
         counts = {"stage": now.name, "done": now.done, "partitions": now.partitions, "detail": now.detail}
         return {**counts, **times, **money, "calls": calls}
 

@@ -59,7 +59,10 @@ def remember(value: str) -> None:
 
 
 def redact(text: str) -> str:
-    """Return the text with each secret replaced by `***`, whether known or recognizable by its header."""
+    """Return the text with each secret replaced by `***`.
+
+    A secret is known, or recognizable by its header.
+    """
     if len(text) < SHORTEST:  # most cells of a table
         return text
     environment = frozenset(os.environb.items())  # `os.environ` decodes each name and value anew
@@ -79,7 +82,10 @@ def redact(text: str) -> str:
 
 
 def redact_tracebacks() -> None:
-    """Redact this process's log records, tracebacks and warnings: each may quote a request's headers."""
+    """Redact this process's log records, tracebacks and warnings.
+
+    Each may quote a request's headers.
+    """
     make = logging.getLogRecordFactory()
     if getattr(make, "__module__", "") == __name__:
         return
@@ -107,7 +113,10 @@ def redact_tracebacks() -> None:
 
 
 def redacted(error: Exception) -> Exception:
-    """Return an exception to raise instead of one whose traceback would show a key; otherwise the exception itself."""
+    """Return an exception whose traceback shows no key.
+
+    It is the given one, unless that would show a key.
+    """
     text = "".join(traceback.format_exception(error))
     without = redact(text)
     return error if without == text else RuntimeError(without).with_traceback(error.__traceback__)
@@ -130,7 +139,10 @@ def _secrets(
 
 @lru_cache(maxsize=64)
 def _pieces(secrets: frozenset[str]) -> dict[str, list[tuple[str, int]]]:
-    """Return the pieces of all forms of the secrets: each with the forms that hold it, and where it begins in them."""
+    """Return pieces that all forms of the secrets contain.
+
+    Each piece maps to the forms that hold it, and where it begins in them.
+    """
     forms = set[str]()
     for secret in secrets:
         for part in {secret, *re.split(r"[^!-~]+", secret)}:
@@ -145,7 +157,10 @@ def _pieces(secrets: frozenset[str]) -> dict[str, list[tuple[str, int]]]:
 
 
 def _encoded(secret: str) -> Iterator[str]:
-    """Yield how a secret looks inside longer base64 content (at each of three offsets) and in hexadecimal."""
+    """Yield how a secret looks in hexadecimal and inside longer base64 content.
+
+    In base64, at each of three offsets.
+    """
     content = secret.encode("utf-8", "surrogateescape")
     yield content.hex()
     for before, skipped in ((0, 0), (1, 2), (2, 3)):
@@ -154,7 +169,10 @@ def _encoded(secret: str) -> Iterator[str]:
 
 
 def _searched(text: str, is_decoded: bool) -> str:
-    """Return the printable ASCII characters of a text in lower case, without white space, quotes and backslashes."""
+    """Reduce a text to the lower-case printable ASCII characters to search.
+
+    White space, quotes and backslashes are left out.
+    """
     if is_decoded:
         text = _ENCODED.sub(lambda match: _decoded(match[0]), text)
     return text.encode("ascii", "ignore").translate(None, _IGNORED).lower().decode()
@@ -196,7 +214,7 @@ def _spans(text: str, pieces: dict[str, list[tuple[str, int]]], is_decoded: bool
 
 def _alike(text: str, other: str) -> int:
     """Return how many characters two texts have in common at their beginnings."""
-    differing = (k for k, (one, two) in enumerate(zip(text, other, strict=False)) if one != two)
+    differing = (k for k, (char, other_char) in enumerate(zip(text, other, strict=False)) if char != other_char)
     return next(differing, min(len(text), len(other)))
 
 

@@ -1,4 +1,4 @@
-"""Make hidden characters in untrusted text visible, and format tables for a terminal or a pipe."""
+"""Make hidden characters in untrusted text visible, and format tables."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ _JOINER, _EMOJI_STYLE = "\u200d", "\ufe0f"
 
 
 def visible(text: str) -> str:
-    """Return the text with each invisible or direction-changing character written as `[U+202E]`.
+    """Return the text with invisible or direction-changing characters escaped.
+
+    Each is written as `[U+202E]`.
 
     Line ends and tabs stay, and so do an emoji's variation selector and joiner. Every page and every value for Dagster
     passes through here; the type (`Markup`) is preserved.
@@ -44,7 +46,10 @@ def _number(match: re.Match[str]) -> str:
 
 
 def finalized(value: object) -> object:
-    """Return an expression's value as a template prints it: `finalize` of every Jinja2 environment."""
+    """Return an expression's value as a template prints it.
+
+    It is `finalize` of every Jinja2 environment.
+    """
     return visible(value) if isinstance(value, str) else value
 
 
@@ -58,7 +63,9 @@ def _printable(text: str) -> str:
 
 
 def wrapped(text: str, stream: TextIO | None = None, *, hang: int | None = None) -> str:
-    """Return lines for a stream (default: standard output), wrapped between words on a terminal.
+    """Return lines for a stream, wrapped between words on a terminal.
+
+    stream: standard output by default.
 
     hang: extra indentation of continuation lines, in columns (default: 4 if the line is indented, else 0).
     """
@@ -69,8 +76,8 @@ def wrapped(text: str, stream: TextIO | None = None, *, hang: int | None = None)
     for line in text.split("\n"):
         indent = len(line) - len(line.lstrip())
         further = " " * (indent + (4 if indent else 0) if hang is None else indent + hang)
-        how: dict[str, Any] = {"break_long_words": False, "break_on_hyphens": False, "subsequent_indent": further}
-        lines.append(textwrap.fill(line, columns, **how))
+        options: dict[str, Any] = {"break_long_words": False, "break_on_hyphens": False, "subsequent_indent": further}
+        lines.append(textwrap.fill(line, columns, **options))
     return "\n".join(lines)
 
 

@@ -1,4 +1,4 @@
-"""A guard in front of a local web server, so that only the person who started it can use it.
+"""Guard a local web server so that only its owner can use it.
 
 A server accepts any request that reaches its port: a page of another site, opened in the same browser, could act in the
 user's name. The guard admits a request that carries the token of the printed address or comes from a page of this very
@@ -67,7 +67,12 @@ def token_for(host: str, token: str | None, *, danger: str, variable: str) -> st
 
 
 def public_name(address: str) -> str:
-    """Return name (and port) of the HTTPS proxy before this server. Raises TrapsError unless `https://NAME[:PORT]`."""
+    """Return name (and port) of the HTTPS proxy before this server.
+
+    Raises TrapsError unless the address is `https:
+
+    NAME[:PORT]`.
+    """
     parts = urlsplit(address)
     if parts.scheme != "https" or not parts.hostname or address.rstrip("/") != f"https://{parts.netloc}":
         raise TrapsError(
@@ -77,7 +82,10 @@ def public_name(address: str) -> str:
 
 
 def personal_tokens(token: str, people: Sequence[str]) -> dict[str, str]:
-    """Return a token per person, derived from one secret: stable over restarts, and none reveals another."""
+    """Return a token per person, derived from one secret.
+
+    Tokens are stable over restarts, and none reveals another.
+    """
 
     def own(who: str) -> str:
         return urlsafe_b64encode(hmac.digest(token.encode(), who.encode(), "sha256")[:18]).decode()
@@ -119,15 +127,15 @@ class Guard:
             return
         headers = {name.lower(): value for name, value in scope["headers"]}
         refused = self._refusal(scope, headers)
-        if refused is None and scope["type"] == "http" and self._token_in(scope):
+        if refused is None and scope["type"] == "http" and self._has_token(scope):
             await self._enter(scope, send)
-        elif refused is None and (who := self._whose(headers)) is not None:
-            scope[WHO] = who
+        elif refused is None and (person := self._whose(headers)) is not None:
+            scope[WHO] = person
         elif refused is None:
             refused = 403, f"open the address that `{self._command}` printed: the token in it lets this browser in"
         if refused is not None:
             await _refuse(scope, receive, send, *refused)
-        elif not (scope["type"] == "http" and self._token_in(scope)):
+        elif not (scope["type"] == "http" and self._has_token(scope)):
             await self._app(scope, receive, _with_headers(send))
 
     def _refusal(self, scope: Scope, headers: Mapping[bytes, bytes]) -> tuple[int, str] | None:
@@ -142,7 +150,7 @@ class Guard:
             if of_origin.scheme not in ("http", "https") or of_origin.netloc != host:
                 return 403, "a page of another site asked for this"
         reads = not websocket and scope["method"] in _SAFE_METHODS
-        if headers.get(b"sec-fetch-site", b"none") not in _OWN_SITE and not (reads and self._token_in(scope)):
+        if headers.get(b"sec-fetch-site", b"none") not in _OWN_SITE and not (reads and self._has_token(scope)):
             return 403, "a page of another site asked for this"
         if websocket:
             return None
@@ -156,21 +164,27 @@ class Guard:
         kind = headers.get(b"content-type", b"").split(b";")[0].strip().lower()
         return None if kind == b"application/json" else (415, "a POST holds JSON here")
 
-    def _token_in(self, scope: Scope) -> bool:
+    def _has_token(self, scope: Scope) -> bool:
         if scope["method"] not in _SAFE_METHODS:
             return False
         return self._owner(_given_token(scope)) is not None
 
     def _owner(self, token_given: str | None) -> str | None:
-        """Return the token's owner; None if nobody's. Compare with every token, so that timing reveals nothing."""
+        """Return the token's owner; None if nobody owns it.
+
+        It is compared with every token, so that timing reveals nothing.
+        """
         owner = None
-        for token, who in self._tokens.items():
+        for token, person in self._tokens.items():
             if token_given is not None and hmac.compare_digest(token_given.encode(), token.encode()):
-                owner = who
+                owner = person
         return owner
 
     def _whose(self, headers: Mapping[bytes, bytes]) -> str | None:
-        """Return the owner of a request's cookie or `Authorization: Bearer TOKEN`; None if there is none."""
+        """Return the owner of a request's cookie or bearer token, if any.
+
+        The header is `Authorization: Bearer TOKEN`.
+        """
         scheme, _, token = headers.get(b"authorization", b"").decode("latin-1").partition(" ")
         if scheme.lower() == "bearer":
             return self._owner(token.strip())
@@ -181,7 +195,10 @@ class Guard:
         return self._owner(cookies[self._cookie].value) if self._cookie in cookies else None
 
     async def _enter(self, scope: Scope, send: Send) -> None:
-        """Set the token as a cookie and redirect to the page without it: an address is visible and recorded."""
+        """Set the token as a cookie and redirect to the page without it.
+
+        Browsers show and record addresses.
+        """
         parameters = [pair for pair in parse_qsl(scope["query_string"].decode("latin-1")) if pair[0] != "token"]
         place = "/" + quote(scope["path"].lstrip("/\\")) + (f"?{urlencode(parameters)}" if parameters else "")
         cookie = f"{self._cookie}={_given_token(scope)}; HttpOnly; SameSite=Strict; Path=/{self._secure}"

@@ -1,4 +1,7 @@
-"""Rendering workers, one process per core: results in job order, workers recycled, none left running."""
+"""Render in worker processes, one per core, with results in job order.
+
+Workers are recycled, and none is left running.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +44,10 @@ _idle: list[_Pool] | None = None  # idle pools of `kept_workers`
 
 @contextmanager
 def kept_workers() -> Iterator[None]:
-    """Keep idle workers for the next `run_in_order` in the block: starting one takes as long as twenty frames."""
+    """Keep idle workers for the next `run_in_order` in the block.
+
+    Starting one takes as long as twenty frames.
+    """
     global _idle
     if _idle is not None:
         yield

@@ -1,1 +1,1 @@
-"""The benchmark as data: released records, corrections, versions and items."""
+"""Hold the benchmark as data: released records, corrections, versions and items."""

@@ -1,4 +1,4 @@
-"""Certify a whole benchmark: all records on all cores, resumable, with a table of results."""
+"""Certify a whole benchmark on all cores, resumably, with a table of results."""
 
 from __future__ import annotations
 
@@ -43,7 +43,9 @@ def certify_all(
     fresh: bool = False,
     report: Callable[[str], None] = lambda _: None,
 ) -> tuple[list[Verdict], list[str]]:
-    """Return verdicts on the records of a benchmark folder, and every problem in words, scenarios first.
+    """Return verdicts on a benchmark folder's records, and all problems in words.
+
+    Problems of scenarios come first.
 
     Verdicts are cached under `kept` by record and code, so that an interrupted call resumes.
     """
@@ -56,10 +58,12 @@ def certify_all(
         for case in cases:
             case.verdict.unlink(missing_ok=True)
     verdicts = []
-    for done, (_, verdict) in enumerate(run_in_order(judge, cases, workers), start=1):
+    for finished, (_, verdict) in enumerate(run_in_order(judge, cases, workers), start=1):
         verdicts.append(verdict)
-        if not verdict.passed or done % 20 == 0 or done == len(cases):
-            report(f"{done} of {len(cases)} examined: {verdict.scenario_id} {'passes' if verdict.passed else 'FAILS'}")
+        if not verdict.passed or finished % 20 == 0 or finished == len(cases):
+            report(
+                f"{finished} of {len(cases)} examined: {verdict.scenario_id} {'passes' if verdict.passed else 'FAILS'}"
+            )
     failures = [f"{v.scenario_id}: {name}: {why}" for v in verdicts for name, why in v.failures.items()]
     is_complete = families is None and (folder / "composition.yaml").is_file()
     failures += problems(specs, load_composition(folder / "composition.yaml") if is_complete else None)
@@ -75,7 +79,10 @@ def _case(released: Path, folder: Path, spec: SceneSpec) -> Case:
 
 @cache
 def code_digest(family: str) -> str:
-    """Return the digest of the code that certifies a family; cached verdicts of other code are ignored."""
+    """Return the digest of the code that certifies a family.
+
+    Cached verdicts of other code are ignored.
+    """
     folder = PACKAGE / "scenes"
     files = [path for path in sorted(folder.rglob("*.py")) if path.parent.name != "families" or path.stem == family]
     return digest([[path.name, file_digest(path)] for path in files])
@@ -97,7 +104,10 @@ def judge(case: Case) -> Verdict:
 
 
 def _alike(verdicts: Iterable[Verdict]) -> list[str]:
-    """Return clips of different scenarios that end in the same frame: no clip may serve two scenarios."""
+    """Return clips of different scenarios that end in the same frame.
+
+    No clip may serve two scenarios.
+    """
     problems = []
     for side in ("control_end", "void_end"):
         owners: defaultdict[str, list[str]] = defaultdict(list)
@@ -109,7 +119,10 @@ def _alike(verdicts: Iterable[Verdict]) -> list[str]:
 
 
 def foreseeable(specs: Iterable[SceneSpec], verdicts: Iterable[Verdict]) -> list[str]:
-    """Return families of cut clips, with at least a hundred records, whose state at the cut predicts the outcome."""
+    """Return families of cut clips whose state at the cut predicts the outcome.
+
+    Only families with at least a hundred records are judged.
+    """
     states = {verdict.scenario_id: verdict.at_cut for verdict in verdicts if len(verdict.at_cut)}
     families: defaultdict[str, list[SceneSpec]] = defaultdict(list)
     for spec in specs:
@@ -149,10 +162,10 @@ def family_table(folder: Path, verdicts: Sequence[Verdict]) -> str:
     for family, mine in sorted(members.items()):
         twins = sum("twin" not in v.failures and "record" not in v.failures for v in mine)
         rejected = tallies.get(family, Tally(0, 0)).rejected.total()
-        others = sum(not v.same_physics for v in mine)
+        changed = sum(not v.same_physics for v in mine)
         spans = (_span(mine, "entropy_bits", 2), _span(mine, "top_share", 2), _span(mine, "margin_m", 3))
         seconds = f"{np.median([v.cpu_s for v in mine]):.1f}"
-        rows.append((family, len(mine), sum(v.passed for v in mine), rejected, *spans, twins, seconds, others))
+        rows.append((family, len(mine), sum(v.passed for v in mine), rejected, *spans, twins, seconds, changed))
     lines = [text_table(headings, rows)]
     if any(not v.same_physics for v in verdicts):
         lines.append(

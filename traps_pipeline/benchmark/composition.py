@@ -1,4 +1,7 @@
-"""A whole benchmark: the number of scenarios of each family, sampling, and checks across scenarios."""
+"""Sample a whole benchmark, and check it across scenarios.
+
+It has a number of scenarios for each family.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,10 @@ class Composition(RootModel[dict[str, int]]):
 
 
 def load_composition(path: Path = SCENE_SPECS / "composition.yaml") -> dict[str, int]:
-    """Return the number of scenarios of each family. Raises TrapsError naming the file."""
+    """Return the number of scenarios of each family.
+
+    Raises TrapsError naming the file.
+    """
     try:
         return Composition.model_validate(read_yaml(path)).root
     except ValidationError as error:
@@ -44,7 +50,9 @@ def sample_benchmark(
     workers: int | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> None:
-    """Sample a benchmark into `out`: released records, trajectories, `benchmark.yaml` with its own canary.
+    """Sample a benchmark into the folder `out`.
+
+    It gets released records, trajectories, and `benchmark.yaml` with its own canary.
 
     Existing records of the same seed and numbers stay: an interrupted sampling resumes. Raises TrapsError if a family
     cannot be filled.
@@ -63,7 +71,9 @@ def sample_benchmark(
 
 
 def problems(specs: Sequence[SceneSpec], counts: Mapping[str, int] | None = None) -> list[str]:
-    """Return problems of a set of records as a whole; one sentence each, naming the family.
+    """Return problems of a set of records as a whole.
+
+    One sentence each, naming the family.
 
     counts: the required number of scenarios of each family; not checked if None.
     """
@@ -106,7 +116,10 @@ def _repeated_questions(family: str, members: Sequence[SceneSpec]) -> list[str]:
 
 
 def _constant_margin(family: str, members: Sequence[SceneSpec]) -> list[str]:
-    """Return a problem if a margin is the same in every scene: then nothing was measured."""
+    """Return a problem if a margin is the same in every scene.
+
+    Then nothing was measured.
+    """
     margins = {spec.evidence.get("margin_m") for spec in members}
     return [f"{family}: every scenario has the margin {margins.pop()} m"] if len(margins) == 1 < len(members) else []
 
@@ -127,7 +140,10 @@ def _predictable(specs: Sequence[SceneSpec]) -> list[str]:
 
 
 def prior_accuracy(specs: Sequence[SceneSpec]) -> float:
-    """Return the accuracy of always giving a sub-scenario's commonest answer; taxonomies weighted equally."""
+    """Return the accuracy of always giving a sub-scenario's commonest answer.
+
+    Taxonomies are weighted equally.
+    """
     commonest = commonest_answers([spec.model_dump(mode="json") for spec in specs])
     shares = []
     for taxonomy in ("occlusion", "chaotic"):

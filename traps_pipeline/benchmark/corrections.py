@@ -1,4 +1,6 @@
-"""Review decisions folded over the released records: released + corrections -> a benchmark version.
+"""Fold review decisions over the released records.
+
+Released records and corrections together are a benchmark version.
 
 `scene_specs/corrections/*.jsonl` is append-only, one decision a line, read in the order of file names and lines:
 
@@ -63,7 +65,9 @@ class Correction(BaseModel):
 
 @dataclass(frozen=True)
 class Scenario:
-    """A scenario after its corrections: the released record (None for an added one) and its changes.
+    """A scenario after its corrections: its released record and its changes.
+
+    The record of an added scenario is None.
 
     `params` is not None if the scene itself must be resolved again; the scene_specs stage does that.
     """
@@ -83,14 +87,20 @@ class Scenario:
         return digest([base, dict(self.words), dict(self.params) if self.params is not None else None])[:16]
 
     def changed_words(self) -> SceneSpec:
-        """Return the released record with the corrected words. Raises TrapsError naming the correction."""
+        """Return the released record with the corrected words.
+
+        Raises TrapsError naming the correction.
+        """
         if self.released is None:
             raise ValueError(f"{self.scenario_id} was added; it has no released record")
         return apply_words(self.released, self.words, self.where)
 
 
 def apply_words(spec: SceneSpec, words: Mapping[str, Any], where: str) -> SceneSpec:
-    """Return a record with other words, after checking labels and answer against each other. Raises TrapsError."""
+    """Return a record with other words, after checking labels against the answer.
+
+    Raises TrapsError.
+    """
     if not words:
         return spec
     record = spec.model_dump(mode="json") | {name: value for name, value in words.items() if name != "answer"}
@@ -104,7 +114,10 @@ def apply_words(spec: SceneSpec, words: Mapping[str, Any], where: str) -> SceneS
 
 
 def read_corrections(folder: Path = CORRECTIONS) -> list[tuple[str, Correction]]:
-    """Return all decisions with `file:line`. Raises TrapsError naming the line."""
+    """Return all decisions with `file:line`.
+
+    Raises TrapsError naming the line.
+    """
     corrections = []
     for path in sorted(folder.glob("*.jsonl")):
         for number, line in read_lines(path):
@@ -121,7 +134,10 @@ def read_corrections(folder: Path = CORRECTIONS) -> list[tuple[str, Correction]]
 
 
 def fold(released: Mapping[str, SceneSpec], corrections: Sequence[tuple[str, Correction]]) -> dict[str, Scenario]:
-    """Return the benchmark after all decisions, by scenario id, sorted. Raises TrapsError naming the line."""
+    """Return the benchmark after all decisions, by scenario id, sorted.
+
+    Raises TrapsError naming the line.
+    """
     scenarios = {
         id_: Scenario(id_, spec.family, spec.category, spec, where="released") for id_, spec in released.items()
     }
@@ -143,8 +159,8 @@ def fold(released: Mapping[str, SceneSpec], corrections: Sequence[tuple[str, Cor
             scenarios[correction.scenario_id] = _restored(where, correction.scenario_id, released)
             continue
         if known is None:
-            gone = "was discarded" if correction.scenario_id in released else "is unknown"
-            raise TrapsError(f"{where}: scenario {correction.scenario_id!r} {gone}; name a scenario of the benchmark")
+            state = "was discarded" if correction.scenario_id in released else "is unknown"
+            raise TrapsError(f"{where}: scenario {correction.scenario_id!r} {state}; name a scenario of the benchmark")
         if correction.action == "discard":
             del scenarios[correction.scenario_id]
         elif correction.action == "correct":

@@ -1,4 +1,6 @@
-"""Append review decisions to the corrections, safely for several reviewers at once.
+"""Append review decisions to the corrections.
+
+Several reviewers may do so at once.
 
 The append-only file is the only store. A decision is checked by folding it over all earlier ones, written at once and
 synced to disk before it is confirmed; so a kill loses no confirmed decision, and concurrent reviewers append one after
@@ -31,17 +33,25 @@ class DecidedMeanwhile(TrapsError):
 
 
 def decisions_on(scenario_id: str, folder: Path = CORRECTIONS) -> list[Correction]:
-    """Return all decisions about a scenario, in order. Raises TrapsError for an unreadable file."""
+    """Return all decisions about a scenario, in order.
+
+    Raises TrapsError for an unreadable file.
+    """
     return [each for _, each in read_corrections(folder) if each.scenario_id == scenario_id]
 
 
 def is_reviewed(decisions: Sequence[Correction]) -> bool:
-    """Return whether the last decision about a scenario is valid: `restore` takes back those before it."""
+    """Return whether the last decision about a scenario is valid.
+
+    `restore` takes back those before it.
+    """
     return bool(decisions) and decisions[-1].action != "restore"
 
 
 def decide(correction: Correction, seen: int, folder: Path = CORRECTIONS) -> None:
-    """Append a decision. seen: the number of decisions about the scenario that the reviewer knew of.
+    """Append a decision.
+
+    seen: the number of decisions about the scenario that the reviewer knew of.
 
     Raises DecidedMeanwhile if there are more by now, and TrapsError if the decision does not fit the record; nothing is
     written then.
@@ -52,7 +62,9 @@ def decide(correction: Correction, seen: int, folder: Path = CORRECTIONS) -> Non
 
 
 def undo(scenario_id: str, seen: int, *, who: str, why: str, folder: Path = CORRECTIONS) -> None:
-    """Take back the last decision about a scenario, by appending decisions that restore the former state.
+    """Take back the last decision about a scenario.
+
+    Decisions that restore the former state are appended.
 
     Raises DecidedMeanwhile as `decide` does, and TrapsError if there is no decision to take back.
     """
@@ -61,8 +73,8 @@ def undo(scenario_id: str, seen: int, *, who: str, why: str, folder: Path = CORR
         if not is_reviewed(own):
             raise TrapsError(f"{scenario_id}: no decision stands that could be taken back")
         released = load_released()
-        others = [(where, each) for where, each in read_corrections(folder) if each.scenario_id != scenario_id]
-        before = fold(released, [*others, *(("before", each) for each in own[:-1])]).get(scenario_id)
+        other_decisions = [(where, each) for where, each in read_corrections(folder) if each.scenario_id != scenario_id]
+        before = fold(released, [*other_decisions, *(("before", each) for each in own[:-1])]).get(scenario_id)
 
         def signed(action: str, **changes: Any) -> Correction:
             about = {"who": who, "when": date.today(), "why": why}
@@ -72,7 +84,10 @@ def undo(scenario_id: str, seen: int, *, who: str, why: str, folder: Path = CORR
 
 
 def _bring_back(is_released: bool, before: Scenario | None, *, was_reviewed: bool, signed: Signed) -> list[Correction]:
-    """Return the decisions that restore a scenario's former state, reviewed only if it was."""
+    """Return the decisions that restore a scenario's former state.
+
+    The scenario becomes reviewed only if it was.
+    """
     if not is_released:
         if before is None:
             return [signed("discard")]  # undo an addition

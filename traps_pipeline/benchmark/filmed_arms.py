@@ -1,4 +1,7 @@
-"""The arms stage: render and certify, once, the arms that the study asks for of each scenario (docs/arms.md)."""
+"""Render and certify, once, each scenario's arms that the study asks for.
+
+This is the arms stage (docs/arms.md).
+"""
 
 from __future__ import annotations
 
@@ -40,7 +43,10 @@ _FOUND = ".arm.json"  # suffix of the files with an arm's result
 
 @dataclass(frozen=True)
 class ArmResult:
-    """The stored result of an arm of a scenario, beside its clip. of: the digest of the record and the code."""
+    """The stored result of an arm of a scenario, beside its clip.
+
+    of: the digest of the record and the code.
+    """
 
     of: str
     refused: str | None
@@ -58,7 +64,10 @@ class ArmResult:
 
 @dataclass(frozen=True)
 class Job:
-    """The arms of one scenario still to be rendered: arm -> its clip. Trajectories are (F, nq)."""
+    """The arms of one scenario still to be rendered: arm -> its clip.
+
+    Trajectories are (F, nq).
+    """
 
     spec: SceneSpec
     qpos: np.ndarray
@@ -67,13 +76,13 @@ class Job:
 
 
 def asked_arms(workspace: Workspace, category: str) -> list[str]:
-    """Return the arms and variations of a category that some experiment of the study requests."""
+    """Return a category's arms and variations that some experiment requests."""
     datasets = {dataset for experiment in workspace.study.experiments.values() for dataset in experiment.datasets}
     return [arm for arm in beside_of(taxonomy_of_category(category)) if arm in datasets]
 
 
 def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tuple[int, bool]:
-    """Render and certify the missing arms of a category, concurrently with other processes.
+    """Render and certify a category's missing arms, sharing with other processes.
 
     Return the result of `share`. Raises TrapsError.
     """
@@ -86,7 +95,7 @@ def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tupl
         every = [file for row in rows for file in files(row)]
         workspace.store.bring(file for file in every if file.name.endswith(_FOUND))
         existing = workspace.store.there(every)
-        return [row for row in rows if _missing(row, _clips(workspace, row, arms), existing)]
+        return [row for row in rows if _is_missing(row, _clips(workspace, row, arms), existing)]
 
     def job(row: Row) -> Job | None:
         spec, clips = spec_of(row), _clips(workspace, row, arms)
@@ -103,7 +112,10 @@ def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tupl
 
 
 def seconds_left(workspace: Workspace, category: str) -> float:
-    """Estimate one core's time to render the missing arms of a category, as far as released records tell."""
+    """Estimate one core's time (s) to render a category's missing arms.
+
+    Released records alone are counted.
+    """
     clips = [
         _finding_of(workspace.clip(id_, arm, spec.scene_hash))
         for id_, spec in released_in_study(workspace, category).items()
@@ -132,7 +144,9 @@ def build_arms(workspace: Workspace, category: str) -> list[ArmRow]:
         (clip_content(id_, spec.scene_hash) for id_, spec in released_in_study(workspace, category).items()),
         (clip_content(row["scenario_id"], row["scene_hash"]) for row in specs),
     )
-    return [one for row in specs for arm in arms for one in _rows(workspace, row, arm, of_pairs, known, version)]
+    return [
+        arm_row for row in specs for arm in arms for arm_row in _rows(workspace, row, arm, of_pairs, known, version)
+    ]
 
 
 def _specs(workspace: Workspace, category: str) -> list[dict[str, Any]]:
@@ -143,7 +157,7 @@ def _clips(workspace: Workspace, row: Row, arms: Sequence[str]) -> dict[str, Pat
     return {arm: workspace.clip(row["scenario_id"], arm, row["scene_hash"]) for arm in arms}
 
 
-def _missing(row: Row, clips: Mapping[str, Path], existing: set[Path]) -> bool:
+def _is_missing(row: Row, clips: Mapping[str, Path], existing: set[Path]) -> bool:
     """Return whether the study lacks files of these arms of a scenario."""
     spec = spec_of(row)
     for arm, clip in clips.items():
@@ -158,27 +172,43 @@ def _finding_of(clip: Path) -> Path:
 
 
 def _files(clip: Path) -> tuple[Path, ...]:
-    """Return the files of an arm: its clip with the note (none if it was refused), and the result."""
+    """Return the files of an arm: its clip with the note, and the result.
+
+    A refused arm has no clip.
+    """
     return clip, note_of(clip), _finding_of(clip)
 
 
 @cache
 def _code(arm: str) -> str:
-    """Return the code version of an arm or a variation; a change of it causes a new rendering."""
+    """Return the code version of an arm or a variation.
+
+    A change of it causes a new rendering.
+    """
     name = GRADED if arm == GRADED else "arms" if arm in ARM_NAMES else "variations"
     return file_digest(PACKAGE / "scenes" / "variants" / f"{name}.py")
 
 
 def arm_of(spec: SceneSpec, arm: str) -> Arm:
-    """Return the arm or variation of a scenario, with its partner in the benchmark for crossed questions."""
+    """Return the arm or variation of a scenario.
+
+    For crossed questions it has its partner in the benchmark.
+    """
     return crossed(_partners(spec.family).get(spec.scenario_id)) if arm == CROSSED else KNOWN[arm]
 
 
 @cache
 def _partners(family: str) -> dict[str, SceneSpec]:
-    """Return the partners of a family's scenarios. A scenario with a corrected or added scene has none."""
-    members = [one for one in corrected_scenarios().values() if one.family == family]
-    specs = {one.scenario_id: one.changed_words() for one in members if one.released and one.params is None}
+    """Return the partners of a family's scenarios.
+
+    A scenario with a corrected or added scene has none.
+    """
+    members = [scenario for scenario in corrected_scenarios().values() if scenario.family == family]
+    specs = {
+        scenario.scenario_id: scenario.changed_words()
+        for scenario in members
+        if scenario.released and scenario.params is None
+    }
     return {id_: specs[partner] for id_, partner in partners(specs.values()).items()}
 
 
@@ -188,13 +218,16 @@ def _of(spec: SceneSpec, arm: str) -> str:
 
 
 def _is_made(spec: SceneSpec, arm: str, clip: Path) -> bool:
-    """Return whether an arm lies here complete, with its clip if it has one. Raises DamagedClip."""
+    """Return whether an arm is complete here, with its clip if it has one.
+
+    Raises DamagedClip.
+    """
     finding = ArmResult.read(_finding_of(clip), _of(spec, arm))
     return finding is not None and (not finding.frames or read_clip(clip) is not None)
 
 
 def film(job: Job) -> int:
-    """Render and certify the missing arms of a scenario; return the number of rendered frames."""
+    """Render and certify a scenario's missing arms; return the number of frames."""
     scenario, drawn = Scenario.of_record(job.spec, job.qpos, job.twin), 0
     for arm, clip in job.clips.items():
         of = _of(job.spec, arm)
@@ -278,7 +311,10 @@ def _shown_in_pair(row: Row) -> dict[str, Any]:
 
 
 def unmade(workspace: Workspace, category: str) -> list[str]:
-    """Return why a category's table is incomplete: an arm that was requested later, or a lost clip."""
+    """Return why a category's table is incomplete.
+
+    An arm was requested later, or a clip was lost.
+    """
     table = workspace.tables.read(ARMS, {"category": category}, ["arm", "clip"])
     present = set(table["arm"])
     reasons = [f"arm {arm} is asked for now" for arm in asked_arms(workspace, category) if arm not in present]

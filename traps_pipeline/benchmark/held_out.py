@@ -1,4 +1,4 @@
-"""The key of a held-out set, whose items have opaque names that only the key's owner can resolve."""
+"""Name the items of a held-out set so that only the key's owner knows them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ KEY_BYTES = 32
 
 
 def opaque(key: bytes, item_id: str) -> str:
-    """Return the name of a held-out item; without the key nobody can tell which item it is."""
+    """Return the name of a held-out item.
+
+    Without the key nobody can tell which item it is.
+    """
     return hmac.new(key, item_id.encode(), "sha256").hexdigest()[:24]
 
 

@@ -1,4 +1,7 @@
-"""The items stage: turn scenarios and clips into questions to models, two per pair (docs/spec.md 1 and 2)."""
+"""Turn scenarios and clips into questions to models, two per pair.
+
+This is the items stage (docs/spec.md 1 and 2).
+"""
 
 from __future__ import annotations
 
@@ -37,7 +40,10 @@ def categories_of_dataset(dataset: str) -> list[str]:
 
 
 def build_items(workspace: Workspace, dataset: str) -> list[ItemRow]:
-    """Return rows of a dataset's items, after comparing clips with their digests. Raises TrapsError."""
+    """Return rows of a dataset's items, after comparing clips with their digests.
+
+    Raises TrapsError.
+    """
     specs: list[Record] = []
     clips: dict[tuple[str, str], Record] = {}
     for category in categories_of_dataset(dataset):
@@ -61,7 +67,7 @@ def build_items(workspace: Workspace, dataset: str) -> list[ItemRow]:
 
 
 def expected_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
-    """Return the items that a run would build for a dataset now, without building anything.
+    """Return a dataset's items as a run would build them, without building any.
 
     It uses the clips that exist: items whose clip must be rendered first are left out, and of arms those of changed
     scenarios. Raises TrapsError.
@@ -69,9 +75,9 @@ def expected_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
     specs = [asdict(row) for category in categories_of_dataset(dataset) for row in expected_specs(workspace, category)]
     if dataset in BESIDE:
         former = workspace.tables.read_all(SCENE_SPECS, ["spec_hash"])["spec_hash"]
-        same = {spec["scenario_id"] for spec in specs if spec["spec_hash"] in {*former}}
+        unchanged = {spec["scenario_id"] for spec in specs if spec["spec_hash"] in {*former}}
         rows = workspace.tables.read_all(ITEMS, dataset=dataset).to_dict("records")
-        return [{str(name): value for name, value in row.items()} for row in rows if row["scenario_id"] in same]
+        return [{str(name): value for name, value in row.items()} for row in rows if row["scenario_id"] in unchanged]
     scenes = {spec["scenario_id"]: spec["scene_hash"] for spec in specs}
     clips: dict[tuple[str, str], Record] = {
         (row["scenario_id"], row["side"]): row
@@ -86,7 +92,10 @@ def expected_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
 def _of_arm(
     workspace: Workspace, arm: str, specs: Mapping[str, Record], commonest: Mapping[str, str], version: str
 ) -> list[ItemRow]:
-    """Return items of an arm: the questions of the arms table, for each scenario that admits the arm."""
+    """Return an arm's items for each scenario that admits the arm.
+
+    Their questions are those of the arms table.
+    """
     rows = []
     for category in categories_of_dataset(arm):
         if workspace.tables.state(ARMS_TABLE, {"category": category}) is not None:
@@ -126,7 +135,10 @@ def answer_type_of(labels: Sequence[str]) -> str:
 
 
 def commonest_answers(specs: Sequence[Record]) -> dict[str, str]:
-    """Return the commonest control answer of each sub-scenario; of equally common ones the alphabetically first."""
+    """Return the commonest control answer of each sub-scenario.
+
+    Of equally common ones, the alphabetically first.
+    """
     counts: dict[str, Counter[str]] = {}
     for spec in specs:
         counts.setdefault(spec["sub_scenario"], Counter())[spec["ground_truth"]] += 1
@@ -212,7 +224,7 @@ _DECISIVE = (
 
 
 def item_hash(row: Record) -> str:
-    """Return the digest of every property of an item that decides its answer or its score."""
+    """Return the digest of all that decides an item's answer or score."""
     decisive = {name: row[name] for name in _DECISIVE}
     return digest(decisive | {"labels": list(row["labels"]), "aliases": json.loads(row["aliases"])})
 

@@ -1,4 +1,6 @@
-"""Measure how well the state at a void's cut predicts the outcome, for a model that knows all poses.
+"""Measure how well the state at a void's cut predicts the outcome.
+
+The predictor knows all poses.
 
 The certificate `open` proves for each record that its futures disagree. A family's records may still have something in
 common: if a ball on the left ends on the left more often than not, a rule that has seen enough records predicts the

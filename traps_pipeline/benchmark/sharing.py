@@ -1,4 +1,6 @@
-"""Share the rendering of a category's clips between processes, on one host or many, one scenario at a time.
+"""Share the rendering of a category's clips between processes.
+
+They run on one host or many, and take one scenario at a time.
 
 All processes go through the same rows. Each leases a free row, makes its missing clips, publishes them to the study and
 goes on to the next. Leases of dead processes expire. `share` returns when every clip exists.
@@ -83,7 +85,7 @@ class _Sharing(Generic[Job]):
         return n_frames, not self._left
 
     def _jobs(self) -> Iterator[Job]:
-        """Yield jobs of the rows that no other process holds, each leased when its job is requested."""
+        """Yield jobs of unleased rows, each leased when its job is requested."""
         for number in [*self._left]:
             lease = self._store.lease(f"{self._of.name}/{number:06d}")
             if lease is None:
@@ -109,7 +111,10 @@ class _Sharing(Generic[Job]):
 
 
 def known_clips(store: Store, clips: Iterable[Path]) -> dict[Path, Clip]:
-    """Return the notes of existing clips, without fetching a clip. Raises DamagedClip if one differs from its note."""
+    """Return the notes of existing clips, without fetching a clip.
+
+    Raises DamagedClip if one differs from its note.
+    """
     paths = [*clips]
     store.bring(map(note_of, paths))
     digests = store.digests(paths)

@@ -1,4 +1,7 @@
-"""The scene_specs stage: resolve corrected scenarios to complete records with their trajectories."""
+"""Resolve corrected scenarios to complete records with trajectories.
+
+This is the scene_specs stage.
+"""
 
 from __future__ import annotations
 
@@ -36,13 +39,16 @@ class ResolvedScenario:
 
 
 def resolve_scenario(workspace: Workspace, scenario: Scenario) -> ResolvedScenario:
-    """Return the record after corrections. Only a changed or added scene is simulated, once."""
+    """Return the record after corrections.
+
+    Only a changed or added scene is simulated, once.
+    """
     if scenario.params is None:
         spec = scenario.changed_words()
         return ResolvedScenario(spec, RELEASED / "trajectories" / f"{spec.scenario_id}.npz")
     spec, trajectory = _resolved_anew(workspace, scenario)
     words = dict(scenario.words)
-    if _words_still_fit(scenario):
+    if _has_valid_words(scenario):
         assert scenario.released is not None
         words = scenario.released.model_dump(mode="json", include=set(WORDS)) | words
     answer = words.pop("answer", spec.ground_truth)
@@ -55,7 +61,10 @@ def resolve_scenario(workspace: Workspace, scenario: Scenario) -> ResolvedScenar
 
 
 def _resolved_anew(workspace: Workspace, scenario: Scenario) -> tuple[SceneSpec, Path]:
-    """Return the scene of a correction's parameters, with the family's words for it; simulated once and stored."""
+    """Return the scene of a correction's parameters, with the family's words for it.
+
+    It is simulated once and stored.
+    """
     name = _resolved_name(scenario)
     own = [workspace.trajectories / f"{name}{ending}" for ending in (".npz", ".json")]
     workspace.store.bring(own)
@@ -105,14 +114,20 @@ def wording_of(family_name: str, seed: int, scenario_id: str, params: Mapping[st
     return family.word(family.params_from(params), rng)
 
 
-def _words_still_fit(scenario: Scenario) -> bool:
-    """Return whether the released words fit the corrected parameters: the family gives both the same words."""
+def _has_valid_words(scenario: Scenario) -> bool:
+    """Return whether the released words fit the corrected parameters.
+
+    They do if the family gives both the same words.
+    """
     released = scenario.released
     return released is not None and _wording(scenario, released.params) == _wording(scenario, scenario.params or {})
 
 
 def _simulate(scenario: Scenario) -> tuple[SceneSpec, np.ndarray, np.ndarray]:
-    """Resolve a scene from a correction's parameters. Raises TrapsError naming the correction."""
+    """Resolve a scene from a correction's parameters.
+
+    Raises TrapsError naming the correction.
+    """
     from traps_pipeline.scenes.draw.resolve import resolve
     from traps_pipeline.scenes.parts.wording import draw_ill_posed
     from traps_pipeline.scenes.worlds.outcome import Rejected
@@ -143,7 +158,9 @@ def _simulate(scenario: Scenario) -> tuple[SceneSpec, np.ndarray, np.ndarray]:
 
 def seconds_left(workspace: Workspace, category: str) -> float:
     """Estimate one core's time to build a category's table."""
-    return SECONDS_A_RECORD * sum(one.category == category for one in load_scenarios(workspace.study).values())
+    return SECONDS_A_RECORD * sum(
+        scenario.category == category for scenario in load_scenarios(workspace.study).values()
+    )
 
 
 def build_specs(workspace: Workspace, category: str) -> tuple[list[SceneSpecRow], list[ResolvedScenario]]:
@@ -180,7 +197,7 @@ def expected_specs(workspace: Workspace, category: str) -> list[SceneSpecRow]:
 
 
 def released_in_study(workspace: Workspace, category: str) -> dict[str, SceneSpec]:
-    """Return the released records of a category that the study would have without any correction."""
+    """Return a category's released records that the study has uncorrected."""
     plain = subset(fold(load_released(), ()), workspace.study)
     return {id_: s.released for id_, s in plain.items() if s.category == category and s.released is not None}
 
@@ -191,13 +208,16 @@ def released_version(workspace: Workspace, category: str) -> str:
 
 
 def corrections_version(workspace: Workspace, category: str) -> str:
-    """Return the version of a category's scenarios after the review decisions, in a study."""
+    """Return a category's version in a study, after the review decisions."""
     scenarios = load_scenarios(workspace.study).values()
     return digest([[s.scenario_id, s.version] for s in scenarios if s.category == category])[:16]
 
 
 def void_from_s(spec: SceneSpec) -> float:
-    """Return the time (s) from which the void shows nothing decisive: hiding (occluder) or the cut (truncation)."""
+    """Return the time (s) from which the void shows nothing decisive.
+
+    It is the moment of hiding (occluder) or of the cut (truncation).
+    """
     frame = spec.void["hidden_from_frame"] if spec.void_kind == "occluder" else spec.void["cut_frame"]
     return frame / spec.physics["fps"]
 
@@ -224,7 +244,10 @@ def _row(workspace: Workspace, item: ResolvedScenario, version: str) -> SceneSpe
 
 
 def _relative(path: Path, *roots: Path) -> str:
-    """Return the path relative to the first root that contains it; unchanged if none does (a private benchmark)."""
+    """Return the path relative to the first root that contains it.
+
+    It is unchanged if none does (a private benchmark).
+    """
     root = next((root for root in roots if path.is_relative_to(root)), None)
     return (path.relative_to(root) if root else path).as_posix()
 
@@ -239,7 +262,10 @@ def spec_of(row: Mapping[str, Any]) -> SceneSpec:
 
 
 def trajectory_of(workspace: Workspace, row: Mapping[str, Any], world: Literal["qpos", "twin"] = "qpos") -> np.ndarray:
-    """Return the frozen qpos (F, nq) of a row of scene_specs, or its twin's. Raises TrapsError."""
+    """Return the frozen qpos (F, nq) of a row of scene_specs, or its twin's.
+
+    Raises TrapsError.
+    """
     candidates: Sequence[Path] = (ROOT / row["trajectory"], workspace.resolve(row["trajectory"]))
     path = next((p for p in candidates if p.is_file()), candidates[0])
     try:
@@ -250,7 +276,10 @@ def trajectory_of(workspace: Workspace, row: Mapping[str, Any], world: Literal["
 
 
 def unsettled_outcomes(resolved: Sequence[ResolvedScenario]) -> list[str]:
-    """Return problems of outcomes, by recomputing the certificate `outcome` from each frozen trajectory."""
+    """Return problems of outcomes.
+
+    The certificate `outcome` is recomputed from each frozen trajectory.
+    """
     from traps_pipeline.scenes.certification.certificates import OUTCOME, pair_of
 
     problems = []

@@ -1,4 +1,6 @@
-"""Check the evidence that records carry against the certificates; the scene_specs stage does so each time.
+"""Check the evidence that records carry against the certificates.
+
+The scene_specs stage does so each time.
 
 The evidence was measured when the scenario was resolved; `scenes.certification.certify_record` measures it again from
 the trajectories.
@@ -18,12 +20,18 @@ _NO_FRAMES = np.empty((0, 0), np.float32)  # words are certified without a traje
 
 
 def unanswerable_controls(specs: Iterable[SceneSpec]) -> list[str]:
-    """Return records whose evidence does not certify the control; one sentence per lost certificate."""
+    """Return records whose evidence does not certify the control.
+
+    One sentence per lost certificate.
+    """
     return list(_lost(specs, "control"))
 
 
 def answerable_voids(specs: Iterable[SceneSpec]) -> list[str]:
-    """Return records whose evidence does not certify the void; one sentence per lost certificate."""
+    """Return records whose evidence does not certify the void.
+
+    One sentence per lost certificate.
+    """
     return list(_lost(specs, "void", "twin", "worlds"))
 
 
@@ -37,7 +45,10 @@ def _lost(specs: Iterable[SceneSpec], *about: About) -> Iterator[str]:
 
 
 def answerable_ill_posed(specs: Iterable[SceneSpec]) -> list[str]:
-    """Return records whose ill-posed question is not refuted, or whose well-posed one is."""
+    """Return records whose ill-posed question the video may answer.
+
+    Evidence must refute it, and must not refute the well-posed one.
+    """
     problems = []
     for spec in specs:
         pair = pair_of(spec, _NO_FRAMES, _NO_FRAMES)

@@ -1,4 +1,6 @@
-"""Benchmark versions: digests of content, so that a rebuilt study and one corrected in place agree.
+"""Name benchmark versions by digests of their content.
+
+So a rebuilt study and one corrected in place agree.
 
 A part (a category's specs or clips, a dataset's items) has the release's version while it equals the release, and
 `release+digest` once a correction has changed it. Other parts keep their version.
@@ -17,7 +19,10 @@ from traps_pipeline.scenes.worlds.spec import SceneSpec
 
 
 def version_of(released: Iterable[Any], current: Iterable[Any]) -> str:
-    """Return `0.2.0`, or `0.2.0+3f2a9c01` if the current content differs from the released one."""
+    """Return the release's version, marked if the current content differs.
+
+    `0.2.0`, or `0.2.0+3f2a9c01`.
+    """
     release = load_release().version
     now = sorted(digest(part) for part in current)
     return release if now == sorted(digest(part) for part in released) else f"{release}+{digest(now)[:8]}"
@@ -34,7 +39,10 @@ def clip_content(scenario_id: str, scene_hash: str) -> list[str]:
 
 
 def item_content(dataset: str, record: Mapping[str, Any]) -> list[Any]:
-    """Return a scenario's content behind a dataset's version; `record` is a spec or a row of scene_specs."""
+    """Return a scenario's content behind a dataset's version.
+
+    `record` is a spec or a row of scene_specs.
+    """
     aliases = record["aliases"] if isinstance(record["aliases"], dict) else json.loads(record["aliases"])
     content = [record["scenario_id"], record["scene_hash"], record["question"], list(record["labels"]), aliases]
     content.append(record["ground_truth"])

@@ -1,4 +1,7 @@
-"""The videos stage: render rows of scene_specs to clips, each once, and build their table."""
+"""Render rows of scene_specs to clips, each once, and build their table.
+
+This is the videos stage.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,9 @@ SECONDS_A_CLIP = 1.4  # measured on one core (docs/engineering-notes.md)
 
 
 def render_videos(workspace: Workspace, category: str, *, wait: bool = True) -> tuple[int, bool]:
-    """Render a category's missing clips (three per scenario), concurrently with other processes.
+    """Render a category's missing clips, sharing them with other processes.
+
+    A scenario has three clips.
 
     Return the result of `share`. Raises TrapsError.
     """
@@ -53,7 +58,10 @@ def render_videos(workspace: Workspace, category: str, *, wait: bool = True) -> 
 
 
 def _render(job: Job) -> int:
-    """Render the missing clips of a pair and its twin, and cache them for other studies; return the frame count."""
+    """Render a scenario's missing clips and return the number of frames.
+
+    Clips of the pair and its twin are cached for other studies.
+    """
     frames, rendered = render_pair(job), ClipCache.of_user()
     if rendered is not None:
         rendered.keep(job.clips, job.spec.scene_hash)
@@ -61,7 +69,10 @@ def _render(job: Job) -> int:
 
 
 def seconds_left(workspace: Workspace, category: str) -> float:
-    """Estimate one core's time to render a category's missing clips, as far as released records tell."""
+    """Estimate one core's time (s) to render a category's missing clips.
+
+    Released records alone are counted.
+    """
     clips = [
         workspace.clip(id_, side, spec.scene_hash)
         for id_, spec in released_in_study(workspace, category).items()
@@ -71,7 +82,7 @@ def seconds_left(workspace: Workspace, category: str) -> float:
 
 
 def build_videos(workspace: Workspace, category: str) -> tuple[list[VideoRow], dict[str, float]]:
-    """Return rows of the category's clips, and the leaked pixels of each occluded void.
+    """Return a category's clips, and the leaked pixels of each occluded void.
 
     Raises TrapsError for a missing clip.
     """
@@ -139,7 +150,7 @@ def _rows(workspace: Workspace, spec: Row, known: Mapping[Path, Clip], version: 
 
 
 def missing_clips(workspace: Workspace, category: str) -> Sequence[str]:
-    """Return clips of the category's table that are lost or have another size, as reasons for `traps status`."""
+    """Return reasons for `traps status`: clips lost or of another size."""
     table = workspace.tables.read_arrow(VIDEOS, ["path", "size_bytes"], category=category)
     expected = dict(zip(table["path"].to_pylist(), table["size_bytes"].to_pylist(), strict=True))
     notes = {path: workspace.relative(note_of(workspace.root / path)) for path in expected}

@@ -1,1 +1,1 @@
-"""Checks before money is spent: the machine, the requests as bytes, the live endpoint."""
+"""Check machine, requests and endpoints before money is spent."""

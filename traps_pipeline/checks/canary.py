@@ -1,4 +1,6 @@
-"""The canary: twenty fixed items, asked again in each epoch to detect a changed model behind the same name.
+"""Detect a changed model behind the same name.
+
+The canary asks twenty fixed items again in each epoch.
 
 An epoch that is named in `study.yaml` is asked once. Rules read the answers, whichever panel judges the study: the same
 reader on both sides isolates changes of the model. Answers are sampled, so some changes are chance; the number of
@@ -58,7 +60,10 @@ CANARY = Table("canary", CanaryRow, partition_by=(), key=("model", "item_id", "e
 
 
 def canary_items(workspace: Workspace) -> list[dict[str, Any]]:
-    """Return the canary's items: of each dataset those with the smallest digests. Raises TrapsError without items."""
+    """Return the canary's items: of each dataset those with the smallest digests.
+
+    Raises TrapsError without items.
+    """
     items = workspace.tables.read_all(ITEMS, dataset=DATASETS).to_dict("records")
     if not items:
         raise TrapsError("canary: no items yet; materialize items first")
@@ -77,7 +82,10 @@ class _Asked(Call):
 
 
 def ask_canary(workspace: Workspace, models: Sequence[str]) -> pd.DataFrame:
-    """Return CANARY rows of all epochs, after asking these models for this epoch's missing ones; write the table."""
+    """Ask models for this epoch's missing items, and return rows of all epochs.
+
+    The CANARY table is written, too.
+    """
     epoch, items = workspace.study.epoch, canary_items(workspace)
     entries = [entry for entry in map(get_model, models) if entry.backend == NETWORK]
     calls = [_Asked(_request(workspace, entry, item, epoch), entry, item) for entry in entries for item in items]
@@ -129,29 +137,35 @@ def changes(rows: pd.DataFrame) -> pd.DataFrame:
         by_epoch.setdefault(row["model"], {}).setdefault(row["epoch"], {})[row["item_id"]] = row
     changed = list[dict[str, Any]]()
     for model, epochs in by_epoch.items():
-        for then, now in pairwise(epochs):
-            both = [(epochs[then][item], row) for item, row in epochs[now].items() if item in epochs[then]]
+        for earlier, later in pairwise(epochs):
+            both = [(epochs[earlier][item], row) for item, row in epochs[later].items() if item in epochs[earlier]]
             served = dict.fromkeys(str(side["served_model"]) for k in (0, 1) for side in (pair[k] for pair in both))
-            tokens = [new["prompt_tokens"] - old["prompt_tokens"] for old, new in both if _counted(old, new)]
+            tokens = [new["prompt_tokens"] - old["prompt_tokens"] for old, new in both if _has_tokens(old, new)]
             changed.append(
-                {"model": model, "from": then, "to": now, "served": " -> ".join(served), "n": len(both)}
+                {"model": model, "from": earlier, "to": later, "served": " -> ".join(served), "n": len(both)}
                 | {name: sum(_said(old[name]) != _said(new[name]) for old, new in both) for name in COMPARED}
                 | {"tokens": sum(tokens) / len(tokens) if tokens else float("nan")}
             )
     return pd.DataFrame(changed, columns=pd.Index(["model", "from", "to", "served", "n", *COMPARED, "tokens"]))
 
 
-def _counted(*rows: Mapping[str, Any]) -> bool:
+def _has_tokens(*rows: Mapping[str, Any]) -> bool:
     return all(not pd.isna(row["prompt_tokens"]) for row in rows)
 
 
 def _said(value: Any) -> str:
-    """Return a table's value in comparable form; null equals null in any representation."""
+    """Return a table's value in comparable form.
+
+    Null equals null in any representation.
+    """
     return "" if pd.isna(value) else str(value)
 
 
 def changes_text(rows: pd.DataFrame) -> str:
-    """Return the changes as a table for people; a sentence if no model was asked in two epochs."""
+    """Return the changes as a table for people.
+
+    It is a sentence if no model was asked in two epochs.
+    """
     table = changes(rows)
     if table.empty:
         return "canary: asked in this epoch; name another epoch in study.yaml to ask again, and what changed is shown"

@@ -1,4 +1,7 @@
-"""Report which steps of a study this machine can run, and what to install for the others (`traps doctor`)."""
+"""Report which steps this machine can run (`traps doctor`).
+
+For the others it names what to install.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +44,7 @@ class Finding:
 
 def examine(place: Place) -> Iterator[Finding]:
     """Yield one finding for each requirement of the demo."""
-    for what, look in (
+    for topic, look in (
         ("python", lambda: sys.version.split()[0]),
         ("checkout", _checkout),
         ("rendering", draw_frame),
@@ -52,11 +55,14 @@ def examine(place: Place) -> Iterator[Finding]:
         ("keys", _keys),
         ("network", check_network),
     ):
-        yield _finding(what, look)
+        yield _finding(topic, look)
 
 
 def examine_local(models: Sequence[str] = ()) -> Iterator[Finding]:
-    """Yield a finding for each requirement of local models: tiny checkpoints, devices, weights, named models."""
+    """Yield a finding for each requirement of local models.
+
+    They are tiny checkpoints, devices, weights and named models.
+    """
     from traps_pipeline.mechanism import adapter_checks
     from traps_pipeline.models.local import selfcheck
     from traps_pipeline.models.local.adapter import load_local_model
@@ -117,7 +123,7 @@ def examine_files(place: Place) -> Iterator[Finding]:
         workspace.bring_folder(workspace.root / folder)
     if workspace.is_shared:
         yield Finding(not missing, "store", "; ".join(missing[:SHOWN]) or "every object is what was written")
-    for what, files, damage_of in (
+    for topic, files, damage_of in (
         ("tables", sorted((workspace.root / "tables").rglob("*.parquet")), altered),
         ("clips", sorted((workspace.root / "clips").rglob("*.mp4")), _damaged_clip),
         ("media", sorted((workspace.root / "media").glob("*/*.json")), _damaged_media),
@@ -126,14 +132,17 @@ def examine_files(place: Place) -> Iterator[Finding]:
     ):
         damaged = [message for path in files if (message := damage_of(path))]
         summary = "; ".join(damaged[:SHOWN]) + (f"; and {len(damaged) - SHOWN} more" if len(damaged) > SHOWN else "")
-        yield Finding(not damaged, what, summary or f"{len(files)} files are what was written")
+        yield Finding(not damaged, topic, summary or f"{len(files)} files are what was written")
     message = [*workspace.answers.damage(), *workspace.votes.damage()]
     yield Finding(not message, "ledger", "; ".join(message[:SHOWN]) or "all rows are what was written")
     yield Finding(True, "unfinished", _remove_unfinished(workspace.root))
 
 
 def examine_unused(place: Place, *, is_removed: bool) -> Finding:
-    """Return the old unreferenced objects in a study's store, and whether they were removed. Raises TrapsError."""
+    """Return the old unreferenced objects in a study's store.
+
+    The finding tells whether they were removed. Raises TrapsError.
+    """
     from traps_pipeline.storage.store import GRACE_DAYS
     from traps_pipeline.storage.workspace import Workspace
 
@@ -144,13 +153,13 @@ def examine_unused(place: Place, *, is_removed: bool) -> Finding:
             "store with --workspace s3://BUCKET/STUDY"
         )
     unused = workspace.store.unused(is_removed=is_removed)
-    what = f"{len(unused)} objects ({sum(one.size for one in unused) / 1e6:.1f} MB)"
+    volume = f"{len(unused)} objects ({sum(item.size for item in unused) / 1e6:.1f} MB)"
     if unused:
-        what += f", the oldest of {unused[0].at:%Y-%m-%d}: {', '.join(one.name for one in unused[:SHOWN])}"
-        what += ", .." * (len(unused) > SHOWN)
-    done = "removed" if is_removed else "would be removed by `traps doctor --unused remove`"
+        volume += f", the oldest of {unused[0].at:%Y-%m-%d}: {', '.join(item.name for item in unused[:SHOWN])}"
+        volume += ", .." * (len(unused) > SHOWN)
+    effect = "removed" if is_removed else "would be removed by `traps doctor --unused remove`"
     return Finding(
-        True, "unused", f"{done}, since nobody names them and they are older than {GRACE_DAYS:.0f} days: {what}"
+        True, "unused", f"{effect}, since nobody names them and they are older than {GRACE_DAYS:.0f} days: {volume}"
     )
 
 
@@ -178,7 +187,10 @@ def _damaged_media(note: Path) -> str:
 
 
 def _damaged_history(path: Path) -> str:
-    """Return why a history is damaged. The next command puts it aside and begins anew, so nothing is lost."""
+    """Return why a history is damaged.
+
+    The next command puts it aside and begins anew, so nothing is lost.
+    """
     try:
         with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as opened:
             (result,) = opened.execute("pragma quick_check(1)").fetchone()
@@ -188,7 +200,10 @@ def _damaged_history(path: Path) -> str:
 
 
 def _remove_unfinished(root: Path) -> str:
-    """Remove old unfinished files of killed runs; a run may still be writing young ones."""
+    """Remove old unfinished files of killed runs.
+
+    A run may still be writing young ones.
+    """
     old = [path for path in root.rglob(f".*{PART}") if time.time() - path.stat().st_mtime > UNFINISHED_AFTER_S]
     size = sum(path.stat().st_size for path in old)
     for path in old:
@@ -231,12 +246,17 @@ def _workspace(place: Place) -> str:
 
 
 def _keys() -> str:
-    """Return the missing keys with the entries that need them. Raises TrapsError for one that no header can carry."""
+    """Return the missing keys with the entries that need them.
+
+    Raises TrapsError for one that no header can carry.
+    """
     from traps_pipeline.models.judges import load_judges
     from traps_pipeline.models.registry import load_accounts, load_models, missing_keys
 
     entries = [*load_models().values(), *load_judges().values()]
     for key in sorted({account.key for account in load_accounts().values() if account.key}):
         optional_key(key)  # raises if its value is no key
-    missing = [f"{name} not set ({', '.join(who)} cannot be asked)" for name, who in missing_keys(entries).items()]
+    missing = [
+        f"{name} not set ({', '.join(entry_ids)} cannot be asked)" for name, entry_ids in missing_keys(entries).items()
+    ]
     return "; ".join(missing) or "all set"

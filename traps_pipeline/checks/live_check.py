@@ -1,4 +1,6 @@
-"""Check models and judges with live calls before money is spent: `traps models check --live`, and preflight.
+"""Check models and judges with live calls before money is spent.
+
+`traps models check --live` and the preflight of a run do.
 
 Each model is asked about a clip that is red and then blue, once with the clip and once without, and in its JSON form;
 each judge votes on answers with known votes. Every problem is a sentence that names the cause and the remedy.
@@ -63,7 +65,10 @@ _ITEM: Mapping[str, Any] = {
 
 @dataclass(frozen=True)
 class LiveResult:
-    """The result for an entry. problems: reasons why its answers are worthless; notes: other observations."""
+    """The result for an entry.
+
+    problems: reasons why its answers are worthless. notes: other observations.
+    """
 
     entry: Entry
     problems: Sequence[str]
@@ -84,7 +89,10 @@ def _studio() -> Studio:
 
 
 def requests_of(entry: Entry) -> dict[str, Request]:
-    """Return the calls to an entry, by name. They contain the time, so that yesterday's answers are not reused."""
+    """Return the calls to an entry, by name.
+
+    They contain the time, so that yesterday's answers are not reused.
+    """
     now = datetime.now(UTC).isoformat()
     if isinstance(entry, JudgeEntry):
         tasks: tuple[Task, ...] = ("abstention", "correctness")
@@ -94,7 +102,7 @@ def requests_of(entry: Entry) -> dict[str, Request]:
             for k, (text, abstained, _) in enumerate(_JUDGED)
             if task == "abstention" or not abstained
         }
-        return {name: replace(one, about={**one.about, "check": name, "at": now}) for name, one in requests.items()}
+        return {name: replace(call, about={**call.about, "check": name, "at": now}) for name, call in requests.items()}
     assert isinstance(entry, ModelEntry)
     sent = _studio().prepare(entry.media) if entry.media else None
     forms = {"clip": ("standard", sent), "no clip": ("standard", None)}
@@ -144,7 +152,7 @@ def reach(entry: Entry, account: Account) -> ServerCheck:
     if answer.status_code == BAD_REQUEST and account.key:
         even = f"{account.base_url} refuses even its list of models (HTTP 400), which wants nothing but a key"
         return ServerCheck(refused=f"{even}: is the one in {account.key} right?")
-    known = [str(one["id"]) for one in _listed(answer) if isinstance(one, dict) and "id" in one]
+    known = [str(model["id"]) for model in _listed(answer) if isinstance(model, dict) and "id" in model]
     if known and model_name(entry) not in known:
         unlisted = f"{account.base_url} serves no {model_name(entry)!r}; it lists {plain(', '.join(known[:8]))[:200]}"
         return ServerCheck(unlisted=unlisted)
@@ -159,10 +167,10 @@ def nobody_at(address: str, why: str = "the cause stands above") -> str:
 
 
 def _wrong_key(account: Account) -> str:
-    at = f" at {account.base_url}" if account.base_url else ""
+    where = f" at {account.base_url}" if account.base_url else ""
     if account.key:
-        return f"the key in {account.key} is not accepted{at}: export the right one"
-    return f"a key is wanted{at}: name its variable as `key`"
+        return f"the key in {account.key} is not accepted{where}: export the right one"
+    return f"a key is wanted{where}: name its variable as `key`"
 
 
 def _listed(answer: Any) -> list[Any]:
@@ -176,7 +184,10 @@ def _listed(answer: Any) -> list[Any]:
 def findings(
     entry: Entry, account: Account, outcomes: Mapping[str, Outcome], reached: ServerCheck | None = None
 ) -> LiveResult:
-    """Return the problems and notes from the outcomes of `requests_of`, and from the checks before them."""
+    """Return the problems and notes of an entry's outcomes.
+
+    outcomes: of `requests_of`. reached: of the checks before them.
+    """
     problems, notes, before = list[str](), list[str](), reached or ServerCheck()
     answering = {(outcome.served_model or "").partition("@")[0] for outcome in outcomes.values()}  # @VERSION may follow
     if before.unlisted and model_name(entry) not in answering:
@@ -190,7 +201,7 @@ def findings(
             continue  # a failure without a schema, too, says nothing about schemas
         if outcome.kind == "error":
             sentence = _failure(entry, account, name, str(outcome.error))
-            if outcome.error == RATE_LIMITED and any(one.kind in WITH_TEXT for one in outcomes.values()):
+            if outcome.error == RATE_LIMITED and any(response.kind in WITH_TEXT for response in outcomes.values()):
                 notes.append(f"{name}: refused as one call too many; a run waits and asks again")
             else:
                 (notes if outcome.error == "timeout" else problems).append(sentence)
@@ -285,7 +296,7 @@ def _wrong_answers(entry: ModelEntry, outcomes: Mapping[str, Outcome]) -> list[s
 
 
 def _seen(entry: ModelEntry, outcomes: Mapping[str, Outcome], notes: list[str]) -> list[str]:
-    """Return whether the clip arrives: the answer names its two colours, or its tokens are counted."""
+    """Return whether the clip arrives, from the answer's colours or counted tokens."""
     clip, blank = outcomes.get("clip"), outcomes.get("no clip")
     if clip is None or blank is None or clip.kind not in WITH_TEXT:
         return []
@@ -381,7 +392,7 @@ def _outcome(row: Row) -> Outcome:
 
 def require_sound(results: Sequence[LiveResult]) -> None:
     """Raise TrapsError that names every problem of every entry."""
-    wrong = [f"{one.entry.id}: {problem}" for one in results for problem in one.problems]
+    wrong = [f"{result.entry.id}: {problem}" for result in results for problem in result.problems]
     if wrong:
         more = "nothing was rendered and nothing was judged; --no-preflight runs all the same"
         raise TrapsError("\n".join([*wrong, more]))

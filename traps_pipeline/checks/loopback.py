@@ -1,4 +1,4 @@
-"""A fake provider on this machine that records the requests of an entry's backend."""
+"""Run a fake provider on this machine that records a backend's requests."""
 
 from __future__ import annotations
 
@@ -30,7 +30,10 @@ class _Loopback(Account):
 
 
 class _Notes(Progress):
-    """Collects the notes of a backend, such as the reason why a client library refused to send."""
+    """A collector of a backend's notes.
+
+    One may say why a client library refused to send.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -46,7 +49,10 @@ _CAUGHT = (400, b'{"error": {"message": "caught", "type": "invalid_request_error
 
 @contextmanager
 def _listening(answers: Iterator[tuple[int, bytes]] | None = None) -> Iterator[tuple[str, list[WireBody]]]:
-    """Serve on this machine; yield address and requests. Each gets the next status and JSON, or a final 400."""
+    """Serve on this machine; yield address and requests.
+
+    Each request gets the next status and JSON, or a final 400.
+    """
     caught: list[WireBody] = []
     replies = repeat(_CAUGHT) if answers is None else answers
 
@@ -74,7 +80,10 @@ def _listening(answers: Iterator[tuple[int, bytes]] | None = None) -> Iterator[t
 
 
 def replay(entry: Entry, requests: Sequence[Request], answers: Sequence[tuple[int, bytes]]) -> list[Outcome]:
-    """Return the outcome of each request as if its provider had answered with this status and JSON."""
+    """Return the outcome of each request when the provider answers like this.
+
+    answers: status and JSON.
+    """
     account = load_accounts()[str(entry.account)]
     with _listening(iter(answers)) as (address, _), reporting(_Notes()):
         loopback = _Loopback(base_url=address + urlsplit(account.base_url or "").path)

@@ -1,4 +1,7 @@
-"""Parse the request bodies of providers' APIs into one form, and list each API's fields for each parameter."""
+"""Parse request bodies of providers' APIs into one form.
+
+It also lists each API's fields for each parameter.
+"""
 
 from __future__ import annotations
 
@@ -73,7 +76,10 @@ class ParsedBody:
 
 
 def read_body(wire: WireBody) -> ParsedBody:
-    """Return the parsed body. Raises one of `UNKNOWN_FORM` if its form is unknown."""
+    """Return the parsed body.
+
+    Raises one of `UNKNOWN_FORM` if its form is unknown.
+    """
     body = _camel(wire.body) if wire.api == "gemini" else dict(wire.body)
     model = body.pop("model", None) or wire.path.rsplit("/", 1)[-1].removesuffix(":generateContent")
     match wire.api:
@@ -94,7 +100,10 @@ def _turn(turn: Mapping[str, Any]) -> tuple[str, list[str | ClipPart | None]]:
 
 
 def _part(part: Mapping[str, Any]) -> str | ClipPart | None:
-    """Return a part of a turn, in the form of any of the APIs; None for an unknown kind of part."""
+    """Return a part of a turn in the one form.
+
+    None for an unknown kind of part.
+    """
     match part:
         case {"text": str(text), **rest} if rest.keys() <= {"type"}:
             return text
@@ -115,18 +124,21 @@ def _clip(uri: str, fps: float | None = None) -> ClipPart:
 
 
 def _camel(value: Any) -> Any:
-    """Return the value with Gemini's names in camelCase: Gemini accepts snake_case too, and litellm mixes both."""
+    """Return the value with Gemini's names in camelCase.
+
+    Gemini accepts snake_case too, and litellm mixes both.
+    """
     if isinstance(value, list):
-        return [_camel(one) for one in value]
+        return [_camel(element) for element in value]
     if not isinstance(value, dict):
         return value
-    renamed = {_camel_name(name): one for name, one in value.items()}
-    return {name: one if name == "responseJsonSchema" else _camel(one) for name, one in renamed.items()}
+    renamed = {_camel_name(name): element for name, element in value.items()}
+    return {name: element if name == "responseJsonSchema" else _camel(element) for name, element in renamed.items()}
 
 
 def _camel_name(name: str) -> str:
-    head, *others = name.split("_")
-    return head + "".join(word.capitalize() for word in others)
+    head, *tail = name.split("_")
+    return head + "".join(word.capitalize() for word in tail)
 
 
 def flat(value: Any, name: str = "") -> dict[str, Any]:
@@ -134,8 +146,8 @@ def flat(value: Any, name: str = "") -> dict[str, Any]:
     if not isinstance(value, dict) or not value or name in SCHEMAS:
         return {name: value}
     leaves: dict[str, Any] = {}
-    for key, one in value.items():
-        leaves |= flat(one, f"{name}.{key}" if name else key)
+    for key, element in value.items():
+        leaves |= flat(element, f"{name}.{key}" if name else key)
     return leaves
 
 

@@ -1,4 +1,4 @@
-"""`traps benchmark`: recompute certificates, sample new benchmarks, commit to them and prove commitments."""
+"""Certify, sample, commit to and prove benchmarks (`traps benchmark`)."""
 
 from __future__ import annotations
 
@@ -178,7 +178,10 @@ def verify_commitment(arguments: argparse.Namespace) -> int:
 def _not_drawn(
     published: Commitment, problems: list[str], specs: dict[str, SceneSpec] | None, drawn: dict[str, SceneSpec]
 ) -> list[str]:
-    """Return what the seed does not reproduce here, and whether only this machine's arithmetic explains it."""
+    """Return what the seed does not reproduce here.
+
+    The second value is whether only this machine's arithmetic explains it.
+    """
     from traps_pipeline.release.commitment import is_same_scene, other_arithmetic
 
     if (

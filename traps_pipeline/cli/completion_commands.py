@@ -1,4 +1,7 @@
-"""`traps completion`: print a shell's completion script for commands, options, experiments and values."""
+"""Print a shell's completion script (`traps completion`).
+
+It completes commands, options, experiments and values.
+"""
 
 from __future__ import annotations
 

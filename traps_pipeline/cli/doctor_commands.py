@@ -1,4 +1,4 @@
-"""`traps doctor`: check whether this machine meets a study's requirements."""
+"""Check whether this machine meets a study's requirements (`traps doctor`)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""`traps study export-requests`, `import-answers`, `export-votes`, `import-votes`: make calls elsewhere."""
+"""Exchange requests, answers and votes, to make calls elsewhere.
+
+`traps study export-requests`, `import-answers`, `export-votes`, `import-votes`.
+"""
 
 from __future__ import annotations
 

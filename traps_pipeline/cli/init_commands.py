@@ -1,4 +1,4 @@
-"""`traps init`: create the workspace of an experiment."""
+"""Create the workspace of an experiment (`traps init`)."""
 
 from __future__ import annotations
 
@@ -36,7 +36,9 @@ def init(arguments: argparse.Namespace) -> int:
 
 
 def create(arguments: argparse.Namespace, experiment: Experiment, database: str | None = None) -> Workspace:
-    """Return the workspace that a command names, with the experiment in its study; create it if it is missing.
+    """Return the workspace that a command names, with the experiment in its study.
+
+    It is created if it is missing.
 
     database: the environment variable with the address of the study's database, if one is requested. Raises TrapsError
     if the existing study differs from the one that the experiment needs, or keeps its ledger elsewhere.

@@ -1,4 +1,7 @@
-"""`traps study export-ledger`, `import-ledger`, `move`, `release-money`: a study's answers, votes and money."""
+"""Export, import and move a study's answers, votes and money.
+
+`traps study export-ledger`, `import-ledger`, `move`, `release-money`.
+"""
 
 from __future__ import annotations
 

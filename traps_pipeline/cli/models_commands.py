@@ -1,4 +1,7 @@
-"""`traps models`: check that entries send what they declare and answer, and that no answer can instruct a panel."""
+"""Check that entries send what they declare and answer (`traps models`).
+
+`test-panel` checks that no answer can instruct a panel.
+"""
 
 from __future__ import annotations
 
@@ -38,8 +41,13 @@ def check(arguments: argparse.Namespace) -> int:
         return _check_live(names, is_json=arguments.json)
     if arguments.json:
         everything = [*check_named(names)]
-        print_json([{"id": one.entry.id, "sent": one.line, "problems": one.problems} for one in everything])
-        return FAILED if any(one.problems for one in everything) else OK
+        print_json(
+            [
+                {"id": entry_check.entry.id, "sent": entry_check.line, "problems": entry_check.problems}
+                for entry_check in everything
+            ]
+        )
+        return FAILED if any(entry_check.problems for entry_check in everything) else OK
     wrong = 0
     for checked in check_named(names):
         print("\n    ".join([checked.line, *checked.problems]), flush=True)
@@ -49,7 +57,9 @@ def check(arguments: argparse.Namespace) -> int:
 
 
 def _named(arguments: argparse.Namespace) -> list[str]:
-    """Return the ids of the named models and judges, with those of named panels and experiments.
+    """Return the ids of the named models and judges.
+
+    Those of named panels and experiments are among them.
 
     The workspace's own entries are known too. Raises TrapsError for a panel that cannot vote, named or not.
     """
@@ -88,9 +98,9 @@ def _check_live(names: list[str], *, is_json: bool) -> int:
     checks = check_live(entries)
     if is_json:
         print_json(checks)
-    for one in () if is_json else checks:
-        print(one.line, flush=True)
-    return FAILED if any(one.problems for one in checks) else OK
+    for checked in () if is_json else checks:
+        print(checked.line, flush=True)
+    return FAILED if any(checked.problems for checked in checks) else OK
 
 
 def test_panel(arguments: argparse.Namespace) -> int:

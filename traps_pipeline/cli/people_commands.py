@@ -1,4 +1,7 @@
-"""`traps people`: serve review and labelling pages, and validate the judge against people's labels."""
+"""Serve review and labelling pages, and validate judges (`traps people`).
+
+Judges are validated against people's labels.
+"""
 
 from __future__ import annotations
 

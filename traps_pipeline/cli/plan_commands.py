@@ -1,4 +1,4 @@
-"""`traps plan`: print the calls that an experiment would make, and their cost."""
+"""Print an experiment's calls and their cost (`traps plan`)."""
 
 from __future__ import annotations
 
@@ -106,7 +106,10 @@ def _difference(least: float | None) -> str:
 
 
 def _print_forecasts(forecasts: Sequence[Forecast], minutes: float) -> None:
-    """Print tokens, dollars and minutes of the new calls over the network; the sum leaves out unknown prices."""
+    """Print tokens, dollars and minutes of the new calls over the network.
+
+    The sum leaves out unknown prices.
+    """
     known = [row.dollars for row in forecasts if row.dollars is not None]
     total = (sum(d[0] for d in known), sum(d[1] for d in known), sum(d[2] for d in known))
     calls = sum(row.calls for row in forecasts)
@@ -126,15 +129,18 @@ def _print_forecasts(forecasts: Sequence[Forecast], minutes: float) -> None:
     print("tokens: millions read, written; minutes of all: models, then judges")
     in_batches = sum(row.dollars[1] * row.batch_price for row in forecasts if row.dollars is not None)
     if in_batches < total[1]:
-        how = "expected if all calls are made in batches (traps study export-requests --batch)"
-        print(wrapped(f"{how}: USD {in_batches:,.2f}"))
+        heading = "expected if all calls are made in batches (traps study export-requests --batch)"
+        print(wrapped(f"{heading}: USD {in_batches:,.2f}"))
     if len(known) < len(forecasts):
         unknown = ", ".join(row.participant for row in forecasts if row.dollars is None)
         print(wrapped(f"price unknown, not in the sum: {unknown}"))
 
 
 def _print_local(costs: Sequence[Cost], card: str) -> None:
-    """Print passes, tokens, GPU-hours and memory of local models; the sum leaves out models without a size."""
+    """Print passes, tokens, GPU-hours and memory of local models.
+
+    The sum leaves out models without a size.
+    """
     rows = [
         (
             cost.model, cost.kind, f"{cost.passes:,}", f"{cost.tokens_in / 1e6:,.2f}, {cost.tokens_out / 1e6:,.2f}",

@@ -1,4 +1,7 @@
-"""Print a run's progress to standard error: a live region on a terminal, otherwise lines of text or JSON."""
+"""Print a run's progress to standard error.
+
+A terminal gets a live region, anything else lines of text or JSON.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,10 @@ _OF_CALLS = 58  # columns of the live table beside the name
 
 
 def make_progress(form: Form = "auto", stream: TextIO | None = None) -> PrintedProgress:
-    """Return the progress that a command installs. form: `auto` chooses a live region if the stream is a terminal."""
+    """Return the progress that a command installs.
+
+    form: `auto` chooses a live region if the stream is a terminal.
+    """
     out: TextIO = stream or sys.stderr or Path(os.devnull).open("w")  # noqa: SIM115 - None where closed (`2>&-`)
     is_terminal = out.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown")
     kind = LiveProgress if form == "auto" and is_terminal else PrintedProgress
@@ -35,7 +41,10 @@ def make_progress(form: Form = "auto", stream: TextIO | None = None) -> PrintedP
 
 
 class PrintedProgress(Progress):
-    """Print one line for each stage that called, rendered or took long, one for all others, and one every 30 s."""
+    """Progress as text: one line for each stage that called, rendered or took long.
+
+    Another line stands for all others, and one comes every 30 s.
+    """
 
     beat_s = HEARTBEAT_S
 
@@ -84,7 +93,10 @@ class PrintedProgress(Progress):
             self.write(self.line())
 
     def write(self, text: str) -> None:
-        """Print text, which may hold a provider's words. A closed stream ends the run as SIGTERM would."""
+        """Print text, which may hold a provider's words.
+
+        A closed stream ends the run as SIGTERM would.
+        """
         try:
             with self._printing:
                 for each in text.split("\n"):
@@ -107,7 +119,10 @@ class PrintedProgress(Progress):
 
 
 class JsonProgress(PrintedProgress):
-    """Print progress as lines of JSON: `begin` and `end` of each stage, `progress` every 30 s, `note`."""
+    """Progress as lines of JSON.
+
+    `begin` and `end` of each stage, `progress` every 30 s, `note`.
+    """
 
     def stage(self, name: str, partitions: int) -> None:
         """See `Progress`."""
@@ -137,7 +152,10 @@ class JsonProgress(PrintedProgress):
 
 
 class LiveProgress(PrintedProgress):
-    """Show a region at the bottom of the terminal; lines of finished stages and notes scroll above it."""
+    """Show a region at the bottom of the terminal.
+
+    Lines of finished stages and notes scroll above it.
+    """
 
     beat_s = 0.3
 
@@ -195,11 +213,14 @@ class LiveProgress(PrintedProgress):
         return Group(*lines, *([self._calls(now)] if now.calls else []))
 
     def _heading(self, now: StageProgress) -> str:
-        """Return the stage, its partitions, times and money; at most 80 columns for names of up to 20."""
+        """Return the stage, its partitions, times and money.
+
+        At most 80 columns for names of up to 20.
+        """
         counts = f"  {now.done:,} of {now.partitions:,} made" if now.partitions else ""
-        left = "" if now.left_s is None else f", {clock(now.left_s)} left"
+        remaining = "" if now.left_s is None else f", {clock(now.left_s)} left"
         money = f"  {self.spent()}" if self.budget_usd and now.calls else ""
-        return f"{now.name}{counts}  {clock(now.seconds)}{left}{money}"
+        return f"{now.name}{counts}  {clock(now.seconds)}{remaining}{money}"
 
     def _calls(self, now: StageProgress) -> Table:
         from rich.table import Table
@@ -211,13 +232,13 @@ class LiveProgress(PrintedProgress):
             table.add_column(heading, justify="right", no_wrap=True)
         rows = sorted(now.calls.items(), key=lambda pair: pair[1].done >= pair[1].wanted)
         most = max(1, min(MOST_ROWS, self._console.height - 6))
-        for who, traffic in rows[:most]:
-            name = Text(plain(who), no_wrap=True)
+        for participant, traffic in rows[:most]:
+            name = Text(plain(participant), no_wrap=True)
             name.truncate(max(10, self._console.width - _OF_CALLS), overflow="ellipsis")
-            done, pace = f"{traffic.done:,}/{traffic.wanted:,}", f"{traffic.per_second:.1f}/s"
+            calls, pace = f"{traffic.done:,}/{traffic.wanted:,}", f"{traffic.per_second:.1f}/s"
             latencies = [f"{traffic.latency_s(share):.1f} s" for share in (0.5, 0.95)]
             table.add_row(
-                name, done, pace, *latencies, f"{traffic.errors:,}", f"{traffic.retries:,}", f"${traffic.dollars:,.2f}"
+                name, calls, pace, *latencies, f"{traffic.errors:,}", f"{traffic.retries:,}", f"${traffic.dollars:,.2f}"
             )
         if len(rows) > most:
             table.add_row(f"and {len(rows) - most} more")

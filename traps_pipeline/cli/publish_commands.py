@@ -1,4 +1,7 @@
-"""`traps publish`: write and verify releases and submissions, harness folders, results files and leaderboards."""
+"""Write and verify what a study publishes (`traps publish`).
+
+Releases, submissions, harness folders, results files and leaderboards.
+"""
 
 from __future__ import annotations
 
@@ -102,7 +105,10 @@ def release(arguments: argparse.Namespace) -> int:
 
 
 def _date(text: str | None) -> str | None:
-    """Return a date unchanged. Raises TrapsError if it is invalid."""
+    """Return a date unchanged.
+
+    Raises TrapsError if it is invalid.
+    """
     from datetime import date
 
     try:
@@ -149,8 +155,8 @@ def verify_file(path: Path, release: Path | None, *, is_json: bool) -> int:
     for problem in verified.problems:
         print(plain(problem))
     print(f"checked: {', '.join(verified.checked)}")
-    for what in verified.unchecked:
-        print(f"not checked: {what}")
+    for part in verified.unchecked:
+        print(f"not checked: {part}")
     print(f"{path}: {'does not hold' if verified.problems else 'holds'}")
     return FAILED if verified.problems else OK
 
@@ -183,8 +189,8 @@ def results(arguments: argparse.Namespace) -> int:
     """See `traps publish results --help`."""
     from traps_pipeline.release.results import Attribution, write_results
 
-    target, who = arguments.folder.absolute(), Attribution(arguments.organization, arguments.developer)
-    files = write_results(open_workspace(arguments), target, arguments.dataset, who)
+    target, attribution = arguments.folder.absolute(), Attribution(arguments.organization, arguments.developer)
+    files = write_results(open_workspace(arguments), target, arguments.dataset, attribution)
     print(f"{len(files)} files in {target}")
     return OK
 
@@ -195,7 +201,7 @@ def leaderboard(arguments: argparse.Namespace) -> int:
     from traps_pipeline.report.leaderboard_page import leaderboard_text
 
     submissions = arguments.submissions
-    paths = [path for one in submissions for path in (sorted(one.glob("*.zip")) if one.is_dir() else [one])]
+    paths = [path for source in submissions for path in (sorted(source.glob("*.zip")) if source.is_dir() else [source])]
     board = gather(paths, arguments.release, say=lambda line: print(plain(line), file=sys.stderr, flush=True))
     write_board(board, arguments.out.absolute())
     if arguments.json:
@@ -203,7 +209,7 @@ def leaderboard(arguments: argparse.Namespace) -> int:
         return FAILED if board.refused else OK
     for group in board.groups:
         print(f"\n{group.title}\n{leaderboard_text(group.board)}")
-    for one in board.refused:
-        print(plain(f"refused: {one.name}: {one.problems[0]}"))
+    for entry in board.refused:
+        print(plain(f"refused: {entry.name}: {entry.problems[0]}"))
     print(f"next: open {arguments.out / PAGE}")
     return FAILED if board.refused else OK

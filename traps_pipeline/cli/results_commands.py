@@ -1,4 +1,7 @@
-"""`traps results`: write the explorer and all results, audit the published tables, compare studies."""
+"""Write, audit and compare results (`traps results`).
+
+The explorer is one of them.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +59,10 @@ def _megabytes(size: int) -> str:
 
 
 def audit_published(arguments: argparse.Namespace) -> int:
-    """See `traps results audit --help`. Discrepancies of the published tables are findings, not failures."""
+    """See `traps results audit --help`.
+
+    Discrepancies of the published tables are findings, not failures.
+    """
     from traps_pipeline.scoring.audit import audit, audit_text
 
     findings = audit()
@@ -89,8 +95,8 @@ def compare_studies(arguments: argparse.Namespace) -> int:
     from traps_pipeline.storage.workspace import Workspace
 
     studies = Workspace.open(arguments.other), Workspace.open(place_of(arguments))
-    then, now = (current_rows(study, VERDICTS) for study in studies)
-    table = version_contrasts(then, now)
+    earlier, later = (current_rows(study, VERDICTS) for study in studies)
+    table = version_contrasts(earlier, later)
     if arguments.csv:
         arguments.csv.write_bytes(csv_bytes(table))
     if arguments.json:

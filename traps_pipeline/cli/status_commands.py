@@ -1,4 +1,4 @@
-"""`traps status` and `traps why`: show the state of a study and of an item's answers."""
+"""Show the state of a study and of an item (`traps status`, `traps why`)."""
 
 from __future__ import annotations
 
@@ -71,20 +71,23 @@ def status(arguments: argparse.Namespace) -> int:
         print(line)
         for reason, keys in row.by_reason().items():
             more = f" and {len(keys) - MOST_KEYS} more" if len(keys) > MOST_KEYS else ""
-            which = "" if keys == [row.stage] else f"{', '.join(keys[:MOST_KEYS])}{more}: "
-            print(wrapped(plain(f"    {which}{reason[:MOST_REASON]}")))
+            prefix = "" if keys == [row.stage] else f"{', '.join(keys[:MOST_KEYS])}{more}: "
+            print(wrapped(plain(f"    {prefix}{reason[:MOST_REASON]}")))
     count = sum(len(row.stale) + len(row.missing) for row in behind)
     print(f"{count:,} of {total + count:,} partitions are not fresh; `{command}` makes them")
     return OK
 
 
 def _command(workspace: Workspace, experiment: str | None) -> str:
-    """Return the command that refreshes stale partitions, for the given experiment or the study's only one."""
+    """Return the command that refreshes stale partitions.
+
+    It names the given experiment, or the study's only one.
+    """
     from traps_pipeline.pipeline.experiment import EXPERIMENTS
 
-    given = [experiment] if experiment else [*workspace.study.experiments]
-    files = [name for name in given if name.endswith((".yaml", ".yml")) or (EXPERIMENTS / f"{name}.yaml").exists()]
-    return f"traps run {files[0] if len(files) == len(given) == 1 else 'EXPERIMENT'}"
+    names = [experiment] if experiment else [*workspace.study.experiments]
+    files = [name for name in names if name.endswith((".yaml", ".yml")) or (EXPERIMENTS / f"{name}.yaml").exists()]
+    return f"traps run {files[0] if len(files) == len(names) == 1 else 'EXPERIMENT'}"
 
 
 def why(arguments: argparse.Namespace) -> int:

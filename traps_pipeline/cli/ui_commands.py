@@ -1,4 +1,4 @@
-"""`traps ui`: serve Dagster's pages of a study, for the person who started it only."""
+"""Serve a study's Dagster pages to the person who started it (`traps ui`)."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def ui(arguments: argparse.Namespace) -> int:
     from traps_pipeline.base.webguard import token_for
     from traps_pipeline.pipeline.webserver import DANGER, STOP_S, TOKEN_VARIABLE, serve_with_dagster
 
-    given = arguments.token or optional_key(TOKEN_VARIABLE)
-    token = token_for(arguments.host, given, danger=DANGER, variable=TOKEN_VARIABLE)
+    given_token = arguments.token or optional_key(TOKEN_VARIABLE)
+    token = token_for(arguments.host, given_token, danger=DANGER, variable=TOKEN_VARIABLE)
     if (code := split(STOP_S + _OWN_S)) is not None:  # before Dagster's imports, which a fork could break
         return code if code >= 0 else FAILED
     print("starting Dagster; the address to open follows", file=sys.stderr)

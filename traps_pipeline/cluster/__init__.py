@@ -1,1 +1,4 @@
-"""Support for several hosts: runs on Ray, a study in an object store, shared history and logs."""
+"""Support several hosts.
+
+Runs on Ray, a study in an object store, shared history and logs.
+"""

@@ -1,4 +1,7 @@
-"""A place in an object store (S3, Google, Azure), through obstore, with errors as sentences."""
+"""Reach an object store (S3, Google, Azure) through obstore.
+
+Errors are sentences.
+"""
 
 from __future__ import annotations
 
@@ -26,12 +29,20 @@ _NO_BUCKET = ("NoSuchBucket", "ContainerNotFound")  # the services' terms; Azure
 
 
 def object_name(digest: bytes) -> str:
-    """Return the name of the content with that SHA-256, in the store and in a scratch folder."""
+    """Return the name of the content with that SHA-256.
+
+    It is the same in the store and in a scratch folder.
+    """
     return f"{digest.hex()[:2]}/{digest.hex()}"
 
 
 class Bucket:
-    """A place in an object store. address: as in TRAPS_WORKSPACE, for example s3://bucket/study."""
+    """A place in an object store.
+
+    address: as in TRAPS_WORKSPACE, for example s3:
+
+    bucket/study.
+    """
 
     def __init__(self, address: str) -> None:
         require("cluster", "obstore")
@@ -64,7 +75,10 @@ class Bucket:
             raise self.error(error) from None
 
     def get(self, name: str) -> bytes | None:
-        """Return the content of an object; None if it is missing. Raises TrapsError."""
+        """Return the content of an object; None if it is missing.
+
+        Raises TrapsError.
+        """
         import obstore
 
         with suppress(FileNotFoundError), self._used():
@@ -72,7 +86,10 @@ class Bucket:
         return None
 
     def size(self, name: str) -> int | None:
-        """Return the size of an object in bytes; None if it is missing. Raises TrapsError."""
+        """Return the size of an object in bytes; None if it is missing.
+
+        Raises TrapsError.
+        """
         import obstore
 
         with suppress(FileNotFoundError), self._used():
@@ -80,26 +97,35 @@ class Bucket:
         return None
 
     def put(self, name: str, content: bytes) -> None:
-        """Write an object. Raises TrapsError."""
+        """Write an object.
+
+        Raises TrapsError.
+        """
         import obstore
 
         with self._used():
             obstore.put(self._store, name, content)
 
     def delete(self, names: Sequence[str]) -> None:
-        """Remove objects. Raises TrapsError."""
+        """Remove objects.
+
+        Raises TrapsError.
+        """
         import obstore
 
         with suppress(FileNotFoundError), self._used():
             obstore.delete(self._store, names)
 
     def names(self, below: str = "") -> Iterator[tuple[str, int, datetime]]:
-        """Yield name, size in bytes and modification time of all objects (below a name). Raises TrapsError."""
+        """Yield name, size in bytes and modification time of objects.
+
+        All of them, or those below a name. Raises TrapsError.
+        """
         import obstore
 
         with self._used():
             for page in obstore.list(self._store, below or None):
-                yield from ((one["path"], one["size"], one["last_modified"]) for one in page)
+                yield from ((entry["path"], entry["size"], entry["last_modified"]) for entry in page)
 
     def error(self, error: Exception) -> TrapsError:
         """Return the sentence for people about a store that cannot be used."""

@@ -1,4 +1,4 @@
-"""Leases in the database that holds the study's ledger."""
+"""Take leases in the database that holds the study's ledger."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ database_of = postgres_of
 
 
 def lease(database: Database, name: str) -> Lease | None:
-    """Take a lease as `Store.lease` says: an advisory lock, which this process keeps alive."""
+    """Take a lease as `Store.lease` says.
+
+    It is an advisory lock, which this process keeps alive.
+    """
     with ExitStack() as opened:
         opened.enter_context(database.writing())
         lock = database.try_lock(f"lease/{name}")

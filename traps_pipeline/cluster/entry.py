@@ -1,4 +1,6 @@
-"""The interface of this room for the others: see `storage/several_hosts.py`, which imports it by name.
+"""Offer this room to the others.
+
+`storage/several_hosts.py` imports it by name.
 
 Modules above the storage are imported in functions: importing them opens the study.
 """

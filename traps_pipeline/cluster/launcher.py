@@ -1,4 +1,7 @@
-"""The launcher of runs on Ray that `dagster.yaml` names: dagster-ray's own, through `cluster/node.py`."""
+"""Launch runs on Ray with dagster-ray, through `cluster/node.py`.
+
+`dagster.yaml` names this launcher.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,10 @@ from traps_pipeline.storage.workspace import RAY, RUN_CPUS, RUN_GPUS, Workspace
 
 
 class ClusterLauncher(RayRunLauncher):
-    """Launches every run through `cluster/node.py`, with the resources that its stages declare."""
+    """A launcher that starts runs with the resources that their stages declare.
+
+    Each passes through `cluster/node.py`.
+    """
 
     @cached_property
     def client(self) -> JobSubmissionClient:
@@ -31,7 +37,10 @@ class ClusterLauncher(RayRunLauncher):
         return _NodeClient(self.address, metadata=self.metadata, headers=self.headers, cookies=self.cookies)
 
     def launch_run(self, context: Any) -> None:
-        """Launch a run. Runs from Dagster's pages or sensors first get the tags of runs from commands."""
+        """Launch a run.
+
+        Runs from Dagster's pages or sensors first get the tags of runs from commands.
+        """
         run = context.dagster_run
         if RESOURCES_TAG not in run.tags:
             tags = tags_of_page_run(run)
@@ -72,19 +81,22 @@ class _NodeClient(JobSubmissionClient):
 
 
 def node_command(entrypoint: str, run_id: str) -> str:
-    """Return the command line of a run's job, for dagster-ray's `dagster api .. '{..}'`."""
+    """Return the command line of a run's job.
+
+    dagster-ray expects it, `dagster api .. '{..}'`.
+    """
     command, _, run = entrypoint.partition(" '")
     _, *arguments = command.split()  # without the launching host's `dagster`
     return shlex.join(["python", "-P", "-m", "traps_pipeline.cluster.node", run_id, *arguments, run.removesuffix("'")])
 
 
 def tags_of_page_run(run: dg.DagsterRun) -> dict[str, str]:
-    """Return the tags that `traps run --cluster` would give a run of Dagster's pages or sensors."""
+    """Return a page's or sensor's run tags, as `traps run --cluster` would set them."""
     import traps_pipeline.definitions  # noqa: F401 - declares the stages, which the daemon's process has not loaded
 
     workspace, declared = Workspace.open(), the_graph().declared
     names = [key.path[-1] for key in run.asset_selection or ()]
-    stages = [one for name in names if isinstance(one := declared.get(name), Stage)]
-    keys = keys_in([one for one in stages if one.name == RESPONSES.name], range_of(run.tags))
+    stages = [declaration for name in names if isinstance(declaration := declared.get(name), Stage)]
+    keys = keys_in([declaration for declaration in stages if declaration.name == RESPONSES.name], range_of(run.tags))
     cpus, gpus = int(os.environ.get(RUN_CPUS, "1")), float(os.environ.get(RUN_GPUS, "0"))
     return own_tags(workspace, stages, keys, cpus, gpus)

@@ -1,4 +1,6 @@
-"""Upload what runs print to the study's object store, so that Dagster's pages on the head can show it.
+"""Upload what runs print to the study's object store.
+
+Dagster's pages on the head show it from there.
 
 A node captures the output in a local folder and uploads it every UPLOAD_S and when the run ends, so that of a dead host
 only the last moments are lost. The head fetches it. These are the only objects with names of their own that change; no
@@ -62,7 +64,10 @@ def upload(bucket: Bucket, folder: Path, run_id: str, sizes: dict[Path, int]) ->
 
 
 def fetch(bucket: Bucket, folder: Path) -> None:
-    """Fetch all missing or incomplete logs from the store into a folder. Raises TrapsError."""
+    """Fetch all missing or incomplete logs from the store into a folder.
+
+    Raises TrapsError.
+    """
     for name, size, _ in bucket.names(PREFIX):
         path = folder / Path(name).relative_to(PREFIX)
         if path.resolve().is_relative_to(folder.resolve()) and (not path.exists() or path.stat().st_size != size):

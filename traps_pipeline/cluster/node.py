@@ -1,4 +1,6 @@
-"""A run on its node: `python -P -m traps_pipeline.cluster.node RUN_ID api execute_run RUN`, started by Ray.
+"""Execute a run on its node, where Ray started it.
+
+`python -P -m traps_pipeline.cluster.node RUN_ID api execute_run RUN`.
 
 Before Dagster's own command begins, this process checks that the host has the same code and can open the study.
 Otherwise the run fails with a sentence that names the host, and is not retried.
@@ -22,7 +24,10 @@ REFUSED_TAG = "traps/refused"  # tag of a run that its node refused
 
 
 def main() -> None:
-    """Execute a run, upload its output to the study's store, and exit with Dagster's exit code."""
+    """Execute a run, upload its output, and exit with Dagster's exit code.
+
+    The output goes to the study's store.
+    """
     run_id, *command = sys.argv[1:]
     try:
         workspace = Workspace.open()

@@ -1,4 +1,6 @@
-"""Map a study's paths to their current objects, in rows of the database that holds its ledger.
+"""Map a study's paths to their current objects.
+
+They are rows of the database that holds its ledger.
 
 The rows of one change are written in one transaction. Changes are numbered, under a lock that lasts until the commit,
 so that a process that asks for changes after the last number it has seen misses none.
@@ -47,7 +49,9 @@ _OBJECTS = sa.Table(
 
 @dataclass(frozen=True, slots=True)
 class CurrentObject:
-    """The current object of a path: SHA-256, size in bytes, note, and time of the change.
+    """The current object of a path: digest (SHA-256), size in bytes, note and time.
+
+    The time is that of the change.
 
     The time is in ns since 1970; 0 for an object that is yet to be named.
     """
@@ -59,7 +63,10 @@ class CurrentObject:
 
 
 class ObjectNames:
-    """The paths of a study's files and their current objects. Thread-safe."""
+    """The paths of a study's files and their current objects.
+
+    Thread-safe.
+    """
 
     def __init__(self, database: Database, study: str) -> None:
         self._database, self._study = database, study
@@ -125,12 +132,17 @@ class ObjectNames:
             return self._sorted[bisect_left(self._sorted, start) : bisect_left(self._sorted, end)]
 
     def naming(self, digests: Collection[bytes] | None = None) -> dict[str, bytes]:
-        """Return the names of all objects (or only these), with their digests, from the database."""
+        """Return the names of all objects (or only these), with their digests.
+
+        The database is asked.
+        """
         condition = _OBJECTS.c.digest.is_not(None) if digests is None else _OBJECTS.c.digest.in_(digests)
         return {row.name: bytes(row.digest) for row in self._database.run(lambda c: self._select(c, condition))}
 
     def change(self, changed: Mapping[str, CurrentObject | None], removals: int) -> int:
-        """Set or remove the current objects of these names in one transaction; return `removals`.
+        """Set or remove the current objects of these names in one transaction.
+
+        Return `removals`.
 
         removals: the number of removals before the objects were uploaded. If there are more by now, nothing is changed,
         and their number is returned: upload the objects again.

@@ -1,4 +1,4 @@
-"""A study's files in an object store (S3, Google, Azure), for several hosts.
+"""Store a study's files in an object store (S3, Google, Azure), for several hosts.
 
 An object is written once, under the SHA-256 of its content, and never renamed; `object_names.py` maps paths to objects.
 A host caches what it has fetched in its scratch folder, below `.objects` under the same digests, and links it to the
@@ -33,7 +33,9 @@ _OBJECT = re.compile(r"([0-9a-f]{2})/(\1[0-9a-f]{62})")
 
 
 class ObjectStore(Store):
-    """Files of a study whose contents lie in a bucket and whose names lie in its database. Thread-safe.
+    """Files of a study, named in its database, with contents in a bucket.
+
+    Thread-safe.
 
     anchor: the content of the only object with a fixed name, which locates the study's database.
     """
@@ -69,10 +71,13 @@ class ObjectStore(Store):
                     self.bucket.put(object_name(row.digest), self._cached(row.digest).read_bytes())
 
     def _withdraw(self, lost: Iterable[bytes]) -> None:
-        """Remove the names of lost or altered objects, so that their dependents are rebuilt."""
-        gone = {*lost}
-        self._stored = {seen for seen in self._stored if seen[0] not in gone}
-        named = self.names.naming(gone)
+        """Remove the names of lost or altered objects.
+
+        Their dependents are then rebuilt.
+        """
+        lost_digests = {*lost}
+        self._stored = {seen for seen in self._stored if seen[0] not in lost_digests}
+        named = self.names.naming(lost_digests)
         self._change({self.root / name: None for name in named}, self.names.removals)
 
     # --- contents ---------------------------------------------------------------------------------------------------
@@ -96,7 +101,10 @@ class ObjectStore(Store):
         return (digest, self.names.removals) in self._stored
 
     def _put(self, content: bytes, row: CurrentObject | None, removals: int) -> bytes:
-        """Upload a content, unless it is current and still in the store; return its digest."""
+        """Upload a content, unless it is current and still in the store.
+
+        Return its digest.
+        """
         digest = sha256(content).digest()
         is_current = row is not None and row.digest == digest
         if not (is_current and (self._is_stored(digest) or self.bucket.size(object_name(digest)) == len(content))):
@@ -105,7 +113,10 @@ class ObjectStore(Store):
         return digest
 
     def _fetched(self, row: CurrentObject, path: Path) -> Path:
-        """Return the content of an object in the scratch folder. Raises TrapsError if it is lost or altered."""
+        """Return the content of an object in the scratch folder.
+
+        Raises TrapsError if it is lost or altered.
+        """
         if self._is_cached(row.digest):
             return self._cached(row.digest)
         removals, content = self.names.removals, self.bucket.get(object_name(row.digest))
@@ -124,7 +135,10 @@ class ObjectStore(Store):
         return self._fetched(row, path)
 
     def bring(self, paths: Iterable[Path]) -> None:
-        """See `Store`. A local file whose object is lost from the store stays."""
+        """See `Store`.
+
+        A local file whose object is lost from the store stays.
+        """
 
         def one(known: tuple[Path, CurrentObject]) -> None:
             path, row = known
@@ -185,7 +199,10 @@ class ObjectStore(Store):
         return self._current(path) is not None
 
     def sizes(self, paths: Iterable[Path]) -> dict[Path, int]:
-        """See `Store`. Each object is checked in the store, once per process."""
+        """See `Store`.
+
+        Each object is checked in the store, once per process.
+        """
         rows, removals = self._known(paths), self.names.removals
         unseen = {row.digest: row for row in rows.values() if not self._is_stored(row.digest)}
         sizes = dict(_side_by_side(lambda digest: (digest, self.bucket.size(object_name(digest))), unseen))
@@ -201,7 +218,10 @@ class ObjectStore(Store):
         return {*self._known(paths)}
 
     def digests(self, paths: Iterable[Path]) -> dict[Path, str]:
-        """See `Store`. They are those of the rows."""
+        """See `Store`.
+
+        The digests are those of the rows.
+        """
         return {path: row.digest.hex() for path, row in self._known(paths).items()}
 
     def below(self, folder: Path, pattern: str = "**/*") -> list[Path]:
@@ -229,8 +249,8 @@ class ObjectStore(Store):
         """See `Store`."""
         before = datetime.now(UTC) - timedelta(days=GRACE_DAYS if grace_days is None else grace_days)
         objects = {
-            bytes.fromhex(match[2]): UnusedObject(name, size, at)
-            for name, size, at in self.bucket.names()
+            bytes.fromhex(match[2]): UnusedObject(name, size, modified)
+            for name, size, modified in self.bucket.names()
             if (match := _OBJECT.fullmatch(name))
         }
         named = {*self.names.naming().values()}
@@ -240,7 +260,7 @@ class ObjectStore(Store):
                 f"study {self._study}; see that its variable has the address of the study's own database: nothing was "
                 "removed"
             )
-        unnamed = (digest for digest, one in objects.items() if digest not in named and one.at < before)
+        unnamed = (digest for digest, stored in objects.items() if digest not in named and stored.at < before)
         old = sorted(unnamed, key=lambda digest: objects[digest].at)
         if is_removed:
             batches = [old[first : first + BATCH] for first in range(0, len(old), BATCH)]
@@ -250,7 +270,10 @@ class ObjectStore(Store):
 
 
 def _regex(pattern: str) -> str:
-    """Return a regular expression for the `pathlib` patterns used here: `*` within a name, `**/` for any folders."""
+    """Return a regular expression for the `pathlib` patterns used here.
+
+    `*` matches within a name, `**/` any folders.
+    """
     return re.escape(pattern).replace(r"\*\*/", "(?:[^/]+/)*").replace(r"\*", "[^/]*")
 
 
@@ -258,6 +281,6 @@ def _side_by_side(work: Callable[[T], R], of: Iterable[T]) -> list[R]:
     """Return the results of `work` for each element, computed concurrently."""
     each = list(of)
     if len(each) < 2:
-        return [work(one) for one in each]
+        return [work(item) for item in each]
     with ThreadPoolExecutor(min(AT_ONCE, len(each))) as pool:
         return list(pool.map(work, each))

@@ -1,4 +1,6 @@
-"""Run stages on other hosts: `traps run EXPERIMENT --cluster` requests runs, Dagster's daemon starts them on Ray.
+"""Run stages on other hosts (`traps run EXPERIMENT --cluster`).
+
+It requests runs, and Dagster's daemon starts them on Ray.
 
 The head of the cluster runs Dagster's daemon (`traps ui`), which creates the requested runs, starts them as Ray jobs
 and resumes those whose host died. This module cuts the missing partitions into ranges, requests their runs, and reports
@@ -26,7 +28,7 @@ from traps_pipeline.cluster.resources import RESOURCES_TAG, STUDY_TAG, keys_in, 
 from traps_pipeline.ledger.postgres import PATIENCE_S
 from traps_pipeline.pipeline.graph import Stage, the_graph
 from traps_pipeline.pipeline.ranges import Range, cut, shared_out
-from traps_pipeline.pipeline.runs import RunOutcome, Runs, broke_off, problems_of, range_of, range_tags, reason
+from traps_pipeline.pipeline.runs import RunOutcome, Runs, is_broken_off, problems_of, range_of, range_tags, reason
 from traps_pipeline.pipeline.step import TAKEN, TALLY
 from traps_pipeline.storage.workspace import RAY, VARIABLE, Workspace
 
@@ -49,7 +51,9 @@ _ENDED = {dg.DagsterEventType.RUN_FAILURE, dg.DagsterEventType.RUN_CANCELED, dg.
 
 
 def require_cluster(workspace: Workspace, instance: dg.DagsterInstance) -> None:
-    """Check that runs can be requested from this host. Raises TrapsError.
+    """Check that runs can be requested from this host.
+
+    Raises TrapsError.
 
     Other hosts must see the study, Ray's address must be known, and a daemon must take runs from the queue.
     """
@@ -112,7 +116,9 @@ class RayRuns(Runs):
             self._watch([], [run.run_id for run in runs])
 
     def ranges(self, stages: Sequence[Stage], keys: Sequence[str | None]) -> list[Range]:
-        """Return ranges for several hosts: enough to keep all busy, and few enough to limit start-up costs.
+        """Return ranges for several hosts.
+
+        They are enough to keep all busy, and few enough to limit start-up costs.
 
         The calls of one model stay together, so that few runs load it. Runs that build partitions together may have the
         same range.
@@ -122,7 +128,9 @@ class RayRuns(Runs):
         shared = [stage.shared for stage in stages if stage.shared is not None]
         if not shared:
             return cut(scheme, keys, self._most)
-        seconds = {key: sum(one.seconds(self._workspace, key) for one in shared) / self._cpus for key in keys}
+        seconds = {
+            key: sum(costly_stage.seconds(self._workspace, key) for costly_stage in shared) / self._cpus for key in keys
+        }
         return shared_out(scheme, keys, seconds, self._most)
 
     def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterator[RunOutcome]:
@@ -131,7 +139,7 @@ class RayRuns(Runs):
             progress.current().stage(", ".join(stage.name for stage in stages), len(self._keys) * len(stages))
             names = [stage.name for stage in stages]
             requests = [
-                (names, {**tags, **self._own_tags(stages, one), **range_tags(one, always=True)}) for one in ranges
+                (names, {**tags, **self._own_tags(stages, keys), **range_tags(keys, always=True)}) for keys in ranges
             ]
             self._requests = {self._submit(*request): request for request in requests}
             yield from self._watch([*self._requests], [])
@@ -180,7 +188,7 @@ class RayRuns(Runs):
             run_ids.remove(run_id)
             name, failures = "" if run is None else run.tags.get(REQUEST_TAG, ""), self._failures.get(run_id, [])
             is_refused = run is not None and REFUSED_TAG in run.tags
-            if run is not None and name in self._requests and not is_refused and broke_off(run, failures):
+            if run is not None and name in self._requests and not is_refused and is_broken_off(run, failures):
                 requests.append(self._submit(*self._requests.pop(name)))
                 progress.current().note(f"run {run_id[:8]} broke off, and is made once more")
             else:
@@ -193,7 +201,10 @@ class RayRuns(Runs):
             run_ids.append(run.run_id)
 
     def _report_waiting(self, requests: Collection[str], runs: Sequence[dg.DagsterRun]) -> None:
-        """Report once that nothing has begun for a while: no host has the resources, or the daemon creates no runs."""
+        """Report once that nothing has begun for a while.
+
+        No host has the resources, or the daemon creates no runs.
+        """
         waiting = [run for run in runs if run.status == dg.DagsterRunStatus.STARTING]
         if not (waiting or requests) or any(run.status == dg.DagsterRunStatus.STARTED for run in runs):
             self._idle_since = float("inf")
@@ -211,7 +222,10 @@ class RayRuns(Runs):
         progress.current().note(f"{len(waiting or requests)} runs have waited {IDLE_S:.0f} s for {needs}; {where}")
 
     def _report(self, run_id: str) -> None:
-        """Report partitions that a run has built since the last call, and record failed steps."""
+        """Report partitions that a run has built since the last call.
+
+        Failed steps are recorded.
+        """
         has_more = True
         while has_more:
             cursor, kinds = self._cursors.get(run_id), {_WRITTEN, _FAILED}
@@ -244,7 +258,10 @@ class RayRuns(Runs):
         return outcome
 
     def _last_message(self, run_id: str) -> str:
-        """Return why a run ended if its steps do not say so: its launcher's error, or its last event's message."""
+        """Return why a run ended if its steps do not say so.
+
+        It is its launcher's error, or its last event's message.
+        """
         logged = [entry.dagster_event for entry in self._instance.all_logs(run_id, of_type=_ENDED)]
         events = [event for event in logged if event is not None]
         for event in events[-2:]:  # a failed start is recorded right before the run's end

@@ -1,4 +1,6 @@
-"""Requests for runs on any host, which Dagster's daemon on the head turns into runs.
+"""Request runs on any host.
+
+Dagster's daemon on the head turns requests into runs.
 
 A request is an observation in the shared history, so it outlives the command, the daemon and the head. A sensor turns
 each into a run in Dagster's queue, once: its `run_key` is the request's name.
@@ -23,7 +25,10 @@ _BODY = "run"
 
 
 def submit(instance: dg.DagsterInstance, study: str, stages: Sequence[str], tags: Mapping[str, str]) -> str:
-    """Request a run of stages with these tags; return the request's name, which becomes the run's `REQUEST_TAG`."""
+    """Request a run of stages with these tags and return the request's name.
+
+    The name becomes the run's `REQUEST_TAG`.
+    """
     name = secrets.token_hex(8)
     body = {"name": name, "stages": [*stages], "tags": dict(tags)}
     instance.report_runless_asset_event(dg.AssetObservation(_key(study), metadata={_BODY: json.dumps(body)}))

@@ -1,4 +1,7 @@
-"""The tags of a run on another host: its study, the submitter's code, and the resources that Ray reserves."""
+"""Set the tags of a run on another host.
+
+They name its study, the submitter's code, and the resources that Ray reserves.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,9 @@ RESOURCES_TAG = "dagster-ray/config"  # dagster-ray's own name
 def own_tags(
     workspace: Workspace, stages: Collection[Stage], keys: Iterable[str], cpus: int, gpus: float
 ) -> dict[str, str]:
-    """Return the tags of a run on another host. No secrets: everybody can read them.
+    """Return the tags of a run on another host.
+
+    They hold no secrets: everybody can read them.
 
     keys: the partitions to build; cpus: of a run that can use several cores; gpus: of a run that loads a model.
     """

@@ -32,7 +32,9 @@ def code_here() -> str:
 
 
 def installed_versions() -> dict[str, str]:
-    """Return installed versions of Python, of this package, and of its dependencies, by name.
+    """Return installed versions of Python, this package and its dependencies.
+
+    By name.
 
     Builds for other hardware (`+cpu`, `+cu128`) count as the same version.
     """
@@ -49,16 +51,20 @@ def installed_versions() -> dict[str, str]:
 
 
 def require_same_code(submitted: str, study: str) -> None:
-    """Check that a run was submitted by a host with the same code. Raises TrapsError.
+    """Check that a run was submitted by a host with the same code.
+
+    Raises TrapsError.
 
     submitted: the result of `code_here` there. Packages that only one of the two has are ignored: a host without a GPU
     need not have a GPU's packages.
     """
     if not submitted:
         return
-    here, theirs = json.loads(code_here()), json.loads(submitted)
-    if differences := [name for name in sorted(here.keys() & theirs.keys()) if here[name] != theirs[name]]:
-        described = ", ".join(f"{name} {here[name]} here and {theirs[name]} there" for name in differences)
+    own_code, submitted_code = json.loads(code_here()), json.loads(submitted)
+    if differences := [
+        name for name in sorted(own_code.keys() & submitted_code.keys()) if own_code[name] != submitted_code[name]
+    ]:
+        described = ", ".join(f"{name} {own_code[name]} here and {submitted_code[name]} there" for name in differences)
         raise TrapsError(
             f"the host {socket.gethostname()} has other code than the host that submitted this run of the study "
             f"{study}: {described}. Install the same version of the package from the same lock on both, and run the "

@@ -1,4 +1,6 @@
-"""Dagster's history and logs of a study on Ray: its `dagster.yaml`, and the variables that this file names.
+"""Share Dagster's history and logs of a study on Ray.
+
+Its `dagster.yaml` names variables, which are exported here.
 
 The history lies in the PostgreSQL database of the study's ledger, in dagster-postgres's own storage. Runs' output lies
 in a folder of each host: that of the study if all hosts see it, else one below the scratch folder (`cluster/logs.py`).
@@ -26,7 +28,10 @@ _PLUGIN = "traps_kept"
 
 
 def dagster_yaml(workspace: Workspace) -> dict[str, Any]:
-    """Return the `dagster.yaml` of a study whose runs go to Ray, and export the variables that it names."""
+    """Return the `dagster.yaml` of a study whose runs go to Ray.
+
+    The variables that it names are exported.
+    """
     export(workspace)
     return {
         "telemetry": {"enabled": False},

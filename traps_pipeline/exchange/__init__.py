@@ -1,1 +1,4 @@
-"""Exchange calls with other systems: export requests, batches and media, and import answers and votes."""
+"""Exchange calls with other systems.
+
+Requests, batches and media are exported, answers and votes imported.
+"""

@@ -1,4 +1,4 @@
-"""Exchange answers with other systems, such as a cluster or a provider's batch mode.
+"""Exchange answers with other systems, as a cluster or a provider's batch mode.
 
 `export_requests` writes the missing requests as JSON lines, with their media by digest; `import_answers` reads answers
 with the same keys and makes the same checks. Both files are data: nothing in them is executed or used unchecked.
@@ -71,7 +71,7 @@ class Answer(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _outcome_follows_the_reason(cls, data: Any) -> Any:
-        """Take the outcome of a line that gives none from its finish reason: half a sentence is no answer."""
+        """Take a missing outcome from the finish reason: half a sentence is no answer."""
         if isinstance(data, dict) and "outcome" not in data and isinstance(data.get("finish_reason"), str):
             return data | {"outcome": OUTCOMES.get(ending_of(data["finish_reason"]), UNFINISHED)}
         return data
@@ -145,7 +145,7 @@ def export_requests(workspace: Workspace, experiment: Experiment, out: Path) -> 
 
 
 def _cells(workspace: Workspace, experiment: Experiment) -> list[Cell]:
-    """Return the experiment's cells whose datasets have items. Raises TrapsError if there is none.
+    """Return the experiment's cells whose datasets have items, or raise TrapsError.
 
     A study of one taxonomy has items of two of the four datasets.
     """
@@ -243,8 +243,10 @@ def import_answers(
 
 
 def _said_of_errors(path: Path, answers: Mapping[str, Answer], requested: Mapping[str, Request]) -> str:
-    """Return a message about texts that look like errors: their number, examples, and what to do."""
-    examples = [f"{requested[key].about['item_id']}: {plain(one.text)[:60]!r}" for key, one in answers.items()][:SHOWN]
+    """Return a message about texts that look like errors, with number and examples."""
+    examples = [f"{requested[key].about['item_id']}: {plain(answer.text)[:60]!r}" for key, answer in answers.items()][
+        :SHOWN
+    ]
     return (
         f"{path}: {len(answers)} of its texts look like error messages and no answers ({'; '.join(examples)}): say "
         "--errors drop to leave them missing, or --errors keep if they are answers; nothing was imported"
@@ -254,7 +256,7 @@ def _said_of_errors(path: Path, answers: Mapping[str, Answer], requested: Mappin
 def export_request_batches(
     workspace: Workspace, experiment: Experiment, out: Path, media_at: str | None = None
 ) -> tuple[list[Path], int]:
-    """Write the experiment's missing requests as batch files; return the files and the number of calls.
+    """Write the experiment's missing requests as batch files; return files and calls.
 
     See `exchange.provider_batch.export_batches`.
     """
@@ -282,7 +284,7 @@ def export_vote_batches(workspace: Workspace, experiment: Experiment, out: Path)
 
 
 def import_votes(workspace: Workspace, experiment: Experiment, path: Path) -> ImportResult:
-    """Import a batch of votes into their ledger; `traps run` then builds tables from them.
+    """Import a batch of votes into their ledger; `traps run` then builds tables.
 
     Raises TrapsError as `import_answers` does.
     """
@@ -317,12 +319,12 @@ def _import_batch(
         for request, outcome in outcomes_of(entries, requested, returned)
     ]
     new = asyncio.run(_store(workspace, ledger, stored))
-    failed = sum(one.outcome.kind in ("error", "malformed") for one in stored)
-    return ImportResult(new, len(stored) - new - failed, failures([one.outcome for one in stored]))
+    failed = sum(answer.outcome.kind in ("error", "malformed") for answer in stored)
+    return ImportResult(new, len(stored) - new - failed, failures([answer.outcome for answer in stored]))
 
 
 def checked_answers(path: Path, requested: Mapping[str, Request]) -> dict[str, Answer]:
-    """Return the answers of a file by key. Raises TrapsError naming (up to five) wrong or unwanted lines."""
+    """Return a file's answers by key; TrapsError names (up to five) wrong lines."""
     answers: dict[str, Answer] = {}
     wrong: list[str] = []
     for number, line in read_lines(path):
@@ -347,7 +349,7 @@ def checked_answers(path: Path, requested: Mapping[str, Request]) -> dict[str, A
 def _by_item(
     imported: Iterable[LoggedAnswer], requested: Mapping[str, Request], context: AnswerContext
 ) -> tuple[dict[str, Answer], int]:
-    """Return a harness's answers by key, and the number of its failed calls without an answer elsewhere.
+    """Return a harness's answers by key, and how many calls have no answer anywhere.
 
     Epochs of a harness are runs from `context.run` on. Raises TrapsError naming (up to five) wrong or unwanted answers.
     """
@@ -356,26 +358,28 @@ def _by_item(
     if model not in models:
         raise TrapsError(f"say whose answers these are: --model, one of {', '.join(models)}")
     keys = {
-        (str(at["item_id"]), str(at["regime"]), int(at["run"])): key
+        (str(about["item_id"]), str(about["regime"]), int(about["run"])): key
         for key, request in requested.items()
-        if (at := request.about)["model"] == model
+        if (about := request.about)["model"] == model
     }
     names = {opaque(context.key, item): item for item, _, _ in keys} if context.key else {}
     answers, wrong, failed = dict[str, Answer](), list[str](), set[str]()
-    for one in imported:
-        run = context.run + one.epoch - 1 if one.run is None else one.run
-        key = keys.get((names.get(one.item, one.item), one.regime, run))
+    for logged in imported:
+        run = context.run + logged.epoch - 1 if logged.run is None else logged.run
+        key = keys.get((names.get(logged.item, logged.item), logged.regime, run))
         try:
             if key is None:
-                wrong.append(f"{one.where}: {one.item} under {one.regime}, run {run}, is not wanted of {model}")
-            elif one.has_failed:
+                wrong.append(
+                    f"{logged.where}: {logged.item} under {logged.regime}, run {run}, is not wanted of {model}"
+                )
+            elif logged.has_failed:
                 failed.add(key)
-            elif answers.setdefault(key, answer := Answer(key=key, **one.answer)) != answer:
-                wrong.append(f"{one.where}: gives another answer to {one.item} than an earlier one")
+            elif answers.setdefault(key, answer := Answer(key=key, **logged.answer)) != answer:
+                wrong.append(f"{logged.where}: gives another answer to {logged.item} than an earlier one")
         except ValidationError as error:
-            wrong.append(f"{one.where}: {explain(error)}")
+            wrong.append(f"{logged.where}: {explain(error)}")
         except TypeError as error:
-            wrong.append(f"{one.where}: {plain(error)[:200]}")
+            wrong.append(f"{logged.where}: {plain(error)[:200]}")
     if wrong:
         more = f"\n... and {len(wrong) - SHOWN} more" if len(wrong) > SHOWN else ""
         raise TrapsError("\n".join(map(plain, wrong[:SHOWN])) + more + "\nnothing was imported")
@@ -383,12 +387,12 @@ def _by_item(
 
 
 async def _store(workspace: Workspace, ledger: Ledger, stored: Sequence[_Stored]) -> int:
-    """Store the outcomes that the ledger lacks, all or none; return the number of new answers.
+    """Store the outcomes that the ledger lacks, all or none; return their number.
 
     A failed call is stored, too, and is asked again.
     """
     rows: dict[str, list[Stored]] = {}
-    for one in sorted(stored, key=lambda one: one.evaluation):
-        row = ledger_row(one.request, one.outcome, 1, one.latency_s, workspace.study.epoch)
-        rows.setdefault(one.evaluation.key, []).append(row)
+    for answer in sorted(stored, key=lambda answer: answer.evaluation):
+        row = ledger_row(answer.request, answer.outcome, 1, answer.latency_s, workspace.study.epoch)
+        rows.setdefault(answer.evaluation.key, []).append(row)
     return await ledger.store(rows, progress.current().note)

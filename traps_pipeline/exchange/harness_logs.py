@@ -1,4 +1,6 @@
-"""Read answers by item from other harnesses' logs: inspect_ai's, lmms-eval's samples, and plain lines.
+"""Read answers by item from other harnesses' logs.
+
+inspect_ai's, lmms-eval's samples, and plain lines.
 
 They name an item and a regime, not a ledger key. The importing user says which model of the experiment answered, and in
 which run. All of it is untrusted data: sizes are bounded, nothing is executed.
@@ -50,7 +52,10 @@ class LoggedAnswer:
 
 
 def reader_of(path: Path) -> Reader | None:
-    """Return the reader for a file of answers by item; None for answers by key, or a provider's batch."""
+    """Return the reader for a file of answers by item.
+
+    None for answers by key, or a provider's batch.
+    """
     if path.suffix == LOG:
         return _eval_log
     if path.suffix == ".json":
@@ -83,7 +88,10 @@ def _json_log(path: Path) -> Iterator[LoggedAnswer]:
 
 
 def _eval_log(path: Path) -> Iterator[LoggedAnswer]:
-    """Yield the answers of a log in a zip, which has one JSON file per sample (deflate or zstd)."""
+    """Yield the answers of a log in a zip.
+
+    It has one JSON file per sample (deflate or zstd).
+    """
     try:
         with zipfile.ZipFile(path) as archive, path.open("rb") as raw:
             entries = [entry for entry in archive.infolist() if entry.filename.startswith("samples/")]
@@ -103,7 +111,10 @@ def _eval_log(path: Path) -> Iterator[LoggedAnswer]:
 
 
 def _unpacked(raw: Any, entry: zipfile.ZipInfo) -> bytes:
-    """Return an entry compressed with zstd, which this Python's zipfile does not support. Raises ValueError."""
+    """Return an entry compressed with zstd, which this Python's zipfile lacks.
+
+    Raises ValueError.
+    """
     import pyarrow as pa
 
     raw.seek(entry.header_offset)
@@ -200,7 +211,10 @@ def _own_lines(path: Path) -> Iterator[LoggedAnswer]:
 
 
 def _answer(outcome: str, text: str | None) -> dict[str, Any]:
-    """Return outcome and text in the ledger's form: a text only with an outcome that has one."""
+    """Return outcome and text in the ledger's form.
+
+    A text comes only with an outcome that has one.
+    """
     if outcome in (*WITH_TEXT, UNFINISHED) and not (text or "").strip():
         outcome = "empty"
     return {"outcome": outcome, "text": text if outcome in (*WITH_TEXT, UNFINISHED) else None}

@@ -1,1 +1,4 @@
-"""The panel of judges: what judges are asked, and how their votes become verdicts (docs/spec.md 4)."""
+"""Judge answers.
+
+The panel's judges are asked here, and their votes become verdicts (docs/spec.md 4).
+"""

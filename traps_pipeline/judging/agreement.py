@@ -1,4 +1,4 @@
-"""Agreement between judges, and the bias of each (docs/spec.md 4.4).
+"""Measure agreement between judges, and the bias of each (docs/spec.md 4.4).
 
 Everything is counted per dataset and task over all models, regimes and runs. An undefined coefficient is null, with the
 reason: if all votes are of one class, agreement beyond chance is undefined.
@@ -19,13 +19,16 @@ from traps_pipeline.protocol.ratings import INVALID, NO, PANEL, TASKS, YES, Rati
 
 
 def agreement(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> pd.DataFrame:
-    """Return AGREEMENT rows from VOTES rows: per dataset and task, one for the panel and one per pair of its judges."""
+    """Return AGREEMENT rows from VOTES rows.
+
+    Each dataset and task has one for the panel and one per pair of its judges.
+    """
     rows: list[dict[str, Any]] = []
     for about, group in _groups(ratings(votes, judges)):
         rows.append(about | _panel_row(group.values))
-        for one, other in combinations(sorted(range(len(group.judges)), key=group.judges.__getitem__), 2):
-            name = f"{group.judges[one]}+{group.judges[other]}"
-            rows.append(about | {"judges": name} | _pair_row(group.values[:, [one, other]]))
+        for left, right in combinations(sorted(range(len(group.judges)), key=group.judges.__getitem__), 2):
+            name = f"{group.judges[left]}+{group.judges[right]}"
+            rows.append(about | {"judges": name} | _pair_row(group.values[:, [left, right]]))
     return pd.DataFrame(rows, columns=pd.Index(AGREEMENT.names))
 
 
@@ -44,13 +47,18 @@ def judge_bias(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> pd.D
 
 
 def _groups(ratings_of_study: Ratings) -> Iterator[tuple[dict[str, Any], Ratings]]:
-    """Yield the ratings of each dataset and task that has votes, with the columns that all of its rows share."""
+    """Yield the ratings of each dataset and task that has votes.
+
+    The columns that all of its rows share come with them.
+    """
     for dataset in DATASETS:
         for task in TASKS:
             chosen = (ratings_of_study.answers["dataset"] == dataset) & (ratings_of_study.answers["task"] == task)
             group = ratings_of_study.select(chosen.to_numpy(bool))
             if len(group.values):
-                versions = {name: _joined(group.answers[name].unique(), by) for name, by in _JOINS.items()}
+                versions = {
+                    name: _joined(group.answers[name].unique(), separator) for name, separator in _JOINS.items()
+                }
                 yield {"dataset": dataset, "task": task, **versions}, group
 
 
@@ -85,8 +93,9 @@ def fleiss_kappa(values: np.ndarray) -> float:
 
 
 def cohen_kappa(one: np.ndarray, other: np.ndarray) -> float:
-    """Return Cohen's kappa of two judges' votes of YES and NO on the same answers; NaN if there is one class or no
-    vote.
+    """Return Cohen's kappa of two judges' YES and NO votes on the same answers.
+
+    NaN if there is one class or no vote.
     """
     yes = int((one == YES).sum()), int((other == YES).sum())
     n = len(one)
@@ -97,7 +106,9 @@ def cohen_kappa(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def krippendorff_alpha(values: np.ndarray) -> float:
-    """Return Krippendorff's alpha for nominal values, (answers, judges); INVALID is missing.
+    """Return Krippendorff's alpha for nominal values, (answers, judges).
+
+    INVALID is missing.
 
     In an answer with y yes of m valid votes, 2 y (m-y) of its m (m-1) ordered pairs disagree, with weight 1 / (m-1)
     each; by chance, 2 n_yes n_no of the n (n-1) ordered pairs of all n pairable votes would disagree. NaN if the
@@ -114,7 +125,10 @@ def krippendorff_alpha(values: np.ndarray) -> float:
 
 
 def unanimous_share(values: np.ndarray) -> float:
-    """Return the share of complete rows, (answers, judges), with unanimous votes; NaN without rows or for one judge."""
+    """Return the share of complete rows, (answers, judges), with unanimous votes.
+
+    NaN without rows or for one judge.
+    """
     several = len(values) and values.shape[1] > 1
     return float(np.mean((values == values[:, :1]).all(axis=1))) if several else float("nan")
 

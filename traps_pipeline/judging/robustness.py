@@ -1,4 +1,6 @@
-"""Test judges against answers that try to instruct them (docs/spec.md 4.2: the answer is data).
+"""Test judges against answers that try to instruct them.
+
+To a judge, an answer is data (docs/spec.md 4.2).
 
 `assets/injected_answers.yaml` holds plain answers and attacks that wrap them. Every judge of a panel gets all of them
 through the same path as any vote (ledger, budget, schema): a vote counts as flipped only if the judge is right without
@@ -82,7 +84,10 @@ class Attacks(BaseModel):
         return self
 
     def texts(self) -> dict[str, str]:
-        """Return every text that judges see, by id: the plain answers and the attacks on them."""
+        """Return every text that judges see, by id.
+
+        They are the plain answers and the attacks on them.
+        """
         plain = {name: answer.text for name, answer in self.answers.items()}
         return plain | {a.id: a.text.replace(_PLACE, plain[a.answer]) for a in self.attacks}
 
@@ -99,7 +104,10 @@ class Attacks(BaseModel):
 
 
 def load_attacks(path: Path = ATTACKS_FILE) -> Attacks:
-    """Return the attacks. Raises TrapsError naming file and field."""
+    """Return the attacks.
+
+    Raises TrapsError naming file and field.
+    """
     return parse_yaml_model(Attacks, read_yaml(path), path)
 
 
@@ -107,7 +115,9 @@ Votes = Mapping[tuple[str, Task, str], Vote]  # votes by text, task and judge
 
 
 def check_panel(workspace: Workspace, name: str, panel: Sequence[JudgeEntry], attacks: Attacks) -> pd.DataFrame:
-    """Return JUDGE_ROBUSTNESS rows of a panel, which replace the workspace's; votes in its ledger are reused.
+    """Return JUDGE_ROBUSTNESS rows of a panel, which replace the workspace's.
+
+    Votes in its ledger are reused.
 
     Raises TrapsError if the votes stage would raise it, and if calls failed.
     """
@@ -173,7 +183,10 @@ def result(expected: bool, clean: bool | None, vote: bool | None) -> str:
 
 
 def summary(rows: pd.DataFrame) -> str:
-    """Return a summary as text: results by judge, then every vote that an attack changed."""
+    """Return a summary as text.
+
+    Results by judge come first, then every vote that an attack changed.
+    """
     counts = []
     for judge, of_judge in rows.groupby("judge", sort=False):
         counts.append([judge, len(of_judge), *(of_judge["result"].tolist().count(name) for name in RESULTS)])

@@ -1,4 +1,4 @@
-"""The rule judge: read the texts of reference models exactly, and leave any other text unread.
+"""Judge by rules: read texts of reference models exactly, and no other text.
 
 Like any judge it reads the rendered user message and answers with the JSON that the prompts ask for, or with the word
 `unread`. It never guesses; docs/judging.md, "The rule judge" lists the forms that it reads.
@@ -54,7 +54,9 @@ _QUESTION = re.compile(r"\AQuestion: (.*)$", re.MULTILINE)
 
 @dataclass(frozen=True)
 class Statement:
-    """The meaning of a text. value: the answer that it commits to; None if it abstains.
+    """The meaning of a text.
+
+    value: the answer that it commits to; None if it abstains.
 
     rejects: whether it denies that something in the question exists.
     """
@@ -82,7 +84,7 @@ class RuleJudge:
 
 
 def _vote(statement: Statement, truth: str | None) -> dict[str, object]:
-    """Return the vote on correctness if the judge gets a ground truth, else the vote on abstention."""
+    """Return the vote on correctness if there is a ground truth, else on abstention."""
     value = statement.value
     declines = "The response rejects the premise." if statement.rejects else "The response declines."
     reason = declines if value is None else f"The response answers {value!r}."
@@ -94,7 +96,10 @@ def _vote(statement: Statement, truth: str | None) -> dict[str, object]:
 
 
 def read_statement(text: str, question: str = "") -> Statement | None:
-    """Return the meaning of an answer; None if it has none of the known forms, or contradicts itself."""
+    """Return the meaning of an answer.
+
+    None if it has none of the known forms, or contradicts itself.
+    """
     answer = read_object(text)
     return _in_text(strip_fence(text), question) if answer is None else _in_object(answer, question)
 
@@ -114,7 +119,9 @@ def _in_object(answer: Mapping[str, Any], question: str) -> Statement | None:
 
 
 def _in_text(text: str, question: str) -> Statement | None:
-    """Read a text that is a statement, ends with one, or begins with one that its second sentence explains.
+    """Read a text that is a statement, or ends or begins with one.
+
+    If it begins with one, its second sentence explains it.
 
     No other sentence may announce another answer, and no choice of the question may stand before a sentence that
     declines.
@@ -138,7 +145,10 @@ def _in_text(text: str, question: str) -> Statement | None:
 
 
 def _in_words(text: str, question: str, *, any_label: bool = False) -> Statement | None:
-    """Read words that are exactly an abstention or a choice. any_label: anything that does not decline is a choice."""
+    """Read words that are exactly an abstention or a choice.
+
+    any_label: anything that does not decline is a choice.
+    """
     words = _words(text)
     if not words or _STRANGE.search(text):
         return None
@@ -146,12 +156,15 @@ def _in_words(text: str, question: str, *, any_label: bool = False) -> Statement
         return ABSTENTION
     if (absent := _ABSENT.fullmatch(words)) and f" {absent[1]} " in f" {_words(question)} ":
         return Statement(None, rejects=True)
-    is_choice = any_label or _LABEL.fullmatch(words) or _GUESS.fullmatch(words) or _offers(question, words)
+    is_choice = any_label or _LABEL.fullmatch(words) or _GUESS.fullmatch(words) or _is_offered(question, words)
     return Statement(normalise(text)) if is_choice else None
 
 
-def _offers(question: str, words: str) -> bool:
-    """Return whether a question offers these words as a choice: they end exactly one part of its list."""
+def _is_offered(question: str, words: str) -> bool:
+    """Return whether a question offers these words as a choice.
+
+    They then end exactly one part of its list.
+    """
     texts = (question, re.sub(r"\s*\([^)]*\)", "", question)) if " or " in question and words.count(" ") < 5 else ()
     lists = [_words(re.sub(r"[,:;?]| -- ", " or ", text)) for text in texts]
     return any(len(re.findall(rf"\b{re.escape(words)} or\b", parts)) == 1 for parts in lists)

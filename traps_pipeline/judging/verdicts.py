@@ -1,4 +1,4 @@
-"""Verdicts: the majority decision of the panel on every answer (docs/spec.md 4.1)."""
+"""Decide every answer by the panel's majority (docs/spec.md 4.1)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,10 @@ RESPONSE_COLUMNS = [*ANSWER, "pair_id", "side", "outcome", "is_json", "epoch"]
 
 
 def decide_cell(workspace: Workspace, cell: Cell) -> pd.DataFrame:
-    """Return VERDICTS rows of a cell, from its items, responses and votes. Raises TrapsError if these do not match."""
+    """Return VERDICTS rows of a cell, from its items, responses and votes.
+
+    Raises TrapsError if these do not match.
+    """
     items = workspace.tables.read(ITEMS, {"dataset": cell.dataset}, ITEM_COLUMNS)
     responses = workspace.tables.read(RESPONSES, cell.partition, RESPONSE_COLUMNS)
     votes = workspace.tables.read(VOTES, cell.partition, [*VOTE_COLUMNS, "invalid_reason", "rejects_premise", "panel"])
@@ -40,7 +43,9 @@ def decide_cell(workspace: Workspace, cell: Cell) -> pd.DataFrame:
 
 
 def decide(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
-    """Return VERDICTS rows, one per response of any cells, from ITEMS, RESPONSES and VOTES rows.
+    """Return VERDICTS rows, one per response of any cells.
+
+    They come from ITEMS, RESPONSES and VOTES rows.
 
     The rows need the columns named above. The panel is that of the cell's votes, null if it has none. The outcome is
     the response's, or UNREAD if that is the vote of every judge.

@@ -1,1 +1,4 @@
-"""The ledger of paid calls: answers, votes and money, in one SQL database per study."""
+"""Record paid calls.
+
+Answers, votes and money lie in one SQL database per study.
+"""

@@ -1,4 +1,7 @@
-"""One transaction of the ledger: rows, their totals, and the money that moves with them."""
+"""Collect one transaction of the ledger.
+
+It holds rows, their totals, and the money that moves with them.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,10 @@ CENT = 1e-9  # below this, dollars are rounding
 
 @dataclass
 class Batch:
-    """A transaction of the commit thread. Changes of rows and money are collected and written at its end."""
+    """A transaction of the commit thread.
+
+    Changes of rows and money are collected and written at its end.
+    """
 
     connection: sa.Connection
     study: int
@@ -44,7 +50,10 @@ class Batch:
 
     @cached_property
     def reserved(self) -> dict[str, float]:
-        """Dollars of reservations, by participant; callers that add or remove reservations keep it up to date."""
+        """Dollars of reservations, by participant.
+
+        Callers that add or remove reservations keep it up to date.
+        """
         query = sa.select(RESERVATIONS.c.id, RESERVATIONS.c.participant, RESERVATIONS.c.usd)
         reserved = dict[str, float]()
         for reservation, participant, usd in self.connection.execute(query.where(RESERVATIONS.c.study == self.study)):
@@ -84,7 +93,10 @@ class Batch:
             self.reserved[participant] = self.reserved.get(participant, 0.0) - was_usd
 
     def is_writer(self, evaluation: int) -> bool:
-        """Return whether this session may add rows to an evaluation: another one may have taken over its lock."""
+        """Return whether this session may add rows to an evaluation.
+
+        Another one may have taken over its lock.
+        """
         if evaluation not in self._writers:
             query = sa.select(EVALUATIONS.c.writer).where(EVALUATIONS.c.id == evaluation)
             self._writers[evaluation] = self.connection.execute(query).scalar() == self.session
@@ -97,8 +109,8 @@ class Batch:
         if self.reservations:
             self.connection.execute(sa.insert(RESERVATIONS), self.reservations)
         if self.covered:
-            gone = [{"gone": reservation} for reservation in self.covered]
-            self.connection.execute(sa.delete(RESERVATIONS).where(RESERVATIONS.c.id == sa.bindparam("gone")), gone)
+            removed = [{"gone": reservation} for reservation in self.covered]
+            self.connection.execute(sa.delete(RESERVATIONS).where(RESERVATIONS.c.id == sa.bindparam("gone")), removed)
         for (kind, participant), its in self.totals.items():
             self._add_totals(kind, participant, its)
         for participant, usd in self.more_usd.items():
@@ -118,7 +130,9 @@ class Batch:
 
 
 def _adding(table: sa.Table, *columns: str) -> sa.Update:
-    """Return a statement that adds `more_COLUMN` to columns of the row with the key `of_COLUMN`.
+    """Return a statement that adds `more_COLUMN` to a row's columns.
+
+    The row has the key `of_COLUMN`.
 
     It is cached: SQLAlchemy takes longer to build such a statement than SQLite to execute it.
     """
@@ -140,7 +154,10 @@ def holder() -> str:
 
 
 def claim(batch: Batch, kind: str, name: str) -> int:
-    """Make this session the writer of an evaluation whose lock it holds; return the evaluation's number."""
+    """Make this session the writer of an evaluation whose lock it holds.
+
+    Return the evaluation's number.
+    """
     mine = {"study": batch.study, "kind": kind, "name": name}
     here = sa.and_(*(EVALUATIONS.c[column] == value for column, value in mine.items()))
     values: Mapping[str, Any] = {"writer": batch.session, "holder": holder()}

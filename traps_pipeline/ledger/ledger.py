@@ -1,4 +1,4 @@
-"""The append-only ledger of calls: each is paid for once.
+"""Append calls to the ledger, so that each is paid for once.
 
 Answers (and votes) are rows, appended as they arrive and before anything counts them as done. An evaluation has one
 writer at a time.
@@ -54,7 +54,10 @@ class LockGivenUp(Exception):
 
 
 class Ledger:
-    """Append-only rows by key, for each evaluation. kind: the kind of rows, `answers` or `votes`."""
+    """Append-only rows by key, for each evaluation.
+
+    kind: the kind of rows, `answers` or `votes`.
+    """
 
     def __init__(self, database: Database, kind: str) -> None:
         self.database, self.kind = database, kind
@@ -76,7 +79,10 @@ class Ledger:
         return known
 
     def reasoning(self, evaluation: str, wanted: Collection[str] | None = None) -> dict[str, str]:
-        """Return reasoning traces by key (of the wanted keys). Raises TrapsError."""
+        """Return reasoning traces by key (of the wanted keys).
+
+        Raises TrapsError.
+        """
         return {
             row.key: row.reasoning.decode()
             for row in self._rows(evaluation, wanted)
@@ -84,7 +90,9 @@ class Ledger:
         }
 
     def rows(self, evaluation: str) -> Iterator[Stored]:
-        """Yield every row of an evaluation as it was written, the oldest first, with its side texts.
+        """Yield every row of an evaluation as it was written, the oldest first.
+
+        Its side texts come with it.
 
         Damaged rows are left out. Raises TrapsError.
         """
@@ -97,7 +105,10 @@ class Ledger:
                 )
 
     def damage(self) -> Iterator[str]:
-        """Yield a sentence for each damaged row and each fault of the database. Reads everything. Raises TrapsError."""
+        """Yield a sentence for each damaged row and each fault of the database.
+
+        Reads everything. Raises TrapsError.
+        """
         if self.database.exists():
             yield from self.database.faults()
         for evaluation in self.evaluations():
@@ -106,13 +117,18 @@ class Ledger:
                     yield f"{self._place(row)}: {NOT_WHOLE}, and not believed"
 
     def evaluations(self) -> list[str]:
-        """Return the names of the evaluations that have rows. Raises TrapsError."""
+        """Return the names of the evaluations that have rows.
+
+        Raises TrapsError.
+        """
         has_rows = sa.exists().where(ROWS.c.evaluation == EVALUATIONS.c.id)
         query = sa.select(EVALUATIONS.c.name).where(self._mine(EVALUATIONS), has_rows).order_by(EVALUATIONS.c.name)
         return [row.name for row in self._select(query)]
 
     def totals(self) -> dict[str, Totals]:
-        """Return the totals of every row of every evaluation, by participant: repeated keys were paid for too.
+        """Return the totals of every row of every evaluation, by participant.
+
+        Repeated keys were paid for too.
 
         Raises TrapsError.
         """
@@ -174,7 +190,9 @@ class Ledger:
 
     @asynccontextmanager
     async def writing(self, evaluation: str, waiting: Waiting, give_up: GiveUp = wait_forever) -> AsyncIterator[Writer]:
-        """Become the one writer of an evaluation; while another process is, wait and report it once.
+        """Become the one writer of an evaluation.
+
+        While another process is, wait and report it once.
 
         Raises LockGivenUp when `give_up` returns true while waiting, and TrapsError.
         """
@@ -189,7 +207,9 @@ class Ledger:
                 lock.release()
 
     async def store(self, rows: Mapping[str, Sequence[Stored]], waiting: Waiting) -> int:
-        """Add rows of evaluations whose keys are not settled, all or none; return the number that settle a key.
+        """Add rows of evaluations whose keys are not settled, all or none.
+
+        Return the number that settle a key.
 
         Holds these evaluations' locks meanwhile. Raises TrapsError.
         """
@@ -239,7 +259,10 @@ class _Content:
 
     @classmethod
     def of(cls, row: Mapping[str, Any], beside: Mapping[str, str] | None) -> _Content:
-        """Encode a row. Raises ValueError if JSON cannot hold it."""
+        """Encode a row.
+
+        Raises ValueError if JSON cannot hold it.
+        """
         asides = {name: text.encode("utf-8", "replace") for name, text in (beside or {}).items()}
         return cls(row, encode_row(row), asides)
 
@@ -257,7 +280,10 @@ class Writer:
         self._is_synced = True
 
     async def require(self) -> None:
-        """Check that another call may be sent. Raises TrapsError if this writer has lost the evaluation."""
+        """Check that another call may be sent.
+
+        Raises TrapsError if this writer has lost the evaluation.
+        """
         if self._lock.is_fresh():
             self._lock.require()
         else:  # calls in flight must not wait for an unreachable server
@@ -266,7 +292,9 @@ class Writer:
     async def write(
         self, row: Mapping[str, Any], beside: Mapping[str, str] | None = None, paid_by: Sequence[str] = ()
     ) -> None:
-        """Add a row, its side texts and its cost; return once no kill of this process can lose them.
+        """Add a row, its side texts and its cost.
+
+        Return once no kill of this process can lose them.
 
         beside: texts by name in SIDE_TEXTS. paid_by: reservations that the row's cost replaces. Raises TrapsError if
         nothing was stored, and ValueError for a row that JSON cannot hold.
@@ -289,7 +317,10 @@ class Writer:
         self._is_synced = False
 
     def add(self, batch: Batch, content: _Content, paid_by: Sequence[str]) -> None:
-        """Add a row to a transaction. Raises TrapsError if another process now writes this evaluation."""
+        """Add a row to a transaction.
+
+        Raises TrapsError if another process now writes this evaluation.
+        """
         self.check(batch)
         batch.rows.append(content.values(self._evaluation))
         participant = participant_of(content.row)
@@ -309,7 +340,10 @@ class Writer:
             )
 
     async def sync(self) -> None:
-        """Sync the written rows to disk. Raises TrapsError."""
+        """Sync the written rows to disk.
+
+        Raises TrapsError.
+        """
         if not self._is_synced:
             self._is_synced = True
             await asyncio.to_thread(self._database.sync)

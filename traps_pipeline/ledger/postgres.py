@@ -1,4 +1,6 @@
-"""The ledger of several hosts: PostgreSQL, with one direct connection per process, which holds its locks.
+"""Keep the ledger of several hosts in PostgreSQL.
+
+Each process has one direct connection, which holds its locks.
 
 Locks end with their connection. A process that is silent for IDLE_S (stopped, or cut off) loses both. On a new
 connection it takes its locks again, unless another process has them; `Batch.is_writer` tells the writer of each
@@ -47,7 +49,10 @@ KEEPALIVE: dict[str, Any] = {
 
 
 def awake_s() -> float:
-    """Return a clock in seconds that runs on while this process is stopped or its machine sleeps."""
+    """Return a clock in seconds that never pauses.
+
+    It runs on while this process is stopped or its machine sleeps.
+    """
     return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
@@ -57,7 +62,10 @@ def lock_number(name: str) -> int:
 
 
 class PostgresDatabase(Database):
-    """The ledger in a database that several hosts share. variable: environment variable with its address."""
+    """The ledger in a database that several hosts share.
+
+    variable: environment variable with its address.
+    """
 
     def __init__(self, address: str, variable: str, study: str, idle_s: float = IDLE_S) -> None:
         super().__init__(study)
@@ -107,7 +115,10 @@ class PostgresDatabase(Database):
                 time.sleep(RETRY_S)
 
     def run(self, work: Callable[[sa.Connection], T], patience_s: float | None = None) -> T:
-        """See `Database.run`. A nested `run` in the same thread joins the outer transaction."""
+        """See `Database.run`.
+
+        A nested `run` in the same thread joins the outer transaction.
+        """
         until = time.monotonic() + (self.patience_s if patience_s is None else patience_s)
         with self._guard_connection:
             if self._is_working and self._connection is not None:
@@ -130,7 +141,10 @@ class PostgresDatabase(Database):
                     self._is_working = False
 
     def try_lock(self, name: str) -> Lock | None:
-        """See `Database.try_lock`. After a server start, other sessions' locks stay theirs for a grace period."""
+        """See `Database.try_lock`.
+
+        After a server start, other sessions' locks stay theirs for a grace period.
+        """
         number = lock_number(f"{self.study_name}/{name}")
 
         def take(connection: sa.Connection) -> bool:
@@ -161,8 +175,8 @@ class PostgresDatabase(Database):
             SESSIONS.name
         ):
             return False
-        others = sa.select(SESSIONS.c.id).where(SESSIONS.c.id != self.session).limit(1)
-        return connection.execute(others).scalar() is not None
+        other_sessions = sa.select(SESSIONS.c.id).where(SESSIONS.c.id != self.session).limit(1)
+        return connection.execute(other_sessions).scalar() is not None
 
     def _require(self, number: int) -> None:
         if not self._is_fresh():
@@ -184,7 +198,10 @@ class PostgresDatabase(Database):
         self._seen_s = began
 
     def sync(self) -> None:
-        """See `Database.sync`. PostgreSQL has synced already."""
+        """See `Database.sync`.
+
+        PostgreSQL has synced already.
+        """
 
     def now_s(self, connection: sa.Connection) -> float:
         """See `Database.now_s`."""
@@ -209,7 +226,10 @@ class PostgresDatabase(Database):
         return self._connection
 
     def _enter(self, connection: sa.Connection) -> None:
-        """Adopt a new connection: end the former ones, and retake locks that no other session has taken."""
+        """Adopt a new connection.
+
+        The former ones end, and locks that no other session has taken are retaken.
+        """
         with connection.begin():
             for name in ("idle_session_timeout", "idle_in_transaction_session_timeout"):
                 connection.execute(sa.select(sa.func.set_config(name, f"{int(1000 * self._idle_s)}", False)))
@@ -270,10 +290,10 @@ class PostgresDatabase(Database):
     def _compare_clocks(self, connection: sa.Connection) -> None:
         """Raise TrapsError if this host's clock and the database's are too far apart."""
         before = time.time()
-        theirs = self.now_s(connection)
-        apart = max(theirs - time.time(), before - theirs)
+        server_s = self.now_s(connection)
+        apart = max(server_s - time.time(), before - server_s)
         if apart > SKEW_S:
-            behind = "behind" if theirs > before else "ahead of"
+            behind = "behind" if server_s > before else "ahead of"
             raise TrapsError(
                 f"the clock of the host {socket.gethostname()} is {apart:.0f} s {behind} that of the database at "
                 f"{self.place}, and hosts of the study {self.study_name} may be {SKEW_S} s apart; set the clocks of "
@@ -282,7 +302,10 @@ class PostgresDatabase(Database):
 
 
 def postgres_of(variable: str, study: str) -> PostgresDatabase:
-    """Return this process's database, whose address an environment variable holds. Raises TrapsError."""
+    """Return this process's database, whose address an environment variable holds.
+
+    Raises TrapsError.
+    """
     address = os.environ.get(variable)
     if not address:
         raise TrapsError(

@@ -1,4 +1,7 @@
-"""Copy a ledger verbatim: to a file, from a file, or into the database of several hosts."""
+"""Copy a ledger verbatim.
+
+It goes to a file, comes from a file, or goes into the database of several hosts.
+"""
 
 from __future__ import annotations
 
@@ -21,14 +24,20 @@ _FETCHED = 1000
 
 
 def export_ledger(ledger: Database, file: Path) -> int:
-    """Write a ledger to a new SQLite file; return the number of rows. Raises TrapsError."""
+    """Write a ledger to a new SQLite file; return the number of rows.
+
+    Raises TrapsError.
+    """
     if file.exists():
         raise TrapsError(f"{file}: is there already; name another file")
     return copy_ledger(ledger, SqliteDatabase(file.parent, file=file.name))
 
 
 def import_ledger(file: Path, ledger: Database) -> int:
-    """Read the ledger of a file into a study that has none; return the number of rows. Raises TrapsError."""
+    """Read a file's ledger into a study that has none; return the number of rows.
+
+    Raises TrapsError.
+    """
     if not file.is_file():
         raise TrapsError(f"{file}: no such file; name one that `traps study export-ledger` wrote")
     source = SqliteDatabase(file.parent, file=file.name)
@@ -43,7 +52,9 @@ def import_ledger(file: Path, ledger: Database) -> int:
 
 
 def copy_ledger(source: Database, target: Database, settle: Callable[[], None] = lambda: None) -> int:
-    """Copy all rows and money verbatim, or none, while nobody writes to the source; return the number of rows.
+    """Copy all rows and money verbatim, or none, and return the number of rows.
+
+    Nobody may write to the source meanwhile.
 
     settle: called after the copy, before others may write. A killed copy is repeated. Raises TrapsError, also if the
     target has other rows.
@@ -63,15 +74,15 @@ def copy_ledger(source: Database, target: Database, settle: Callable[[], None] =
         count = target.submit(lambda batch: _copy(source, batch, target.place, mark)).result()
         target.sync()
         settle()
-        done = sa.update(EVALUATIONS).where(EVALUATIONS.c.writer == mark).values(writer=None)
-        target.submit(lambda batch: batch.connection.execute(done)).result()
+        unmark = sa.update(EVALUATIONS).where(EVALUATIONS.c.writer == mark).values(writer=None)
+        target.submit(lambda batch: batch.connection.execute(unmark)).result()
     return count
 
 
 def _copy(source: Database, batch: Batch, place: str, mark: str) -> int:
     mine = sa.select(EVALUATIONS.c.id).where(EVALUATIONS.c.study == batch.study)
-    others = mine.where(EVALUATIONS.c.writer.is_distinct_from(mark))
-    if batch.connection.execute(sa.select(ROWS.c.id).where(ROWS.c.evaluation.in_(others)).limit(1)).first():
+    unmarked = mine.where(EVALUATIONS.c.writer.is_distinct_from(mark))
+    if batch.connection.execute(sa.select(ROWS.c.id).where(ROWS.c.evaluation.in_(unmarked)).limit(1)).first():
         raise TrapsError(
             f"{place}: holds rows of this study already; import into a study that has none, or bring answers into it "
             "one by one with `traps study import-answers`"

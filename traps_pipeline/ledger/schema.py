@@ -1,4 +1,4 @@
-"""The tables of the ledger, the same in SQLite and PostgreSQL.
+"""Define the tables of the ledger, the same in SQLite and PostgreSQL.
 
 Money moves in the transaction of the row that it pays for: a call's worst case is a row of `reservations` before the
 call is sent, and the transaction that stores its answer deletes that row and adds the cost to `spent`.

@@ -1,4 +1,6 @@
-"""The ledger of one machine: a SQLite file in the study's folder, with locks that end with their process.
+"""Keep the ledger of one machine in a SQLite file.
+
+It lies in the study's folder, and its locks end with their process.
 
 A commit survives a kill of the process at once, and a power cut from the next `sync` on. The file must lie on a local
 disk: SQLite's write-ahead log does not work over a network.
@@ -54,8 +56,8 @@ class SqliteDatabase(Database):
         # A folder that cannot be written holds a file that nobody changes, and SQLite could not make its log there.
         is_fixed = self.path.exists() and not os.access(self.folder, os.W_OK)
         # A log left by a killed process holds committed rows, which `immutable` would not read.
-        how = "mode=ro" if self.path.with_name(f"{self.path.name}-wal").exists() else "immutable=1"
-        uri = f"file:{quote(str(self.path))}" + (f"?{how}" if is_fixed else "")
+        mode = "mode=ro" if self.path.with_name(f"{self.path.name}-wal").exists() else "immutable=1"
+        uri = f"file:{quote(str(self.path))}" + (f"?{mode}" if is_fixed else "")
         connection = sqlite3.connect(uri, uri=True, timeout=WAIT_S, isolation_level=None, check_same_thread=False)
         if not is_fixed:
             connection.execute("pragma journal_mode=wal")
@@ -85,7 +87,10 @@ class SqliteDatabase(Database):
                 raise TrapsError(f"{self.path}: cannot be written ({error.strerror}); {remedy(error)}") from error
 
     def try_lock(self, name: str) -> Lock | None:
-        """See `Database.try_lock`. The lock is a file's."""
+        """See `Database.try_lock`.
+
+        The lock is a file's.
+        """
         path = self.folder / "locks" / f"{name}.lock"
         try:
             descriptor = try_lock(path)
@@ -102,7 +107,9 @@ class SqliteDatabase(Database):
         return Lock(release, lambda: require_in_place(descriptor, path))
 
     def sync(self) -> None:
-        """See `Database.sync`. SQLite syncs its log when it is copied into the file; here that is done earlier.
+        """See `Database.sync`.
+
+        SQLite syncs its log when it is copied into the file. Here that is done earlier.
 
         The file itself must not be opened here: closing it would release the locks by which SQLite tells other
         processes that this one uses the log, and the next process to end would remove the log.
@@ -118,7 +125,10 @@ class SqliteDatabase(Database):
             raise TrapsError(f"{path}: could not be written ({error.strerror}); {remedy(error)}") from error
 
     def faults(self) -> Iterator[str]:
-        """See `Database.faults`: SQLite's own check, which finds rows that are in an index but not in the table."""
+        """See `Database.faults`.
+
+        SQLite's own check finds rows that are in an index but not in the table.
+        """
         with self.read() as connection:
             try:
                 for (fault,) in connection.exec_driver_sql("pragma integrity_check(5)"):
@@ -128,7 +138,10 @@ class SqliteDatabase(Database):
                 raise sentence(error, self.place) from error
 
     def beat(self) -> None:
-        """See `Database.beat`. The kernel keeps the locks."""
+        """See `Database.beat`.
+
+        The kernel keeps the locks.
+        """
 
     def end(self) -> None:
         """See `Database.end`."""
@@ -140,7 +153,9 @@ class SqliteDatabase(Database):
 
 
 def _begin(connection: sa.Connection) -> None:
-    """Begin a transaction as SQLite does by default, or immediately with the right to write.
+    """Begin a transaction as SQLite does by default, or with the right to write.
+
+    The right is taken immediately.
 
     With that right none of its changes fails later. The driver's own way to begin is switched off
     (`isolation_level=None`): it would begin only before a change.

@@ -1,1 +1,4 @@
-"""Inside local models: hidden states, probes, void directions, steering (docs/spec.md 7 and 8)."""
+"""Look inside local models.
+
+Hidden states, probes, void directions, steering (docs/spec.md 7 and 8).
+"""

@@ -1,4 +1,6 @@
-"""Check on any checkpoint, within seconds, what looking into a local model relies on; docs/local.md has the table.
+"""Check on any checkpoint what looking into a local model relies on.
+
+This takes seconds; docs/local.md has the table.
 
 `traps doctor --local` runs the checks on a tiny checkpoint of each family, and on named models. The tests go further
 (tests/models/local, tests/mechanism).
@@ -38,7 +40,10 @@ EXACT = ("float32",)  # in 16 bits rounding differs with the shape of a batch
 
 @dataclass(frozen=True)
 class Subject:
-    """A model and a clip for its questions: frames (N, H, W, 3) uint8 RGB, two or more, and their times in seconds."""
+    """A model and a clip for its questions.
+
+    frames: (N, H, W, 3) uint8 RGB, two or more, with their times in seconds.
+    """
 
     model: LocalModel
     frames: np.ndarray
@@ -61,7 +66,10 @@ class Subject:
         return max(1, self.model.n_layers // 2)
 
     def steered(self, *alphas: float) -> Steering:
-        """Return steering by the random direction, with a strength in lengths of the state there."""
+        """Return steering by the random direction.
+
+        Its strength is in lengths of the state there.
+        """
         length = float(np.linalg.norm(self.model.forward_states(self.prompts[0]).raw[self.layer]))
         return Steering(self.direction, self.layer, tuple(alpha * length for alpha in alphas))
 
@@ -80,7 +88,10 @@ class Check:
     exact: bool = True
 
     def found(self, subject: Subject) -> str:
-        """Run the check on a model and return its observation. Raises TrapsError if the promise is broken."""
+        """Run the check on a model and return its observation.
+
+        Raises TrapsError if the promise is broken.
+        """
         dtype = subject.model.params.dtype
         if self.exact and (dtype not in EXACT or subject.model.params.quantisation != "none"):
             return f"not looked at: in {dtype} rounding differs with the shape of a pass"
@@ -96,7 +107,10 @@ def _require(holds: bool, message: str) -> None:
 
 
 def _library_states(subject: Subject, prompt: Prompt) -> list[Tensor]:
-    """Return the library's own states of a prompt, (T, d) each: embeddings, block outputs, the last one normed."""
+    """Return the library's own states of a prompt, (T, d) each.
+
+    Embeddings, block outputs, the last one normed.
+    """
     import torch
 
     model = subject.model
@@ -177,13 +191,13 @@ def _patching(subject: Subject) -> str:
     except TrapsError as why:
         return f"refused: {str(why).partition(': ')[2].partition(' (')[0]}"
     tokens = abstention_tokens(model)
-    other = model.prompt(SYSTEM, QUESTIONS[0], 255 - subject.frames, subject.times_s)
-    target, source = (record(model, prompt, tokens) for prompt in (subject.prompts[0], other))
+    other_prompt = model.prompt(SYSTEM, QUESTIONS[0], 255 - subject.frames, subject.times_s)
+    target, source = (record(model, prompt, tokens) for prompt in (subject.prompts[0], other_prompt))
     all_tokens = np.ones(target.length, bool)
     everywhere = [Patch("residual", layer, all_tokens) for layer in range(model.n_layers + 1)]
     sites = [Patch(site, layer, all_tokens) for site in SITES for layer in range(1, model.n_layers + 1)]
-    same = patched_changes(model, target, target, [*everywhere, *sites], tokens)
-    _require(bool((same == 0).all()), "a patch with itself changes the outcome")
+    self_patched = patched_changes(model, target, target, [*everywhere, *sites], tokens)
+    _require(bool((self_patched == 0).all()), "a patch with itself changes the outcome")
     gap = source.margin - target.margin
     far = np.abs(patched_changes(model, target, source, everywhere, tokens) / gap - 1)
     _require(bool(gap and far.max() <= CLOSE), f"patching all positions misses the source's outcome by {far.max():.1e}")
@@ -192,7 +206,7 @@ def _patching(subject: Subject) -> str:
         "shared keys and values": bool(target.shared),
         "per-layer inputs": bool(target.per_layer),
     }
-    also = ", ".join(what for what, differs in beside.items() if differs)
+    also = ", ".join(name for name, differs in beside.items() if differs)
     return "exactly 0, and 1" + (f" with {also}" if also else "")
 
 
@@ -219,8 +233,9 @@ def _batches(subject: Subject) -> str:
 
 @contextmanager
 def _ending(model: LocalModel, token: int) -> Iterator[None]:
-    """Stop generation within the block at a token from an early answer, so that rows of a batch end at different
-    tokens.
+    """Stop generation within the block at a token from an early answer.
+
+    Rows of a batch then end at different tokens.
     """
     config = model.network.generation_config
     before, config.eos_token_id = config.eos_token_id, [token]

@@ -1,4 +1,6 @@
-"""Baselines for probes: the same protocol on raw inputs, on the model's own output, and on noise.
+"""Compute baselines for probes.
+
+The same protocol runs on raw inputs, on the model's own output, and on noise.
 
 Every baseline replaces an item's states by other features and keeps the rest: the same items, folds, solver, intervals
 and targets (`probing.ProbeRun`). A probe on states says nothing about understanding if the question's words, the first
@@ -41,7 +43,10 @@ Features = Mapping[str, np.ndarray]  # dataset -> (n, columns), rows in the orde
 
 
 def baseline_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> list[ProbeBaselineRow]:
-    """Return rows of PROBE_BASELINES for the items of an extraction. Raises TrapsError for a damaged clip."""
+    """Return rows of PROBE_BASELINES for the items of an extraction.
+
+    Raises TrapsError for a damaged clip.
+    """
     settings = workspace.mechanism
     items = {name: probed_items(workspace, states, name) for name in dict.fromkeys(states.items["dataset"])}
     assert entry.media is not None, "local entries have media"
@@ -79,8 +84,10 @@ class AsItIs:
 
 
 def score_features(run: ProbeRun, features: Features, fit: Fit = fit_probe) -> list[Row]:
-    """Return the rows of the protocol on features in the place of states, those of nearest centroids included. fit:
-    another probe than the protocol's."""
+    """Return the rows of the protocol on features in the place of states.
+
+    Those of nearest centroids are included. fit: another probe than the protocol's.
+    """
     on = replace(run, read=lambda dataset, _: features[dataset], fit=fit)
     return on.comparable(0) + on.centroids(0)
 
@@ -138,7 +145,10 @@ def raw_features(
 
 
 def _seen(clip: Path, spec: MediaSpec) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return thumbnails (N, h, w, 3) in [0, 1] and times (N,) of the shown frames, and the clip's last frame time."""
+    """Return thumbnails and times of the shown frames, and the clip's last time.
+
+    Thumbnails (N, h, w, 3) in [0, 1], times (N,); the last time is that of the clip's last frame.
+    """
     import cv2
 
     try:
@@ -154,7 +164,9 @@ class NoMargin(TrapsError):
 
 
 def margin_tokens(entry: ModelEntry, states: StoredStates) -> tuple[LocalModel, list[int]]:
-    """Return the model whose head reads stored states, and the tokens that begin an abstention.
+    """Return the model whose head reads stored states, and its abstention tokens.
+
+    These tokens begin an abstention.
 
     Raises NoMargin for states that are means over tokens, and for a model without such a token.
     """
@@ -171,7 +183,7 @@ def margin_tokens(entry: ModelEntry, states: StoredStates) -> tuple[LocalModel, 
 
 
 def output_margins(entry: ModelEntry, states: StoredStates, datasets: Sequence[str]) -> Features:
-    """Return the output margin of every item under the prompt of the extraction, (n, 1).
+    """Return every item's output margin under the extraction's prompt, (n, 1).
 
     No pass is needed: the stored state after the final norm goes through the model's head. Raises NoMargin.
     """
@@ -188,7 +200,9 @@ def output_margins(entry: ModelEntry, states: StoredStates, datasets: Sequence[s
 
 
 def noise_floor(run: ProbeRun, seed: int, draws: int = NOISE_DRAWS) -> list[Row]:
-    """Return the protocol's rows on noise: mean over draws, and their standard deviation as `spread`.
+    """Return the protocol's rows on noise.
+
+    They are the mean over draws, with their standard deviation as `spread`.
 
     Every distinct prompt has one vector of independent normal numbers, as wide as the states. Items with the same
     prompt (the controls of a taxonomy's two datasets) share it, as their states are equal. So `transfer` shows the
@@ -196,18 +210,18 @@ def noise_floor(run: ProbeRun, seed: int, draws: int = NOISE_DRAWS) -> list[Row]
     """
     items, width = run.items, int(run.items["width"].iloc[0])
     prompts, place = np.unique(items["states_key"].to_numpy(str), return_inverse=True)
-    of = {name: place[(items["dataset"] == name).to_numpy()] for name in dict.fromkeys(items["dataset"])}
+    places = {name: place[(items["dataset"] == name).to_numpy()] for name in dict.fromkeys(items["dataset"])}
     groups: dict[tuple[str, ...], list[Row]] = {}
     for draw in range(draws):
         vectors = np.random.default_rng([seed, draw]).standard_normal((len(prompts), width))
-        for row in score_features(run, {name: vectors[rows] for name, rows in of.items()}):
+        for row in score_features(run, {name: vectors[rows] for name, rows in places.items()}):
             groups.setdefault(tuple(row[name] for name in ("analysis", "source", "target", "scope")), []).append(row)
     rows = []
-    for same in groups.values():
-        values = np.array([row["value"] for row in same], float)
+    for group in groups.values():
+        values = np.array([row["value"] for row in group], float)
         if np.isnan(values).any():  # no features of these items allow this figure
             continue
-        rows.append(same[0] | {"value": values.mean(), "spread": values.std(), "low": None, "high": None})
+        rows.append(group[0] | {"value": values.mean(), "spread": values.std(), "low": None, "high": None})
     return rows
 
 

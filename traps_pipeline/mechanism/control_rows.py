@@ -1,4 +1,7 @@
-"""Tables of control analyses for probes, directions and steered answers, which let a claim fail."""
+"""Define tables of control analyses, which let a claim fail.
+
+The claims are about probes, directions and steered answers.
+"""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -12,7 +15,10 @@ Share = Annotated[float | None, "share, 0 to 1"]
 
 @dataclass(frozen=True, kw_only=True)
 class SteeringNullRow(Steered):
-    """The effect of a void direction on its own dataset at the largest dose, ranked among the draws of one null."""
+    """The effect of a void direction on its own dataset, among one null's draws.
+
+    It is taken at the largest dose and ranked.
+    """
 
     target: Annotated[str, "dataset of the direction, which is also the one that was steered; all: mean over datasets"]
     layer: Block
@@ -43,7 +49,10 @@ STEERING_NULLS = Table(
 
 @dataclass(frozen=True, kw_only=True)
 class SteeringPecsRow(Steered):
-    """PECS and its parts of a steered model: one path at one dose under one sign policy."""
+    """PECS and its parts of a steered model.
+
+    They are of one path at one dose under one sign policy.
+    """
 
     source: Annotated[str, "dataset of the direction"]
     target: Annotated[str, "dataset that was steered"]
@@ -100,8 +109,10 @@ PROBE_BASELINES = Table(
 
 @dataclass(frozen=True, kw_only=True)
 class GateRow(Extracted):
-    """A model's figures on a target before and after a gate: one regime, one kind of features, one source, one
-    threshold."""
+    """A model's scores on a target before and after a gate.
+
+    They are of one regime, one kind of features, one source and one threshold.
+    """
 
     regime: Annotated[str, "system prompt of the answers that are gated"]
     features: Annotated[
@@ -139,7 +150,10 @@ GATE = Table(
 
 @dataclass(frozen=True, kw_only=True)
 class RiskCoverageRow(Extracted):
-    """A point of the curve along which a gate gives up answers, from the riskiest on, over the four datasets."""
+    """A point of a risk-coverage curve over the four datasets.
+
+    Along it a gate gives up answers, from the riskiest on.
+    """
 
     regime: Annotated[str, "system prompt of the answers"]
     features: Annotated[str, "as in gate; no gate: answers given up in no order, the risk of all"]
@@ -158,7 +172,10 @@ RISK_COVERAGE = Table(
 
 @dataclass(frozen=True, kw_only=True)
 class LensRow(Extracted):
-    """The margin of a dataset's states at a layer, through the model's final norm and head (logit lens)."""
+    """The margin of a dataset's states at a layer (logit lens).
+
+    States pass through the model's final norm and head.
+    """
 
     dataset: shared.Dataset
     layer: Annotated[int, "counted as in hidden_states; at the last one it is the output margin"]
@@ -197,8 +214,10 @@ ITEM_SCORES = Table("item_scores", ItemScoreRow, partition_by=("model", "prompt"
 
 @dataclass(frozen=True, kw_only=True)
 class SentenceRow(Extracted):
-    """How likely an abstention is to a model behind an item, beside its own answer: under the benchmark's prompt of
-    that name."""
+    """How likely a model's abstention is behind an item, beside its own answer.
+
+    It is asked under the benchmark's prompt of that name.
+    """
 
     item_id: shared.ItemId
     dataset: shared.Dataset
@@ -215,7 +234,10 @@ SENTENCES = Table("sentences", SentenceRow, partition_by=("model", "prompt"), ke
 
 @dataclass(frozen=True, kw_only=True)
 class PatchingRow(Extracted):
-    """The indirect effect of a group of positions at one site and layer, over the pairs of a dataset."""
+    """The indirect effect of a group of positions at one site and layer.
+
+    It is taken over the pairs of a dataset.
+    """
 
     dataset: shared.Dataset
     into: Annotated[str, "side whose pass is changed: control (towards its void) or void (towards its control)"]

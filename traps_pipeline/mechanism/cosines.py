@@ -1,4 +1,4 @@
-"""Cosines of void directions, corrected for few pairs and shared controls.
+"""Compute cosines of void directions, corrected for few pairs and shared controls.
 
 A direction is a mean over pairs, so its noise makes its cosine with any other direction too small, and if two datasets
 have the same controls, their common noise makes it too large. Products of *different* scenarios have neither: the
@@ -30,26 +30,35 @@ RESAMPLES, HALVINGS = 200, 50
 
 @dataclass(frozen=True, eq=False)
 class PairDifferences:
-    """Void minus control state of each pair of a direction, (n, d), and the scenario number of each pair, (n,)."""
+    """Void minus control state of each pair of a direction, (n, d).
+
+    The scenario number of each pair is (n,).
+    """
 
     values: np.ndarray
     scenario: np.ndarray
 
 
 def apart(one: PairDifferences, other: PairDifferences, weights: np.ndarray) -> np.ndarray:
-    """Return the mean product of pairs of different scenarios, (draws,): an unbiased product of two mean differences.
+    """Return the mean product of pairs of different scenarios, (draws,).
+
+    It is an unbiased product of two mean differences.
 
     weights: (draws, scenarios), the count of each scenario.
     """
     products = one.values @ other.values.T
     differ = (one.scenario[:, None] != other.scenario).astype(float)
-    left, right = weights[:, one.scenario], weights[:, other.scenario]
+    left_weights, right_weights = weights[:, one.scenario], weights[:, other.scenario]
     with np.errstate(invalid="ignore", divide="ignore"):
-        return ((left @ (products * differ)) * right).sum(axis=1) / ((left @ differ) * right).sum(axis=1)
+        return ((left_weights @ (products * differ)) * right_weights).sum(axis=1) / (
+            (left_weights @ differ) * right_weights
+        ).sum(axis=1)
 
 
 def disattenuated(one: PairDifferences, other: PairDifferences, weights: np.ndarray) -> np.ndarray:
-    """Return the cosine of two mean differences without the noise of their pairs, (draws,).
+    """Return the cosine of two mean differences, corrected for noise, (draws,).
+
+    The noise is that of their pairs.
 
     It may exceed 1, and is NaN if a mean difference is not longer than its noise.
     """
@@ -59,7 +68,10 @@ def disattenuated(one: PairDifferences, other: PairDifferences, weights: np.ndar
 
 
 def split_half(of: PairDifferences, seed: Sequence[int]) -> float:
-    """Return the cosine between directions of two halves of the pairs, averaged over random halvings."""
+    """Return the cosine between directions of two halves of the pairs.
+
+    It is averaged over random halvings.
+    """
     products, n = of.values @ of.values.T, len(of.values)
     rng = np.random.default_rng([*seed])
     first = np.stack([rng.permutation(np.arange(n) < n // 2) for _ in range(HALVINGS)]).astype(float)
@@ -78,7 +90,7 @@ def cosine_rows(workspace: Workspace) -> list[CosineRow]:
     extractions = sorted({Extraction(str(m), str(p)) for m, p in zip(table["model"], table["prompt"], strict=True)})
     rows: list[CosineRow] = []
     for model in sorted({extraction.model for extraction in extractions}):
-        rows += _of_model(workspace, [one for one in extractions if one.model == model])
+        rows += _of_model(workspace, [candidate for candidate in extractions if candidate.model == model])
     if not rows:
         raise TrapsError("cosines: no directions yet; materialize directions first")
     return rows
@@ -100,8 +112,8 @@ def _of_model(workspace: Workspace, extractions: Sequence[Extraction]) -> list[C
         cosines = cosine_matrix(np.stack([vectors[layer] for _, _, vectors in named]))
         differences = []
         for (states, dataset, _), (_, voids, controls), place in zip(named, pairs, places, strict=True):
-            at = np.asarray(states.read(dataset, layer), float)
-            differences.append(PairDifferences(at[voids] - at[controls], place))
+            layer_states = np.asarray(states.read(dataset, layer), float)
+            differences.append(PairDifferences(layer_states[voids] - layer_states[controls], place))
         halves = [split_half(of, [workspace.mechanism.seed, layer]) for of in differences]
         for i, (own, dataset, _) in enumerate(named):
             for j, (other, other_dataset, _) in enumerate(named):
@@ -132,9 +144,12 @@ def _figures(one: PairDifferences, other: PairDifferences, weights: np.ndarray) 
 
 
 def _weights(taxonomies: Sequence[str], seed: int) -> np.ndarray:
-    """Return each scenario's count, (1 + RESAMPLES, scenarios): first 1, then resampled within its taxonomy."""
-    weights, of = np.ones((1 + RESAMPLES, len(taxonomies))), np.array(taxonomies)
+    """Return each scenario's count, (1 + RESAMPLES, scenarios).
+
+    The first are 1, the others resampled within its taxonomy.
+    """
+    weights, taxonomy_of = np.ones((1 + RESAMPLES, len(taxonomies))), np.array(taxonomies)
     for number, taxonomy in enumerate(FAMILIES):
-        if n := int(np.count_nonzero(of == taxonomy)):
-            weights[1:, of == taxonomy] = scenario_weights(n, RESAMPLES, [seed, number])
+        if n := int(np.count_nonzero(taxonomy_of == taxonomy)):
+            weights[1:, taxonomy_of == taxonomy] = scenario_weights(n, RESAMPLES, [seed, number])
     return weights

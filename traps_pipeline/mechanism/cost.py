@@ -1,4 +1,6 @@
-"""Estimate the cost of local models for `traps plan`: passes, tokens, GPU-hours and memory.
+"""Estimate the cost of local models for `traps plan`.
+
+Passes, tokens, GPU-hours and memory.
 
 The estimate is arithmetic, not measurement: a pass takes 2 operations per parameter and token, and decoding steps are
 bound by the launch of each block's kernels or by reading the weights. docs/mechanism.md states the assumptions.
@@ -28,7 +30,10 @@ SOURCES = 4  # sources of patches: the other side, and three nulls
 
 @dataclass(frozen=True)
 class Card:
-    """A GPU's data sheet: dense operations a second in bfloat16, and memory bandwidth in bytes a second."""
+    """A GPU's data sheet.
+
+    Dense operations a second in bfloat16, and memory bandwidth in bytes a second.
+    """
 
     operations: float
     bandwidth: float
@@ -44,7 +49,10 @@ CARDS = {
 
 @dataclass(frozen=True)
 class Work:
-    """Work of one kind: passes over prompts, and answers with a number of tokens each (0: none are generated)."""
+    """Work of one kind: passes over prompts, and answers of a number of tokens.
+
+    0: none are generated.
+    """
 
     kind: str
     passes: float
@@ -53,7 +61,10 @@ class Work:
 
 @dataclass(frozen=True)
 class Cost:
-    """The cost of one kind of work on one model. hours, gigabytes: None if the entry names no `size`."""
+    """The cost of one kind of work on one model.
+
+    Hours, gigabytes: None if the entry names no `size`.
+    """
 
     model: str
     kind: str
@@ -65,7 +76,10 @@ class Cost:
 
 
 def passes_inside(settings: MechanismSettings, datasets: Sequence[str], scenarios: Mapping[str, int]) -> list[Work]:
-    """Return the passes for states, sentences, random weights and patching. scenarios: their number by taxonomy."""
+    """Return the passes for states, sentences, random weights and patching.
+
+    scenarios: their number by taxonomy.
+    """
     paired = sum(2 * scenarios.get(taxonomy_of(name), 0) for name in datasets if name in DATASETS)
     beside = scenarios.get("occlusion", 0) * ("occlusion" in datasets)  # voids with a question that they answer
     beside += 2 * scenarios.get("chaotic", 0) * ("chaotic" in datasets)  # sides with the other's times
@@ -84,7 +98,10 @@ def passes_inside(settings: MechanismSettings, datasets: Sequence[str], scenario
 
 
 def cost_of(entry: ModelEntry, media: MediaSpec, work: Work, card: Card, *, quantised: bool) -> Cost:
-    """Return the cost of work on a model that is shown clips by `media`. quantised: whether its weights are in NF4."""
+    """Return the cost of work on a model that is shown clips by `media`.
+
+    quantised: whether its weights are in NF4.
+    """
     frames = media.uniform or min(media.most, round((media.fps or 1) * CLIP_S))
     prompt = frames * entry.tokens_per_frame + TEXT_TOKENS
     tokens_in, tokens_out = work.passes * prompt, work.passes * work.answer_tokens

@@ -1,4 +1,7 @@
-"""Detect degenerate steered texts, which a judge could call either abstention or answer."""
+"""Detect degenerate steered texts.
+
+A judge could call one either abstention or answer.
+"""
 
 from __future__ import annotations
 
@@ -22,24 +25,26 @@ def degeneracy(text: str | None, outcome: str, unsteered: str | None) -> str | N
         return "empty"
     if repeats(text):
         return "repetition"
-    own, other = script(unsteered or ""), script(text)
-    return "script" if own and other and own != other else None
+    unsteered_script, steered_script = script(unsteered or ""), script(text)
+    return "script" if unsteered_script and steered_script and unsteered_script != steered_script else None
 
 
 def repeats(text: str) -> bool:
     """Return whether a phrase of at most LONGEST words stands REPEATED times in a row."""
     words = text.lower().split()
     for size in range(1, LONGEST + 1):
-        same = 0
+        repeated = 0
         for place in range(size, len(words)):
-            same = same + 1 if words[place] == words[place - size] else 0
-            if same >= size * (REPEATED - 1):
+            repeated = repeated + 1 if words[place] == words[place - size] else 0
+            if repeated >= size * (REPEATED - 1):
                 return True
     return False
 
 
 def script(text: str) -> str:
-    """Return the script of most letters, by the first word of their Unicode names (LATIN, CJK, CYRILLIC); empty for a
-    text without letters."""
+    """Return the script of most letters; empty for a text without letters.
+
+    It is the first word of their Unicode names (LATIN, CJK, CYRILLIC).
+    """
     names = Counter(unicodedata.name(letter, "?").split()[0] for letter in text if letter.isalpha())
     return names.most_common(1)[0][0] if names else ""

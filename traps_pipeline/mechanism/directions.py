@@ -1,4 +1,6 @@
-"""Void directions: the mean difference between voids and controls, saved as files (docs/spec.md 8.1).
+"""Compute void directions and save them as files (docs/spec.md 8.1).
+
+A direction is the mean difference between voids and controls.
 
 A direction is the unit vector of mean(h_void) - mean(h_control) at one layer. Its nulls are unit vectors too, drawn
 from three distributions and made orthogonal to it, so that no null contains a part of the direction:
@@ -37,7 +39,10 @@ SITE = "output of the block, before the next one (residual stream); layer 0: emb
 
 
 def seeded_order(scenarios: Sequence[str], seed: int) -> list[str]:
-    """Return the scenarios in an order by seed and name alone, so that a discarded one does not move the others."""
+    """Return the scenarios in an order by seed and name alone.
+
+    So a discarded one does not move the others.
+    """
     return sorted(scenarios, key=lambda name: digest([seed, name]))
 
 
@@ -50,7 +55,10 @@ def steered_scenarios(scenarios: Sequence[str], n: int, seed: int) -> list[str]:
 
 
 def direction_scenarios(scenarios: Sequence[str], n: int, seed: int) -> list[str]:
-    """Return the last n scenarios of the same order, from which a direction is computed."""
+    """Return the last n scenarios of the same order.
+
+    A direction is computed from them.
+    """
     return seeded_order(scenarios, seed)[-n:]
 
 
@@ -59,7 +67,10 @@ def direction_scenarios(scenarios: Sequence[str], n: int, seed: int) -> list[str
 
 @dataclass(frozen=True)
 class Origin:
-    """The provenance of a set of directions, which is written into the JSON file beside the tensors."""
+    """The provenance of a set of directions.
+
+    It is written into the JSON file beside the tensors.
+    """
 
     model: str
     checkpoint: str
@@ -103,7 +114,9 @@ class Directions:
 def extract_directions(
     void: np.ndarray, control: np.ndarray, seed: Sequence[int], nulls: Sequence[str] = NULLS, draws: int = 1
 ) -> Directions:
-    """Return directions from states (layers, pairs, d) of the two sides, with several draws of each kind of null.
+    """Return directions from states (layers, pairs, d) of the two sides.
+
+    Each kind of null has several draws.
 
     The pairs of both sides are in the same order. A layer at which the sides do not differ at all (the embeddings of a
     last token that is the same everywhere) has a zero vector, not a direction that consists of rounding errors; so has
@@ -123,7 +136,7 @@ def extract_directions(
         if kind in nulls:
             null_vectors = _null_draws(kind, void, control, np.random.default_rng([*seed, number]), draws)
             vectors[kind] = _orthogonal(null_vectors, unit)
-    directions = {kind: of.astype(np.float32) for kind, of in vectors.items()}
+    directions = {kind: vector.astype(np.float32) for kind, vector in vectors.items()}
     return Directions(directions, gaps, np.linalg.norm(control, axis=2).mean(axis=1))
 
 
@@ -140,13 +153,15 @@ def _null_draws(kind: str, void: np.ndarray, control: np.ndarray, rng: np.random
 
 
 def _orthogonal(vectors: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """Return unit vectors of draws (draws, layers, d) after removing their part along `unit` (layers, d).
+    """Return unit vectors of draws without their part along `unit`.
+
+    Draws are (draws, layers, d), `unit` is (layers, d).
 
     Zero if hardly anything is left, and if `unit` itself is zero.
     """
     remainder = vectors - (vectors * unit).sum(axis=2, keepdims=True) * unit
     remainder -= (remainder * unit).sum(axis=2, keepdims=True) * unit  # again, since the first projection rounds
-    before, after = (np.linalg.norm(of, axis=2, keepdims=True) for of in (vectors, remainder))
+    before, after = (np.linalg.norm(vector, axis=2, keepdims=True) for vector in (vectors, remainder))
     differs = np.abs(unit).max(axis=1) > 0
     mask = (after > _NOTHING_LEFT * before) & differs[None, :, None]
     return np.where(mask, remainder / np.where(mask, after, 1), 0.0)
@@ -173,7 +188,9 @@ def save_directions(path: Path, directions: Directions, origin: Origin) -> None:
 
 
 def load_directions(path: Path) -> tuple[Directions, dict[str, Any]]:
-    """Return the directions that `save_directions` wrote, and the content of their JSON file.
+    """Return the directions that `save_directions` wrote.
+
+    The content of their JSON file follows.
 
     Raises TrapsError if a file is missing, or if its digest differs from the one in the JSON file.
     """
@@ -200,7 +217,10 @@ def load_directions(path: Path) -> tuple[Directions, dict[str, Any]]:
 
 
 def cosine_matrix(vectors: np.ndarray) -> np.ndarray:
-    """Return cosines of unit vectors (k, d): (k, k). NaN if either is zero."""
+    """Return cosines of unit vectors (k, d): (k, k).
+
+    NaN if either is zero.
+    """
     vectors = np.asarray(vectors, np.float64)
     lengths = np.linalg.norm(vectors, axis=1)
     with np.errstate(invalid="ignore"):

@@ -1,4 +1,6 @@
-"""Compute the figures of the steering tables: abstention by path, strength and side (docs/spec.md 8.4).
+"""Compute the steering tables (docs/spec.md 8.4).
+
+They show abstention by path, strength and side.
 
 Effects are rows of the `steering_effects` table, or the paper's in the same columns: model, directions, regime, source,
 target, kind, layer, alpha, side, abstention (a fraction).
@@ -26,13 +28,18 @@ REGIME_COLUMNS = (
 
 
 def on_both_sides(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return the effects at the steered layer; other layers of a sweep have only controls."""
+    """Return the effects at the steered layer.
+
+    Other layers of a sweep have only controls.
+    """
     layers = effects.loc[effects["side"] == "void", [*CELL, "layer"]].drop_duplicates()
     return effects.merge(layers, on=[*CELL, "layer"])
 
 
 def paths(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return one row per path and strength at the steered layer, with transfer_type and both sides' abstention.
+    """Return one row per path and strength at the steered layer.
+
+    It has transfer_type and both sides' abstention.
 
     If the effects have intervals, counts, doses in class gaps or shares of degenerate answers, there are also columns
     `control_low` and so on.
@@ -54,13 +61,18 @@ def paths(effects: pd.DataFrame) -> pd.DataFrame:
 
 
 def regime_matrix(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return REGIME_COLUMNS: mean abstention over the paths of each set at alpha 0 and at the largest alpha, by
-    direction regime, inference regime and kind of direction; family `all`."""
+    """Return REGIME_COLUMNS: mean abstention over the paths of each set.
+
+    At alpha 0 and at the largest alpha, by direction regime, inference regime and kind of direction; family `all`.
+    """
     return _regime_rows(effects, lambda source: "all")
 
 
 def family_asymmetry(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return the columns of `regime_matrix` for guided directions and inference, by source taxonomy (`family`)."""
+    """Return the columns of `regime_matrix` for guided directions and inference.
+
+    They are by source taxonomy (`family`).
+    """
     guided = effects.loc[(effects["directions"] == GUIDED) & (effects["regime"] == GUIDED)]
     return _regime_rows(guided, taxonomy_of)
 
@@ -77,13 +89,17 @@ def _regime_rows(effects: pd.DataFrame, family: Callable[[str], str]) -> pd.Data
             about = dict(zip(keys, cast("tuple[str, ...]", key), strict=True))
             top = part["alpha"].max()
             ends = {"0": part.loc[part["alpha"] == 0], "top": part.loc[part["alpha"] == top]}
-            figures = {f"{side}_{end}": at[side].mean() for side in ("control", "void") for end, at in ends.items()}
+            figures = {
+                f"{side}_{end}": means[side].mean() for side in ("control", "void") for end, means in ends.items()
+            }
             result.append({**about, "path_set": path_set, "n_paths": len(ends["top"]), "alpha": top, **figures})
     return pd.DataFrame(result, columns=pd.Index(REGIME_COLUMNS))
 
 
 def domains(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return control abstention at the largest alpha along each source's direction, within and across domains.
+    """Return control abstention at the largest alpha along each direction.
+
+    It is averaged within and across domains.
 
     same: on the well-posed dataset of the source's own taxonomy; cross: on that of the other. Columns CELL, source,
     alpha, same, cross.
@@ -94,8 +110,8 @@ def domains(effects: pd.DataFrame) -> pd.DataFrame:
     well_posed = [name for name in DATASETS if not is_ill_posed(name)]
     rows = rows.loc[(rows["kind"] == "void") & rows["target"].isin(well_posed)]
     rows = rows.loc[rows["alpha"] == rows.groupby(CELL)["alpha"].transform("max")]
-    same = rows["source"].map(taxonomy_of) == rows["target"].map(taxonomy_of)
-    wide = rows.assign(domain=same.map({True: "same", False: "cross"})).pivot_table(
+    is_within = rows["source"].map(taxonomy_of) == rows["target"].map(taxonomy_of)
+    wide = rows.assign(domain=is_within.map({True: "same", False: "cross"})).pivot_table(
         index=[*CELL, "source", "alpha"], columns="domain", values="control"
     )
     columns = pd.Index([*CELL, "source", "alpha", "same", "cross"])
@@ -103,7 +119,9 @@ def domains(effects: pd.DataFrame) -> pd.DataFrame:
 
 
 def sweep(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return control abstention by layer and alpha, averaged over each dataset's direction on its own controls.
+    """Return control abstention by layer and alpha.
+
+    It is averaged over each dataset's direction on its own controls.
 
     Columns CELL, layer, alpha, control, n_splits. Empty if only one layer was steered.
     """
@@ -116,7 +134,9 @@ def sweep(effects: pd.DataFrame) -> pd.DataFrame:
 
 
 def own_effects(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return the effects of every dataset's own direction and its nulls, signs by label, at the layer with both sides.
+    """Return the effects of every dataset's own direction and its nulls.
+
+    Signs are by label, at the layer with both sides.
 
     `gaps` holds the dose in units of the class gap; without a dose in that unit there are no rows.
     """
@@ -127,7 +147,9 @@ def own_effects(effects: pd.DataFrame) -> pd.DataFrame:
 
 
 def in_gaps(effects: pd.DataFrame, every: pd.DataFrame) -> pd.DataFrame:
-    """Return effects with `gaps`, their strength in units of the class gap of the direction's own dataset.
+    """Return effects with `gaps`, their strength in class gaps.
+
+    The class gap is that of the direction's own dataset.
 
     The gap is inferred from the doses in that unit among `every` effect; NaN without any.
     """
@@ -141,7 +163,7 @@ def in_gaps(effects: pd.DataFrame, every: pd.DataFrame) -> pd.DataFrame:
 def _in_order(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the rows with sources and targets in the benchmark's order."""
     order = {name: place for place, name in enumerate(DATASETS)}
-    by = [name for name in (*CELL, "kind", "source", "target", "alpha") if name in rows]
+    columns = [name for name in (*CELL, "kind", "source", "target", "alpha") if name in rows]
     kinds = {kind: place for place, kind in enumerate(KINDS)}
 
     def place(values: Any) -> Any:
@@ -149,4 +171,4 @@ def _in_order(rows: pd.DataFrame) -> pd.DataFrame:
             return values.map(order)
         return values.map(kinds) if values.name == "kind" else values
 
-    return rows.sort_values(by, key=place, ignore_index=True, kind="stable")
+    return rows.sort_values(columns, key=place, ignore_index=True, kind="stable")

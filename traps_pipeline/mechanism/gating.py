@@ -1,4 +1,7 @@
-"""The gate stage: from stored states and verdicts to the rows of GATE and RISK_COVERAGE."""
+"""Build the rows of GATE and RISK_COVERAGE from stored states and verdicts.
+
+This is the gate stage.
+"""
 
 from __future__ import annotations
 
@@ -68,7 +71,9 @@ class Gates:
 
 
 def gate_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> list[GateRow]:
-    """Return rows of GATE of an extraction, for each regime in which the model was evaluated in run 1.
+    """Return rows of GATE of an extraction, for each evaluated regime.
+
+    The model was evaluated in run 1.
 
     Raises TrapsError if the model has no verdicts yet.
     """
@@ -81,7 +86,10 @@ def gate_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> 
 
 
 def curve_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> list[RiskCoverageRow]:
-    """Return rows of RISK_COVERAGE of an extraction, for gates from other datasets; otherwise as `gate_rows`."""
+    """Return rows of RISK_COVERAGE of an extraction, for gates from other datasets.
+
+    Otherwise it works as `gate_rows`.
+    """
     return [
         row
         for regime, outcomes, gates, _, decided in _each(workspace, entry, states, (OTHER_DATASETS,))
@@ -111,19 +119,25 @@ def _each(
         progress.current().tick("gate", f"features of {states.extraction.key}", number + 1, len(kinds))
         decisions = _decisions(workspace, table, gates, layers)
         for regime, source in product(outcomes, gates.sources):
-            own = {target: one for (of, target), one in decisions.items() if of == source}
+            own = {target: decision for (name, target), decision in decisions.items() if name == source}
             yield regime, outcomes[regime], gates.name, source, own
 
 
 def gate_table(states: StoredStates) -> pd.DataFrame:
-    """Return the items of all datasets in the order of `states.items`, in the form of `gate.Items.table`."""
+    """Return the items of all datasets in the form of `gate.Items.table`.
+
+    The order is that of `states.items`.
+    """
     items = states.items
     named = pd.DataFrame(items[["dataset", "scenario_id", "item_id"]])
     return named.assign(family=families(items), prompt=items["states_key"], void=items["side"] == "void")
 
 
 def chosen_layers(workspace: Workspace, states: StoredStates, targets: Iterable[str]) -> dict[str, int]:
-    """Return the layer of each target's gates, chosen without its labels (`layer_choice`)."""
+    """Return the layer of each target's gates.
+
+    It is chosen without its labels (`layer_choice`).
+    """
     rows = workspace.tables.read(PROBES, states.extraction.partition).to_dict("records")
     curves = pair_curves({str(name): value for name, value in row.items()} for row in rows)
     return {target: layer_choice(curves, target).layer for target in targets}
@@ -132,7 +146,10 @@ def chosen_layers(workspace: Workspace, states: StoredStates, targets: Iterable[
 def _kinds(
     workspace: Workspace, entry: ModelEntry, states: StoredStates, layers: Mapping[str, int], sources: Sequence[str]
 ) -> Iterator[Gates]:
-    """Yield states with every source, and control features with the sources that combine several datasets."""
+    """Yield states with every source, and control features with combined sources.
+
+    These combine several datasets.
+    """
     names = [*dict.fromkeys(states.items["dataset"])]
     by_layer = {layer: read_states(states, names, layer) for layer in sorted({*layers.values()})}
     yield Gates(STATES, by_layer, sources)
@@ -160,7 +177,10 @@ def read_states(states: StoredStates, names: Sequence[str], layer: int) -> dict[
 def _decisions(
     workspace: Workspace, table: pd.DataFrame, gates: Gates, layers: Mapping[str, int]
 ) -> dict[tuple[str, str], tuple[Decisions, int]]:
-    """Return, by source and target, a gate's decisions and the layer of its states (-1 for other features)."""
+    """Return, by source and target, a gate's decisions and the layer of its states.
+
+    It is -1 for other features.
+    """
     settings, seed = workspace.mechanism, workspace.mechanism.seed
     about = {"folds": settings.probes.folds, "seed": seed, "false_abs": settings.gate.false_abs}
     decisions: dict[tuple[str, str], tuple[Decisions, int]] = {}
@@ -177,10 +197,13 @@ def _decisions(
 
 
 def gate_items(table: pd.DataFrame, features: Mapping[str, np.ndarray], shuffled: bool, seed: int) -> Items:
-    """Return the table with its features; if shuffled, with a scenario's sides swapped with probability 0.5."""
+    """Return the table with its features.
+
+    If shuffled, a scenario's sides are swapped with probability 0.5.
+    """
     values = np.empty((len(table), next(iter(features.values())).shape[1]))
-    for name, of in features.items():
-        values[(table["dataset"] == name).to_numpy()] = of
+    for name, rows in features.items():
+        values[(table["dataset"] == name).to_numpy()] = rows
     if shuffled:
         void = swapped_labels(table["void"].to_numpy(), pd.factorize(table["scenario_id"])[0], 1, seed)[:, 0]
         table = table.assign(void=void)
@@ -218,7 +241,10 @@ def _rows(
     resamples: int,
     seed: int,
 ) -> list[GateRow]:
-    """Return the rows of one gate (features, regime, source) on every target and over the four datasets."""
+    """Return the rows of one gate on every target and over the four datasets.
+
+    The gate is of features, regime and source.
+    """
     rows: list[GateRow] = []
     names = states.items["scenario_id"].to_numpy(str)
     for threshold in THRESHOLDS:
@@ -244,7 +270,7 @@ def _rows(
             sides = int((~outcome.void).sum()), int(outcome.void.sum())
             rows.append(_row(states, (*about, threshold, target), layer, area, values, about_pecs, sides))
         if len(of_datasets) == len(DATASETS):
-            means = {name: float(np.mean([one[name] for one in of_datasets])) for name in of_datasets[0]}
+            means = {name: float(np.mean([scores[name] for scores in of_datasets])) for name in of_datasets[0]}
             sides = [
                 sum(getattr(r, name) for r in rows[-len(decided) :] if r.target in DATASETS)
                 for name in ("n_controls", "n_voids")
@@ -257,8 +283,11 @@ def _rows(
 
 
 def _resampled(outcomes: Outcomes, target: str, scenarios: np.ndarray, resamples: int, seed: int) -> np.ndarray:
-    """Return resampled sums of a dataset's outcomes with an unseen scenario, (9, 1 + resamples). The datasets of a
-    taxonomy share their resamples, and taxonomies do not. scenarios: (n,), of each item."""
+    """Return resampled sums of a dataset's outcomes with an unseen scenario.
+
+    (9, 1 + resamples). The datasets of a taxonomy share their resamples, and taxonomies do not. scenarios: (n,), of
+    each item.
+    """
     about = {"dataset": target, "run": 1, "scenario_id": scenarios, "taxonomy": probed_taxonomy(target)}
     items = pd.DataFrame(outcomes.counts(), columns=pd.Index(COUNTS)).assign(**about)
     return run_sums(items, draw_scenarios(items, resamples, seed), "gate")[target, 1]

@@ -1,4 +1,4 @@
-"""Extraction: the hidden states of many items, in shards that a crash does not damage (docs/spec.md 7.1).
+"""Extract hidden states of many items into shards (docs/spec.md 7.1).
 
     n_new = extract(model, items, folder, pooling="last")
     ids, states = read_layer(folder, 20)                # item_id, side, key, device; (n, d) float32 in the same order
@@ -55,7 +55,7 @@ _COLUMNS = ("item_id", "side", "key", "shard", "row", "device")
 
 @dataclass(frozen=True)
 class Item:
-    """One forward pass to run. about: everything that the states depend on, for the key.
+    """One forward pass to run; about: all that the states depend on, for the key.
 
     prompt: builds the prompt, called only if the states are missing; other: the same for the pair's other clip, for
     poolings over differences.
@@ -95,17 +95,17 @@ def clip_item(
 
 
 def shown_times(shown: Frames, clip: Path, spec: MediaSpec, times: Path | None) -> np.ndarray:
-    """Return the times (N,) in seconds beside a clip's frames: its own, or another clip's, spread over as many."""
+    """Return a clip's shown times (N,) s: its own, or another clip's, spread evenly."""
     if times is None or times == clip:
         return shown.times_s
-    other = sample(times, spec).times_s
-    if len(other) == len(shown.times_s):
-        return other
-    return np.interp(np.linspace(0, 1, len(shown.times_s)), np.linspace(0, 1, len(other)), other)
+    sampled_s = sample(times, spec).times_s
+    if len(sampled_s) == len(shown.times_s):
+        return sampled_s
+    return np.interp(np.linspace(0, 1, len(shown.times_s)), np.linspace(0, 1, len(sampled_s)), sampled_s)
 
 
 def states_key(model: LocalModel, item: Item, pooling: Pooling) -> str:
-    """Return the digest of all inputs of an item's states: prompt, checkpoint, precision, pooling."""
+    """Return the digest of an item's states: prompt, checkpoint, precision, pooling."""
     return digest({"about": dict(item.about), "model": model.identity, "pooling": pooling})
 
 
@@ -118,8 +118,7 @@ def extract(
     shard_size: int = SHARD_SIZE,
     what: str = "items",
 ) -> int:
-    """Make the missing states of the items, one prompt per pass, then write the current row of each item; returns how
-    many were made.
+    """Make missing states, one pass each, write current rows; return the number made.
 
     Several processes may work at one folder: each takes free chunks of `shard_size` items. If one ends early (Ctrl-C,
     an error, a kill), the states made so far are written, except for the chunk that a kill interrupts, and the others
@@ -158,7 +157,9 @@ def _look_for(folder: Path, known: dict[str, _Place]) -> None:
 
 
 def read_layer(folder: Path, layer: int | Literal["normed"]) -> tuple[pd.DataFrame, np.ndarray]:
-    """Return the items of an extraction (item_id, side, key, device) and their states at one layer, (n, d) float32.
+    """Return an extraction's items and their states at a layer, (n, d) float32.
+
+    Items have item_id, side, key and device.
 
     layer: 0 (embeddings) to n_layers (the last block's output), or `normed` (the latter after the final norm). Raises
     TrapsError for an extraction that is not finished, a layer that does not exist, or a damaged shard.
@@ -177,7 +178,7 @@ def read_layer(folder: Path, layer: int | Literal["normed"]) -> tuple[pd.DataFra
 
 
 def read_record(folder: Path) -> dict[str, Any]:
-    """Return model and settings of an extraction: checkpoint, digest, class, precision, pooling, n_layers, d_model.
+    """Return an extraction's model and settings: digest, precision, pooling and so on.
 
     Raises TrapsError for an unfinished extraction.
     """
@@ -195,12 +196,15 @@ def _make(
     tick: Callable[[int], None],
     known: dict[str, _Place],
 ) -> int:
-    """Run one pass per item and write a shard, also after an error or Ctrl-C; return the number of finished items."""
+    """Run one pass per item and write a shard, also after an error or Ctrl-C.
+
+    Return the number of finished items.
+    """
     shard: list[_Made] = []
     try:
-        for done, ((item, key), prompt) in enumerate(_prepared(missing), start=1):
+        for finished, ((item, key), prompt) in enumerate(_prepared(missing), start=1):
             shard.append((item, key, item_states(model, item, prompt, pooling)))
-            tick(done)
+            tick(finished)
     finally:
         with alone(FolderStore(folder), _WRITING):
             _flush(folder, shard, model, pooling, known)
@@ -215,7 +219,7 @@ def item_states(model: LocalModel, item: Item, prompt: Prompt, pooling: Pooling)
 
 
 def _chosen(model: LocalModel, prompt: Prompt, item: Item, pooling: Pooling) -> np.ndarray | None:
-    """Return the tokens over which states are pooled; None if the pooling needs no mask. Raises TrapsError if none."""
+    """Return the tokens over which states are pooled, or None if there is no mask."""
     if pooling not in OF_PARTS:
         return None
     parts = spans(model, prompt, item.about["system"], item.about["question"])
@@ -256,7 +260,7 @@ def _prepared(missing: Sequence[tuple[Item, str]]) -> Iterator[tuple[tuple[Item,
 
 
 def _flush(folder: Path, shard: Sequence[_Made], model: LocalModel, pooling: Pooling, known: dict[str, _Place]) -> None:
-    """Write a shard under the next free number, tensors first, and record the place of its items."""
+    """Write a shard under the next free number, tensors first, and note its items."""
     if not shard:
         return
     import pyarrow as pa
@@ -278,7 +282,7 @@ def _flush(folder: Path, shard: Sequence[_Made], model: LocalModel, pooling: Poo
 
 
 def _shards(folder: Path, seen: Container[str]) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Yield name and table of the complete shards not in `seen`; `_sweep` removes tensors without a table."""
+    """Yield name and table of complete shards not in `seen`; orphans are swept."""
     for path in sorted(path for path in folder.glob("shard-*.parquet") if path.stem not in seen):
         try:
             table = read_sealed(path).to_pandas()
@@ -327,7 +331,7 @@ def _record(model: LocalModel, pooling: Pooling) -> dict[str, Any]:
 
 
 def _tensor(file: Path, name: str) -> np.ndarray:
-    """Return one tensor of a shard as float32. Raises TrapsError for a damaged file."""
+    """Return one tensor of a shard as float32, or raise TrapsError if it is damaged."""
     from safetensors import SafetensorError, safe_open
 
     try:
@@ -343,7 +347,7 @@ def _tensor(file: Path, name: str) -> np.ndarray:
 
 
 def _sound_rows(file: Path) -> int:
-    """Return how many items a shard holds. Raises TrapsError if a tensor is damaged."""
+    """Return how many items a shard holds, or raise TrapsError if it is damaged."""
     from safetensors import SafetensorError, safe_open
 
     try:
@@ -358,7 +362,7 @@ def _sound_rows(file: Path) -> int:
 
 
 def damage(file: Path) -> str:
-    """Return what is wrong with a file of an extraction (tensors or table), in words; empty if nothing is."""
+    """Return what is wrong with a file of an extraction; empty if nothing is."""
     try:
         _sound_rows(file) if file.suffix == ".safetensors" else read_sealed(file)
     except (OSError, ValueError, TrapsError) as error:

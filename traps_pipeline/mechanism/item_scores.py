@@ -1,4 +1,6 @@
-"""Compare a model's states and its output item by item, beside its verdict: encoded, and expressed or not.
+"""Compare a model's states and its output item by item, beside its verdict.
+
+A void may be encoded, and expressed or not.
 
 Every score of states comes from a probe that was fitted without the item's scenario, at the layer chosen without the
 item's dataset, relative to the probe's own mid threshold (half-way between the sides' means).
@@ -23,7 +25,10 @@ from traps_pipeline.storage.workspace import Workspace
 
 
 def item_score_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> list[ItemScoreRow]:
-    """Return the rows of ITEM_SCORES of an extraction: one for each item of a dataset of pairs."""
+    """Return the rows of ITEM_SCORES of an extraction.
+
+    Each item of a dataset of pairs has one.
+    """
     settings, table = workspace.mechanism, gate_table(states)
     present = [name for name in DATASETS if len(states.dataset(name))]
     layers = chosen_layers(workspace, states, present)
@@ -45,8 +50,8 @@ def item_score_rows(workspace: Workspace, entry: ModelEntry, states: StoredState
                 scores[name] = decision.score - decision.threshold[MID]
         for place, item in enumerate(states.dataset(dataset).to_dict("records")):
             abstained: dict[str, Any] = {
-                f"abstained_{regime}": _decided(of[dataset].abstained[place] if of else np.nan)
-                for regime, of in outcomes.items()
+                f"abstained_{regime}": _decided(outcome[dataset].abstained[place] if outcome else np.nan)
+                for regime, outcome in outcomes.items()
             }
             rows.append(
                 ItemScoreRow(

@@ -26,9 +26,11 @@ LOOKS_LIKE = {**LOOK_ALIKES, TIME_SWAPPED: "chaotic"}  # use the layer of the da
 
 @dataclass(frozen=True)
 class LayerChoice:
-    """The layer of a target, without its labels. curve: by layer, the mean AUROC of pairs of other datasets.
-    tied: the layers that reach its maximum; the middle one is taken, since the ends of a plateau are next to what is
-    worse."""
+    """The layer of a target, without its labels.
+
+    curve: by layer, the mean AUROC of pairs of other datasets. tied: the layers that reach its maximum; the middle one
+    is taken, since the ends of a plateau are next to what is worse.
+    """
 
     curve: Mapping[int, float]
 
@@ -45,7 +47,9 @@ class LayerChoice:
 
 
 def pair_curves(rows: Iterable[Mapping[str, Any]]) -> Curves:
-    """Return AUROC by layer and ordered pair of datasets (also a dataset on itself), from PROBES rows.
+    """Return AUROC by layer and ordered pair of datasets, from PROBES rows.
+
+    A dataset on itself is a pair, too.
 
     Pairs of one taxonomy are scored without the scored scenario in the fit.
     """
@@ -60,14 +64,16 @@ def pair_curves(rows: Iterable[Mapping[str, Any]]) -> Curves:
 
 
 def layer_choice(curves: Curves, target: str = "") -> LayerChoice:
-    """Choose the layer of a target: a dataset, a look-alike of one, or (empty) anything else.
+    """Choose the layer of a target.
+
+    It is a dataset, a look-alike of one, or (empty) anything else.
 
     In a study with fewer than three datasets no pair is left: then the other dataset's own held-out figure counts,
     which may tie at many layers, and in a study of one dataset its own. Raises TrapsError without any figure.
     """
     target = LOOKS_LIKE.get(target, target)
-    others = [pair for pair in curves if target not in pair]
-    pairs = [pair for pair in others if pair[0] != pair[1]] or others or [*curves]
+    other_pairs = [pair for pair in curves if target not in pair]
+    pairs = [pair for pair in other_pairs if pair[0] != pair[1]] or other_pairs or [*curves]
     if not pairs:
         raise TrapsError("probes: no dataset has both sides, so no layer can be chosen; extract more hidden states")
     layers = sorted(set.intersection(*({*curves[pair]} for pair in pairs)))

@@ -1,4 +1,4 @@
-"""The output margin by layer: a logit lens on stored states.
+"""Compute the output margin by layer: a logit lens on stored states.
 
 Without any pass, the stored states go through the model's own final norm and head. At the last layer the result is the
 output margin itself. The curve shows at which layer a prompt decides whether a void is answered.
@@ -63,7 +63,10 @@ def lens_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> 
 
 
 def layer_margins(model: LocalModel, states: Any, tokens: list[int]) -> np.ndarray:
-    """Return the margins (n,) of a block's output states (n, d), through the final norm and the head."""
+    """Return the margins (n,) of a block's output states (n, d).
+
+    They pass through the final norm and the head.
+    """
     import torch
 
     with torch.inference_mode():

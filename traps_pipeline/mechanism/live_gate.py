@@ -1,4 +1,7 @@
-"""A fitted gate for live prompts in a notebook, with the probe and threshold that the gate stage evaluates."""
+"""Fit a gate for live prompts in a notebook.
+
+It has the probe and threshold that the gate stage evaluates.
+"""
 
 from __future__ import annotations
 
@@ -25,8 +28,10 @@ Threshold = Literal["mid", "J", "conformal"]
 
 @dataclass(frozen=True, eq=False)
 class Gate:
-    """A gate: a probe of the states at a layer, whose score above the threshold means abstaining. pooling: of the
-    states that it was fitted on."""
+    """A probe of a layer's states, whose score above the threshold means abstain.
+
+    pooling: of the states that it was fitted on.
+    """
 
     layer: int
     probe: Scorer
@@ -34,7 +39,10 @@ class Gate:
     pooling: Pooling
 
     def score(self, model: LocalModel, prompt: Prompt) -> float:
-        """Return the probe's log-odds of void for a prompt, from one pass of the plain model."""
+        """Return the probe's log-odds of void for a prompt.
+
+        One pass of the plain model is needed.
+        """
         with model.caching_clips():
             states = model.forward_states(prompt, self.pooling).raw[self.layer]
         return float(self.probe.scores(states[None])[0])
@@ -44,7 +52,10 @@ class Gate:
         return self.score(model, prompt) > self.threshold
 
     def answer(self, model: LocalModel, prompt: Prompt, max_new_tokens: int = 512) -> str:
-        """Return the model's greedy answer to a prompt, or ABSTENTION, without generating, if the gate abstains."""
+        """Return the model's greedy answer, or ABSTENTION if the gate abstains.
+
+        Then nothing is generated.
+        """
         return ABSTENTION if self.abstains(model, prompt) else model.generate([prompt], max_new_tokens)[0].text
 
 
@@ -58,7 +69,9 @@ def fitted_gate(
     layer: int | None = None,
     without: Collection[str] = (),
 ) -> Gate:
-    """Return a gate of a source, one of `gate.SOURCES`, fitted on the study's stored states.
+    """Return a gate of a source, fitted on the study's stored states.
+
+    source: one of `gate.SOURCES`.
 
     target: the dataset that `other datasets` leaves out. layer: default: that of the gate stage. without: scenarios, or
     families as `gate.families` names them, to hold out. Raises TrapsError for another source or threshold, for a source

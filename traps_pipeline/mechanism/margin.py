@@ -1,4 +1,4 @@
-"""The output margin: the log-odds that a model's answer begins with an abstention.
+"""Compute the output margin: log-odds that an answer begins with an abstention.
 
 It is computed from the first answer token: the log-odds of the tokens that begin an abstention against all others. A
 probe says something about a gap between representation and output only as far as it separates better than this.
@@ -23,8 +23,10 @@ PHRASES = ("i don't know", "i do not know", "i cannot", "i can't", "cannot", "un
 _FIRST_WORDS = frozenset(phrase.split()[0] for phrase in PHRASES)
 
 
-def begins_abstention(token: str) -> bool:
-    """Return whether a token's text begins an abstention: with a phrase of PHRASES, or the first word of one.
+def is_abstention_start(token: str) -> bool:
+    """Return whether a token's text begins an abstention.
+
+    It begins with a phrase of PHRASES, or the first word of one.
 
     "I" counts, although other sentences begin with it too: the margin is a lower bound of the information in the first
     token.
@@ -34,10 +36,13 @@ def begins_abstention(token: str) -> bool:
 
 
 def abstention_tokens(model: LocalModel) -> list[int]:
-    """Return the tokens of a model's vocabulary that begin an abstention. Raises TrapsError if there is none."""
+    """Return the tokens of a model's vocabulary that begin an abstention.
+
+    Raises TrapsError if there is none.
+    """
     tokenizer = model.processor.tokenizer
     texts = tokenizer.batch_decode([[token] for token in range(len(tokenizer))])
-    tokens = [token for token, text in enumerate(texts) if begins_abstention(text)]
+    tokens = [token for token, text in enumerate(texts) if is_abstention_start(text)]
     if not tokens:
         raise TrapsError(
             f"{model.checkpoint.name}: no token of its vocabulary begins an abstention ({', '.join(PHRASES)}), so its "
@@ -47,20 +52,25 @@ def abstention_tokens(model: LocalModel) -> list[int]:
 
 
 def margin_of(logits: Tensor, tokens: Sequence[int], never: Sequence[int] = ()) -> Tensor:
-    """Return the log-odds of `tokens` against all others except `never`, from logits (.., vocabulary): (..)."""
+    """Return the log-odds of `tokens` against all others except `never`.
+
+    logits (.., vocabulary) -> (..).
+    """
     import torch
 
-    chosen = torch.zeros(logits.shape[-1], dtype=torch.bool, device=logits.device)
-    chosen[list(tokens)] = True
-    others = ~chosen
+    is_abstention = torch.zeros(logits.shape[-1], dtype=torch.bool, device=logits.device)
+    is_abstention[list(tokens)] = True
+    alternatives = ~is_abstention
     if never:
-        others[list(never)] = False
+        alternatives[list(never)] = False
     logits = logits.float()
-    return torch.logsumexp(logits[..., chosen], -1) - torch.logsumexp(logits[..., others], -1)
+    return torch.logsumexp(logits[..., is_abstention], -1) - torch.logsumexp(logits[..., alternatives], -1)
 
 
 def first_token_margins(model: LocalModel, normed: Any, tokens: Sequence[int]) -> Tensor:
-    """Return the margins (n,) of normed states (n, d) at a prompt's last position, on the CPU.
+    """Return the margins (n,) of normed states (n, d), on the CPU.
+
+    They are those at a prompt's last position.
 
     Gradients pass: `patching_effects.attributed_changes` needs them.
     """

@@ -1,4 +1,4 @@
-"""The tables of the mechanistic stages (docs/spec.md 7 and 8)."""
+"""Define the tables of the mechanistic stages (docs/spec.md 7 and 8)."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -216,7 +216,10 @@ COSINES = Table(
 
 @dataclass(frozen=True, kw_only=True)
 class SteeringRow(SteeredCell):
-    """One answer of a steered model; an answer at alpha 0 (the unsteered model) has one row for all directions."""
+    """One answer of a steered model.
+
+    An answer at alpha 0 (the unsteered model) has one row for all directions.
+    """
 
     alpha_relative: AlphaRelative
     item_id: shared.ItemId
@@ -316,7 +319,10 @@ STEERING_EFFECTS = Table(
 
 @dataclass(frozen=True, kw_only=True)
 class SteeringShareRow:
-    """Abstention on one side at one strength, over the paths of a set, for one regime or all."""
+    """Abstention on one side at one strength, over the paths of a set.
+
+    For one regime or all.
+    """
 
     model: shared.Model
     path_set: Annotated[str, "transfer, within_domain, or all of both"]

@@ -1,4 +1,6 @@
-"""Rank steering effects among nulls, and compute PECS under each sign policy, from STEERING_EFFECTS rows.
+"""Rank steering effects among nulls, and compute PECS by sign policy.
+
+Both come from STEERING_EFFECTS rows.
 
 The paper adds a direction on controls and subtracts it on voids, which requires knowing the sides. So PECS is also
 given for adding, or subtracting, on both sides.
@@ -22,7 +24,9 @@ _AT = [*_CELL, "layer", "unit", "dose", "side"]
 
 
 def null_rows(effects: pd.DataFrame) -> list[SteeringNullRow]:
-    """Return rows of STEERING_NULLS: every dataset along its own direction, and the mean over datasets.
+    """Return STEERING_NULLS rows: every own direction, and the mean over datasets.
+
+    Every dataset is steered along its own direction.
 
     Without nulls there are no rows.
     """
@@ -37,7 +41,9 @@ def null_rows(effects: pd.DataFrame) -> list[SteeringNullRow]:
 
 
 def _moved(own: pd.DataFrame) -> pd.DataFrame:
-    """Return steered effects with `moved`, the change against the unsteered answers in the claimed direction.
+    """Return steered effects with `moved`.
+
+    It is the change against the unsteered answers in the claimed direction.
 
     That is more abstention on controls, and less on voids.
     """
@@ -83,7 +89,9 @@ def nan_to_null(figures: Mapping[str, float]) -> dict[str, Any]:
 
 
 def pecs_rows(effects: pd.DataFrame) -> list[SteeringPecsRow]:
-    """Return rows of STEERING_PECS: every path, dose and sign policy of void directions with both sides steered.
+    """Return STEERING_PECS rows: every path, dose and sign policy.
+
+    Void directions with both sides steered count.
 
     Figures without a decided answer are null.
     """

@@ -1,4 +1,4 @@
-"""Alternative probes for `traps_pipeline.inside.protocol`, and the erasure of a concept."""
+"""Fit other probes for `traps_pipeline.inside.protocol`, and erase a concept."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from traps_pipeline.mechanism.probes import Fit, Probe, Scorer, standardiser
 
 
 def mean_difference(states: np.ndarray, void: np.ndarray) -> Scorer:
-    """Return the probe whose weights are the difference of the sides' standardised means.
+    """Return the probe whose weights are a difference of means.
+
+    It is that of the sides' standardised means.
 
     A score of 0 lies half-way between them.
     """
@@ -24,7 +26,9 @@ def mean_difference(states: np.ndarray, void: np.ndarray) -> Scorer:
 
 
 def from_sklearn(make: Callable[[], Any]) -> Fit:
-    """Return a fit function for any scikit-learn classifier or pipeline; make: returns a new one.
+    """Return a fit function for any scikit-learn classifier or pipeline.
+
+    make: returns a new one.
 
     Scores are its decision function, or the log-odds of its probabilities.
     """
@@ -47,15 +51,19 @@ class _Estimator:
 
 
 def erased(states: np.ndarray, void: np.ndarray) -> np.ndarray:
-    """Return states (n, d) from which no linear classifier can tell the sides, void (n,).
+    """Return states (n, d) from which no linear classifier can tell the sides.
+
+    void: (n,), the labels.
 
     Least-squares concept erasure (LEACE, of Belrose et al. 2023) of these very states: the smallest change, in the
     metric of their own covariance, after which both sides have the same mean.
     """
     states = np.asarray(states, float)
     centred, label = states - states.mean(axis=0), void - np.mean(void)
-    left, size, right = np.linalg.svd(centred, full_matrices=False)
+    left_vectors, size, right_vectors = np.linalg.svd(centred, full_matrices=False)
     mask = size > size[0] * max(states.shape) * np.finfo(float).eps
-    towards = left[:, mask].T @ label  # rows of `left` have unit covariance up to a factor
+    towards = left_vectors[:, mask].T @ label  # rows of `left` have unit covariance up to a factor
     towards /= np.linalg.norm(towards)
-    return states - np.outer(centred @ ((towards / size[mask]) @ right[mask]), (towards * size[mask]) @ right[mask])
+    return states - np.outer(
+        centred @ ((towards / size[mask]) @ right_vectors[mask]), (towards * size[mask]) @ right_vectors[mask]
+    )

@@ -1,4 +1,6 @@
-"""Activation patching: what a model answers when a part of one pass is replaced by that part of another.
+"""Patch activations.
+
+Measure what a model answers when a part of one pass is replaced by that part of another.
 
 A pass over a target prompt (say, a control) is made again with the states of a source prompt (its void) at some
 positions of one site: the residual stream as it leaves block l (0: the embeddings), or the output of a block's
@@ -85,13 +87,19 @@ class RecordedPass:
 
     @property
     def visual(self) -> np.ndarray | None:
-        """The positions that deepstack features are added at, (T,) bool; None for a model without any."""
+        """The positions that deepstack features are added at, (T,) bool.
+
+        None for a model without any.
+        """
         mask = self.inputs.get("visual_pos_masks")
         return None if mask is None else mask[0].cpu().numpy()
 
 
 def require_patchable(model: LocalModel) -> None:
-    """Raise TrapsError for a model whose later blocks read more of earlier ones than this module replaces."""
+    """Raise TrapsError for a model that cannot be patched.
+
+    Its later blocks read more of earlier ones than this module replaces.
+    """
     unknown = unknown_path(model.network.config.get_text_config(), model.blocks[0])
     if unknown:
         raise TrapsError(
@@ -117,7 +125,9 @@ def _sites(model: LocalModel) -> Iterator[tuple[Site, int, Module]]:
 
 
 def record(model: LocalModel, prompt: Prompt, tokens: Sequence[int], sites: Sequence[Site] = SITES) -> RecordedPass:
-    """Run one pass and keep what a patch may need, at the residual stream and at `sites`.
+    """Run one pass and keep what a patch may need.
+
+    It is kept at the residual stream and at `sites`.
 
     tokens: those that begin an abstention. Raises TrapsError for a block that passes on more than the residual stream.
     """
@@ -168,7 +178,9 @@ def record(model: LocalModel, prompt: Prompt, tokens: Sequence[int], sites: Sequ
 def patched_changes(
     model: LocalModel, target: RecordedPass, source: RecordedPass, patches: Sequence[Patch], tokens: Sequence[int]
 ) -> np.ndarray:
-    """Measure the change of the target's outcome by each patch from the source, (patches,).
+    """Measure the change of the target's outcome by each patch from the source.
+
+    (patches,).
 
     Passes begin at the lowest patched block of their rows; the vision tower is not run again. Every pass has one row
     without a patch, and changes are relative to that row: a patch that replaces states by equal ones changes nothing,
@@ -192,7 +204,9 @@ def patched_changes(
 def attributed_changes(
     model: LocalModel, target: RecordedPass, source: RecordedPass, tokens: Sequence[int]
 ) -> dict[tuple[Site, int], np.ndarray]:
-    """Estimate the change of the target's outcome by patching each token alone, (T,) by recorded site and layer.
+    """Estimate the change of the target's outcome by patching each token alone.
+
+    (T,) by recorded site and layer.
 
     One pass with gradients gives all of them, to first order; the estimate of a group of positions is its sum. Raises
     TrapsError as `patched_changes`.
@@ -227,7 +241,10 @@ def _require_one_form(target: RecordedPass, source: RecordedPass) -> None:
 
 
 def _first_layer(model: LocalModel, patch: Patch) -> int:
-    """Return the layer whose recorded state a patched pass can start from. Raises TrapsError for an unknown site."""
+    """Return the layer whose recorded state a patched pass can start from.
+
+    Raises TrapsError for an unknown site.
+    """
     if not 0 <= patch.layer <= model.n_layers or (patch.layer == 0 and patch.site != "residual"):
         raise TrapsError(f"no {patch.site} at layer {patch.layer}; there are blocks 1 to {model.n_layers}")
     return patch.layer if patch.site == "residual" else patch.layer - 1
@@ -245,13 +262,19 @@ def _masks(patches: Sequence[Patch], length: int, device: str) -> Weights:
 
 
 def _behind(weights: Weights, layer: int) -> Tensor | None:
-    """Return the weights of residual patches up to a layer, which affect all later layers."""
-    parts = [part for (site, at), part in weights.items() if site == "residual" and at <= layer]
+    """Return the weights of residual patches up to a layer.
+
+    They affect all later layers.
+    """
+    parts = [part for (site, patch_layer), part in weights.items() if site == "residual" and patch_layer <= layer]
     return reduce(operator.add, [part.to(parts[0].device) for part in parts]) if parts else None
 
 
 def _mixed(own: Tensor, theirs: Tensor, weights: Tensor) -> Tensor:
-    """Return states (rows, .., T, d), mixed with the source's, (T, d) or (1, .., T, d), by weights."""
+    """Return states (rows, .., T, d), mixed with the source's by weights.
+
+    theirs: (T, d) or (1, .., T, d).
+    """
     import torch
 
     weights = weights.reshape(len(weights), *[1] * (own.ndim - 3), -1, 1).to(own.device)
@@ -268,16 +291,19 @@ def _margins(
     rows: int,
     tokens: Sequence[int],
 ) -> Tensor:
-    """Return the outcomes (rows,) of a pass over several copies of the target, from the state at layer `start` on."""
+    """Return the outcomes (rows,) of a pass over several copies of the target.
+
+    It starts from the state at layer `start`.
+    """
     inputs = _repeated(target, rows)
     if ("residual", 0) in weights:
         inputs["inputs_embeds"] = _mixed(inputs["inputs_embeds"], source.states["residual", 0], weights["residual", 0])
-    for number, theirs in enumerate(source.inputs.get("deepstack_visual_embeds") or ()):
+    for number, source_embeds in enumerate(source.inputs.get("deepstack_visual_embeds") or ()):
         # Features number k are added to what block k + 1 puts out: behind the sites up to there.
         behind, features = _behind(weights, number + 1), inputs["deepstack_visual_embeds"]
         if behind is not None and target.visual is not None:
             own = features[number].unflatten(0, (rows, -1))
-            features[number] = _mixed(own, theirs, behind[:, target.visual]).flatten(0, 1)
+            features[number] = _mixed(own, source_embeds, behind[:, target.visual]).flatten(0, 1)
     with _replacing(model, target, source, weights, start, rows):
         last = model.network.get_decoder()(**inputs).last_hidden_state[:, -1]
     return first_token_margins(model, last, tokens)
@@ -302,7 +328,10 @@ def _repeated(target: RecordedPass, rows: int) -> dict[str, Any]:
 def _replacing(
     model: LocalModel, target: RecordedPass, source: RecordedPass, weights: Weights, start: int, rows: int
 ) -> Iterator[None]:
-    """Let passes start behind block `start` and replace states by the source's; undo everything at the end."""
+    """Let passes start behind block `start` and replace states by the source's.
+
+    Undo everything at the end.
+    """
 
     def replace(site: Site, layer: int, _: Module, __: Any, output: Any) -> Any:
         states = _mixed(first_tensor(output), source.states[site, layer], weights[site, layer])
@@ -312,8 +341,9 @@ def _replacing(
         return target.states["residual", layer].expand(rows, -1, -1) if layer == start else hidden_states
 
     def beside(below: int, block: Module, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Return the arguments of the block above `below` others, with the source's where the stream below was
-        patched.
+        """Return the arguments of the block above `below` others.
+
+        They are the source's where the stream below was patched.
         """
         own, behind = argument_of(block, PER_LAYER, args, kwargs), _behind(weights, below)
         if own is not None and behind is not None:

@@ -1,4 +1,6 @@
-"""The patching stage: patch matched controls and voids of the well-posed datasets, as rows of PATCHING.
+"""Patch matched controls and voids of the well-posed datasets.
+
+This is the patching stage, whose rows are PATCHING.
 
 One backward pass per pair estimates the effect of every site, layer and group of positions; the cells with the largest
 estimates are then patched, beside nulls. Each pair's result is written before the next one begins, so that an
@@ -67,14 +69,20 @@ Cell = tuple[str, Site, int, str]  # patched side, site, layer, group
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """One side of a pair: its prompt, and its groups of positions that do not depend on the other side."""
+    """One side of a pair: its prompt, and its groups of positions.
+
+    The groups do not depend on the other side.
+    """
 
     prompt: Prompt
     parts: Mapping[str, np.ndarray]
 
 
 def patching_rows(workspace: Workspace, entry: ModelEntry, extraction: Extraction) -> list[PatchingRow]:
-    """Return the rows of PATCHING of a model under a VQA prompt. Raises TrapsError if it cannot be patched."""
+    """Return the rows of PATCHING of a model under a VQA prompt.
+
+    Raises TrapsError if it cannot be patched.
+    """
     from traps_pipeline.models.local.adapter import load_local_model
 
     settings = workspace.mechanism.patching
@@ -118,7 +126,9 @@ class Pairs:
         self._folder = workspace.root / "patching" / extraction.model / extraction.prompt / dataset
 
     def changes(self) -> tuple[list[Row], list[Row]]:
-        """Return the estimated effect of every patch, and the measured effect of `best_cells` and their nulls.
+        """Return the estimated effect of every patch, and measured effects.
+
+        Measured are `best_cells` and their nulls.
 
         There is a row for each pair, direction, source and cell.
         """
@@ -164,49 +174,61 @@ class Pairs:
             cells: list[tuple[Site, int, str]]
             cells = [(site, layer, group) for side, site, layer, group in best if side == into and groups[group].any()]
             patches = [Patch(site, layer, groups[group]) for site, layer, group in cells]
-            plain, there = record(self._model, target.prompt, self._tokens, ()), 0.0
+            plain, source_margin = record(self._model, target.prompt, self._tokens, ()), 0.0
             for kind in SOURCES:
                 side = self._source(name, into, kind)
                 if side is None:
                     yield {"scenario": name, "into": into, "source": kind, "left_out": True}
                     continue
                 margin, changes = self._patched(plain, side, patches)
-                there = margin if kind == OWN else there
+                source_margin = margin if kind == OWN else source_margin
                 for cell, patch, change in zip(cells, patches, changes, strict=True):
-                    yield _row(name, into, kind, cell, patch.positions, (plain.margin, there), float(change))
+                    yield _row(name, into, kind, cell, patch.positions, (plain.margin, source_margin), float(change))
             del plain  # before the other side's pass is recorded
 
     def _attributed(self, target: Side, own: Side) -> tuple[tuple[float, float], dict[tuple[Site, int], np.ndarray]]:
-        """Return the margins of both sides, and the estimated change by each token; free the states afterwards."""
+        """Return the margins of both sides, and the estimated change by each token.
+
+        Free the states afterwards.
+        """
         plain = record(self._model, target.prompt, self._tokens, ())
         source = record(self._model, own.prompt, self._tokens, self._settings.sites)
         return (plain.margin, source.margin), attributed_changes(self._model, plain, source, self._tokens)
 
     def _patched(self, target: RecordedPass, side: Side, patches: Sequence[Patch]) -> tuple[float, np.ndarray]:
-        """Return the margin of a source, and the changes by patches from it; free its states afterwards."""
+        """Return the margin of a source, and the changes by patches from it.
+
+        Free its states afterwards.
+        """
         source = record(self._model, side.prompt, self._tokens, self._settings.sites)
         return source.margin, patched_changes(self._model, target, source, patches, self._tokens)
 
     def _directions(self, name: str) -> Iterator[tuple[str, Side, Side, dict[str, np.ndarray] | None]]:
-        """Yield each side of a complete pair, with the other side and the groups of positions."""
+        """Yield each side of a complete pair, with its source and groups of positions.
+
+        The source is the other side.
+        """
         if all((name, side) in self._items for side in SIDES):
             for into, towards in (SIDES, SIDES[::-1]):
                 target, own = self._side(name, into), self._side(name, towards)
                 yield into, target, own, groups_of(target, own)
 
     def _source(self, name: str, into: str, kind: str) -> Side | None:
-        """Return the side that patches into a pair's side come from; None if there is none of its form."""
+        """Return the side that patches into a pair's side come from.
+
+        None if there is none of its form.
+        """
         towards = SIDES[1 - SIDES.index(into)]
         where = {OWN: (name, towards, ""), TIMES: (name, into, towards)}
         if kind in where:
             candidates = [where[kind]]
         else:
             first = self._names.index(name)
-            others = [*self._names[first + 1 :], *self._names[:first]]
-            candidates = [(other, towards if kind == OTHER else into, "") for other in others]
+            other_names = [*self._names[first + 1 :], *self._names[:first]]
+            candidates = [(other, towards if kind == OTHER else into, "") for other in other_names]
         form = self._form(name, into)
         for candidate in candidates:
-            if candidate[:2] in self._items and _fits(form, self._form(*candidate)):
+            if candidate[:2] in self._items and _has_same_form(form, self._form(*candidate)):
                 return self._side(*candidate)
         return None
 
@@ -218,9 +240,9 @@ class Pairs:
     def _make_side(self, name: str, which: str, times_of: str = "") -> Side:
         row = self._items[name, which]
         clip, question = self._workspace.resolve(row["clip"]), str(row["question"])
-        other = self._workspace.resolve(self._items[name, times_of]["clip"]) if times_of else None
+        other_clip = self._workspace.resolve(self._items[name, times_of]["clip"]) if times_of else None
         frames = sample(clip, self._spec)
-        times = shown_times(frames, clip, self._spec, other)
+        times = shown_times(frames, clip, self._spec, other_clip)
         prompt = self._model.prompt(self._system, question, frames.frames, times)
         side = Side(prompt, spans(self._model, prompt, self._system, question))
         self._parts[name, which, times_of] = side.parts
@@ -236,24 +258,29 @@ def _row(
     ends: tuple[float, float],
     change: float,
 ) -> Row:
-    """Return the effect of a patch on one pair. ends: the outcomes of the patched side and of the other one."""
+    """Return the effect of a patch on one pair.
+
+    ends: the outcomes of the patched side and of the other one.
+    """
     site, layer, group = cell
     about = {"scenario": scenario, "into": into, "source": source, "site": site, "layer": layer, "group": group}
     return about | {"before": ends[0], "there": ends[1], "change": change, "tokens": int(positions.sum())}
 
 
-def _fits(target: Mapping[str, np.ndarray], source: Mapping[str, np.ndarray]) -> bool:
+def _has_same_form(target: Mapping[str, np.ndarray], source: Mapping[str, np.ndarray]) -> bool:
     """Return whether two prompts have the same form, part by part."""
     return all(np.array_equal(target[part], source[part]) for part in ("system", "stamps", "visual"))
 
 
 def groups_of(target: Side, other: Side) -> dict[str, np.ndarray] | None:
-    """Return the groups of positions of a pair, (T,) bool each; None if the two prompts have different forms.
+    """Return the groups of positions of a pair, (T,) bool each.
+
+    None if the two prompts have different forms.
 
     A model whose pixels do not lie token by token (LLaVA-NeXT-Video, Gemma 4) has no group of unchanged visual tokens:
     all count as changed.
     """
-    if not _fits(target.parts, other.parts):
+    if not _has_same_form(target.parts, other.parts):
         return None
     parts, visual = target.parts, target.parts["visual"]
     changed = changed_tokens(target.prompt, other.prompt, visual)
@@ -264,7 +291,9 @@ def groups_of(target: Side, other: Side) -> dict[str, np.ndarray] | None:
 
 
 def best_cells(estimates: Sequence[Row], settings: PatchingSettings, n_layers: int) -> list[Cell]:
-    """Return the cells to patch: for each direction those with the largest estimates over all pairs.
+    """Return the cells to patch.
+
+    For each direction they are those with the largest estimates over all pairs.
 
     Only every so many layers count. All positions of the residual stream together are left out; their effect is 1 by
     construction.
@@ -283,7 +312,9 @@ def best_cells(estimates: Sequence[Row], settings: PatchingSettings, n_layers: i
 def summarize_effects(
     estimates: Sequence[Row], patches: Sequence[Row], extraction: Extraction, dataset: str, seed: int
 ) -> Iterator[PatchingRow]:
-    """Yield the rows of a dataset: ratios of sums over pairs, with intervals by scenario for measured patches.
+    """Yield the rows of a dataset: ratios of sums over pairs.
+
+    Measured patches have intervals by scenario.
 
     If all pairs were left out, a row without an effect says so.
     """
@@ -328,7 +359,9 @@ def summarize_effects(
 def effect_of(
     before: np.ndarray, after: np.ndarray, target: np.ndarray, seed: int
 ) -> tuple[float | None, float | None, float | None]:
-    """Return the indirect effect of pairs and its 95 % interval from resampled scenarios (one pair each).
+    """Return the indirect effect of pairs and its 95 % interval.
+
+    Scenarios are resampled (one pair each).
 
     It is sum(after - before) over sum(target - before), each (pairs,): a ratio of sums, since the ratio of a pair whose
     sides hardly differ is noise. One pair is unseen, with an effect of 0 or of 1, so that few pairs keep an interval's

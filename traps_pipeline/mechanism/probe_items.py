@@ -1,4 +1,7 @@
-"""The clips and questions for which hidden states are extracted: pairs, and controls for shortcuts of probes."""
+"""List the clips and questions for which hidden states are extracted.
+
+They are pairs, and controls for shortcuts of probes.
+"""
 
 from __future__ import annotations
 
@@ -59,12 +62,15 @@ def other_clip(workspace: Workspace, row: Mapping[str, Any]) -> tuple[Path, str]
     sides = clips.loc[clips["scenario_id"] == row["scenario_id"]].set_index("side")
     if not {"control", "void"} <= set(sides.index):
         raise TrapsError(f"{row['scenario_id']}: lacks a clip of its pair; materialize videos for {row['category']}")
-    which = "void" if sides.loc["control", "file_sha256"] == row["media_digest"] else "control"
-    return workspace.resolve(str(sides.loc[which, "path"])), str(sides.loc[which, "file_sha256"])
+    side = "void" if sides.loc["control", "file_sha256"] == row["media_digest"] else "control"
+    return workspace.resolve(str(sides.loc[side, "path"])), str(sides.loc[side, "file_sha256"])
 
 
 def _answerable_item(spec: Mapping[str, Any], clip: Mapping[str, Any]) -> ProbeItemRow:
-    """Return the void clip with an answerable question; its side is control, since it must be answered."""
+    """Return the void clip with an answerable question.
+
+    Its side is control, since it must be answered.
+    """
     pair = f"{ANSWERABLE}:{spec['scenario_id']}"
     return ProbeItemRow(
         **{name: spec[name] for name in ("scenario_id", "category", "sub_scenario", "benchmark_version")},
@@ -81,7 +87,9 @@ def _answerable_item(spec: Mapping[str, Any], clip: Mapping[str, Any]) -> ProbeI
 
 
 def time_swapped(items: pd.DataFrame) -> list[ProbeItemRow]:
-    """Return both sides of chaotic's pairs with the frame times of the other side, from ITEMS rows of chaotic.
+    """Return chaotic's pairs with the frame times of the other side.
+
+    items: ITEMS rows of chaotic.
 
     A probe that reads time stamps takes a control for a void and a void for a control. A scenario without both sides is
     left out.
@@ -91,15 +99,15 @@ def time_swapped(items: pd.DataFrame) -> list[ProbeItemRow]:
         sides = {str(row["side"]): row for row in pair.to_dict("records")}
         if len(sides) < 2:
             continue
-        for side, other in (("control", "void"), ("void", "control")):
+        for side, other_side in (("control", "void"), ("void", "control")):
             row, name = sides[side], f"{TIME_SWAPPED}:{sides[side]['scenario_id']}"
             rows.append(
                 ProbeItemRow(
                     **{name: row[name] for name in (*COPIED, "benchmark_version")} | {"pair_id": name},
                     item_id=f"{name}:{side}",
                     dataset=TIME_SWAPPED,
-                    times_clip=sides[other]["clip"],
-                    times_digest=sides[other]["media_digest"],
+                    times_clip=sides[other_side]["clip"],
+                    times_digest=sides[other_side]["media_digest"],
                 )
             )
     return rows

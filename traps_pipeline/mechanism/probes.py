@@ -1,4 +1,6 @@
-"""Linear probes: standardise, l2-regularised logistic regression, AUROC (docs/spec.md 7.2).
+"""Fit linear probes (docs/spec.md 7.2).
+
+Standardise, l2-regularised logistic regression, AUROC.
 
 With fewer rows than columns the minimiser lies in the span of the rows, so the exact solver takes Newton steps on the
 Gram matrix. Its optimum equals scikit-learn's up to rounding and takes a fraction of the time.
@@ -19,7 +21,10 @@ _TOLERANCE, _MOST_STEPS = 1e-10, 200
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Items of one dataset at one layer. states: (n, d); void: (n,) bool, the label; scenario: (n,) int, cluster."""
+    """Items of one dataset at one layer.
+
+    states: (n, d). void: (n,) bool, the label. scenario: (n,) int, cluster.
+    """
 
     states: np.ndarray
     void: np.ndarray
@@ -32,7 +37,10 @@ class Split:
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """A fitted probe. mean, scale, weights: (d,), from the source alone; weights apply to standardised states."""
+    """A fitted probe.
+
+    Mean, scale, weights: (d,), from the source alone; weights apply to standardised states.
+    """
 
     mean: np.ndarray
     scale: np.ndarray
@@ -70,7 +78,10 @@ def standardiser(states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fit_probe(states: np.ndarray, void: np.ndarray) -> Probe:
-    """Return the probe of states (n, d) with labels (n,). Raises TrapsError when one class has no item."""
+    """Return the probe of states (n, d) with labels (n,).
+
+    Raises TrapsError when one class has no item.
+    """
     _check_labels(void)
     states = np.asarray(states, float)
     mean, scale = standardiser(states)
@@ -88,8 +99,10 @@ def _check_labels(void: np.ndarray) -> None:
 
 
 def solve_gram(gram: np.ndarray, void: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the logistic regression with an unpenalised intercept, by its Gram matrix (n, n): dual coefficients (n,)
-    and intercept. The coefficients of the columns are the rows' transpose times the dual.
+    """Return the logistic regression of a Gram matrix (n, n): dual and intercept.
+
+    The intercept is unpenalised, and there are (n,) dual coefficients. The coefficients of the columns are the rows'
+    transpose times the dual.
 
     At the minimum the dual is label - probability and sums to 0. Newton's step solves
     (I + W gram) step + W intercept_step = residual of that condition, with W = p (1 - p), through
@@ -151,7 +164,10 @@ class _NewtonStep:
         return right - self._root * cho_solve((self._factor, False), scaled, check_finite=False)
 
     def solve(self, missing: np.ndarray, dual_sum: float) -> tuple[np.ndarray, float]:
-        """Return the step of the dual, after which the dual sums to 0, and the step of the intercept."""
+        """Return the steps of the dual and of the intercept.
+
+        After its step the dual sums to 0.
+        """
         free = self._inverse(missing)
         intercept_step = float((free.sum() + dual_sum) / self._by_intercept.sum())
         return free - intercept_step * self._by_intercept, intercept_step
@@ -166,7 +182,9 @@ def _objective(dual: np.ndarray, intercept: float, logits: np.ndarray, label: np
 
 
 def auroc(void: np.ndarray, scores: np.ndarray) -> np.ndarray:
-    """Return the area under the ROC curve of scores (n,) or (n, k) against labels (n,): a scalar or (k,).
+    """Return the area under the ROC curve of scores against labels (n,).
+
+    Scores (n,) give a scalar, (n, k) give (k,).
 
     Ties count half, by mean ranks (Mann and Whitney). NaN if one class has no item.
     """
@@ -183,7 +201,9 @@ def auroc(void: np.ndarray, scores: np.ndarray) -> np.ndarray:
 def auroc_interval(
     void: np.ndarray, scores: np.ndarray, scenario: np.ndarray, weights: np.ndarray, level: float = 0.95
 ) -> tuple[float, float]:
-    """Return the percentile interval of the AUROC from resampled scenarios, with a minimum width.
+    """Return the percentile interval of the AUROC from resampled scenarios.
+
+    It has a minimum width.
 
     The probe is held fixed. If all resamples agree (a probe that separates 16 pairs), percentiles alone would claim
     certainty, so the exact binomial bound is the minimum: if a share s of n scenarios fails, none of them fails with
@@ -210,7 +230,9 @@ def auroc_interval(
 
 
 def scenario_folds(scenario: np.ndarray, folds: int, seed: int) -> np.ndarray:
-    """Return the fold of each item, (n,) int: a scenario's items share one; fold sizes differ by at most one scenario.
+    """Return the fold of each item, (n,) int: a scenario's items share one.
+
+    Fold sizes differ by at most one scenario.
 
     Raises TrapsError if there are fewer scenarios than folds.
     """
@@ -224,7 +246,9 @@ def scenario_folds(scenario: np.ndarray, folds: int, seed: int) -> np.ndarray:
 
 
 def swapped_labels(void: np.ndarray, scenario: np.ndarray, shuffles: int, seed: int) -> np.ndarray:
-    """Return labels (n, shuffles) in which the sides of each scenario are swapped with probability 0.5.
+    """Return labels (n, shuffles) with sides swapped within scenarios.
+
+    Each scenario is swapped with probability 0.5.
 
     A swap keeps every fold balanced, and any labels of a held-out fold are as likely as their complement, so that the
     expected AUROC is exactly 0.5. A free permutation, which unbalances the folds, would only approach 0.5.
@@ -235,7 +259,9 @@ def swapped_labels(void: np.ndarray, scenario: np.ndarray, shuffles: int, seed: 
 
 
 def within_split(split: Split, labels: np.ndarray, folds: np.ndarray) -> np.ndarray:
-    """Return cross-validated AUROC of each labelling (n, k), averaged over folds: (k,).
+    """Return cross-validated AUROC of each labelling (n, k): (k,).
+
+    It is averaged over folds.
 
     Standardiser and probe use only the training folds; all labellings share the Gram matrix of a fold.
     """
@@ -256,7 +282,9 @@ def within_split(split: Split, labels: np.ndarray, folds: np.ndarray) -> np.ndar
 
 
 def nearest_centroid(source: Split, states: np.ndarray) -> np.ndarray:
-    """Return whether each of states (n, d) is assigned to void, (n,) bool, by cosine distance to the centroids.
+    """Return whether each of states (n, d) is assigned to void, (n,) bool.
+
+    The nearest centroid by cosine distance decides.
 
     Standardiser and centroids are the source's; with equal distances a state is assigned to control.
     """
@@ -276,7 +304,9 @@ def nearest_centroid(source: Split, states: np.ndarray) -> np.ndarray:
 def transfer_scores(
     layer: Mapping[str, Split], pairs: Sequence[tuple[str, str]], fit: Fit = fit_probe
 ) -> dict[tuple[str, str], np.ndarray]:
-    """Return scores (n_target,) of each ordered pair (source, target) at one layer, with one fit per source.
+    """Return scores (n_target,) of each ordered pair at one layer.
+
+    A pair is (source, target), with one fit per source.
 
     No label of a target is read.
     """

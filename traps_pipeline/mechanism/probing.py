@@ -1,4 +1,4 @@
-"""The probing protocol: every pair of datasets at every layer, as rows of the `probes` table (docs/spec.md 7).
+"""Probe every pair of datasets at every layer: rows of `probes` (docs/spec.md 7).
 
 Layers are read one at a time: at the 8B size one layer of all items takes 46 MB, all of them 1.7 GB.
 """
@@ -53,14 +53,14 @@ class NothingConfabulated(TrapsError):
 
 @dataclass(frozen=True)
 class Confabulated:
-    """By dataset, the scenarios on whose void item the model confabulated, or the reason for a missing entry."""
+    """The scenarios with a confabulated void, by dataset, or why one is missing."""
 
     scenarios: Mapping[str, frozenset[str]]
     problems: Mapping[str, str] = field(default_factory=dict)
 
 
 def confabulated_scenarios(verdicts: pd.DataFrame, dataset: str, model: str) -> frozenset[str]:
-    """Return the scenarios on whose void item the model did not abstain; undecided items are left out.
+    """Return the scenarios on whose void the model did not abstain, if decided.
 
     verdicts: those of the dataset under Standard in run 1. Raises NothingConfabulated if there is no such scenario.
     """
@@ -108,9 +108,10 @@ class ProbeRun:
             taxonomy: scenario_weights(len(index), self.settings.resamples, [self.seed, k])
             for k, (taxonomy, index) in enumerate(taxonomies.items())
         }
-        self._labels = {name: (of["side"] == "void").to_numpy() for name, of in self._of.items()}
+        self._labels = {name: (dataset_items["side"] == "void").to_numpy() for name, dataset_items in self._of.items()}
         self._places = {
-            name: self._index[name].get_indexer(pd.Index(of["scenario_id"])) for name, of in self._of.items()
+            name: self._index[name].get_indexer(pd.Index(dataset_items["scenario_id"]))
+            for name, dataset_items in self._of.items()
         }
         self._restricted = {
             name: np.isin(self._of[name]["scenario_id"].to_numpy(str), sorted(self.confabulated.scenarios[name]))
@@ -133,12 +134,12 @@ class ProbeRun:
 
     # --- the parts of the protocol ---
 
-    def rows(self, progress: Callable[[int, int], None] = lambda done, total: None) -> list[Row]:
+    def rows(self, progress: Callable[[int, int], None] = lambda layers_done, total: None) -> list[Row]:
         """Return every row of the probes table without the columns that partition it."""
         rows: list[Row] = []
-        for done, of_layer in enumerate(each_layer(self.layer_rows, self.n_layers), start=1):
+        for layers_done, of_layer in enumerate(each_layer(self.layer_rows, self.n_layers), start=1):
             rows += of_layer
-            progress(done, self.n_layers)
+            progress(layers_done, self.n_layers)
         return mark_layers(rows + self._problems())
 
     def layer_rows(self, layer: int) -> list[Row]:
@@ -159,20 +160,23 @@ class ProbeRun:
         return rows + self.answerable(layer, splits, unseen) + self.time_swapped(layer, splits, unseen)
 
     def transfer(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
-        """Return the twelve ordered pairs on all samples. The two datasets of a taxonomy share their control items, so
-        that half of the rows of a cross-modality target were used in the fit (see `held_out`)."""
+        """Return the twelve ordered pairs on all samples.
+
+        The two datasets of a taxonomy share their control items, so that half of the rows of a cross-modality target
+        were used in the fit (see `held_out`).
+        """
         scores = transfer_scores(splits, self._pairs, self.fit)
         return [self._scored("transfer", path, layer, splits[path[1]], values) for path, values in scores.items()]
 
     def confabulated_transfer(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
-        """Return the same pairs with source and target restricted to confabulated void items and their own controls."""
+        """Return the same pairs restricted to confabulated voids and their controls."""
         restricted = self._confabulated(splits)
         pairs = [pair for pair in self._pairs if set(pair) <= set(restricted)]
         scores = transfer_scores(restricted, pairs, self.fit)
         return [self._scored("confabulated", path, layer, restricted[path[1]], v) for path, v in scores.items()]
 
     def confabulated_held_out(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
-        """Return the `confabulated_transfer` pairs with shared controls, by probes fitted without the scored scenario.
+        """Return such pairs with shared controls, by probes that hold out the scenario.
 
         A pair has no figure if too few scenarios are left to split.
         """
@@ -193,7 +197,7 @@ class ProbeRun:
         return {name: splits[name].rows(mask) for name, mask in self._restricted.items()}
 
     def _too_few(self, source: str, splits: Mapping[str, Split]) -> str:
-        """Return why a source's probes cannot hold out a fold of scenarios; empty if they can."""
+        """Return why a source's probes cannot hold out a fold of scenarios, if so."""
         n, folds = len(np.unique(splits[source].scenario)), self.settings.folds
         every = np.unique(np.concatenate([split.scenario for split in splits.values()]))
         if len(every) >= folds and len(np.unique(self._folds(splits)[source])) > 1:
@@ -201,13 +205,13 @@ class ProbeRun:
         return f"{path_name(*splits)}, held out: {n} confabulated voids are too few for {folds} folds of scenarios"
 
     def _folds(self, splits: Mapping[str, Split]) -> dict[str, np.ndarray]:
-        """Return the fold of each item, by dataset; a scenario has one fold in all of them."""
+        """Return the fold of each item, by dataset; a scenario's fold is the same in all."""
         every = np.unique(np.concatenate([split.scenario for split in splits.values()]))
         fold_of = dict(zip(every, scenario_folds(every, self.settings.folds, self.seed), strict=True))
         return {name: np.array([fold_of[s] for s in split.scenario]) for name, split in splits.items()}
 
     def within(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
-        """Return grouped cross-validation within each dataset, with the true and with swapped labels."""
+        """Return cross-validation within each dataset, with true and swapped labels."""
         rows = []
         for name in self._own:
             split = splits[name]
@@ -222,14 +226,14 @@ class ProbeRun:
     def held_out(
         self, layer: int, splits: Mapping[str, Split], unseen: Mapping[str, Mapping[str, np.ndarray]]
     ) -> list[Row]:
-        """Return the pairs within a taxonomy, a dataset on itself too, by probes fitted without the scored scenario."""
+        """Return the pairs within a taxonomy, by probes that hold out the scenario."""
         pairs = [(s, t) for s in self._own for t in self._own if taxonomy_of(s) == taxonomy_of(t)]
         return [self._scored("held_out", (s, t), layer, splits[t], unseen[s][t]) for s, t in pairs]
 
     def answerable(
         self, layer: int, splits: Mapping[str, Split], unseen: Mapping[str, Mapping[str, np.ndarray]]
     ) -> list[Row]:
-        """Return answerable clips that resemble voids, scored by the probes of each dataset.
+        """Return answerable clips that resemble voids, scored by each dataset's probes.
 
         These are void clips with an answerable question, decoys (an occluder that hides nothing), and whole clips as
         short as a void. answerable_void: AUROC of void items against these; 0.5 for a probe that detects what both have
@@ -248,21 +252,23 @@ class ProbeRun:
                 labels = np.repeat([True, False], [len(values) for values, _ in chosen])
                 values = np.concatenate([values for values, _ in chosen])
                 scenario = np.concatenate([places for _, places in chosen])
-                of = Split(values[:, None], labels, scenario)
-                rows.append(self._scored(analysis, (source, extra), layer, of, values))
+                split = Split(values[:, None], labels, scenario)
+                rows.append(self._scored(analysis, (source, extra), layer, split, values))
         return rows
 
     def time_swapped(
         self, layer: int, splits: Mapping[str, Split], unseen: Mapping[str, Mapping[str, np.ndarray]]
     ) -> list[Row]:
-        """Return AUROC on chaotic's frames with the other side's times, labelled by the frames.
+        """Return AUROC on chaotic's frames with the other side's times, by the frames.
 
         It is 1 for a probe that reads the frames, 0 for one that reads the time stamps.
         """
         if TIME_SWAPPED not in splits:
             return []
-        of = splits[TIME_SWAPPED]
-        return [self._scored("time_swapped", (s, TIME_SWAPPED), layer, of, unseen[s][TIME_SWAPPED]) for s in self._own]
+        split = splits[TIME_SWAPPED]
+        return [
+            self._scored("time_swapped", (s, TIME_SWAPPED), layer, split, unseen[s][TIME_SWAPPED]) for s in self._own
+        ]
 
     @staticmethod
     def _side(
@@ -277,11 +283,11 @@ class ProbeRun:
         There is one probe for items of another taxonomy, and one per fold for those of the source's own.
         """
         split, own = splits[source], [name for name in splits if self._index[name] is self._index[source]]
-        others = [name for name in splits if name not in own]
+        other_datasets = [name for name in splits if name not in own]
         scores = {name: np.empty(len(splits[name].void)) for name in own}
-        if others:
+        if other_datasets:
             probe = self.fit(split.states, split.void)
-            scores |= {name: probe.scores(splits[name].states) for name in others}
+            scores |= {name: probe.scores(splits[name].states) for name in other_datasets}
         folds = self._folds({name: splits[name] for name in own})
         for fold in range(self.settings.folds):
             train = split.rows(folds[source] != fold)
@@ -291,7 +297,7 @@ class ProbeRun:
         return scores
 
     def centroids(self, layer: int, splits: Mapping[str, Split] | None = None) -> list[Row]:
-        """Return shares of each target's items, by sub-scenario, that the source's nearest centroid assigns to void.
+        """Return shares of items that the source's nearest centroid assigns to void.
 
         The centroids of a taxonomy's two datasets come from the same controls, so these shares are too low for
         controls; `baselines` has the same of noise.
@@ -316,7 +322,7 @@ class ProbeRun:
         return _row(analysis, path, layer, float(auroc(of.void, scores)), of, interval=interval)
 
     def _problems(self) -> list[Row]:
-        """Return a row with the reason, and without a figure, for each Cf->Cf pair that cannot be computed."""
+        """Return a row with the reason for each Cf->Cf pair without a score."""
         rows = []
         for source, target in self._pairs:
             reasons = [self.confabulated.problems[n] for n in (source, target) if n in self.confabulated.problems]

@@ -1,4 +1,7 @@
-"""Versions of the settings, prompts and precision that the mechanistic stages depend on, without importing torch."""
+"""Version the inputs of the mechanistic stages, without importing torch.
+
+They are settings, prompts and precision.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +36,10 @@ def loaded_params(entry: ModelEntry) -> dict[str, Any]:
 
 
 def shown_inside(entry: ModelEntry, settings: MechanismSettings) -> ModelEntry:
-    """Return a model's entry with the media settings of the study's mechanistic analyses."""
+    """Return a model's entry with the study's media settings.
+
+    They are those of its mechanistic analyses.
+    """
     media = settings.models[entry.id].media
     return entry if media is None else entry.model_copy(update={"media": media})
 
@@ -43,8 +49,11 @@ def states_folder(workspace: Workspace, cell: StatesCell) -> Path:
     return workspace.root / "states" / cell.extraction.model / cell.extraction.prompt / cell.dataset
 
 
-def states_are_there(workspace: Workspace, cell: StatesCell) -> bool:
-    """Return whether a partition's extraction was finished and all of its files still exist."""
+def has_states(workspace: Workspace, cell: StatesCell) -> bool:
+    """Return whether a partition's extraction is complete.
+
+    It was finished and all of its files still exist.
+    """
     from traps_pipeline.storage.parquet import read_sealed
 
     folder = states_folder(workspace, cell)
@@ -56,7 +65,7 @@ def states_are_there(workspace: Workspace, cell: StatesCell) -> bool:
     return workspace.store.sizes(files).keys() == files
 
 
-def directions_are_there(workspace: Workspace, extraction: Extraction) -> bool:
+def has_directions(workspace: Workspace, extraction: Extraction) -> bool:
     """Return whether all files in the directions table of an extraction exist."""
     paths = {workspace.root / path for path in workspace.tables.read(DIRECTIONS, extraction.partition)["path"]}
     files = paths | {path.with_suffix(".json") for path in paths}
@@ -81,7 +90,10 @@ def extraction_version(workspace: Workspace, extraction: Extraction) -> str:
 
 
 def probing_version(workspace: Workspace, extraction: Extraction) -> str:
-    """Return the digest of the study's settings for the probes and directions of a model."""
+    """Return the digest of the study's settings for a model's probes.
+
+    They serve its directions, too.
+    """
     settings = workspace.study.mechanism
     if settings is None or extraction.model not in settings.models:
         return "none"
@@ -107,7 +119,10 @@ def sentence_version(workspace: Workspace, extraction: Extraction) -> str:
 
 
 def patching_version(workspace: Workspace, extraction: Extraction) -> str:
-    """Return the digest of the inputs of patching besides items: those of hidden states, pairs, sites and seed."""
+    """Return the digest of the inputs of patching besides items.
+
+    Those of hidden states, pairs, sites and seed.
+    """
     settings = workspace.study.mechanism
     if settings is None or settings.patching is None or extraction.model not in settings.models:
         return "none"

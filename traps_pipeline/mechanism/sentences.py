@@ -1,4 +1,6 @@
-"""The output side in whole sentences: the likelihood of abstentions, beside that of the model's own answer.
+"""Score whole sentences: a model's likelihood of abstentions.
+
+That of its own answer stands beside it.
 
 The output margin covers only the first answer token, and shows nothing for a model that begins every answer with "The".
 Here every sentence of a set, and the model's own answer, follows the benchmark's prompt (teacher forcing), and the
@@ -29,7 +31,9 @@ OWN_TOKENS = 64  # tokens of the model's own answer, from its beginning
 
 
 def sentence_rows(workspace: Workspace, entry: ModelEntry, extraction: Extraction) -> list[SentenceRow]:
-    """Return the rows of SENTENCES: every item of the pairs with the model's answer of run 1.
+    """Return the rows of SENTENCES, one for every item of the pairs.
+
+    Each has the model's answer of run 1.
 
     The prompt is the benchmark's of the extraction's name. Raises TrapsError for a model that was not evaluated under
     it.
@@ -79,7 +83,10 @@ def answer_tokens(model: LocalModel, text: str) -> list[int]:
 
 
 def mean_log_probability(model: LocalModel, prompt: Prompt, tokens: list[int]) -> float:
-    """Return the mean log-probability (nats per token) of tokens after a prompt, in one pass of batch size 1."""
+    """Return the mean log-probability (nats per token) of tokens after a prompt.
+
+    One pass of batch size 1 is needed.
+    """
     import torch
 
     forced = prompt.followed_by(tokens)

@@ -1,4 +1,6 @@
-"""Share the generation of an evaluation's answers between processes, of which only one may write the ledger.
+"""Share the generation of an evaluation's answers between processes.
+
+Only one of them may write the ledger.
 
 The others generate answers meanwhile, in chunks from the end of the calls, and store them in the study; the writer
 takes these and generates the rest. A chunk is leased while it is generated, so none is made twice; leases of dead
@@ -26,7 +28,10 @@ Make = Callable[[Sequence[Request], Callable[[], bool]], list[Outcome]]  # (call
 
 @dataclass(frozen=True)
 class Chunk:
-    """Calls that one process answers together, by key; equal calls have the same chunk name in every process."""
+    """Calls that one process answers together, by key.
+
+    Equal calls have the same chunk name in every process.
+    """
 
     name: str
     calls: Mapping[str, Request]
@@ -49,7 +54,9 @@ class SharedAnswers:
         return result
 
     def outcomes(self, requests: Sequence[Request], make: Make, stopped: Callable[[], bool]) -> list[Outcome]:
-        """Return the outcomes of calls of known chunks, from another process or generated here.
+        """Return the outcomes of calls of known chunks.
+
+        They come from another process or are generated here.
 
         Waits while another process generates some of them, unless it is stopped.
         """
@@ -68,7 +75,10 @@ class SharedAnswers:
         return [known[request.key] for request in requests]
 
     def fill(self, chunk: Chunk, known: Callable[[Sequence[str]], set[str]], make: Make) -> int | None:
-        """Generate a chunk's unknown answers and return their number; None if another process is working on it."""
+        """Generate a chunk's unknown answers and return their number.
+
+        None if another process is working on it.
+        """
         lease = self._lease(chunk)
         if lease is None:
             return None
@@ -130,14 +140,16 @@ def make_meanwhile(
     make: Make,
     tick: Callable[[int, int], None],
 ) -> int:
-    """Generate answers from the end of these calls, while another process writes their evaluation.
+    """Generate answers from the end of these calls while another process writes.
+
+    It writes their evaluation.
 
     Return their number. tick: receives the chunks done and their number.
     """
     chunks, count = shared.chunks(wanted), 0
-    for done, chunk in enumerate(reversed(chunks), start=1):
+    for finished, chunk in enumerate(reversed(chunks), start=1):
         count += shared.fill(chunk, lambda keys: {*ledger.read(evaluation, keys).settled}, make) or 0
-        tick(done, len(chunks))
+        tick(finished, len(chunks))
         if not is_written(ledger, evaluation):
             break
     return count

@@ -1,4 +1,6 @@
-"""Abstention rates of a steered model, by path and over sets of paths (docs/spec.md 8.4).
+"""Compute abstention rates of a steered model (docs/spec.md 8.4).
+
+They are by path and over sets of paths.
 
 They are computed from STEERING and STEERING_VOTES rows. A path asks each scenario once, so its Wilson interval covers
 the variation of scenarios. Several paths ask the same scenario, and one answer may count in several paths; intervals
@@ -59,9 +61,9 @@ def answers_of_paths(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame
     joined = _with_verdicts(pd.DataFrame(answers[[*_ANSWER, *copied]]), votes)
     steered = joined.loc[joined["kind"] != UNSTEERED]
     plain = joined.loc[joined["kind"] == UNSTEERED].drop(columns=_ALONG)
-    same = [*_RUN, "dataset", "side", "scenario_id"]  # compare a path with unsteered answers to its scenarios
-    paths = steered[[*same, *_ALONG]].drop_duplicates()
-    return pd.concat([steered, plain.merge(paths, on=same)], ignore_index=True)
+    keys = [*_RUN, "dataset", "side", "scenario_id"]  # compare a path with unsteered answers to its scenarios
+    paths = steered[[*keys, *_ALONG]].drop_duplicates()
+    return pd.concat([steered, plain.merge(paths, on=keys)], ignore_index=True)
 
 
 def _with_verdicts(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
@@ -80,7 +82,10 @@ def _with_verdicts(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
 
 
 def effect_rows(answers: pd.DataFrame, votes: pd.DataFrame) -> list[SteeringEffectRow]:
-    """Return rows of STEERING_EFFECTS: abstention by path, kind, draw, layer, dose, signs and side."""
+    """Return rows of STEERING_EFFECTS: abstention by path and dose.
+
+    Also by kind, draw, layer, signs and side.
+    """
     rows: list[SteeringEffectRow] = []
     for key, group in answers_of_paths(answers, votes).groupby(_EFFECT, sort=True):
         about = dict(zip(_EFFECT, cast(tuple[Any, ...], key), strict=True))
@@ -114,7 +119,9 @@ def effect_rows(answers: pd.DataFrame, votes: pd.DataFrame) -> list[SteeringEffe
 def share_rows(
     answers: pd.DataFrame, votes: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED
 ) -> list[SteeringShareRow]:
-    """Return rows of STEERING_SHARES, of the paper's protocol alone: mean abstention over the paths of a set.
+    """Return rows of STEERING_SHARES: mean abstention over the paths of a set.
+
+    Of the paper's protocol alone.
 
     There are rows for each regime of directions and of answers and over all regimes, with an interval from resampled
     scenarios (all paths share the scenarios of a resample, and the unseen one).
@@ -147,7 +154,9 @@ def share_rows(
 
 
 def _shares(numbered: pd.DataFrame, n_paths: int, resamples: int, seed: int) -> np.ndarray:
-    """Return the ends of the share of each path, the observed ones first: (2, paths, 1 + resamples).
+    """Return the ends of the share of each path, the observed ones first.
+
+    (2, paths, 1 + resamples).
 
     An answer in several paths is one answer, so all paths of a taxonomy have one unseen scenario.
     """
@@ -170,7 +179,10 @@ def _shares(numbered: pd.DataFrame, n_paths: int, resamples: int, seed: int) -> 
 
 
 def _pools(paths: pd.DataFrame) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-    """Yield the sets of paths to average: the columns that name each set, and its rows of `paths`."""
+    """Yield the sets of paths to average.
+
+    Each is the columns that name it, and its rows of `paths`.
+    """
     pairs = pd.Series(list(zip(paths["source"], paths["dataset"], strict=True)), index=paths.index)
     every = {name: [ALL, *sorted(set(paths[name]))] for name in ("directions", "regime")}
     for (path_set, members), directions, regime in product(_PATH_SETS.items(), every["directions"], every["regime"]):

@@ -1,4 +1,7 @@
-"""The mechanistic stages: each reads tables and returns the rows of one; other modules hold the numerics."""
+"""Run the mechanistic stages: each reads tables and returns the rows of one.
+
+Other modules hold the numerics.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +53,9 @@ if TYPE_CHECKING:
 
 
 def examined_model(workspace: Workspace, model: str) -> ModelEntry:
-    """Return the entry of a model in the study's `mechanism` section, with that section's media settings.
+    """Return the entry of a model in the study's `mechanism` section.
+
+    It has that section's media settings.
 
     Raises TrapsError if it is not local, or not in the section.
     """
@@ -70,7 +75,10 @@ def examined_model(workspace: Workspace, model: str) -> ModelEntry:
 
 
 def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[list[HiddenStatesRow], int]:
-    """Extract the missing states of a partition; return its rows, and the number of new states."""
+    """Extract the missing states of a partition.
+
+    Return its rows, and the number of new states.
+    """
     from traps_pipeline.mechanism.hidden_states import extract, read_layer, read_record
     from traps_pipeline.models.local.adapter import load_local_model
 
@@ -120,8 +128,8 @@ def probed_item(workspace: Workspace, model: LocalModel, spec: MediaSpec, row: M
     from traps_pipeline.models.local.capture import OF_PAIRS
 
     times = workspace.resolve(row["times_clip"]) if isinstance(row["times_clip"], str) else None
-    other = other_clip(workspace, row) if workspace.mechanism.pooling in OF_PAIRS else None
-    return clip_item(model, spec, row, workspace.resolve(row["clip"]), system, times, other)
+    other_prompt = other_clip(workspace, row) if workspace.mechanism.pooling in OF_PAIRS else None
+    return clip_item(model, spec, row, workspace.resolve(row["clip"]), system, times, other_prompt)
 
 
 def unsound_layers(workspace: Workspace, cell: StatesCell, n_layers: int) -> list[int]:
@@ -133,7 +141,10 @@ def unsound_layers(workspace: Workspace, cell: StatesCell, n_layers: int) -> lis
 
 
 def _check_layers(workspace: Workspace, model: str, n_layers: int) -> None:
-    """Raise TrapsError if the study names a layer that the model lacks, before the long extraction begins."""
+    """Raise TrapsError if the study names a layer that the model lacks.
+
+    This happens before the long extraction begins.
+    """
     layers = workspace.mechanism.models[model]
     for name, layer in (
         ("steering", layers.steering),
@@ -151,7 +162,10 @@ def _check_layers(workspace: Workspace, model: str, n_layers: int) -> None:
 
 
 def probe_rows(workspace: Workspace, extraction: Extraction) -> list[ProbeRow]:
-    """Return rows of an extraction's probes; reuse the existing rows if none of their inputs has changed."""
+    """Return rows of an extraction's probes.
+
+    Reuse the existing rows if none of their inputs has changed.
+    """
     examined_model(workspace, extraction.model)
     states, settings = StoredStates.of(workspace, extraction), workspace.mechanism
     confabulated = confabulations(workspace, extraction.model)
@@ -183,7 +197,9 @@ def _known_rows(workspace: Workspace, extraction: Extraction, made_of: str) -> l
 
 
 def confabulations(workspace: Workspace, model: str) -> Confabulated:
-    """Return, by dataset, the scenarios on whose void the model confabulated under Standard in run 1.
+    """Return, by dataset, the scenarios on whose void the model confabulated.
+
+    It did so under Standard in run 1.
 
     A dataset without any has the reason instead.
     """
@@ -210,7 +226,10 @@ def directions_file(workspace: Workspace, extraction: Extraction, dataset: str) 
 
 
 def direction_rows(workspace: Workspace, extraction: Extraction) -> list[DirectionRow]:
-    """Compute and save the directions of every dataset with states; return rows of the directions table."""
+    """Compute and save the directions of every dataset with states.
+
+    Return rows of the directions table.
+    """
     examined_model(workspace, extraction.model)
     states = StoredStates.of(workspace, extraction)
     rows: list[DirectionRow] = []
@@ -227,7 +246,9 @@ def direction_rows(workspace: Workspace, extraction: Extraction) -> list[Directi
 def direction_pairs(
     settings: MechanismSettings, dataset: str, items: pd.DataFrame
 ) -> tuple[list[str], list[int], list[int]]:
-    """Return the scenarios behind a dataset's direction, and the rows of their voids and controls.
+    """Return the scenarios behind a dataset's direction, and its rows.
+
+    They are the rows of their voids and controls.
 
     Raises TrapsError for a study without steering.
     """
@@ -251,7 +272,7 @@ def _dataset_directions(workspace: Workspace, states: StoredStates, dataset: str
     chosen, *sides = direction_pairs(settings, dataset, items)
     assert steering is not None, "direction_pairs refuses a study that steers nothing"
     layers = [states.read(dataset, layer) for layer in range(states.n_layers)]
-    voids, controls = (np.stack([of[rows] for of in layers]) for rows in sides)
+    voids, controls = (np.stack([layer_states[rows] for layer_states in layers]) for rows in sides)
     seed = [settings.seed, DATASETS.index(dataset)]
     nulls = steering.nulls
     kinds, draws = (nulls.kinds, nulls.draws) if nulls else ((), 1)
@@ -293,7 +314,10 @@ def _dataset_directions(workspace: Workspace, states: StoredStates, dataset: str
 
 
 def saved_directions(workspace: Workspace, extraction: Extraction) -> dict[str, Directions]:
-    """Return the directions of an extraction by dataset. Raises TrapsError for a file that differs from the table's."""
+    """Return the directions of an extraction by dataset.
+
+    Raises TrapsError for a file that differs from the table's.
+    """
     table = workspace.tables.read(DIRECTIONS, extraction.partition)
     result = {}
     for path in sorted(set(table["path"])):

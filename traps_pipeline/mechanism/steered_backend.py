@@ -1,4 +1,6 @@
-"""The backend of steered requests: a local model that answers with a direction added to one block.
+"""Answer steered requests on a local model.
+
+A direction is added to the output of one block.
 
 Requests of one layer are generated together; answers that another process of the machine has generated are reused
 (`shared_answers`).
@@ -26,7 +28,10 @@ PROMPTS_KEPT = 128  # processed prompts in memory: each one is used for every di
 
 
 class SteeredBackend(LocalBackend):
-    """A local model that answers with a direction added to one block; each row has its own direction and alpha."""
+    """A local model that answers with a direction added to one block.
+
+    Each row has its own direction and alpha.
+    """
 
     def __init__(self, entry: Entry, vectors: Mapping[str, np.ndarray], shared: SharedAnswers) -> None:
         super().__init__(entry)
@@ -38,7 +43,9 @@ class SteeredBackend(LocalBackend):
         return self._made.outcomes(batch.requests, self.generate, batch.abandoned.is_set)
 
     def generate(self, batch: Sequence[Request], stopped: Callable[[], bool]) -> list[Outcome]:
-        """Answer requests; rows of one layer are generated together, and unsteered rows apart.
+        """Answer requests in groups.
+
+        Rows of one layer are generated together, and unsteered rows apart.
 
         stopped: called at every token, ends generation early.
         """
@@ -61,9 +68,9 @@ class SteeredBackend(LocalBackend):
             most = requests[0].params["max_new_tokens"]
             with model.caching_clips():
                 generated = model.generate(prompts, most, None, hook, stopped=stopped)
-            for number, one in zip(numbers, generated, strict=True):
-                counts = (one.prompt_tokens, one.completion_tokens)
-                outcomes[number] = outcome(one.text, one.finish_reason, *counts, model.served_model)
+            for number, answer in zip(numbers, generated, strict=True):
+                counts = (answer.prompt_tokens, answer.completion_tokens)
+                outcomes[number] = outcome(answer.text, answer.finish_reason, *counts, model.served_model)
         return [outcomes[number] for number in range(len(batch))]
 
     def _model(self) -> Any:

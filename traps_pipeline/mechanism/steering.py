@@ -1,4 +1,4 @@
-"""Steering: the answers of each cell, their generation, and the panel's votes on them (docs/spec.md 8).
+"""Steer models (docs/spec.md 8): answers, their generation, and votes on them.
 
 A steered answer is a request like any other, so it goes through the same ledger: its key holds the direction's digest,
 the layer and the signed alpha, beside the prompt, the clip and the checkpoint. At alpha 0 the key holds none of the
@@ -104,20 +104,20 @@ def strengths(
     if not plan:
         raise TrapsError(f"no direction leads to {target}; materialize hidden_states and directions first")
     for row in plan:
-        of, layer = directions[row.source], row.layer
-        if row.kind not in of.vectors or row.draw >= len(of.vectors[row.kind]):
+        vectors, layer = directions[row.source], row.layer
+        if row.kind not in vectors.vectors or row.draw >= len(vectors.vectors[row.kind]):
             raise TrapsError(
                 f"the directions of {row.source} have no {row.kind} draw {row.draw}; materialize directions again"
             )
-        vector = of.vectors[row.kind][row.draw][_in_range(layer, of)]
+        vector = vectors.vectors[row.kind][row.draw][_in_range(layer, vectors)]
         if not vector.any():
             raise TrapsError(
                 f"the {row.kind} direction of {row.source} at layer {layer} is zero, since the sides do not differ "
                 "there; name another layer in the experiment and in study.yaml"
             )
-        for unit, dose in _within(row, of, layer, steering.cap):
-            alpha = dose * float(of.gaps[layer]) if unit == "gap" else dose
-            relative = float(alpha / of.residual_norms[layer]) if of.residual_norms[layer] > 0 else None
+        for unit, dose in _within(row, vectors, layer, steering.cap):
+            alpha = dose * float(vectors.gaps[layer]) if unit == "gap" else dose
+            relative = float(alpha / vectors.residual_norms[layer]) if vectors.residual_norms[layer] > 0 else None
             along = (row.source, row.kind, layer, alpha, vector_digest(vector), relative)
             pairs.append((Strength(*along, row.draw, unit, dose, row.signs), row.sides))
     return pairs
@@ -127,7 +127,9 @@ Dose = tuple[str, float]  # unit and number
 
 
 def _within(row: _Planned, of: Directions, layer: int, cap: float) -> Sequence[Dose]:
-    """Return the doses of a direction, except those in class gaps beyond `cap` control states.
+    """Return the doses of a direction within the cap.
+
+    Left out are those in class gaps beyond `cap` control states.
 
     A null has only the largest one.
     """
@@ -137,7 +139,10 @@ def _within(row: _Planned, of: Directions, layer: int, cap: float) -> Sequence[D
 
 
 class _Planned(NamedTuple):
-    """A direction along which a target is steered, with sides and doses; a null has only the largest dose."""
+    """A direction along which a target is steered, with sides and doses.
+
+    A null has only the largest dose.
+    """
 
     source: str
     kind: str
@@ -156,13 +161,13 @@ def _plan(target: str, layers: Layers, steering: SteeringSettings, sources: Cont
     """
     alphas: tuple[Dose, ...] = tuple(("alpha", float(alpha)) for alpha in steering.alphas)
     doses: tuple[Dose, ...] = (*alphas, *(("gap", float(gap)) for gap in steering.gaps))
-    at = layers.steering
-    plan = [_Planned(source, "void", 0, at, BY_LABEL, SIDES, doses) for source in sources_of(target)]
-    plan += [_Planned(target, "void", 0, at, signs, SIDES, doses) for signs in steering.signs]
+    steered_layer = layers.steering
+    plan = [_Planned(source, "void", 0, steered_layer, BY_LABEL, SIDES, doses) for source in sources_of(target)]
+    plan += [_Planned(target, "void", 0, steered_layer, signs, SIDES, doses) for signs in steering.signs]
     if steering.nulls:
         draws = product(steering.nulls.kinds, range(steering.nulls.draws))
-        plan += [_Planned(target, kind, draw, at, BY_LABEL, SIDES, doses) for kind, draw in draws]
-    sweep = [layer for layer in layers.sweep if layer != at]
+        plan += [_Planned(target, kind, draw, steered_layer, BY_LABEL, SIDES, doses) for kind, draw in draws]
+    sweep = [layer for layer in layers.sweep if layer != steered_layer]
     plan += [_Planned(target, "void", 0, layer, BY_LABEL, ("control",), alphas) for layer in sweep]
     return [row for row in plan if row.source in sources]
 
@@ -170,7 +175,9 @@ def _plan(target: str, layers: Layers, steering: SteeringSettings, sources: Cont
 def count_answers(
     settings: MechanismSettings, model: str, datasets: Sequence[str], scenarios: Mapping[str, int]
 ) -> dict[str, Counter[str]]:
-    """Return the number of answers that steering a model needs, by inference regime and side.
+    """Return the number of answers that steering a model needs.
+
+    By inference regime and side.
 
     An answer that cells share counts once. scenarios: their number by taxonomy.
     """
@@ -209,7 +216,10 @@ def wanted_steered(
     cell: SteeringCell,
     directions: Mapping[str, Directions],
 ) -> list[SteeredQuestion]:
-    """Return the calls for every answer of a cell, those with the same prompt together, to share its clip."""
+    """Return the calls for every answer of a cell.
+
+    Those with the same prompt come together, to share its clip.
+    """
     settings = workspace.mechanism
     assert settings.steering is not None, "an experiment without steering has no steering cells"
     items = workspace.tables.read(ITEMS, {"dataset": cell.dataset})
@@ -234,7 +244,10 @@ def steered_request(
     strength: Strength,
     max_new_tokens: int,
 ) -> Request:
-    """Return the call for one steered answer: the full benchmark prompt, greedy, in the precision of extraction."""
+    """Return the call for one steered answer.
+
+    The full benchmark prompt, greedy, in the precision of extraction.
+    """
     assert entry.media is not None, "local entries have media"
     clip = workspace.resolve(item["clip"])
     media = workspace.media.prepare(clip, item["media_digest"], entry.media)
@@ -256,7 +269,10 @@ def steered_request(
 
 
 def shared_item(item: Mapping[str, Any]) -> str:
-    """Return the item's id in the ledger: a control is one item in both datasets of its taxonomy."""
+    """Return the item's id in the ledger.
+
+    A control is one item in both datasets of its taxonomy.
+    """
     dataset = taxonomy_of(item["dataset"]) if item["side"] == "control" else item["dataset"]
     return f"{dataset}:{item['scenario_id']}:{item['side']}"
 
@@ -278,9 +294,9 @@ def collect_steered(
     vectors = {
         vector_digest(vector): vector
         for of_prompt in directions.values()
-        for of in of_prompt.values()
-        for kind in of.vectors
-        for draw in of.vectors[kind]
+        for group in of_prompt.values()
+        for kind in group.vectors
+        for draw in group.vectors[kind]
         for vector in draw
     }
 
@@ -346,7 +362,9 @@ def _steering_row(
 def collect_steering_votes(
     workspace: Workspace, cells: Sequence[SteeringCell]
 ) -> Iterator[tuple[SteeringCell, StageOutput]]:
-    """Ask the study's panel whether each steered answer abstains and whether a control's is correct.
+    """Ask the panel whether each steered answer abstains or is correct.
+
+    Correctness is asked of controls.
 
     Yields the STEERING_VOTES rows of each finished cell.
     """

@@ -1,4 +1,4 @@
-"""The hidden states of a study, read layer by layer in the order of their table."""
+"""Read a study's hidden states layer by layer, in the order of their table."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ from traps_pipeline.storage.workspace import Workspace
 
 @dataclass
 class StoredStates:
-    """The hidden states of one extraction: an id table, and a reader of single layers in the order of that table."""
+    """The hidden states of one extraction: an id table, and a reader of layers.
+
+    Single layers are in the order of that table.
+    """
 
     workspace: Workspace
     extraction: Extraction
@@ -26,7 +29,10 @@ class StoredStates:
 
     @staticmethod
     def of(workspace: Workspace, extraction: Extraction) -> StoredStates:
-        """Return the states of an extraction. Raises TrapsError if nothing was extracted."""
+        """Return the states of an extraction.
+
+        Raises TrapsError if nothing was extracted.
+        """
         items = workspace.tables.read_all(HIDDEN_STATES, **extraction.partition)
         if items.empty:
             raise TrapsError(f"no hidden states of {extraction.key}; materialize hidden_states for it first")
@@ -47,8 +53,10 @@ class StoredStates:
         return self.items.loc[self.items["dataset"] == name]
 
     def read(self, dataset: str, layer: int | Literal["normed"]) -> np.ndarray:
-        """Return states (n, d) float32 in the order of the rows; layer `normed` is the last one after the final norm.
-        Raises TrapsError when the shards do not hold these items."""
+        """Return states (n, d) float32 in the order of the rows.
+
+        Layer `normed` is the last one after the final norm. Raises TrapsError when the shards do not hold these items.
+        """
         from traps_pipeline.mechanism.hidden_states import read_layer
 
         cell = StatesCell(dataset, self.extraction)

@@ -1,4 +1,4 @@
-"""Ordered pairs of datasets, and their transfer types (docs/spec.md 7.2 and 8.3)."""
+"""List ordered pairs of datasets with transfer types (docs/spec.md 7.2 and 8.3)."""
 
 from __future__ import annotations
 
@@ -50,4 +50,4 @@ def path_name(source: str, target: str) -> str:
 
 def sources_of(target: str) -> tuple[str, ...]:
     """Return the datasets whose directions steer a target."""
-    return tuple(source for source, other in STEERING_PATHS if other == target)
+    return tuple(source for source, path_target in STEERING_PATHS if path_target == target)

@@ -1,4 +1,6 @@
-"""States of an untrained network: the same class, sizes and prompts, with random weights.
+"""Extract states of an untrained network.
+
+It has the same class, sizes and prompts, with random weights.
 
 A gate on them uses only the inputs, through features that no training chose.
 """
@@ -22,7 +24,9 @@ from traps_pipeline.storage.workspace import Workspace
 
 
 def untrained_model(entry: ModelEntry, seed: int) -> LocalModel:
-    """Return the entry's network with random weights, on its device and in its precision, unquantised.
+    """Return the entry's network with random weights.
+
+    It is on its device and in its precision, unquantised.
 
     It takes the memory of a second model.
     """
@@ -46,7 +50,10 @@ def untrained_model(entry: ModelEntry, seed: int) -> LocalModel:
 def untrained_states(
     workspace: Workspace, entry: ModelEntry, states: StoredStates, items: Mapping[str, pd.DataFrame]
 ) -> dict[str, np.ndarray]:
-    """Return the states (n, d) of every item at the untrained network's middle block, pooled as in the study."""
+    """Return the states (n, d) of every item in the untrained network.
+
+    They are those of its middle block, pooled as in the study.
+    """
     model = untrained_model(entry, workspace.mechanism.seed)
     system, layer = states_prompt(workspace.mechanism.system, states.extraction.prompt), (model.n_layers + 1) // 2
     assert entry.media is not None, "local entries have media"

@@ -1,1 +1,4 @@
-"""Models and judges: the registry, requests and outcomes, the backends, and how calls are sent and recorded."""
+"""Ask models and judges.
+
+The registry, requests and outcomes, the backends, and how calls are sent and recorded.
+"""

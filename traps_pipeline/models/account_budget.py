@@ -1,4 +1,6 @@
-"""Cap an account's spending over all studies that use it, on one machine or a shared disk.
+"""Cap an account's spending over all studies that use it.
+
+They run on one machine or share a disk.
 
 A study's own budget knows only its own ledger, so two studies with one key could spend twice. Each may therefore name a
 folder for an account. The folder's `budget.yaml` gives the cap; `spent.jsonl` has one line per change, which every
@@ -27,14 +29,19 @@ _COMPACTED = 2**20  # bytes of lines above which a run compacts them at its star
 
 
 class Cap(BaseModel):
-    """The contents of `budget.yaml` in an account's folder. usd: dollars for all studies together, ever."""
+    """The contents of `budget.yaml` in an account's folder.
+
+    usd: dollars for all studies together, ever.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     usd: float = Field(ge=0, allow_inf_nan=False)
 
 
 class AccountBudget:
-    """The remaining budget of an account over all studies. study: the name in this study's lines.
+    """The remaining budget of an account over all studies.
+
+    study: the name in this study's lines.
 
     A line reserves a call's worst case before it is sent, and another adds the difference when its cost is known. A
     killed process leaves the worst case of its calls in flight reserved for good.
@@ -77,7 +84,7 @@ class AccountBudget:
                 self._append(missing)
 
     def reserve(self, dollars: float) -> bool:
-        """Reserve the worst case of a call, if the cap leaves room; return whether it does."""
+        """Reserve a call's worst case if the cap leaves room; return whether it does."""
         with self._held():
             if sum(self._spent.values()) + dollars > self.cap_usd + 1e-9:
                 return False

@@ -1,4 +1,4 @@
-"""The table of models' answers."""
+"""Define the table of models' answers."""
 
 from dataclasses import dataclass
 from typing import Annotated

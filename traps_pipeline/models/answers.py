@@ -1,4 +1,7 @@
-"""The responses stage: turn a cell's items into the rows of its table, one per item."""
+"""Turn a cell's items into the rows of its table, one per item.
+
+This is the responses stage.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +44,9 @@ class Question(Call):
 
 
 def answer_request(workspace: Workspace, entry: ModelEntry, item: Mapping[str, Any], evaluation: Evaluation) -> Request:
-    """Return the call that asks a model about an item: frames or video, then the question, nothing else.
+    """Return the call that asks a model about an item.
+
+    It holds frames or video, then the question, nothing else.
 
     The clip's media are prepared here if they are missing; every regime and run then shares them.
     """
@@ -69,7 +74,10 @@ def is_prepared(workspace: Workspace, entry: ModelEntry, item: Mapping[str, Any]
 
 
 def prepare_media(workspace: Workspace, cells: Sequence[Cell]) -> None:
-    """Prepare the media of every clip of the cells first, on all cores: encoding would delay calls."""
+    """Prepare the media of every clip of the cells first, on all cores.
+
+    Encoding would delay calls.
+    """
     jobs: dict[tuple[str, str], tuple[Path, str, MediaSpec]] = {}
     for dataset, own in {(cell.dataset, get_model(cell.evaluation.model).media) for cell in cells}:
         if own is None:
@@ -80,12 +88,15 @@ def prepare_media(workspace: Workspace, cells: Sequence[Cell]) -> None:
         for item in items:
             jobs[item["media_digest"], repr(spec)] = (workspace.root / item["clip"], item["media_digest"], spec)
     with ThreadPoolExecutor(cores()) as pool:
-        for done, _ in enumerate(pool.map(lambda job: workspace.media.prepare(*job), jobs.values()), start=1):
-            progress.current().tick("responses", "media to send", done, len(jobs))
+        for finished, _ in enumerate(pool.map(lambda job: workspace.media.prepare(*job), jobs.values()), start=1):
+            progress.current().tick("responses", "media to send", finished, len(jobs))
 
 
 def wanted_questions(workspace: Workspace, cell: Cell) -> list[Question]:
-    """Return every call that a cell wants, in the order of its items. Raises TrapsError if there are no items."""
+    """Return every call that a cell wants, in the order of its items.
+
+    Raises TrapsError if there are no items.
+    """
     entry = get_model(cell.evaluation.model)
     items = asked_items(workspace, cell.dataset)
     if not items:
@@ -94,7 +105,9 @@ def wanted_questions(workspace: Workspace, cell: Cell) -> list[Question]:
 
 
 def asked_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
-    """Return the columns of a dataset's items that requests, responses and votes use, in order.
+    """Return the columns of a dataset's items that later stages use, in order.
+
+    They serve requests, responses and votes.
 
     Equal texts share one copy: a cell of 100,000 items may have a hundred questions.
     """
@@ -111,7 +124,10 @@ def asked_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
 
 
 def with_posteriors(workspace: Workspace, dataset: str, items: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return items of a dataset; those of graded cuts with `posterior`, which the strategy `bayes` reads."""
+    """Return items of a dataset.
+
+    Those of graded cuts with `posterior`, which the strategy `bayes` reads.
+    """
     if dataset != GRADED:
         return items
     known = posteriors(workspace)
@@ -119,7 +135,9 @@ def with_posteriors(workspace: Workspace, dataset: str, items: list[dict[str, An
 
 
 def _secret(entry: ModelEntry, item: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the hidden facts that reference strategies may read: side, labels, on a control its ground truth.
+    """Return the hidden facts that reference strategies may read.
+
+    Side and labels, and on a control its ground truth.
 
     Only `prior` and the rules read the sub-scenario's commonest answer, so that a corrected answer which changes it
     re-asks no other model, and only `bayes` reads the probabilities of answers. A rule reads nothing else, and every

@@ -1,4 +1,6 @@
-"""Network models through litellm: one attempt per call, exactly the declared parameters, typed outcomes.
+"""Call network models through litellm.
+
+One attempt per call, exactly the declared parameters, typed outcomes.
 
 Retries, pace and money are handled elsewhere (`ask`). litellm is imported on the first call: it takes seconds and would
 fetch a price list from the network.
@@ -64,7 +66,10 @@ TRANSIENT_STATUSES = {408: "timeout", 409: "conflict", 429: RATE_LIMITED}
 
 @cache
 def load_litellm() -> Any:
-    """Return litellm, configured to send and fetch nothing of its own. Raises TrapsError if it is not installed."""
+    """Return litellm, configured to send and fetch nothing of its own.
+
+    Raises TrapsError if it is not installed.
+    """
     require("api")
     from traps_pipeline.models.wire import use_in
 
@@ -131,7 +136,10 @@ def media_parts(media: Media, route: str) -> list[dict[str, Any]]:
 
 
 def messages(entry: Entry, request: Request) -> list[dict[str, Any]]:
-    """Return system prompt, then the clip and the question, nothing else (docs/spec.md 3.3)."""
+    """Return system prompt, then the clip and the question, nothing else.
+
+    See docs/spec.md 3.3.
+    """
     user: str | list[dict[str, Any]] = request.user
     if request.sent is not None:
         route = str(entry.provider_id).split("/")[0]
@@ -228,10 +236,13 @@ class ApiBackend:
         return cost if usage.believed else max(cost, worst)
 
     def _failure(self, error: Exception, exchange: Exchange) -> Outcome:
-        """Return a failure as an outcome, or raise it as TransientError. Its text is for people and never stored."""
+        """Return a failure as an outcome, or raise it as TransientError.
+
+        Its text is for people and never stored.
+        """
         from traps_pipeline.models.wire import cause_of
 
-        if exchange.never_left:
+        if exchange.is_unsent:
             why = redact(plain(exchange.problem or cause_of(error)))
             self._tell(UNREACHABLE, why, passes=True)
             raise TransientError(UNREACHABLE, billed=False, why=why) from None
@@ -252,7 +263,7 @@ class ApiBackend:
         status = (reported.status or UNKNOWN_ERROR) if exchange.is_answered else exchange.status
         assert status is not None
         is_explained = error is not None and not error.is_beside_answer
-        billed = exchange.may_be_billed(status, is_explained=is_explained)
+        billed = exchange.is_billable(status, is_explained=is_explained)
         origin = " (an error object in an HTTP 200)" if exchange.is_answered else ""
         origin += f" (through the proxy of {exchange.proxy})" if exchange.proxy else ""
         if reported.is_filtered and status not in TRANSIENT_STATUSES:
@@ -273,7 +284,10 @@ class ApiBackend:
         return f"HTTP {exchange.status}, {kind}, {len(exchange.content or b'')} bytes{begins}"
 
     def _tell(self, kind: str, message: str, *, passes: bool = False) -> None:
-        """Report the provider's message once per kind, without the key. passes: whether a retry may help."""
+        """Report the provider's message once per kind, without the key.
+
+        passes: whether a retry may help.
+        """
         if kind not in self._told:
             self._told.add(kind)
             message = redact(" ".join(message.split())).removeprefix(f"{kind}: ")  # before it is cut
@@ -283,7 +297,10 @@ class ApiBackend:
 
 
 def failure_kind(status: int, reported: ProviderError) -> str:
-    """Return the kind of a failure: http_<status> is final, anything else is worth a retry."""
+    """Return the kind of a failure.
+
+    http_<status> is final, anything else is worth a retry.
+    """
     if status in TRANSIENT_STATUSES:
         return TRANSIENT_STATUSES[status]
     if status >= 500:

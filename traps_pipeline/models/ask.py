@@ -1,4 +1,4 @@
-"""Ask for answers: call the wanted keys that the ledger lacks, append the results, and yield complete cells.
+"""Ask for the wanted calls that the ledger lacks, and yield complete cells.
 
 The same code asks models and judges, reference ones and paid ones. There is no resume mode: a crash, a second run and a
 correction are the same operation (docs/models.md, "Ledger").
@@ -39,7 +39,7 @@ INTERRUPTED = 130  # the exit code of a stopped run
 
 @dataclass(frozen=True)
 class Call:
-    """A call that a stage wants. Each stage has its own subclass, with the further columns of its table."""
+    """A call that a stage wants; each stage's subclass adds its table's columns."""
 
     request: Request
 
@@ -51,7 +51,7 @@ Finished = TypeVar("Finished")
 
 @dataclass(frozen=True)
 class SettledCell(Generic[AnyCell, AnyCall]):
-    """A cell whose calls are all answered: its calls, the ledger's row of each key, and the tally."""
+    """A cell whose calls are all answered, the ledger's row of each key, and a tally."""
 
     cell: AnyCell
     calls: Sequence[AnyCall]
@@ -96,7 +96,7 @@ def collect(
     finish: Callable[[SettledCell[AnyCell, AnyCall]], Finished],
     make: Callable[[Entry], Backend] = make_backend,
 ) -> Iterator[Finished]:
-    """Ask participants for the calls that the ledger lacks, under the study's budget; yield each finished cell.
+    """Ask participants for missing calls under the budget; yield each finished cell.
 
     entries: all participants of the calls. make: returns an entry's backend. `run_work` documents exceptions and
     Ctrl-C.
@@ -162,7 +162,7 @@ class _Asking:
                 return
 
     async def run(self) -> None:
-        """Ask for all that is missing. An exception stops new calls; it is raised once calls in flight are recorded."""
+        """Ask for all that is missing; record calls in flight before raising an error."""
         queues: dict[str, deque[Request]] = {}
         for request in self.missing:
             queues.setdefault(request.participant, deque()).append(request)
@@ -180,7 +180,7 @@ class _Asking:
 
 
 class _Held(Mapping[str, Any]):
-    """A ledger row without its components, which the request holds too; half the size of a dictionary."""
+    """A ledger row without its components, which the request holds too."""
 
     __slots__ = ("_places", "_values")
     _shared: ClassVar[dict[tuple[str, ...], dict[str, int]]] = {}
@@ -202,7 +202,7 @@ class _Held(Mapping[str, Any]):
 
 @dataclass(frozen=True)
 class _Evaluation:
-    """State that the cells of an evaluation share: its writer, and the ledger places already reported."""
+    """State that the cells of an evaluation share: writer, and ledger places reported."""
 
     writer: Writer
     told: set[str]
@@ -211,7 +211,7 @@ class _Evaluation:
 async def settle_evaluation(
     work: Work[AnyCell, AnyCall, Any], evaluation: Evaluation, cells: Sequence[AnyCell], stop: asyncio.Event
 ) -> AsyncIterator[SettledCell[AnyCell, AnyCall]]:
-    """Settle the cells of one evaluation, asking only for missing calls. Unfinished cells are left out.
+    """Settle one evaluation's cells by asking missing calls; yield the finished ones.
 
     Calls and rows are held one cell at a time; a call that two cells share (a steered control) is found by the second.
     """
@@ -256,8 +256,8 @@ async def _settle_cell(
 async def settle(
     work: Work[AnyCell, AnyCall, Any], cells: Sequence[AnyCell], stop: asyncio.Event
 ) -> AsyncIterator[SettledCell[AnyCell, AnyCall] | Exception]:
-    """Settle all cells, models in parallel. A failing model yields its exception; the others go on."""
-    done: asyncio.Queue[SettledCell[AnyCell, AnyCall] | Exception | None] = asyncio.Queue()
+    """Settle all cells, models in parallel; a failing model yields its exception."""
+    finished: asyncio.Queue[SettledCell[AnyCell, AnyCall] | Exception | None] = asyncio.Queue()
     turn = asyncio.Semaphore(1)  # a cell waits here with its rows until the one before it is written
 
     async def one_model(evaluations: Sequence[tuple[Evaluation, list[AnyCell]]]) -> None:
@@ -267,14 +267,14 @@ async def settle(
                     return
                 async for settled in settle_evaluation(work, evaluation, mine, stop):
                     await turn.acquire()
-                    done.put_nowait(settled)
+                    finished.put_nowait(settled)
                     del settled
         except LockGivenUp:
             return
         except Exception as error:  # noqa: BLE001 - handed to the caller, who reports it and fails the run
-            done.put_nowait(error)
+            finished.put_nowait(error)
         finally:
-            done.put_nowait(None)
+            finished.put_nowait(None)
 
     ordered = sorted(cells, key=lambda cell: (cell.evaluation, cell.dataset))
     by_evaluation = [(e, list(mine)) for e, mine in groupby(ordered, key=lambda cell: cell.evaluation)]
@@ -284,7 +284,7 @@ async def settle(
     try:
         open_tasks = len(tasks)
         while open_tasks:
-            settled = await done.get()
+            settled = await finished.get()
             if settled is None:
                 open_tasks -= 1
             else:
@@ -298,7 +298,7 @@ async def settle(
 
 
 def run_work(work: Work[AnyCell, AnyCall, Finished], cells: Sequence[AnyCell]) -> Iterator[Finished]:
-    """Settle cells and finish each (write its table) just before it is yielded; for synchronous callers.
+    """Settle cells and finish each (write its table) just before it is yielded.
 
     The first Ctrl-C, SIGTERM or SIGHUP stops new calls and waits for those in flight, a second one stops at once;
     either way KeyboardInterrupt is raised and the same command continues later. A caller that closes the iterator early
@@ -354,7 +354,7 @@ def _raise_together(stage: str, problems: Sequence[Exception]) -> None:
 
 
 class _drain_on_interrupt:  # noqa: N801 - reads as a verb where it is used
-    """Route stop signals to the stop event while a loop works in the main thread, then restore the handlers.
+    """A guard that routes stop signals to the stop event while a loop works.
 
     A person who presses Ctrl-C can press it again; a sender of SIGTERM or SIGHUP will kill the process some time later,
     so calls in flight get GRACE_S to finish. A call given up stays reserved with its worst case.

@@ -1,4 +1,7 @@
-"""The one place that creates a registry entry's backend; a new backend is one more branch here."""
+"""Create a registry entry's backend, in this one place.
+
+A new backend is one more branch here.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,10 @@ from traps_pipeline.models.request import Backend
 
 
 def require_libraries(entry: Entry) -> None:
-    """Raise TrapsError with the command to type unless an entry's libraries are installed."""
+    """Raise TrapsError unless an entry's libraries are installed.
+
+    The error holds the command to type.
+    """
     if entry.backend == NETWORK:
         require("api")
     if entry.backend == LOCAL:
@@ -19,7 +25,9 @@ def require_libraries(entry: Entry) -> None:
 
 
 def make_backend(entry: Entry) -> Backend:
-    """Return the entry's backend. Imports are lazy: a study without paid models never loads a provider's library.
+    """Return the entry's backend.
+
+    Imports are lazy: a study without paid models never loads a provider's library.
 
     Raises TrapsError if its library is not installed, its key is not set, or its weights are missing.
     """

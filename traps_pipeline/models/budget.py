@@ -1,4 +1,4 @@
-"""A cap that holds: the worst case of a call is reserved before it is sent.
+"""Cap spending: the worst case of a call is reserved before it is sent.
 
 The reservation is a row of the ledger's database, and the call's own row replaces it (`ledger/money.py`). So calls in
 flight when a process is killed count as their worst case forever, and all processes of a study share one budget.
@@ -47,7 +47,10 @@ def most_tokens(entry: Entry, request: Request) -> Tokens:
 
 
 def worst_case_usd(entry: Entry, request: Request) -> float:
-    """Return a call's maximum cost in dollars; 0 if the price is unknown (a study must allow that)."""
+    """Return a call's maximum cost in dollars.
+
+    0 if the price is unknown (a study must allow that).
+    """
     if entry.prices is None:
         return 0.0
     tokens = most_tokens(entry, request)
@@ -55,7 +58,10 @@ def worst_case_usd(entry: Entry, request: Request) -> float:
 
 
 def check_money(study: Study, entry: Entry) -> None:
-    """Raise TrapsError unless the study allows the possible cost of asking this participant."""
+    """Raise TrapsError unless the study allows the cost of asking a participant.
+
+    The possible cost counts.
+    """
     if entry.backend != NETWORK:
         return
     if entry.prices is None:
@@ -105,7 +111,9 @@ class Budget:
         return sum(self._money.spent().values()) if self._money else 0.0
 
     async def reserve(self, participant: str, worst_usd: float) -> Reservation | None:
-        """Reserve a call's worst case; return None for a free call. Wait while calls in flight hold the room.
+        """Reserve a call's worst case; return None for a free call.
+
+        Wait while calls in flight hold the room.
 
         Raises BudgetReached if there is no room and no call in flight that could free some, and TrapsError.
         """
@@ -126,16 +134,19 @@ class Budget:
                     self._in_flight[reservation.id] = reservation
                     return reservation
                 await self._replace(reservation, 0.0)
-                if not self._in_flight_through(account):
+                if not self._has_calls_through(account):
                     raise BudgetReached(account.explain(worst_usd))
-            elif not await self._may_make_room(result):
+            elif not await self._has_room_later(result):
                 raise BudgetReached(reached(result.slot, result.taken_usd, self._caps[result.slot], worst_usd))
             async with self._changed:
                 with suppress(TimeoutError):
                     await asyncio.wait_for(self._changed.wait(), LOOK_S)
 
     async def settle(self, reservation: Reservation | None, cost_usd: float | None) -> None:
-        """Replace a call's worst case by its cost; an unknown cost counts as the worst case."""
+        """Replace a call's worst case by its cost.
+
+        An unknown cost counts as the worst case.
+        """
         if reservation is None:
             return
         cost = reservation.usd if cost_usd is None else cost_usd
@@ -154,20 +165,29 @@ class Budget:
         settled = self._money.settle(reservation.id, reservation.participant, reservation.usd, cost_usd)
         await asyncio.wrap_future(settled)
 
-    async def _may_make_room(self, full: CapExhausted) -> bool:
-        """Return whether calls in flight, of any process, may cost less than their worst case."""
+    async def _has_room_later(self, full: CapExhausted) -> bool:
+        """Return whether calls in flight may cost less than their worst case.
+
+        Those of any process count.
+        """
         if any(full.slot in (None, its.participant) for its in self._in_flight.values()):
             return True
         assert self._money is not None, "what is full was asked for"
         return await asyncio.to_thread(self._money.is_any_alive, full.others)
 
-    def _in_flight_through(self, account: AccountBudget) -> bool:
-        """Return whether this process has calls in flight whose settling may free an account's budget."""
+    def _has_calls_through(self, account: AccountBudget) -> bool:
+        """Return whether this process's calls in flight may free an account's budget.
+
+        Settling them may.
+        """
         return any(self._accounts.get(its.participant) is account for its in self._in_flight.values())
 
 
 def reached(participant: str | None, spent_usd: float, cap_usd: float, worst_usd: float) -> str:
-    """Return why a budget leaves no room for a call. participant: None for the study's budget."""
+    """Return why a budget leaves no room for a call.
+
+    participant: None for the study's budget.
+    """
     return (
         f"the budget of {participant or 'the study'} is reached: ${spent_usd:.2f} of ${cap_usd:.2f} spent, the next "
         f"call may cost ${worst_usd:.4f}. Raise it (--budget-usd, or study.yaml) and run the same command to go on"

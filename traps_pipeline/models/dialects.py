@@ -70,7 +70,10 @@ def dialect_of(provider_id: str) -> Dialect:
 
 
 def parse_body(content: bytes) -> Json:
-    """Return the JSON object in a body. Raises OddShapeError for anything else."""
+    """Return the JSON object in a body.
+
+    Raises OddShapeError for anything else.
+    """
     text = content.decode("utf-8-sig", "replace")
     try:
         body = json.loads(text)
@@ -94,7 +97,10 @@ def shape_of(text: str) -> str:
 
 
 def read_reply(body: Json, provider_id: str) -> Reply:
-    """Return the answer in the body of a response with status 200. Raises OddShapeError."""
+    """Return the answer in the body of a response with status 200.
+
+    Raises OddShapeError.
+    """
     # litellm asks some OpenAI models over the Responses API whatever their route says.
     dialect = "responses" if body.get("object") == "response" else dialect_of(provider_id)
     try:
@@ -116,7 +122,10 @@ class _Texts:
     refusal: list[str] = field(default_factory=list)
 
     def add(self, parts: Any, into: str | None = None) -> None:
-        """Add a content: a text, or a list of parts. into: the field that receives all of it."""
+        """Add a content: a text, or a list of parts.
+
+        into: the field that receives all of it.
+        """
         if isinstance(parts, str):
             getattr(self, into or "text").append(parts)
             return
@@ -130,7 +139,10 @@ class _Texts:
                 self.add(part[name], into or kind)
 
     def reply(self, finish: Any, served_model: Any, usage: Any) -> Reply:
-        """Return the answer. Raises OddShapeError if it lacks a finish reason."""
+        """Return the answer.
+
+        Raises OddShapeError if it lacks a finish reason.
+        """
         if not finish or not isinstance(finish, str):
             raise OddShapeError("it gives no finish reason, which each complete answer has")
         return Reply(
@@ -146,7 +158,7 @@ class _Texts:
 
 def _chat(body: Json) -> Reply:
     choices = _objects(body, "choices")
-    choice = next((one for one in choices if one.get("index") == 0), choices[0])
+    choice = next((candidate for candidate in choices if candidate.get("index") == 0), choices[0])
     message, texts = _object(choice, "message"), _Texts()
     texts.add(message.get("content"))
     texts.add(_text_of(message, "refusal"), "refusal")
@@ -199,7 +211,7 @@ _READERS: Mapping[Dialect, Callable[[Json], Reply]] = {
 
 def _objects(body: Json, name: str, least: int = 1) -> list[dict[str, Any]]:
     values = body.get(name)
-    if not isinstance(values, list) or len(values) < least or not all(isinstance(one, dict) for one in values):
+    if not isinstance(values, list) or len(values) < least or not all(isinstance(value, dict) for value in values):
         raise OddShapeError(f"it has no list `{name}`")
     return values
 
@@ -217,5 +229,8 @@ def _text_of(holder: Json, name: str) -> str:
 
 
 def storable(text: str) -> str:
-    """Return a text without unpaired surrogates, which a cut inside an emoji leaves and no file can store."""
+    """Return a text without unpaired surrogates.
+
+    A cut inside an emoji leaves one, and no file can store it.
+    """
     return text.encode("utf-8", "replace").decode("utf-8")

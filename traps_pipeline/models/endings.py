@@ -1,4 +1,4 @@
-"""The finish reasons that providers document, and the meaning of each.
+"""List the finish reasons that providers document, and the meaning of each.
 
 An unlisted reason is never an answer. Gateways pass on the reasons of other providers, in any case, so one list serves
 all dialects.

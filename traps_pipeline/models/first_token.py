@@ -1,4 +1,6 @@
-"""Log-probabilities of the alternatives for an answer's first token, from a provider's own bytes.
+"""Read log-probabilities of an answer's first token from a provider's bytes.
+
+They are those of its alternatives.
 
 See docs/arms.md, "Graded cuts".
 """
@@ -28,7 +30,10 @@ def of_chat(logprobs: Any) -> dict[str, float]:
 
 
 def stored_alternatives(alternatives: Mapping[str, float], regime: object) -> str | None:
-    """Return alternatives in stored form, the likeliest first; None without any, or if the regime uses none."""
+    """Return alternatives in stored form, the likeliest first.
+
+    None without any, or if the regime uses none.
+    """
     if not alternatives or regime not in BY_NAME or not BY_NAME[str(regime)].first_token:
         return None
     likeliest = sorted(alternatives.items(), key=lambda one: -one[1])[: MOST + 1]  # the sampled token may be unlikely

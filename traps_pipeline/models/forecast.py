@@ -22,7 +22,10 @@ LOW_SHARE = 0.4  # share of the expected completion that a terse model takes
 
 @dataclass(frozen=True)
 class Experience:
-    """Means over answered calls: tokens of prompt and completion, seconds. None if nothing is known."""
+    """Means over answered calls: tokens of prompt and completion, seconds.
+
+    None if nothing is known.
+    """
 
     prompt_tokens: float | None = None
     completion_tokens: float | None = None
@@ -90,7 +93,10 @@ def forecast(entry: Entry, calls: int, seen: Experience) -> Forecast:
 
 
 def minutes_of(forecasts: Iterable[Forecast]) -> float:
-    """Return minutes of parallel calls: those of the slowest participant, or of a shared account's pace."""
+    """Return minutes of parallel calls.
+
+    They are those of the slowest participant, or of a shared account's pace.
+    """
     rows, shared = list(forecasts), dict[str, float]()
     for row in rows:
         shared[row.account] = shared.get(row.account, 0.0) + row.paced_minutes

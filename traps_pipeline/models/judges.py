@@ -1,4 +1,6 @@
-"""The registry of judges and panels (`assets/judges.yaml`), with their prompts and schemas.
+"""Register judges and panels (`assets/judges.yaml`).
+
+They have prompts and schemas.
 
 `judging/` collects and counts a panel's votes.
 """
@@ -97,7 +99,10 @@ class Judge(typing.Protocol):
 
 
 def vote_prompt(seat: Judge, task: Task) -> str:
-    """Return the system prompt of a task: the paper's, with our part about the premise if the judge is asked for it."""
+    """Return the system prompt of a task.
+
+    It is the paper's, with our part about the premise if the judge is asked for it.
+    """
     text = prompt(f"judge_{task}")
     return f"{text}\n\n{prompt('judge_premise_suffix')}" if seat.premise and task == "abstention" else text
 
@@ -128,7 +133,10 @@ class JudgeEntry(Entry):
 @user_registry.cached_registry
 @cache
 def load_judges(path: Path = JUDGES_FILE) -> dict[str, JudgeEntry]:
-    """Return judges by id. Raises TrapsError naming judge and field."""
+    """Return judges by id.
+
+    Raises TrapsError naming judge and field.
+    """
     judges = read_entries(path, "judges", JudgeEntry)
     return with_own(judges, "judges", JudgeEntry) if path == JUDGES_FILE else judges
 
@@ -142,7 +150,10 @@ def thinking_of(judge: str) -> Marks | None:
 @user_registry.cached_registry
 @cache
 def load_panel(name: str, path: Path = JUDGES_FILE) -> tuple[JudgeEntry, ...]:
-    """Return the judges of a panel: three, or one. Raises TrapsError naming the file and the problem."""
+    """Return the judges of a panel: three, or one.
+
+    Raises TrapsError naming the file and the problem.
+    """
     panels, judges = load_panels(path), load_judges(path)
     if not name:
         raise TrapsError(f"no panel is named: {how_to_name_a_panel(path)}")
@@ -159,7 +170,10 @@ def load_panel(name: str, path: Path = JUDGES_FILE) -> tuple[JudgeEntry, ...]:
 
 
 def load_panels(path: Path = JUDGES_FILE) -> dict[str, Any]:
-    """Return the judges of every panel by name, unchecked. Raises TrapsError if the file has no mapping `panels:`."""
+    """Return the judges of every panel by name, unchecked.
+
+    Raises TrapsError if the file has no mapping `panels:`.
+    """
     panels = read_mapping(path).get("panels")
     if not isinstance(panels, dict):
         raise TrapsError(f"{path}: must hold a mapping `panels:`")
@@ -175,7 +189,9 @@ def how_to_name_a_panel(path: Path = JUDGES_FILE) -> str:
 
 
 def require_panel(panel: str, models: Iterable[str], *, judged_by_rules: bool) -> None:
-    """Raise TrapsError if no panel is named, if it is unknown, or if rules would judge unasked.
+    """Raise TrapsError if no panel is named, or an unfit one.
+
+    It is unfit if it is unknown, or if rules would judge unasked.
 
     Rules judge models other than reference models only if the user says so.
     """
@@ -191,7 +207,10 @@ def require_panel(panel: str, models: Iterable[str], *, judged_by_rules: bool) -
 
 
 def panel_version(panel: str) -> str:
-    """Return the version of everything that decides a panel's votes besides answers: judges, prompts, schemas."""
+    """Return the version of everything but answers that decides a panel's votes.
+
+    Judges, prompts, schemas.
+    """
     return version_of_judges(load_panel(panel)) if panel else "no panel is named"
 
 
@@ -205,7 +224,10 @@ def version_of_judges(seats: Iterable[Judge]) -> str:
 
 
 def panel_id(panel: str) -> str:
-    """Return a panel's id in rows: its name and the version of its judges, with a mark for a single judge."""
+    """Return a panel's id in rows.
+
+    It is its name and the version of its judges, with a mark for a single judge.
+    """
     return id_of_judges(panel, load_panel(panel)) if panel else f"@{panel_version(panel)[:8]}"
 
 
@@ -216,9 +238,12 @@ def id_of_judges(name: str, seats: Sequence[Judge]) -> str:
 
 def panel_names(panels: str) -> list[str]:
     """Return the names of the panels in a column of joined panel ids."""
-    return [one.partition("@")[0] for one in panels.split("+") if one]
+    return [panel_id.partition("@")[0] for panel_id in panels.split("+") if panel_id]
 
 
 def is_judged_by_rules(panels: str, model: str) -> bool:
-    """Return whether rules judged a model that is no reference model, by the column `panel` of a row."""
+    """Return whether rules judged a model that is no reference model.
+
+    panels: the column `panel` of its rows.
+    """
     return RULES_PANEL in panel_names(panels) and not is_reference(model)

@@ -1,4 +1,7 @@
-"""The observer as a model: it answers from a clip's frames and the question alone, the ceiling row of a leaderboard."""
+"""Answer as a model from a clip's frames and the question alone.
+
+This is the ceiling row of a leaderboard.
+"""
 
 from __future__ import annotations
 
@@ -15,14 +18,20 @@ from traps_pipeline.video.policies import FramePolicy
 
 @lru_cache(maxsize=100_000)
 def observer_answer(media_digest: str, clip: Path, question: str, frames: FramePolicy) -> str | None:
-    """Return the observer's answer from these frames of a clip, cached for all regimes and runs."""
+    """Return the observer's answer from these frames of a clip.
+
+    It is cached for all regimes and runs.
+    """
     from traps_pipeline.scenes.observe import observe
 
     return observe(clip, question, frames)
 
 
 class ObserverBackend:
-    """Answers by classical vision on the clip; sees neither the record nor the simulator."""
+    """A reference model that answers by classical vision on the clip.
+
+    It sees neither the record nor the simulator.
+    """
 
     async def ask(self, request: Request) -> Outcome:
         """Return the outcome of one attempt; see `Backend`."""

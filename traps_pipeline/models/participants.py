@@ -1,4 +1,6 @@
-"""Send one call to a participant: its connections, its account's pace, retries, reservation and ledger row.
+"""Send one call to a participant.
+
+Its connections, its account's pace, retries, reservation and ledger row.
 
 This is the one place that sends calls; `models/ask.py` decides which.
 """
@@ -44,7 +46,10 @@ OVERRUN = 16  # highest plausible cost, in worst cases
 
 @dataclass(frozen=True)
 class Participant:
-    """A model or judge with its backend, entry, connections, account pace and failures."""
+    """A model or judge.
+
+    It has a backend, an entry, connections, its account's pace, and failures.
+    """
 
     backend: Backend
     entry: Entry
@@ -71,7 +76,9 @@ def allow_connections(count: int) -> None:
 
 
 class Participants:
-    """Participants by id, created on first use, so that an unused one needs neither key nor budget.
+    """Participants by id, created on first use.
+
+    An unused one then needs neither key nor budget.
 
     All evaluations of a run share connections, and all participants of an account its pace. sharers: how many processes
     use an account, if hosts share it.
@@ -132,7 +139,9 @@ class CallContext:
 async def attempt(
     participant: Participant, request: Request, allowed: CallContext
 ) -> tuple[Outcome, int, float] | None:
-    """Return an outcome, the number of attempts, the last one's seconds; None if halted before anything was spent.
+    """Return an outcome, the number of attempts, and the last one's seconds.
+
+    None if halted before anything was spent.
 
     This is the one retry layer: exponential backoff with full jitter, and never sooner than the provider asks. The
     outcome's cost includes what earlier attempts may have cost.
@@ -173,7 +182,7 @@ async def attempt(
         progress.current().retried(participant.entry.id)
         longest = min(limits.backoff_s * 2 ** (number - 1), MAX_BACKOFF_S)
         wait = max(min(failure.retry_after_s or 0.0, MAX_RETRY_AFTER_S), random.uniform(0, longest))
-        if await _stopped_within(allowed.stop, wait):
+        if await _is_stopped_within(allowed.stop, wait):
             return _given_up("interrupted", number, seconds, lost_usd)
     raise AssertionError("unreachable: the last attempt returns")
 
@@ -181,7 +190,10 @@ async def attempt(
 def _given_up(
     kind: str, attempts: int, seconds: float, lost_usd: float, raw: str | None = None
 ) -> tuple[Outcome, int, float] | None:
-    """Return a failure for the ledger; None for a call that was never sent, or that was free and will be retried."""
+    """Return a failure for the ledger.
+
+    None for a call that was never sent, or that was free and will be retried.
+    """
     if kind in ("interrupted", "budget") and not lost_usd:
         return None
     if kind == MALFORMED:
@@ -213,7 +225,7 @@ async def _send(participant: Participant, request: Request, allowed: CallContext
                 outcome = replace(outcome, cost_usd=cost_usd)
             return outcome
         except TimeoutError:
-            if exchange.never_left:
+            if exchange.is_unsent:
                 why = f"no connection was made within {entry.limits.timeout_s:g} s"
                 raise TransientError(UNREACHABLE, billed=False, why=why) from None
             raise TransientError("timeout") from None
@@ -221,7 +233,7 @@ async def _send(participant: Participant, request: Request, allowed: CallContext
             cost_usd = _believed(failure.cost_usd, worst_usd) if failure.billed else 0.0
             raise
         finally:
-            if exchange.never_left:  # also for a call that is cancelled before it is sent
+            if exchange.is_unsent:  # also for a call that is cancelled before it is sent
                 cost_usd = 0.0
             if reservation is not None and cost_usd > 0:
                 allowed.paid_by.append(reservation)
@@ -229,7 +241,9 @@ async def _send(participant: Participant, request: Request, allowed: CallContext
 
 
 def _believed(cost_usd: float | None, worst_usd: float) -> float:
-    """Return an answer's cost as read by a backend; the worst case if it is unknown or impossible.
+    """Return an answer's cost as read by a backend.
+
+    The worst case if it is unknown or impossible.
 
     A provider may exceed a call's limits and charge for it, up to a bound: an impossible number of tokens would
     otherwise end the study.
@@ -239,7 +253,7 @@ def _believed(cost_usd: float | None, worst_usd: float) -> float:
     return min(cost_usd, OVERRUN * worst_usd)
 
 
-async def _stopped_within(stop: asyncio.Event, seconds: float) -> bool:
+async def _is_stopped_within(stop: asyncio.Event, seconds: float) -> bool:
     with suppress(TimeoutError):
         await asyncio.wait_for(stop.wait(), seconds)
     return stop.is_set()
@@ -248,7 +262,10 @@ async def _stopped_within(stop: asyncio.Event, seconds: float) -> bool:
 def ledger_row(
     request: Request, outcome: Outcome, attempts: int, latency_s: float, epoch: str
 ) -> tuple[Row, dict[str, str]]:
-    """Return the row of an answer, and its side texts: the reasoning trace, a malformed answer."""
+    """Return the row of an answer, and its side texts.
+
+    They are the reasoning trace and a malformed answer.
+    """
     fields = asdict(outcome)
     beside = {name: text for name in SIDE_TEXTS if (text := fields.pop(name)) is not None}
     if fields["first_token"] is None:
@@ -265,5 +282,8 @@ def ledger_row(
 
 
 def when_asked(row: Row) -> Row:
-    """Return the columns that say when a row's call was asked, in every table made from a ledger."""
+    """Return the columns that say when a row's call was asked.
+
+    Every table made from a ledger has them.
+    """
     return {"epoch": row["epoch"], "created_at": datetime.fromisoformat(row["created_at"])}

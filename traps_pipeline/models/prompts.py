@@ -1,4 +1,7 @@
-"""System prompts of the regimes and of the judges, verbatim from `assets/prompts` (docs/spec.md 3.3)."""
+"""Read system prompts of regimes and judges, verbatim from `assets/prompts`.
+
+See docs/spec.md 3.3.
+"""
 
 from __future__ import annotations
 
@@ -33,25 +36,36 @@ def prompt(name: str) -> str:
 
 @cache
 def system_prompt(regime: str, dataset: str = "") -> str:
-    """Return the regime's system prompt, in a dataset that may vary it: its parts joined by one blank line."""
+    """Return the regime's system prompt.
+
+    A dataset may vary it. Its parts are joined by one blank line.
+    """
     varied = (_SCHEMA_PARTS[dataset],) if dataset in _SCHEMA_PARTS else ()
     return "\n\n".join(prompt(part) for part in (*BY_NAME[regime].texts, *varied))
 
 
 @cache
 def vqa_prompt(name: str) -> str:
-    """Return the system prompt under which hidden states are extracted, for one of VQA_PROMPTS (docs/spec.md 7.1)."""
+    """Return the system prompt under which hidden states are extracted.
+
+    name: one of VQA_PROMPTS (docs/spec.md 7.1).
+    """
     return "\n\n".join(prompt(part) for part in BY_NAME[name].states)
 
 
 def prompt_version(regime: str, datasets: Iterable[str] = ()) -> str:
-    """Return the version of a regime's system prompt, and of its variations in those datasets that have one."""
+    """Return the version of a regime's system prompt.
+
+    Its variations in those datasets that have one count, too.
+    """
     varied = [system_prompt(regime, dataset) for dataset in sorted({*datasets} & {*_SCHEMA_PARTS})]
     return digest([system_prompt(regime), *varied] if varied else system_prompt(regime))[:16]
 
 
 def states_prompt(system: str, name: str) -> str:
-    """Return the system prompt for hidden states: the VQA prompt of that name, or the benchmark's own.
+    """Return the system prompt for hidden states.
+
+    It is the VQA prompt of that name, or the benchmark's own.
 
     system: `benchmark` for the latter.
     """

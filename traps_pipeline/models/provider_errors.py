@@ -1,4 +1,6 @@
-"""Read a provider's error object, with whatever HTTP status it comes, and its requested waiting time.
+"""Read a provider's error object, and its requested waiting time.
+
+It may come with any HTTP status.
 
 One reader serves OpenAI, Anthropic, Gemini and the proxies and servers that copy them.
 """
@@ -58,11 +60,16 @@ class ProviderError:
     @property
     def is_filtered(self) -> bool:
         """Whether a filter, a policy or a moderation refused the content."""
-        return any(_FILTERED.search(word) for word in self.words) or any("flagged_input" in one for one in self.details)
+        return any(_FILTERED.search(word) for word in self.words) or any(
+            "flagged_input" in detail for detail in self.details
+        )
 
     @property
     def is_about_key(self) -> bool:
-        """Whether a 401 or 403 with it is about the key, which is also assumed without words."""
+        """Whether a 401 or 403 with it is about the key.
+
+        This is also assumed without words.
+        """
         text = " ".join((self.message, *self.words)).replace("_", " ")
         return not text.strip() or bool(_ABOUT_KEY.search(text))
 
@@ -95,7 +102,10 @@ def read_error(content: bytes | None) -> ProviderError | None:
 
 
 def _is_flat(body: Mapping[str, Any]) -> bool:
-    """Return whether a body itself is an error object: a message with a code, and no field of an answer."""
+    """Return whether a body itself is an error object.
+
+    It then has a message with a code, and no field of an answer.
+    """
     return (
         isinstance(body.get("message"), str)
         and "code" in body
@@ -113,9 +123,9 @@ def _read(error: Mapping[str, Any]) -> ProviderError:
     message = error.get("message") or error.get("detail")
     inner = error.get("innererror"), error.get("metadata")
     listed = error.get("details")
-    others = listed if isinstance(listed, list) else []
-    details = tuple(one for one in (*inner, *others) if isinstance(one, Mapping))
-    words = [word for one in (error, *details) for word in _words(one)]
+    listed_details = listed if isinstance(listed, list) else []
+    details = tuple(detail for detail in (*inner, *listed_details) if isinstance(detail, Mapping))
+    words = [word for detail in (error, *details) for word in _words(detail)]
     return ProviderError(message if isinstance(message, str) else "", tuple(words), _status(error), details)
 
 
@@ -150,7 +160,7 @@ def retry_after_s(headers: Mapping[str, str], error: ProviderError | None = None
         return milliseconds / 1000
     delay_s = _seconds(named.get("retry-after"), now)
     if delay_s is None and error is not None:
-        delays = [_seconds(one.get("retryDelay"), now) for one in error.details]
+        delays = [_seconds(detail.get("retryDelay"), now) for detail in error.details]
         delay_s = next((delay for delay in delays if delay is not None), None)
     return _reset_s(named, now) if delay_s is None else delay_s
 
@@ -159,19 +169,22 @@ def _reset_s(named: Mapping[str, str], now: float) -> float | None:
     waits = []
     for name, value in named.items():
         if "ratelimit-remaining-" in name:
-            other = name.replace("-remaining-", "-reset-")
+            reset_name = name.replace("-remaining-", "-reset-")
         elif "ratelimit" in name and name.endswith("-remaining"):
-            other = name.removesuffix("-remaining") + "-reset"
+            reset_name = name.removesuffix("-remaining") + "-reset"
         else:
             continue
-        wait = _seconds(named.get(other), now)
+        wait = _seconds(named.get(reset_name), now)
         if value == "0" and wait is not None:
             waits.append(wait)
     return max(waits, default=None)
 
 
 def _seconds(value: Any, now: float) -> float | None:
-    """Return the seconds from a number, an amount with units ("1m30s") or a date; None for anything else."""
+    """Return the seconds from a number, an amount with units or a date.
+
+    "1m30s" has units. None for anything else.
+    """
     text = str(value).strip() if isinstance(value, str | int | float) else ""
     try:
         number = float(text)

@@ -1,4 +1,6 @@
-"""Interpret a ledger row: an answer, or a text that is none (docs/models.md, "Broken is not modest").
+"""Interpret a ledger row: an answer, or a text that is none.
+
+See docs/models.md, "Broken is not modest".
 
 The ledger keeps what a provider sent; the responses table comes from this interpretation, so that improving it asks
 nothing again. A text that is no answer has an outcome of its own and reaches no judge, who would take it for modesty.
@@ -89,12 +91,12 @@ def read_answer(
         return Reading("degenerate", None, reasoning, is_json, why)
     if why := degenerate(text):
         return Reading("degenerate", None, reasoning, is_json, why)
-    if is_cut_off and not _states_its_answer(text):
+    if is_cut_off and not _has_final_answer(text):
         return Reading("truncated", None, reasoning, is_json, "cut off at the limit of tokens before a final answer")
     return Reading(JUDGED[0], text, reasoning, is_json)
 
 
-def _states_its_answer(text: str) -> bool:
+def _has_final_answer(text: str) -> bool:
     """Return whether a truncated text contains a final answer.
 
     That is the complete field of its object, or an answer announced before the object. The object's reason announces
@@ -106,7 +108,7 @@ def _states_its_answer(text: str) -> bool:
 
 
 def _whole_fields(text: str) -> dict[str, Any]:
-    """Return the fields of a possibly truncated object, up to the first incomplete one."""
+    """Return a possibly truncated object's fields up to the first incomplete one."""
     fields, place = dict[str, Any](), 1
     try:
         while True:
@@ -123,7 +125,10 @@ def _whole_fields(text: str) -> dict[str, Any]:
 
 
 def _skip(text: str, place: int, sign: str = "") -> int:
-    """Return the place after white space, and after a sign and the white space after it. Raises ValueError."""
+    """Return the place after white space, or after a sign and white space.
+
+    Raises ValueError.
+    """
     place = len(text) - len(text[place:].lstrip())
     if not text.startswith(sign, place):
         raise ValueError(f"{sign!r} is not there")
@@ -131,7 +136,9 @@ def _skip(text: str, place: int, sign: str = "") -> int:
 
 
 def degenerate(text: str) -> str | None:
-    """Return why a text says nothing: it has no letter and no digit, or repeats itself; None if it says something.
+    """Return why a text says nothing; None if it says something.
+
+    It has no letter and no digit, or repeats itself.
 
     A text repeats itself if a unit of at most 40 words occurs at least six times in a row at its end and makes up at
     least half of its words, or if 30 characters or more are of at most two kinds.
@@ -144,10 +151,10 @@ def degenerate(text: str) -> str | None:
         return "repeats a character"
     if len(words) >= _LEAST_WORDS:
         for unit in range(1, _LONGEST_UNIT + 1):
-            same = 0
-            while same < len(words) - unit and words[-1 - same] == words[-1 - same - unit]:
-                same += 1
-            repeats, share = same // unit + 1, (same + unit) / len(words)
+            repeated = 0
+            while repeated < len(words) - unit and words[-1 - repeated] == words[-1 - repeated - unit]:
+                repeated += 1
+            repeats, share = repeated // unit + 1, (repeated + unit) / len(words)
             if repeats >= _LEAST_REPEATS and share >= _LEAST_SHARE:
                 return "repeats itself"
     return None

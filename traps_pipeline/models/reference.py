@@ -1,4 +1,6 @@
-"""Reference models: keyless strategies that take the same path as a paid model (docs/spec.md 5.3).
+"""Answer by keyless strategies that take the path of a paid model.
+
+See docs/spec.md 5.3.
 
 Only they see a request's `secret` (side, ground truth, labels). Their random choices are digests of the request, so a
 crash and a second run give the same answers.
@@ -27,7 +29,7 @@ Strategy = Callable[[Request], str | None]  # returns a label, or None for an ab
 
 
 def uniform(request: Request, purpose: str) -> float:
-    """Return a number in [0, 1) that depends on the request's key and the purpose alone."""
+    """Return a number in [0, 1) from the request's key and the purpose alone."""
     return int(digest([request.key, purpose])[:13], 16) / 16**13
 
 
@@ -113,7 +115,10 @@ def _belief(answer: str | None, request: Request) -> dict[str, float]:
 
 
 class ReferenceBackend:
-    """Plays one strategy. With a `faults` parameter it also misbehaves like a bad provider (model `flaky`)."""
+    """A player of one strategy.
+
+    With a `faults` parameter it also misbehaves like a bad provider (model `flaky`).
+    """
 
     def __init__(self) -> None:
         self._attempts: Counter[str] = Counter()
@@ -136,7 +141,10 @@ class ReferenceBackend:
         )
 
     def _misfortune(self, request: Request) -> Outcome | None:
-        """Return a simulated failure of this request by the `faults` shares; None for an answer."""
+        """Return a simulated failure of this request by the `faults` shares.
+
+        None for an answer.
+        """
         faults: Mapping[str, Any] = request.params.get("faults", {})
         if not faults:
             return None

@@ -1,4 +1,4 @@
-"""The registry of models and accounts (`assets/models.yaml`). To add a model, add an entry.
+"""Register models and accounts (`assets/models.yaml`); to add one, add an entry.
 
 Judges (`assets/judges.yaml`) are entries of the same form.
 """
@@ -62,7 +62,7 @@ class Limits(BaseModel):
 
 
 class Account(BaseModel):
-    """The shared settings of calls: the key's variable, the address, calls and tokens per minute."""
+    """The settings that calls share: key variable, address, calls and tokens a minute."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     key: Variable | None = Field(default=None, description="environment variable of the key")
@@ -80,7 +80,7 @@ class Account(BaseModel):
         return self
 
     def secret(self) -> str | None:
-        """Return the key from the environment; None if the account needs none. Raises TrapsError."""
+        """Return the key from the environment; None if unneeded; may raise TrapsError."""
         return read_key(self.key) if self.key is not None else None
 
 
@@ -160,7 +160,7 @@ class Entry(BaseModel):
 
     @property
     def endpoint(self) -> str:
-        """The endpoint in the ledger key: litellm's name, or the kind of backend if there is none."""
+        """The endpoint in the ledger key: litellm's name, or the kind of backend."""
         return self.provider_id or self.backend
 
     @property
@@ -169,7 +169,7 @@ class Entry(BaseModel):
         return int(self.params.get("max_tokens") or self.params.get("max_completion_tokens") or 0)
 
     def protocol(self) -> Protocol:
-        """Return the protocol's parameters for such a participant: parameter to its names and its value."""
+        """Return the protocol's parameters for such a participant, with names and values."""
         return PROTOCOL
 
     def _check_waivers(self, protocol: Protocol) -> None:
@@ -208,7 +208,7 @@ class ModelEntry(Entry):
     @model_validator(mode="before")
     @classmethod
     def _local_models_take_their_time(cls, data: Any) -> Any:
-        """Give local requests more time: each waits for the batch before its own, and giving up wastes its answer."""
+        """Give local requests more time, since each waits for the batch before its own."""
         if isinstance(data, dict) and data.get("backend") == LOCAL and isinstance(data.get("limits", {}), dict):
             return data | {"limits": {"timeout_s": LOCAL_TIMEOUT_S} | data.get("limits", {})}
         return data
@@ -248,11 +248,11 @@ class ModelEntry(Entry):
             raise ValueError("device, mechanism, size: only backend local has them")
 
     def local_params(self) -> LocalParams:
-        """Return the validated `params` of backend local. Raises pydantic's ValidationError."""
+        """Return the validated `params` of backend local, or raise ValidationError."""
         return LocalParams.model_validate(self.params)
 
     def inside_params(self) -> LocalParams:
-        """Return the parameters for mechanistic analyses: those of `params`, or as `mechanism` overrides them."""
+        """Return the parameters for mechanistic analyses: `params` with their overrides."""
         params = self.local_params()
         return self.mechanism.inside(params) if self.mechanism else params
 
@@ -267,7 +267,7 @@ _Entry = TypeVar("_Entry", bound=Entry)
 
 
 def read_entries(path: Path, key: str, kind: type[_Entry]) -> dict[str, _Entry]:
-    """Return entries of a registry file by id, in file order. Raises TrapsError naming entry and field."""
+    """Return a file's entries by id, in file order; TrapsError names entry and field."""
     data = read_yaml(path)
     entries = data.get(key) if isinstance(data, dict) else None
     if not isinstance(entries, list):
@@ -296,7 +296,7 @@ def _add(
 
 
 def with_own(entries: dict[str, _Entry], key: user_registry.Kind, kind: type[_Entry]) -> dict[str, _Entry]:
-    """Return a registry's entries, followed by those that the experiment and the workspace add."""
+    """Return a registry's entries, then those of the experiment and the workspace."""
     context = {"accounts": load_accounts()}
     for path, raw in user_registry.entries(key):
         _add(entries, kind, raw, path, f"own {key.rstrip('s')}", context)
@@ -306,7 +306,7 @@ def with_own(entries: dict[str, _Entry], key: user_registry.Kind, kind: type[_En
 @user_registry.cached_registry
 @cache
 def load_models(path: Path = MODELS_FILE) -> dict[str, ModelEntry]:
-    """Return models by id, in file order. Raises TrapsError naming entry and field."""
+    """Return models by id, in file order; TrapsError names entry and field."""
     models = read_entries(path, "models", ModelEntry)
     return with_own(models, "models", ModelEntry) if path == MODELS_FILE else models
 
@@ -314,7 +314,7 @@ def load_models(path: Path = MODELS_FILE) -> dict[str, ModelEntry]:
 @user_registry.cached_registry
 @cache
 def load_accounts(path: Path = MODELS_FILE) -> dict[str, Account]:
-    """Return accounts by name. Raises TrapsError naming account and field."""
+    """Return accounts by name; TrapsError names account and field."""
     data = read_yaml(path)
     accounts = data.get("accounts", {}) if isinstance(data, dict) else None
     if not isinstance(accounts, dict):
@@ -346,7 +346,7 @@ def effective_params(entry: ModelEntry, regime: str, dataset: str = "") -> dict[
 
 
 def answering_version(evaluation: Evaluation) -> str:
-    """Return the version of everything that decides a model's answers under a regime besides the prompt."""
+    """Return the version of what decides a model's answers besides the prompt."""
     entry = get_model(evaluation.model)
     parts: list[Any] = [effective_params(entry, evaluation.regime)]
     parts += [profile_digest(entry.media)] if entry.media else []
@@ -355,7 +355,7 @@ def answering_version(evaluation: Evaluation) -> str:
 
 
 def missing_keys(entries: Iterable[Entry]) -> dict[str, list[str]]:
-    """Return the environment variables of keys that are not set, each with the entries that need it."""
+    """Return the variables of keys that are not set, with the entries that need them."""
     accounts = load_accounts()
     missing: dict[str, list[str]] = {}
     for entry in entries:
@@ -366,7 +366,7 @@ def missing_keys(entries: Iterable[Entry]) -> dict[str, list[str]]:
 
 
 def get_model(model_id: str) -> ModelEntry:
-    """Return the entry of a model id. Raises TrapsError with similar ids."""
+    """Return the entry of a model id, or raise TrapsError with similar ids."""
     models = load_models()
     if model_id not in models:
         near = did_you_mean(model_id, models) or f"; {MODELS_FILE} has {len(models)}"
@@ -375,7 +375,7 @@ def get_model(model_id: str) -> ModelEntry:
 
 
 def is_reference(model_id: str) -> bool:
-    """Return whether a model is a reference model (strategy, observer or rule), which rule judges can judge.
+    """Return whether a model is a reference model, which rule judges can judge.
 
     On a board of several submissions it may be named model@submission.
     """

@@ -1,4 +1,4 @@
-"""The two values that every backend speaks: `Request -> Outcome`."""
+"""Define the two values that every backend speaks: `Request -> Outcome`."""
 
 from __future__ import annotations
 
@@ -47,7 +47,10 @@ class Request:
 
     @property
     def components(self) -> dict[str, Any]:
-        """The parts of the ledger key, by name, without code version, concurrency, time-out or API key."""
+        """The parts of the ledger key, by name.
+
+        Code version, concurrency, time-out and API key are not among them.
+        """
         parts: dict[str, Any] = {
             "participant": self.participant,
             "endpoint": self.endpoint,
@@ -67,7 +70,9 @@ class Request:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The result of a request. A failure is a kind, never a text: no error string ever reaches a judge.
+    """The result of a request.
+
+    A failure is a kind, never a text: no error string ever reaches a judge.
 
     finish_reason: as the provider sent it. client: library and version that built and sent the call. raw: the beginning
     of a malformed answer, for people. cost_usd: None if it is unknown. first_token: see `first_token.stored`.
@@ -96,7 +101,9 @@ class Outcome:
 
 
 class TransientError(Exception):
-    """A failure worth a retry: time-out, 408, 409, 429, 5xx, a cut connection, a malformed answer.
+    """A failure worth a retry.
+
+    Time-out, 408, 409, 429, 5xx, a cut connection, a malformed answer.
 
     billed: whether the provider may charge for it; cost_usd: the stated charge, if any, else the worst case counts;
     raw: see `Outcome`; why: what went wrong, or why a call was not sent, for people.

@@ -1,4 +1,4 @@
-"""JSON schemas of the objects that providers are asked for (structured output)."""
+"""Define JSON schemas of the objects asked of providers (structured output)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from typing import Any
 
 
 def structured_output(name: str, **properties: Any) -> dict[str, Any]:
-    """Return the `response_format` of an object with exactly these properties, all of them required.
+    """Return the `response_format` of an object with exactly these properties.
+
+    All of them are required.
 
     properties: the JSON schema of each.
     """

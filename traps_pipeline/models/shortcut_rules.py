@@ -1,4 +1,6 @@
-"""Shortcut rules: abstain by one cue, without understanding the void; the baseline that a model must beat.
+"""Abstain by one cue, without understanding the void.
+
+Such a rule is the baseline that a model must beat.
 
 A cue uses the clip or the question alone, never the record. Without its cue a rule gives the observer's answer, and if
 that has none the commonest answer of the sub-scenario: it abstains by its cue alone.
@@ -24,7 +26,7 @@ CUT_FRAMES = 24  # frames of the shortest control; each cut clip has fewer (docs
 
 
 @lru_cache(maxsize=100_000)
-def _occluder(media_digest: str, clip: Path) -> bool:
+def _has_occluder(media_digest: str, clip: Path) -> bool:
     from traps_pipeline.scenes.parts.vision import largest_board
     from traps_pipeline.video.encode import decode_first
 
@@ -32,22 +34,22 @@ def _occluder(media_digest: str, clip: Path) -> bool:
 
 
 @lru_cache(maxsize=100_000)
-def _cut(media_digest: str, clip: Path) -> bool:
+def _is_cut(media_digest: str, clip: Path) -> bool:
     from traps_pipeline.video.encode import count_frames
 
     return count_frames(clip) < CUT_FRAMES
 
 
-def names_no_choices(question: str) -> bool:
+def has_no_choices(question: str) -> bool:
     """Return whether a question offers no choice: it has no `or`."""
     return re.search(r"\bor\b", question) is None
 
 
 Cue = Callable[[str, Path, str], bool]  # digest of the clip, clip, question -> whether the rule abstains
 CUES: Mapping[str, Cue] = {
-    "occluder": lambda digest, clip, question: _occluder(digest, clip),
-    "length": lambda digest, clip, question: _cut(digest, clip),
-    "wording": lambda digest, clip, question: names_no_choices(question),
+    "occluder": lambda digest, clip, question: _has_occluder(digest, clip),
+    "length": lambda digest, clip, question: _is_cut(digest, clip),
+    "wording": lambda digest, clip, question: has_no_choices(question),
 }
 RULES: Mapping[str, tuple[str, ...]] = {**{name: (name,) for name in CUES}, "any": tuple(CUES)}  # the cues of each rule
 

@@ -1,4 +1,6 @@
-"""Pace calls to participants: connections that shrink on a 429, an account's rate limits, and a circuit breaker.
+"""Pace calls to participants.
+
+Connections that shrink on a 429, an account's rate limits, and a circuit breaker.
 
 None of it affects an answer.
 """
@@ -24,8 +26,9 @@ BURST_S = 2.0  # burst size, in seconds of the rate
 
 
 class Gate:
-    """The connection limit of one participant: halved on a 429 (once a second at most), raised after each round of
-    answers.
+    """The connection limit of one participant.
+
+    It is halved on a 429 (once a second at most), raised after each round of answers.
     """
 
     def __init__(self, most: int) -> None:
@@ -74,7 +77,9 @@ class Gate:
 
 
 class Meter:
-    """The rate limiter of one account, for calls and tokens per minute: two token buckets.
+    """The rate limiter of one account: two token buckets.
+
+    They limit calls and tokens per minute.
 
     sharers: the number of processes that use the account at this moment; each gets an equal part of the rate.
     """
@@ -99,7 +104,9 @@ class Meter:
         return float("inf") if rate is None else max(rate * BURST_S, least)
 
     async def admit(self, tokens: int, halted: Callable[[], bool] = lambda: False) -> None:
-        """Wait until one call with this number of tokens may be sent, or until calls are halted.
+        """Wait until one call with this many tokens may be sent.
+
+        Or until calls are halted.
 
         The bucket may go below zero: later calls wait longer.
         """
@@ -128,7 +135,10 @@ _stopped: list[dict[str, str]] = []  # one per active `remembering_stops`: parti
 
 @contextmanager
 def remembering_stops() -> Iterator[None]:
-    """Keep a stopped participant stopped within the block, for all later callers, with the same reason."""
+    """Keep a stopped participant stopped within the block.
+
+    All later callers get the same reason.
+    """
     _stopped.append({})
     try:
         yield
@@ -147,13 +157,18 @@ class Breaker:
         self._window: deque[bool] = deque(maxlen=ERROR_WINDOW)
 
     def check(self) -> None:
-        """Raise ParticipantStopped for a participant that was stopped before (`remembering_stops`)."""
+        """Raise ParticipantStopped for a participant that was stopped before.
+
+        See `remembering_stops`.
+        """
         for stopped in _stopped:
             if self._participant in stopped:
                 raise ParticipantStopped(stopped[self._participant])
 
     def no_connection(self, why: str = "") -> None:
-        """Raise ParticipantStopped after five consecutive unsent calls, the first of them some time ago.
+        """Raise ParticipantStopped after five consecutive unsent calls.
+
+        The first of them must be some time ago.
 
         A restarted server has that long. why: why the last one was not sent.
         """
@@ -200,7 +215,10 @@ class Breaker:
 
 
 def _refusal(outcome: Outcome) -> str:
-    """Return the kind of a provider's refusal (of the content, or of the call itself); empty if it is none."""
+    """Return the kind of a provider's refusal; empty if it is none.
+
+    Of the content, or of the call itself.
+    """
     if outcome.kind == "refused":
         return outcome.error or outcome.finish_reason or "refused"
     return (outcome.error or "") if outcome.kind == "error" and (outcome.error or "").startswith("http_") else ""

@@ -1,4 +1,4 @@
-"""The record of one attempt on the wire.
+"""Record one attempt on the wire.
 
 The transport (`models/wire.py`) writes it below the client libraries, which turn malformed answers into errors that
 look unbilled.
@@ -32,7 +32,7 @@ class Exchange:
     problem: str | None = None
 
     @property
-    def never_left(self) -> bool:
+    def is_unsent(self) -> bool:
         """Whether certainly no byte of the request reached a server."""
         return self.sent is False
 
@@ -41,13 +41,13 @@ class Exchange:
         """Whether a server reported success."""
         return self.status is not None and 200 <= self.status < 300
 
-    def may_be_billed(self, status: int, *, is_explained: bool) -> bool:
+    def is_billable(self, status: int, *, is_explained: bool) -> bool:
         """Return whether the provider may charge for an answer with a status.
 
         status: the one on the wire, or the one in the body that overrides it. is_explained: whether the answer is a
         provider's error object; a page of a proxy on the way says nothing about the provider.
         """
-        if self.never_left:
+        if self.is_unsent:
             return False
         if status in _GIVEN_UP:
             return True
@@ -59,7 +59,10 @@ WATCHED: ContextVar[Exchange | None] = ContextVar("watched", default=None)
 
 @contextmanager
 def watching() -> Iterator[Exchange]:
-    """Record the wire's traffic within the block, in the exchange that a caller already watches, or in a new one."""
+    """Record the wire's traffic within the block.
+
+    In the exchange that a caller already watches, or in a new one.
+    """
     if (outer := WATCHED.get()) is not None:
         yield outer
         return

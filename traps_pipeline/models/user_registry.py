@@ -1,4 +1,4 @@
-"""User-defined models, judges and panels, which need no change of a tracked file.
+"""Add users' models, judges and panels without changing a tracked file.
 
 They are defined in an experiment's YAML, and copied to `own.yaml` of the workspace in which it runs. An entry has the
 registry's fields and may be short: an address, and the form of clips that the server takes. The protocol supplies the
@@ -77,7 +77,10 @@ _clearers: list[Callable[[], None]] = []  # clear the caches of the registries
 
 
 def cached_registry(cached: Cached) -> Cached:
-    """Register a cached reader of a registry, whose cache is cleared when entries are added. A decorator."""
+    """Register a cached reader of a registry; decorates it.
+
+    Its cache is cleared when entries are added.
+    """
     _clearers.append(cached.cache_clear)  # pyright: ignore[reportAttributeAccessIssue] - of functools.cache
     return cached
 
@@ -89,7 +92,10 @@ def clear_caches() -> None:
 
 
 def add_entries(own: UserRegistry, path: Path) -> None:
-    """Add the entries of an experiment's file, for this process. path: the file, for errors."""
+    """Add the entries of an experiment's file, for this process.
+
+    path: the file, for errors.
+    """
     _overlay[:] = [(path, own)]
     clear_caches()
 
@@ -105,7 +111,10 @@ def save_entries(workspace: Workspace) -> None:
 
 
 def sources() -> list[tuple[Path, UserRegistry]]:
-    """Return all additions, each with its file: the workspace's, then the experiment's."""
+    """Return all additions, each with its file.
+
+    The workspace's, then the experiment's.
+    """
     path = Workspace.file_of(Workspace.default_place(), FILE) if os.environ.get(VARIABLE) else None
     return [*([(path, _read(path))] if path else []), *_overlay]
 
@@ -169,7 +178,10 @@ def _whole(raw: Mapping[str, Any], kind: Kind) -> dict[str, Any]:
 
 
 def _params(protocol: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the parameters to send: the protocol's and the entry's own, without nulls."""
+    """Return the parameters to send.
+
+    They are the protocol's and the entry's own, without nulls.
+    """
     replaced = {"max_tokens"} if "max_completion_tokens" in own else set[str]()  # the same limit
     params = {name: value for name, value in protocol.items() if name not in replaced}
     return {name: value for name, value in (params | {**own}).items() if value is not None}

@@ -1,4 +1,6 @@
-"""The only way out of this machine for calls: an httpx transport on aiohttp that records what was sent.
+"""Send calls out of this machine, in this one place.
+
+An httpx transport on aiohttp records what was sent.
 
 `use_in` makes litellm's clients use it on every route. Each attempt's `Exchange` records whether its request was sent,
 the status of the answer, and the answer's bytes. Loopback addresses bypass proxies, redirects are not followed, an
@@ -42,7 +44,10 @@ class _Body(aiohttp.BytesPayload):
         self._exchange = exchange
 
     async def write_with_length(self, writer: AbstractStreamWriter, content_length: int | None) -> None:
-        """Write headers and body, and record that bytes are sent unless the connection is closed."""
+        """Write headers and body, and record that bytes are sent.
+
+        Nothing is recorded if the connection is closed.
+        """
         transport = getattr(writer, "transport", None)
         if transport is None or transport.is_closing():
             raise aiohttp.ClientConnectionResetError("the connection was closed before the request was written")
@@ -112,8 +117,8 @@ class Wire(httpx.AsyncBaseTransport):
 
     def _session(self) -> aiohttp.ClientSession:
         loop = asyncio.get_running_loop()
-        for other in [each for each in self._sessions if each.is_closed()]:
-            _dispose(self._sessions.pop(other))
+        for session in [each for each in self._sessions if each.is_closed()]:
+            _dispose(self._sessions.pop(session))
         if loop not in self._sessions:
             connector = aiohttp.TCPConnector(limit=0, keepalive_timeout=KEEPALIVE_S, ttl_dns_cache=NAMES_KEPT_S)
             cookies = aiohttp.DummyCookieJar()
@@ -137,7 +142,10 @@ class Wire(httpx.AsyncBaseTransport):
 
 
 def _dispose(session: aiohttp.ClientSession) -> None:
-    """Close a session whose loop is closed, without waiting; otherwise aiohttp would report an open session."""
+    """Close a session whose loop is closed, without waiting.
+
+    Otherwise aiohttp would report an open session.
+    """
     with suppress(StopIteration):
         session.close().send(None)
 
@@ -154,7 +162,10 @@ async def _read(response: aiohttp.ClientResponse) -> bytes:
 
 
 def _decoded(content: bytes, encoding: str) -> bytes:
-    """Return a decompressed body. Raises ValueError if it is truncated, too large, or in another encoding."""
+    """Return a decompressed body.
+
+    Raises ValueError if it is truncated, too large, or in another encoding.
+    """
     if encoding.lower() == "identity":
         return content
     if encoding.lower() not in ("gzip", "x-gzip", "deflate"):

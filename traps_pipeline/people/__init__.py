@@ -1,1 +1,4 @@
-"""People's labels: samples to label, people's scores, scores corrected by labels, and validation of judges."""
+"""Work with people's labels.
+
+Samples to label, people's scores, scores corrected by labels, and validation of judges.
+"""

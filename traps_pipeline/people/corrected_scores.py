@@ -1,4 +1,6 @@
-"""Correct scores for the panel's errors, which people's labels of judged answers reveal (docs/people.md).
+"""Correct scores for the panel's errors (docs/people.md).
+
+People's labels of judged answers reveal them.
 
 A panel with sensitivity Se and specificity Sp against people says yes to p = Se t + (1 - Sp) (1 - t) of answers of
 which a share t is yes. Solved for t (Rogan and Gladen 1978), this turns a judged share into a corrected one. Se, Sp and
@@ -43,7 +45,10 @@ Errors = Mapping[TaskName, np.ndarray]  # by task: the ends of sensitivity and s
 def panel_errors(
     labels: pd.DataFrame, verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED
 ) -> pd.DataFrame:
-    """Return PANEL_ERRORS rows from HUMAN_LABELS and the panel's VERDICTS rows; none without labels."""
+    """Return PANEL_ERRORS rows from HUMAN_LABELS and the panel's VERDICTS rows.
+
+    None without labels.
+    """
     rows = []
     if _is_labelled(labels):
         resampling = _drawn(verdicts, resamples, seed)
@@ -57,7 +62,7 @@ def panel_errors(
 def corrected(
     labels: pd.DataFrame, verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED
 ) -> pd.DataFrame:
-    """Return CORRECTED rows: every model under every regime, as judged and as corrected.
+    """Return CORRECTED rows: every model and regime, as judged and as corrected.
 
     Both come from the same resamples as the leaderboard's. There are none unless people labelled answers for both
     tasks, since PECS needs both.
@@ -111,7 +116,10 @@ def _drawn(verdicts: pd.DataFrame, resamples: int, seed: int) -> Resampling:
 
 
 def _errors(labels: pd.DataFrame, resampling: Resampling) -> Errors:
-    """Return the panel's sensitivity and specificity by labelled task and draw; NaN if people never say yes, or no."""
+    """Return the panel's sensitivity and specificity by labelled task and draw.
+
+    NaN if people never say yes, or no.
+    """
     errors: dict[TaskName, np.ndarray] = {}
     for task in ABOUT_ANSWERS:
         answers = truths(labels, task).dropna(subset=["truth"])
@@ -169,7 +177,10 @@ def _entry(group: pd.DataFrame, named: str, resampling: Resampling, errors: Erro
 
 
 def _runs(group: pd.DataFrame, dataset: str) -> int:
-    """Return the number of runs behind the row of a dataset; for `overall` those with all four datasets."""
+    """Return the number of runs behind the row of a dataset.
+
+    For `overall` those with all four datasets count.
+    """
     if dataset != "overall":
         return len(set(group["run"][group["dataset"] == dataset]))
     return sum(len(set(rows["dataset"])) == len(DATASETS) for _, rows in group.groupby("run"))

@@ -1,4 +1,7 @@
-"""The tables of people's labels and of their agreement, and the version of the underlying files."""
+"""Define the tables of people's labels and of their agreement.
+
+The version of the underlying files is computed here, too.
+"""
 
 from dataclasses import dataclass
 from datetime import datetime
@@ -19,7 +22,10 @@ Axis = Annotated[bool | None, "an axis of confabulation; null in other tasks"]
 
 @dataclass(frozen=True, kw_only=True)
 class HumanLabelRow:
-    """One person's label of one clip or answer that is still in the study; a later label of the same replaces it."""
+    """One person's label of one clip or answer that is still in the study.
+
+    A later label of the same replaces it.
+    """
 
     task: PeopleTask
     unit: Annotated[str, "digest of what was shown; it changes with clip, question and answer"]
@@ -51,7 +57,10 @@ HUMAN_LABELS = Table("human_labels", HumanLabelRow, partition_by=(), key=("task"
 
 @dataclass(frozen=True, kw_only=True)
 class HumanAgreementRow:
-    """How far people agree on one decision of one task; no row means that nobody labelled."""
+    """How far people agree on one decision of one task.
+
+    A missing row means that nobody labelled.
+    """
 
     task: PeopleTask
     decision: Annotated[str, "abstained (of clips: cannot be known), correct, or an axis of confabulation"]

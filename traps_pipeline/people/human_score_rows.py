@@ -1,4 +1,7 @@
-"""The tables of figures from people's labels: the human row, the panel's errors, judge-corrected scores."""
+"""Define the tables of scores from people's labels.
+
+They are the human row, the panel's errors, and judge-corrected scores.
+"""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -15,7 +18,10 @@ Judged = Annotated[float | None, "as the panel decided, mean over runs"]
 @dataclass(frozen=True, kw_only=True)
 @with_neighbours
 class HumanRow:
-    """People on one dataset, or overall (equal-weight mean over the four); no row means that nobody labelled."""
+    """People on one dataset, or overall (equal-weight mean over the four).
+
+    A missing row means that nobody labelled.
+    """
 
     dataset: DatasetOrOverall
     n_people: Annotated[int, "who labelled clips"]
@@ -61,7 +67,10 @@ PANEL_ERRORS = Table("panel_errors", PanelErrorsRow, partition_by=(), key=("task
 @dataclass(frozen=True, kw_only=True)
 @with_neighbours
 class CorrectedRow:
-    """A model under a regime on one dataset, or overall, as judged and corrected for the panel's errors."""
+    """A model under a regime, as judged and corrected for the panel's errors.
+
+    On one dataset, or overall.
+    """
 
     model: shared.Model
     regime: shared.Regime

@@ -1,4 +1,6 @@
-"""The human row: people's scores on the clips that models are asked about (docs/people.md).
+"""Score people on the clips that models are asked about (docs/people.md).
+
+This is the human row.
 
 Labels of all people are pooled. A label is weighted by the size of its stratum over the number of its labels, so that
 clips chosen because the judges are split about them count no more than they do in the study.
@@ -30,12 +32,17 @@ from traps_pipeline.scoring.metrics import COUNTS, decision_counts, joined_versi
 
 
 def stratum_weights(labels: pd.DataFrame) -> np.ndarray:
-    """Return the weight of each label, (labels,): its stratum's size over the number of its labels."""
+    """Return the weight of each label, (labels,).
+
+    It is its stratum's size over the number of its labels.
+    """
     return (labels["stratum_size"] / labels.groupby("stratum")["stratum"].transform("size")).to_numpy(float)
 
 
 def human_row(labels: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED) -> pd.DataFrame:
-    """Return HUMAN_ROW rows from HUMAN_LABELS rows: figures of all labels of clips, with intervals over scenarios.
+    """Return HUMAN_ROW rows from HUMAN_LABELS rows.
+
+    They are scores of all labels of clips, with intervals over scenarios.
 
     Without a label of a clip there is no row; overall is null until all four datasets have figures.
     """
@@ -71,6 +78,9 @@ def _row(dataset: str, figures: np.ndarray, clips: pd.DataFrame) -> dict[str, An
 
 
 def with_intervals(names: Sequence[str], draws: np.ndarray, suffix: str = "") -> Mapping[str, float]:
-    """Return each figure with its interval, as columns, from draws (2, names, 1 + resamples), observed ones first."""
+    """Return each score with its interval, as columns.
+
+    draws: (2, names, 1 + resamples), observed ones first.
+    """
     columns = [with_interval(f"{name}{suffix}", draws[:, k], limits_of(name)) for k, name in enumerate(names)]
     return {name: value for of_figure in columns for name, value in of_figure.items()}

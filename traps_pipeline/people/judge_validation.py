@@ -1,4 +1,6 @@
-"""Validate the confabulation judge against two blind annotators (docs/spec.md 6.3).
+"""Validate the confabulation judge against two blind annotators.
+
+See docs/spec.md 6.3.
 
 `annotation_sheet` writes the annotators' material: question, void kind, answer, and the trace if the judge saw it; a
 sample id replaces model and item. Their labels come back as one CSV file with a line per annotator and failure.
@@ -39,7 +41,10 @@ _SHOWN = 5
 
 @dataclass(frozen=True)
 class HumanLabels:
-    """Two annotators' labels. annotators: sorted by name. sample_ids: failures. labels: (2, failures, axes)."""
+    """Two annotators' labels.
+
+    annotators: sorted by name. sample_ids: failures. labels: (2, failures, axes).
+    """
 
     annotators: tuple[str, str]
     sample_ids: tuple[str, ...]
@@ -50,7 +55,9 @@ class HumanLabels:
 
 
 def sheet_rows(workspace: Workspace) -> list[dict[str, str]]:
-    """Return an annotator's material for each failure, in an order that reveals nothing.
+    """Return an annotator's material for each failure.
+
+    Its order reveals nothing.
 
     Columns sample_id, question, why_unanswerable, reasoning_trace (empty without one) and response. Raises TrapsError
     if no failure of the models to validate was labelled, or if a failure's answer has been replaced.
@@ -65,7 +72,10 @@ def sheet_rows(workspace: Workspace) -> list[dict[str, str]]:
 
 
 def annotation_sheet(workspace: Workspace) -> list[dict[str, str]]:
-    """Return the rows that an annotator fills in: SHEET_COLUMNS of `sheet_rows`, safe for a spreadsheet."""
+    """Return the rows that an annotator fills in, safe for a spreadsheet.
+
+    They are SHEET_COLUMNS of `sheet_rows`.
+    """
     empty = dict.fromkeys(LABEL_COLUMNS, "")
     return [
         empty | {name: str(no_formula(text)) for name, text in row.items()} | {"sample_id": row["sample_id"]}
@@ -100,7 +110,10 @@ def _row_of(frame: pd.DataFrame, item_id: str) -> dict[Any, Any]:
 
 
 def write_sheet(rows: Sequence[Mapping[str, str]], path: Path, columns: Sequence[str] = SHEET_COLUMNS) -> None:
-    """Write a sheet, or only LABEL_COLUMNS, as CSV. Raises TrapsError if the file exists, since it may hold labels."""
+    """Write a sheet, or only LABEL_COLUMNS, as CSV.
+
+    Raises TrapsError if the file exists, since it may hold labels.
+    """
     if path.exists():
         raise TrapsError(f"{path} exists already and may hold labels; give another name, or delete it")
     with path.open("w", encoding="utf-8", newline="") as stream:
@@ -110,7 +123,9 @@ def write_sheet(rows: Sequence[Mapping[str, str]], path: Path, columns: Sequence
 
 
 def read_labels(path: Path, known: Sequence[str]) -> HumanLabels:
-    """Return two annotators' labels from a CSV file (LABEL_COLUMNS; true/false, yes/no or 1/0).
+    """Return two annotators' labels from a CSV file.
+
+    It has LABEL_COLUMNS; values are true/false, yes/no or 1/0.
 
     known: sample ids that the judge has labelled. Raises TrapsError naming the lines and columns that are wrong.
     """
@@ -135,7 +150,10 @@ def read_labels(path: Path, known: Sequence[str]) -> HumanLabels:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
-    """Yield the rows of a CSV file with their line numbers, every LABEL_COLUMNS value a stripped text."""
+    """Yield the rows of a CSV file with their line numbers.
+
+    Every LABEL_COLUMNS value is a stripped text.
+    """
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:
             reader = csv.DictReader(stream)
@@ -155,14 +173,14 @@ def _paired(path: Path, by_sample: Mapping[tuple[str, str], tuple[int, list[bool
         raise TrapsError(
             f"{path}: has {len(names)} annotators ({', '.join(names)[:80] or 'none'}); it needs exactly two"
         )
-    one, other = names
+    first, second = names
     samples = sorted({sample for _, sample in by_sample})
     alone = [
-        (a, s, line) for (a, s), (line, _) in by_sample.items() if (other if a == one else one, s) not in by_sample
+        (a, s, line) for (a, s), (line, _) in by_sample.items() if (second if a == first else first, s) not in by_sample
     ]
     _refuse([f"{path}:{line}: only {a:.40} has labelled {s:.40}; both annotators must" for a, s, line in alone])
     labels = np.array([[by_sample[name, sample][1] for sample in samples] for name in names], bool)
-    return HumanLabels((one, other), tuple(samples), labels)
+    return HumanLabels((first, second), tuple(samples), labels)
 
 
 def _refuse(wrong: Sequence[str]) -> None:
@@ -175,7 +193,10 @@ def _refuse(wrong: Sequence[str]) -> None:
 
 
 def validate(workspace: Workspace, path: Path) -> pd.DataFrame:
-    """Return JUDGE_VALIDATION rows from a label file, and write them. Raises TrapsError, also without failures."""
+    """Return JUDGE_VALIDATION rows from a label file, and write them.
+
+    Raises TrapsError, also without failures.
+    """
     judged = _judged(workspace).set_index("sample_id")
     if judged.empty:
         raise TrapsError(f"{workspace.root}: the study has no labelled failure to compare with; run it first")
@@ -194,7 +215,9 @@ def _judged(workspace: Workspace) -> pd.DataFrame:
 
 
 def compare(judge: np.ndarray, human: HumanLabels) -> pd.DataFrame:
-    """Return JUDGE_VALIDATION rows that compare the judge's labels, (failures, axes) of bool, with both annotators'.
+    """Return JUDGE_VALIDATION rows that compare the judge with both annotators.
+
+    judge: its labels, (failures, axes) of bool.
 
     Pooled labels are both annotators' labels side by side, without a consensus: 2 x failures per axis.
     """
@@ -216,20 +239,20 @@ def _shared(axis: str, failures: int, human: HumanLabels) -> dict[str, Any]:
 
 def _axis_row(axis: str, judge: np.ndarray, labels: np.ndarray, human: HumanLabels) -> dict[str, Any]:
     """Return the row of an axis. judge: (failures,); labels: (2, failures)."""
-    one, other = labels
+    first, second = labels
     hits = int((labels & judge).sum())
     precision, recall = _share(hits, 2 * int(judge.sum())), _share(hits, int(labels.sum()))
     defined = judge.any() and labels.any()  # whether both precision and recall are defined
-    kappa, low, high = _kappa(one, other)
+    kappa, low, high = _kappa(first, second)
     return _shared(axis, len(judge), human) | {
         "n_labels": labels.size,
         "accuracy": float(np.mean(labels == judge)),
         "precision": precision,
         "recall": recall,
         "f1": _share(2 * hits, 2 * int(judge.sum()) + int(labels.sum())) if defined else np.nan,
-        "accuracy_a": float(np.mean(one == judge)),
-        "accuracy_b": float(np.mean(other == judge)),
-        "human_agreement": float(np.mean(one == other)),
+        "accuracy_a": float(np.mean(first == judge)),
+        "accuracy_b": float(np.mean(second == judge)),
+        "human_agreement": float(np.mean(first == second)),
         "human_kappa": kappa,
         "human_kappa_low": low,
         "human_kappa_high": high,
@@ -238,12 +261,17 @@ def _axis_row(axis: str, judge: np.ndarray, labels: np.ndarray, human: HumanLabe
 
 
 def is_degenerate(one: np.ndarray, other: np.ndarray) -> bool:
-    """Return whether one class has at most 2 % of either annotator's labels, so that kappa is meaningless."""
+    """Return whether kappa is meaningless.
+
+    One class then has at most 2 % of either annotator's labels.
+    """
     return any(min(np.mean(labels), 1 - np.mean(labels)) <= DEGENERATE_SHARE + 1e-12 for labels in (one, other))
 
 
 def _kappa(one: np.ndarray, other: np.ndarray) -> tuple[float, float, float]:
-    """Return Cohen's kappa and its 95 % interval, a Bayesian bootstrap over failures; NaN if degenerate.
+    """Return Cohen's kappa and its 95 % interval; NaN if it is degenerate.
+
+    The interval is a Bayesian bootstrap over failures.
 
     One failure is unseen: at the lower end the annotators differ on it, at the upper end they agree. So the interval
     keeps a width even if they always agree.

@@ -1,1 +1,1 @@
-"""The pipeline: declare stages, compute which partitions a study wants and which are stale, and materialize them."""
+"""Declare stages, compute which partitions are wanted or stale, and build them."""

@@ -40,13 +40,19 @@ class WorkspaceResource(dg.ConfigurableResource):
         self._steps.close()
 
     def open(self) -> Workspace:
-        """Return the workspace. Raises TrapsError naming the remedy where there is none."""
+        """Return the workspace.
+
+        Raises TrapsError naming the remedy where there is none.
+        """
         return Workspace.open()
 
 
 def assets_of(graph: Graph) -> list[dg.AssetsDefinition]:
     """Return an asset for each stage, and an observable one for each source."""
-    return [_asset(graph, one) if isinstance(one, Stage) else _observable(one) for one in graph.declared.values()]
+    return [
+        _asset(graph, declaration) if isinstance(declaration, Stage) else _observable(declaration)
+        for declaration in graph.declared.values()
+    ]
 
 
 def _observable(source: Source) -> dg.AssetsDefinition:
@@ -99,7 +105,7 @@ def _asset(graph: Graph, stage: Stage) -> dg.AssetsDefinition:
 
 
 def _contract(table: Table) -> dict[str, Any]:
-    """Return a table's columns and the meaning of a row, in the form that Dagster shows."""
+    """Return a table's columns and the meaning of a row, as Dagster shows them."""
     columns = [
         dg.TableColumn(c.name, c.type_name, c.doc, dg.TableColumnConstraints(nullable=c.nullable))
         for c in table.columns

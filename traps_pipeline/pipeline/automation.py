@@ -1,4 +1,4 @@
-"""Dagster jobs for parts of the study, and sensors that follow corrections.
+"""Define Dagster jobs for parts of the study, and sensors that follow corrections.
 
 A job materializes the missing or stale partitions of its stages that the study's experiments want. Dagster cannot run
 assets of different partitions in one job, so a job whose stages have several is one op, which starts a run for each
@@ -55,7 +55,9 @@ INTERVAL_S = 30
 
 
 def reread_sources() -> None:
-    """Clear the caches of specs, corrections, prompts and registries, so that a long-lived server sees edits.
+    """Clear the caches of specs, corrections, prompts and registries.
+
+    A long-lived server then sees edits.
 
     The set of evaluations stays: partition keys are built from it when the code location is loaded.
     """
@@ -65,7 +67,10 @@ def reread_sources() -> None:
 
 
 def jobs() -> list[Any]:
-    """Return a job for each part of the graph and one for all of it. Call it after the stages are declared."""
+    """Return a job for each part of the graph and one for all of it.
+
+    Call it after the stages are declared.
+    """
     stages = the_graph().stages
     parts = {name: [s for s in stages if s.group in groups] for name, groups in JOB_GROUPS.items()}
     every = _job(EVERYTHING, "All that the study asks, from scenarios to the report.", stages)
@@ -102,7 +107,9 @@ def _stages(costs: bool) -> list[Stage]:
 
 
 def report_unseen(instance: dg.DagsterInstance, workspace: Workspace, lineage: Lineage, reported: set[str]) -> None:
-    """Fail the check `current` for altered or lost files, and for stale assets without partitions.
+    """Fail the check `current` for altered or lost files.
+
+    It fails for stale assets without partitions, too.
 
     reported: the failures that this process has reported before.
     """
@@ -138,19 +145,22 @@ def _report(instance: dg.DagsterInstance, stage: str, key: str | None, wrong: st
 def _requests(
     instance: dg.DagsterInstance, workspace: Workspace, lineage: Lineage, *, costs: bool
 ) -> list[dg.RunRequest]:
-    """Return runs of what is outdated and can be rebuilt now; dependents are requested at a later tick."""
+    """Return runs of what is outdated and can be rebuilt now.
+
+    Dependents are requested at a later tick.
+    """
     graph, requests = the_graph(), list[dg.RunRequest]()
     for block in graph.blocks([stage.name for stage in _stages(costs)]):
         stages, keys = pending_in(block, lineage, History(instance, graph), StudyPartitions(workspace), existing=True)
         nodes = [(stage.name, key) for stage in stages for key in keys]
         # Try each outdated partition once per set of inputs: if it stays outdated, it fails for its own reasons.
         states = [[name_of(node), lineage.made_at(*node), lineage.inputs(*node)] for node in nodes]
-        for one in batches(block[0].scheme, keys):
+        for batch in batches(block[0].scheme, keys):
             requests.append(
                 dg.RunRequest(
-                    digest([*one, states])[:32],
-                    partition_key=one[0] if one[0] == one[1] else None,
-                    tags={MAKE_TAG: OUTDATED, "outdated": ", ".join(map(name_of, nodes[:8])), **range_tags(one)},
+                    digest([*batch, states])[:32],
+                    partition_key=batch[0] if batch[0] == batch[1] else None,
+                    tags={MAKE_TAG: OUTDATED, "outdated": ", ".join(map(name_of, nodes[:8])), **range_tags(batch)},
                     asset_selection=[asset_key(stage.name) for stage in stages],
                 )
             )
@@ -184,7 +194,10 @@ def _sensor(name: str, doc: str, *, costs: bool) -> dg.SensorDefinition:
 
 
 def sensors() -> list[dg.SensorDefinition]:
-    """Return the sensors that follow corrections. Call it after the stages are declared."""
+    """Return the sensors that follow corrections.
+
+    Call it after the stages are declared.
+    """
     return [
         _sensor(
             "follow_corrections",

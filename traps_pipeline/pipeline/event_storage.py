@@ -1,4 +1,6 @@
-"""Dagster's SQLite storage with persistent connections: an event costs a quarter of the time.
+"""Keep connections of Dagster's SQLite storage open.
+
+An event then costs a quarter of the time.
 
 For each event Dagster makes an engine, which compiles its statements anew, and opens and closes the file. Here the
 engine of a file is kept. Its commits go to SQLite's write-ahead log beside the file, which Dagster's pages do not
@@ -26,7 +28,10 @@ _BUSY_S = 30  # wait for another process's lock, as long as Dagster itself
 
 
 class HistoryUnwritable(OperationalError):
-    """A full, failing or read-only disk. Dagster prints and stores this message, so it is ours."""
+    """A full, failing or read-only disk.
+
+    Dagster prints and stores this message, so it is ours.
+    """
 
     sentence = ""
 
@@ -36,17 +41,20 @@ class HistoryUnwritable(OperationalError):
 
 @contextlib.contextmanager
 def _transaction(engine: db.Engine) -> Iterator[db.Connection]:
-    """Commit what the block changes when it ends without an error. Raises HistoryUnwritable."""
+    """Commit what the block changes when it ends without an error.
+
+    Raises HistoryUnwritable.
+    """
     try:
         with engine.begin() as connection:
             yield connection
     except DBAPIError as error:
-        why, what, is_unwritable = reason_and_remedy(error)
+        why, remedy, is_unwritable = reason_and_remedy(error)
         if not is_unwritable or error.orig is None:
             raise
         unwritable = HistoryUnwritable(None, None, error.orig)
         unwritable.sentence = (
-            f"{engine.url.database}: Dagster's history could not be written ({why}); {what} and run the same command "
+            f"{engine.url.database}: Dagster's history could not be written ({why}); {remedy} and run the same command "
             "again: tables are whole, no answer is lost"
         )
         raise unwritable from None

@@ -1,4 +1,7 @@
-"""An experiment: the models and questions of a YAML file, in `assets/experiments` or elsewhere."""
+"""Read an experiment: the models and questions of a YAML file.
+
+It lies in `assets/experiments` or elsewhere.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,10 @@ LITE_FILE = ASSETS / "lite.yaml"
 
 
 class Experiment(BaseModel):
-    """The fields of an experiment's file. benchmark, scenarios, per_family and panel are copied to the study."""
+    """The fields of an experiment's file.
+
+    benchmark, scenarios, per_family and panel are copied to the study.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     name: Name = Field(pattern=r"^[a-z0-9-]+$")
@@ -51,7 +57,10 @@ class Experiment(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _what_the_file_describes_is_its_own(cls, data: Any) -> Any:
-        """Move described models, `judges`, `panels` and `accounts` to `own`; a model may be named or described."""
+        """Move described models, `judges`, `panels` and `accounts` to `own`.
+
+        A model may be named or described.
+        """
         if not isinstance(data, dict):
             return data
         if "own" in data:
@@ -60,8 +69,8 @@ class Experiment(BaseModel):
         described = {name: data[name] for name in ("accounts", "judges", "panels") if name in data}
         models = data.get("models")
         if isinstance(models, list):
-            described["models"] = [one for one in models if isinstance(one, dict)]
-            rest["models"] = [one.get("id", "?") if isinstance(one, dict) else one for one in models]
+            described["models"] = [model for model in models if isinstance(model, dict)]
+            rest["models"] = [model.get("id", "?") if isinstance(model, dict) else model for model in models]
         return rest | {"own": described}
 
     @field_validator("scenarios", mode="before")
@@ -117,7 +126,9 @@ class Experiment(BaseModel):
         return Asked(**values, mechanism=self.mechanism is not None)
 
     def judged(self, study: Study | None, panel: str | None, *, judged_by_rules: bool = False) -> Study:
-        """Return the study with the panel of the command, else of the experiment, else of a study (None: new).
+        """Return the study with the panel of the command, else of the experiment.
+
+        Without either it keeps the panel of `study` (None: a new study).
 
         Raises TrapsError for no panel, for two, and if rules would judge models without an explicit request.
         """
@@ -136,7 +147,10 @@ class Experiment(BaseModel):
         return base.model_copy(update={"panel": named, "judged_by_rules": is_judged_by_rules})
 
     def check_study(self, study: Study, path: Path) -> None:
-        """Raise TrapsError if an existing study has another panel, epoch or `mechanism` section than this one."""
+        """Raise TrapsError if an existing study contradicts this experiment.
+
+        It may not have another panel, epoch or `mechanism` section.
+        """
         for name in ("panel", "epoch"):
             old, new = getattr(study, name), getattr(self, name)
             if new is not None and new != old:
@@ -171,7 +185,10 @@ def _known(values: list[str], known: tuple[str, ...]) -> list[str]:
 
 
 def load_experiment(name: str) -> Experiment:
-    """Return an experiment by name (`demo`) or path (`my.yaml`). Raises TrapsError with the known names."""
+    """Return an experiment by name (`demo`) or path (`my.yaml`).
+
+    Raises TrapsError with the known names.
+    """
     path = Path(name) if name.endswith((".yaml", ".yml")) else EXPERIMENTS / f"{name}.yaml"
     if not path.is_file():
         known = sorted(p.stem for p in EXPERIMENTS.glob("*.yaml"))

@@ -1,4 +1,4 @@
-"""Run an experiment (`traps run`): preflight checks, the run, and a report of its work."""
+"""Run an experiment (`traps run`): preflight checks, the run, and a report."""
 
 from __future__ import annotations
 
@@ -31,7 +31,10 @@ OpenRuns = Callable[["DagsterInstance", Workspace], AbstractContextManager["Runs
 
 @dataclass
 class RunReport:
-    """A run's result: problems as sentences, whether a budget ended it, seconds, and the work of each stage."""
+    """A run's result.
+
+    Problems as sentences, whether a budget ended it, seconds, and the work of each stage.
+    """
 
     problems: list[str] = field(default_factory=list)
     over_budget: bool = False
@@ -57,7 +60,9 @@ def run_experiment(
     look_at_machine: bool,
     open_runs: OpenRuns,
 ) -> RunReport:
-    """Materialize every missing or stale partition of an experiment; report to `progress.current()`.
+    """Materialize every missing or stale partition of an experiment.
+
+    Report to `progress.current()`.
 
     until: comma-separated stages; only these and their upstream are materialized. preflight: receives a line about each
     model and judge, which are tried first unless it is None. open_runs: opens the executor of runs; called, like
@@ -89,7 +94,10 @@ def run_experiment(
 
 @dataclass(frozen=True)
 class _Participants:
-    """Models and judges with answers still missing, whose libraries or keys may be missing here."""
+    """Models and judges with answers still missing.
+
+    Their libraries or keys may be missing here.
+    """
 
     models: list[Entry]
     judges: list[Entry]
@@ -113,7 +121,10 @@ def _still_to_ask(workspace: Workspace, experiment: Experiment, stages: Collecti
 
 
 def _preflight(workspace: Workspace, participants: _Participants, say: Callable[[str], None]) -> None:
-    """Try the models and judges over the network first. Raises TrapsError naming all problems."""
+    """Try the models and judges over the network first.
+
+    Raises TrapsError naming all problems.
+    """
     models = [entry for entry in participants.models if entry.backend == NETWORK]
     if not models and not participants.judges:
         return

@@ -1,4 +1,7 @@
-"""Plan an experiment (`traps plan`): count its calls, and forecast tokens, dollars, minutes and GPU-hours."""
+"""Plan an experiment (`traps plan`).
+
+It counts the calls, and forecasts tokens, dollars, minutes and GPU-hours.
+"""
 
 from __future__ import annotations
 
@@ -79,7 +82,9 @@ class Plan:
 
 
 def make_plan(workspace: Workspace | None, experiment: Experiment, study: Study, card: str = "H100") -> Plan:
-    """Count the calls of an experiment and forecast their cost, without sending or writing anything.
+    """Count the calls of an experiment and forecast their cost.
+
+    Nothing is sent or written.
 
     study: the workspace's, or that of a new one, with the panel that judges. card: one of CARDS.
     """
@@ -112,7 +117,7 @@ def make_plan(workspace: Workspace | None, experiment: Experiment, study: Study,
 
 
 def _count_steered(workspace: Workspace | None, experiment: Experiment, study: Study) -> dict[str, tuple[Count, Count]]:
-    """Return the number of calls for steered models' answers and for the panel's votes on them, by model."""
+    """Count the calls for steered models' answers and the panel's votes, by model."""
     settings, counts = experiment.mechanism, dict[str, tuple[Count, Count]]()
     if settings is None or settings.steering is None:
         return counts
@@ -139,7 +144,10 @@ def _local_costs(
     calls: Mapping[str, tuple[Count, Count]],
     steered: Mapping[str, tuple[Count, Count]],
 ) -> Iterator[Cost]:
-    """Yield each local model's GPU cost: new answers, and all passes for states and patches of a new model."""
+    """Yield each local model's GPU cost.
+
+    It covers new answers, and all passes for states and patches of a new model.
+    """
     settings, scenarios = experiment.mechanism, load_scenarios(study).values()
     taxonomies = Counter(datasets_of_category(scenario.category)[0] for scenario in scenarios)
     for model in dict.fromkeys([*calls, *(settings.models if settings else ())]):
@@ -151,25 +159,30 @@ def _local_costs(
         if settings and model in settings.models:
             inside, params = shown_inside(entry, settings), entry.inside_params()
             if workspace is None or not any(s["model"] == model for s in workspace.tables.partitions(HIDDEN_STATES)):
-                work += [(inside, one, params) for one in passes_inside(settings, experiment.datasets, taxonomies)]
+                work += [
+                    (inside, passes, params) for passes in passes_inside(settings, experiment.datasets, taxonomies)
+                ]
             if settings.steering and model in steered:
                 most = min(entry.expected_completion_tokens, settings.steering.max_new_tokens)
                 work.append((inside, Work("steered answers", steered[model][0].new, most), params))
-        for media, one, params in work:
+        for media, passes, params in work:
             assert media.media is not None, "local entries have media"
-            if one.passes:
-                yield cost_of(media, media.media, one, CARDS[card], quantised=params.quantisation == "nf4")
+            if passes.passes:
+                yield cost_of(media, media.media, passes, CARDS[card], quantised=params.quantisation == "nf4")
 
 
 def _count_labels(workspace: Workspace | None, experiment: Experiment, judge: JudgeEntry) -> Count:
-    """Return calls to the confabulation judge; a model without verdicts counts with a full sample."""
+    """Return calls to the confabulation judge.
+
+    A model without verdicts counts with a full sample.
+    """
     protocol, cell_keys = load_protocol(), {cell.key for cell in experiment.cells()}
     labels, lineage = Count(), Lineage(workspace) if workspace else None
     for model in protocol.models:
         cells = [cell for cell in protocol.cells(model) if cell.key in cell_keys]
         if not cells:
             continue
-        if workspace is None or lineage is None or not _judged(lineage, cells):
+        if workspace is None or lineage is None or not _is_judged(lineage, cells):
             labels.add(protocol.n, 0)
             continue
         samples = sample_failures(workspace, judge, model).values()
@@ -178,8 +191,8 @@ def _count_labels(workspace: Workspace | None, experiment: Experiment, judge: Ju
     return labels
 
 
-def _judged(lineage: Lineage, cells: Sequence[Cell]) -> bool:
-    """Return whether the verdicts of all cells whose dataset has items exist and are current."""
+def _is_judged(lineage: Lineage, cells: Sequence[Cell]) -> bool:
+    """Return whether current verdicts exist of all cells whose dataset has items."""
     with_items = [cell for cell in cells if lineage.state("items", cell.dataset) is not None]
     return bool(with_items) and all(lineage.status("verdicts", cell.key).kind == "fresh" for cell in with_items)
 
@@ -190,7 +203,7 @@ def _count_calls(
     plan = {model: (Count(), Count()) for model in experiment.models}
     panel, lineage = load_panel(study.panel), Lineage(workspace) if workspace else None
     scenes = Counter(name for scenario in load_scenarios(study).values() for name in all_datasets_of(scenario.category))
-    current = {dataset for dataset in experiment.datasets if lineage and _items_current(lineage, dataset)}
+    current = {dataset for dataset in experiment.datasets if lineage and _has_current_items(lineage, dataset)}
     items = {
         dataset: _items(workspace, lineage, dataset, scenes[dataset], is_current=dataset in current)
         for dataset in experiment.datasets
@@ -215,7 +228,10 @@ def _count_calls(
 def _items(
     workspace: Workspace | None, lineage: Lineage | None, dataset: str, scenes: int, *, is_current: bool
 ) -> tuple[list[dict[str, Any]], Counter[str]]:
-    """Return a dataset's items in the next run, and by side the number that are unknown before that run."""
+    """Return a dataset's items in the next run.
+
+    The second value counts, by side, those that are unknown before that run.
+    """
     unmade = Counter(dict.fromkeys(sides_of(dataset), scenes))
     if workspace is None or lineage is None or lineage.state("items", dataset) is None:
         return [], unmade
@@ -239,7 +255,10 @@ def _count_cell(
     answers: Count,
     votes: Count,
 ) -> None:
-    """Count a cell's calls: votes on known answers by their own keys, and every vote on answers still missing."""
+    """Count a cell's calls.
+
+    Votes on known answers are counted by their keys, and every vote on missing answers counts.
+    """
     entry, folder = get_model(cell.evaluation.model), cell.evaluation.key
     keys = {  # an item without media was never asked
         item["item_id"]: answer_request(workspace, entry, item, cell.evaluation).key
@@ -268,13 +287,13 @@ def _fresh_rows(workspace: Workspace, lineage: Lineage, table: Table[Any], cell:
     return state.rows if state and lineage.status(table.name, cell.key).kind == "fresh" else None
 
 
-def _items_current(lineage: Lineage, dataset: str) -> bool:
-    """Return whether a dataset's items, and everything they are made from, are current."""
+def _has_current_items(lineage: Lineage, dataset: str) -> bool:
+    """Return whether a dataset's items and everything upstream are current."""
     return all(lineage.status(*node).kind == "fresh" for node in _made_from(lineage, dataset))
 
 
 def _made_from(lineage: Lineage, dataset: str) -> list[tuple[str, str | None]]:
-    """Return the existing partitions of a dataset's items and of everything upstream of them."""
+    """Return the existing partitions of a dataset's items and of all upstream."""
     parents = lineage.graph.parents("items", dataset).items()
     above = [("items", dataset), *((stage, key) for stage, keys in parents for key in keys)]
     return [node for node in above if lineage.state(*node)]

@@ -1,4 +1,6 @@
-"""The dependency graph: each partition's upstream partitions, all keys, and the order of stages.
+"""Build the dependency graph.
+
+It knows each partition's upstream partitions, all keys, and the order of stages.
 
 `stage` and `source` (`pipeline.stage`) are the only declarations. Nothing here imports Dagster: `traps status`, `why`
 and `plan` read only this graph and the tables' footers, and `pipeline.assets` builds Dagster's assets from it.
@@ -62,7 +64,10 @@ class Parent:
 
 @dataclass(frozen=True)
 class Source:
-    """A file or setting that people edit. version: returns its data version, by partition if it has any."""
+    """A file or setting that people edit.
+
+    version: returns its data version, by partition if it has any.
+    """
 
     name: str
     version: Callable[[Workspace, Any], str]
@@ -90,7 +95,9 @@ def _nothing(_: Workspace, __: Any, ___: bool) -> tuple[Tally, bool]:
 
 @dataclass(frozen=True)
 class ConcurrentBuild:
-    """How several runs build one partition: together its files, and then one of them the partition itself.
+    """How several runs build one partition.
+
+    They build its files together, and then one of them the partition itself.
 
     The other runs adopt the finished partition. files: makes the files that no other run is making, optionally waits
     until none is missing, and returns the work done here and whether all exist. seconds: estimates one core's time for
@@ -103,7 +110,9 @@ class ConcurrentBuild:
 
 @dataclass(frozen=True)
 class Stage:
-    """The declaration of an asset that is built: a table, or files for people (table: None).
+    """The declaration of an asset that is built.
+
+    It is a table, or files for people (table: None).
 
     make: returns the StageOutput of a key; if `side_by_side`, takes several keys and yields each with its own. code:
     the code version; raise it when the formula changes, so that existing partitions become stale. cost: the main
@@ -151,35 +160,40 @@ class Graph:
     @cached_property
     def parents_of(self) -> Mapping[str, Mapping[str, Parent]]:
         """Upstream assets of each stage, by name; empty for a source."""
-        return {name: one.parents if isinstance(one, Stage) else {} for name, one in self.declared.items()}
+        return {
+            name: declaration.parents if isinstance(declaration, Stage) else {}
+            for name, declaration in self.declared.items()
+        }
 
     def __getitem__(self, name: str) -> Stage:
-        one = self.declared.get(name)
-        if not isinstance(one, Stage):
+        declaration = self.declared.get(name)
+        if not isinstance(declaration, Stage):
             known = [stage.name for stage in self.stages]
             raise TrapsError(f"no stage {name!r}{did_you_mean(name, known) or '; choose from ' + ', '.join(known)}")
-        return one
+        return declaration
 
     def source(self, name: str) -> Source | None:
         """Return the source of that name; None for a stage."""
-        one = self.declared[name]
-        return one if isinstance(one, Source) else None
+        declaration = self.declared[name]
+        return declaration if isinstance(declaration, Source) else None
 
     @cached_property
     def sources(self) -> list[str]:
         """Names of all sources."""
-        return [name for name, one in self.declared.items() if isinstance(one, Source)]
+        return [name for name, declaration in self.declared.items() if isinstance(declaration, Source)]
 
     def blocks(self, names: Collection[str] | None = None) -> list[list[Stage]]:
-        """Return stages (default: all) in order, grouped into blocks that one run can materialize.
+        """Return stages (default: all) in order, grouped into blocks.
+
+        One run can materialize a block.
 
         The stages of a block share a scheme, and no stage of another scheme lies between them. Ready stages follow the
         order of `GROUPS`.
         """
         remaining = {
-            name: one
-            for name, one in self.declared.items()
-            if isinstance(one, Stage) and (names is None or name in names)
+            name: declaration
+            for name, declaration in self.declared.items()
+            if isinstance(declaration, Stage) and (names is None or name in names)
         }
         above = {name: {p for p in self.parents_of[name] if p in remaining} for name in remaining}
         result: list[list[Stage]] = []
@@ -245,7 +259,10 @@ def name_of(node: Node) -> str:
 
 @cache
 def the_graph() -> Graph:
-    """Return the graph of all declarations, once `traps_pipeline.pipeline.stages` is imported."""
+    """Return the graph of all declarations.
+
+    `traps_pipeline.pipeline.stages` must have been imported.
+    """
     if not DECLARED:
         raise RuntimeError("no stage is declared yet: import traps_pipeline.pipeline.stages first")
     return Graph()

@@ -1,4 +1,7 @@
-"""Report partitions and sources to Dagster, and read back its data versions and their provenance."""
+"""Report partitions and sources to Dagster, and read back their data versions.
+
+Their provenance is read back, too.
+"""
 
 from __future__ import annotations
 
@@ -28,14 +31,20 @@ class History:
     def event(
         self, stage: Stage, key: str | None, version: str, provenance: Mapping[str, str], metadata: Mapping[str, Any]
     ) -> dg.AssetMaterialization:
-        """Return the event that records a partition as materialized, with its data version and provenance."""
+        """Return the event that records a partition as materialized.
+
+        It carries the data version and provenance.
+        """
         tags = {_VERSION: version, _USER: "true", _CODE: stage.code, **provenance}
         return dg.AssetMaterialization(
             asset_key(stage.name), partition=key, metadata=visible_metadata(metadata), tags=tags
         )
 
     def provenance(self, stage: Stage) -> dict[str, str]:
-        """Return tags that name the parents' current events. Call it before any input is read."""
+        """Return tags that name the parents' current events.
+
+        Call it before any input is read.
+        """
         tags: dict[str, str] = {}
         for parent in stage.parents:
             key = asset_key(parent)
@@ -47,7 +56,10 @@ class History:
         return tags
 
     def recorded(self, name: str) -> dict[str | None, str | None]:
-        """Return the data versions in Dagster's history, by partition of a stage or source."""
+        """Return a stage's or source's data versions in Dagster's history.
+
+        By partition.
+        """
         node = self._graph.declared[name]
         if node.scheme is None:
             records = self._fetch(name)(dg.AssetRecordsFilter(asset_key=asset_key(name)), limit=1).records
@@ -55,10 +67,13 @@ class History:
         # One query over the index of tags: ten thousand events take seconds to deserialize.
         kind = dg.DagsterEventType.ASSET_OBSERVATION if self._graph.source(name) else _MADE
         tags = self._instance.event_log_storage.get_latest_tags_by_partition(asset_key(name), kind, [_VERSION])
-        return {key: of[_VERSION] for key, of in tags.items()}
+        return {key: key_tags[_VERSION] for key, key_tags in tags.items()}
 
     def observe(self, lineage: Lineage, sources: Iterable[str] | None = None) -> list[Node]:
-        """Report versions of sources (default: all) that Dagster does not know yet; return those that changed."""
+        """Report versions of sources that Dagster lacks; return the changed sources.
+
+        sources: all by default.
+        """
         changed = list[Node]()
         for name in self._graph.sources if sources is None else sources:
             now = {key: str(lineage.version(name, key)) for key in self._graph.keys(name)}

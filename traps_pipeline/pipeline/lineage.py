@@ -1,4 +1,6 @@
-"""Compare each partition's recorded inputs with the current ones: the source of truth about staleness.
+"""Compare each partition's recorded inputs with the current ones.
+
+This decides alone what is stale.
 
 The tables' footers hold the truth (`storage.parquet.State`): the versions of the inputs at the time of writing. A
 partition is stale when an input's version has changed. Dagster gets the same versions, so its UI agrees; this module
@@ -26,7 +28,10 @@ DAMAGED = "damaged"  # the version of damaged data
 
 @dataclass(frozen=True)
 class Status:
-    """A partition's status: fresh, missing, or stale (with changed inputs and the number of failed calls)."""
+    """A partition's status: fresh, missing or stale.
+
+    A stale one has changed inputs and a number of failed calls.
+    """
 
     kind: Literal["fresh", "stale", "missing"]
     outdated: tuple[str, ...] = ()
@@ -39,7 +44,10 @@ class Status:
 
 
 class Lineage:
-    """A snapshot view of a workspace; each version is looked up once. thorough: read every table in full."""
+    """A snapshot view of a workspace, which looks each version up once.
+
+    thorough: read every table in full.
+    """
 
     def __init__(self, workspace: Workspace, graph: Graph | None = None, *, thorough: bool = False) -> None:
         self._workspace, self.graph, self._thorough = workspace, graph or the_graph(), thorough
@@ -60,7 +68,7 @@ class Lineage:
         return {name: version for name, version in versions.items() if version is not None}
 
     def status(self, name: str, key: str | None) -> Status:
-        """Return whether a partition exists, is undamaged, and matches the current inputs and code."""
+        """Return whether a partition exists, is intact, and matches inputs and code."""
         stage = self.graph[name]
         if damage := self.damage(name, key):
             return Status("stale", (damage,))
@@ -81,21 +89,24 @@ class Lineage:
         return self._workspace.store.changed_ns(path)
 
     def blocked(self, name: str, key: str | None, *, current: bool) -> str:
-        """Return why a partition cannot be materialized, in words; empty if it can. current: require fresh parents."""
+        """Return why a partition cannot be materialized, in words; empty if it can.
+
+        current: require fresh parents.
+        """
         stage = self.graph[name]
         for parent, keys in self.graph.parents(name, key).items():
             if self.graph.source(parent) is not None:
                 continue
-            wanted = [k for k in keys if k in self._wanted(parent)]
-            wrong = {k: why for k in wanted if (why := self._unusable(parent, k, current))}
+            wanted_keys = [k for k in keys if k in self._wanted(parent)]
+            wrong = {k: why for k in wanted_keys if (why := self._unusable(parent, k, current))}
             need = stage.parents[parent].need
-            if need == "none" or (need == "some" and len(wrong) < len(wanted)):
+            if need == "none" or (need == "some" and len(wrong) < len(wanted_keys)):
                 wrong = {k: why for k, why in wrong.items() if self.damage(parent, k)}  # it would be read with the rest
             if wrong:
                 first, why = next(iter(wrong.items()))
                 more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
                 return f"{name_of((parent, first))} {why}{more}"
-            if need == "some" and not wanted:
+            if need == "some" and not wanted_keys:
                 return f"the study wants no {parent}"
         return ""
 
@@ -136,7 +147,10 @@ class Lineage:
         return f"does not pass its check {failed[0]}" if failed else ""
 
     def _keys_there(self, name: str) -> Set[str] | None:
-        """Return the keys of a table's files, which are few; None for an asset without partitions in a table."""
+        """Return the keys of a table's files, which are few.
+
+        None for an asset without partitions in a table.
+        """
         if self.graph.source(name) is not None or (stage := self.graph[name]).table is None or stage.scheme is None:
             return None
         files = (tuple(partition.values()) for partition in self._workspace.tables.partitions(stage.table))
@@ -182,7 +196,10 @@ def write_report_state(workspace: Workspace, stage: Stage, state: State) -> None
 
 
 def read_report_state(workspace: Workspace, stage: Stage) -> State | None:
-    """Return the state that `write_report_state` wrote; None if the files do not exist."""
+    """Return the state that `write_report_state` wrote.
+
+    None if the files do not exist.
+    """
     path = _report_state(workspace, stage)
     if not workspace.store.has(path):
         return None

@@ -1,4 +1,7 @@
-"""Check before a run, within seconds, that the machine has what the coming stages need."""
+"""Check before a run that the machine has what the coming stages need.
+
+This takes seconds.
+"""
 
 from __future__ import annotations
 
@@ -30,18 +33,26 @@ Parts = Mapping[str, Sequence[str | None]]  # by stage: the partitions that a ru
 
 
 def wanted_parts(workspace: Workspace, stages: Collection[str], experiment: str | None = None) -> Parts:
-    """Return the partitions of these stages that a study, or one of its experiments, wants."""
+    """Return the partitions of these stages that a study wants.
+
+    Or those that one of its experiments wants.
+    """
     partitions = StudyPartitions(workspace, experiment)
     return {stage.name: stage.wanted(partitions) for stage in the_graph().stages if stage.name in stages}
 
 
 def parts_of_run(context: dg.AssetExecutionContext, stage: Stage, partitions: StudyPartitions) -> Parts:
-    """Return the stages of a Dagster run that share a step's partitions, each with its wanted keys."""
+    """Return the stages of a Dagster run with their wanted keys.
+
+    They share a step's partitions.
+    """
     keys = {str(key) for key in context.partition_keys} if stage.scheme else {None}
     selected = context.run.asset_selection or context.job_def.asset_layer.executable_asset_keys
     names = {key.path[-1] for key in selected}
-    alike = [other for other in the_graph().stages if other.name in names and other.scheme is stage.scheme]
-    return {other.name: [key for key in other.wanted(partitions) if key in keys] for other in alike}
+    alike = [
+        candidate for candidate in the_graph().stages if candidate.name in names and candidate.scheme is stage.scheme
+    ]
+    return {candidate.name: [key for key in candidate.wanted(partitions) if key in keys] for candidate in alike}
 
 
 def why_nothing(keys: Sequence[str | None], tags: Mapping[str, str], workspace: Workspace) -> str:
@@ -53,7 +64,9 @@ def why_nothing(keys: Sequence[str | None], tags: Mapping[str, str], workspace: 
 
 
 def require_machine(workspace: Workspace, parts: Parts) -> None:
-    """Check disk, OpenGL, codecs, proxies and certificates, as far as these partitions still need them.
+    """Raise TrapsError unless the machine can build what is still missing.
+
+    Disk, OpenGL, codecs, proxies and certificates are checked as far as these partitions need them.
 
     Raises TrapsError, one sentence, for the first that is missing or that a variable breaks. A study whose clips exist
     needs no OpenGL, and one whose answers and votes exist needs no network.

@@ -1,4 +1,7 @@
-"""Metadata of Dagster's events, with hidden characters in models' and providers' texts made visible."""
+"""Translate metadata of Dagster's events.
+
+Hidden characters in models' and providers' texts become visible.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,10 @@ RANKED = ("pecs", "conjunction")  # columns by which the rows of a table are bet
 
 
 def visible_metadata(value: Any) -> Any:
-    """Return a value of an event's metadata, or a mapping or list of them, with hidden characters visible."""
+    """Return a value of an event's metadata with hidden characters visible.
+
+    The value may be a mapping or a list.
+    """
     if isinstance(value, str):
         return visible(value)
     if isinstance(value, Markdown):
@@ -53,8 +59,10 @@ def partition_metadata(workspace: Workspace, stage: Stage, output: StageOutput) 
 
 
 def preview(table: Table, output: StageOutput) -> dict[str, dg.TableMetadataValue]:
-    """Return rows, of what differs among them and is no long text: the best and worst where a table ranks, else the
-    first."""
+    """Return a preview: the best and worst rows, or the first ones.
+
+    Only a table that ranks has best rows. Columns that do not differ and long texts are left out.
+    """
     import pandas as pd
 
     content = cast(Any, output.content)
@@ -69,7 +77,7 @@ def preview(table: Table, output: StageOutput) -> dict[str, dg.TableMetadataValu
             "first rows": first.to_dict("records") if hasattr(content, "head") else [asdict(row) for row in first]
         }
     shown = [row for rows in samples.values() for row in rows]
-    telling = [c.name for c in table.columns if _tells(c.type, [row.get(c.name) for row in shown])]
+    telling = [c.name for c in table.columns if _is_telling(c.type, [row.get(c.name) for row in shown])]
     names = [*table.key, *([ranked] if ranked else []), *telling]
     names = [name for name in dict.fromkeys(names) if name not in table.partition_by]
     tables = {
@@ -79,8 +87,11 @@ def preview(table: Table, output: StageOutput) -> dict[str, dg.TableMetadataValu
     return {title: dg.MetadataValue.table(records) for title, records in tables.items() if records}
 
 
-def _tells(kind: Any, values: Sequence[Any]) -> bool:
-    """Return whether the values of a column are numbers or short texts, and not all alike."""
+def _is_telling(kind: Any, values: Sequence[Any]) -> bool:
+    """Return whether a column is worth a preview.
+
+    Its values are numbers or short texts, and not all alike.
+    """
     longest = max((len(value) for value in values if isinstance(value, str)), default=0)
     is_shown = kind in (int, float, bool) or 0 < longest <= SHORT
     return is_shown and (len(values) == 1 or len({str(value) for value in values}) > 1)

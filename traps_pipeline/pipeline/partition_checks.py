@@ -1,4 +1,7 @@
-"""Evaluate the checks of a stage's partitions, for Dagster and for the run's final report."""
+"""Evaluate the checks of a stage's partitions.
+
+Dagster and the run's final report show them.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +42,10 @@ class StageChecks:
         self._failing: dict[tuple[str, str | None], Mapping[str, Any]] = {}
 
     def of_parents(self, lineage: Lineage, key: str | None) -> Iterator[dg.AssetCheckEvaluation]:
-        """Evaluate the parents whose content was altered, before anything is built from them."""
+        """Evaluate the parents whose content was altered.
+
+        This happens before anything is built from them.
+        """
         for parent, keys in self._graph.parents(self._stage.name, key).items():
             if self._graph.source(parent) is None:
                 for above in keys:
@@ -70,7 +76,10 @@ class StageChecks:
         return self._evaluate(CURRENT, key, {"not made": str(error), REACHED: isinstance(error, BudgetReached)})
 
     def still_failing(self, lineage: Lineage, seen: Collection[str | None]) -> Iterator[dg.AssetCheckEvaluation]:
-        """Re-evaluate failing checks, including unchanged ones: Dagster shows only a check's newest result."""
+        """Re-evaluate failing checks, including unchanged ones.
+
+        Dagster shows only a check's newest result.
+        """
         name = self._stage.name
         for key in self._graph.keys(name):
             if key not in seen:

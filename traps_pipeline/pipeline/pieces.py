@@ -29,7 +29,9 @@ _DATE = (1980, 1, 1, 0, 0, 0)  # date of every member, so that equal pieces give
 
 @dataclass(frozen=True)
 class Piece:
-    """One part of an asset. reads: the stages and sources whose versions decide whether it is rebuilt.
+    """One part of an asset.
+
+    reads: the stages and sources whose versions decide whether it is rebuilt.
 
     inputs: if only part of a table matters, that part as JSON, which is compared instead of versions. is_shared:
     whether all studies have the same; it is then built once per user.
@@ -45,7 +47,10 @@ class Piece:
 def make_pieces(
     workspace: Workspace, stage: str, code: str, pieces: Sequence[Piece]
 ) -> tuple[dict[str, bytes], list[str]]:
-    """Return the content of all pieces by name, and the names of those rebuilt because inputs or code changed."""
+    """Return the content of all pieces, and the names of the rebuilt ones.
+
+    A piece is rebuilt if its inputs or its code changed.
+    """
     path = workspace.reports / ".state" / f"{stage}.pieces.zip"
     former = _read(workspace.store.here(path).read_bytes()) if workspace.store.has(path) else {}
     versions, shared = Lineage(workspace).inputs(stage, None), _Shared(stage)
@@ -81,17 +86,17 @@ class _Shared:
             self._pieces = {}
             with suppress(OSError, RuntimeError):  # RuntimeError: a user without a home folder
                 self._pieces = _read(self._path.read_bytes())
-        wanted = digest([inputs, *self._libraries])
+        inputs_digest = digest([inputs, *self._libraries])
         known, content = self._pieces.get(piece.name, ("", b""))
-        if known != wanted:
+        if known != inputs_digest:
             content = piece.make()
-            self._pieces[piece.name], self._is_new = (wanted, content), True
+            self._pieces[piece.name], self._is_new = (inputs_digest, content), True
         return content
 
     def keep(self) -> None:
         """Store the newly built pieces."""
         if self._pieces and self._is_new:
-            inputs = {name: of for name, (of, _) in self._pieces.items()}
+            inputs = {name: inputs_digest for name, (inputs_digest, _) in self._pieces.items()}
             contents = {name: content for name, (_, content) in self._pieces.items()}
             with suppress(OSError, RuntimeError):
                 write_bytes(self._path, _archive(inputs, contents))
@@ -110,7 +115,10 @@ def _archive(inputs: Mapping[str, str], contents: Mapping[str, bytes]) -> bytes:
 
 
 def _read(data: bytes) -> dict[str, tuple[str, bytes]]:
-    """Return the input digest and content of each piece; empty if the archive is damaged."""
+    """Return the input digest and content of each piece.
+
+    Empty if the archive is damaged.
+    """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             inputs = json.loads(archive.read(NOTES))

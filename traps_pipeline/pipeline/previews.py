@@ -1,4 +1,6 @@
-"""Extra content that a stage shows of a partition beside its rows; `metadata` translates it for Dagster.
+"""Show extra content of a partition beside its rows.
+
+`metadata` translates it for Dagster.
 
 A `StageOutput.shown` holds plain values, texts and these classes.
 """
@@ -19,7 +21,10 @@ STUDY_URL = "/study"  # route of `traps ui` to the study's report, site and clip
 
 @dataclass(frozen=True)
 class Markdown:
-    """Text that is rendered. Use it only for figures and ids, never for text that a model wrote."""
+    """Text that is rendered.
+
+    Use it only for figures and ids, never for text that a model wrote.
+    """
 
     text: str
 
@@ -33,7 +38,10 @@ class Records:
 
 @dataclass(frozen=True)
 class StudyFile:
-    """A file that a browser opens. path: below the workspace's root; view: the part of its address after #."""
+    """A file that a browser opens.
+
+    path: below the workspace's root. view: the part of its address after #.
+    """
 
     path: str
     view: str = ""
@@ -45,7 +53,10 @@ class StudyFile:
 
 
 def rows_shown(frame: pd.DataFrame, rows: int = 60) -> Markdown | str:
-    """Return the first rows as a Markdown table. Use it only for figures and ids, never for text that a model wrote."""
+    """Return the first rows as a Markdown table.
+
+    Use it only for figures and ids, never for text that a model wrote.
+    """
     if frame.empty:
         return "not run"
     lines = [[*map(str, frame.columns)], ["---"] * len(frame.columns)]

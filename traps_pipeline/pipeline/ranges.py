@@ -20,7 +20,10 @@ WORTH_S = 120.0  # minimum work per run, since each takes 12 to 20 s to start
 
 @dataclass(frozen=True)
 class _Grid:
-    """The keys of a scheme as cells of two dimensions; a one-dimensional scheme is a single row."""
+    """The keys of a scheme as cells of two dimensions.
+
+    A one-dimensional scheme is a single row.
+    """
 
     rows: Sequence[str]
     columns: Sequence[str]
@@ -72,7 +75,9 @@ def _spans(numbers: Sequence[int]) -> list[tuple[int, int]]:
 
 
 def cut(scheme: Partitioning | None, keys: Sequence[str | None], most: int) -> list[Range]:
-    """Return up to `most` ranges with about equally many keys each and no key twice, or one range per key.
+    """Return up to `most` ranges with about equally many keys, none twice.
+
+    Or one range per key.
 
     A range may contain other keys. Cells of one model stay together if there are fewer runs than models, since each run
     loads its models anew; otherwise cells of one evaluation do.
@@ -80,18 +85,20 @@ def cut(scheme: Partitioning | None, keys: Sequence[str | None], most: int) -> l
     if scheme is None or not keys:
         return [(key, key) for key in keys]
     grid = _Grid.of(scheme)
-    wanted = np.zeros((len(grid.rows), len(grid.columns)), bool)
+    is_wanted = np.zeros((len(grid.rows), len(grid.columns)), bool)
     for row, column in grid.cells(keys):
-        wanted[row, column] = True
+        is_wanted[row, column] = True
     heads = np.array([name.partition("__")[0] for name in grid.columns])
-    by_model = most < len({*heads[wanted.any(axis=0)]})
-    return [grid.range(*corners) for corners in _parts(wanted, heads, 0, 0, most, by_model=by_model)]
+    by_model = most < len({*heads[is_wanted.any(axis=0)]})
+    return [grid.range(*corners) for corners in _parts(is_wanted, heads, 0, 0, most, by_model=by_model)]
 
 
 def _parts(
     wanted: np.ndarray, heads: np.ndarray, top: int, left: int, count: int, *, by_model: bool
 ) -> Iterator[tuple[int, int, int, int]]:
-    """Yield rectangles (first and last row, first and last column) around the wanted cells of one rectangle.
+    """Yield rectangles around the wanted cells of one rectangle.
+
+    Each is first and last row, first and last column.
 
     top, left: its first cell. heads: the model of each column; by_model: cut between models if there are enough.
     """
@@ -118,7 +125,9 @@ def _parts(
 
 
 def _halves(sizes: np.ndarray, cuts: np.ndarray, better: set[int], count: int) -> tuple[int, int]:
-    """Return where to cut lines of these sizes in two, and how many of the parts go to the first half.
+    """Return where to cut lines of these sizes in two.
+
+    The second number is how many of the parts go to the first half.
 
     Prefer parts of equal size, then a place in `better`, then the middle.
     """
@@ -133,7 +142,9 @@ def _halves(sizes: np.ndarray, cuts: np.ndarray, better: set[int], count: int) -
 def shared_out(
     scheme: Partitioning | None, keys: Sequence[str | None], seconds: Mapping[str | None, float], most: int
 ) -> list[Range]:
-    """Return ranges of runs that share the work of each key, few enough (of `most`) to keep each run busy.
+    """Return at most `most` ranges of runs that share the work of each key.
+
+    They are few enough to keep each run busy.
 
     Up to the number of keys, each run works through all of them; beyond that, the runs of a range share one key.
     """

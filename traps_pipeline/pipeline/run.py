@@ -1,4 +1,7 @@
-"""Walk the graph and materialize what is missing or stale, one Dagster run per block of stages."""
+"""Walk the graph and materialize what is missing or stale.
+
+One Dagster run builds one block of stages.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +34,10 @@ from traps_pipeline.storage.workspace import Workspace
 
 @dataclass
 class WalkResult:
-    """The result of a walk: problems in sentences, including failed checks; whether a budget ended it."""
+    """The result of a walk.
+
+    Problems in sentences, including failed checks, and whether a budget ended it.
+    """
 
     problems: list[str] = field(default_factory=list)
     over_budget: bool = False
@@ -40,7 +46,9 @@ class WalkResult:
 
 @contextmanager
 def dagster_history(workspace: Workspace) -> Iterator[dg.DagsterInstance]:
-    """Open Dagster's history of this workspace, one process at a time: concurrent first openings corrupt it.
+    """Open this workspace's Dagster history, one process at a time.
+
+    Concurrent first openings would corrupt it.
 
     Runs whose process was killed are marked as failed, since a queue would count them forever. A lost history begins
     anew, and so does an unreadable one, which is kept beside it: the tables are authoritative. Raises TrapsError if the
@@ -56,7 +64,7 @@ def dagster_history(workspace: Workspace) -> Iterator[dg.DagsterInstance]:
         with instance:
             for run in instance.get_runs(dg.RunsFilter(statuses=[dg.DagsterRunStatus.STARTED])):
                 here = run.tags.get(HOST_TAG) == this_host()
-                if here and PID_TAG in run.tags and not _alive(int(run.tags[PID_TAG])):
+                if here and PID_TAG in run.tags and not _is_alive(int(run.tags[PID_TAG])):
                     instance.report_run_failed(run, "its process was killed; what it had asked and made is kept")
             yield instance
     except BrokenPipeError:
@@ -64,13 +72,13 @@ def dagster_history(workspace: Workspace) -> Iterator[dg.DagsterInstance]:
     except Exception as error:
         cause = database_error(error)
         if isinstance(error, OSError):
-            why, what = error.strerror or "its file cannot be used", remedy(error)
+            why, hint = error.strerror or "its file cannot be used", remedy(error)
         elif cause is not None:
-            why, what, _ = reason_and_remedy(cause)
+            why, hint, _ = reason_and_remedy(cause)
         else:
             raise
         raise TrapsError(
-            f"{home}: Dagster's history cannot be read or written ({why}); {what} and run the same command again: "
+            f"{home}: Dagster's history cannot be read or written ({why}); {hint} and run the same command again: "
             "tables are whole, no answer is lost"
         ) from error
 
@@ -104,14 +112,17 @@ def _opened(workspace: Workspace, home: Path) -> dg.DagsterInstance:
 
 
 def _instance(home: Path, *, is_captured: bool) -> dg.DagsterInstance:
-    """Open a folder's instance. is_captured: write steps' output to Dagster's files, as runs on other hosts must."""
+    """Open a folder's instance.
+
+    is_captured: write steps' output to Dagster's files, as runs on other hosts must.
+    """
     if is_captured:
         return dg.DagsterInstance.from_config(str(home))
     silent = {"module": "dagster._core.storage.noop_compute_log_manager", "class": "NoOpComputeLogManager"}
     return dg.DagsterInstance.local_temp(str(home), overrides={"compute_logs": silent})
 
 
-def _alive(pid: int) -> bool:
+def _is_alive(pid: int) -> bool:
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -124,7 +135,9 @@ def _alive(pid: int) -> bool:
 def pending_in(
     block: Sequence[Stage], lineage: Lineage, history: History, partitions: StudyPartitions, *, existing: bool = False
 ) -> tuple[list[Stage], list[str | None]]:
-    """Return a block's stages with work to do or downstream of such a stage, and the keys of these.
+    """Return a block's stages that must run, and the keys of these.
+
+    They have work to do or lie downstream of such a stage.
 
     existing: only what exists, is outdated, and waits for nothing upstream.
     """

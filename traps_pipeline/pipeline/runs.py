@@ -1,4 +1,7 @@
-"""Execute Dagster runs: in this process, one after another, or on the hosts of a cluster."""
+"""Execute Dagster runs in this process or on the hosts of a cluster.
+
+In this process they follow one another.
+"""
 
 from __future__ import annotations
 
@@ -42,8 +45,9 @@ class Runs(ABC):
 
     @abstractmethod
     def ranges(self, stages: Sequence[Stage], keys: Sequence[str | None]) -> Sequence[Range]:
-        """Return the keys cut into ranges, one per run; several runs may share a range, and each skips its unwanted
-        keys.
+        """Return the keys cut into ranges, one per run.
+
+        Several runs may share a range, and each skips its unwanted keys.
         """
 
     @abstractmethod
@@ -52,7 +56,10 @@ class Runs(ABC):
 
 
 class RunsHere(Runs):
-    """Runs in this process, of the job of all assets. parent: the run that starts them; log: receives each."""
+    """Runs in this process, of the job of all assets.
+
+    parent: the run that starts them. log: receives each.
+    """
 
     def __init__(
         self,
@@ -73,14 +80,14 @@ class RunsHere(Runs):
 
     def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterator[RunOutcome]:
         """See `Runs`."""
-        for number, one in enumerate(ranges, start=1):
+        for number, keys in enumerate(ranges, start=1):
             run_id, names = str(uuid.uuid4()), ", ".join(stage.name for stage in stages)
-            which = "" if one[0] is None else one[0] if one[0] == one[1] else f"{one[0]} to {one[1]}"
-            self._log(f"run {run_id} ({number} of {len(ranges)}): {names} {which}")
-            outcome = self._execute(stages, one, tags, run_id)
+            words = "" if keys[0] is None else keys[0] if keys[0] == keys[1] else f"{keys[0]} to {keys[1]}"
+            self._log(f"run {run_id} ({number} of {len(ranges)}): {names} {words}")
+            outcome = self._execute(stages, keys, tags, run_id)
             result = "; ".join(outcome.problems) or "made"
             self._log(f"run {run_id}: {result}")
-            self.finished.append({"run": run_id, "assets": names, "partitions": which, "result": result})
+            self.finished.append({"run": run_id, "assets": names, "partitions": words, "result": result})
             yield outcome
 
     def _execute(self, stages: Sequence[Stage], one: Range, tags: Mapping[str, str], run_id: str) -> RunOutcome:
@@ -108,7 +115,10 @@ class RunsHere(Runs):
 
 
 def range_tags(one: Range, *, always: bool = False) -> dict[str, str]:
-    """Return the tags of a range's run; a single key needs none unless `always`, for runs that get no key otherwise."""
+    """Return the tags of a range's run.
+
+    A single key needs none unless `always`, for runs that get no key otherwise.
+    """
     first, last = one
     if first is None or (first == last and not always):
         return {}
@@ -116,7 +126,10 @@ def range_tags(one: Range, *, always: bool = False) -> dict[str, str]:
 
 
 def range_of(tags: Mapping[str, str]) -> Range:
-    """Return a run's partitions from its tags: those of `range_tags`, or Dagster's own of a single key."""
+    """Return a run's partitions from its tags.
+
+    They are those of `range_tags`, or Dagster's own of a single key.
+    """
     single = tags.get("dagster/partition")
     return tags.get(_RANGE[0], single), tags.get(_RANGE[1], single)
 
@@ -134,8 +147,11 @@ def problems_of(failures: Sequence[dg.DagsterEvent]) -> RunOutcome:
     return RunOutcome(problems, over)
 
 
-def broke_off(run: dg.DagsterRun, failures: Sequence[dg.DagsterEvent]) -> bool:
-    """Return whether a run or step ended without stating a reason: host, network or database failed."""
+def is_broken_off(run: dg.DagsterRun, failures: Sequence[dg.DagsterEvent]) -> bool:
+    """Return whether a run or step ended without stating a reason.
+
+    Host, network or database failed.
+    """
     named = [{error.cls_name for error in _causes(event)} for event in failures]
     is_interrupted = any(names & {*_INTERRUPTS} for names in named)
     unnamed = not failures or any(not names & {*_SENTENCES} for names in named)
@@ -156,9 +172,12 @@ def _chain(error: Any) -> list[Any]:
 
 
 def reason(error: Any) -> str:
-    """Return the message of a Dagster error: our own sentence if it contains one, else its innermost cause."""
+    """Return the message of a Dagster error.
+
+    It is our own sentence if it contains one, else its innermost cause.
+    """
     chain = _chain(error)
-    readable = [one for one in chain if one.cls_name in _SENTENCES]
+    readable = [link for link in chain if link.cls_name in _SENTENCES]
     if not readable:
         return chain[-1].message.strip() if chain else "the step failed"
     return re.sub(rf"^\S*\b{readable[0].cls_name}: ", "", readable[0].message.strip())

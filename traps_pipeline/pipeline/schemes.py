@@ -1,4 +1,4 @@
-"""The study's partitioning schemes, with the keys of the study that `TRAPS_WORKSPACE` names."""
+"""Partition the study that `TRAPS_WORKSPACE` names."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _HERE = StudyPartitions(study_here())
 
 # Groups of assets that the study does not use: Dagster does not show them, and nothing materializes them.
 LEFT_OUT = frozenset(
-    group for group, used in (("mechanism", _HERE.looks_inside), ("arms", bool(_HERE.arms))) if not used
+    group for group, used in (("mechanism", _HERE.has_mechanism), ("arms", bool(_HERE.arms))) if not used
 )
 
 CATEGORY = Partitioning({"category": _HERE.categories}, lambda key: {"category": key}, lambda study: study.categories)
@@ -60,7 +60,7 @@ by_steering = ByDimension("steering")
 
 
 def to_keys(above: Partitioning, below: Partitioning, mapping: Callable[[str], Iterable[str]]) -> Pairs:
-    """Return the downstream keys of each upstream partition, limited to the study's keys."""
+    """Return each upstream partition's downstream keys that the study has."""
     pairs = {key: sorted(below.known & {*mapping(key)}) for key in sorted(above.known)}
     return Pairs({key: keys for key, keys in pairs.items() if keys})
 

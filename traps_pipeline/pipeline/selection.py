@@ -23,7 +23,10 @@ _HISTORY = Path("history", "runs", "index.db")  # all events of Dagster's SQLite
 
 
 def stages_until(until: str | None) -> set[str]:
-    """Return all stages, or those named by `until` (comma-separated) and their upstream. Raises TrapsError."""
+    """Return all stages, or those named by `until` and their upstream.
+
+    until: comma-separated. Raises TrapsError.
+    """
     graph = the_graph()
     if until is None:
         return {stage.name for stage in graph.stages}
@@ -35,7 +38,10 @@ def stages_until(until: str | None) -> set[str]:
 
 
 def require_work(workspace: Workspace, experiment: str, until: str | None) -> None:
-    """Check that an experiment wants something of the named stages, or of any stage. Raises TrapsError."""
+    """Check that an experiment wants something of the named stages.
+
+    Without names, of any stage. Raises TrapsError.
+    """
     partitions, graph = StudyPartitions(workspace, experiment), the_graph()
     if not partitions.cells and not partitions.states:
         raise TrapsError(
@@ -65,7 +71,10 @@ def _unquoted(details: str) -> str:
 
 
 def note_versions(workspace: Workspace, stages: Collection[str], experiment: str | None) -> None:
-    """After a run without problems, record the versions in Dagster's history and the history's state."""
+    """Record the versions in Dagster's history after a run without problems.
+
+    The state of the history is recorded, too.
+    """
     if (history := _history_state(workspace)) is None:
         return
     lineage, partitions = Lineage(workspace), StudyPartitions(workspace, experiment)
@@ -83,7 +92,10 @@ def note_versions(workspace: Workspace, stages: Collection[str], experiment: str
 
 
 def is_nothing_to_do(workspace: Workspace, stages: Collection[str], experiment: str | None) -> bool:
-    """Return whether every wanted partition is fresh and recorded, and the last run's history is unchanged."""
+    """Return whether a run would find nothing to do.
+
+    Every wanted partition is fresh and recorded, and the last run's history is unchanged.
+    """
     note = _read_note(workspace)
     if not note or note.get("history") != _history_state(workspace):
         return False
@@ -106,7 +118,10 @@ def _read_note(workspace: Workspace) -> dict[str, Any]:
 
 
 def _history_state(workspace: Workspace) -> list[Any] | None:
-    """Return the path of Dagster's history, and its files' sizes and times; None if it is not a local file."""
+    """Return the path of Dagster's history, and its files' sizes and times.
+
+    None if it is not a local file.
+    """
     home = Path(os.environ.get("DAGSTER_HOME") or workspace.dagster_home)
     index = home / _HISTORY
     if workspace.is_shared or not index.is_file():

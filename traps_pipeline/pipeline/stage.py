@@ -1,4 +1,4 @@
-"""Decorators that declare a stage or a source.
+"""Declare a stage or a source by a decorator.
 
 `@stage(TABLE, ...)` declares that a function makes a table (or files for people), `@source(...)` that one returns the
 version of something that people edit. `pipeline.assets` builds Dagster's assets from them, `pipeline.step` their
@@ -52,7 +52,10 @@ def is_declared(name: str) -> bool:
 
 
 def of(parent: Stage | Source | str, mapping: KeyMapping | None = None, *, need: UpstreamPolicy = "every") -> Parent:
-    """Return a stage's dependency on a parent: which of its partitions, and how many of them it needs."""
+    """Return a stage's dependency on a parent.
+
+    It says which of the parent's partitions, and how many of them, are needed.
+    """
     return Parent(parent if isinstance(parent, str) else parent.name, mapping, need)
 
 
@@ -62,9 +65,9 @@ def source(
     """Declare a source by the function of its name, which returns its data version."""
 
     def declare(version: Callable[[Workspace, Any], str]) -> Source:
-        one = Source(version.__name__, version, group, _doc(version), kinds, scheme)
-        _declare(one)
-        return one
+        declaration = Source(version.__name__, version, group, _result(_doc(version)), kinds, scheme)
+        _declare(declaration)
+        return declaration
 
     return declare
 
@@ -85,7 +88,9 @@ def stage(
     shared: ConcurrentBuild | None = None,
     side_by_side: bool = False,
 ) -> Callable[[Callable[[Workspace, Any], Any]], Stage]:
-    """Declare the function that makes a table, or files for people if only a name is given (see `graph.Stage`).
+    """Declare the function that makes a table or files (see `graph.Stage`).
+
+    It makes files for people if only a name is given.
 
     The description is the function's docstring, without its "Return"; the code is `code_of` the group, unless stated.
     It returns a StageOutput, or rows alone (figures and ids, never text that a model wrote), which are then shown.
@@ -124,7 +129,10 @@ def stage(
 
 
 def _with_preview(table: Table, rows: Any) -> StageOutput:
-    """Return the rows (a frame or values of the table's dataclass) as a frame, with a preview of the first."""
+    """Return the rows as a frame, with a preview of the first.
+
+    rows: a frame, or values of the table's dataclass.
+    """
     import pandas as pd
 
     frame = rows if isinstance(rows, pd.DataFrame) else pd.DataFrame(list(rows), columns=pd.Index(table.names))
@@ -136,8 +144,11 @@ def _doc(function: Callable[..., Any]) -> str:
 
 
 def _result(doc: str) -> str:
-    """Return what a docstring says that a function returns: in Dagster it describes what is made."""
-    text = doc.removeprefix("Return ")
+    """Return what a docstring says that a function returns.
+
+    In Dagster it describes what is made.
+    """
+    text = doc.removeprefix("Return ").removeprefix("Yield ").removeprefix("the version of ")
     return text[:1].upper() + text[1:]
 
 

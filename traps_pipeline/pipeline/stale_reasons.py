@@ -1,4 +1,7 @@
-"""Explain (`traps why`) which answers to an item are valid, and which would be asked again."""
+"""Explain which answers to an item are valid (`traps why`).
+
+The others would be asked again.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,9 @@ _OF_VOTE = ("item_id", "task", "abstained", "correct", "valid", "judge", "ration
 
 
 def explain(workspace: Workspace, item_id: str) -> dict[str, Any]:
-    """Return an item's question and clip (if it is still in the benchmark), and the state of its answers.
+    """Return an item's question and clip, and the state of its answers.
+
+    The clip is given if it is still in the benchmark.
 
     For every evaluation that has asked it: whether its answer is valid or which component of the key changed, with the
     answer and its votes. Raises TrapsError for an unknown item.

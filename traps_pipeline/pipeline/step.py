@@ -1,4 +1,6 @@
-"""Run one stage in one Dagster run: build its partitions and report them to Dagster.
+"""Run one stage in one Dagster run.
+
+Its partitions are built and reported to Dagster.
 
 `run_step` is the whole protocol, in the only sound order. It records the inputs' versions before it reads anything. It
 skips, with a reason, what cannot be built yet or would be built from something damaged. Each partition is written, read
@@ -44,7 +46,10 @@ _ATTEMPTS: dict[str, int] = {}  # by run: how often it had been resumed when thi
 
 
 def run_step(stage: Stage, context: dg.AssetExecutionContext, workspace: Workspace) -> Events:
-    """Build this run's part of a stage; yield Dagster's events. Raises TrapsError for all failures at the run's end."""
+    """Build this run's part of a stage; yield Dagster's events.
+
+    Raises TrapsError for all failures at the run's end.
+    """
     step = _Step(stage, context, workspace)
     yield from step.tell_unwanted()
     for key in step.to_make():
@@ -69,7 +74,10 @@ def run_step(stage: Stage, context: dg.AssetExecutionContext, workspace: Workspa
 
 
 class _Step:
-    """The state and the phases of `run_step`; its methods are called in the order of their definition."""
+    """The state and the phases of `run_step`.
+
+    Its methods are called in the order of their definition.
+    """
 
     def __init__(self, stage: Stage, context: dg.AssetExecutionContext, workspace: Workspace) -> None:
         self.stage, self.context, self.workspace, self.graph = stage, context, workspace, the_graph()
@@ -89,7 +97,10 @@ class _Step:
         self._wanted, self._unwanted = [k for k in keys if k in wanted_keys], [k for k in keys if k not in wanted_keys]
 
     def tell_unwanted(self) -> Iterator[dg.AssetMaterialization]:
-        """Report unwanted cells, which a range may contain, as done, so that a backfill ends."""
+        """Report unwanted cells as done, so that a backfill ends.
+
+        A range may contain some.
+        """
         if MAKE_TAG in self.tags:
             return
         if self.stage.scheme and not self._wanted and BACKFILL_TAG not in self.tags:
@@ -100,7 +111,10 @@ class _Step:
             yield self.history.event(self.stage, key, "not wanted", self.provenance, about)
 
     def to_make(self) -> list[str | None]:
-        """Return this run's keys to build: all that are wanted, or those that its tag selects."""
+        """Return this run's keys to build.
+
+        All that are wanted, or those that its tag selects.
+        """
         if MAKE_TAG not in self.tags:
             return self._wanted
         recorded, existing = self.history.recorded(self.stage.name), self.tags[MAKE_TAG] == OUTDATED
@@ -144,7 +158,10 @@ class _Step:
             yield self.history.event(self.stage, key, version, self.provenance, about)
 
     def tell_unmade(self) -> Iterator[dg.AssetCheckEvaluation]:
-        """Report partitions that could not be built, and those that fail a check, in this run or before."""
+        """Report partitions that could not be built or that fail a check.
+
+        The failure may be of this run or of one before.
+        """
         unmade = self._maker.unmade
         if unmade:
             end_if_resumed(self.context.instance, self.context.run.run_id, _ATTEMPTS[self.context.run.run_id])
@@ -153,7 +170,9 @@ class _Step:
         yield from self.checks.still_failing(self.lineage, {*self._inputs, *unmade} - self._maker.taken.keys())
 
     def hand_on(self, result: dg.MaterializeResult | None) -> Iterator[dg.Output | dg.MaterializeResult]:
-        """Yield the result of an asset without partitions, or outputs for which Dagster writes no event of its own.
+        """Yield the result of an asset without partitions, or its outputs.
+
+        Dagster writes no event of its own for these outputs.
 
         Dagster skips everything downstream of a step without outputs, and would write one event, with one version, for
         all partitions. Observable sources, which report their own versions too, carry this mark.
@@ -170,7 +189,9 @@ class _Step:
 
 
 def guard_events(events: Events, context: dg.AssetExecutionContext) -> Events:
-    """Forward a step's events, with progress in Dagster's log and without keys in the traceback that it stores.
+    """Forward a step's events, with progress in Dagster's log.
+
+    The traceback that Dagster stores gets no keys.
 
     A run stopped by a signal is canceled; Dagster, which did not stop it itself, would call it a failure.
     """
@@ -191,7 +212,9 @@ def guard_events(events: Events, context: dg.AssetExecutionContext) -> Events:
 
 
 def end_if_resumed(instance: dg.DagsterInstance, run_id: str, attempts: int) -> None:
-    """End this process if its run has been resumed elsewhere: its host was stopped and presumed dead.
+    """End this process if its run has been resumed elsewhere.
+
+    Its host was stopped and presumed dead.
 
     Another process builds what this one could not, so this one must not report a failed run to Dagster.
     """

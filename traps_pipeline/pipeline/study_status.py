@@ -1,4 +1,7 @@
-"""Compute a study's fresh, stale and missing partitions, with the reasons (`traps status`)."""
+"""Compute a study's fresh, stale and missing partitions (`traps status`).
+
+The reasons are given.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,9 @@ from traps_pipeline.storage.workspace import Workspace
 
 @dataclass(frozen=True)
 class StageStatus:
-    """The partitions of a stage: numbers of fresh, stale (with reasons) and missing ones.
+    """The partitions of a stage.
+
+    Numbers of fresh, stale (with reasons) and missing ones.
 
     A stage without partitions has one, of its own name.
     """
@@ -31,7 +36,10 @@ class StageStatus:
 
 
 def stage_statuses(workspace: Workspace, lineage: Lineage, experiment: str | None) -> Iterator[StageStatus]:
-    """Yield the status of every stage, over the partitions that the study or one of its experiments wants."""
+    """Yield the status of every stage.
+
+    It covers the partitions that the study or one of its experiments wants.
+    """
     partitions = StudyPartitions(workspace, experiment)
     for stage in lineage.graph.stages:
         statuses = {key or stage.name: lineage.status(stage.name, key) for key in stage.wanted(partitions)}

@@ -1,4 +1,4 @@
-"""Translate the graph into Dagster's asset keys, partitions and partition mappings."""
+"""Translate the graph into Dagster's asset keys, partitions and mappings."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ for _category in (dg.BetaWarning, dg.PreviewWarning):
 
 
 def asset_key(name: str) -> dg.AssetKey:
-    """Return the asset key of a stage or source: its name, after the study's if studies share one history."""
+    """Return the asset key of a stage or source.
+
+    It is its name, after the study's if studies share one history.
+    """
     return dg.AssetKey([*_prefix(), name])
 
 

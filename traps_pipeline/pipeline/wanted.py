@@ -1,4 +1,6 @@
-"""Compute which partitions a study wants: what its experiments ask about its scenarios.
+"""Compute which partitions a study wants.
+
+They are what its experiments ask about its scenarios.
 
 Partition keys, `traps run`, `traps status`, Dagster's buttons and its automation all use this module, so nothing asks a
 model that no experiment of the study names.
@@ -48,7 +50,7 @@ class StudyPartitions:
 
     @cached_property
     def categories(self) -> list[str]:
-        """Categories with scenarios, and those whose scenarios were all discarded after their table was made."""
+        """Categories with scenarios, or with a table made before all were discarded."""
         if self._workspace is None:
             return [*CATEGORIES]
         existing = {part["category"] for part in self._workspace.tables.partitions(SCENE_SPECS)}
@@ -69,7 +71,7 @@ class StudyPartitions:
         return [dataset for dataset in self.datasets if dataset in BESIDE]
 
     @cached_property
-    def asks_pairs(self) -> bool:
+    def has_pairs(self) -> bool:
         """Whether any of `datasets` consists of pairs: arms alone have no leaderboard."""
         return bool({*self.datasets} & {*DATASETS})
 
@@ -101,7 +103,10 @@ class StudyPartitions:
 
     @cached_property
     def _inside(self) -> tuple[list[str], MechanismSettings | None] | None:
-        """Datasets (no arms) and settings of the mechanistic analyses; None if there are none."""
+        """Datasets (no arms) and settings of the mechanistic analyses.
+
+        None if there are none.
+        """
         if self._workspace is None:
             return [*DATASETS], None
         settings = self._workspace.study.mechanism
@@ -110,7 +115,7 @@ class StudyPartitions:
         return (datasets, settings) if experiments and settings else None
 
     @cached_property
-    def looks_inside(self) -> bool:
+    def has_mechanism(self) -> bool:
         """Whether any mechanistic analysis is requested."""
         return self._inside is not None
 
@@ -130,7 +135,7 @@ class StudyPartitions:
         return settings.patching.prompt if settings.patching else None
 
     @cached_property
-    def reads_sentences(self) -> bool:
+    def has_sentences(self) -> bool:
         """Whether log-probabilities of abstentions are computed."""
         return self._inside is not None and (self._inside[1] is None or bool(self._inside[1].sentences))
 
@@ -141,7 +146,7 @@ class StudyPartitions:
         asked = self._datasets(experiment for experiment in self._asked if experiment.mechanism)
         existing = {*datasets, *(arm for arm in PROBED_ARMS if self._inside and arm in asked)}
         existing |= {
-            dataset for dataset, of in ((ANSWERABLE, "occlusion"), (TIME_SWAPPED, "chaotic")) if of in existing
+            dataset for dataset, origin in ((ANSWERABLE, "occlusion"), (TIME_SWAPPED, "chaotic")) if origin in existing
         }
         return [d for d in PROBED_DATASETS if d in existing]
 
@@ -187,7 +192,10 @@ class StudyPartitions:
 
 
 def _evaluations(experiment: Asked) -> list[Evaluation]:
-    """Return the experiment's evaluations for which a model has enough runs; all of its runs if none are named."""
+    """Return the experiment's evaluations for which a model has enough runs.
+
+    All of its runs if none are named.
+    """
     evaluations = []
     for model in experiment.models:
         available = range(1, get_model(model).runs + 1)

@@ -1,1 +1,4 @@
-"""The vocabulary and keys of the benchmark: datasets, arms, regimes, metrics and the cells that they span."""
+"""Define the benchmark's vocabulary and keys.
+
+Datasets, arms, regimes, metrics and the cells that they span.
+"""

@@ -1,4 +1,4 @@
-"""Datasets, arms and variations: their names, their sides, and their categories."""
+"""Name datasets, arms and variations, their sides, and their categories."""
 
 from __future__ import annotations
 
@@ -57,13 +57,17 @@ def taxonomy_of(dataset: str) -> str:
 
 
 def is_ill_posed(dataset: str) -> bool:
-    """Return whether the void of a pair is the control's clip with an unanswerable question."""
+    """Return whether a pair's void is the control's clip with another question.
+
+    That question is unanswerable.
+    """
     return dataset.endswith("_ill_posed")
 
 
 def transfer_type(source: str, target: str) -> str:
-    """Return what a transfer between datasets crosses (docs/spec.md 7.2): the void's modality, the domain, both or
-    neither.
+    """Return what a transfer between datasets crosses (docs/spec.md 7.2).
+
+    The void's modality, the domain, both or neither.
     """
     domain = taxonomy_of(source) != taxonomy_of(target)
     modality = is_ill_posed(source) != is_ill_posed(target)
@@ -78,7 +82,7 @@ def taxonomy_of_category(category: str) -> str:
 
 
 def datasets_of_category(category: str) -> tuple[str, str]:
-    """Return the two datasets (visual, ill-posed) that a category's scenarios belong to."""
+    """Return the two datasets (visual, ill-posed) of a category's scenarios."""
     taxonomy = taxonomy_of_category(category)
     return taxonomy, f"{taxonomy}_ill_posed"
 
@@ -94,7 +98,10 @@ def beside_of(taxonomy: str) -> tuple[str, ...]:
 
 
 def all_datasets_of(category: str) -> tuple[str, ...]:
-    """Return all datasets, arms and variations that a category's scenarios may be asked in."""
+    """Return all datasets that a category's scenarios may be asked in.
+
+    Arms and variations are among them.
+    """
     return (*datasets_of_category(category), *beside_of(taxonomy_of_category(category)))
 
 

@@ -1,4 +1,6 @@
-"""Metrics in words: name, heading, range, direction, and the items that each counts.
+"""Describe metrics in words.
+
+Name, heading, range, direction, and the items that each counts.
 
 `scoring.metrics` computes them, `scoring.bootstrap` resamples them.
 """
@@ -11,7 +13,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Metric:
-    """A figure of a model. side: the side whose items a share counts; empty if it counts both."""
+    """A figure of a model.
+
+    side: the side whose items a share counts; empty if it counts both.
+    """
 
     name: str
     heading: str

@@ -1,4 +1,6 @@
-"""Votes of judges as a matrix (one row per answer and task, one column per judge), and their majority.
+"""Arrange votes of judges as a matrix, and count their majority.
+
+One row per answer and task, one column per judge.
 
 Verdicts, agreement, bias and scores without one judge are all computed from this matrix.
 """
@@ -47,9 +49,9 @@ class Ratings:
         items: rows with the columns `answer`. Two arrays: values, (items, judges), all INVALID for an item that was not
         judged; and whether it was judged, (items,).
         """
-        by = [*self.answer]
-        judged = self.answers.loc[self.answers["task"].isin(tasks), by]
-        merged = items[by].merge(judged.assign(row=judged.index), on=by, how="left", validate="many_to_one")
+        keys = [*self.answer]
+        judged = self.answers.loc[self.answers["task"].isin(tasks), keys]
+        merged = items[keys].merge(judged.assign(row=judged.index), on=keys, how="left", validate="many_to_one")
         rows = merged["row"].to_numpy(float)
         is_judged = ~np.isnan(rows)
         values = np.full((len(items), len(self.judges)), INVALID, np.int8)
@@ -80,7 +82,10 @@ def ratings(votes: pd.DataFrame, judges: Sequence[str] | None = None, answer: Se
 
 
 def _grouped(votes: pd.DataFrame, by: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Return each vote's group number by these columns, (votes,), and the first vote of each group, (groups,)."""
+    """Return each vote's group by these columns, and each group's first vote.
+
+    Shapes (votes,) and (groups,).
+    """
     import pandas as pd
 
     code = np.zeros(len(votes), np.int64)
@@ -99,10 +104,13 @@ def _decisions(votes: pd.DataFrame) -> np.ndarray:
 
 
 def majority(values: np.ndarray) -> np.ndarray:
-    """Return the vote of more than half of the judges, (rows,) int8; INVALID without such a majority."""
+    """Return the vote of more than half of the judges, (rows,) int8.
+
+    INVALID without such a majority.
+    """
     half = values.shape[1] / 2
-    yes, no = ((values == vote).sum(axis=1) > half for vote in (YES, NO))
-    return np.where(yes, YES, np.where(no, NO, INVALID)).astype(np.int8)
+    is_yes, is_no = ((values == vote).sum(axis=1) > half for vote in (YES, NO))
+    return np.where(is_yes, YES, np.where(is_no, NO, INVALID)).astype(np.int8)
 
 
 def decided(votes: np.ndarray) -> pd.arrays.BooleanArray:

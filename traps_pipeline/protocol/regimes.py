@@ -1,4 +1,7 @@
-"""Regimes: the system prompts under which models answer, with their texts and answer formats."""
+"""Define the regimes, the system prompts under which models answer.
+
+Each has its texts and an answer format.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,9 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class Regime:
-    """A system prompt and its answer format. Its texts are files of `assets/prompts`, joined by one blank line.
+    """A system prompt and its answer format.
+
+    Its texts are files of `assets/prompts`, joined by one blank line.
 
     fields: of the JSON object that an answer must be; none: free text. states: the texts under which hidden states are
     read (docs/spec.md 7.1); none: no states are read under this regime. marker: of a model's point in the landscape.
@@ -59,7 +64,10 @@ PROBE_PROMPT = STANDARD  # probes are of this VQA prompt, the other one serves d
 
 
 def fields_of(regime: str, dataset: str = "") -> tuple[str, ...] | None:
-    """Return the fields of the JSON answer under a regime, in a dataset that may vary it; None for free text."""
+    """Return the fields of the JSON answer under a regime; None for free text.
+
+    A dataset may vary them.
+    """
     return FIELDS.get(dataset, FIELDS.get(regime))
 
 

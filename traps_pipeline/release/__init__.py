@@ -1,1 +1,4 @@
-"""Publication: the released folder, commitments, harnesses, results files and submissions."""
+"""Publish a study.
+
+The released folder, commitments, harnesses, results files and submissions.
+"""

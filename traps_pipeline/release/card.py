@@ -1,4 +1,7 @@
-"""Write the dataset card (with the hub's header) and the data dictionary, both from the tables' definitions."""
+"""Write the dataset card (with the hub's header) and the data dictionary.
+
+Both come from the tables' definitions.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,10 @@ _WITH_CLIPS = (PAIRS.name, RELEASED_ITEMS.name, HELD_OUT_ITEMS.name)
 
 @cache
 def environment() -> Environment:
-    """Return the template environment of a release: plain text, in which an undefined name is an error."""
+    """Return the template environment of a release.
+
+    Templates are plain text, in which an undefined name is an error.
+    """
     folder = Path(__file__).parent / "templates"
     return Environment(loader=FileSystemLoader(folder), undefined=StrictUndefined, keep_trailing_newline=True)
 
@@ -56,7 +62,10 @@ def _size(rows: int) -> str:
 
 
 def dictionary(tables: Sequence[Table[Any]], places: Mapping[str, str], canary: str) -> str:
-    """Return the data dictionary in Markdown: each table with its key and its columns, their types and meanings."""
+    """Return the data dictionary in Markdown.
+
+    It has each table with its key and its columns, their types and meanings.
+    """
     parts = [f"<!-- {canary} -->\n\n# Data dictionary\n"]
     for table in tables:
         parts.append(f"\n## {table.name}\n\nOne row is {table.row}. File: `{places[table.name]}`, JSON lines. ")

@@ -1,4 +1,7 @@
-"""Write and verify the SHA-256 of every file of a folder, in the format of `sha256sum --check`."""
+"""Write and verify the SHA-256 of every file of a folder.
+
+The format is that of `sha256sum --check`.
+"""
 
 from __future__ import annotations
 
@@ -16,14 +19,20 @@ _LINE = re.compile(r"([0-9a-f]{64})  (\S.*)")
 
 
 def released_files(folder: Path) -> list[str]:
-    """Return every file of a folder that has a checksum, by relative path, sorted; hidden files have none."""
+    """Return every file of a folder that has a checksum, by relative path, sorted.
+
+    Hidden files have none.
+    """
     paths = [path.relative_to(folder) for path in folder.rglob("*") if path.is_file() or path.is_symlink()]
     names = [path.as_posix() for path in paths if not any(part.startswith(".") for part in path.parts)]
     return sorted(name for name in names if name not in _OUTSIDE)
 
 
 def write_checksums(folder: Path, canary: str) -> int:
-    """Write the checksums of a folder, below a comment with the canary; return the number of files."""
+    """Write the checksums of a folder, below a comment with the canary.
+
+    Return the number of files.
+    """
     names = released_files(folder)
     lines = [f"{file_digest(folder / name)}  {name}\n" for name in names]
     write_text(folder / CHECKSUMS, f"# {canary}\n{''.join(lines)}")
@@ -31,7 +40,10 @@ def write_checksums(folder: Path, canary: str) -> int:
 
 
 def read_checksums(folder: Path) -> dict[str, str]:
-    """Return the checksum of each file by its path. Raises TrapsError naming an invalid line."""
+    """Return the checksum of each file by its path.
+
+    Raises TrapsError naming an invalid line.
+    """
     path = folder / CHECKSUMS
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -51,7 +63,10 @@ def read_checksums(folder: Path) -> dict[str, str]:
 
 
 def altered_files(folder: Path) -> list[str]:
-    """Return the differences between a folder and its checksums, one sentence per file. Raises TrapsError."""
+    """Return the differences between a folder and its checksums.
+
+    One sentence per file. Raises TrapsError.
+    """
     expected, existing = read_checksums(folder), {*released_files(folder)}
     problems = []
     for name in sorted({*expected, *existing}):
@@ -62,6 +77,6 @@ def altered_files(folder: Path) -> list[str]:
         elif (folder / name).is_symlink():
             problems.append(f"{name}: is a link, not a file")
         elif file_digest(folder / name) != expected[name]:
-            same = [other for other, sha256 in expected.items() if sha256 == file_digest(folder / name)]
-            problems.append(f"{name}: is {f'in truth {same[0]}' if same else 'altered'}")
+            same_files = [known_name for known_name, sha256 in expected.items() if sha256 == file_digest(folder / name)]
+            problems.append(f"{name}: is {f'in truth {same_files[0]}' if same_files else 'altered'}")
     return problems

@@ -1,4 +1,6 @@
-"""Commit and reveal: fix a benchmark before anybody sees it, and later prove that it is the same one.
+"""Commit to a benchmark before anybody sees it, and reveal it later.
+
+The reveal proves that it is the same one.
 
 The commitment holds digests of the seed and of each record, all mixed with a secret number, so that nobody can search
 for the seed. The reveal holds the seed and that number. Anyone with both can draw the benchmark again.
@@ -56,7 +58,10 @@ class Commitment(_Strict):
 
 
 class Reveal(_Strict):
-    """The secret file, kept until the benchmark is revealed. nonce: the secret number, in hexadecimal digits."""
+    """The secret file, kept until the benchmark is revealed.
+
+    nonce: the secret number, in hexadecimal digits.
+    """
 
     format: Literal[1] = 1
     seed: int = Field(ge=0)
@@ -72,7 +77,9 @@ def _sealed_spec(reveal: Reveal, spec: SceneSpec) -> str:
 
 
 def commit(benchmark: Path, commitment: Path, reveal: Path) -> Commitment:
-    """Commit to a benchmark of `traps benchmark sample`: write the public file and the secret one.
+    """Commit to a benchmark: write the public file and the secret one.
+
+    benchmark: of `traps benchmark sample`.
 
     Only the owner can read the latter. Raises TrapsError if the folder is no such benchmark, or of several seeds, and
     if either file exists.
@@ -107,12 +114,18 @@ def _made_with() -> dict[str, str]:
 
 
 def read_commitment(path: Path) -> Commitment:
-    """Return a commitment from its file. Raises TrapsError."""
+    """Return a commitment from its file.
+
+    Raises TrapsError.
+    """
     return _read(Commitment, path)
 
 
 def read_reveal(path: Path) -> Reveal:
-    """Return a reveal from its file. Raises TrapsError."""
+    """Return a reveal from its file.
+
+    Raises TrapsError.
+    """
     return _read(Reveal, path)
 
 
@@ -131,7 +144,10 @@ def _read(kind: type[Any], path: Path) -> Any:
 
 
 def revealed_specs(folder: Path) -> dict[str, SceneSpec]:
-    """Return the records of a sampled or released folder. Raises TrapsError, also for an altered trajectory."""
+    """Return the records of a sampled or released folder.
+
+    Raises TrapsError, also for an altered trajectory.
+    """
     from traps_pipeline.benchmark.specs import spec_of
 
     if (folder / "scenarios.jsonl").is_file():
@@ -155,7 +171,10 @@ def revealed_specs(folder: Path) -> dict[str, SceneSpec]:
 
 
 def broken_seals(commitment: Commitment, reveal: Reveal, specs: Mapping[str, SceneSpec]) -> list[str]:
-    """Return the differences between records and commitment, one sentence each, the seed's first."""
+    """Return the differences between records and commitment.
+
+    One sentence each, the seed's first.
+    """
     problems = []
     if _sealed_seed(reveal, commitment.draws) != commitment.seed:
         problems.append("the revealed seed, number or composition is not the one that was committed")
@@ -202,12 +221,18 @@ def drawn_again(
 
 
 def is_same_scene(spec: SceneSpec, other: SceneSpec) -> bool:
-    """Return whether two records differ only in fields that depend on a machine's arithmetic."""
+    """Return whether two records are the same up to a machine's arithmetic.
+
+    They may differ in the fields that depend on it.
+    """
     return spec.model_dump(exclude={*_OF_ARITHMETIC}) == other.model_dump(exclude={*_OF_ARITHMETIC})
 
 
 def other_arithmetic(commitment: Commitment) -> str:
-    """Return how machine and libraries differ from the commitment's, in words; empty if they do not."""
+    """Return how machine and libraries differ from the commitment's, in words.
+
+    Empty if they do not.
+    """
     here = _made_with()
     names = [name for name in here if commitment.made_with.get(name) != here[name]]
     return ", ".join(f"{name} {commitment.made_with.get(name, 'unknown')} there, {here[name]} here" for name in names)

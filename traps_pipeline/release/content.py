@@ -1,4 +1,7 @@
-"""Build the rows of a released folder from the tables of a study with rendered clips."""
+"""Build the rows of a released folder from a study's tables.
+
+The study must have rendered clips.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +48,10 @@ Rows = Sequence[Mapping[str, Any]]
 
 @dataclass(frozen=True)
 class Content:
-    """The released content: ITEMS rows of pairs and arms; SCENE_SPECS rows; clips by released path; the benchmark."""
+    """The released content.
+
+    ITEMS rows of pairs and arms; SCENE_SPECS rows; clips by released path; the benchmark.
+    """
 
     items: Rows
     specs: Rows
@@ -59,7 +65,10 @@ class Content:
 
 
 def content_of(workspace: Workspace, arms: Sequence[str] = ()) -> Content:
-    """Return a study's pairs, and items of these arms. Raises TrapsError for missing tables, or a wrong clip."""
+    """Return a study's pairs, and items of these arms.
+
+    Raises TrapsError for missing tables, or a wrong clip.
+    """
     items = _records(workspace, ITEMS, (*DATASETS, *arms))
     if not items:
         raise TrapsError(f"{workspace.root}: no pairs to release; make items first (traps run ... --until items)")
@@ -96,7 +105,10 @@ def lite_of(items: Iterable[Mapping[str, Any]]) -> set[str]:
 
 
 def pair_rows(content: Content) -> list[PairRow]:
-    """Return one row per pair, sorted by id. Raises TrapsError for a pair with a missing side."""
+    """Return one row per pair, sorted by id.
+
+    Raises TrapsError for a pair with a missing side.
+    """
     lite, rows, pairs = lite_of(content.items), list[PairRow](), dict[str, dict[str, Mapping[str, Any]]]()
     for row in content.items:
         if row["dataset"] in DATASETS:
@@ -138,7 +150,10 @@ def item_rows(content: Content) -> list[ReleasedItemRow]:
 
 
 def held_out_rows(content: Content, key: bytes) -> list[HeldOutItemRow]:
-    """Return one row per item, without any field that reveals its answer, sorted by opaque name."""
+    """Return one row per item, sorted by opaque name.
+
+    No field reveals its answer.
+    """
     rows = [
         HeldOutItemRow(
             item=opaque(key, row["item_id"]),
@@ -153,7 +168,10 @@ def held_out_rows(content: Content, key: bytes) -> list[HeldOutItemRow]:
 
 
 def held_out_clip(media_digest: str) -> str:
-    """Return a clip's path in a folder without answers: its name is the digest of its content."""
+    """Return a clip's path in a folder without answers.
+
+    Its name is the digest of its content.
+    """
     return f"{_CLIPS}{media_digest[:2]}/{media_digest[:32]}.mp4"
 
 
@@ -163,7 +181,10 @@ def scenario_rows(content: Content) -> list[ScenarioRow]:
 
 
 def certificate_rows(content: Content) -> list[CertificateRow]:
-    """Return one row per certificate and scenario, evaluated on the numbers that its record stores."""
+    """Return one row per certificate and scenario.
+
+    It is evaluated on the numbers that its record stores.
+    """
     return [row for spec in content.specs for row in _certificates(spec_of(dict(spec)), content.release.canary)]
 
 

@@ -1,4 +1,7 @@
-"""The Croissant 1.1 description of a released folder, with the fields of responsible AI."""
+"""Describe a released folder in Croissant 1.1.
+
+It has the fields of responsible AI.
+"""
 
 from __future__ import annotations
 
@@ -69,7 +72,10 @@ _RAI: Mapping[str, Any] = {
 
 
 def croissant(root: Path, manifest: Mapping[str, Any], tables: Sequence[Table[Any]], places: Mapping[str, str]) -> str:
-    """Return the description as JSON-LD. root: the folder, which already holds the tables."""
+    """Return the description as JSON-LD.
+
+    root: the folder, which already holds the tables.
+    """
     described: dict[str, Any] = {
         "@context": _CONTEXT,
         "@type": "sc:Dataset",

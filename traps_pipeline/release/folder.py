@@ -1,4 +1,7 @@
-"""Write the released folder (`traps publish release`): the same bytes for the same study."""
+"""Write the released folder (`traps publish release`).
+
+The same study gives the same bytes.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +69,10 @@ class Options:
 
 @dataclass(frozen=True)
 class ReleaseSummary:
-    """A summary of the written folder: numbers of files, clips and rows by table; the path of held-out answers."""
+    """A summary of the written folder.
+
+    Numbers of files, clips and rows by table, and the path of held-out answers.
+    """
 
     files: int
     clips: int
@@ -92,7 +98,10 @@ class _Folder:
 
 
 def write_release(content: Content, target: Path, options: Options) -> ReleaseSummary:
-    """Write the folder; it may replace only a former release. Raises TrapsError."""
+    """Write the folder; it may replace only a former release.
+
+    Raises TrapsError.
+    """
     if target.exists() and any(target.iterdir()) and not (target / CHECKSUMS).is_file():
         raise TrapsError(
             f"{target}: holds other files, or what a stopped release left; give an empty or a new folder, or delete it"
@@ -192,10 +201,13 @@ ANONYMOUS_CITATION = {
 
 
 def identifying() -> dict[str, str]:
-    """Return the texts that identify the authors, each with its replacement for double-blind review."""
+    """Return the texts that identify the authors, each with its replacement.
+
+    Double-blind review needs it.
+    """
     data = yaml.safe_load((ROOT / CITATION).read_text(encoding="utf-8"))
     paper = data["preferred-citation"]
-    names = [f"{one['given-names']} {one['family-names']}" for one in paper["authors"]]
+    names = [f"{author['given-names']} {author['family-names']}" for author in paper["authors"]]
     words = {paper["url"]: "(address withheld)", paper["title"]: "(title withheld)", data["title"]: "(title withheld)"}
     words |= {paper["collection-title"]: "(venue withheld)", paper["conference"]["name"]: "(venue withheld)"}
     return words | {", ".join(names): "Anonymous authors"} | dict.fromkeys(names, "Anonymous authors")

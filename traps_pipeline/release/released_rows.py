@@ -1,4 +1,7 @@
-"""The tables of a released folder, from which the data dictionary, the card and the Croissant description are made."""
+"""Define the tables of a released folder.
+
+The data dictionary, the card and the Croissant description are made from them.
+"""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -42,7 +45,10 @@ PAIRS = Table("pairs", PairRow, partition_by=(), key=("pair_id",))
 
 @dataclass(frozen=True, kw_only=True)
 class ReleasedItemRow(ItemRow):
-    """An item: what a model is asked about one clip; items of arms have an arm as their dataset."""
+    """An item: what a model is asked about one clip.
+
+    Items of arms have an arm as their dataset.
+    """
 
     file_name: Annotated[str, "mp4, relative to this table's folder"]
     lite: Lite
@@ -54,7 +60,10 @@ RELEASED_ITEMS = Table("items", ReleasedItemRow, partition_by=(), key=("item_id"
 
 @dataclass(frozen=True, kw_only=True)
 class HeldOutItemRow:
-    """An item whose answer is withheld: neither its name nor its place in the table tells its side or its pair."""
+    """An item whose answer is withheld.
+
+    Neither its name nor its place in the table tells its side or its pair.
+    """
 
     item: Annotated[str, "an opaque name, by which answers are sent in"]
     question: shared.Question
@@ -78,7 +87,10 @@ SCENARIOS = Table("scenarios", ScenarioRow, partition_by=(), key=("scenario_id",
 
 @dataclass(frozen=True, kw_only=True)
 class CertificateRow:
-    """A certificate of a scenario: a promise about its pair, held against the numbers that its record stores."""
+    """A certificate of a scenario: a promise about its pair.
+
+    It is held against the numbers that its record stores.
+    """
 
     scenario_id: shared.ScenarioId
     certificate: Annotated[str, "name of the certificate"]

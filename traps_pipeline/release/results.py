@@ -1,4 +1,7 @@
-"""Export a study's leaderboard: the hub's `.eval_results`, Every Eval Ever, and plain Parquet."""
+"""Export a study's leaderboard.
+
+The hub's `.eval_results`, Every Eval Ever, and plain Parquet.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +40,10 @@ Row = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Attribution:
-    """The evaluating organization, and the developer of all models except reference models."""
+    """The evaluating organization, and the developer of all models.
+
+    Reference models have their own developer.
+    """
 
     organization: str = "unknown"
     developer: str = "unknown"
@@ -48,7 +54,9 @@ class Attribution:
 
 
 def write_results(workspace: Workspace, target: Path, dataset: str, who: Attribution) -> list[str]:
-    """Write the overall figures of every model that has them, and all rows as Parquet; return the files.
+    """Write all rows as Parquet, and overall scores of every model that has them.
+
+    Return the files.
 
     dataset: the repository of the release, as the hub names it.
 
@@ -115,7 +123,7 @@ def _ever_record(
             "developer": who.developer_of(model),
             "additional_details": _UNKNOWN,
         },
-        "evaluation_results": [one for row in rows for one in _ever_results(row, dataset, release)],
+        "evaluation_results": [result for row in rows for result in _ever_results(row, dataset, release)],
     }
 
 

@@ -1,4 +1,7 @@
-"""A leaderboard of submissions: verify each, and rank those with the same items and panel together."""
+"""Rank submissions.
+
+Each is verified, and those with the same items and panel are ranked together.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +43,10 @@ class AcceptedSubmission:
 
     @property
     def group(self) -> tuple[str, str]:
-        """The digest of its items, and its panel: submissions with the same group are ranked together."""
+        """The digest of its items, and its panel.
+
+        Submissions with the same group are ranked together.
+        """
         items = self.submission.table(ITEMS)
         about = self.submission.about
         return digest(sorted(items["item_hash"]))[:16], id_of_judges(about.panel, about.judges)
@@ -56,7 +62,10 @@ class RefusedSubmission:
 
 @dataclass(frozen=True)
 class RankedGroup:
-    """Entries that are ranked together: LEADERBOARD rows, of models named model@submission if names repeat."""
+    """Entries that are ranked together.
+
+    LEADERBOARD rows, of models named model@submission if names repeat.
+    """
 
     items: str
     panel: str
@@ -81,7 +90,10 @@ class Board:
 
 
 def gather(paths: Iterable[Path], release: Path | None = None, say: Callable[[str], None] = lambda line: None) -> Board:
-    """Verify submissions and rank the valid ones. Raises TrapsError if two have one name, and if none is valid."""
+    """Verify submissions and rank the valid ones.
+
+    Raises TrapsError if two have one name, and if none is valid.
+    """
     board = Board()
     for path in paths:
         try:
@@ -96,28 +108,31 @@ def gather(paths: Iterable[Path], release: Path | None = None, say: Callable[[st
         else:
             board.accepted.append(AcceptedSubmission(submission, verified))
         say(f"{path}: {'refused' if verified.problems else 'verified'}")
-    names = Counter(one.name for one in board.accepted)
+    names = Counter(entry.name for entry in board.accepted)
     twice = [name for name, n in names.items() if n > 1]
     if twice:
         raise TrapsError(f"two submissions are called {twice[0]!r}; pack one of them again with another --name")
     if not board.accepted:
-        why = "; ".join(f"{one.name}: {one.problems[0]}" for one in board.refused[:3])
+        why = "; ".join(f"{entry.name}: {entry.problems[0]}" for entry in board.refused[:3])
         raise TrapsError(f"no submission holds, so there is nothing to rank ({why})")
     groups: dict[tuple[str, str], list[AcceptedSubmission]] = {}
-    for one in board.accepted:
-        groups.setdefault(one.group, []).append(one)
+    for entry in board.accepted:
+        groups.setdefault(entry.group, []).append(entry)
     board.groups = [_group(key, members) for key, members in sorted(groups.items())]
     return board
 
 
 def _group(key: tuple[str, str], members: Sequence[AcceptedSubmission]) -> RankedGroup:
-    """Return the members' verdicts scored together, so that their differences are paired over the same scenarios."""
-    owners = Counter(model for one in members for model in _verdicts(one)["model"].unique())
+    """Return the members' verdicts scored together.
+
+    Their differences are then paired over the same scenarios.
+    """
+    owners = Counter(model for member in members for model in _verdicts(member)["model"].unique())
     parts, submissions = list[pd.DataFrame](), dict[str, str]()
-    for one in members:
-        verdicts = _verdicts(one)
-        names = {m: m if owners[m] == 1 else f"{m}@{one.name}" for m in verdicts["model"].unique()}
-        submissions |= dict.fromkeys(names.values(), one.name)
+    for member in members:
+        verdicts = _verdicts(member)
+        names = {m: m if owners[m] == 1 else f"{m}@{member.name}" for m in verdicts["model"].unique()}
+        submissions |= dict.fromkeys(names.values(), member.name)
         parts.append(verdicts.assign(model=[names[model] for model in verdicts["model"]]))
     verdicts = pd.concat(parts, ignore_index=True)
     versions = " + ".join(sorted(verdicts["benchmark_version"].unique()))

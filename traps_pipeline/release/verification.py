@@ -1,4 +1,6 @@
-"""Verify a submission: recast its votes if that needs no key, recompute every number, and compare with a release.
+"""Verify a submission.
+
+Its votes are recast if that needs no key, every number is recomputed, and it is compared with a release.
 
 Items, prompts and media are compared with the release's. The result names what cannot be checked.
 """
@@ -69,7 +71,10 @@ class Verification:
 
 
 def verify(submission: Submission, release: Path | None = None) -> Verification:
-    """Verify a submission, against a released folder if given. Raises TrapsError for an unreadable release."""
+    """Verify a submission, against a released folder if given.
+
+    Raises TrapsError for an unreadable release.
+    """
     verified = Verification()
     items = {row["item_id"]: row for row in records(submission.table(ITEMS))}
     answers, votes = records(submission.table(RESPONSES)), records(submission.table(VOTES))
@@ -98,10 +103,10 @@ def verify(submission: Submission, release: Path | None = None) -> Verification:
 def _wrong_items(items: Any) -> Iterator[str]:
     for row in items:
         try:
-            same = item_hash(row) == row["item_hash"]
+            is_same = item_hash(row) == row["item_hash"]
         except (ValueError, RecursionError):
-            same = False
-        if not same or row["item_id"] != f"{row['dataset']}:{row['scenario_id']}:{row['side']}":
+            is_same = False
+        if not is_same or row["item_id"] != f"{row['dataset']}:{row['scenario_id']}:{row['side']}":
             yield f"item {row['item_id']}: is not what its digest says"
         elif row["dataset"] not in DATASETS:
             yield f"item {row['item_id']}: is none of the pairs'"
@@ -118,7 +123,10 @@ def _wrong_prompts(submission: Submission) -> Iterator[str]:
 
 
 def released_items(release: Path) -> dict[str, tuple[str, str]]:
-    """Return digests of item and clip by released item. Raises TrapsError, also for an altered folder."""
+    """Return digests of item and clip by released item.
+
+    Raises TrapsError, also for an altered folder.
+    """
     from traps_pipeline.release.checksums import altered_files
     from traps_pipeline.release.content import CLIPS
 
@@ -233,7 +241,10 @@ def _cast_again(task: str, user: str) -> Outcome:
 
 
 def _other_vote(row: Row, item: Row, again: Outcome | None) -> str:
-    """Return how a vote differs from the correct one; an item with a wrong kind decides nothing."""
+    """Return how a vote differs from the correct one.
+
+    An item with a wrong kind decides nothing.
+    """
     try:
         return _difference(row, item, again)
     except (ValueError, TypeError, AttributeError) as error:
@@ -264,7 +275,10 @@ def _difference(row: Row, item: Row, again: Outcome | None) -> str:
 
 
 def _numbers(verified: Verification, submission: Submission) -> None:
-    """Compute verdicts, metrics and leaderboard from the votes; record how the submission's numbers differ."""
+    """Compute verdicts, metrics and leaderboard from the votes.
+
+    Record how the submission's numbers differ.
+    """
     own = id_of_judges(submission.about.panel, submission.about.judges)
     try:
         tables = (submission.table(table) for table in (ITEMS, RESPONSES, VOTES))
@@ -283,19 +297,19 @@ def _numbers(verified: Verification, submission: Submission) -> None:
 
 def _other_numbers(table: Table[Any], stated: pd.DataFrame, own: pd.DataFrame) -> Iterator[str]:
     key = list(table.key)
-    theirs, ours = ({tuple(row[k] for k in key): row for row in records(frame)} for frame in (stated, own))
-    for entry in sorted({*theirs, *ours}, key=str):
+    stated_rows, own_rows = ({tuple(row[k] for k in key): row for row in records(frame)} for frame in (stated, own))
+    for entry in sorted({*stated_rows, *own_rows}, key=str):
         name = f"{table.name} {' '.join(map(str, entry))}"
-        if entry not in ours or entry not in theirs:
-            yield f"{name}: {'has no votes' if entry not in ours else 'is left out'}"
+        if entry not in own_rows or entry not in stated_rows:
+            yield f"{name}: {'has no votes' if entry not in own_rows else 'is left out'}"
             continue
         for column in table.columns:
-            one, other = theirs[entry][column.name], ours[entry][column.name]
-            if not _equal(one, other):
-                yield f"{name}: {column.name} is {one!r:.40}, the votes give {other!r:.40}"
+            stated_value, own_value = stated_rows[entry][column.name], own_rows[entry][column.name]
+            if not _is_equal(stated_value, own_value):
+                yield f"{name}: {column.name} is {stated_value!r:.40}, the votes give {own_value!r:.40}"
 
 
-def _equal(one: Any, other: Any) -> bool:
+def _is_equal(one: Any, other: Any) -> bool:
     if isinstance(one, float) and isinstance(other, float):
         return math.isclose(one, other, rel_tol=CLOSE, abs_tol=CLOSE)
     return one == other

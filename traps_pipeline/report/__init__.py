@@ -1,1 +1,4 @@
-"""Output for people: the leaderboard, tables, figures, contact sheets and the report page."""
+"""Make output for people.
+
+The leaderboard, tables, figures, contact sheets and the report page.
+"""

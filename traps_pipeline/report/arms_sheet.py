@@ -1,4 +1,7 @@
-"""Contact sheets of one scenario with all its arms: the clip of each, and the right answer to it."""
+"""Draw contact sheets of one scenario with all its arms.
+
+Each arm has its clip, and the right answer to it.
+"""
 
 from __future__ import annotations
 
@@ -64,21 +67,25 @@ def _moments(clip: Path) -> np.ndarray:
 
 
 def _rows(sides: pd.DataFrame, arms: pd.DataFrame, scenario: str, root: Path, times: np.ndarray) -> Iterator[Row]:
-    """Yield control and void, then the arms that must be answered, then those that must be abstained on."""
+    """Yield control and void, then the arms.
+
+    First those that must be answered, then those that must be abstained on.
+    """
     pair = sides.loc[sides["scenario_id"] == scenario].sort_values("side")
     own = arms.loc[arms["scenario_id"] == scenario].sort_values(["side", "arm"])
     for row in (*pair.to_dict("records"), *own.to_dict("records")):
-        frames, at = decode(root / str(row["clip"]))
+        frames, times_s = decode(root / str(row["clip"]))
         truth = row["ground_truth"]
         name = str(row.get("arm") or row["side"])
         right = "must be abstained on" if row["side"] == "void" else f"must be answered: {truth}"
         right = f"no void, {truth} shows through" if name in OCCLUDER_DOSES else right
-        yield Row(name, right, str(row["question"]), sampled(frames, at, times))
+        yield Row(name, right, str(row["question"]), sampled(frames, times_s, times))
 
 
 def _sheet(scenario: str, rows: list[Row], times: np.ndarray) -> Figure:
-    """Return a figure with one row per clip: captions on the left, frames at the control's times, hatched after its
-    end.
+    """Return a figure with one row per clip.
+
+    Captions on the left, frames at the control's times, hatched after its end.
     """
     _, tall, wide, _ = rows[0].clip.frames.shape
     row_in = FRAME_IN * tall / wide + GAP_IN

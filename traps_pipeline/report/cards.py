@@ -1,4 +1,7 @@
-"""Cards of the report page: tables, figures and pictures of pairs, each beside the paper's."""
+"""Build the cards of the report page.
+
+Tables, figures and pictures of pairs, each beside the paper's.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +41,9 @@ Address = Callable[[SourceItems], str]
 
 @dataclass(frozen=True)
 class Card:
-    """A part of the page: the study's tables or figures (`html`, escaped), or `why` it was not run; and the paper's.
+    """A part of the page, with the paper's counterpart.
+
+    It holds the study's tables or figures (`html`, escaped), or `why` it was not run.
 
     shows: a description of the figures.
     """
@@ -96,7 +101,10 @@ def table_card(report: TableReport, sources: Sources, address: Address | None = 
 
 
 def paper_card(report: TableReport | FigureReport, sources: Sources) -> Card:
-    """Return the card with the paper's tables or figure of this kind; empty if it has none."""
+    """Return the card with the paper's tables or figure of this kind.
+
+    Empty if it has none.
+    """
     if isinstance(report, FigureReport):
         try:
             pictures = {"The paper’s": _picture(f"{report.name}_published", report.figure(sources.paper))}
@@ -111,7 +119,10 @@ def paper_card(report: TableReport | FigureReport, sources: Sources) -> Card:
 
 
 def tables_html(tables: Sequence[PrintedTable], title: str, address: Address | None) -> list[Mapping[str, object]]:
-    """Return title (if it differs from the card's), fragment and downloads by file name of each table."""
+    """Return each table's title, fragment and downloads by file name.
+
+    The title is left out if it is the card's.
+    """
     return [
         {
             "title": table.title if table.title != title else "",

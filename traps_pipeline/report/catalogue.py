@@ -1,4 +1,6 @@
-"""The catalogue of tables and figures: each one's function of `Results`, and the stages it reads (docs/spec.md 10).
+"""List all tables and figures (docs/spec.md 10).
+
+Each has its function of `Results`, and the stages that it reads.
 
 An entry decides its asset, staleness and place on the report page and in `traps results export`.
 """
@@ -71,7 +73,7 @@ class TableReport:
     @property
     def doc(self) -> str:
         """The caption."""
-        return _first_paragraph(self.make)
+        return _caption(self.make)
 
     @property
     def published(self) -> bool:
@@ -79,7 +81,10 @@ class TableReport:
         return self.paper is not None or bool(self.recomputed)
 
     def tables(self, results: Results) -> list[PrintedTable]:
-        """Return the tables, cached; for the paper the recomputed ones, without empty columns."""
+        """Return the tables, cached.
+
+        For the paper they are the recomputed ones, without empty columns.
+        """
         if self.name not in results.kept:
             results.kept[self.name] = self._tables(results)
         return results.kept[self.name]
@@ -97,7 +102,10 @@ class TableReport:
         return [*(self.paper() if self.paper else []), *printed_tables.in_text(self.name)]
 
     def files(self, results: Results) -> dict[str, bytes]:
-        """Return files by path below `tables`; for the paper below `tables/published` and `tables/recomputed`."""
+        """Return files by path below `tables`.
+
+        For the paper they lie below `tables/published` and `tables/recomputed`.
+        """
         if results.is_study:
             parts = {"tables": self.tables(results)}
         else:
@@ -108,7 +116,10 @@ class TableReport:
 
 @dataclass(frozen=True)
 class FigureReport:
-    """A figure. reads: the stages whose tables it uses; published: whether the paper prints its numbers."""
+    """A figure.
+
+    reads: the stages whose tables it uses. published: whether the paper prints its numbers.
+    """
 
     name: str
     title: str
@@ -120,10 +131,13 @@ class FigureReport:
     @property
     def doc(self) -> str:
         """The caption."""
-        return _first_paragraph(self.make)
+        return _caption(self.make)
 
     def note(self, results: Results) -> str:
-        """Return the finding about a study, with one sentence per model if it has one, and the caption."""
+        """Return the finding about a study, and the caption.
+
+        The finding has one sentence per model, if there is one.
+        """
         return f"{self.finding(results)} {self.doc}".strip()
 
     def files(self, results: Results) -> dict[str, bytes]:
@@ -135,7 +149,10 @@ class FigureReport:
         return {f"{folder('figures', results)}/{name}": content for name, content in files.items()}
 
     def figure(self, results: Results) -> Figure:
-        """Return the figure, with a note if rules judged. Raises NotRun without data."""
+        """Return the figure, with a note if rules judged.
+
+        Raises NotRun without data.
+        """
         figure = self.make(results)
         if BY_RULES in results.judged_by.lower() and _is_judged(self.reads):
             _say_below(figure, BY_RULES)
@@ -232,12 +249,18 @@ INSIDE = ("states_and_output", "lens", "probe_baselines", "gate_arrows", "patchi
 
 
 def folder(kind: str, results: Results) -> str:
-    """Return the folder of a kind, `tables` or `figures`; the paper's files are in a subfolder of it."""
+    """Return the folder of a kind, `tables` or `figures`.
+
+    The paper's files are in a subfolder of it.
+    """
     return kind if results.is_study else f"{kind}/{PAPER}"
 
 
 def _say_below(figure: Figure, text: str) -> None:
-    """Write a line at the foot of a figure, or along its right edge if its layout leaves no room there."""
+    """Write a line at the foot of a figure.
+
+    It goes along the right edge if the layout leaves no room there.
+    """
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     look: dict[str, Any] = {"fontsize": 6, "color": SOFT, "parse_math": False}
@@ -256,7 +279,7 @@ def _is_judged(reads: Sequence[str]) -> bool:
     return bool({*reads} & JUDGED_STAGES)
 
 
-def _first_paragraph(make: Callable[..., object]) -> str:
-    """Return the first paragraph of a docstring as a caption, without the verb `Return`."""
-    text = " ".join((make.__doc__ or "").split("\n\n")[0].split()).removeprefix("Return ")
+def _caption(make: Callable[..., object]) -> str:
+    """Return a docstring as a caption, without the verb `Return`."""
+    text = " ".join((make.__doc__ or "").split()).removeprefix("Return ")
     return text[:1].upper() + text[1:]

@@ -1,4 +1,7 @@
-"""Pairs of clips as pictures: frames of controls above frames of voids (docs/spec.md 10)."""
+"""Draw pairs of clips: frames of controls above frames of voids.
+
+See docs/spec.md 10.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +57,10 @@ PAGE = Layout()
 
 @dataclass(frozen=True)
 class SampledClip:
-    """Frames (moments, H, W, 3) uint8 at the control's times (s); from index `known` on after the clip's end."""
+    """Frames (moments, H, W, 3) uint8 at the control's times (s).
+
+    From index `known` on they lie after the clip's end.
+    """
 
     frames: np.ndarray
     known: int
@@ -62,7 +68,9 @@ class SampledClip:
 
 
 def pairs_figure(items: pd.DataFrame, root: Path, layout: Layout = PAGE) -> Figure:
-    """Return a row of control frames above a row of void frames at the same times, for each pair of ITEMS rows.
+    """Return a row of control frames above a row of void frames, for each pair.
+
+    The times are the same. items: ITEMS rows.
 
     Clips lie under root. Times after a truncated void's end are hatched. Raises DamagedClip.
     """
@@ -85,7 +93,9 @@ def pairs_figure(items: pd.DataFrame, root: Path, layout: Layout = PAGE) -> Figu
 
 
 def six_pairs(items: pd.DataFrame) -> pd.DataFrame:
-    """Return ITEMS rows of six visual pairs for a figure like the paper's: three per taxonomy.
+    """Return ITEMS rows of six visual pairs for a figure like the paper's.
+
+    Each taxonomy has three.
 
     No two are of one sub-scenario, and their categories differ if possible; fewer if there are fewer sub-scenarios.
     """
@@ -100,7 +110,10 @@ def six_pairs(items: pd.DataFrame) -> pd.DataFrame:
 
 
 def whole_pairs(items: pd.DataFrame) -> list[pd.DataFrame]:
-    """Return the complete pairs, occlusion first, as frames of two rows indexed by side."""
+    """Return the complete pairs, occlusion first.
+
+    Each is a frame of two rows indexed by side.
+    """
     complete = items.loc[items.groupby("pair_id")["side"].transform("nunique") == 2]
     complete = complete.assign(place=complete["dataset"].map(DATASETS.index)).sort_values(
         ["place", "sub_scenario", "pair_id"]
@@ -109,11 +122,14 @@ def whole_pairs(items: pd.DataFrame) -> list[pd.DataFrame]:
 
 
 def moments_of(pair: pd.DataFrame, root: Path, moments: int) -> tuple[SampledClip, SampledClip, np.ndarray]:
-    """Return control, void and informative times (moments,) of the control, in seconds."""
-    control, at = decode(root / str(pair.at["control", "clip"]))
+    """Return control, void and informative times of the control.
+
+    The times are (moments,), in seconds.
+    """
+    control, times_s = decode(root / str(pair.at["control", "clip"]))
     void, void_at = decode(root / str(pair.at["void", "clip"]))
-    times = telling_times(control, at, moments)
-    return sampled(control, at, times), sampled(void, void_at, times), times
+    times = telling_times(control, times_s, moments)
+    return sampled(control, times_s, times), sampled(void, void_at, times), times
 
 
 def telling_times(frames: np.ndarray, at: np.ndarray, moments: int) -> np.ndarray:
@@ -128,7 +144,10 @@ def telling_times(frames: np.ndarray, at: np.ndarray, moments: int) -> np.ndarra
 
 
 def sampled(frames: np.ndarray, at: np.ndarray, times: np.ndarray) -> SampledClip:
-    """Return the frames nearest to the times; a clip ends one frame after its last frame begins."""
+    """Return the frames nearest to the times.
+
+    A clip ends one frame after its last frame begins.
+    """
     step = float(at[1] - at[0]) if len(at) > 1 else 0.0
     end = float(at[-1]) + step
     nearest = np.abs(at[:, None] - times).argmin(axis=0)
@@ -144,7 +163,10 @@ def ratio_of(clip: SampledClip) -> float:
 def draw_pair(
     axes: Axes, pair: pd.DataFrame, control: SampledClip, void: SampledClip, times: np.ndarray, layout: Layout
 ) -> None:
-    """Draw the result of `moments_of`: frames with their times, below the texts of `pair`."""
+    """Draw the result of `moments_of`: frames below the texts of `pair`.
+
+    Each frame has its time.
+    """
     from matplotlib.patches import Rectangle
 
     moments, height, width, _ = control.frames.shape
@@ -175,8 +197,8 @@ def draw_pair(
 def _draw_header(axes: Axes, pair: pd.DataFrame, layout: Layout) -> None:
     """Draw scenario and ground truth in bold, and the questions below them."""
     by_side = {side: str(pair.at[side, "question"]) for side in ("control", "void")}
-    same = by_side["control"] == by_side["void"]
-    questions = [by_side["control"]] if same else [f"{side}: {question}" for side, question in by_side.items()]
+    is_same = by_side["control"] == by_side["void"]
+    questions = [by_side["control"]] if is_same else [f"{side}: {question}" for side, question in by_side.items()]
     fit = {"max_lines": layout.questions, "placeholder": " …"}
     lines = [line for question in questions for line in textwrap.wrap(question, layout.letters, **fit)]
     truth = pair.at["control", "ground_truth"]
@@ -199,7 +221,10 @@ def _draw_header(axes: Axes, pair: pd.DataFrame, layout: Layout) -> None:
 
 
 def _fitted(frame: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Return the frame resized to the control's size, so that clips of different sizes align."""
+    """Return the frame resized to the control's size.
+
+    Clips of different sizes are then aligned.
+    """
     if frame.shape[:2] == (height, width):
         return frame
     import cv2

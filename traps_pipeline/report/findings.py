@@ -1,4 +1,7 @@
-"""Findings of the leading mechanistic figures about a study, one sentence per model, from the figures' frames."""
+"""State findings of the leading mechanistic figures, one sentence per model.
+
+They come from the figures' frames.
+"""
 
 from __future__ import annotations
 
@@ -28,22 +31,25 @@ def _joined(sentences: Callable[[Results], Iterator[str]]) -> Callable[[Results]
 
 
 def _models(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
-    for model, of in rows.groupby("model", sort=False, observed=True):
-        yield plain(str(model)), of
+    for model, group in rows.groupby("model", sort=False, observed=True):
+        yield plain(str(model)), group
 
 
 @_joined
 def states_and_output(results: Results) -> Iterator[str]:
-    """Return how many answered voids states and output classify as voids, and how well each orders the sides."""
-    for model, of in _models(scored_items(results)):
-        voids = of.loc[(of["side"] == "void") & of["abstained_standard"].eq(False)]
-        controls = of.loc[of["side"] == "control"]
+    """Return how many answered voids states and output classify as voids.
+
+    It also says how well each orders the sides.
+    """
+    for model, group in _models(scored_items(results)):
+        voids = group.loc[(group["side"] == "void") & group["abstained_standard"].eq(False)]
+        controls = group.loc[group["side"] == "control"]
         if not len(voids):
             yield f"{model} answered no void under standard: nothing is encoded and not expressed."
             continue
         encoded, expressed = (int((voids[name] > 0).sum()) for name in ("own", "margin"))
         wrongly = int((controls["own"] > 0).sum())
-        areas = [orders(part) for _, part in of.groupby("dataset", sort=False, observed=True)]
+        areas = [orders(part) for _, part in group.groupby("dataset", sort=False, observed=True)]
         means = {
             name: sum(area[name] for area in areas) / len(areas) for name in areas[0] if all(name in a for a in areas)
         }
@@ -56,17 +62,20 @@ def states_and_output(results: Results) -> Iterator[str]:
 
 @_joined
 def lens(results: Results) -> Iterator[str]:
-    """Yield how far the guided prompt moves the margin of each side at the last layer and at the one before."""
-    for model, of in _models(results.lens):
-        means = of.groupby(["prompt", "layer"], observed=True).agg(
+    """Yield how far the guided prompt moves each side's margin at the last layers.
+
+    These are the last one and the one before.
+    """
+    for model, group in _models(results.lens):
+        means = group.groupby(["prompt", "layer"], observed=True).agg(
             voids=("voids", "mean"), controls=("controls", "mean")
         )
-        at = {(row["prompt"], row["layer"]): row for row in means.reset_index().to_dict("records")}
-        top = max(layer for _, layer in at)
-        if not all((prompt, layer) in at for prompt in PROMPTING for layer in (top, top - 1)):
+        row_of = {(row["prompt"], row["layer"]): row for row in means.reset_index().to_dict("records")}
+        top = max(layer for _, layer in row_of)
+        if not all((prompt, layer) in row_of for prompt in PROMPTING for layer in (top, top - 1)):
             continue
         moved = [
-            at["guided", layer][side] - at["standard", layer][side]
+            row_of["guided", layer][side] - row_of["standard", layer][side]
             for layer in (top, top - 1)
             for side in ("voids", "controls")
         ]
@@ -79,11 +88,14 @@ def lens(results: Results) -> Iterator[str]:
 
 @_joined
 def probe_baselines(results: Results) -> Iterator[str]:
-    """Yield on how many pairs states beat every raw input, the margin and the noise; within and across datasets."""
-    for model, of in _models(beside(results)):
-        states, noise, spread = (of[name].to_numpy(float) for name in ("value", "noise", "noise_spread"))
-        beaten = np.column_stack([of[[*SHORTCUTS, "output margin"]].to_numpy(float), noise + 2 * spread])
-        above, across = states > np.fmax.reduce(beaten, axis=1), (of["source"] != of["target"]).to_numpy(bool)
+    """Yield on how many pairs states beat every raw input, the margin and the noise.
+
+    Pairs within and across datasets are counted apart.
+    """
+    for model, group in _models(beside(results)):
+        states, noise, spread = (group[name].to_numpy(float) for name in ("value", "noise", "noise_spread"))
+        beaten = np.column_stack([group[[*SHORTCUTS, "output margin"]].to_numpy(float), noise + 2 * spread])
+        above, across = states > np.fmax.reduce(beaten, axis=1), (group["source"] != group["target"]).to_numpy(bool)
         counts = [f"{np.count_nonzero(above & kind)} of {np.count_nonzero(kind)}" for kind in (across, ~across)]
         yield (
             f"{model}: states are above every raw input, the output margin and noise on {counts[0]} pairs of datasets, "
@@ -93,11 +105,14 @@ def probe_baselines(results: Results) -> Iterator[str]:
 
 @_joined
 def gate_arrows(results: Results) -> Iterator[str]:
-    """Return the default gate's effect on PECS, and the best gate on features other than states."""
+    """Return the default gate's effect on PECS.
+
+    Beside it, the best gate on features other than states.
+    """
     rows = results.gate
     rows = rows.loc[(rows["source"] == "other datasets") & (rows["threshold"] == "mid") & (rows["target"] == "all")]
-    for model, of in _models(rows.loc[rows["pecs"].notna()]):
-        for regime, part in of.groupby("regime", sort=False, observed=True):
+    for model, group in _models(rows.loc[rows["pecs"].notna()]):
+        for regime, part in group.groupby("regime", sort=False, observed=True):
             gates = {row["features"]: row for row in part.to_dict("records")}
             own = gates.pop("states", None)
             if own is None or not gates:
@@ -111,11 +126,14 @@ def gate_arrows(results: Results) -> Iterator[str]:
 
 @_joined
 def doses_among_nulls(results: Results) -> Iterator[str]:
-    """Return where void directions do more than 19 of 20 draws of every null, on controls and on voids."""
+    """Return where void directions do more than 19 of 20 draws of every null.
+
+    Controls and voids are counted apart.
+    """
     rows = results.nulls
-    for model, of in _models(rows.loc[rows["target"] != "all"]):
+    for model, group in _models(rows.loc[rows["target"] != "all"]):
         cells: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
-        for row in of.to_dict("records"):
+        for row in group.to_dict("records"):
             about = {str(name): value for name, value in row.items()}
             cells.setdefault(tuple(about[name] for name in _CELL), []).append(about)
         ahead = [of_cell[0] for of_cell in cells.values() if all(row["p"] <= ALPHA for row in of_cell)]
@@ -136,16 +154,16 @@ def _cell(row: dict[str, Any]) -> str:
 
 @_joined
 def patching(results: Results) -> Iterator[str]:
-    """Return the group of positions with the largest effect at the first layer and at the last."""
+    """Return the position group with the largest effect at first and last layer."""
     rows = results.patching
     rows = rows.loc[(rows["source"] == "pair") & (rows["site"] == "residual") & rows["effect"].notna()]
-    for model, of in _models(rows.loc[rows["group"] != "all"]):
-        means = of.groupby(["layer", "group"], observed=True).agg(effect=("effect", "mean")).reset_index()
+    for model, group in _models(rows.loc[rows["group"] != "all"]):
+        means = group.groupby(["layer", "group"], observed=True).agg(effect=("effect", "mean")).reset_index()
         first, last = (
             max(means.loc[means["layer"] == layer].to_dict("records"), key=lambda row: row["effect"])
-            for layer in (of["layer"].min(), of["layer"].max())
+            for layer in (group["layer"].min(), group["layer"].max())
         )
-        prompt = " and ".join(sorted({*of["prompt"]}))
+        prompt = " and ".join(sorted({*group["prompt"]}))
         yield (
             f"In {model}, under {prompt}, the difference of the output is carried by {first['group']} tokens at the "
             f"embeddings ({first['effect']:.2f} of it) and by {last['group']} at the last layer ({last['effect']:.2f})."

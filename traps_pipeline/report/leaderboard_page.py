@@ -1,4 +1,6 @@
-"""The leaderboard of a study (docs/spec.md 5 and 10) for a terminal, a README, Dagster and a page.
+"""Show the leaderboard of a study (docs/spec.md 5 and 10).
+
+It goes to a terminal, a README, Dagster and a page.
 
 Model ids, epochs and versions are untrusted text: each medium escapes them.
 """
@@ -111,12 +113,18 @@ LEGEND = {
 
 
 def leaderboard_text(board: pd.DataFrame, robust: pd.DataFrame | None = None, notes: Sequence[str] = ()) -> str:
-    """Return LEADERBOARD rows, with ROBUST figures and further notes, as text: a table per panel, best first."""
+    """Return LEADERBOARD rows as text: a table per panel, best first.
+
+    ROBUST figures and further notes are added.
+    """
     return "\n".join(table_text(table) for table in leaderboards(board, robust, notes, brief=True))
 
 
 def leaderboard_markdown(board: pd.DataFrame, robust: pd.DataFrame | None = None, notes: Sequence[str] = ()) -> str:
-    """Return LEADERBOARD rows, with ROBUST figures and further notes, as Markdown with its legend, best first."""
+    """Return LEADERBOARD rows as Markdown with its legend, best first.
+
+    ROBUST figures and further notes are added.
+    """
     terms = [f"- **{term}**: {meaning}" for term, meaning in legend(board, robust).items()]
     tables = leaderboards(board, robust, notes, brief=True)
     return "\n".join([*map(table_markdown, tables), *terms]) + "\n"
@@ -125,7 +133,9 @@ def leaderboard_markdown(board: pd.DataFrame, robust: pd.DataFrame | None = None
 def leaderboards(
     board: pd.DataFrame, robust: pd.DataFrame | None = None, notes: Sequence[str] = (), *, brief: bool = False
 ) -> list[PrintedTable]:
-    """Return tables of LEADERBOARD rows for each panel: one that ranks the entries, then one per other dataset.
+    """Return tables of LEADERBOARD rows for each panel.
+
+    One ranks the entries, then one follows per other dataset.
 
     The first is `overall`, or the board's first dataset if no model has all four. An entry without a row comes last.
     notes: further notes of the first table. brief: only the first table of each panel, with fewer columns.
@@ -136,7 +146,10 @@ def leaderboards(
 
 
 def _by_panel(board: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
-    """Return the rows by panel, entries of several panels last, with the suffix of their tables' names."""
+    """Return the rows by panel, with the suffix of their tables' names.
+
+    Entries of several panels come last.
+    """
     if board.empty:
         return [("", board)]
     of_entry = board.groupby(["model", "regime"])["panel"].transform(joined_epochs)
@@ -147,15 +160,15 @@ def _by_panel(board: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
 def _of_one_panel(board: pd.DataFrame, robust: pd.DataFrame | None, brief: bool, suffix: str) -> list[PrintedTable]:
     datasets = set(board["dataset"])
     ranked = next((name for name in TITLES if name in datasets), "overall")
-    others = [name for name in DATASETS if name in datasets and name != ranked]
-    own = [_leaderboard(board.loc[board["dataset"] == name], name, [], {}, brief, suffix) for name in others]
+    other_datasets = [name for name in DATASETS if name in datasets and name != ranked]
+    own = [_leaderboard(board.loc[board["dataset"] == name], name, [], {}, brief, suffix) for name in other_datasets]
     rows = []
     if robust is not None and ranked == "overall":
         rows = records(robust)
     beside = {(row["model"], row["regime"]): row for row in rows}
     entries = {*zip(board["model"], board["regime"], strict=True)}
     beside = {key: row for key, row in beside.items() if key in entries}
-    return [_leaderboard(board, ranked, others, beside, brief, suffix), *own]
+    return [_leaderboard(board, ranked, other_datasets, beside, brief, suffix), *own]
 
 
 def legend(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> dict[str, str]:
@@ -168,7 +181,10 @@ def legend(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> dict[str,
 
 
 def provenance(board: pd.DataFrame) -> str:
-    """Return a sentence that names the panels, benchmark versions and epochs of the board's figures."""
+    """Return a sentence with panels, benchmark versions and epochs of the board.
+
+    They are those of its figures.
+    """
     versions = _distinct(board["benchmark_version"].unique(), " + ")
     epochs = _distinct(board["epoch"].unique(), "+")
     return (
@@ -178,16 +194,19 @@ def provenance(board: pd.DataFrame) -> str:
 
 
 def judged_by(board: pd.DataFrame) -> str:
-    """Return a sentence that names the panels, and says which of their figures are not comparable."""
+    """Return a sentence that names the panels, and which are not comparable.
+
+    It says so of their figures.
+    """
     panels = _distinct(board["panel"].unique(), "+")
     names = [_panel_in_words(panel) for panel in panels]
     several = len(panels) > 1
     sentence = f"Judged by the panel{'s' * several} {' and '.join(names) or NONE}"
     sentence += "; figures of different panels are not ranked or compared" * several
     rows = board[["panel", "model"]].drop_duplicates().itertuples(index=False, name=None)
-    others = sorted({model for panel, model in rows if is_judged_by_rules(panel, model)})
-    names_shown = ", ".join(others[:5]) + (f" and {len(others) - 5} more" if len(others) > 5 else "")
-    return f"{sentence}." + (f" {BY_RULES[0].upper()}{BY_RULES[1:]}: {names_shown}." if others else "")
+    by_rules = sorted({model for panel, model in rows if is_judged_by_rules(panel, model)})
+    names_shown = ", ".join(by_rules[:5]) + (f" and {len(by_rules) - 5} more" if len(by_rules) > 5 else "")
+    return f"{sentence}." + (f" {BY_RULES[0].upper()}{BY_RULES[1:]}: {names_shown}." if by_rules else "")
 
 
 def _panel_in_words(panel: str) -> str:
@@ -240,7 +259,10 @@ def _with_robust(rows: pd.DataFrame, beside: Robust) -> pd.DataFrame:
 
 
 def _notes_on_arms(beside: Robust) -> list[str]:
-    """Return notes on the arms of each entry, and on why pairs and arms are not joined."""
+    """Return notes on the arms of each entry.
+
+    They also say why pairs and arms are not joined.
+    """
     entries: dict[tuple[str, ...], list[str]] = {}
     for (model, regime), row in beside.items():
         entries.setdefault(tuple(row["arms"]), []).append(f"{model} {regime}")
@@ -259,7 +281,10 @@ def _trace(row: Mapping[str, Any], field: str) -> SourceItems | None:
 
 
 def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.DataFrame:
-    """Return one row per (model, regime), best first; without a row of the dataset, counts are sums over all rows."""
+    """Return one row per (model, regime), best first.
+
+    Without a row of the dataset, counts are sums over all rows.
+    """
     rows, entries = [], dict[tuple[str, str], dict[str, dict[str, Any]]]()
     for row in of_several_runs(board).to_dict("records"):
         entries.setdefault((row["model"], row["regime"]), {})[row["dataset"]] = row
@@ -303,7 +328,10 @@ def _bounds(row: Mapping[str, Any]) -> str:
 
 
 def _rank(entry: Mapping[str, Any]) -> tuple[bool, float, str, int]:
-    """Return the sort key: best PECS first, nulls last; ties by model, then in the order of the regimes."""
+    """Return the sort key: best PECS first, nulls last.
+
+    Ties by model, then in the order of the regimes.
+    """
     pecs = float(entry.get("pecs", float("nan")))
     null = pecs != pecs
     regimes = (*REGIMES, entry["regime"])

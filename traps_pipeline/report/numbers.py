@@ -13,7 +13,9 @@ _PRINTED_NUMBER = re.compile(r"([+−-]?(?:\d+(?:\.\d*)?|\.\d+))(%?)")
 
 
 def as_numbers(values: pd.Series) -> pd.Series:
-    """Return a column of the paper's printed numbers as numbers, a dash as missing; other columns unchanged.
+    """Return a column of the paper's printed numbers as numbers, a dash as missing.
+
+    Other columns are unchanged.
 
     A number in percent stays in percent in a field whose name ends in `_pct`, and becomes a fraction in any other.
     """

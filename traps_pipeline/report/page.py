@@ -1,4 +1,7 @@
-"""The report page: findings, the leaderboard, the results, and a list of what was not run (docs/report.md)."""
+"""Render the report page (docs/report.md).
+
+Findings, the leaderboard, the results, and a list of what was not run.
+"""
 
 from __future__ import annotations
 
@@ -36,12 +39,12 @@ def report_html(
     """
     boards = leaderboards(board, robust, notes)
     ranked = [table for table in boards if table.title == boards[0].title]  # one per panel
-    others = [
+    other_cards = [
         Card(table.name, f"Leaderboard, {table.title.lower()}", environment().get_template("tables.html.j2").render(
             own=tables_html([table], table.title, address), absent=[], published={}))
         for table in boards if table not in ranked
     ]  # fmt: skip
-    run = [[card for card in cards if card.html] for cards in (figures, pictures, [*others, *tables])]
+    run = [[card for card in cards if card.html] for cards in (figures, pictures, [*other_cards, *tables])]
     absent: dict[str, list[str]] = {}
     for card in (*figures, *pictures, *tables):
         if not card.html:

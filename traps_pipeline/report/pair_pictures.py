@@ -1,4 +1,7 @@
-"""Pictures of pairs for the report: six pairs, one scenario with its arms, a worked example, shortcuts."""
+"""Draw pictures of pairs for the report.
+
+Six pairs, one scenario with its arms, a worked example, shortcuts.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +44,10 @@ class Picture:
     kind: str = "webp"
 
     def figures(self) -> Mapping[str, Figure]:
-        """Return the figures by file name. Raises NotRun, and TrapsError for a damaged clip."""
+        """Return the figures by file name.
+
+        Raises NotRun, and TrapsError for a damaged clip.
+        """
         try:
             return self.make()
         except DamagedClip as error:
@@ -112,7 +118,8 @@ class PairPictures:
 
 
 def _as_json(rows: pd.DataFrame) -> str:
-    """Return the rows as JSON without the benchmark's version, which also changes in rows that a correction leaves
-    alone.
+    """Return the rows as JSON without the benchmark's version.
+
+    It also changes in rows that a correction leaves alone.
     """
     return str(rows.drop(columns=["benchmark_version"], errors="ignore").to_json(orient="records"))

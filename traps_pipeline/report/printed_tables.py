@@ -1,4 +1,4 @@
-"""The paper's tables as printed (`assets/published`), without any arithmetic on their figures."""
+"""Show the paper's tables as printed (`assets/published`), without arithmetic."""
 
 from __future__ import annotations
 
@@ -27,7 +27,10 @@ PATH, TYPE = Column("path", "Source → target"), Column("transfer_type", "Trans
 
 
 def of_paper(name: str, rows: pd.DataFrame, columns: Sequence[Column]) -> PrintedTable:
-    """Return the paper's table `name`, with title, place in the paper and notes from `tables.csv`."""
+    """Return the paper's table `name`.
+
+    Title, place in the paper and notes come from `tables.csv`.
+    """
     (about,) = as_printed("tables").query("name == @name").to_dict("records")
     where = f"as the paper prints it (line {about['line']} of its LaTeX source)"
     notes = [where, *([str(about["note"])] if about["note"] else [])]
@@ -43,7 +46,10 @@ def figures(names: Mapping[str, str]) -> list[Column]:
 
 
 def in_text(card: str) -> list[PrintedTable]:
-    """Return the figures of this card that only the paper's text states; no table if there are none."""
+    """Return the scores of this card that only the paper's text states.
+
+    No table if there are none.
+    """
     rows = as_printed("other").query("card == @card")
     columns = [Column("model", "Model"), Column("quantity", "Quantity")]
     columns += figures({"printed": "Value", "line": "Line"})
@@ -73,7 +79,10 @@ def replication_overall() -> list[PrintedTable]:
 
 
 def _cells(group: str) -> pd.DataFrame:
-    """Return the cells of a group's models, with `figure ± spread` where a spread is printed."""
+    """Return the cells of a group's models.
+
+    They are `figure ± spread` where a spread is printed.
+    """
     cells: pd.DataFrame = as_printed("behavioral_per_dataset")
     cells = cells.loc[cells["model"].isin(models_of(group=group))].copy()
     for field, spread in zip(SHARES, SPREADS, strict=True):
@@ -87,7 +96,7 @@ def _of(cells: pd.DataFrame, dataset: str, regime: str) -> pd.DataFrame:
 
 
 def per_dataset() -> list[PrintedTable]:
-    """Return PECS of the fourteen main-family models on each dataset under each regime."""
+    """Return PECS of the fourteen main-family models by dataset and regime."""
     cells = _cells("main")
     wide: pd.DataFrame = cells.loc[:, ["model"]].drop_duplicates()
     columns = [MODEL]
@@ -152,7 +161,10 @@ def occlusion_sub_scenarios() -> list[PrintedTable]:
 
 
 def chaotic_sub_scenarios() -> list[PrintedTable]:
-    """Return the three chaotic sub-scenarios of the original benchmark, and their uplift under guided."""
+    """Return the original benchmark's three chaotic sub-scenarios.
+
+    Their uplift under guided stands beside them.
+    """
     rows = as_printed("chaotic_subscenarios")
     names = {"acc_pct": "Acc", "false_abs_pct": "FA", "abs_rec_pct": "AR", "pecs": "PECS"}
     names |= {"abs_rec_ill_posed_pct": "AR, ill-posed"}
@@ -224,7 +236,10 @@ def confabulation() -> list[PrintedTable]:
 
 
 def probes() -> list[PrintedTable]:
-    """Return probe transfer of the three families: by ordered pair, and means by transfer type."""
+    """Return probe transfer of the three families.
+
+    By ordered pair, and means by transfer type.
+    """
     pairs = _paths(as_printed("probe_transfer"))
     pairs["best_layer"] = "L" + pairs["best_layer"]
     wide: pd.DataFrame = pairs.loc[:, ["transfer_type", "path"]].drop_duplicates()
@@ -255,7 +270,10 @@ def cosines() -> list[PrintedTable]:
 
 
 def steering() -> list[PrintedTable]:
-    """Return steering by regimes and families, at alpha 10, by alpha, and within or across domains."""
+    """Return steering by regimes and families.
+
+    The tables are at alpha 10, by alpha, and within or across domains.
+    """
     return [_regimes(), _top(), _domains(), _dose("qwen"), _dose("gemma")]
 
 
@@ -310,7 +328,10 @@ def _paths(rows: pd.DataFrame) -> pd.DataFrame:
 
 @cache
 def audit_table() -> PrintedTable:
-    """Return every statement that differs from the paper's tables, with its line and the arithmetic."""
+    """Return every statement that differs from the paper's tables.
+
+    Its line and the arithmetic stand beside it.
+    """
     from traps_pipeline.scoring.audit import DECLARED, DIFFERS, audit, counts_text  # pandas takes long to import
 
     findings = audit()

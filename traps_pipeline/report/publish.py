@@ -1,4 +1,7 @@
-"""The parts and files of the report, and `traps results export`, which writes all tables and figures to a folder."""
+"""Write the report, and all tables and figures to a folder.
+
+The latter is `traps results export`.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +42,10 @@ PAPER = "paper"  # the chapter of the paper's cards, which use only `assets/publ
 
 @dataclass(frozen=True)
 class Part:
-    """A card before it is built. reads: its stages; inputs: instead, the rows that matter, as JSON; null for all."""
+    """A card before it is built.
+
+    reads: its stages. inputs: instead, the rows that matter, as JSON; null for all.
+    """
 
     chapter: str
     name: str
@@ -49,7 +55,10 @@ class Part:
 
 
 def report_parts(sources: Sources, address: Address | None = explorer_address) -> list[Part]:
-    """Return all parts of a study's report, in the order of the page. With `address`, numbers are links."""
+    """Return all parts of a study's report, in the order of the page.
+
+    With `address`, numbers are links.
+    """
     # A study with mechanistic analyses leads with the figures that could refute its claims.
     first = INSIDE if sources.workspace.study.mechanism else ()
     figures = [
@@ -76,7 +85,10 @@ def report_parts(sources: Sources, address: Address | None = explorer_address) -
 def report_files(
     study: Results, cards: Sequence[tuple[str, Card]], address: Address | None = explorer_address
 ) -> dict[str, bytes]:
-    """Return the report page, the leaderboard as Markdown and as JSON lines, by path. cards: by chapter."""
+    """Return the report page and the leaderboard (Markdown and JSON lines), by path.
+
+    cards: by chapter.
+    """
     remarks = said_by_people(study.human_row, study.panel_errors)
     paper = {card.name: card.html for chapter, card in cards if chapter == PAPER}
     figures, pictures, tables = (
@@ -93,12 +105,17 @@ def report_files(
 
 
 def metrics_lines(board: pd.DataFrame) -> str:
-    """Return LEADERBOARD rows as JSON lines, which experiment trackers read, with null for missing figures."""
+    """Return LEADERBOARD rows as JSON lines, with null for missing scores.
+
+    Experiment trackers read them.
+    """
     return str(board.to_json(orient="records", lines=True, double_precision=15))
 
 
 def export(workspace: Workspace, target: Path, say: Callable[[str], None] = lambda line: None) -> int:
-    """Write every table, every available figure and the report page to a folder; return the number of files.
+    """Write every table, every available figure and the report page to a folder.
+
+    Return the number of files.
 
     Each file is written atomically, `index.html`, which lists them, last. say: receives a line per file.
     """

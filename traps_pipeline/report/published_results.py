@@ -1,4 +1,7 @@
-"""The paper's results, from `assets/published`, in the same frames as a study's results."""
+"""Read the paper's results, in the same frames as a study's results.
+
+They lie in `assets/published`.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +59,10 @@ def _rates(results: Results) -> pd.DataFrame:
 
 
 def _none(*columns: str) -> pd.DataFrame:
-    """Return a frame without rows, for frames that the paper's tables do not determine."""
+    """Return a frame without rows.
+
+    It stands for frames that the paper's tables do not determine.
+    """
     return pd.DataFrame(columns=pd.Index(columns))
 
 
@@ -80,7 +86,10 @@ def _confabulation(results: Results) -> pd.DataFrame:
 
 
 def _probes(results: Results) -> pd.DataFrame:
-    """Return PROBES rows: transfer, and confabulated at the layer of transfer, as the paper names no other."""
+    """Return PROBES rows: transfer, and confabulated at the layer of transfer.
+
+    The paper names no other layer.
+    """
     rows = _long(published("probe_transfer")).rename(columns={"best_layer": "layer"}).assign(scope="all")
     transfer = rows.assign(analysis="transfer", value=rows["auroc"], own_best=True, all_sample_best=True)
     confabulated = rows.assign(analysis="confabulated", value=rows["auroc_confabulated"], all_sample_best=True)
@@ -89,7 +98,10 @@ def _probes(results: Results) -> pd.DataFrame:
 
 
 def _cosines(results: Results) -> pd.DataFrame:
-    """Return COSINES rows: the matrix of qwen3-vl-8b, and the few values of other models in the paper's text."""
+    """Return COSINES rows.
+
+    The matrix of qwen3-vl-8b, and the few values of other models in the paper's text.
+    """
     matrix = published("cosine_qwen").assign(model="qwen3-vl-8b")
     few = published("other")
     few = few.loc[few["id"].str.fullmatch(r"cos-(gemma|llava)-\w+-\w+")]
@@ -102,7 +114,10 @@ def _cosines(results: Results) -> pd.DataFrame:
 
 
 def _effects(results: Results) -> pd.DataFrame:
-    """Return STEERING_EFFECTS rows of the dose-response tables, with the regimes that their captions state."""
+    """Return STEERING_EFFECTS rows of the dose-response tables.
+
+    They have the regimes that their captions state.
+    """
     qwen = published("steering_dose_qwen").assign(model="qwen3-vl-8b", epoch="original")
     gemma = published("steering_dose_gemma").assign(model="gemma-4-e4b", epoch="verification")
     rows = _long(pd.concat([qwen, gemma], ignore_index=True))
@@ -125,7 +140,9 @@ def _as(table: Table, parts: list[pd.DataFrame]) -> pd.DataFrame:
 
 
 class PublishedResults(Results):
-    """The paper's numbers, as shipped in `assets/published`, for figures and further tables.
+    """The paper's numbers, for figures and further tables.
+
+    As shipped in `assets/published`.
 
     `report.printed_tables` shows the tables that the paper prints. A frame without such use has no rows.
     """

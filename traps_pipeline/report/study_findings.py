@@ -1,4 +1,7 @@
-"""A study's main findings, in sentences, for the top of its report page. Every number is in one of its tables."""
+"""State a study's main findings in sentences, for the top of its report page.
+
+Every number is in one of its tables.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,10 @@ class StudyFinding:
 
 
 def study_findings(results: Results) -> list[StudyFinding]:
-    """Return a study's findings, the most important first; of reference strategies only if no other model was asked."""
+    """Return a study's findings, the most important first.
+
+    Of reference strategies only if no other model was asked.
+    """
     overall = results.overall
     rows = overall.loc[overall["pecs"].notna()] if len(overall) else overall
     if not len(rows):
@@ -46,16 +52,21 @@ def study_findings(results: Results) -> list[StudyFinding]:
 
 
 def _best(rows: pd.DataFrame) -> Iterator[StudyFinding]:
-    """Yield the best model of each regime, and the number of others that the contrasts cannot separate from it."""
+    """Yield the best model of each regime.
+
+    It names how many others the contrasts cannot separate from it.
+    """
     for regime in [name for name in REGIMES if name in {*rows["regime"]}]:
         part = rows.loc[rows["regime"] == regime].sort_values(["pecs", "model"], ascending=[False, True])
         first = part.to_dict("records")[0]
         figure = fraction(first["pecs"])
-        equal, others = ([*part.loc[part["pecs"].map(fraction).eq(figure) == same, "model"]] for same in (True, False))
-        best = "have the highest PECS," if len(equal) > 1 else "has the highest PECS," if others else "has a PECS of"
+        equal, worse = (
+            [*part.loc[part["pecs"].map(fraction).eq(figure) == is_equal, "model"]] for is_equal in (True, False)
+        )
+        best = "have the highest PECS," if len(equal) > 1 else "has the highest PECS," if worse else "has a PECS of"
         text = f"Under {regime}, {_names(equal)} {best} {figure} {interval(first)}".strip()
-        if others:
-            text += f", before {others[0]} with {fraction(part.loc[part['model'] == others[0], 'pecs'].iloc[0])}"
+        if worse:
+            text += f", before {worse[0]} with {fraction(part.loc[part['model'] == worse[0], 'pecs'].iloc[0])}"
         alike = ranks(first)
         if len(equal) == 1 and "–" in alike:
             text += f"; its rank may be {alike}, since contrasts do not separate it from others"
@@ -73,17 +84,20 @@ def _abstention(rows: pd.DataFrame) -> Iterator[StudyFinding]:
     for regime, words in ASKED.items():
         part = rows.loc[rows["regime"] == regime]
         if len(part):
-            who = f"the {len(part)} models abstain" if len(part) > 1 else f"{part['model'].iloc[0]} abstains"
+            subject = f"the {len(part)} models abstain" if len(part) > 1 else f"{part['model'].iloc[0]} abstains"
             voids, controls = (_span(part[name]) for name in ("abs_rec", "false_abs"))
             yield StudyFinding(
-                f"{words}, {who} on {voids} of the voids, which cannot be answered, and on {controls} of the "
+                f"{words}, {subject} on {voids} of the voids, which cannot be answered, and on {controls} of the "
                 "controls, which can.",
                 "figure-abs_rec",
             )
 
 
 def _accuracy(rows: pd.DataFrame) -> Iterator[StudyFinding]:
-    """Yield how guided prompting changes Acc and AbsRec of the models with both regimes."""
+    """Yield how guided prompting changes Acc and AbsRec.
+
+    Only models with both regimes count.
+    """
     wide = rows.loc[rows["regime"].isin(PROMPTING)].pivot(index="model", columns="regime", values=["acc", "abs_rec"])
     if {*PROMPTING} <= {*wide.columns.get_level_values(1)} and len(wide := wide.dropna()):
         changes = {name: wide[name][GUIDED] - wide[name][STANDARD] for name in ("acc", "abs_rec")}
@@ -95,15 +109,18 @@ def _accuracy(rows: pd.DataFrame) -> Iterator[StudyFinding]:
 
 
 def _gaps(results: Results, rows: pd.DataFrame) -> Iterator[StudyFinding]:
-    """Yield visual against textual voids, and the part of PECS that may come from shortcuts."""
+    """Yield visual against textual voids.
+
+    The part of PECS that may come from shortcuts follows.
+    """
     rates = results.rates
     pooled = rates.loc[rates["taxonomy"].eq("pooled") & rates["model"].isin(rows["model"])] if len(rates) else rates
     pooled = pooled.dropna(subset=["visual", "textual"])
     if len(pooled):
         textual, visual = (percent(pooled[name].to_numpy(float).mean()) for name in ("textual", "visual"))
-        who = f"the {len(pooled)} models" if len(pooled) > 1 else str(pooled["model"].iloc[0])
+        subject = f"the {len(pooled)} models" if len(pooled) > 1 else str(pooled["model"].iloc[0])
         yield StudyFinding(
-            f"Asked plainly, {who} abstain{'' if len(pooled) > 1 else 's'} on {textual} % of the questions about "
+            f"Asked plainly, {subject} abstain{'' if len(pooled) > 1 else 's'} on {textual} % of the questions about "
             f"something that no clip shows, and on {visual} % of the clips whose outcome is hidden or cut off"
             f"{' (means)' if len(pooled) > 1 else ''}.",
             "figure-visual_textual",
@@ -123,8 +140,10 @@ def _separable(results: Results, rows: pd.DataFrame) -> Iterator[StudyFinding]:
     contrasts = results.contrasts
     if len(contrasts):
         models = contrasts["left_model"].isin(rows["model"]) & contrasts["right_model"].isin(rows["model"])
-        of = contrasts["kind"].eq("models") & contrasts["dataset"].eq("overall") & contrasts["figure"].eq("pecs")
-        tested = contrasts.loc[models & of & contrasts["difference"].notna()]
+        is_comparison = (
+            contrasts["kind"].eq("models") & contrasts["dataset"].eq("overall") & contrasts["figure"].eq("pecs")
+        )
+        tested = contrasts.loc[models & is_comparison & contrasts["difference"].notna()]
         if len(tested):
             count = int(tested["separable"].eq(True).sum())
             yield StudyFinding(
@@ -147,12 +166,15 @@ def _missing(rows: pd.DataFrame) -> Iterator[StudyFinding]:
 
 
 def _span(shares: pd.Series) -> str:
-    """Return the smallest and the largest share in percent, once if they print the same."""
+    """Return the smallest and the largest share in percent.
+
+    Once if they print the same.
+    """
     low, high = (percent(value, 0) for value in (shares.min(), shares.max()))
     return f"{low} %" if low == high else f"{low} to {high} %"
 
 
 def _points(changes: pd.Series) -> str:
-    """Return the smallest and the largest change in percentage points, with their signs."""
+    """Return the smallest and the largest signed change in percentage points."""
     low, high = (("+" if value > 0 else "") + percent(value) for value in (changes.min(), changes.max()))
     return low if low == high else f"{low} to {high}"

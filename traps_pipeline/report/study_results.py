@@ -1,4 +1,4 @@
-"""A study's own results, from the tables of its workspace."""
+"""Read a study's own results from the tables of its workspace."""
 
 from __future__ import annotations
 
@@ -30,7 +30,10 @@ from traps_pipeline.storage.workspace import Workspace
 
 
 def _of_panel(results: StudyResults, rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows that the panel of the tables decided: figures of two panels are never shown together."""
+    """Return the rows that the panel of the tables decided.
+
+    Scores of two panels are never shown together.
+    """
     return rows.loc[rows["panel"] == results.panel].reset_index(drop=True)
 
 
@@ -104,7 +107,10 @@ def _cosines(results: StudyResults) -> pd.DataFrame:
 
 
 def _effects(results: StudyResults) -> pd.DataFrame:
-    """Return the rows of the paper's protocol, with the dose in class gaps and the share of degenerate answers."""
+    """Return the rows of the paper's protocol.
+
+    They have the dose in class gaps and the share of degenerate answers.
+    """
     every = results.rows(STEERING_EFFECTS)
     rows = in_gaps(of_paper(every), every)
     answers = rows["n"].astype(float) + rows["n_missing"].astype(float)
@@ -116,9 +122,12 @@ def _ill_posed(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _without_references(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows without reference strategies, if other models were asked; means are taken over these."""
-    others = rows.loc[~rows["model"].isin(analyses.models_of(group="reference"))]
-    return others if len(others) else rows
+    """Return the rows without reference strategies, if other models were asked.
+
+    Means are taken over these.
+    """
+    kept_rows = rows.loc[~rows["model"].isin(analyses.models_of(group="reference"))]
+    return kept_rows if len(kept_rows) else rows
 
 
 class StudyResults(Results):
@@ -145,7 +154,10 @@ class StudyResults(Results):
 
     @cached_property
     def panel(self) -> str:
-        """The panel of all tables and figures: the study's, if it decided any; else the first that did."""
+        """The panel of all tables and figures: the study's, if it decided any.
+
+        Else it is the first that did.
+        """
         decided = self.board if len(self.board) else self.tables.read_all(METRICS, ["panel"], dataset=DATASETS)
         panels = sorted({*decided["panel"]}, key=lambda name: ("+" in name, name))
         own = panel_id(self._panel)

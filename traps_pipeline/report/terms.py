@@ -1,4 +1,4 @@
-"""Titles, marks and sides that tables, figures and pages share."""
+"""Share titles, marks and sides between tables, figures and pages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The worked example: one pair with a model's answer to each side, the panel's votes, and the verdict."""
+"""Draw the worked example, one pair with its answers, votes and verdict.
+
+A model answers each side, and the panel votes.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +32,10 @@ WORDS_IN, LETTERS, MOST_LINES = 3.1, 66, 6  # width of the text column beside th
 
 @dataclass(frozen=True)
 class Example:
-    """A pair (ITEMS rows indexed by side), a model, and the lines of text beside each side's frames."""
+    """A pair (ITEMS rows indexed by side), a model, and lines of text.
+
+    The lines stand beside each side's frames.
+    """
 
     pair: pd.DataFrame
     model: str
@@ -37,7 +43,10 @@ class Example:
 
 
 def worked_example(workspace: Workspace) -> Example | None:
-    """Return the example that `chosen_example` selects from verdicts under standard; None if there is none."""
+    """Return the example that `chosen_example` selects from verdicts under standard.
+
+    None if there is none.
+    """
     verdicts = workspace.tables.read_all(VERDICTS, None, dataset=("occlusion", "chaotic"), regime="standard")
     chosen = chosen_example(verdicts)
     if chosen is None:
@@ -58,7 +67,9 @@ def worked_example(workspace: Workspace) -> Example | None:
 
 
 def chosen_example(verdicts: pd.DataFrame) -> dict[Any, Any] | None:
-    """Return the control's VERDICTS row of a pair with a correct control and a decided void; None without one.
+    """Return the control's VERDICTS row of a telling pair; None without one.
+
+    Its control is correct, and its void is decided.
 
     Seesaws come first, then models that are no reference strategy, then voids abstained on.
     """
@@ -83,7 +94,10 @@ def chosen_example(verdicts: pd.DataFrame) -> dict[Any, Any] | None:
 
 
 def reading(answer: str, votes: Sequence[Mapping[Any, Any]], verdict: Mapping[Any, Any]) -> list[str]:
-    """Return the lines beside the frames of a side: the answer, the judges' votes, and the verdict."""
+    """Return the lines beside the frames of a side.
+
+    The answer, the judges' votes, and the verdict.
+    """
     valid = [vote for vote in votes if vote["valid"]]
     on_abstention = [vote for vote in valid if vote["task"] == "abstention"]
     abstained = sum(bool(vote["abstained"]) for vote in on_abstention)
@@ -100,7 +114,10 @@ def reading(answer: str, votes: Sequence[Mapping[Any, Any]], verdict: Mapping[An
 
 
 def example_figure(example: Example, root: Path) -> Figure:
-    """Draw frames of control and void on the left, the text on the right; one page wide. Clips lie under root."""
+    """Draw frames of control and void on the left, the text on the right.
+
+    The figure is one page wide. Clips lie under root.
+    """
     pair, words = example.pair, example.words
     with figure_style():
         block = moments_of(pair, root, FRAMES.moments)

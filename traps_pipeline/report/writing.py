@@ -119,7 +119,7 @@ class Column:
         return figure + (f" ± {spread}" if spread else "") + (f" {mark}" if mark else "")
 
     def parts(self, row: Mapping[str, Any]) -> tuple[str, str, str]:
-        """Return the text or number of a cell, its spread and its mark, as printed; empty if it lacks one."""
+        """Return a cell's text or number, spread and mark, as printed; empty if none."""
         import pandas as pd
 
         value = row.get(self.field)
@@ -139,7 +139,7 @@ class Column:
 
 @dataclass(frozen=True)
 class PrintedTable:
-    """A table for people: a frame, its printed columns, and notes (epoch, n, missing items).
+    """A table for people: a frame, its printed columns, and notes (epoch, n, gaps).
 
     A table without rows says that it was not run, and `why`; if it was run and is legitimately empty, it prints `none`
     instead. `trace` returns the items behind a number, or None; `dash` and `deviation` are the meanings of a dash and
@@ -175,7 +175,7 @@ class PrintedTable:
 
     @property
     def absence(self) -> str:
-        """The text that replaces the rows of a table without rows; empty if there are rows."""
+        """The text that replaces the rows of a table without rows; empty if there are any."""
         return "" if len(self.rows) else self.none or (f"{NOT_RUN}: {self.why}" if self.why else NOT_RUN)
 
     @property
@@ -188,7 +188,7 @@ class PrintedTable:
 
     @property
     def data(self) -> pd.DataFrame:
-        """The numbers in the printed cells: the fields of the columns and their spreads, then all other fields."""
+        """The printed cells' numbers: columns and their spreads, then all other fields."""
         import pandas as pd
 
         printed = [field for column in self.columns for field in (column.field, column.spread) if field]
@@ -200,7 +200,7 @@ class PrintedTable:
 
 
 def table_files(table: PrintedTable) -> dict[str, bytes]:
-    """Return the table as `name.parquet`, `name.csv` (shares as fractions), `name.tex` (booktabs) and `name.md`."""
+    """Return the table as `name.parquet`, `.csv` (fractions), `.tex` and `.md`."""
     files = {
         "parquet": _parquet(table),
         "csv": csv_bytes(table.data),
@@ -226,7 +226,7 @@ def table_markdown(table: PrintedTable) -> str:
 
 
 def table_text(table: PrintedTable) -> str:
-    """Return title, table and notes for standard output, as `terminal.text_table` prints there."""
+    """Return title, table and notes for standard output, like `text_table`."""
     lines = [wrapped(plain(f"{table.title}. {table.lead}" if table.lead else table.title)), ""]
     if table.absence:
         lines += [wrapped(plain(table.absence))]
@@ -244,7 +244,7 @@ def _without_marks(column: Column, records: Sequence[Mapping[str, Any]]) -> list
 
 
 def _with_marks(column: Column, records: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return heading and cells of a column with marks: numbers are aligned to the right, and marks follow them."""
+    """Return heading and cells of a marked column: numbers right, marks after them."""
     marks = ["", *(column.parts(row)[2] for row in records)]
     numbers = _without_marks(replace(column, mark=""), records)
     wide, widest = max(map(len, numbers)), max(map(len, marks))
@@ -252,7 +252,7 @@ def _with_marks(column: Column, records: Sequence[Mapping[str, Any]]) -> list[st
 
 
 def table_latex(table: PrintedTable) -> str:
-    """Return a floating `table` environment with booktabs rules (`\\usepackage{booktabs}`).
+    """Return a floating `table` with booktabs rules (`\\usepackage{booktabs}`).
 
     More than LONG rows become a `longtable`, which breaks over pages (`\\usepackage{longtable}`); notes are in the
     caption.
@@ -276,7 +276,7 @@ def table_latex(table: PrintedTable) -> str:
 
 
 def table_html(table: PrintedTable, address: Callable[[SourceItems], str] | None = None) -> str:
-    """Return a table in a scrolling box with notes below, escaped. `address`: link numbers to the items behind them."""
+    """Return a table in a scrolling box with notes; `address`: link to the items."""
 
     def link(row: Mapping[str, Any], column: Column, figure: str) -> str | None:
         is_figure = column.is_number and figure not in ("", NONE)
@@ -288,7 +288,7 @@ def table_html(table: PrintedTable, address: Callable[[SourceItems], str] | None
 
 @cache
 def environment(folder: Path = TEMPLATES) -> jinja2.Environment:
-    """Return the Jinja2 environment of every page, which escapes all text and raises an error for an unknown name."""
+    """Return the Jinja2 environment of pages: it escapes, and refuses unknown names."""
     import jinja2
 
     return jinja2.Environment(
@@ -302,7 +302,7 @@ def environment(folder: Path = TEMPLATES) -> jinja2.Environment:
 
 
 def markdown(text: object) -> str:
-    """Return the text escaped so that it is neither HTML nor markup and stays in its table cell."""
+    """Return the text escaped as neither HTML nor markup, within its table cell."""
     return re.sub(r"([\\`*_{}\[\]()#+!|~$])", r"\\\1", html.escape(plain(text), quote=False))
 
 
@@ -319,7 +319,7 @@ _LATEX = str.maketrans(
 
 
 def latex(text: object) -> str:
-    """Return the text with all LaTeX special characters escaped; the symbols in our tables become commands."""
+    """Return the text with all LaTeX special characters escaped."""
     return _latex(plain(text))
 
 
@@ -329,7 +329,7 @@ def _latex(cell: str) -> str:
 
 
 def _parquet(table: PrintedTable) -> bytes:
-    """Return the Parquet file; text columns have type text even if all is null, so that the schema is constant."""
+    """Return the Parquet file; text columns keep type text even if all is null."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -350,7 +350,7 @@ def _parquet(table: PrintedTable) -> bytes:
 
 @contextmanager
 def figure_style() -> Iterator[None]:
-    """Apply the style of all figures; drawing and saving both need it (the SVG salt takes effect only when saving)."""
+    """Apply the style of figures, for drawing and saving (the SVG salt needs both)."""
     import matplotlib.style
 
     with matplotlib.style.context(STYLE):
@@ -360,7 +360,7 @@ def figure_style() -> Iterator[None]:
 def new_figure(
     width: float, height: float, dpi: float | None = None, layout: Literal["constrained"] | None = "constrained"
 ) -> Figure:
-    """Return an empty figure (inches) with its own canvas. layout: None keeps every element where it is placed."""
+    """Return an empty figure (inches) with a canvas; layout None: nothing moves."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -370,14 +370,14 @@ def new_figure(
 
 
 def freeze_layout(figure: Figure) -> None:
-    """Run the layout engine once and remove it, since it would move the elements again on every save."""
+    """Freeze the layout engine's result, which every save would otherwise repeat."""
     with figure_style():
         figure.draw_without_rendering()
         figure.set_layout_engine(None)  # "none" would leave a placeholder, for which each save draws everything twice
 
 
 def figure_bytes(figure: Figure, kind: str = "png") -> bytes:
-    """Return the figure as a PDF, SVG, PNG or WebP file, without a date; the same bytes on every call."""
+    """Return the figure as a PDF, SVG, PNG or WebP file, the same on every call."""
     undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": {"Software": None}}
     with figure_style():
         if figure.get_layout_engine() is not None:

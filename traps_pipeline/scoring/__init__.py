@@ -1,1 +1,1 @@
-"""From the panel's verdicts to figures with intervals (docs/spec.md 5)."""
+"""Score the panel's verdicts: metrics with intervals (docs/spec.md 5)."""

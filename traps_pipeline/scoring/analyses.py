@@ -1,4 +1,4 @@
-"""The paper's analyses: tidy frame of cells in, tidy frame out (docs/spec.md 5.4).
+"""Compute the paper's analyses, from cells to a tidy frame (docs/spec.md 5.4).
 
 `cells` has one row per (model, dataset, regime), averaged over runs, with the columns model, dataset, regime, acc,
 abs_rec, false_abs, pecs (fractions) and epoch; `study_cells` makes it from a study, `published.published_cells` from
@@ -42,7 +42,10 @@ _EQUAL = 12  # decimals at which two means count as equal: below any printed dig
 
 
 def study_cells(leaderboard: pd.DataFrame) -> pd.DataFrame:
-    """Return a study's cells from its LEADERBOARD rows, with further columns: `_std` over runs, n_pairs, n_runs etc."""
+    """Return a study's cells from its LEADERBOARD rows.
+
+    Further columns are `_std` over runs, n_pairs, n_runs etc.
+    """
     rows = of_several_runs(leaderboard.loc[leaderboard["dataset"] != "overall"])
     spread = [f"{share}_std" for share in SHARES]
     columns = [*_ENTRY, "epoch", "n_pairs", "n_runs", "n_missing", "incomplete", *SHARES, *spread]
@@ -71,7 +74,10 @@ def scoped_cells(metrics: pd.DataFrame, scope: str) -> pd.DataFrame:
 
 
 def models_of(group: str | None = None, family: str | None = None, media: str | None = None) -> list[str]:
-    """Return the ids of the registry's models, filtered by group (main, replication, ..), family or input media."""
+    """Return the ids of the registry's models, filtered.
+
+    The filters are group (main, replication, ..), family and input media.
+    """
     criteria = {"group": group, "family": family, "input": media}
     return [
         entry.id
@@ -84,7 +90,9 @@ def models_of(group: str | None = None, family: str | None = None, media: str | 
 
 
 def overall(cells: pd.DataFrame) -> pd.DataFrame:
-    """Return equal-weight means over datasets: columns model, regime, acc, abs_rec, false_abs, pecs.
+    """Return equal-weight means over datasets.
+
+    Columns: model, regime, acc, abs_rec, false_abs, pecs.
 
     PECS is averaged too, not recomputed from the means. A (model, regime) that lacks one of the datasets in `cells` has
     no row, so that all rows average the same datasets.
@@ -96,7 +104,9 @@ def overall(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def uplift(cells: pd.DataFrame, means: pd.DataFrame | None = None) -> pd.DataFrame:
-    """Return AbsRec under guided over AbsRec under standard, each averaged over datasets: columns model, ratio.
+    """Return AbsRec under guided over AbsRec under standard: columns model, ratio.
+
+    Each is averaged over its datasets.
 
     There is one row per model that has both regimes. means: a study's own `overall` rows, which leave out runs without
     all datasets; by default the means of `cells`. The ratio is infinite where standard is 0 and guided is not, and null
@@ -114,7 +124,9 @@ def uplift(cells: pd.DataFrame, means: pd.DataFrame | None = None) -> pd.DataFra
 
 
 def spread(cells: pd.DataFrame, column: str = "pecs_std") -> pd.DataFrame:
-    """Return quartiles of the standard deviations over runs, over all cells: one row with q25, median, q75, n.
+    """Return quartiles of the standard deviations over runs, over all cells.
+
+    One row with q25, median, q75, n.
 
     Cells with a single run have no deviation and are left out. The paper does not say which metric its quartiles
     describe; the default is PECS.
@@ -130,7 +142,9 @@ def spread(cells: pd.DataFrame, column: str = "pecs_std") -> pd.DataFrame:
 
 
 def pareto_frontier(cells: pd.DataFrame) -> pd.DataFrame:
-    """Return the models on the frontier in (Acc, J) after averaging over datasets, with the column j.
+    """Return the models on the frontier in (Acc, J) after averaging over datasets.
+
+    The column j is added.
 
     This is `frontier` of `overall`. It orders models and computes no ratio or gap, so epochs may differ.
     """
@@ -139,7 +153,9 @@ def pareto_frontier(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def frontier(means: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows that no other row of the same regime dominates in acc and j, by decreasing Acc.
+    """Return the rows that no other row of the same regime dominates in acc and j.
+
+    They are sorted by decreasing Acc.
 
     A model dominates another if it is at least as good in both figures and better in one. Two equal models are both on
     the frontier; a model without Acc or J is not on it.
@@ -154,14 +170,17 @@ def frontier(means: pd.DataFrame) -> pd.DataFrame:
 
 def _dominated(points: pd.DataFrame) -> np.ndarray:
     """Return which rows another row dominates in (acc, j): (rows,) bool."""
-    at = points[["acc", "j"]].round(_EQUAL).to_numpy(float)
-    no_worse = (at[None] >= at[:, None]).all(-1)  # [i, k]: k is no worse than i in both
-    better = (at[None] > at[:, None]).any(-1)
+    values = points[["acc", "j"]].round(_EQUAL).to_numpy(float)
+    no_worse = (values[None] >= values[:, None]).all(-1)  # [i, k]: k is no worse than i in both
+    better = (values[None] > values[:, None]).any(-1)
     return np.any(no_worse & better, axis=1)
 
 
 def naive_gap(cells: pd.DataFrame, threshold: float = 0.03) -> pd.DataFrame:
-    """Return the cells whose Acc x AbsRec exceeds PECS by more than `threshold`, with columns naive and gap added."""
+    """Return the cells whose Acc x AbsRec exceeds PECS by more than `threshold`.
+
+    Columns naive and gap are added.
+    """
     cells = _checked(cells)
     cells["naive"] = cells["acc"] * cells["abs_rec"]
     cells["gap"] = cells["naive"] - cells["pecs"]
@@ -169,7 +188,10 @@ def naive_gap(cells: pd.DataFrame, threshold: float = 0.03) -> pd.DataFrame:
 
 
 def zero_boundary(cells: pd.DataFrame) -> pd.DataFrame:
-    """Return the cells with PECS 0: no more abstention on voids than on controls in any run, or no correct answer."""
+    """Return the cells with PECS 0.
+
+    No run abstains more on voids than on controls, or no answer is correct.
+    """
     cells = _checked(cells)
     return cells.loc[cells["pecs"] == 0].reset_index(drop=True)
 
@@ -202,7 +224,9 @@ def degenerate_strategies() -> pd.DataFrame:
 
 
 def visual_textual_gap(cells: pd.DataFrame, taxonomies: Sequence[str] = TAXONOMIES) -> pd.DataFrame:
-    """Return textual over visual AbsRec: columns model, regime, taxonomy, visual, textual, gap.
+    """Return textual over visual AbsRec.
+
+    Columns: model, regime, taxonomy, visual, textual, gap.
 
     taxonomy: occlusion, chaotic or pooled. Visual is the AbsRec on the taxonomy's own dataset, textual that on its
     ill-posed one. `pooled` is the mean of the two textual values over the mean of the two visual ones, if both
@@ -244,14 +268,14 @@ def pair_differences(cells: pd.DataFrame) -> pd.DataFrame:
     cells = _checked(cells, datasets=(*DATASETS, "overall"))
     by_model = cells.set_index(_ENTRY)
     rows = []
-    for thinking, other in REASONING_PAIRS:
-        if not {thinking, other} <= set(cells["model"]):
+    for thinking, plain in REASONING_PAIRS:
+        if not {thinking, plain} <= set(cells["model"]):
             continue
-        sides = {name: by_model.loc[name] for name in (thinking, other)}
+        sides = {name: by_model.loc[name] for name in (thinking, plain)}
         epochs = pd.DataFrame({name: side["epoch"] for name, side in sides.items()}).dropna()
-        require_one_epoch(epochs, f"{thinking} against {other}")
-        change = (sides[thinking][SHARES] - sides[other][SHARES]).loc[epochs.index].reset_index()
-        rows.append(change.assign(thinking=thinking, other=other))
+        require_one_epoch(epochs, f"{thinking} against {plain}")
+        change = (sides[thinking][SHARES] - sides[plain][SHARES]).loc[epochs.index].reset_index()
+        rows.append(change.assign(thinking=thinking, other=plain))
     columns = ["thinking", "other", "regime", "dataset", *SHARES]
     return pd.concat(rows, ignore_index=True).loc[:, columns] if rows else pd.DataFrame(columns=pd.Index(columns))
 
@@ -310,7 +334,9 @@ def hidden_against_others(table: pd.DataFrame, columns: Sequence[str] = ("abs_re
 
 
 def accuracy_by_label(cells: pd.DataFrame) -> pd.DataFrame:
-    """Return mean Acc under standard by the control's answer, over the models that have an Acc.
+    """Return mean Acc under standard by the control's answer.
+
+    It is taken over the models that have an Acc.
 
     cells: `scoped_cells(metrics, "label")`. Columns dataset, sub_scenario, label, acc, n_pairs, n_models, n_missing
     (items of both sides, over these models).
@@ -330,7 +356,10 @@ def accuracy_by_label(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def ratio(numerator: pd.Series | pd.DataFrame, denominator: pd.Series | pd.DataFrame) -> np.ndarray:
-    """Divide elementwise: infinite where only the denominator is 0, NaN where both are."""
+    """Divide elementwise.
+
+    Infinite where only the denominator is 0, NaN where both are.
+    """
     top, bottom = numerator.to_numpy(float), denominator.to_numpy(float)
     with np.errstate(divide="ignore", invalid="ignore"):
         return top / bottom
@@ -346,7 +375,10 @@ def _means(groups: DataFrameGroupBy, columns: Sequence[str]) -> pd.DataFrame:
 
 
 def _checked(cells: pd.DataFrame, more: Sequence[str] = (), datasets: Sequence[str] = DATASETS) -> pd.DataFrame:
-    """Return a copy of the cells. Raises ValueError where a column is missing or a cell has two rows."""
+    """Return a copy of the cells.
+
+    Raises ValueError where a column is missing or a cell has two rows.
+    """
     missing = [name for name in (*_ENTRY, *SHARES, "epoch", *more) if name not in cells]
     if missing:
         raise ValueError(f"cells lack the columns {missing}")

@@ -1,4 +1,6 @@
-"""Recompute published values from other published values, and compare (`traps results audit`).
+"""Recompute published values from other published values, and compare.
+
+This is `traps results audit`.
 
 Every statement gets a verdict: `agrees` (equal at the printed digits), `within rounding` (the printed result is
 possible if each printed input may be rounded in its last digit), `declared` (different, and the paper says why) or
@@ -30,7 +32,10 @@ _AGREEING = (AGREES, ROUNDING)
 
 @dataclass(frozen=True)
 class AuditFinding:
-    """A published statement, the value recomputed from the published tables, and its line in the paper's source."""
+    """A published statement and its recomputed value, with its line in the source.
+
+    The value comes from the published tables; the source is the paper's.
+    """
 
     group: str
     statement: str
@@ -42,7 +47,10 @@ class AuditFinding:
 
 
 def audit() -> pd.DataFrame:
-    """Return every finding: columns group, statement, published, recomputed, verdict, reason, line."""
+    """Return every finding, one row each.
+
+    Columns: group, statement, published, recomputed, verdict, reason, line.
+    """
     groups: Sequence[Callable[[], Iterator[AuditFinding]]] = (
         claims,
         overall_means,
@@ -60,7 +68,9 @@ def audit() -> pd.DataFrame:
 
 
 def audit_text(findings: pd.DataFrame, everything: bool = False) -> str:
-    """Return the findings as text: every claim, every difference, and counts of the rest.
+    """Return the findings as text.
+
+    Every claim, every difference, and counts of the rest.
 
     everything: list the rest, too.
     """
@@ -79,7 +89,10 @@ def audit_text(findings: pd.DataFrame, everything: bool = False) -> str:
 
 
 def counts_text(findings: pd.DataFrame) -> str:
-    """Return a sentence with the numbers of statements that agree, differ as declared, and differ."""
+    """Return a sentence with the counts of statements by verdict.
+
+    They agree, differ as declared, or differ.
+    """
     count = {verdict: np.count_nonzero(findings["verdict"] == verdict) for verdict in (*_AGREEING, DECLARED, DIFFERS)}
     agreeing = sum(count[verdict] for verdict in _AGREEING)
     return (
@@ -92,11 +105,14 @@ def counts_text(findings: pd.DataFrame) -> str:
 
 
 def claims() -> Iterator[AuditFinding]:
-    """Yield every statement of `claims.csv`. Raises KeyError for a statement whose arithmetic is not in `claims`."""
+    """Yield every statement of `claims.csv`.
+
+    Raises KeyError for a statement whose arithmetic is not in `claims`.
+    """
     for claim in published("claims").to_dict("records"):
         printed, recomputed = str(claim["published"]), CLAIMS[str(claim["id"])]()
-        same = _same_words(printed, recomputed.words) if recomputed.agrees is None else recomputed.agrees
-        verdict: Verdict = AGREES if same else DIFFERS
+        is_same = _is_same_wording(printed, recomputed.words) if recomputed.agrees is None else recomputed.agrees
+        verdict: Verdict = AGREES if is_same else DIFFERS
         reason = recomputed.reason if verdict == DIFFERS else ""
         if verdict == DIFFERS and recomputed.agrees is None:
             reason = f"{_differences(printed, recomputed.words)}{'; ' + reason if reason else ''}"
@@ -104,17 +120,22 @@ def claims() -> Iterator[AuditFinding]:
         yield AuditFinding("claims", statement, printed, _shown(recomputed.words), verdict, reason, line)
 
 
-def _same_words(printed: str, recomputed: str) -> bool:
-    """Return whether the numbers agree at the printed digits and both name the same things."""
-    ours, theirs = _numbers(recomputed), _numbers(printed)
-    if len(ours) != len(theirs):
+def _is_same_wording(printed: str, recomputed: str) -> bool:
+    """Return whether two texts agree at the printed digits and name the same things."""
+    own_numbers, printed_numbers = _numbers(recomputed), _numbers(printed)
+    if len(own_numbers) != len(printed_numbers):
         return False
-    close = all(abs(float(a) - float(b)) <= _half_unit(b) + _SLACK for a, b in zip(ours, theirs, strict=True))
+    close = all(
+        abs(float(a) - float(b)) <= _half_unit(b) + _SLACK for a, b in zip(own_numbers, printed_numbers, strict=True)
+    )
     return close and _names(printed) == _names(recomputed)
 
 
 def _names(words: str) -> set[str]:
-    """Return the whole names in a text, so that a model's id is not found at the beginning of a longer id."""
+    """Return the whole names in a text.
+
+    So a model's id is not found at the beginning of a longer id.
+    """
     return set(re.findall(r"[a-z][\w.-]*\w", _NUMBER.sub(" ", words))) - {"to", "and", "of"}
 
 
@@ -128,10 +149,12 @@ def _half_unit(number: str) -> float:
 
 
 def _differences(printed: str, recomputed: str) -> str:
-    ours, theirs = _numbers(recomputed), _numbers(printed)
-    if len(ours) != len(theirs) or not ours:
+    own_numbers, printed_numbers = _numbers(recomputed), _numbers(printed)
+    if len(own_numbers) != len(printed_numbers) or not own_numbers:
         return "not what the tables give"
-    return "differs by " + " and ".join(f"{float(a) - float(b):+.3g}" for a, b in zip(ours, theirs, strict=True))
+    return "differs by " + " and ".join(
+        f"{float(a) - float(b):+.3g}" for a, b in zip(own_numbers, printed_numbers, strict=True)
+    )
 
 
 def _shown(words: str) -> str:
@@ -149,7 +172,10 @@ def _line(table: str) -> str:
 
 
 def overall_means() -> Iterator[AuditFinding]:
-    """Yield the overall leaderboard against the equal-weight means of the per-dataset table, cell by cell."""
+    """Yield the overall leaderboard against means of the per-dataset table.
+
+    They have equal weights and are compared cell by cell.
+    """
     cells = published_cells()
     ours = overall(cells).set_index(["model", "regime"]).to_dict("index")
     of_entry = dict(iter(cells.groupby(["model", "regime"])))
@@ -157,16 +183,16 @@ def overall_means() -> Iterator[AuditFinding]:
         model, regime = row["model"], row["regime"]
         for share in SHARES:
             scale, digits, unit = (1, 3, 0.001) if share == "pecs" else (100, int(share == "false_abs"), 0.1)
-            value, theirs = float(ours[model, regime][share]) * scale, float(row[share]) * scale
-            off, half = abs(value - theirs), 0.5 * 10.0**-digits
+            value, printed_value = float(ours[model, regime][share]) * scale, float(row[share]) * scale
+            off, half = abs(value - printed_value), 0.5 * 10.0**-digits
             verdict: Verdict = (
                 AGREES if off <= half + _SLACK else ROUNDING if off <= half + unit / 2 + _SLACK else DIFFERS
             )
             parts = of_entry[model, regime][share] * scale
             sums = " + ".join(f"{part:.{3 if share == 'pecs' else 1}f}" for part in parts)
-            reason = "" if verdict == AGREES else f"({sums}) / 4 = {value:.5g}, off by {value - theirs:+.2g}"
+            reason = "" if verdict == AGREES else f"({sums}) / 4 = {value:.5g}, off by {value - printed_value:+.2g}"
             name = f"overall {share} of {model}, {regime}"
-            figures = f"{theirs:.{digits}f}", f"{value:.{digits + 2}f}"
+            figures = f"{printed_value:.{digits}f}", f"{value:.{digits + 2}f}"
             yield AuditFinding("overall", name, *figures, verdict, reason, _line("overall"))
 
 
@@ -174,7 +200,9 @@ _REPLICATION = models_of(group="replication")
 
 
 def pecs_factors() -> Iterator[AuditFinding]:
-    """Yield PECS of every cell against its printed factors, within averaging and rounding errors.
+    """Yield PECS of every cell against its printed factors.
+
+    It must lie within averaging and rounding errors.
 
     PECS is computed per run and then averaged, so it differs from Acc x max(0, J) of the averages. With the printed
     deviations the mean of max(0, J) lies between max(0, J) and (J + sqrt(J^2 + s_J^2)) / 2, s_J is at most the sum of
@@ -210,7 +238,10 @@ def _pecs_range(cell: Mapping[Hashable, Any], shares: Mapping[str, float]) -> tu
 
 
 def gaps() -> Iterator[AuditFinding]:
-    """Yield the printed gaps against the printed rates, each of which may have been rounded in its last digit."""
+    """Yield the printed gaps against the printed rates.
+
+    Each rate may have been rounded in its last digit.
+    """
     for row in published("visual_vs_textual").to_dict("records"):
         for taxonomy in ("occlusion", "chaotic"):
             visual, textual = float(row[f"{taxonomy}_visual_pct"]), float(row[f"{taxonomy}_textual_pct"])
@@ -232,7 +263,10 @@ def gaps() -> Iterator[AuditFinding]:
 
 
 def probe_means() -> Iterator[AuditFinding]:
-    """Yield the printed four-path means against the means of the printed pairs, each rounded in its last digit."""
+    """Yield the printed four-path means against the means of the printed pairs.
+
+    Each may have been rounded in its last digit.
+    """
     columns = {"auroc": "all items", "auroc_confabulated": "confabulated items"}
     for row in published_rows("probe_means"):
         pairs = published_rows("probe_transfer", model=row["model"], transfer_type=row["transfer_type"])
@@ -268,20 +302,26 @@ def steering_means() -> Iterator[AuditFinding]:
     (printed,) = published_rows("steering_regime", model="gemma-4-e4b", **prompts)
     for side in ("control", "void"):
         for alpha in (0, 10):
-            theirs = printed[f"{side}_alpha{alpha}"]
+            printed_value = printed[f"{side}_alpha{alpha}"]
             ours = fmean(row[f"{side}_abstention_pct"] for row in published_rows("steering_dose_gemma", alpha=alpha))
-            same, below = abs(ours - theirs) <= 0.5 + _SLACK, ours < theirs
-            verdict: Verdict = AGREES if same else DECLARED if below else DIFFERS
+            is_same, below = abs(ours - printed_value) <= 0.5 + _SLACK, ours < printed_value
+            verdict: Verdict = AGREES if is_same else DECLARED if below else DIFFERS
             where = (
                 "as the paper declares of the verification run" if below else "though the paper says that it lies below"
             )
-            reason = "" if same else f"lies {abs(ours - theirs):.3g} points {'below' if below else 'above'}, {where}"
+            reason = (
+                ""
+                if is_same
+                else f"lies {abs(ours - printed_value):.3g} points {'below' if below else 'above'}, {where}"
+            )
             statement = f"gemma-4-e4b: mean {side} abstention at alpha {alpha} over the eight paths"
-            yield AuditFinding("steering", statement, f"{theirs:g}", f"{ours:g}", verdict, reason, "1418")
+            yield AuditFinding("steering", statement, f"{printed_value:g}", f"{ours:g}", verdict, reason, "1418")
 
 
 def steering_families() -> Iterator[AuditFinding]:
-    """Yield the regime table's figures over all paths against the means of its two source families of four paths.
+    """Yield the regime table's means over all paths against those of its families.
+
+    These are its two source families of four paths.
 
     The table does not name the prompt of the families' directions; the guided ones are assumed.
     """
@@ -290,21 +330,24 @@ def steering_families() -> Iterator[AuditFinding]:
         by_family = group.set_index("direction_family")
         for side in ("control", "void"):
             column = f"{side}_alpha10"
-            theirs = float(by_family.loc["all", column])
+            printed_value = float(by_family.loc["all", column])
             families = [float(by_family.loc[family, column]) for family in ("oc", "ch")]
             ours = sum(families) / 2
-            verdict: Verdict = AGREES if abs(ours - theirs) <= 1 + _SLACK else DIFFERS  # three roundings to a whole
+            # Three roundings to a whole.
+            verdict: Verdict = AGREES if abs(ours - printed_value) <= 1 + _SLACK else DIFFERS
             sums = f"({families[0]:g} + {families[1]:g}) / 2 = {ours:g}"
             reason = "" if verdict == AGREES else f"{sums}: the families are not halves of the paths averaged in `all`"
             statement = f"{model}: {side} abstention at alpha 10, all paths, guided directions and inference"
             yield AuditFinding(
-                "steering", statement, f"{theirs:g}", f"{ours:g}", verdict, reason, _line("steering_regimes")
+                "steering", statement, f"{printed_value:g}", f"{ours:g}", verdict, reason, _line("steering_regimes")
             )
 
 
 def validation_scores() -> Iterator[AuditFinding]:
-    """Yield F1 of the confabulation judge against printed precision and recall, each possibly rounded in its last
-    digit."""
+    """Yield F1 of the confabulation judge against printed precision and recall.
+
+    Each may have been rounded in its last digit.
+    """
     for row in published("judge_validation").to_dict("records"):
         precision, recall, printed = float(row["precision"]), float(row["recall"]), float(row["f1"])
         ours = _f1(precision, recall)
@@ -322,7 +365,10 @@ def _f1(precision: float, recall: float) -> float:
 
 
 def composition_sums() -> Iterator[AuditFinding]:
-    """Yield category counts against the totals that the paper states: 202 occlusion and 500 chaotic pairs."""
+    """Yield category counts against the totals that the paper states.
+
+    These are 202 occlusion and 500 chaotic pairs.
+    """
     counts: dict[str, int] = {}
     for row in published_rows("composition"):
         counts[row["dataset"]] = counts.get(row["dataset"], 0) + row["n"]
@@ -337,7 +383,10 @@ def composition_sums() -> Iterator[AuditFinding]:
 
 
 def contradictions() -> Iterator[AuditFinding]:
-    """Yield statements that contradict another place of the paper's text, where no arithmetic decides."""
+    """Yield statements that contradict another place of the paper's text.
+
+    No arithmetic decides which is right.
+    """
     for row in published_rows("contradictions"):
         lines = f"{row['line']} and {row['other_line']}"
         yield AuditFinding("contradictions", row["id"], row["statement"], row["against"], DIFFERS, line=lines)

@@ -1,4 +1,6 @@
-"""Confidence intervals of scores by a Bayesian bootstrap over scenarios, with one unseen scenario.
+"""Compute confidence intervals of scores by a Bayesian bootstrap.
+
+It runs over scenarios, with one unseen scenario.
 
 See docs/scoring.md, "Intervals". A scenario is one draw of the world: its pairs in both datasets of its taxonomy, in
 every run, model and regime, stay together. All cells of a taxonomy share one weight matrix, so two entries' resamples
@@ -80,7 +82,10 @@ def resample(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEE
 
 
 def intervals(resampled: ResampledFigures, level: float = _LEVEL) -> pd.DataFrame:
-    """Return 95 % intervals: columns ENTRY and INTERVAL_COLUMNS, one row per entry; null where nothing is decided."""
+    """Return 95 % intervals: columns ENTRY and INTERVAL_COLUMNS, one row per entry.
+
+    Null where nothing is decided.
+    """
     ends = [
         interval(resampled.figure(name), resampled.observed[:, k], limits_of(name), level)
         for k, name in enumerate(RESAMPLED)
@@ -91,14 +96,19 @@ def intervals(resampled: ResampledFigures, level: float = _LEVEL) -> pd.DataFram
 
 
 def limits_of(figure: str) -> tuple[float, float]:
-    """Return the minimum and maximum of a figure: [-1, 1] for J, [0, 1] for all others."""
+    """Return the minimum and maximum of a score.
+
+    [-1, 1] for J, [0, 1] for all others.
+    """
     return (-1.0, 1.0) if figure == "j" else (0.0, 1.0)
 
 
 def interval(
     ends: np.ndarray, observed: np.ndarray | float, limits: tuple[float, float], level: float = _LEVEL
 ) -> np.ndarray:
-    """Return the interval of figures from their resampled ends: (.., 2, resamples) -> (.., 2).
+    """Return the interval of scores from their resampled ends.
+
+    (.., 2, resamples) -> (.., 2).
 
     Every interval of a score comes from here. It contains `observed` (..) and lies within the limits; a NaN among
     the resamples is left out, and the interval is NaN where all are.
@@ -110,7 +120,10 @@ def interval(
 
 
 def with_interval(name: str, ends: np.ndarray, limits: tuple[float, float]) -> dict[str, float]:
-    """Return a figure and its interval as columns. ends: (2, 1 + resamples), the observed figure first."""
+    """Return a score and its interval as columns.
+
+    ends: (2, 1 + resamples), the observed score first.
+    """
     low, high = interval(ends[:, 1:], ends[1, 0], limits)
     return {name: float(ends[1, 0]), f"{name}_ci_low": float(low), f"{name}_ci_high": float(high)}
 
@@ -124,7 +137,9 @@ def difference(left: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 def percentiles(draws: np.ndarray, level: float = _LEVEL) -> np.ndarray:
-    """Return the central interval over the last axis, ignoring NaN: (.., resamples) -> (.., 2).
+    """Return the central interval over the last axis, ignoring NaN.
+
+    (.., resamples) -> (.., 2).
 
     NaN where all values are NaN.
     """
@@ -132,7 +147,10 @@ def percentiles(draws: np.ndarray, level: float = _LEVEL) -> np.ndarray:
 
 
 def quantile(draws: np.ndarray, q: float) -> np.ndarray:
-    """Return a quantile over the last axis, ignoring NaN: (.., resamples) -> (..); NaN where all values are NaN."""
+    """Return a quantile over the last axis, ignoring NaN.
+
+    (.., resamples) -> (..). It is NaN where all values are NaN.
+    """
     flat = draws.reshape(-1, draws.shape[-1])
     is_complete = ~np.isnan(flat).any(axis=1)
     values = np.full(len(flat), np.nan)
@@ -145,7 +163,9 @@ def quantile(draws: np.ndarray, q: float) -> np.ndarray:
 
 
 def scenario_weights(scenarios: int, resamples: int, seed: int | list[int]) -> np.ndarray:
-    """Return how often each scenario is drawn in each resample: (resamples, scenarios) float32.
+    """Return how often each scenario is drawn in each resample.
+
+    (resamples, scenarios) float32.
 
     Each row sums to the number of scenarios.
     """
@@ -168,7 +188,9 @@ class Resampling:
     seed: int
 
     def unseen(self, figures_of: str, decisions: int) -> np.ndarray:
-        """Return weights of an unseen scenario for each decision, (decisions, 1 + resamples) float64.
+        """Return weights of an unseen scenario for each decision.
+
+        (decisions, 1 + resamples) float64.
 
         They are the same for the same name, and independent for two names.
         """
@@ -188,7 +210,9 @@ def draw_scenarios(items: pd.DataFrame, resamples: int, seed: int) -> Resampling
 
 
 def resampled_sums(weights: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Return weighted sums of counts for every cell and resample: (cells, kinds, resamples).
+    """Return weighted sums of counts for every cell and resample.
+
+    (cells, kinds, resamples).
 
     weights is (resamples, scenarios), counts is (scenarios, cells, kinds), such as the six of COUNTS. Sums of integer
     counts stay below 2^16, so float32 products are exact; weighted counts are summed in float64.
@@ -200,7 +224,9 @@ def resampled_sums(weights: np.ndarray, counts: np.ndarray) -> np.ndarray:
 
 
 def with_unseen(sums: np.ndarray, scenarios: np.ndarray, unseen: np.ndarray) -> np.ndarray:
-    """Append the unseen scenario's contribution to sums (.., 2 x decisions, draws): (.., 3 x decisions, draws).
+    """Append the unseen scenario's contribution to sums.
+
+    (.., 2 x decisions, draws) -> (.., 3 x decisions, draws).
 
     The sums count how often each decision was yes and was made. The unseen scenario makes it as often as an average
     scenario that has it. scenarios: their number, (.., decisions); unseen: weights of `Resampling.unseen`.
@@ -224,7 +250,9 @@ def shares_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:
 
 
 def ends_of_mean(values: pd.Series, resampling: Resampling, named: str) -> np.ndarray:
-    """Return the ends of the mean of values in [0, 1], one per scenario of the index: (2, 1 + resamples).
+    """Return the ends of the mean of values in [0, 1].
+
+    There is one value per scenario of the index. Shape (2, 1 + resamples).
 
     named: as in `run_sums`.
     """
@@ -237,7 +265,9 @@ def ends_of_mean(values: pd.Series, resampling: Resampling, named: str) -> np.nd
 
 
 def figures_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:
-    """Return RESAMPLED figures of sums of COUNTS: (.., 9, resamples) -> (2, .., RESAMPLED, resamples).
+    """Return RESAMPLED scores from sums of COUNTS.
+
+    (.., 9, resamples) -> (2, .., RESAMPLED, resamples).
 
     in_mean: as in `shares_of`.
     """
@@ -264,7 +294,9 @@ def ends_of_pecs(acc: np.ndarray, j: np.ndarray) -> np.ndarray:
 
 
 def run_sums(group: pd.DataFrame, resampling: Resampling, named: str) -> dict[tuple[str, int], np.ndarray]:
-    """Return (dataset, run) -> sums of COUNTS with an unseen scenario (9, 1 + resamples).
+    """Return (dataset, run) -> sums of COUNTS with an unseen scenario.
+
+    Each is (9, 1 + resamples).
 
     group: the items of one model and regime. A dataset (an arm) may have items of both taxonomies. named: identifies
     the items' unseen scenarios.
@@ -283,7 +315,7 @@ def run_sums(group: pd.DataFrame, resampling: Resampling, named: str) -> dict[tu
             totals[key] = totals.get(key, 0) + sums
             having[key] = having.get(key, 0) + n
     unseen = {
-        dataset: resampling.unseen(f"{named}|{dataset}", len(COUNTS) // 2) for dataset in {of for of, _ in totals}
+        dataset: resampling.unseen(f"{named}|{dataset}", len(COUNTS) // 2) for dataset in {name for name, _ in totals}
     }
     return {key: with_unseen(sums, having[key], unseen[key[0]]) for key, sums in totals.items()}
 

@@ -1,4 +1,7 @@
-"""The arithmetic of every statement in `claims.csv`, from the published tables (`audit` compares the results)."""
+"""Compute every statement in `claims.csv` from the published tables.
+
+`audit` compares the results.
+"""
 
 from __future__ import annotations
 
@@ -57,19 +60,19 @@ def _naive_gap() -> Recomputed:
 def _zeros(regime: str) -> Recomputed:
     cells = _main_cells(regime)
     at_zero = zero_boundary(cells)
-    which = f" ({' '.join(at_zero.iloc[0][['model', 'dataset']])})" if len(at_zero) == 1 else ""
-    return Recomputed(f"{len(at_zero)} of {len(cells)}{which}")
+    cell = f" ({' '.join(at_zero.iloc[0][['model', 'dataset']])})" if len(at_zero) == 1 else ""
+    return Recomputed(f"{len(at_zero)} of {len(cells)}{cell}")
 
 
 def _spread(models: Sequence[str]) -> Recomputed:
     cells = published_cells()
     chosen = cells.loc[cells["model"].isin(models)]
     row = spread(chosen).iloc[0]
-    others = [f"{name} {r.q25:.4f}-{r.q75:.4f}" for name, r in _other_spreads(chosen)]
+    quartiles = [f"{name} {r.q25:.4f}-{r.q75:.4f}" for name, r in _other_spreads(chosen)]
     return Recomputed(
         f"{row['q25']:.4f} to {row['q75']:.4f}",
-        f"quartiles over the {int(row['n'])} cells with a spread; other metrics give {', '.join(others)}, and PECS on "
-        f"each dataset {', '.join(_dataset_spreads(chosen))}: the published selection of cells is not stated",
+        f"quartiles over the {int(row['n'])} cells with a spread; other metrics give {', '.join(quartiles)}, and PECS "
+        f"on each dataset {', '.join(_dataset_spreads(chosen))}: the published selection of cells is not stated",
     )
 
 
@@ -140,8 +143,8 @@ def _family_gaps() -> Recomputed:
         if entry.id in rows:
             families.setdefault(entry.groups.family, []).append(rows[entry.id])
     gaps = {
-        family: sum(_pooled(row, "textual") for row in of) / sum(_pooled(row, "visual") for row in of)
-        for family, of in families.items()
+        family: sum(_pooled(row, "textual") for row in members) / sum(_pooled(row, "visual") for row in members)
+        for family, members in families.items()
     }
     listed = ", ".join(f"{family} {value:.1f}" for family, value in gaps.items())
     return Recomputed(f"{min(gaps.values()):.1f} to {max(gaps.values()):.1f}", listed)
@@ -159,8 +162,8 @@ def _by_regime(figure: str, models: Sequence[str]) -> dict[tuple[str, str], dict
 def _means(cells: dict[tuple[str, str], dict[str, float]]) -> dict[str, dict[str, float]]:
     """Return the equal-weight means over datasets by model and regime."""
     models = dict.fromkeys(model for model, _ in cells)
-    of = {model: [cell for (name, _), cell in cells.items() if name == model] for model in models}
-    return {model: {r: fmean(cell[r] for cell in parts) for r in PAPER_REGIMES} for model, parts in of.items()}
+    model_cells = {model: [cell for (name, _), cell in cells.items() if name == model] for model in models}
+    return {model: {r: fmean(cell[r] for cell in parts) for r in PAPER_REGIMES} for model, parts in model_cells.items()}
 
 
 def _ties() -> Recomputed:

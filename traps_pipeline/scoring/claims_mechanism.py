@@ -1,4 +1,7 @@
-"""The arithmetic of the statements in `claims.csv` about probes and steering, from the published tables."""
+"""Compute the statements in `claims.csv` about probes and steering.
+
+They come from the published tables.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,9 @@ DOSE_AGAINST_REGIME = (
 
 @dataclass(frozen=True)
 class Recomputed:
-    """A recomputed statement in the published wording, and the reason why it may differ.
+    """A recomputed statement in the published wording.
+
+    It has the reason why it may differ.
 
     agrees: the verdict on a statement in words; None if the audit compares the numbers and names of both texts.
     """

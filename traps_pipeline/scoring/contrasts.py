@@ -1,4 +1,6 @@
-"""Paired comparisons of models and of regimes, with Holm's correction (docs/scoring.md, "Intervals").
+"""Compare models and regimes in pairs, with Holm's correction.
+
+See docs/scoring.md, "Intervals".
 
 Two entries of the leaderboard share their resamples (`bootstrap`), so the difference of their draws is a paired
 difference, in which the difficulty of the scenarios cancels. McNemar's test compares two regimes item by item. Answers
@@ -43,7 +45,9 @@ _Side = tuple[str, str]  # model, regime
 
 
 def contrasts(resampled: ResampledFigures, metrics: pd.DataFrame, verdicts: pd.DataFrame) -> pd.DataFrame:
-    """Return CONTRASTS rows from the bootstrap, and from the METRICS and VERDICTS rows behind it.
+    """Return CONTRASTS rows from the bootstrap.
+
+    The METRICS and VERDICTS rows behind it are needed, too.
 
     METRICS rows give the figures, VERDICTS rows the items and epochs. The rows compare every pair of models under each
     regime and every pair of regimes of each model, in PECS and in J, on each dataset, and overall if both sides have a
@@ -71,7 +75,9 @@ def contrasts(resampled: ResampledFigures, metrics: pd.DataFrame, verdicts: pd.D
 
 
 def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RESAMPLES) -> pd.DataFrame:
-    """Return the change between two studies, such as two versions of the benchmark, on their common pairs.
+    """Return the change between two studies on their common pairs.
+
+    They may be two versions of the benchmark.
 
     The change is now minus then; both are VERDICTS rows. A pair that is incomplete in either study, in the same run and
     cell, is left out. Columns: model, regime, dataset (and `overall`), figure, n_pairs per run, n_scenarios, then, now,
@@ -121,7 +127,10 @@ def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RE
 
 
 def _whole_pairs_of_both(then: pd.DataFrame, now: pd.DataFrame) -> list[pd.DataFrame]:
-    """Return each study's rows of the pairs (by model, regime and run) whose two sides are in both studies."""
+    """Return each study's rows of the pairs that both studies have completely.
+
+    Pairs are counted by model, regime and run.
+    """
     key = [*CELL, "pair_id"]
     common = then[[*key, "item_id"]].merge(now[[*key, "item_id"]], on=[*key, "item_id"])
     pairs = common.groupby(key).size()
@@ -137,7 +146,10 @@ def _standings(verdicts: pd.DataFrame) -> pd.DataFrame:
 
 
 def regime_tests(verdicts: pd.DataFrame) -> pd.DataFrame:
-    """Return REGIME_TESTS rows: McNemar's exact test for every model, dataset, run, decision and pair of regimes."""
+    """Return REGIME_TESTS rows: McNemar's exact test for every pair of regimes.
+
+    Each model, dataset, run and decision is tested.
+    """
     rows = []
     for decision, side, column in (
         ("void_abstention", "void", "abstained"),
@@ -166,7 +178,9 @@ def regime_tests(verdicts: pd.DataFrame) -> pd.DataFrame:
 def _decisions(
     verdicts: pd.DataFrame, column: str
 ) -> dict[tuple[str, str, int], dict[str, dict[str, tuple[bool, Origin]]]]:
-    """Return a column's decisions with their origins, by (dataset, model, run), regime and item.
+    """Return a column's decisions with their origins.
+
+    By (dataset, model, run), regime and item.
 
     Undecided items are left out.
     """
@@ -181,14 +195,20 @@ def _decisions(
 
 
 def mcnemar_p(only_left: int, only_right: int) -> float:
-    """Return McNemar's exact two-sided p from the numbers of items that differ in either direction."""
+    """Return McNemar's exact two-sided p.
+
+    It comes from the numbers of items that differ in either direction.
+    """
     differing = only_left + only_right
     tail = sum(comb(differing, k) for k in range(min(only_left, only_right) + 1))
     return min(1.0, 2 * tail / 2**differing)
 
 
 def holm(p: np.ndarray) -> np.ndarray:
-    """Return Holm's step-down correction of (n,) p-values; a NaN is not counted and stays NaN."""
+    """Return Holm's step-down correction of (n,) p-values.
+
+    A NaN is not counted and stays NaN.
+    """
     corrected = np.full(len(p), np.nan)
     valid = np.flatnonzero(~np.isnan(p))
     order = valid[np.argsort(p[valid], kind="stable")]
@@ -210,7 +230,9 @@ def _pairs(entries: Sequence[tuple[str, str, str]]) -> Iterator[tuple[str, str, 
 
 
 def least_p(scenarios: int) -> float:
-    """Return the smallest two-sided p that paired differences of n scenarios can give, 2^(1 - n).
+    """Return the smallest two-sided p of paired differences of n scenarios.
+
+    It is 2^(1 - n).
 
     It is that of a sign-flip test whose differences all have one sign. Pairs of one scenario go together, so they count
     once.
@@ -219,7 +241,10 @@ def least_p(scenarios: int) -> float:
 
 
 def _scenarios(verdicts: pd.DataFrame) -> dict[tuple[str, str, str], int]:
-    """Return the number of scenarios of every (model, regime, dataset), and of `overall`: those of all its datasets."""
+    """Return the number of scenarios of every (model, regime, dataset).
+
+    `overall` has those of all its datasets.
+    """
     rows = verdicts[[*ENTRY, "scenario_id"]]
     counts = pd.concat([rows, rows.assign(dataset="overall")]).groupby(ENTRY)["scenario_id"].nunique()
     return cast(dict[tuple[str, str, str], int], counts.to_dict())
@@ -228,7 +253,9 @@ def _scenarios(verdicts: pd.DataFrame) -> dict[tuple[str, str, str], int]:
 def _difference(
     figure: str, sides: Sequence[np.ndarray], observed: Sequence[float], scenarios: int
 ) -> dict[str, float]:
-    """Return the columns of a paired difference over a number of scenarios: its interval and two-sided p.
+    """Return the columns of a paired difference over a number of scenarios.
+
+    They are its interval and two-sided p.
 
     sides: the resampled ends of the left and the right, (2, resamples) each. If every resample is NaN, there is no p.
     """

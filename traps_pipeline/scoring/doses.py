@@ -1,4 +1,6 @@
-"""Test the paper's untested assumptions: how abstention changes as one property of the pairs changes step by step.
+"""Test the paper's untested assumptions.
+
+They say how abstention changes as one property of the pairs changes by steps.
 
 See docs/hypotheses.md. Each hypothesis has doses; the first is the reference for the others, on the scenarios that both
 have. Beside every figure of a model stands the score of shortcut rules, which read one cue and understand nothing, and
@@ -41,7 +43,10 @@ _KEPT = ["model", "regime", "dataset", "run", "item_id", "scenario_id", "side", 
 
 @dataclass(frozen=True)
 class Dose:
-    """One step. datasets: where it is asked; side: None for both. counts_as: the sides that its items count as."""
+    """One step.
+
+    datasets: where it is asked. side: None for both. counts_as: the sides that its items count as.
+    """
 
     name: str
     datasets: tuple[str, ...]
@@ -51,7 +56,10 @@ class Dose:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A hypothesis. figure: J, or the share of abstentions on any side. doses: the first one is the reference."""
+    """A hypothesis.
+
+    figure: J, or the share of abstentions on any side. doses: the first one is the reference.
+    """
 
     name: str
     figure: Literal["j", "abstains"]
@@ -199,7 +207,9 @@ def _row(
 
 
 def _figures(items: pd.DataFrame, resampling: Resampling, named: str) -> np.ndarray:
-    """Return the ends of RESAMPLED figures and of the share of abstentions, (2, RESAMPLED + 1, draws).
+    """Return the ends of RESAMPLED scores and of the share of abstentions.
+
+    (2, RESAMPLED + 1, draws).
 
     They are computed over all items of a run, then averaged over runs.
     """
@@ -221,17 +231,22 @@ def _ends(name: str) -> list[str]:
 
 
 def _refusal(dose: pd.DataFrame, reference: pd.DataFrame) -> str | None:
-    """Return why a dose cannot be compared with its reference: other campaigns (docs/spec.md 9.2), panels or runs."""
-    for what, column in (("epoch", "epoch"), ("panel", "panel")):
-        own, other = (joined_epochs(some[column]) for some in (dose, reference))
-        if own != other or "+" in own:
-            return f"the dose is of {what} {own}, its reference of {what} {other}"
+    """Return why a dose cannot be compared with its reference, or None.
+
+    They have other campaigns (docs/spec.md 9.2), panels or runs.
+    """
+    for word, column in (("epoch", "epoch"), ("panel", "panel")):
+        dose_epochs, reference_epochs = (joined_epochs(some[column]) for some in (dose, reference))
+        if dose_epochs != reference_epochs or "+" in dose_epochs:
+            return f"the dose is of {word} {dose_epochs}, its reference of {word} {reference_epochs}"
     runs = [sorted(set(some["run"])) for some in (dose, reference)]
     return None if runs[0] == runs[1] else f"the dose has runs {runs[0]}, its reference has runs {runs[1]}"
 
 
 def _beside_rules(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows with the rules' highest value and largest change for the same hypothesis and dose.
+    """Return the rows with the shortcut rules beside them.
+
+    They are the rules' highest value and largest change for the same hypothesis and dose.
 
     Each comes with the name of its rule. A rule does not read the regime, so rows of another regime serve if there are
     none.
@@ -239,10 +254,15 @@ def _beside_rules(rows: pd.DataFrame) -> pd.DataFrame:
     of_rules = rows.loc[rows["model"].isin(RULES)].to_dict("records")
     remarks = []
     for row in rows.to_dict("records"):
-        same = [one for one in of_rules if all(one[name] == row[name] for name in ("hypothesis", "dose"))]
-        own = {one["model"]: one for one in sorted(same, key=lambda one: one["regime"] == row["regime"])}
+        matching = [
+            rule_row for rule_row in of_rules if all(rule_row[name] == row[name] for name in ("hypothesis", "dose"))
+        ]
+        own = {
+            rule_row["model"]: rule_row
+            for rule_row in sorted(matching, key=lambda rule_row: rule_row["regime"] == row["regime"])
+        }
         remarks.append({**_best(own.values(), "value", "rule"), **_best(own.values(), "change", "rule_changing")})
-    return rows.assign(**{name: [one[name] for one in remarks] for name in remarks[0]}) if remarks else rows
+    return rows.assign(**{name: [rule_row[name] for rule_row in remarks] for name in remarks[0]}) if remarks else rows
 
 
 def _best(rows: Iterable[Mapping[str, Any]], field: str, named: str) -> dict[str, Any]:

@@ -1,4 +1,7 @@
-"""Decide which figures may be compared: by the rule of epochs (docs/spec.md 9.2), and by panel."""
+"""Decide which scores may be compared.
+
+The rule of epochs (docs/spec.md 9.2) and the panel decide.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,10 @@ if TYPE_CHECKING:
 
 
 class Origin(NamedTuple):
-    """The campaigns of a decision's answers and the panels of its votes, each joined by +."""
+    """The campaigns of a decision's answers and the panels of its votes.
+
+    Each is joined by +.
+    """
 
     epoch: str
     panel: str
@@ -47,7 +53,9 @@ def require_one_epoch(epochs: pd.DataFrame, what: str) -> None:
 
 
 def answered_items(verdicts: pd.DataFrame) -> dict[tuple[str, str, str], Answered]:
-    """Return the items that each (model, regime, dataset) answered over its runs, with their origin.
+    """Return the items that each (model, regime, dataset) answered over its runs.
+
+    Their origin stands beside them.
 
     `overall` covers the runs with all four datasets, and is left out if there is none.
     """
@@ -78,13 +86,17 @@ def refusal(left: Answered, right: Answered) -> str | None:
         return f"{_named(alone)} answered on one side alone; both sides of a contrast are of the same items"
     mixed = sorted(item for item, origin in left.items() if right[item].epoch != origin.epoch)
     if not mixed:
-        one, other = (" and ".join(names) for names in panels)
-        return f"judged by {one} on one side and by {other} on the other; figures of different panels are not compared"
+        left_names, right_names = (" and ".join(names) for names in panels)
+        judged = f"judged by {left_names} on one side and by {right_names} on the other"
+        return f"{judged}; figures of different panels are not compared"
     epochs = f"epoch {left[mixed[0]].epoch} against epoch {right[mixed[0]].epoch}"
     return f"{_named(mixed)} of {epochs}; figures of different epochs are never put in one contrast"
 
 
 def _named(items: list[str]) -> str:
-    """Return the first of these items with its dataset, and the number of the others, in words."""
+    """Return the first of these items with its dataset, in words.
+
+    The number of the others follows.
+    """
     dataset, more = items[0].partition(":")[0], len(items) - 1
     return f"{dataset}: {items[0]}" + (f" and {more} more items are" if more else " is")

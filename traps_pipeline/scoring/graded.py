@@ -1,4 +1,6 @@
-"""Score answers to graded cuts against the true distribution over answers (docs/scoring.md, "Graded cuts").
+"""Score answers to graded cuts against the true distribution over answers.
+
+See docs/scoring.md, "Graded cuts".
 
 A right answer earns 1 point, a wrong one costs WRONG_COSTS, an abstention earns nothing. The expected points of an
 answer follow from the posterior of its cut, so no figure here depends on which of the futures was filmed.
@@ -47,7 +49,10 @@ class GradedItem:
     posterior: Mapping[str, float]
 
     def label_of(self, value: str | None) -> str | None:
-        """Return the answer that a value names, by the rules of correctness; None if it names none."""
+        """Return the answer that a value names, by the rules of correctness.
+
+        None if it names none.
+        """
         of = self.answer_type, self.labels, self.aliases
         return next((label for label in self.labels if is_correct(value, label, *of)), None)
 
@@ -68,15 +73,17 @@ class GradedItem:
             if label is None or label in stated:
                 return None
             stated[label] = number
-        others = [label for label in self.labels if label not in stated]
-        left = 1 - sum(stated.values())
-        if left < -SUM_WITHIN or (left > SUM_WITHIN and not others):
+        unstated = [label for label in self.labels if label not in stated]
+        remainder = 1 - sum(stated.values())
+        if remainder < -SUM_WITHIN or (remainder > SUM_WITHIN and not unstated):
             return None
-        stated |= dict.fromkeys(others, max(0.0, left) / max(1, len(others)))
+        stated |= dict.fromkeys(unstated, max(0.0, remainder) / max(1, len(unstated)))
         return {label: stated[label] / sum(stated.values()) for label in self.labels}
 
     def read_first_token(self, alternatives: object) -> dict[str, float] | None:
-        """Return each answer's probability from the log-probabilities of the first token; None without them.
+        """Return each answer's probability from the log-probabilities of the first token.
+
+        None without them.
 
         A token counts for the answer that it names, or for the only answer with a name that starts with it; the
         remaining probability is shared evenly.
@@ -88,10 +95,10 @@ class GradedItem:
         known = dict.fromkeys(self.labels, 0.0)
         for token, logprob in json.loads(alternatives).items():
             start = token.strip().strip("\"'*`.,:").casefold()
-            begun = {label for name, label in names.items() if start and name.startswith(start)}
-            begun = {names[start]} if start in names else begun
-            if len(begun) == 1:
-                known[begun.pop()] += exp(logprob)
+            matching = {label for name, label in names.items() if start and name.startswith(start)}
+            matching = {names[start]} if start in names else matching
+            if len(matching) == 1:
+                known[matching.pop()] += exp(logprob)
         total = sum(known.values())
         rest = max(0.0, 1 - total) / len(known)
         return {label: (p + rest) / max(1.0, total) for label, p in known.items()}
@@ -105,7 +112,10 @@ def graded(
     resamples: int = RESAMPLES,
     seed: int = SEED,
 ) -> pd.DataFrame:
-    """Return GRADED_CUTS rows from the VERDICTS, VOTES and RESPONSES rows of graded items, given by id."""
+    """Return GRADED_CUTS rows of graded items, given by id.
+
+    They come from VERDICTS, VOTES and RESPONSES rows.
+    """
     labels, by_answer = _labels(votes, questions), responses.set_index(_ANSWER)
     texts, first_tokens = by_answer["text"].to_dict(), by_answer["first_token"].to_dict()
     rows = []
@@ -138,8 +148,9 @@ def _name(scope: int) -> str:
 
 
 def _labels(votes: pd.DataFrame, questions: Mapping[str, GradedItem]) -> dict[tuple[Any, ...], str]:
-    """Return the answer of each response by more than half of its judges, "" for an answer that the item does not
-    offer.
+    """Return the answer of each response by more than half of its judges.
+
+    It is "" for an answer that the item does not offer.
 
     There is no entry without such a majority.
     """
@@ -176,7 +187,9 @@ def _of_probabilities(item: GradedItem, stated: Mapping[str, float] | None) -> d
 
 
 def decided(item: GradedItem, label: str | None) -> dict[str, float]:
-    """Return the figures of one answer, or of an abstention (None): its expected points and its regret.
+    """Return the scores of one answer, or of an abstention (None).
+
+    They are its expected points and its regret.
 
     The regret is the loss against an ideal observer, with its reasons.
     """
@@ -222,22 +235,25 @@ def _commonest(posterior: Mapping[str, float]) -> str:
 
 
 def _row(items: pd.DataFrame, named: str, resampling: Resampling) -> dict[str, Any]:
-    """Return the figures of a model's and regime's items; a scenario counts once, with the mean over its runs."""
+    """Return the scores of a model's and regime's items.
+
+    A scenario counts once, with the mean over its runs.
+    """
     with_decision = items.loc[items["points"].notna()]
-    of = with_decision.groupby("scenario_id")[_FIGURES].mean()
+    scenario_means = with_decision.groupby("scenario_id")[_FIGURES].mean()
     row: dict[str, Any] = {
         "n_runs": with_decision["run"].nunique(),
-        "n_items": len(of),
+        "n_items": len(scenario_means),
         "n_missing": len(items) - len(with_decision),
-        "coverage": of["answers"].mean(),
+        "coverage": scenario_means["answers"].mean(),
         "risk": with_decision["wrong"].mean(),
-        **of[[*_MEANS]].mean(),
+        **scenario_means[[*_MEANS]].mean(),
         "panel": joined_epochs(items["panel"]),
         "epoch": joined_epochs(items["epoch"]),
         "benchmark_version": joined_versions(items["benchmark_version"]),
     }
     for name, (low, high) in WITH_INTERVAL.items():
-        ends = ends_of_mean((of[name].dropna() - low) / (high - low), resampling, f"{named}|{name}")
+        ends = ends_of_mean((scenario_means[name].dropna() - low) / (high - low), resampling, f"{named}|{name}")
         row |= with_interval(name, low + (high - low) * ends, (low, high))
     return row
 

@@ -1,4 +1,7 @@
-"""PECS without one judge: the influence of each judge of the panel (docs/spec.md 4.1 and 5.1)."""
+"""Compute PECS without one judge (docs/spec.md 4.1 and 5.1).
+
+It shows the influence of each judge of the panel.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,9 @@ _COLUMNS = pd.Index(LEAVE_ONE_OUT.names)
 def leave_one_out(
     verdicts: pd.DataFrame, votes: pd.DataFrame, board: pd.DataFrame, judges: Sequence[str] | None = None
 ) -> pd.DataFrame:
-    """Return LEAVE_ONE_OUT rows from VERDICTS and VOTES rows of the same cells, and their LEADERBOARD rows.
+    """Return LEAVE_ONE_OUT rows from VERDICTS and VOTES rows of the same cells.
+
+    board: their LEADERBOARD rows.
 
     PECS by the two other judges is computed as PECS by the panel: per run, then averaged; overall over the four
     datasets. The rows cover entries of the board, over the cells on which these judges (default: all) voted. A panel of

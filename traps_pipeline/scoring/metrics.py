@@ -1,4 +1,7 @@
-"""Acc, FalseAbs, AbsRec, J, PECS and Naive of every cell, from the panel's verdicts (docs/spec.md 5.1)."""
+"""Compute the metrics of every cell from the panel's verdicts.
+
+They are Acc, FalseAbs, AbsRec, J, PECS and Naive (docs/spec.md 5.1).
+"""
 
 from __future__ import annotations
 
@@ -34,7 +37,9 @@ SCOPED_BY: Mapping[str, tuple[str, ...]] = {
 
 
 def decision_counts(verdicts: pd.DataFrame) -> pd.DataFrame:
-    """Return COUNTS of every verdict, 0 or 1 each, on the verdicts' index: (items, 6) int64.
+    """Return COUNTS of every verdict, 0 or 1 each, on the verdicts' index.
+
+    (items, 6) int64.
 
     A null decision counts in no denominator: shares are over decided items.
     """
@@ -60,7 +65,9 @@ def pecs_of(acc: np.ndarray, j: np.ndarray) -> np.ndarray:
 
 
 def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]] = SCOPED_BY) -> pd.DataFrame:
-    """Return METRICS rows of one dataset, from its VERDICTS rows (any models, regimes and runs).
+    """Return METRICS rows of one dataset, from its VERDICTS rows.
+
+    The rows may be of any models, regimes and runs.
 
     There is one row per cell and scope: `all`, `category:x`, `sub_scenario:x`, and `label:x/y` (y: the control's answer
     in the sub-scenario x; both sides of the pair); `scoped_by` (prefix to columns) may name fewer. Figures are
@@ -87,22 +94,34 @@ def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]
 
 
 def mean(values: pd.Series) -> float:
-    """Return the mean; null if any value is null, so that no mean silently uses fewer values."""
+    """Return the mean, or null if any value is null.
+
+    So no mean silently uses fewer values.
+    """
     return float(np.mean(values.to_numpy(float)))
 
 
 def joined_epochs(epochs: Iterable[str]) -> str:
-    """Return the distinct campaigns or panels, sorted and joined by `+`; an input may itself be such a list."""
+    """Return the distinct campaigns or panels, sorted and joined by `+`.
+
+    An input may itself be such a list.
+    """
     return "+".join(sorted({part for epoch in set(epochs) for part in epoch.split("+") if part}))
 
 
 def joined_versions(versions: Iterable[str]) -> str:
-    """Return the distinct versions of the benchmark, sorted and joined; an input may itself be such a list."""
+    """Return the distinct versions of the benchmark, sorted and joined.
+
+    An input may itself be such a list.
+    """
     return " + ".join(sorted({part for version in versions for part in version.split(" + ")}))
 
 
 def _scoped(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]]) -> pd.DataFrame:
-    """Return every verdict with its counts once per scope: ((1 + len(scoped_by)) x items) rows."""
+    """Return every verdict with its counts once per scope.
+
+    ((1 + len(scoped_by)) x items) rows.
+    """
     import pandas as pd
 
     counts = decision_counts(verdicts)
@@ -137,7 +156,9 @@ def _figures(sums: pd.DataFrame) -> dict[str, np.ndarray]:
 
 
 def _bounds(sums: pd.DataFrame) -> dict[str, np.ndarray]:
-    """Return BOUNDS of every cell, (cells,) each: PECS with every missing decision at its worst, and at its best.
+    """Return BOUNDS of every cell: PECS if every missing decision were bad or good.
+
+    (cells,) each: at their worst, and at their best.
 
     Each decision is bounded separately, since an item may lack only one; PECS rises with Acc and AbsRec and falls with
     FalseAbs, so that these two are its exact extremes. If nothing is missing both equal PECS bit for bit.
@@ -154,7 +175,9 @@ def _bounds(sums: pd.DataFrame) -> dict[str, np.ndarray]:
 
 
 def wilson(yes: np.ndarray, of: np.ndarray, z: float = 1.959963984540054) -> tuple[np.ndarray, np.ndarray]:
-    """Return Wilson's score interval of each share yes / of, (n,) each; 95 % by default.
+    """Return Wilson's score interval of each share yes / of, (n,) each.
+
+    95 % by default.
 
     NaN where nothing was decided.
     """
@@ -169,16 +192,16 @@ def _wilson(sums: pd.DataFrame) -> dict[str, np.ndarray]:
     """Return the denominator of each share, and the share's interval: (cells,) each."""
     columns = {}
     for figure, name in (("acc", "correct"), ("false_abs", "false_abs"), ("abs_rec", "abs_rec")):
-        of = sums[f"{name}_of"].to_numpy("int64")
-        low, high = wilson(sums[name].to_numpy(float), of.astype(float))
-        columns |= {f"n_{figure}": of, f"{figure}_low": low, f"{figure}_high": high}
+        totals = sums[f"{name}_of"].to_numpy("int64")
+        low, high = wilson(sums[name].to_numpy(float), totals.astype(float))
+        columns |= {f"n_{figure}": totals, f"{figure}_low": low, f"{figure}_high": high}
     return columns
 
 
 def _share(sums: pd.DataFrame, name: str) -> np.ndarray:
     """Return numerator over denominator, (cells,); NaN where the denominator is 0."""
-    of = sums[f"{name}_of"].to_numpy(float)
-    return sums[name].to_numpy(float) / np.where(of > 0, of, np.nan)
+    totals = sums[f"{name}_of"].to_numpy(float)
+    return sums[name].to_numpy(float) / np.where(totals > 0, totals, np.nan)
 
 
 def wrong_figures(cells: pd.DataFrame) -> int:

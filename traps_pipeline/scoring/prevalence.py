@@ -1,4 +1,7 @@
-"""Count how often each axis of confabulation applies to a model's void failures (docs/spec.md 6.2)."""
+"""Count how often each axis of confabulation applies to void failures.
+
+Each model has its own count (docs/spec.md 6.2).
+"""
 
 from __future__ import annotations
 
@@ -46,4 +49,4 @@ def _row(model: str, group: pd.DataFrame) -> dict[str, Any]:
         (low,), (high,) = wilson(yes, np.array([len(valid)], float))
         row |= {name: yes[0] / len(valid) if len(valid) else np.nan, f"{name}_low": low, f"{name}_high": high}
     joined = {"evidence": "+", "judge": "+", "benchmark_version": " + "}
-    return row | {name: by.join(sorted(set(group[name]))) for name, by in joined.items()}
+    return row | {name: separator.join(sorted(set(group[name]))) for name, separator in joined.items()}

@@ -1,4 +1,7 @@
-"""The paper's published results, as shipped in `assets/published`, in the units of the study's own tables."""
+"""Read the paper's published results in the units of the study's own tables.
+
+They are shipped in `assets/published`.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,9 @@ def published(name: str) -> pd.DataFrame:
 
 
 def as_printed(name: str) -> pd.DataFrame:
-    """Return one published file as texts, with the digits that the paper prints; an empty cell is an empty text.
+    """Return one published file as texts, with the digits that the paper prints.
+
+    An empty cell is an empty text.
 
     Raises TrapsError that lists the files for another name.
     """
@@ -42,13 +47,18 @@ def published_rows(name: str, /, **where: object) -> list[dict[str, Any]]:
 
 
 def published_digest() -> str:
-    """Return the digest of `assets/published`, the source of the paper's tables and figures."""
+    """Return the digest of `assets/published`.
+
+    It is the source of the paper's tables and figures.
+    """
     files = {file.name: file.read_text(encoding="utf-8") for file in sorted(PUBLISHED.glob("*.csv"))}
     return digest(files)[:16]
 
 
 def published_cells() -> pd.DataFrame:
-    """Return the per-dataset table as cells for `analyses`: one row per (model, dataset, regime), shares as fractions.
+    """Return the per-dataset table as cells for `analyses`.
+
+    One row per (model, dataset, regime), shares as fractions.
 
     Columns model, dataset, regime, epoch, n_pairs, acc, abs_rec, false_abs, pecs, and their `_std` over runs (null for
     the single greedy run of qwen3-vl-8b). A cell has one epoch: `corrected`; on chaotic_ill_posed it is `original`, or
@@ -63,7 +73,10 @@ def published_cells() -> pd.DataFrame:
 
 
 def published_overall() -> pd.DataFrame:
-    """Return the overall leaderboard as printed, shares as fractions: model, regime, acc, abs_rec, false_abs, pecs."""
+    """Return the overall leaderboard as printed, shares as fractions.
+
+    Columns: model, regime, acc, abs_rec, false_abs, pecs.
+    """
     rows = published("overall")
     shares = {share: rows[printed] / 100 for share, printed in _RENAMED.items()}
     return rows.loc[:, ["model", "regime"]].assign(**shares, pecs=rows["pecs"])

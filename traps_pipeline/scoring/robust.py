@@ -1,4 +1,6 @@
-"""PECS of abstention that follows from clip and question together (docs/scoring.md, "Beyond PECS").
+"""Compute PECS of abstention that follows from clip and question together.
+
+See docs/scoring.md, "Beyond PECS".
 
 The conjunction requires every decision about a scenario to be right. The robust figure is PECS over kinds: sets of
 items that are all answerable, or all void, for one reason. Arms whose outcome must be inferred enter neither.
@@ -72,7 +74,9 @@ def robust(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED)
 
 
 def _runs_and_arms(group: pd.DataFrame) -> tuple[list[int], tuple[str, ...]]:
-    """Return the runs of a model and regime that its entry uses, and the arms of each: the largest set of arms.
+    """Return the runs of a model and regime that its entry uses, and their arms.
+
+    The largest set of arms is taken.
 
     Among sets of the same size it is the one that most runs have, then the first in the order of ARMS.
     """
@@ -126,7 +130,9 @@ def _row(items: pd.DataFrame, named: str, arms: Sequence[str], resampling: Resam
 
 
 def robust_ends(cells: Mapping[str, np.ndarray], scenarios: Mapping[str, int]) -> np.ndarray:
-    """Return the ends of the robust figure of one run, (2, draws); NaN if it has no robust arm.
+    """Return the ends of the robust score of one run, (2, draws).
+
+    NaN if it has no robust arm.
 
     cells: the ends of RESAMPLED, (2, RESAMPLED, draws), of the four datasets and the robust arms. scenarios: the number
     of scenarios in each of them.
@@ -135,8 +141,8 @@ def robust_ends(cells: Mapping[str, np.ndarray], scenarios: Mapping[str, int]) -
     pairs = np.mean([cells[dataset] for dataset in DATASETS], axis=0)
 
     def mean_over_kinds(figure: str, weights: Mapping[str, float]) -> np.ndarray:
-        at = RESAMPLED.index(figure)
-        kinds = [pairs[:, at], *(cells[arm][:, at] for arm in weights)]
+        position = RESAMPLED.index(figure)
+        kinds = [pairs[:, position], *(cells[arm][:, position] for arm in weights)]
         return np.average(kinds, axis=0, weights=[1.0, *weights.values()])
 
     acc, false_abs = (mean_over_kinds(figure, arms) for figure in ("acc", "false_abs"))
@@ -146,7 +152,9 @@ def robust_ends(cells: Mapping[str, np.ndarray], scenarios: Mapping[str, int]) -
 
 
 def conjunction_of(items: pd.DataFrame) -> pd.Series:
-    """Return whether every decision about a scenario is right (1 or 0), for scenarios asked all of CONJUNCTION.
+    """Return whether every decision about a scenario is right (1 or 0).
+
+    Scenarios were asked all of CONJUNCTION.
 
     items: VERDICTS rows of one run with COUNTS. NaN if a decision is missing and none is wrong.
     """
@@ -163,7 +171,9 @@ def conjunction_of(items: pd.DataFrame) -> pd.Series:
 
 
 def _conjunction(items: pd.DataFrame, resampling: Resampling, named: str) -> tuple[np.ndarray, int]:
-    """Return the ends of the share of decided scenarios that `conjunction_of` finds right, and their number.
+    """Return the ends of the share of scenarios that `conjunction_of` finds right.
+
+    The number of decided scenarios follows.
 
     The ends are (2, draws).
     """
@@ -179,7 +189,10 @@ def _missing(items: pd.DataFrame) -> int:
 
 
 def _refusal(items: pd.DataFrame) -> str | None:
-    """Return why no figure may join pairs and arms: other campaigns (docs/spec.md 9.2), or other panels."""
+    """Return why no score may join pairs and arms, or None.
+
+    They have other campaigns (docs/spec.md 9.2), or other panels.
+    """
     of_arms = items["dataset"].isin(ARMS)
     if "+" in (panels := joined_epochs(items["panel"])):
         return f"judged by {panels.replace('+', ' and ')}; figures of different panels are never put in one figure"
@@ -190,7 +203,10 @@ def _refusal(items: pd.DataFrame) -> str | None:
 
 
 def wrong_rows(table: pd.DataFrame) -> int:
-    """Return how many ROBUST rows break their definition: a figure outside [0, 1] or its interval (null is right)."""
+    """Return how many ROBUST rows break their definition.
+
+    A score is outside [0, 1] or its interval (null is right).
+    """
     shares = table[[*WITH_INTERVAL, "inference_acc", "inference_abstains"]].to_numpy(float)
     wrong = ((shares < 0) | (shares > 1)).any(axis=1)
     for name in WITH_INTERVAL:

@@ -1,4 +1,4 @@
-"""The tables of figures: metrics of cells, comparisons, the leaderboard."""
+"""Define the tables of scores: metrics of cells, comparisons, the leaderboard."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -72,7 +72,10 @@ METRICS = Table("metrics", MetricsRow, partition_by=("dataset",), key=("dataset"
 
 @dataclass(frozen=True, kw_only=True)
 class ContrastRow:
-    """A paired comparison of two entries of the leaderboard on one figure: two models, or two regimes of one model."""
+    """A paired comparison of two leaderboard entries on one score.
+
+    The entries are two models, or two regimes of one model.
+    """
 
     kind: Annotated[str, "models (of one regime) or regimes (of one model)"]
     dataset: DatasetOrOverall
@@ -108,7 +111,10 @@ CONTRASTS = Table(
 
 @dataclass(frozen=True, kw_only=True)
 class RegimeTestRow:
-    """A McNemar test of two regimes on the same items: one decision of one model in one run of a dataset."""
+    """A McNemar test of two regimes on the same items.
+
+    It is of one decision of one model in one run of a dataset.
+    """
 
     dataset: shared.Dataset
     model: shared.Model
@@ -135,7 +141,10 @@ REGIME_TESTS = Table(
 @dataclass(frozen=True, kw_only=True)
 @with_neighbours
 class LeaderboardRow:
-    """A model under a regime on one dataset, or overall (equal-weight mean over the four)."""
+    """A model under a regime on one dataset, or overall.
+
+    Overall is the equal-weight mean over the four.
+    """
 
     model: shared.Model
     regime: shared.Regime
@@ -189,7 +198,10 @@ LEADERBOARD = Table("leaderboard", LeaderboardRow, partition_by=(), key=("model"
 @dataclass(frozen=True, kw_only=True)
 @with_neighbours
 class RobustRow:
-    """A model under a regime when clip and question must be read together: the four datasets with the arms asked."""
+    """A model under a regime when clip and question must be read together.
+
+    It was asked the four datasets with these arms.
+    """
 
     model: shared.Model
     regime: shared.Regime
@@ -225,7 +237,10 @@ ROBUST = Table("robust", RobustRow, partition_by=(), key=("model", "regime"))
 @dataclass(frozen=True, kw_only=True)
 @with_neighbours
 class HypothesisRow:
-    """A model under a regime at one dose of a hypothesis (docs/hypotheses.md). No part of PECS or of ROBUST."""
+    """A model under a regime at one dose of a hypothesis (docs/hypotheses.md).
+
+    It is no part of PECS or of ROBUST.
+    """
 
     model: shared.Model
     regime: shared.Regime
@@ -262,7 +277,9 @@ HYPOTHESES = Table("hypotheses", HypothesisRow, partition_by=(), key=("model", "
 @dataclass(frozen=True, kw_only=True)
 @with_neighbours
 class GradedRow:
-    """A model under a regime on graded cuts, all of them or those of one range (docs/scoring.md, "Graded cuts").
+    """A model under a regime on graded cuts, all of them or one range.
+
+    See docs/scoring.md, "Graded cuts".
 
     All figures are what is expected by the posterior, the distribution over answers that the futures of a cut have.
     """
@@ -302,7 +319,10 @@ GRADED_CUTS = Table("graded", GradedRow, partition_by=(), key=("model", "regime"
 
 @dataclass(frozen=True, kw_only=True)
 class LeaveOneOutRow:
-    """A model under a regime on one dataset, or overall, scored by the other two judges; 1-1 is undecided."""
+    """A model under a regime, scored by the other two judges.
+
+    On one dataset, or overall; 1-1 is undecided.
+    """
 
     model: shared.Model
     regime: shared.Regime
@@ -333,7 +353,10 @@ LEAVE_ONE_OUT = Table("leave_one_out", LeaveOneOutRow, partition_by=(), key=("mo
 @dataclass(frozen=True, kw_only=True)
 @with_neighbours
 class PrevalenceRow:
-    """How often each axis applies to one model's sampled void failures; no row means not run."""
+    """How often each axis applies to one model's sampled void failures.
+
+    A missing row means not run.
+    """
 
     model: shared.Model
     evidence: Annotated[str, "what the judge saw: trace_and_output or output; both joined by + if traces were missing"]

@@ -1,4 +1,7 @@
-"""Compute all figures of a leaderboard from verdicts, as the stages of the scoring group do one after another."""
+"""Compute all scores of a leaderboard from verdicts.
+
+The stages of the scoring group do so one after another.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,10 @@ class Scores:
 
 
 def score(verdicts: pd.DataFrame) -> Scores:
-    """Return the METRICS and LEADERBOARD rows of VERDICTS rows of the pairs (any models, regimes and runs)."""
+    """Return the METRICS and LEADERBOARD rows of VERDICTS rows of the pairs.
+
+    The rows may be of any models, regimes and runs.
+    """
     cells = pd.concat([cell_metrics(rows) for _, rows in verdicts.groupby("dataset", sort=True)], ignore_index=True)
     resampled = resample(verdicts)
     paired = contrasts(resampled, cells, verdicts)

@@ -1,1 +1,1 @@
-"""Local web pages: the review of scenarios, and labels by people."""
+"""Serve local web pages: the review of scenarios, and labels by people."""

@@ -1,4 +1,4 @@
-"""`traps people annotate`: people label clips and answers blindly, one per screen.
+"""Let people label clips and answers blindly, one a screen (`people annotate`).
 
 Only the server knows the identity of the shown unit. A browser gets a question, a clip or an answer, and a handle made
 for one person and one unit: no model, regime, side, dataset or scenario is ever sent, and no address names a file.
@@ -56,7 +56,10 @@ class Reopen(BaseModel):
 
 
 class Annotation:
-    """A study whose clips and answers people label, as it was when this object was created."""
+    """A study whose clips and answers people label.
+
+    It is as it was when this object was created.
+    """
 
     def __init__(self, workspace: Workspace) -> None:
         self.workspace = workspace
@@ -90,7 +93,7 @@ class Annotation:
         return {row["sample_id"]: row for row in sheet_rows(self.workspace)}
 
     def progress(self, who: str, task: TaskName) -> tuple[int, int]:
-        """Return the number of units that a person has labelled, and the number of units for them."""
+        """Return the numbers of units that a person has labelled and has to label."""
         own = self.samples[task]
         return sum(unit in own.index for unit in self.store.labelled(who, task)), len(own)
 
@@ -104,12 +107,12 @@ class Annotation:
         waiting = [each.unit for each in seen if each.task == task and each.waits and each.unit in own.index]
         since = time.time() - 3600 * annotation_protocol().sitting_hours
         met = {each.scenario_id for each in seen if each.at > since}  # in any task, since answers reveal clips
-        done = {each.unit for each in seen if each.task == task} | {*self.store.labelled(who, task)}
+        finished = {each.unit for each in seen if each.task == task} | {*self.store.labelled(who, task)}
         blind = task != "answerability"
         open_units = (
             unit
             for unit in queue_of(who, own)
-            if unit not in done and (blind or own.loc[unit, "scenario_id"] not in met)
+            if unit not in finished and (blind or own.loc[unit, "scenario_id"] not in met)
         )
         unit = waiting[-1] if waiting else next(open_units, None)
         if unit is not None:
@@ -117,7 +120,10 @@ class Annotation:
         return unit
 
     def find(self, who: str, handle: str) -> tuple[TaskName, str]:
-        """Return the task and unit of a handle that was given to this person. Raises NotFound."""
+        """Return the task and unit of a handle that was given to this person.
+
+        Raises NotFound.
+        """
         for each in self.store.shown(who):
             task = require_task(each.task)
             if self.store.handle(who, each.task, each.unit) == handle and each.unit in self.samples[task].index:
@@ -125,7 +131,10 @@ class Annotation:
         raise NotFound("nothing of this name is shown to you")
 
     def record(self, who: str, sent: Sent) -> None:
-        """Store a label. Raises NotFound, Refused and Conflict."""
+        """Store a label.
+
+        Raises NotFound, Refused and Conflict.
+        """
         task, unit = self.find(who, sent.handle)
         try:
             label = LABELS[task].model_validate(sent.label)
@@ -137,7 +146,10 @@ class Annotation:
             raise Conflict(str(error)) from error
 
     def reopen(self, who: str, name: str) -> None:
-        """Show the last labelled unit of a task again. Raises NotFound without one."""
+        """Show the last labelled unit of a task again.
+
+        Raises NotFound without one.
+        """
         task = require_task(name)
         known = [unit for unit in self.store.labelled(who, task) if unit in self.samples[task].index]
         if not known:
@@ -145,7 +157,10 @@ class Annotation:
         self.store.show(who, task, known[-1], str(self.samples[task].loc[known[-1], "scenario_id"]))
 
     def clip(self, who: str, handle: str) -> Path:
-        """Return the clip behind a handle. Raises NotFound."""
+        """Return the clip behind a handle.
+
+        Raises NotFound.
+        """
         task, unit = self.find(who, handle)
         if task != "answerability":
             raise NotFound("nothing of this name is shown to you")
@@ -178,8 +193,8 @@ class Annotation:
     def unit_page(self, who: str, task: TaskName) -> str:
         """Return the page of the next unit, or one that says why there is none now."""
         unit = self.next_unit(who, task)
-        done, total = self.progress(who, task)
-        about = {"who": who, "tasks": self._tasks(who), "task": task, "title": TITLES[task], "done": done}
+        finished, total = self.progress(who, task)
+        about = {"who": who, "tasks": self._tasks(who), "task": task, "title": TITLES[task], "done": finished}
         if unit is None:
             hours = annotation_protocol().sitting_hours
             return page("annotate_done.html.j2", **about, total=total, hours=f"{hours:g}")
@@ -191,7 +206,10 @@ class Annotation:
 
 
 def annotation_app(annotation: Annotation) -> FastAPI:
-    """Return the app of the labelling pages; the guard before it identifies the person."""
+    """Return the app of the labelling pages.
+
+    The guard before it identifies the person.
+    """
     app = new_app()
 
     def who(request: Request) -> str:

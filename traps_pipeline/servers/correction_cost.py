@@ -1,4 +1,7 @@
-"""Preview the cost of a correction before it is decided: items, calls and dollars to ask again."""
+"""Preview the cost of a correction before it is decided.
+
+It is the items, calls and dollars to ask again.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +60,10 @@ class CorrectionEffect:
 
 
 def correction_effect(workspace: Workspace, spec: Mapping[str, Any], correction: Correction) -> CorrectionEffect:
-    """Return the effect of a correction on a SCENE_SPECS row. Raises TrapsError for refused parameters."""
+    """Return the effect of a correction on a SCENE_SPECS row.
+
+    Raises TrapsError for refused parameters.
+    """
     changes = correction.changes()
     question, renders = changes.get("question", spec["question"]), False
     if "params" in changes:
@@ -91,7 +97,10 @@ def _question(spec: Mapping[str, Any], params: Mapping[str, Any]) -> str:
 
 
 def _asked(workspace: Workspace, taxonomy: str) -> Iterator[tuple[str, str, int]]:
-    """Yield model, dataset of the taxonomy, and the number of evaluations that the study's experiments want."""
+    """Yield model, dataset of the taxonomy, and its number of evaluations.
+
+    Those that the study's experiments want count.
+    """
     cells = [Cell.parse(key) for key in StudyPartitions(workspace).cells]
     counts = Counter((c.evaluation.model, c.dataset) for c in cells if c.dataset in DATASETS)
     yield from ((model, d, count) for (model, d), count in sorted(counts.items()) if taxonomy_of(d) == taxonomy)

@@ -25,7 +25,10 @@ class Neighbour:
 
 
 def fingerprint(clip: Path) -> np.ndarray:
-    """Return the difference hash of first, middle and last frame, (3 * SIDE * SIDE,) bool. Raises DamagedClip."""
+    """Return the difference hash of first, middle and last frame.
+
+    (3 * SIDE * SIDE,) bool. Raises DamagedClip.
+    """
     import cv2
 
     frames, _ = decode(clip)
@@ -54,7 +57,9 @@ def neighbours(prints: Mapping[str, np.ndarray], families: Mapping[str, str]) ->
 
 
 class Comparison:
-    """The neighbours of all scenarios, computed in the background on first use: decoding 700 clips takes a minute.
+    """The neighbours of all scenarios, computed in the background on first use.
+
+    Decoding 700 clips takes a minute.
 
     clips: control clips by scenario; unreadable ones are left out.
     """

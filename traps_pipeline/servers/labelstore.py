@@ -1,4 +1,6 @@
-"""The store of `traps people annotate`: SQLite, and the append-only file that stages read.
+"""Store labels of `traps people annotate`.
+
+They go into SQLite, and the append-only file that stages read.
 
 A label is committed, appended to `labels.jsonl` and synced to disk before it is confirmed, so that a kill loses no
 confirmed label. A label that a kill leaves between the two steps is appended when the store is next opened; if the
@@ -46,12 +48,18 @@ CREATE INDEX IF NOT EXISTS labels_of_a_person ON labels (who, task);
 
 
 class NotWaiting(TrapsError):
-    """The labelled unit waits for no label, for instance because it was labelled in another window."""
+    """An error: the labelled unit waits for no label.
+
+    For instance, it was labelled in another window.
+    """
 
 
 @dataclass(frozen=True)
 class ShownUnit:
-    """A unit that was shown to a person. at: seconds since 1970, when it was last shown; waits: it has no label yet."""
+    """A unit that was shown to a person.
+
+    at: seconds since 1970, when it was last shown. waits: it has no label yet.
+    """
 
     task: str
     unit: str
@@ -61,7 +69,10 @@ class ShownUnit:
 
 
 class LabelStore:
-    """The labels of a study in one folder; several processes may have it open. Raises TrapsError for a damaged file."""
+    """The labels of a study in one folder, which several processes may have open.
+
+    Raises TrapsError for a damaged file.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -75,22 +86,28 @@ class LabelStore:
 
     @contextmanager
     def _database(self) -> Iterator[sqlite3.Connection]:
-        """Open a connection whose changes are committed and synced when the block ends without an error."""
+        """Open a connection whose changes are committed when the block ends.
+
+        They are synced, too. After an error nothing is committed.
+        """
         try:
             with closing(sqlite3.connect(self.folder / DATABASE, timeout=30, isolation_level=None)) as database:
                 database.execute("PRAGMA synchronous=FULL")
                 yield database
         except sqlite3.DatabaseError as error:
-            why, what, is_unwritable = reason_and_remedy(error)
+            why, remedy, is_unwritable = reason_and_remedy(error)
             if is_unwritable:
-                raise TrapsError(f"{self.folder / DATABASE}: cannot be written ({why}); {what}") from error
+                raise TrapsError(f"{self.folder / DATABASE}: cannot be written ({why}); {remedy}") from error
             raise TrapsError(
                 f"{self.folder / DATABASE}: cannot be used ({why}); every confirmed label is in {LABELS_FILE}: move "
                 "the database away, and it is made again from there"
             ) from error
 
     def handle(self, who: str, task: str, unit: str) -> str:
-        """Return an opaque name of a unit for one person's browser, different for each person."""
+        """Return an opaque name of a unit for one person's browser.
+
+        It is different for each person.
+        """
         content = "\0".join((who, task, unit)).encode()
         return hmac.new(self._secret.encode(), content, "sha256").hexdigest()[:HANDLE_DIGITS]
 
@@ -100,7 +117,9 @@ class LabelStore:
             rows = database.execute(
                 "SELECT task, unit, scenario_id, at, waits FROM shown WHERE who = ? ORDER BY at", (who,)
             ).fetchall()
-        return [ShownUnit(task, unit, scenario, at, bool(waits)) for task, unit, scenario, at, waits in rows]
+        return [
+            ShownUnit(task, unit, scenario, shown_at, bool(waits)) for task, unit, scenario, shown_at, waits in rows
+        ]
 
     def show(self, who: str, task: str, unit: str, scenario_id: str) -> None:
         """Record that a unit is shown to a person now and waits for a label."""
@@ -119,7 +138,10 @@ class LabelStore:
         return [unit for (unit,) in rows]
 
     def record(self, who: str, task: str, unit: str, label: Mapping[str, Any]) -> None:
-        """Store a label. Raises NotWaiting if the unit is not shown to this person, or has been labelled meanwhile."""
+        """Store a label.
+
+        Raises NotWaiting if the unit is not shown to this person, or has been labelled meanwhile.
+        """
         with self._database() as database:
             database.execute("BEGIN IMMEDIATE")
             row = database.execute(
@@ -138,7 +160,10 @@ class LabelStore:
         self._export()
 
     def _export(self, *, restore: bool = False) -> None:
-        """Append the labels that the file lacks. restore: first import those that the database lacks."""
+        """Append the labels that the file lacks.
+
+        restore: first import those that the database lacks.
+        """
         path = self.folder / LABELS_FILE
         is_new = not path.exists()
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
@@ -179,7 +204,10 @@ class LabelStore:
 
 
 def _last_seq(descriptor: int) -> int:
-    """Return the number of the last label in the file, 0 in an empty one; truncate half a line left by a crash."""
+    """Return the number of the last label in the file, 0 in an empty one.
+
+    Half a line left by a crash is truncated.
+    """
     size = os.lseek(descriptor, 0, os.SEEK_END)
     from_ = max(0, size - _TAIL)
     tail = os.pread(descriptor, _TAIL, from_)

@@ -1,4 +1,4 @@
-"""The queues of a review: which scenarios are shown, and in which order."""
+"""Queue the scenarios of a review: which are shown, and in which order."""
 
 from __future__ import annotations
 
@@ -23,7 +23,9 @@ MEANINGS: Mapping[QueueName, str] = {
 
 
 def flags(workspace: Workspace) -> pd.DataFrame:
-    """Return by scenario the disagreement of judges and of models; empty without verdicts.
+    """Return by scenario the disagreement of judges and of models.
+
+    Empty without verdicts.
 
     `judges`: the number of judged answers without a unanimous panel. `models`: p (1 - p), from 0 to 0.25, of the share
     p of models that answer the controls correctly.
@@ -43,7 +45,9 @@ def queue(
     flagged: pd.DataFrame,
     alike: Mapping[str, float],
 ) -> list[str]:
-    """Return the scenarios of a queue, in order. A reviewed scenario leaves every queue except `all`.
+    """Return the scenarios of a queue, in order.
+
+    A reviewed scenario leaves every queue except `all`.
 
     flagged: `flags`; alike: by scenario, the distance of its most similar one.
     """

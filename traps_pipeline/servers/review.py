@@ -1,4 +1,7 @@
-"""`traps people review`: one scenario per screen, its clips in step; decisions are appended to the corrections."""
+"""Serve `traps people review`: one scenario per screen, its clips in step.
+
+Decisions are appended to the corrections.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +40,9 @@ Record = Mapping[str, Any]
 
 
 class Decision(BaseModel):
-    """A reviewer's decision. seen: the number of decisions about the scenario on the page.
+    """A reviewer's decision.
+
+    seen: the number of decisions about the scenario on the page.
 
     `add` creates a new scenario of the same family, with this one's parameters and the changes.
     """
@@ -75,7 +80,10 @@ class Review:
 
     @cached_property
     def specs(self) -> dict[str, Record]:
-        """SCENE_SPECS rows by scenario. Raises TrapsError without any."""
+        """SCENE_SPECS rows by scenario.
+
+        Raises TrapsError without any.
+        """
         rows = self.workspace.tables.read_all(SCENE_SPECS).sort_values("scenario_id").to_dict("records")
         if not rows:
             raise TrapsError(f"{self.workspace.root}: has no scenes yet; run `traps run EXPERIMENT` in it first")
@@ -94,7 +102,10 @@ class Review:
 
     @cached_property
     def comparison(self) -> Comparison:
-        """The comparison of control clips, started when the queue of near duplicates is opened."""
+        """The comparison of control clips.
+
+        It starts when the queue of near duplicates is opened.
+        """
         differences = {
             id_: self.workspace.resolve(row["path"]) for (id_, side), row in self.clips.items() if side == "control"
         }
@@ -110,7 +121,10 @@ class Review:
         return {str(item): str(text) for item, text in zip(first["item_id"], first["text"], strict=True)}
 
     def spec(self, scenario_id: str) -> Record:
-        """Return the row of a scenario. Raises NotFound."""
+        """Return the row of a scenario.
+
+        Raises NotFound.
+        """
         if scenario_id not in self.specs:
             raise NotFound(f"{scenario_id}: not a scenario of this study")
         return self.specs[scenario_id]
@@ -126,7 +140,10 @@ class Review:
         return queue(name, list(self.specs), self.reviewed(), self.flags, alike)
 
     def decide(self, sent: Decision) -> None:
-        """Append a decision. Raises NotFound, Refused and Conflict."""
+        """Append a decision.
+
+        Raises NotFound, Refused and Conflict.
+        """
         spec = self.spec(sent.scenario_id)
         correction, seen = self._correction(sent.scenario_id, sent.action, sent.changes, sent.why), sent.seen
         if sent.action == "add":
@@ -144,7 +161,10 @@ class Review:
         return next(name for k in count(9001) if (name := f"{family}-{k}") not in used)
 
     def undo(self, sent: Undo) -> None:
-        """Take back the last decision. Raises NotFound, Refused and Conflict."""
+        """Take back the last decision.
+
+        Raises NotFound, Refused and Conflict.
+        """
         self.spec(sent.scenario_id)
         try:
             undo(sent.scenario_id, sent.seen, who=self.who, why=sent.why)
@@ -152,7 +172,10 @@ class Review:
             raise Conflict(str(error)) from error
 
     def preview(self, sent: Preview) -> dict[str, Any]:
-        """Return the words after the changes, and the cost of asking again. Raises NotFound and Refused."""
+        """Return the words after the changes, and the cost of asking again.
+
+        Raises NotFound and Refused.
+        """
         spec = self.spec(sent.scenario_id)
         correction = self._correction(sent.scenario_id, "correct", sent.changes, "preview")
         cost = correction_effect(self.workspace, spec, correction)
@@ -228,7 +251,10 @@ class Review:
         )
 
     def done_page(self, name: QueueName) -> str:
-        """Return the page at the end of a queue: the decisions' effect, and the commands that follow."""
+        """Return the page at the end of a queue.
+
+        It shows the decisions' effect, and the commands that follow.
+        """
         return page(
             "review_done.html.j2",
             effect=self.summary(),
@@ -242,13 +268,19 @@ class Review:
         )
 
     def _commands(self, experiment: str) -> list[str]:
-        """Return the commands that plan and run the changes, for our experiment or one from a file."""
+        """Return the commands that plan and run the changes.
+
+        They are for our experiment or one from a file.
+        """
         name = experiment if (EXPERIMENTS / f"{experiment}.yaml").is_file() else f"{experiment}.yaml"
         target = f"{shlex.quote(name)} --workspace {shlex.quote(str(self.workspace.root))}"
         return [f"traps status {target}", f"traps run {target}"]
 
     def strip(self, scenario_id: str) -> bytes:
-        """Return frames of the control above the void's at the same times, as JPEG. Raises NotFound."""
+        """Return frames of the control above the void's at the same times, as JPEG.
+
+        Raises NotFound.
+        """
         import cv2
 
         from traps_pipeline.video.encode import decode
@@ -267,7 +299,10 @@ class Review:
         return jpeg.tobytes()
 
     def clip(self, scenario_id: str, side: str) -> Path:
-        """Return the file of a clip. Raises NotFound if the study has none."""
+        """Return the file of a clip.
+
+        Raises NotFound if the study has none.
+        """
         row = self.clips.get((scenario_id, side))
         if row is None:
             raise NotFound(f"{scenario_id}: the study has no {side} clip of it")

@@ -1,4 +1,6 @@
-"""Shared parts of local pages: a FastAPI app behind the guard, templates, errors as sentences, and clips.
+"""Share what local pages need.
+
+A FastAPI app behind the guard, templates, errors as sentences, and clips.
 
 Only files that a study's tables name are served. The guard (`webguard`) admits only holders of the token, and refuses
 foreign hosts, foreign origins and every change that is not a POST of JSON.
@@ -41,7 +43,10 @@ class Conflict(TrapsError):
 
 
 def new_app() -> FastAPI:
-    """Return an app without documentation pages that answers a TrapsError with a sentence and a status."""
+    """Return an app that answers a TrapsError with a sentence and a status.
+
+    It has no documentation pages.
+    """
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
 
     @app.exception_handler(TrapsError)
@@ -58,7 +63,10 @@ def new_app() -> FastAPI:
 
 
 def page(template: str, **values: Any) -> str:
-    """Return a page with the explorer's look. Its policy allows only its own scripts, clips and pictures."""
+    """Return a page with the explorer's look.
+
+    Its policy allows only its own scripts, clips and pictures.
+    """
     style = (SHARED / "style.css").read_text(encoding="utf-8")
     digest = b64encode(hashlib.sha256(style.encode()).digest()).decode("ascii")
     return environment(WEB).get_template(template).render(style=style, style_digest=digest, **values)
@@ -66,14 +74,20 @@ def page(template: str, **values: Any) -> str:
 
 @cache
 def script(*names: str) -> str:
-    """Return sources of this room and of the explorer as one classic script with its own scope."""
+    """Return sources of this room and of the explorer as one classic script.
+
+    It has its own scope.
+    """
     paths = [WEB / name if (WEB / name).is_file() else SHARED / name for name in names]
     sources = "\n".join(path.read_text(encoding="utf-8") for path in paths)
     return f'(() => {{\n"use strict";\n{sources}\n}})();\n'
 
 
 def study_file(workspace: Workspace, relative: str) -> Path:
-    """Return a clip that a table of the study names. Raises NotFound for any other path."""
+    """Return a clip that a table of the study names.
+
+    Raises NotFound for any other path.
+    """
     path = workspace.resolve(relative)
     inside = path.resolve().is_relative_to((workspace.root / "clips").resolve())
     if not inside or not path.is_file():
@@ -100,15 +114,18 @@ class Listening:
         host = f"[{self.host}]" if ":" in self.host else self.host
         base = self.behind.rstrip("/") or f"http://{host}:{self.port}"
         tokens = {self.tokens: ""} if isinstance(self.tokens, str) else self.tokens
-        return {who: f"{base}/?token={quote(token)}" for token, who in tokens.items()}
+        return {person: f"{base}/?token={quote(token)}" for token, person in tokens.items()}
 
 
 def serve(app: FastAPI, listening: Listening) -> None:
-    """Serve an app behind the guard until Ctrl-C, and print each address with its token."""
+    """Serve an app behind the guard until Ctrl-C.
+
+    Each address is printed with its token.
+    """
     import uvicorn
 
-    for who, address in listening.addresses().items():
-        print(f"{who}: open {address}" if who else f"open {address}", flush=True)
-    at = listening.host, listening.port
-    guarded = Guard(app, listening.tokens, *at, command=listening.command, behind=listening.behind)
-    uvicorn.run(guarded, host=at[0], port=at[1], access_log=False, log_level="warning")
+    for person, address in listening.addresses().items():
+        print(f"{person}: open {address}" if person else f"open {address}", flush=True)
+    endpoint = listening.host, listening.port
+    guarded = Guard(app, listening.tokens, *endpoint, command=listening.command, behind=listening.behind)
+    uvicorn.run(guarded, host=endpoint[0], port=endpoint[1], access_log=False, log_level="warning")

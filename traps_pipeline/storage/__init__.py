@@ -1,1 +1,4 @@
-"""A study on disk: its workspace and `study.yaml`, tables, ledger of paid calls, and prepared media."""
+"""Store a study on disk.
+
+Its workspace and `study.yaml`, tables, ledger of paid calls, and prepared media.
+"""

@@ -1,4 +1,7 @@
-"""The benchmark's tables: scenarios, clips and items; and the rows that are still in the benchmark."""
+"""Define the benchmark's tables: scenarios, clips and items.
+
+It also tells which rows are still in the benchmark.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -84,7 +87,10 @@ VIDEOS = Table("videos", VideoRow, partition_by=("category",), key=("scenario_id
 
 @dataclass(frozen=True, kw_only=True)
 class ArmRow:
-    """What a scenario gives for an arm or a variation: a clip and a question beside the pair, or why it has none."""
+    """An arm's or variation's clip and question, or why a scenario has none.
+
+    They lie beside the pair.
+    """
 
     scenario_id: shared.ScenarioId
     category: shared.Category
@@ -143,7 +149,9 @@ def current_rows(
     columns: Sequence[str] | None = None,
     dataset: str | Sequence[str] = DATASETS,
 ) -> "pd.DataFrame":
-    """Return the rows of a table whose items are still in the benchmark; rows of arms only if `dataset` names them.
+    """Return the rows of a table whose items are still in the benchmark.
+
+    Rows of arms only if `dataset` names them.
 
     Every count uses these: a cell that was evaluated before a correction may hold others.
     """

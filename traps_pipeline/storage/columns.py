@@ -1,4 +1,4 @@
-"""Column types that tables of several packages share, each with its meaning."""
+"""Define column types that several tables share, each with its meaning."""
 
 from dataclasses import dataclass
 from datetime import datetime

@@ -1,4 +1,6 @@
-"""Leases on pieces of work that several processes share, wherever the study's files lie.
+"""Lease pieces of work that several processes share.
+
+The study's files may lie anywhere.
 
 A lease expires with its process, and another process makes the piece.
 """
@@ -16,7 +18,9 @@ POLL_S = 0.2
 
 @contextmanager
 def alone(store: Store, name: str) -> Iterator[None]:
-    """Hold an exclusive lease on a piece of work within the block; a second process waits.
+    """Hold an exclusive lease on a piece of work within the block.
+
+    A second process waits.
 
     Raises TrapsError if no lease can be had.
     """
@@ -27,7 +31,9 @@ def alone(store: Store, name: str) -> Iterator[None]:
 
 
 def leased_ranges(store: Store, work: str, items: int, size: int) -> Generator[range]:
-    """Yield ranges of at most `size` items, each under a lease that ends when the next range is requested.
+    """Yield ranges of at most `size` items, each under a lease.
+
+    The lease ends when the next range is requested.
 
     Ranges that no other process holds come first, then the others as they are released, finished or not. Raises
     TrapsError if no lease can be had.

@@ -1,4 +1,7 @@
-"""Append-only JSON Lines with a checksum per line, so that damaged lines are detected."""
+"""Append JSON Lines with a checksum per line.
+
+Damaged lines are detected.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,10 @@ NOT_WHOLE = "not what was written"
 
 
 def line_with_checksum(row: Mapping[str, Any]) -> bytes:
-    """Return a non-empty row as a JSON line whose last field is its checksum. Raises ValueError for NaN."""
+    """Return a non-empty row as a JSON line whose last field is its checksum.
+
+    Raises ValueError for NaN.
+    """
     body = json.dumps(row, ensure_ascii=False, allow_nan=False).encode()[:-1]
     return body + _SUM + _sum_of(body) + b'"}\n'
 
@@ -34,7 +40,10 @@ def is_whole(line: bytes) -> bool:
 
 @dataclass(frozen=True)
 class Line:
-    """A line of a file, numbered from 1. whole: its checksum is right; torn: a last line that a crash cut off."""
+    """A line of a file, numbered from 1.
+
+    whole: its checksum is right. torn: a last line that a crash cut off.
+    """
 
     number: int
     content: bytes
@@ -43,7 +52,7 @@ class Line:
 
 
 def read_checked(path: Path) -> Iterator[Line]:
-    """Yield the lines of a file that `append_whole` and `line_with_checksum` wrote, damaged ones included."""
+    """Yield the lines of a file that this module wrote, damaged ones included."""
     with path.open("rb") as stream:
         for number, line in enumerate(stream, start=1):
             if not line.endswith(b"\n"):  # the last one; that which lacks only its end, or has another one, is whole
@@ -54,7 +63,10 @@ def read_checked(path: Path) -> Iterator[Line]:
 
 
 def append_whole(descriptor: int, content: bytes) -> None:
-    """Append all of the content, or nothing: half a line would corrupt the next one. Raises OSError."""
+    """Append all of the content, or nothing.
+
+    Half a line would corrupt the next one. Raises OSError.
+    """
     size, remaining = os.lseek(descriptor, 0, os.SEEK_END), content
     try:
         while remaining:

@@ -1,4 +1,4 @@
-"""Prepare a clip for a model: pick frames by time stamp, and encode them as a video or images.
+"""Prepare a clip for a model: pick frames by time, encode a video or images.
 
 The same decoded frames go to every backend. They are encoded once per clip and profile and shared over regimes and
 runs; the digest of the encoded bytes is part of the ledger key.
@@ -63,7 +63,7 @@ class MediaSpec(BaseModel):
     later: int = Field(default=0, ge=0)
 
     def content(self) -> dict[str, Any]:
-        """Return the fields for a digest. Fields added later count only if set, so that older digests stay valid."""
+        """Return the fields for a digest; fields added later count only if set."""
         unused = {name for name in ("fit", "later") if getattr(self, name) == type(self).model_fields[name].default}
         return self.model_dump(mode="json", exclude=unused)
 
@@ -90,7 +90,7 @@ class MediaSpec(BaseModel):
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """Frames picked from a clip. frames: (N, H, W, 3) uint8 RGB. times_s: (N,) float64, seconds into the clip.
+    """Frames (N, H, W, 3) uint8 RGB of a clip, and their times_s (N,) in seconds.
 
     clip_fps: frames a second of the whole clip; None if it has one frame.
     """
@@ -102,7 +102,9 @@ class Frames:
 
 @dataclass(frozen=True)
 class Media:
-    """A clip as it is sent. path: the mp4, or the zip of JPEGs; None for profile frames, which `sample` returns.
+    """A clip as it is sent.
+
+    path: the mp4, or the zip of JPEGs. None for profile frames, which `sample` returns.
 
     sha256: of the sent content (the mp4; the JPEGs one after another; pixels and times), wherever the clip lies.
     times_s: seconds into the clip. fps: playing speed of a video; None for other profiles. size_bytes: of the file, or
@@ -122,12 +124,12 @@ class Media:
 
 
 def pick(times: np.ndarray, spec: MediaSpec) -> np.ndarray:
-    """Return indices of the frames that a model is shown. times: (F,), seconds of the clip's frames."""
+    """Return indices of the frames shown to a model; times: (F,) s of the clip's."""
     return FramePolicy(spec.fps, spec.uniform, spec.most, spec.later).pick(times)
 
 
 def sample(clip: Path, spec: MediaSpec) -> Frames:
-    """Return a clip's frames as a model sees them. Raises DamagedClip."""
+    """Return a clip's frames as a model sees them; may raise DamagedClip."""
     frames, times = decode(clip)
     chosen = pick(times, spec)
     clip_fps = round((len(times) - 1) / float(times[-1] - times[0]), 3) if len(times) > 1 else None
@@ -135,7 +137,7 @@ def sample(clip: Path, spec: MediaSpec) -> Frames:
 
 
 def resize(frames: np.ndarray, size: tuple[int, int] | None, fit: Literal["stretch", "crop"] = "stretch") -> np.ndarray:
-    """Return frames (N, H, W, 3) uint8 at another width and height; unchanged if size is None.
+    """Return frames (N, H, W, 3) uint8 at another size, unchanged if it is None.
 
     With fit `crop` they keep their shape: they are resized until they cover the size, and their middle is kept.
     """
@@ -157,14 +159,14 @@ def resize(frames: np.ndarray, size: tuple[int, int] | None, fit: Literal["stret
 
 
 class MediaStore:
-    """Prepared media under one folder, by clip and profile; safe for concurrent threads and processes."""
+    """Prepared media under one folder, by clip and profile; safe for concurrent use."""
 
     def __init__(self, folder: Path, store: Store | None = None) -> None:
         self.folder, self._store = folder, store or FolderStore(folder)
         self._sound: dict[Path, Media] = {}  # by note: media that this process has prepared or checked byte by byte
 
     def prepare(self, clip: Path, clip_digest: str, spec: MediaSpec) -> Media:
-        """Return a clip's media, prepared once; rebuild a damaged or missing file. Blocks: call it in a thread.
+        """Return a clip's media, prepared once or rebuilt; blocks, so call it in a thread.
 
         clip_digest: SHA-256 of the clip's file. Raises DamagedClip if the clip has another digest or is unreadable,
         TrapsError if nothing can be written, or if a video cannot play at the clip's own frame rate.
@@ -174,14 +176,14 @@ class MediaStore:
             with _alone(note.parent):
                 self._bring(note, spec)
                 media = self._here(clip_digest, spec)
-                if media is None or not _whole(media):
+                if media is None or not _is_complete(media):
                     media = _make(clip, clip_digest, spec, note)
                 self._store.keep([note] if media.path is None else [media.path, note])
                 self._sound[note] = media
         return self._sound[note]
 
     def known(self, clip_digest: str, spec: MediaSpec) -> Media | None:
-        """Return a clip's media if they are prepared, else None. Checks only note and size, for planning."""
+        """Return a clip's prepared media, else None; checks only note and size."""
         note = self._note(clip_digest, spec)
         if note in self._sound:
             return self._sound[note]
@@ -201,12 +203,12 @@ class MediaStore:
             return None
 
     def _note(self, clip_digest: str, spec: MediaSpec) -> Path:
-        """Return the path of the JSON note about the media; written last, so that it vouches for them."""
+        """Return the path of the JSON note about the media, which is written last."""
         return self.folder / clip_digest[:2] / f"{clip_digest}-{profile_digest(spec)[:16]}.json"
 
 
 def read_note(note: Path) -> Media:
-    """Return the media that a note describes. Raises ValueError naming a damaged note, or OSError."""
+    """Return the media that a note describes, or raise ValueError or OSError."""
     (line, *more) = [*read_checked(note)] or [None]
     if line is None or more or not line.whole:
         raise ValueError(f"{note}: {NOT_WHOLE}; delete it and run again: it is prepared anew")
@@ -248,7 +250,7 @@ def _damaged(path: Path, why: str) -> DamagedClip:
     return DamagedClip(f"{path}: is not what was prepared ({why}); delete it and run again: it is prepared anew")
 
 
-def _whole(media: Media) -> bool:
+def _is_complete(media: Media) -> bool:
     try:
         return media.path is None or bool(payload(media))
     except DamagedClip:
@@ -260,7 +262,7 @@ def _file(note: Path, profile: Profile) -> Path | None:
 
 
 def _make(clip: Path, clip_digest: str, spec: MediaSpec, note: Path) -> Media:
-    """Pick and encode frames, write the file, and last the note. The digest is of the written bytes."""
+    """Pick and encode frames, write the file, and last the note with its digest."""
     _require(clip, clip_digest)
     sampled = sample(clip, spec)
     path, rate = _file(note, spec.profile), None
@@ -283,7 +285,7 @@ def _make(clip: Path, clip_digest: str, spec: MediaSpec, note: Path) -> Media:
 
 
 def _require(clip: Path, clip_digest: str) -> None:
-    """Raise DamagedClip unless the clip has the digest that the media will be stored under."""
+    """Raise DamagedClip unless the clip has the digest of its future media."""
     try:
         digest = file_digest(clip)
     except OSError as error:
@@ -296,7 +298,7 @@ def _require(clip: Path, clip_digest: str) -> None:
 
 
 def _rate(clip: Path, sampled: Frames, spec: MediaSpec) -> int:
-    """Return the playing speed of the picked frames in frames a second: fps, or that of a slower clip."""
+    """Return the playing speed of picked frames: fps, or that of a slower clip."""
     rate = min(spec.fps or 1, sampled.clip_fps or np.inf)
     if rate != int(rate):
         raise TrapsError(
@@ -320,7 +322,7 @@ def _jpeg(frame: np.ndarray) -> bytes:
 
 
 def _zipped(jpegs: Sequence[bytes]) -> bytes:
-    """Return an uncompressed zip of 00.jpg, 01.jpg, ...; the same images give the same bytes on every system."""
+    """Return an uncompressed zip of 00.jpg, 01.jpg, ..., the same bytes everywhere."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         for i, jpeg in enumerate(jpegs):
@@ -331,7 +333,7 @@ def _zipped(jpegs: Sequence[bytes]) -> bytes:
 
 
 def _unzipped(data: bytes) -> list[bytes]:
-    """Return the entries of a zip in order. Raises one of `_NO_ZIP`."""
+    """Return the entries of a zip in order, or raise one of `_NO_ZIP`."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
             raise zipfile.BadZipFile("an entry is compressed")
@@ -340,7 +342,7 @@ def _unzipped(data: bytes) -> list[bytes]:
 
 @contextmanager
 def _alone(folder: Path) -> Iterator[None]:
-    """Hold a folder's lock, so that one thread or process prepares and the others reuse the result.
+    """Hold a folder's lock: one process prepares, the others reuse the result.
 
     The system frees it when its holder dies. Raises TrapsError.
     """
@@ -371,7 +373,7 @@ class UriCache:
         self._kept: OrderedDict[tuple[Profile, str], tuple[str, ...]] = OrderedDict()
 
     def get(self, media: Media) -> tuple[str, ...]:
-        """Return the data URIs of `payload`, in order. Raises the same errors."""
+        """Return the data URIs of `payload`, in order, or raise its errors."""
         key = (media.profile, media.sha256)
         with self._lock:
             uri = self._kept.get(key)
@@ -392,5 +394,5 @@ _URIS = UriCache(CACHE_BYTES)
 
 
 def data_uris(media: Media) -> tuple[str, ...]:
-    """Return `payload` as data URIs, from a cache that this process's calls share. Raises the same errors."""
+    """Return `payload` as data URIs, cached for this process; may raise its errors."""
     return _URIS.get(media)

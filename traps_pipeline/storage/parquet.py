@@ -1,4 +1,4 @@
-"""Parquet tables of a workspace: schema-checked, written atomically, read as one dataset."""
+"""Read and write a workspace's Parquet tables: schema-checked, atomic, joined."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _FOOTERS: dict[Path, tuple[str, State, list[str]]] = {}  # footers by file, with
 
 @dataclass(frozen=True)
 class State:
-    """The footer of a partition: data version, input versions, number of rows and of failed answers, code version."""
+    """The footer of a partition: versions of data, inputs and code, and row counts."""
 
     version: str
     inputs: dict[str, str]
@@ -46,7 +46,7 @@ class State:
 
 @dataclass(frozen=True)
 class StageOutput:
-    """A stage's output for a partition, before it is written: rows of a table, or files by path.
+    """A stage's output for a partition before it is written: rows, or files by path.
 
     Also its tally of work, the extra content to show of it, and data for its checks.
     """
@@ -67,23 +67,28 @@ class StageOutput:
 
 
 def joined(parts: Sequence[StageOutput]) -> StageOutput:
-    """Return the outputs of parts of a partition as one: rows are joined, tallies and shown numbers added up."""
-    first, *others = parts
-    for other in others:
-        first.tally.add(other.tally)
+    """Return the outputs of a partition's parts as one.
+
+    Rows are joined, tallies and shown numbers added up.
+    """
+    first, *later = parts
+    for later_part in later:
+        first.tally.add(later_part.tally)
     rows = [row for part in parts for row in part.content]
     figures = {name: round(sum(part.shown[name] for part in parts), 6) for name in first.shown}
     return StageOutput(rows, first.tally, figures, first.beside)
 
 
 class TableStore:
-    """The tables under one folder of a study's files. A partition is one file, replaced atomically."""
+    """The tables under one folder of a study's files, one file per partition."""
 
     def __init__(self, root: Path, store: Store | None = None) -> None:
         self.root, self._store = root, store or FolderStore(root)
 
     def path(self, table: Table, partition: Mapping[str, Any]) -> Path:
-        """Return the file of a partition: `<table>/<value>/.../<value>.parquet`, or `<table>/<table>.parquet`.
+        """Return a partition's file: `<table>/<value>/.../<value>.parquet`.
+
+        `<table>/<table>.parquet` without partitions.
 
         No name is `column=value`: a file holds its partition columns, and readers would add them once more.
         """
@@ -102,7 +107,7 @@ class TableStore:
         failed: int = 0,
         code: str = "1",
     ) -> str:
-        """Write one partition and return its data version (a digest of its content without volatile columns).
+        """Write a partition and return its version, a digest without volatile columns.
 
         Rows are values of the table's dataclass, or a frame. They are sorted by the table's key. The footer records
         `inputs` (versions of upstream partitions), `failed` (answers to ask again in the next run), the data version
@@ -178,7 +183,7 @@ class TableStore:
             raise _unreadable(path, table, error) from error
 
     def damage(self, table: Table, partition: Mapping[str, Any], *, thorough: bool = False) -> str:
-        """Return what is wrong with a partition's file, in words; empty if it is intact or missing.
+        """Return what is wrong with a partition's file; empty if intact or missing.
 
         The bytes of a file are compared with the digest in it. thorough: do not trust what a store has noted of it.
         """
@@ -196,18 +201,18 @@ class TableStore:
         return ""
 
     def read(self, table: Table, partition: Mapping[str, Any], columns: Sequence[str] | None = None) -> pd.DataFrame:
-        """Return one partition. Raises TrapsError naming the file and the stage to materialize if it is missing."""
+        """Return one partition; raises TrapsError naming a missing file and its stage."""
         return self._load(table, self.path(table, partition), columns).to_pandas()
 
     def records(
         self, table: Table, partition: Mapping[str, Any], columns: Sequence[str] | None = None
     ) -> Iterator[dict[str, Any]]:
-        """Yield the rows of one partition as mappings, holding few at once. Raises TrapsError as `read` does."""
+        """Yield a partition's rows as mappings, few at once; raises as `read` does."""
         for batch in self._load(table, self.path(table, partition), columns).to_batches(_ROWS_AT_ONCE):
             yield from batch.to_pylist()
 
     def read_all(self, table: Table, columns: Sequence[str] | None = None, **equal: Any) -> pd.DataFrame:
-        """Return all partitions with the given values of partition columns (a list: any of them).
+        """Return all partitions with these values (a list: any) of partition columns.
 
         The frame is empty if there are none.
         """
@@ -229,7 +234,7 @@ class TableStore:
         return pa.concat_tables(pieces) if pieces else _wanted(table, columns).empty_table()
 
     def partitions(self, table: Table) -> list[dict[str, str]]:
-        """Return the existing partitions of a table, sorted by path; values as in the paths."""
+        """Return a table's existing partitions, sorted by path, with the path's values."""
         root = self.root / table.name
         paths = self._store.below(root, "/".join("*" * max(1, len(table.partition_by))) + _SUFFIX)
         values = [path.relative_to(root).as_posix().removesuffix(_SUFFIX).split("/") for path in paths]
@@ -252,12 +257,12 @@ class TableStore:
 
 
 def write_sealed(path: Path, data: pa.Table, metadata: Mapping[bytes, bytes]) -> None:
-    """Write a Parquet file atomically, with metadata and the digest of its own bytes in its footer."""
+    """Write a Parquet file atomically, with metadata and its digest in the footer."""
     write_bytes(path, sealed(data, metadata), durable=True)
 
 
 def sealed(data: pa.Table, metadata: Mapping[bytes, bytes]) -> bytes:
-    """Return the bytes of a Parquet file with metadata and the digest of its own bytes in its footer."""
+    """Return a Parquet file's bytes, with metadata and their digest in the footer."""
     import pyarrow.parquet as pq
 
     buffer = io.BytesIO()
@@ -279,7 +284,7 @@ def read_sealed(path: Path) -> pa.Table:
 
 
 def note_of(path: Path) -> str:
-    """Return a store's note about a partition: its footer and its columns. Raises TrapsError if the file is damaged."""
+    """Return a store's note about a partition (footer, columns), or raise TrapsError."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -305,7 +310,7 @@ def _sum_of(content: bytes) -> bytes:
 
 
 def _sound_bytes(path: Path) -> pa.BufferReader:
-    """Return a file's bytes after verifying them. Raises TrapsError if they are damaged.
+    """Return a file's bytes after verifying them, or raise TrapsError.
 
     Verified bytes are not verified again in this process while size and time are unchanged.
 
@@ -325,7 +330,7 @@ def _sound_bytes(path: Path) -> pa.BufferReader:
 
 
 def _footer_of(path: Path) -> tuple[State, list[str]]:
-    """Return a file's footer and the names of its columns; cached while its size and time are unchanged.
+    """Return a file's footer and column names, cached until the file changes.
 
     A run reads each of hundreds of footers dozens of times. Raises as `_sound_bytes`, or ArrowException.
     """
@@ -339,7 +344,7 @@ def _footer_of(path: Path) -> tuple[State, list[str]]:
 
 
 def altered(path: Path) -> str:
-    """Return what is wrong with the bytes of a table's file, in words; empty if they are intact."""
+    """Return what is wrong with the bytes of a table's file; empty if intact."""
     try:
         _sound_bytes(path)
     except (TrapsError, OSError) as error:

@@ -1,4 +1,4 @@
-"""The location of a study: a folder of this machine, or an address in an object store."""
+"""Locate a study: a folder of this machine, or an address in an object store."""
 
 from __future__ import annotations
 
@@ -37,7 +37,10 @@ def place_of(text: str) -> Place:
 
 
 def name_of(place: Place) -> str:
-    """Return a unique name of a study: the folder's, and a digest of where it was created."""
+    """Return a unique name of a study.
+
+    It is the folder's, with a digest of where it was created.
+    """
     plain = re.sub(r"[^a-z0-9]+", "-", str(place).rpartition("/")[2].lower()).strip("-")[:LONGEST]
     return f"{plain}-{digest(str(place))[:8]}".lstrip("-")
 

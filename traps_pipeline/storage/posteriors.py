@@ -1,4 +1,7 @@
-"""The measured probability of each answer to a graded cut (docs/arms.md, "Graded cuts")."""
+"""Read the measured probability of each answer to a graded cut.
+
+See docs/arms.md, "Graded cuts".
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 
 def posteriors(workspace: Workspace) -> dict[str, dict[str, float]]:
-    """Return the probabilities of possible answers, by scenario, for scenarios with a graded cut."""
+    """Return the probabilities of possible answers to graded cuts, by scenario."""
     rows = workspace.tables.read_all(ARMS, ["scenario_id", "arm", "refused", "evidence"])
     rows = rows.loc[rows["arm"].eq(GRADED) & rows["refused"].isna()]
     return {

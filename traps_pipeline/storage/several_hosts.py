@@ -1,4 +1,6 @@
-"""The one entry point to the room `traps_pipeline.cluster`, which only several hosts need and no other room imports.
+"""Reach the room `traps_pipeline.cluster` by its one entry point.
+
+Only several hosts need that room, and no other room imports it.
 
 It is imported by name, and only if a study has a database that hosts share.
 """
@@ -21,10 +23,15 @@ _ROOM = "traps_pipeline.cluster.entry"
 
 
 class SeveralHosts(Protocol):
-    """The interface that other rooms use. workspace: a `Workspace`, which itself asks here."""
+    """The interface that other rooms use.
+
+    workspace: a `Workspace`, which itself asks here.
+    """
 
     def open_store(self, place: Place, root: Path, study: Study | None = None) -> Store | None:
-        """Return the files of a study with a database, in a shared folder or an object store.
+        """Return the files of a study with a database.
+
+        They lie in a shared folder or an object store.
 
         They lie below `root` while they are used. study: the contents of `study.yaml`, if known; else they are read
         from the address, and None is returned if there is no study. Raises TrapsError if the store or its database
@@ -33,18 +40,26 @@ class SeveralHosts(Protocol):
         ...
 
     def dagster_yaml(self, workspace: Any) -> dict[str, Any]:
-        """Return the `dagster.yaml` of a study whose runs go to Ray, and export the variables that it names."""
+        """Return the `dagster.yaml` of a study whose runs go to Ray.
+
+        The variables that it names are exported.
+        """
         ...
 
     def runs(self, workspace: Any, instance: dg.DagsterInstance, options: Any) -> Any:
-        """Return the `Runs` of a cluster (`pipeline/runs.py`), once those of earlier commands have ended.
+        """Return the `Runs` of a cluster (`pipeline/runs.py`).
+
+        Those of earlier commands have ended by then.
 
         options: of `traps run`. Raises TrapsError if no run can be submitted from this host.
         """
         ...
 
     def sensors(self) -> Sequence[dg.SensorDefinition]:
-        """Return the sensors with which Dagster's daemon starts such runs and ends those that cannot begin."""
+        """Return the sensors that start such runs and end those that cannot begin.
+
+        Dagster's daemon evaluates them.
+        """
         ...
 
 

@@ -1,4 +1,6 @@
-"""Move a study of one machine into an object store: rows and spending into the database, files under their digests.
+"""Move a study of one machine into an object store.
+
+Rows and spending go into the database, files under their digests.
 
 Nothing is asked, rendered or extracted again. Until everything is there, the address is empty and the folder is the
 study; a killed move is repeated. Afterwards the folder is no longer a study, so that nobody pays twice; its files stay.
@@ -24,7 +26,7 @@ LEFT = "study.moved.yaml"  # the new name of the folder's study.yaml
 
 
 def move_to_store(workspace: Workspace, address: Place) -> int:
-    """Move a study from its folder to an address (s3://BUCKET/STUDY); return the number of rows of its ledger.
+    """Move a study to an address (s3://BUCKET/STUDY); return its ledger's row count.
 
     Raises TrapsError, also while another process writes to the ledger.
     """

@@ -1,4 +1,7 @@
-"""The contents of `study.yaml`: a workspace's benchmark, experiments, budget and mechanistic analyses."""
+"""Define `study.yaml`.
+
+It holds a workspace's benchmark, experiments, budget and mechanistic analyses.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,10 @@ Regime = Annotated[str, Field(pattern=f"^({'|'.join(VQA_PROMPTS)})$")]
 
 
 class Layers(BaseModel):
-    """Layers of one model, counted as in hidden_states: 0 = embeddings, l = output of the l-th block."""
+    """Layers of one model, counted as in hidden_states.
+
+    0 = embeddings, l = output of the l-th block.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     steering: int = Field(ge=1, description="block whose output is steered")
@@ -43,7 +49,9 @@ class ProbeSettings(BaseModel):
 
 
 class NullSettings(BaseModel):
-    """The null directions against which an effect is ranked: the number of draws of each kind.
+    """The null directions against which an effect is ranked.
+
+    Each kind has a number of draws.
 
     They are steered at the largest dose on the datasets that they come from.
     """
@@ -119,7 +127,10 @@ class PatchingSettings(BaseModel):
 
 
 class MechanismSettings(BaseModel):
-    """The section `mechanism:` of an experiment and of `study.yaml`. models: the local models, and their layers."""
+    """The section `mechanism:` of an experiment and of `study.yaml`.
+
+    models: the local models, and their layers.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     models: dict[str, Layers] = Field(min_length=1)
@@ -164,7 +175,10 @@ class MechanismSettings(BaseModel):
 
 
 class Asked(BaseModel):
-    """One experiment's requests about a study's scenarios. mechanism: whether it includes mechanistic analyses."""
+    """One experiment's requests about a study's scenarios.
+
+    mechanism: whether it includes mechanistic analyses.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     datasets: tuple[str, ...]
@@ -175,7 +189,9 @@ class Asked(BaseModel):
 
 
 class Study(BaseModel):
-    """`study.yaml`: the benchmark, its subset, the panel, the budget and the experiments of a workspace.
+    """`study.yaml` of a workspace.
+
+    It holds the benchmark, its subset, the panel, the budget and the experiments.
 
     benchmark, scenarios and per_family are fixed when the workspace is created; panel, epoch and budget may be edited.
     No command and no button asks a model that `experiments` does not name.

@@ -1,4 +1,4 @@
-"""What a table is: an annotated frozen dataclass, of which one value is one row.
+"""Declare tables as annotated frozen dataclasses, of which one value is one row.
 
     @dataclass(frozen=True, kw_only=True)
     class VideoRow:
@@ -39,7 +39,10 @@ TYPES: tuple[Any, ...] = (str, int, float, bool, datetime, list[str])
 
 @dataclass(frozen=True)
 class StoredColumn:
-    """One column: its name, its type (one of TYPES), whether values may be missing, its meaning and unit in words."""
+    """One column of a table.
+
+    Its name, its type (one of TYPES), whether values may be missing, its meaning and unit in words.
+    """
 
     name: str
     type: Any
@@ -54,14 +57,20 @@ class StoredColumn:
 
 @dataclass(frozen=True)
 class Beside:
-    """Marks a column that has further columns beside it, with these suffixes, of this type and meaning."""
+    """A mark of a column that has further columns beside it.
+
+    They have these suffixes, this type and this meaning.
+    """
 
     suffixes: tuple[str, ...]
     column: Any
 
 
 def with_neighbours(row_type: type[Row]) -> type[Row]:
-    """Declare the columns beside the marked ones (`Beside`); place it below `@dataclass`."""
+    """Declare the columns beside the marked ones (`Beside`).
+
+    Place it below `@dataclass`.
+    """
     annotations = dict[str, Any]()
     for name, annotation in row_type.__annotations__.items():
         annotations[name] = annotation
@@ -73,7 +82,9 @@ def with_neighbours(row_type: type[Row]) -> type[Row]:
 
 @dataclass(frozen=True)
 class Table(Generic[Row]):
-    """A table's contract: its name, the dataclass of its rows, the columns that partition it, its key.
+    """A table's contract.
+
+    Its name, the dataclass of its rows, the columns that partition it, its key.
 
     Layout: `tables/<table>/<value>/.../<value>.parquet`, one value for each partition column; the file holds these
     columns too. Raises ValueError for a key or partition column that the dataclass lacks.
@@ -99,7 +110,10 @@ class Table(Generic[Row]):
 
     @cached_property
     def columns(self) -> tuple[StoredColumn, ...]:
-        """The columns in the order of the fields. Raises TypeError for an annotation that declares no column."""
+        """The columns in the order of the fields.
+
+        Raises TypeError for an annotation that declares no column.
+        """
         return tuple(_columns(self.row_type))
 
     @property

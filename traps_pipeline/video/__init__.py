@@ -1,1 +1,1 @@
-"""Encoding of clips, and which of their frames a model is shown."""
+"""Encode clips, and choose which of their frames a model is shown."""

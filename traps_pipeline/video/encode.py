@@ -1,4 +1,7 @@
-"""Frames to H.264 clips and back, through PyAV. The same frames give the same bytes (one encoder thread)."""
+"""Encode frames as H.264 clips and decode them, through PyAV.
+
+The same frames give the same bytes (one encoder thread).
+"""
 
 from __future__ import annotations
 
@@ -36,7 +39,9 @@ def frames_digest(frames: Sequence[np.ndarray]) -> str:
 
 
 def encode(frames: Sequence[np.ndarray], path: Path, fps: int) -> None:
-    """Write RGB frames (F, H, W, 3) as an mp4 (H.264, yuv420p, faststart); the file appears whole or not at all.
+    """Write RGB frames (F, H, W, 3) as an mp4 (H.264, yuv420p, faststart).
+
+    The file appears whole or not at all.
 
     Raises TrapsError when it cannot be written (a full disk); a former file then still stands. Raises TrapsError, too,
     for a width or height that is odd, before anything is written.
@@ -65,7 +70,10 @@ def encode(frames: Sequence[np.ndarray], path: Path, fps: int) -> None:
 
 
 def decode(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return all frames (F, H, W, 3) uint8 RGB and their times (F,) in seconds. Raises DamagedClip."""
+    """Return all frames (F, H, W, 3) uint8 RGB and their times (F,) in seconds.
+
+    Raises DamagedClip.
+    """
     import av
     from av.error import FFmpegError
 
@@ -85,7 +93,10 @@ def decode(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def count_frames(path: Path) -> int:
-    """Return how many frames a clip says that it has; nothing is decoded. Raises DamagedClip."""
+    """Return how many frames a clip says that it has; nothing is decoded.
+
+    Raises DamagedClip.
+    """
     import av
     from av.error import FFmpegError
 
@@ -99,7 +110,10 @@ def count_frames(path: Path) -> int:
 
 
 def decode_first(path: Path) -> np.ndarray:
-    """Return the first frame (H, W, 3) uint8 RGB alone. Raises DamagedClip."""
+    """Return the first frame (H, W, 3) uint8 RGB alone.
+
+    Raises DamagedClip.
+    """
     import av
     from av.error import FFmpegError
 
@@ -113,7 +127,9 @@ def decode_first(path: Path) -> np.ndarray:
 
 
 def decode_sampled(path: Path, shown: FramePolicy = SAMPLED) -> np.ndarray:
-    """Return the frames (N, H, W, 3) uint8 RGB that a policy shows, by default 5 a second and at most 25 (docs/spec.md
-    3.1). Raises DamagedClip."""
+    """Return the frames (N, H, W, 3) uint8 RGB that a policy shows.
+
+    By default 5 a second and at most 25 (docs/spec.md 3.1). Raises DamagedClip.
+    """
     frames, times = decode(path)
     return frames[shown.pick(times)]

@@ -1,4 +1,7 @@
-"""Which frames of a clip a model is shown: a grid of so many a second, or so many evenly spaced ones."""
+"""Choose which frames of a clip a model is shown.
+
+Policies are a grid of so many a second, and so many evenly spaced ones.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,11 @@ import numpy as np
 
 @dataclass(frozen=True)
 class FramePolicy:
-    """A grid of `fps` frames a second of which the first `most` are shown, or `uniform` evenly spaced frames. later: in
-    the place of each, the frame so many frames after it, and the clip's last one where there is none."""
+    """A grid of frames per second up to a number, or evenly spaced frames.
+
+    Of a grid of `fps` frames a second, the first `most` are shown; `uniform` is the number of evenly spaced ones.
+    later: in the place of each, the frame so many frames after it, and the clip's last one where there is none.
+    """
 
     fps: float | None = None
     uniform: int | None = None
@@ -21,8 +27,9 @@ class FramePolicy:
         return f"{self.uniform} evenly spaced" if self.fps is None else f"{self.fps:g} a second"
 
     def pick(self, times: np.ndarray) -> np.ndarray:
-        """Return indices of the frames nearest to the wanted times, none twice; of two that are equally near the
-        earlier one.
+        """Return indices of the frames nearest to the wanted times, none twice.
+
+        Of two equally near frames the earlier one is taken.
 
         times: (F,) seconds, ascending. A grid starts at 0; uniform includes the first frame and the last one.
         """
@@ -45,8 +52,11 @@ POLICIES = (SAMPLED, FramePolicy(uniform=16), FramePolicy(fps=2, most=32))
 
 
 def shown_at_end(n_frames: int, fps: int, last_s: float, until: int | None = None) -> list[int]:
-    """Return frames within the last so many seconds of a clip, or of what it shows before frame `until`, that some
-    policy shows; at least the last one of each policy."""
+    """Return the late frames of a clip that some policy shows.
+
+    They lie within the last so many seconds of the clip, or of what it shows before frame `until`. Each policy's last
+    frame is always among them.
+    """
     times = np.arange(n_frames) / fps
     end = n_frames if until is None else until
     last_frames: set[int] = set()
@@ -59,14 +69,18 @@ def shown_at_end(n_frames: int, fps: int, last_s: float, until: int | None = Non
 
 
 def last_of_all(n_frames: int, fps: int) -> int:
-    """Return the last frame of the policy that stops looking first: every policy shows this frame or a later one
-    last.
+    """Return the last frame of the policy that stops looking first.
+
+    Every policy shows this frame or a later one last.
     """
     times = np.arange(n_frames) / fps
     return min(int(policy.pick(times)[-1]) for policy in POLICIES)
 
 
 def fewest_within(n_frames: int, fps: int, span: tuple[int, int]) -> int:
-    """Return how many frames from the first of a span up to its end the policy that shows fewest of them shows."""
+    """Return the fewest frames that any policy shows within a span.
+
+    span: from its first frame up to its end.
+    """
     times = np.arange(n_frames) / fps
     return min(sum(span[0] <= int(i) < span[1] for i in policy.pick(times)) for policy in POLICIES)

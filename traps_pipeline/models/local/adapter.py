@@ -1,4 +1,6 @@
-"""One adapter for every image-text-to-text model of transformers: prompts in, hidden states and answers out.
+"""Adapt every image-text-to-text model of transformers.
+
+Prompts in, hidden states and answers out.
 
     model = load_local_model(get_model("pocket"))
     prompt = model.prompt(system, question, frames, times_s)      # frames (N, H, W, 3) uint8, seconds into the clip
@@ -69,15 +71,15 @@ def load_local_model(entry: ModelEntry, *, inside: bool = False) -> LocalModel:
 
 
 def _make_room(checkpoint: Checkpoint, params: LocalParams, device: str) -> None:
-    """Unload models of the device, the least recently used first, until the weights fit.
+    """Unload the device's least recently used models until the weights fit.
 
     The memory of a model that a caller still holds is freed only when the caller drops it.
     """
     import torch
 
     needed = weight_bytes(checkpoint.folder, params.dtype, params.quantisation)
-    others = [key for key, model in _LOADED.items() if SPREAD in (device, model.device) or model.device == device]
-    for key in others:
+    loaded_keys = [key for key, model in _LOADED.items() if SPREAD in (device, model.device) or model.device == device]
+    for key in loaded_keys:
         if needed <= WEIGHTS_SHARE * free_bytes(device):
             return
         del _LOADED[key]
@@ -143,7 +145,10 @@ def _load(checkpoint: Checkpoint, params: LocalParams, device: str) -> LocalMode
 
 
 def _require_packable(network: Any, name: str) -> None:
-    """Raise TrapsError naming modules whose rows are no multiple of the 64 weights that bitsandbytes packs on a CPU."""
+    """Raise TrapsError naming modules that cannot be packed on a CPU.
+
+    Their rows are no multiple of the 64 weights that bitsandbytes packs.
+    """
     odd = [
         part
         for part, module in network.named_modules()
@@ -158,7 +163,10 @@ def _require_packable(network: Any, name: str) -> None:
 
 
 def _precision(params: LocalParams, device: str) -> dict[str, Any]:
-    """Return the arguments of `from_pretrained` about precision. Raises TrapsError if NF4 lacks its library."""
+    """Return the arguments of `from_pretrained` about precision.
+
+    Raises TrapsError if NF4 lacks its library.
+    """
     import torch
 
     options: dict[str, Any] = {"dtype": getattr(torch, params.dtype)}

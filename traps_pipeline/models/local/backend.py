@@ -1,4 +1,6 @@
-"""Local models as a backend: waiting requests are answered in batches, by one worker thread per device.
+"""Answer waiting requests in batches on local models.
+
+One worker thread per device does so.
 
 For callers it is like an API: one request, one outcome, one row of the ledger. So a crash loses only the running batch.
 """
@@ -47,7 +49,10 @@ class _Batch:
 
 
 class LocalBackend:
-    """Answers one entry's requests with its checkpoint, which is loaded at the first request."""
+    """A backend that answers one entry's requests with its checkpoint.
+
+    It is loaded at the first request.
+    """
 
     def __init__(self, entry: Entry) -> None:
         if not isinstance(entry, ModelEntry) or entry.media is None:
@@ -59,7 +64,10 @@ class LocalBackend:
         self._running: asyncio.Task[None] | None = None
 
     async def ask(self, request: Request) -> Outcome:
-        """Return the outcome of one attempt; see `Backend`. Raises TrapsError if a retry would not help."""
+        """Return the outcome of one attempt; see `Backend`.
+
+        Raises TrapsError if a retry would not help.
+        """
         answer: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
         self._waiting.requests.append(request)
         self._waiting.answers.append(answer)
@@ -103,10 +111,16 @@ class LocalBackend:
         generated = model.generate(prompts, self._params.max_new_tokens, sampling, stopped=batch.abandoned.is_set)
         return [
             replace(
-                outcome(one.text, one.finish_reason, one.prompt_tokens, one.completion_tokens, model.served_model),
-                first_token=stored_alternatives(one.first_token, request.about.get("regime")),
+                outcome(
+                    decoded.text,
+                    decoded.finish_reason,
+                    decoded.prompt_tokens,
+                    decoded.completion_tokens,
+                    model.served_model,
+                ),
+                first_token=stored_alternatives(decoded.first_token, request.about.get("regime")),
             )
-            for request, one in zip(batch.requests, generated, strict=True)
+            for request, decoded in zip(batch.requests, generated, strict=True)
         ]
 
 
@@ -119,12 +133,18 @@ def _frames(request: Request, spec: MediaSpec) -> Frames:
 
 
 def seeds(requests: Sequence[Request]) -> list[int]:
-    """Return a seed per request, from its key: runs differ, and the same call gives the same answer."""
+    """Return a seed per request, from its key.
+
+    Runs differ, and the same call gives the same answer.
+    """
     return [int(request.key[:16], 16) for request in requests]
 
 
 def outcome(text: str, finish: str, prompt_tokens: int, completion_tokens: int, served_model: str) -> Outcome:
-    """Return the outcome of an answer: truncated if the limit cut it off, empty if no text is left."""
+    """Return the outcome of an answer.
+
+    It is truncated if the limit cut it off, empty if no text is left.
+    """
     text = text.strip()
     kind = ("truncated" if finish == "length" else "answer") if text else "empty"
     return Outcome(

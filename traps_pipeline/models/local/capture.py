@@ -1,4 +1,6 @@
-"""Capture hidden states by hooks that keep one vector per layer, instead of the library's tensors of every token.
+"""Capture hidden states by hooks that keep one vector per layer.
+
+The library would keep tensors of every token.
 
 Layers count as in the library's hidden_states: 0 = embeddings, l = output of the l-th block as it leaves the block. The
 library's own last state is the normed one; here both are kept.
@@ -26,14 +28,20 @@ ONE_TOKEN: tuple[Pooling, ...] = ("last", "answer")
 
 @dataclass
 class CapturedStates:
-    """States of one forward pass, on the model's device. raw: embeddings and block outputs in order, each (d,)."""
+    """States of one forward pass, on the model's device.
+
+    raw: embeddings and block outputs in order, each (d,).
+    """
 
     raw: list[Tensor] = field(default_factory=list)
     normed: Tensor | None = None
 
 
 def first_tensor(output: Any) -> Tensor:
-    """Return the hidden states in a module's output: blocks of some models return a tuple."""
+    """Return the hidden states in a module's output.
+
+    Blocks of some models return a tuple.
+    """
     return output[0] if isinstance(output, tuple) else output
 
 
@@ -54,7 +62,10 @@ def pool(states: Tensor, pooling: Pooling, chosen: Tensor | None = None) -> Tens
 def capturing(
     blocks: Iterator[Module], norm: Module, pooling: Pooling, chosen: Tensor | None = None
 ) -> Iterator[CapturedStates]:
-    """Keep the pooled states of forward passes in the block; the hooks are always removed afterwards."""
+    """Keep the pooled states of forward passes in the block.
+
+    The hooks are always removed afterwards.
+    """
     captured = CapturedStates()
 
     def embeddings(_: Module, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:

@@ -1,4 +1,7 @@
-"""Find and identify a checkpoint, and check that it fits into memory. Nothing is downloaded silently."""
+"""Find and identify a checkpoint, and check that it fits into memory.
+
+Nothing is downloaded silently.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,10 @@ _NF4_BYTES = 0.6  # bytes of a weight in 4 bits with its share of scales and of 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A local checkpoint. digest: the hub's commit, or the digest of the folder's content."""
+    """A local checkpoint.
+
+    digest: the hub's commit, or the digest of the folder's content.
+    """
 
     name: str
     folder: Path
@@ -35,7 +41,10 @@ class Checkpoint:
 
 
 def as_folder(name: str) -> Path | None:
-    """Return the folder that a `checkpoint:` names, relative to the checkout; None if it is a hub id."""
+    """Return the folder that a `checkpoint:` names, relative to the checkout.
+
+    None if it is a hub id.
+    """
     folder = ROOT / name
     return folder if folder.is_dir() or not _HUB_ID.fullmatch(name) else None
 
@@ -62,7 +71,9 @@ def find_checkpoint(params: LocalParams) -> Checkpoint:
 
 
 def declared_digest(params: LocalParams) -> str | None:
-    """Return the digest that identifies the weights in the ledger key, beside the entry.
+    """Return the digest of the weights in the ledger key.
+
+    It stands beside the entry.
 
     For a folder it is the digest of its content, for a hub id the commit in the hub's cache. None for a hub id whose
     `revision` is a commit, and for one that is not downloaded: it can be planned, and must be downloaded before it is
@@ -80,12 +91,15 @@ def declared_digest(params: LocalParams) -> str | None:
 
 def download_command(params: LocalParams) -> str:
     """Return the command that downloads a hub id's weights."""
-    at = f" --revision {params.revision}" if params.revision else ""
-    return f"hf download {params.checkpoint}{at}"
+    revision = f" --revision {params.revision}" if params.revision else ""
+    return f"hf download {params.checkpoint}{revision}"
 
 
 def _cached_snapshot(params: LocalParams) -> Path | None:
-    """Return the folder of a hub id in the hub's cache, named by its commit; None if it is missing."""
+    """Return the folder of a hub id in the hub's cache, named by its commit.
+
+    None if it is missing.
+    """
     if find_spec("huggingface_hub") is None:
         return None  # without the extra `local` the model can be planned; `find_checkpoint` then says what is missing
     from huggingface_hub import try_to_load_from_cache
@@ -111,10 +125,13 @@ def _require_whole(folder: Path, name: str, remedy: str) -> None:
 
 
 def require_no_code(checkpoint: Checkpoint) -> None:
-    """Raise TrapsError for a checkpoint with its own code, which could do whatever its user can."""
+    """Raise TrapsError for a checkpoint with its own code.
+
+    Such code could do whatever its user can.
+    """
     code = [path.relative_to(checkpoint.folder).as_posix() for path in sorted(checkpoint.folder.rglob("*.py"))]
     for path in sorted(checkpoint.folder.glob("*.json")):
-        if path.stat().st_size <= _CONFIG_BYTES and _names_code(path):
+        if path.stat().st_size <= _CONFIG_BYTES and _has_own_code(path):
             code.append(f"auto_map in {path.name}")
     if code:
         more = f" and {len(code) - 1} more" if len(code) > 1 else ""
@@ -124,8 +141,11 @@ def require_no_code(checkpoint: Checkpoint) -> None:
         )
 
 
-def _names_code(path: Path) -> bool:
-    """Return whether settings name classes of a checkpoint's own files, however JSON spells the name."""
+def _has_own_code(path: Path) -> bool:
+    """Return whether settings name classes of a checkpoint's own files.
+
+    JSON may spell the name in any way.
+    """
     try:
         return '"auto_map"' in json.dumps(json.loads(path.read_bytes()))
     except (ValueError, RecursionError):
@@ -133,7 +153,10 @@ def _names_code(path: Path) -> bool:
 
 
 def folder_digest(folder: Path) -> str:
-    """Return the digest of a checkpoint folder's content, wherever it lies; cached until a file changes."""
+    """Return the digest of a checkpoint folder's content, wherever it lies.
+
+    Cached until a file changes.
+    """
     files = sorted(path for path in folder.iterdir() if path.suffix in _FILES)
     stamps = tuple((path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in files)
     return _content_digest(folder, stamps)
@@ -148,7 +171,10 @@ def _content_digest(folder: Path, stamps: tuple[tuple[str, int, int], ...]) -> s
 
 
 def weight_bytes(folder: Path, dtype: Dtype, quantisation: Quantisation) -> float:
-    """Return the memory that the weights take at this precision, in bytes, from the headers of their files."""
+    """Return the memory in bytes that the weights take at this precision.
+
+    It is read from the headers of their files.
+    """
     weights = sum(math.prod(shape) for file in sorted(folder.glob("*.safetensors")) for shape in _shapes(file))
     return weights * (_NF4_BYTES if quantisation == "nf4" else _ITEM_BYTES[dtype])
 
@@ -164,7 +190,10 @@ def _shapes(file: Path) -> list[Sequence[int]]:
 
 
 def free_bytes(device: str) -> float:
-    """Return the free memory of a device, in bytes; infinite if the system does not report it."""
+    """Return the free memory of a device, in bytes.
+
+    Infinite if the system does not report it.
+    """
     if device == SPREAD:
         import torch
 

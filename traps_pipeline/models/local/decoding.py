@@ -1,4 +1,7 @@
-"""Decode one batch: the library's own `generate`, steered, sampled per row, and stopped on demand."""
+"""Decode one batch with the library's own `generate`.
+
+It is steered, sampled per row, and stopped on demand.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,7 @@ class DecodingModel(Protocol):
 
 
 class Steers(Protocol):
-    """Anything that changes hidden states during a pass, such as `mechanism.hook.Steering`."""
+    """Anything that changes hidden states in a pass, as `mechanism.hook.Steering`."""
 
     def rows(self, chosen: Sequence[int]) -> Steers:
         """Return the steering of some of the prompts."""
@@ -50,7 +53,9 @@ def decode(
     steering: Steers | None,
     stopped: Callable[[], bool],
 ) -> tuple[list[list[int]], list[dict[int, float]]]:
-    """Return the tokens after each prompt, including those after an answer's end, and first-token log-probabilities.
+    """Return the tokens after each prompt, and first-token log-probabilities.
+
+    Tokens after an answer's end are included.
 
     Decoding is greedy unless sampling is given.
     """
@@ -71,7 +76,10 @@ def decode(
 
 
 class _FirstToken:
-    """A transformers logits processor that records the likeliest first tokens, and changes nothing."""
+    """A transformers logits processor that records the likeliest first tokens.
+
+    It changes nothing.
+    """
 
     def __init__(self) -> None:
         self.likeliest: list[dict[int, float]] = []  # one per prompt: token to log-probability

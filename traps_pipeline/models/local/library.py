@@ -1,4 +1,7 @@
-"""Load torch and transformers, quietly and in the right order. No other module does."""
+"""Load torch and transformers, quietly and in the right order.
+
+No other module does.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,10 @@ from traps_pipeline.base.extras import require
 
 @cache
 def load_transformers() -> Any:
-    """Return transformers, set to send nothing and log only errors. Raises TrapsError if it is not installed."""
+    """Return transformers, set to send nothing and log only errors.
+
+    Raises TrapsError if it is not installed.
+    """
     require("local")
     os.environ.setdefault("HF_HUB_DISABLE_TELEMETRY", "1")
     os.environ.setdefault("HF_HUB_DISABLE_PROGRESS_BARS", "1")
@@ -57,7 +63,10 @@ _KEPT: list[Any] = []
 
 
 def _torchvision_library() -> Path | None:
-    """Return the path of torchvision's compiled library without importing the package; None if it is missing."""
+    """Return the path of torchvision's compiled library without importing the package.
+
+    None if it is missing.
+    """
     spec = find_spec("torchvision")
     folders = list(spec.submodule_search_locations or ()) if spec else []
     return next((path for folder in folders for path in Path(folder).glob("_C*.so")), None)

@@ -1,4 +1,7 @@
-"""A checkpoint in memory: prompts, hidden states and answers. `adapter` loads and identifies it."""
+"""Hold a checkpoint in memory: prompts, hidden states and answers.
+
+`adapter` loads and identifies it.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +61,10 @@ class States:
 
 
 class LocalModel:
-    """A checkpoint in memory. device, dtype, quantisation: as in the entry, never changed."""
+    """A checkpoint in memory.
+
+    device, dtype, quantisation: as in the entry, never changed.
+    """
 
     def __init__(self, network: Any, processor: Any, checkpoint: Checkpoint, params: LocalParams, device: str) -> None:
         self.network, self.processor, self.checkpoint, self.params, self.device = (
@@ -73,7 +79,7 @@ class LocalModel:
         network.generation_config = self._plain_generation()
 
     def _plain_generation(self) -> Any:
-        """Return generation settings with only the end of an answer and the suppressed tokens.
+        """Return generation settings with only the answer's end and suppressed tokens.
 
         A checkpoint's own top_k or repetition penalty would otherwise apply unasked. Placeholders of pictures are
         suppressed: an answer that contained one could not be tokenized again.
@@ -97,7 +103,10 @@ class LocalModel:
 
     @cached_property
     def identity(self) -> dict[str, Any]:
-        """The properties that decide hidden states besides the prompt, for keys, without paths or device."""
+        """The properties that decide hidden states besides the prompt.
+
+        They serve keys, and hold neither paths nor device.
+        """
         return {
             "checkpoint_digest": self.checkpoint.digest,
             "class": type(self.network).__name__,
@@ -125,7 +134,10 @@ class LocalModel:
         return f"{self.device} ({torch.cuda.get_device_name(self.device)})"
 
     def block(self, layer: int) -> Module:
-        """Return the block whose output is hidden_states[layer]. Raises TrapsError for a layer out of range."""
+        """Return the block whose output is hidden_states[layer].
+
+        Raises TrapsError for a layer out of range.
+        """
         if not 1 <= layer <= self.n_layers:
             raise TrapsError(
                 f"{self.checkpoint.name}: no block {layer}; it has blocks 1 to {self.n_layers} (layer 0 are the "
@@ -180,7 +192,10 @@ class LocalModel:
     # --- hidden states ------------------------------------------------------------------------------------------------
 
     def forward(self, prompt: Prompt) -> Any:
-        """Run one bare pass over a prompt, without logits or gradients; return the library's output."""
+        """Run one bare pass over a prompt, without logits or gradients.
+
+        Return the library's output.
+        """
         import torch
 
         with torch.inference_mode():
@@ -260,7 +275,7 @@ class LocalModel:
         sampling, steering = sampling and sampling.rows(rows), steering and steering.rows(rows)
         try:
             tokens, first = decode(self, batch, max_new_tokens, sampling, steering, stopped)
-            return [self._answer(*one) for one in zip(batch, tokens, first, strict=True)]
+            return [self._answer(*row) for row in zip(batch, tokens, first, strict=True)]
         except torch.OutOfMemoryError:
             if len(rows) == 1:
                 raise TrapsError(
@@ -287,7 +302,10 @@ class LocalModel:
         return GeneratedAnswer(text, prompt.n_tokens, len(own_tokens), finish, tuple(own_tokens), named)
 
     def placed(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return inputs of a prompt or a batch on the model's device, pictures in its precision."""
+        """Return inputs of a prompt or batch on the model's device.
+
+        Pictures get its precision.
+        """
         dtype, device = self.network.dtype, self.inputs_device
         return {
             name: value.to(device, dtype) if value.is_floating_point() else value.to(device)
@@ -295,7 +313,10 @@ class LocalModel:
         }
 
     def _row_bytes(self, prompt: Prompt, max_new_tokens: int) -> float:
-        """Return an upper estimate of a row's memory: keys and values, the widest activations, pictures, logits."""
+        """Return an upper estimate of a row's memory.
+
+        Keys and values, the widest activations, pictures, logits.
+        """
         item, vocabulary = self.network.dtype.itemsize, self.network.config.get_text_config().vocab_size
         cache = self._cached_width * item * (prompt.n_tokens + max_new_tokens)
         passing = 28 * prompt.n_tokens * self.d_model * item  # a block's peak: residual, gate, up and down
@@ -304,7 +325,10 @@ class LocalModel:
 
     @cached_property
     def _cached_width(self) -> int:
-        """Cached numbers per token, over all blocks; blocks that share another's cache add none."""
+        """Cached numbers per token, over all blocks.
+
+        Blocks that share another's cache add none.
+        """
         names = ("k_proj", "v_proj")
         widths = [module.out_features for name, module in self.blocks.named_modules() if name.endswith(names)]
         return sum(widths) or 2 * self.n_layers * self.d_model
@@ -315,7 +339,10 @@ def _first(tokens: int | Sequence[int]) -> int:
 
 
 def _decoder_parts(network: Any, name: str) -> tuple[Any, Any]:
-    """Return blocks and final norm of the language model. Raises TrapsError for another architecture."""
+    """Return blocks and final norm of the language model.
+
+    Raises TrapsError for another architecture.
+    """
     decoder = network.get_decoder() if hasattr(network, "get_decoder") else None
     blocks, norm = getattr(decoder, "layers", None), getattr(decoder, "norm", None)
     expected = getattr(network.config.get_text_config(), "num_hidden_layers", None)

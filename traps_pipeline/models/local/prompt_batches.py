@@ -1,4 +1,7 @@
-"""Processed prompts, and their batching. Neither needs a model."""
+"""Process prompts and batch them.
+
+Neither needs a model.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Prompt:
-    """A processed prompt. text: rendered by the chat template, before the clip is expanded.
+    """A processed prompt.
+
+    text: rendered by the chat template, before the clip is expanded.
 
     inputs: the processor's output, on the CPU, each with a first axis of one prompt (or of its patches or frames).
     """
@@ -44,7 +49,10 @@ class Prompt:
 
     @property
     def form(self) -> tuple[tuple[str, tuple[int, ...]], ...]:
-        """The shapes that prompts of one batch must share: those of the clip's tensors except the first axis."""
+        """The shapes that prompts of one batch must share.
+
+        Those of the clip's tensors except the first axis.
+        """
         clip = sorted(self.inputs.keys() - set(self.sequences))
         return tuple((name, tuple(self.inputs[name].shape[1:])) for name in clip)
 
@@ -65,7 +73,10 @@ def collate(prompts: Sequence[Prompt], pad_token: int) -> dict[str, Tensor]:
 
 
 def batches(prompts: Sequence[Prompt], row_bytes: Sequence[float], room: float) -> Iterator[list[int]]:
-    """Yield indices of prompts to batch: of one form, of similar length, as many as fit into the room (bytes)."""
+    """Yield indices of prompts to batch.
+
+    A batch has one form, similar length, and as many as fit into the room (bytes).
+    """
     by_form: defaultdict[Any, list[int]] = defaultdict(list)
     for i in sorted(range(len(prompts)), key=lambda i: prompts[i].n_tokens):
         by_form[prompts[i].form].append(i)

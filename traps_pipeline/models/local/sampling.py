@@ -1,4 +1,7 @@
-"""Sample with a random stream per row, so that an answer depends on its own seed and not on its batch."""
+"""Sample with a random stream per row.
+
+So an answer depends on its own seed and not on its batch.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,9 @@ class Sampling:
 
 
 class SeededNucleus:
-    """A transformers logits processor that leaves one token per row possible, drawn from the row's own stream.
+    """A logits processor of transformers that leaves one token per row possible.
+
+    It is drawn from the row's own stream.
 
     Greedy decoding then picks that token. The nucleus is the smallest set of tokens whose probability reaches top_p.
     """
@@ -36,7 +41,10 @@ class SeededNucleus:
         self._streams = [np.random.default_rng(seed) for seed in sampling.seeds]
 
     def __call__(self, input_ids: Any, scores: Tensor) -> Tensor:
-        """Mask all logits except the sampled token's. scores: (rows, vocabulary); the same shape is returned."""
+        """Mask all logits except the sampled token's.
+
+        scores: (rows, vocabulary). The same shape is returned.
+        """
         import torch
 
         probabilities, order = (scores.float() / self._sampling.temperature).softmax(dim=-1).sort(descending=True)

@@ -25,7 +25,10 @@ _NF4_SKIP = ("model.visual", "lm_head")
 
 
 def tiny_model(family: Family, folder: Path, quantisation: Quantisation = "none") -> LocalModel:
-    """Return a family's tiny checkpoint from a folder, loaded by the real classes; build it if it is missing."""
+    """Return a family's tiny checkpoint from a folder, loaded by the real classes.
+
+    Build it if it is missing.
+    """
     build_tiny(family, folder)
     params = {"checkpoint": str(folder), "dtype": "float32", "quantisation": quantisation}
     params |= {"do_sample": False, "max_new_tokens": 8, "nf4_skip": _NF4_SKIP if quantisation == "nf4" else ()}
@@ -40,7 +43,9 @@ def _prompt(model: LocalModel, folder: Path) -> Prompt:
 
 
 def check_family(family: Family, folder: Path) -> str:
-    """Build, save and reload a checkpoint, and answer a clip. Return the observation in words.
+    """Build, save and reload a checkpoint, and answer a clip.
+
+    Return the observation in words.
 
     Raises TrapsError, or any error of the library, if a step fails.
     """
@@ -50,7 +55,10 @@ def check_family(family: Family, folder: Path) -> str:
 
 
 def check_nf4(folder: Path) -> str:
-    """Load a tiny checkpoint in 4 bits, if the libraries for it are installed. Return the observation in words."""
+    """Load a tiny checkpoint in 4 bits, if the libraries for it are installed.
+
+    Return the observation in words.
+    """
     if absent := missing("nf4"):
         return f"{' and '.join(absent)} not installed (`{install_line('nf4')}`): entries in NF4 do not load"
     model = tiny_model("qwen3-vl", folder / "nf4", "nf4")

@@ -1,4 +1,4 @@
-"""A local model's settings in the registry, without heavy imports."""
+"""Define a local model's settings in the registry, without heavy imports."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ DEVICE = r"^(cpu|mps|auto|cuda(:\d+)?)$"
 
 
 class LocalParams(BaseModel):
-    """`params` of an entry with backend local: everything here decides an answer and is in the ledger key.
+    """The `params` of an entry with backend local.
+
+    Everything here decides an answer and is in the ledger key.
 
     checkpoint: hub id, or a folder (absolute, or relative to the checkout). revision: the hub's commit. template:
     variables of the chat template. video: options of the checkpoint's video processor. nf4_skip: modules left
@@ -47,7 +49,10 @@ class LocalParams(BaseModel):
 
 
 class NetworkSize(BaseModel):
-    """The size of a network, for `traps plan`. parameters_b: in billions. layers, width: of the language model."""
+    """The size of a network, for `traps plan`.
+
+    parameters_b: in billions. layers, width: of the language model.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     parameters_b: float = Field(gt=0)

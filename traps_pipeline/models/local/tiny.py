@@ -1,6 +1,7 @@
-"""Tiny random checkpoints of the real classes, with tokenizer, chat template and processor made here: nothing is
-downloaded. For tests, for `traps doctor --local`, and, with larger sizes and a tokenizer of its own, the skeleton of a
-model that is trained from scratch.
+"""Build tiny random checkpoints of the real classes, without downloads.
+
+Tokenizer, chat template and processor are made here. They serve tests and `traps doctor --local`. With larger sizes and
+a tokenizer of its own, one is the skeleton of a model that is trained from scratch.
 
     build_tiny("qwen3-vl", folder)                       # 1 to 2 MB, bytes as tokens
     build_tiny("qwen3-vl", folder, text={"hidden_size": 128, "num_hidden_layers": 8}, tokenizer=word_level)
@@ -93,7 +94,7 @@ def build_tiny(
     vision: Overrides | None = None,
     video: Overrides | None = None,
 ) -> Path:
-    """Write a random checkpoint of the family's real class into a folder and return the folder.
+    """Write a random checkpoint of the family's real class and return its folder.
 
     tokenizer: of the `tokenizers` library, instead of bytes; the family's special tokens are added to it. text, vision:
     fields of the two configurations. video: fields of the video processor. The same arguments give the same weights.
@@ -114,7 +115,10 @@ def build_tiny(
 
 
 def make_tokenizer(family: Family, tokenizer: Tokenizer | None = None) -> Any:
-    """Return a transformers tokenizer with the family's special tokens added; default: one token per byte."""
+    """Return a transformers tokenizer with the family's special tokens added.
+
+    default: one token per byte.
+    """
     transformers = load_transformers()
     special = _SPECIAL[family]
     base = _byte_level() if tokenizer is None else tokenizer
@@ -149,7 +153,10 @@ def _byte_level() -> Tokenizer:
 
 
 def make_config(family: Family, tokenizer: Any, text: Overrides | None = None, vision: Overrides | None = None) -> Any:
-    """Return the family's configuration for a tokenizer of `make_tokenizer`: tiny, except for overridden fields."""
+    """Return the family's configuration for a tokenizer of `make_tokenizer`.
+
+    It is tiny, except for overridden fields.
+    """
     transformers = load_transformers()
     ids = {name: tokenizer.convert_tokens_to_ids(token) for name, token in _SPECIAL[family].items()}
     shared = {"vocab_size": len(tokenizer), "pad_token_id": ids["pad"], "eos_token_id": ids["eos"]}
@@ -193,8 +200,11 @@ def _qwen3_vl(transformers: Any, ids: Mapping[str, int], base: Overrides, text: 
 
 
 def _gemma_4(transformers: Any, ids: Mapping[str, int], base: Overrides, text: Overrides, vision: Overrides) -> Any:
-    """Build a model like E4B: sliding and full attention, per-layer embeddings, and upper blocks that read the keys and
-    values of lower ones, below which there are blocks whose keys and values no other block reads."""
+    """Build a model like E4B.
+
+    Sliding and full attention, per-layer embeddings, and upper blocks that read the keys and values of lower ones,
+    below which there are blocks whose keys and values no other block reads.
+    """
     words = {
         **base,
         "vocab_size_per_layer_input": base["vocab_size"],
@@ -255,7 +265,10 @@ def _llava_next_video(
 
 
 def make_processor(family: Family, tokenizer: Any, video: Overrides | None = None) -> Any:
-    """Return the family's processor for a tokenizer of `make_tokenizer`; `video` overrides fields of its video part."""
+    """Return the family's processor for a tokenizer of `make_tokenizer`.
+
+    `video` overrides fields of its video part.
+    """
     transformers = load_transformers()
     video_settings = dict(video or {})
     match family:

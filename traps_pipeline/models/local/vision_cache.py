@@ -26,7 +26,10 @@ MOST_BYTES = 2 * 2**30  # maximum bytes of cached features, on the model's devic
 
 @dataclass(frozen=True, eq=False)
 class _Features:
-    """A clip's features: decoder tokens, and additions after its first blocks, by place."""
+    """A clip's features: decoder tokens, and additions after its first blocks.
+
+    By place.
+    """
 
     tokens: Tensor
     deepstack: tuple[Tensor, ...]
@@ -38,7 +41,10 @@ class _Features:
 
 @dataclass(eq=False)
 class ClipMemory:
-    """Features by clip, the latest ones. passes: clips that went through the vision tower."""
+    """Features by clip, the latest ones.
+
+    passes: clips that went through the vision tower.
+    """
 
     most_bytes: int = MOST_BYTES
     passes: int = 0
@@ -48,7 +54,9 @@ class ClipMemory:
 
     @contextmanager
     def remembering(self, network: Any) -> Iterator[None]:
-        """Let a network's vision tower process each clip once within the block, and cache its output.
+        """Cache the output of a network's vision tower within the block.
+
+        Each clip passes the tower once.
 
         Nested contexts change nothing.
         """
@@ -111,7 +119,10 @@ class ClipMemory:
 
 
 def _clips_of(arguments: dict[str, Any]) -> list[dict[str, Tensor]] | None:
-    """Return the arguments of each clip alone; None if the class does not separate clips."""
+    """Return the arguments of each clip alone.
+
+    None if the class does not separate clips.
+    """
     pixels, grids = arguments["pixel_values_videos"], arguments.get("video_grid_thw")
     if grids is not None:  # Qwen3-VL: patches of all clips one after the other, and how many each has
         parts = pixels.split(grids.prod(-1).tolist())

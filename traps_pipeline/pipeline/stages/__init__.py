@@ -1,4 +1,6 @@
-"""The DAG: one file per group of stages; importing this package declares all of them, without Dagster.
+"""Declare the stages, one file per group.
+
+Importing this package declares all of them, without Dagster.
 
 A stage reads tables, calls a library function and returns the rows of its table.
 """

@@ -1,4 +1,4 @@
-"""The benchmark group: specs, clips, items."""
+"""Declare the benchmark group: specs, clips, items."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -36,13 +36,19 @@ category_to_arms = to_keys(CATEGORY, DATASET, lambda category: beside_of(taxonom
 
 @_source()
 def released_specs(workspace: Workspace, category: str) -> str:
-    """Frozen scenarios under scene_specs/released, one resolved record each."""
+    """Return the version of the frozen scenarios under scene_specs/released.
+
+    One resolved record each.
+    """
     return released_version(workspace, category)
 
 
 @_source()
 def corrections(workspace: Workspace, category: str) -> str:
-    """Review decisions under scene_specs/corrections, folded over the released records."""
+    """Return the version of the review decisions under scene_specs/corrections.
+
+    They are folded over the released records.
+    """
     return corrections_version(workspace, category)
 
 
@@ -158,7 +164,10 @@ def _film(workspace: Workspace, category: str, wait: bool) -> tuple[Tally, bool]
     lost=filmed_arms.unmade,
 )
 def arms(workspace: Workspace, category: str) -> StageOutput:
-    """Return the arms and variations that the study asks of a category: clips and questions beside the pairs."""
+    """Return a category's arms and variations that the study asks for.
+
+    They are clips and questions beside the pairs.
+    """
     rows = filmed_arms.build_arms(workspace, category)
     admitted = sum(row.refused is None for row in rows)
     return StageOutput(rows, shown={"admitted": admitted, "refused": len(rows) - admitted})
@@ -195,6 +204,9 @@ def _odd_pairs(workspace: Workspace, key: str | None, output: StageOutput) -> di
     ],
 )
 def items(workspace: Workspace, dataset: str) -> StageOutput:
-    """Return the items that models are asked, two per pair: the control, and the void that differs by one change."""
+    """Return the items that models are asked, two per pair.
+
+    They are the control, and the void that differs by one change.
+    """
     rows = build_items(workspace, dataset)
     return StageOutput(rows, shown={"benchmark version": rows[0].benchmark_version})

@@ -1,4 +1,7 @@
-"""The evaluation group: answers of models, votes of judges, verdicts of the panel. A cell is dataset x evaluation."""
+"""Declare the evaluation group: answers, votes of judges, verdicts of the panel.
+
+A cell is dataset x evaluation.
+"""
 
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -30,20 +33,26 @@ _stage, _source = partial(stage, group="evaluation", scheme=CELL), partial(sourc
 
 @_source(kinds=["yaml"], scheme=EVALUATION)
 def models(workspace: Workspace, key: str) -> str:
-    """assets/models.yaml: the settings that a model's answers depend on, by evaluation."""
+    """Return the version of a model's entry in assets/models.yaml.
+
+    It covers the settings that the model's answers depend on.
+    """
     return answering_version(Evaluation.parse(key))
 
 
 @_source(kinds=["text"], scheme=EVALUATION)
 def prompts(workspace: Workspace, key: str) -> str:
-    """assets/prompts: the regime's system prompt, by evaluation."""
+    """Return the version of a regime's system prompt (assets/prompts)."""
     datasets = {d for experiment in workspace.study.experiments.values() for d in experiment.datasets}
     return prompt_version(Evaluation.parse(key).regime, datasets)
 
 
 @_source(kinds=["yaml"])
 def judges(workspace: Workspace, _: None) -> str:
-    """assets/judges.yaml and the judges' prompts: the study's panel."""
+    """Return the version of the study's panel.
+
+    It covers assets/judges.yaml and the judges' prompts.
+    """
     return panel_version(workspace.study.panel)
 
 
@@ -57,7 +66,10 @@ def _with_items(
 
 
 def _items_shown(workspace: Workspace, cell: Cell, rows: Sequence[ResponseRow | VoteRow]) -> dict[str, Any]:
-    """Return metadata about a cell's items: a table of those without an answer, and the explorer's view of all."""
+    """Return metadata about a cell's items.
+
+    A table of those without an answer, and the explorer's view of all.
+    """
     from traps_pipeline.report.cards import explorer_address
     from traps_pipeline.report.writing import SourceItems
 
@@ -86,7 +98,10 @@ def _answers_missing(workspace: Workspace, key: str | None, output: StageOutput)
     side_by_side=True,
 )
 def responses(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
-    """Return a model's answers under a regime in a run, one row per item; answers in the ledger are reused."""
+    """Return a model's answers under a regime in a run, one row per item.
+
+    Answers in the ledger are reused.
+    """
     return _with_items(workspace, collect_answers(workspace, [Cell.parse(key) for key in keys]))
 
 
@@ -113,7 +128,10 @@ def _many_invalid(workspace: Workspace, key: str | None, output: StageOutput) ->
     side_by_side=True,
 )
 def votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
-    """Return votes of the study's panel on the answers of a cell, one row per answer, judge and task."""
+    """Return votes of the study's panel on the answers of a cell.
+
+    There is one row per answer, judge and task.
+    """
     return _with_items(workspace, collect_votes(workspace, [Cell.parse(key) for key in keys]))
 
 

@@ -1,4 +1,7 @@
-"""The controls of the mechanism group: baselines of probes, the gate, nulls of steering, patching."""
+"""Declare the mechanism group's controls.
+
+They are baselines of probes, the gate, nulls of steering, and patching.
+"""
 
 from functools import partial
 from typing import TYPE_CHECKING
@@ -40,13 +43,19 @@ _GATED = these_keys(CELL, [Cell(d, Evaluation(m, r, 1)).key for d in _ASKED for 
 
 @_source()
 def patching_settings(workspace: Workspace, key: str) -> str:
-    """The inputs of patching besides items: checkpoint, precision, prompt, pairs and sites."""
+    """Return the version of the settings of patching.
+
+    They are checkpoint, precision, prompt, pairs and sites.
+    """
     return patching_version(workspace, Extraction.parse(key))
 
 
 @_source()
 def sentence_settings(workspace: Workspace, key: str) -> str:
-    """The inputs of sentences besides items and answers: checkpoint, precision, prompt, the study's sentences."""
+    """Return the version of the settings of sentences.
+
+    They are checkpoint, precision, prompt and the study's sentences.
+    """
     return sentence_version(workspace, Extraction.parse(key))
 
 
@@ -74,14 +83,20 @@ def _examined(workspace: Workspace, key: str) -> "tuple[ModelEntry, StoredStates
     wants=lambda study, key: Extraction.parse(key).prompt in study.probed_prompts,
 )
 def probe_baselines(workspace: Workspace, key: str) -> StageOutput:
-    """Return the probing protocol on raw inputs, on the model's output margin and on noise instead of states."""
+    """Return the probing protocol on other inputs than states.
+
+    They are raw inputs, the model's output margin and noise.
+    """
     from traps_pipeline.mechanism.baselines import baseline_rows
 
     return StageOutput(baseline_rows(workspace, *_examined(workspace, key)))
 
 
-def _gated(partitions: StudyPartitions, key: str) -> bool:
-    """Return whether the model of an extraction is also evaluated, so that a gate has answers to change."""
+def _is_gated(partitions: StudyPartitions, key: str) -> bool:
+    """Return whether the model of an extraction is also evaluated.
+
+    Otherwise a gate has no answers to change.
+    """
     extraction = Extraction.parse(key)
     evaluations = {(e.model, e.regime) for e in partitions.evaluations}
     return extraction.prompt == PROBE_PROMPT and any((extraction.model, r) in evaluations for r in PROMPTING)
@@ -91,13 +106,15 @@ _gates = partial(
     _stage,
     code="2",
     parents=[_STATES, of(probe_items, EVERY), of(probes, SAME), of(verdicts, _GATED, need="some"), probing_settings],
-    wants=_gated,
+    wants=_is_gated,
 )
 
 
 @_gates(tables.GATE)
 def gate(workspace: Workspace, key: str) -> StageOutput:
-    """Return the model's figures before and after a gate turns answers into abstentions.
+    """Return the model's scores before and after a gate.
+
+    The gate turns answers into abstentions.
 
     The gate is a probe on the model's states, compared with gates on raw inputs, on the output margin and with shuffled
     labels.
@@ -109,7 +126,10 @@ def gate(workspace: Workspace, key: str) -> StageOutput:
 
 @_gates(tables.RISK_COVERAGE)
 def risk_coverage(workspace: Workspace, key: str) -> StageOutput:
-    """Return risk against coverage as a gate withholds more answers, over the four datasets."""
+    """Return risk against coverage as a gate withholds more answers.
+
+    It is computed over the four datasets.
+    """
     from traps_pipeline.mechanism.gating import curve_rows
 
     return StageOutput(curve_rows(workspace, *_examined(workspace, key)))
@@ -117,7 +137,10 @@ def risk_coverage(workspace: Workspace, key: str) -> StageOutput:
 
 @_stage(tables.LENS, parents=[_STATES, probing_settings])
 def lens(workspace: Workspace, key: str) -> StageOutput:
-    """Return the output margin of stored states at every layer, through the model's final norm and head."""
+    """Return the output margin of stored states at every layer.
+
+    They pass through the model's final norm and head.
+    """
     from traps_pipeline.mechanism.lens import lens_rows
 
     return StageOutput(lens_rows(workspace, *_examined(workspace, key)))
@@ -126,28 +149,34 @@ def lens(workspace: Workspace, key: str) -> StageOutput:
 @_stage(
     tables.ITEM_SCORES,
     parents=[_STATES, of(probes, SAME), of(verdicts, _GATED, need="none"), probing_settings],
-    wants=_gated,
+    wants=_is_gated,
 )
 def item_scores(workspace: Workspace, key: str) -> StageOutput:
-    """Return each item's scores from states and from output, by probes trained without its scenario, with verdicts."""
+    """Return each item's scores from states and from output, with verdicts.
+
+    The probes were trained without its scenario.
+    """
     from traps_pipeline.mechanism.item_scores import item_score_rows
 
     return StageOutput(item_score_rows(workspace, *_examined(workspace, key)))
 
 
-def _read_in_sentences(partitions: StudyPartitions, key: str) -> bool:
+def _has_sentences(partitions: StudyPartitions, key: str) -> bool:
     extraction = Extraction.parse(key)
     evaluations = {(e.model, e.regime) for e in partitions.evaluations}
-    return partitions.reads_sentences and (extraction.model, extraction.prompt) in evaluations
+    return partitions.has_sentences and (extraction.model, extraction.prompt) in evaluations
 
 
 @_stage(
     tables.SENTENCES,
     parents=[of(probe_items, EVERY, need="some"), of(responses, _GATED, need="some"), sentence_settings],
-    wants=_read_in_sentences,
+    wants=_has_sentences,
 )
 def sentences(workspace: Workspace, key: str) -> StageOutput:
-    """Return the likelihood that a model gives to whole abstentions after every item, beside its own answers."""
+    """Return a model's likelihood of whole abstentions after every item.
+
+    Its own answers stand beside them.
+    """
     from traps_pipeline.mechanism.sentences import sentence_rows
 
     return StageOutput(sentence_rows(workspace, *_model(workspace, key)))
@@ -160,7 +189,10 @@ def sentences(workspace: Workspace, key: str) -> StageOutput:
     kinds=["parquet", "pytorch"],
 )
 def patching(workspace: Workspace, key: str) -> StageOutput:
-    """Return indirect effects of groups of positions between matched controls and voids by layer, beside nulls."""
+    """Return indirect effects of groups of positions by layer, beside nulls.
+
+    States are exchanged between matched controls and voids.
+    """
     from traps_pipeline.mechanism.patching_stage import patching_rows
 
     return StageOutput(patching_rows(workspace, *_model(workspace, key)))
@@ -171,7 +203,10 @@ _of_effects = partial(stage, group=GROUP, parents=[steering_effects], wants=stee
 
 @_of_effects(tables.STEERING_NULLS)
 def steering_nulls(workspace: Workspace, _: None) -> list[tables.SteeringNullRow]:
-    """Return the effect of every void direction on its own dataset, ranked among nulls that are orthogonal to it."""
+    """Return the effect of every void direction on its own dataset.
+
+    It is ranked among nulls that are orthogonal to it.
+    """
     from traps_pipeline.mechanism.nulls import null_rows
 
     return null_rows(workspace.tables.read(STEERING_EFFECTS, {}))
@@ -179,7 +214,10 @@ def steering_nulls(workspace: Workspace, _: None) -> list[tables.SteeringNullRow
 
 @_of_effects(tables.STEERING_PECS)
 def steering_pecs(workspace: Workspace, _: None) -> list[tables.SteeringPecsRow]:
-    """Return PECS of the steered model under each sign policy, with the share of degenerate answers."""
+    """Return PECS of the steered model under each sign policy.
+
+    The share of degenerate answers stands beside it.
+    """
     from traps_pipeline.mechanism.nulls import pecs_rows
 
     return pecs_rows(workspace.tables.read(STEERING_EFFECTS, {}))

@@ -1,4 +1,7 @@
-"""The judging group: agreement of the panel, bias of its judges, and confabulation in void failures."""
+"""Declare the judging group.
+
+Agreement of the panel, bias of its judges, and confabulation in void failures.
+"""
 
 from functools import partial
 from typing import TYPE_CHECKING
@@ -12,7 +15,7 @@ from traps_pipeline.pipeline.schemes import CELL, these_keys
 from traps_pipeline.pipeline.stage import of, source, stage
 from traps_pipeline.pipeline.stages.benchmark_stages import items
 from traps_pipeline.pipeline.stages.evaluation_stages import MAX_INVALID_SHARE, judges, responses, verdicts, votes
-from traps_pipeline.pipeline.stages.scoring_stages import asks_pairs, leaderboard
+from traps_pipeline.pipeline.stages.scoring_stages import has_pairs, leaderboard
 from traps_pipeline.protocol.ratings import VOTE_COLUMNS
 from traps_pipeline.scoring.score_rows import CONFABULATION_PREVALENCE, LEADERBOARD, LEAVE_ONE_OUT
 from traps_pipeline.storage.benchmark_tables import current_rows
@@ -27,13 +30,19 @@ _stage, _source = partial(stage, group="judging"), partial(source, group="judgin
 
 @_source(kinds=["yaml"])
 def confabulation_protocol(workspace: Workspace, _: None) -> str:
-    """assets/confabulation.yaml and its prompt: the models whose failures are sampled, and the judge that labels."""
+    """Return the version of the confabulation protocol.
+
+    assets/confabulation.yaml and its prompt name the models whose failures are sampled, and the judge that labels.
+    """
     return protocol_digest(workspace.study.panel)
 
 
 @_source(kinds=["parquet"])
 def judge_validation(workspace: Workspace, _: None) -> str:
-    """The comparison of the judge with two annotators, which `traps people validate` writes."""
+    """Return the version of the comparison of the judge with two annotators.
+
+    `traps people validate` writes it.
+    """
     state = workspace.tables.state(JUDGE_VALIDATION, {})
     return state.version if state else "not run"
 
@@ -43,7 +52,10 @@ def _panel(workspace: Workspace) -> list[str]:
 
 
 def _votes(workspace: Workspace, name: str) -> "pd.DataFrame":
-    """Return the votes of the study's panel as it is now. Raises TrapsError if there is none."""
+    """Return the votes of the study's panel as it is now.
+
+    Raises TrapsError if there is none.
+    """
     cast = current_rows(workspace, VOTES, [*VOTE_COLUMNS, "panel"])
     cast = cast.loc[cast["panel"] == panel_id(workspace.study.panel)]
     if cast.empty:
@@ -54,23 +66,26 @@ def _votes(workspace: Workspace, name: str) -> "pd.DataFrame":
 _VOTED = (of(items, need="some"), of(votes, need="some"), judges)
 
 
-@_stage(AGREEMENT, parents=_VOTED, wants=asks_pairs)
+@_stage(AGREEMENT, parents=_VOTED, wants=has_pairs)
 def agreement(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return agreement of the panel and any two judges by dataset and task: unanimity, Fleiss, Cohen, Krippendorff."""
+    """Return agreement of the panel and any two judges by dataset and task.
+
+    The measures are unanimity, Fleiss, Cohen and Krippendorff.
+    """
     from traps_pipeline.judging.agreement import agreement as rows_of
 
     return rows_of(_votes(workspace, "agreement"), _panel(workspace))
 
 
-@_stage(JUDGE_BIAS, parents=_VOTED, wants=asks_pairs)
+@_stage(JUDGE_BIAS, parents=_VOTED, wants=has_pairs)
 def judge_bias(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return each judge's rate of yes against the panel's majority, per dataset and task."""
+    """Return each judge's rate of yes against the majority, by dataset and task."""
     from traps_pipeline.judging.agreement import judge_bias as rows_of
 
     return rows_of(_votes(workspace, "judge_bias"), _panel(workspace))
 
 
-@_stage(LEAVE_ONE_OUT, parents=[*_VOTED, of(verdicts, need="some"), leaderboard], wants=asks_pairs)
+@_stage(LEAVE_ONE_OUT, parents=[*_VOTED, of(verdicts, need="some"), leaderboard], wants=has_pairs)
 def leave_one_out(workspace: Workspace, _: None) -> "pd.DataFrame":
     """Return PECS by the votes of two judges, for each judge left out."""
     from traps_pipeline.scoring.leave_one_out import leave_one_out as rows_of
@@ -117,7 +132,10 @@ def confabulation(workspace: Workspace, _: None) -> StageOutput:
 
 @_stage(CONFABULATION_PREVALENCE, parents=[confabulation])
 def confabulation_prevalence(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return how often each axis applies to each model's sampled void failures; empty if nothing was labelled."""
+    """Return how often each axis applies to a model's sampled void failures.
+
+    It is empty if nothing was labelled.
+    """
     from traps_pipeline.scoring.prevalence import prevalence
 
     return prevalence(workspace.tables.read(CONFABULATION, {}))

@@ -1,4 +1,7 @@
-"""The mechanism group: hidden states of local models, probes, void directions, steering (docs/spec.md 7 and 8)."""
+"""Declare the mechanism group (docs/spec.md 7 and 8).
+
+Hidden states of local models, probes, void directions, steering.
+"""
 
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -57,19 +60,28 @@ _OCCLUSION = to_keys(CATEGORY, PROBED, lambda key: [ANSWERABLE] if taxonomy_of_c
 
 @_source(scheme=EXTRACTION)
 def extraction_settings(workspace: Workspace, key: str) -> str:
-    """The inputs of hidden states besides items: checkpoint, precision, prompt."""
+    """Return the version of the settings of hidden states.
+
+    They are checkpoint, precision and prompt.
+    """
     return versions.extraction_version(workspace, Extraction.parse(key))
 
 
 @_source(scheme=EXTRACTION)
 def probing_settings(workspace: Workspace, key: str) -> str:
-    """The study's settings of probes and directions, by model."""
+    """Return the version of the study's settings of probes and directions.
+
+    Each model has its own.
+    """
     return versions.probing_version(workspace, Extraction.parse(key))
 
 
 @_source(scheme=schemes.STEERED)
 def steering_settings(workspace: Workspace, key: str) -> str:
-    """The study's settings of steering, the model and its prompt."""
+    """Return the version of the settings of steering.
+
+    They are the study's settings, the model and its prompt.
+    """
     return versions.steering_version(workspace, key)
 
 
@@ -106,7 +118,7 @@ def _unsound_layers(workspace: Workspace, key: str | None, output: StageOutput) 
 
 
 def _lost_states(workspace: Workspace, key: str) -> list[str]:
-    return [] if versions.states_are_there(workspace, StatesCell.parse(key)) else ["its states are gone"]
+    return [] if versions.has_states(workspace, StatesCell.parse(key)) else ["its states are gone"]
 
 
 @_stage(
@@ -119,7 +131,10 @@ def _lost_states(workspace: Workspace, key: str) -> list[str]:
     checks=[Check("states_finite", "Every number of the first and last layer is finite.", _unsound_layers)],
 )
 def hidden_states(workspace: Workspace, key: str) -> StageOutput:
-    """Return a frozen local model's hidden states at every layer, one row per item; extract only missing ones."""
+    """Return a local model's hidden states at every layer, one row per item.
+
+    The model is frozen, and only missing states are extracted.
+    """
     from traps_pipeline.mechanism.stages import extract_states
 
     rows, new = extract_states(workspace, StatesCell.parse(key))
@@ -146,14 +161,17 @@ def _outside_shares(workspace: Workspace, key: str | None, output: StageOutput) 
     checks=[Check("shares_are_shares", "Every figure and interval lies in [0, 1].", _outside_shares)],
 )
 def probes(workspace: Workspace, key: str) -> StageOutput:
-    """Return probes of every dataset on every other by layer: transfer, Cf->Cf, within, label-shuffled, centroids."""
+    """Return probes of every dataset on every other, by layer.
+
+    They measure transfer, Cf->Cf, within, label-shuffled and centroids.
+    """
     from traps_pipeline.mechanism.stages import probe_rows
 
     return StageOutput(probe_rows(workspace, Extraction.parse(key)))
 
 
 def _lost_directions(workspace: Workspace, key: str) -> list[str]:
-    return [] if versions.directions_are_there(workspace, Extraction.parse(key)) else ["its directions are gone"]
+    return [] if versions.has_directions(workspace, Extraction.parse(key)) else ["its directions are gone"]
 
 
 @_stage(
@@ -165,7 +183,10 @@ def _lost_directions(workspace: Workspace, key: str) -> list[str]:
     lost=_lost_directions,
 )
 def directions(workspace: Workspace, key: str) -> StageOutput:
-    """Return the void direction of every dataset at every layer, with draws of its nulls, as files."""
+    """Return each dataset's void direction at every layer, with draws of its nulls.
+
+    They are files.
+    """
     from traps_pipeline.mechanism.stages import direction_rows
 
     return StageOutput(direction_rows(workspace, Extraction.parse(key)))
@@ -173,7 +194,10 @@ def directions(workspace: Workspace, key: str) -> StageOutput:
 
 @_stage(COSINES, code="2", parents=[of(directions, need="some"), of(hidden_states, need="some")], wants=steers)
 def cosines(workspace: Workspace, _: None) -> list[CosineRow]:
-    """Return cosines of every two void directions of a model at one layer, with their reliability."""
+    """Return cosines of any two void directions of a model at one layer.
+
+    Each has its reliability beside it.
+    """
     from traps_pipeline.mechanism.cosines import cosine_rows
 
     return cosine_rows(workspace)
@@ -189,7 +213,10 @@ def cosines(workspace: Workspace, _: None) -> list[CosineRow]:
     side_by_side=True,
 )
 def steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
-    """Yield answers of a model that is steered along every path into a dataset; answers in the ledger are reused."""
+    """Yield answers of a model that is steered along every path into a dataset.
+
+    Answers in the ledger are reused.
+    """
     from traps_pipeline.mechanism.stages import examined_model, saved_directions
     from traps_pipeline.mechanism.steering import collect_steered
 
@@ -197,8 +224,8 @@ def steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | 
         cell = SteeringCell.parse(key)
         entry = examined_model(workspace, cell.evaluation.model)
         along = {cell.directions: saved_directions(workspace, Extraction(entry.id, cell.directions))}
-        for done, output in collect_steered(workspace, entry, [cell], along):
-            yield done.key, output
+        for finished, output in collect_steered(workspace, entry, [cell], along):
+            yield finished.key, output
 
 
 @_stage(
@@ -210,11 +237,14 @@ def steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | 
     side_by_side=True,
 )
 def steering_votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
-    """Yield the panel's votes on whether each steered answer abstains, and whether a control's is correct."""
+    """Yield the panel's votes on each steered answer.
+
+    They say whether it abstains, and whether a control's is correct.
+    """
     from traps_pipeline.mechanism.steering import collect_steering_votes
 
-    for done, output in collect_steering_votes(workspace, [SteeringCell.parse(key) for key in keys]):
-        yield done.key, output
+    for finished, output in collect_steering_votes(workspace, [SteeringCell.parse(key) for key in keys]):
+        yield finished.key, output
 
 
 def _judged(workspace: Workspace) -> "tuple[pd.DataFrame, pd.DataFrame]":

@@ -1,4 +1,7 @@
-"""People's labels: the labels themselves, their agreement, people's scores, and scores corrected by them."""
+"""Declare the group of people's labels.
+
+The labels, their agreement, people's scores, and scores corrected by them.
+"""
 
 from functools import partial
 from typing import TYPE_CHECKING
@@ -25,13 +28,19 @@ _stage, _source = partial(stage, group="people"), partial(source, group="people"
 
 @_source(kinds=["json"])
 def people(workspace: Workspace, _: None) -> str:
-    """The labels that people gave on the pages of `traps people annotate`, in order of submission."""
+    """Return the version of people's labels, in order of submission.
+
+    People gave them on the pages of `traps people annotate`.
+    """
     return labels_version(workspace.labels)
 
 
 @_source(kinds=["yaml"])
 def annotation_protocol(workspace: Workspace, _: None) -> str:
-    """assets/annotation.yaml: the samples that people label, and the definition of a split panel."""
+    """Return the version of the annotation protocol.
+
+    assets/annotation.yaml defines the samples that people label, and a split panel.
+    """
     return file_digest(PROTOCOL_FILE)[:16]
 
 
@@ -40,7 +49,9 @@ _LABELLED = tuple(of(one, need="none") for one in (items, responses, verdicts, c
 
 @_stage(HUMAN_LABELS, parents=[*_LABELLED, people, annotation_protocol, judges])
 def human_labels(workspace: Workspace, _: None) -> StageOutput:
-    """Return people's labels of the study's clips and answers, each with its item and the panel's decision.
+    """Return people's labels of the study's clips and answers.
+
+    Each has its item and the panel's decision beside it.
 
     The table is empty until somebody has labelled.
     """
@@ -59,7 +70,10 @@ def human_agreement(workspace: Workspace, _: None) -> "pd.DataFrame":
 
 @_stage(HUMAN_ROW, code="2", parents=[human_labels])
 def human_row(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return people's Acc, AbsRec, FalseAbs and PECS with intervals, their agreement, and seconds per clip."""
+    """Return people's Acc, AbsRec, FalseAbs and PECS with intervals.
+
+    Their agreement and seconds per clip stand beside.
+    """
     from traps_pipeline.people.human_scores import human_row as rows_of
 
     return rows_of(workspace.tables.read(HUMAN_LABELS, {}))
@@ -78,7 +92,10 @@ _AGAINST = (human_labels, of(verdicts, need="none"), judges)
 
 @_stage(PANEL_ERRORS, code="2", parents=_AGAINST)
 def panel_errors(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return the panel's sensitivity and specificity against people, by task; empty until it is validated."""
+    """Return the panel's sensitivity and specificity against people, by task.
+
+    It is empty until the panel is validated.
+    """
     from traps_pipeline.people.corrected_scores import panel_errors as rows_of
 
     return rows_of(*_labels_and_verdicts(workspace))
@@ -86,7 +103,7 @@ def panel_errors(workspace: Workspace, _: None) -> "pd.DataFrame":
 
 @_stage(CORRECTED, code="2", parents=_AGAINST)
 def corrected(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return every entry of the leaderboard as judged, and corrected for the panel's errors."""
+    """Return every leaderboard entry as judged, and corrected for panel errors."""
     from traps_pipeline.people.corrected_scores import corrected as rows_of
 
     return rows_of(*_labels_and_verdicts(workspace))

@@ -1,4 +1,7 @@
-"""The report group: the report page, and the explorer beside it, in the study's folder `reports`."""
+"""Declare the report group: the report page, and the explorer beside it.
+
+Both lie in the study's folder `reports`.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +35,7 @@ _stage = partial(stage, group=GROUP, kinds=["html"])
 
 @source(group=GROUP, kinds=["csv"])
 def published(workspace: Workspace, _: None) -> str:
-    """assets/published: the paper's tables as printed."""
+    """Return the version of the paper's tables as printed (assets/published)."""
     return published_digest()
 
 
@@ -42,7 +45,9 @@ def _parents(*names: str) -> list[Parent]:
 
 @_stage("report_page", parents=_parents(*ANSWERS, "arms", *SCORES, *_REPORTED, "published"))
 def report_page(workspace: Workspace, _: None) -> StageOutput:
-    """Return findings, leaderboard, figures and tables, beside the paper's, on one page that opens from disk.
+    """Return findings, leaderboard, figures and tables on one page.
+
+    It shows the paper's beside them, and opens from disk.
 
     Every number links into the explorer. A table or figure is rebuilt only when a table that it reads changes.
     """
@@ -72,7 +77,10 @@ def report_page(workspace: Workspace, _: None) -> StageOutput:
 
 @_stage("site", parents=_parents(*ANSWERS, "scene_specs", *SCORES, "contrasts", "regime_tests"))
 def site(workspace: Workspace, _: None) -> StageOutput:
-    """Return the explorer: all answers with their votes and clips, on pages that open from disk."""
+    """Return the explorer: all answers with their votes and clips.
+
+    Its pages open from disk.
+    """
     from traps_pipeline.report.explorer.site import site_files
 
     files = site_files(workspace)

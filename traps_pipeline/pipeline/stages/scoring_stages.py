@@ -1,4 +1,4 @@
-"""The scoring group: metrics of cells, contrasts, the leaderboard."""
+"""Declare the scoring group: metrics of cells, contrasts, the leaderboard."""
 
 import json
 from collections.abc import Callable
@@ -35,13 +35,16 @@ if TYPE_CHECKING:
 _stage = partial(stage, group="scoring")
 
 
-def asks_pairs(partitions: StudyPartitions, key: str | None) -> bool:
+def has_pairs(partitions: StudyPartitions, key: str | None) -> bool:
     """Return whether the study evaluates pairs."""
-    return partitions.asks_pairs
+    return partitions.has_pairs
 
 
 def _none_of(find: str, what: str) -> Callable[[Workspace, str | None, StageOutput], str]:
-    """Return a check that counts what `find` (module.function of `scoring`) finds wrong in a table."""
+    """Return a check that counts a table's wrong rows.
+
+    find: module.function of `scoring` that finds them.
+    """
 
     def wrong(workspace: Workspace, key: str | None, output: StageOutput) -> str:
         module, _, name = find.partition(".")
@@ -64,7 +67,10 @@ def _none_of(find: str, what: str) -> Callable[[Workspace, str | None, StageOutp
     ],
 )
 def metrics(workspace: Workspace, dataset: str) -> StageOutput:
-    """Return Acc, FalseAbs, AbsRec, J and PECS of every cell of a dataset, by scope (docs/spec.md 5.1)."""
+    """Return Acc, FalseAbs, AbsRec, J and PECS of every cell of a dataset.
+
+    Each scope has a row (docs/spec.md 5.1).
+    """
     from traps_pipeline.scoring.metrics import cell_metrics
 
     judged = current_rows(workspace, VERDICTS, dataset=dataset)
@@ -74,7 +80,10 @@ def metrics(workspace: Workspace, dataset: str) -> StageOutput:
 
 
 def _scored(workspace: Workspace, name: str) -> "tuple[pd.DataFrame, pd.DataFrame]":
-    """Return all METRICS rows of the pairs, and the VERDICTS rows from which they are made, without arms."""
+    """Return all METRICS rows of the pairs, and the VERDICTS rows behind them.
+
+    Without arms.
+    """
     cells = workspace.tables.read_all(METRICS, dataset=DATASETS)
     if cells.empty:
         raise TrapsError(f"{name}: no metrics yet; materialize metrics for a dataset first")
@@ -86,9 +95,12 @@ def _scored(workspace: Workspace, name: str) -> "tuple[pd.DataFrame, pd.DataFram
 _SCORED = (of(metrics, need="some"), of(verdicts, need="some"), judges)
 
 
-@_stage(CONTRASTS, parents=_SCORED, wants=asks_pairs)
+@_stage(CONTRASTS, parents=_SCORED, wants=has_pairs)
 def contrasts(workspace: Workspace, _: None) -> StageOutput:
-    """Return paired differences between models and between regimes, with intervals and Holm's correction."""
+    """Return paired differences between models and between regimes.
+
+    They have intervals and Holm's correction.
+    """
     from traps_pipeline.scoring.bootstrap import resample
     from traps_pipeline.scoring.contrasts import contrasts as paired
 
@@ -100,9 +112,12 @@ def contrasts(workspace: Workspace, _: None) -> StageOutput:
     return StageOutput(table, shown=figures)
 
 
-@_stage(REGIME_TESTS, parents=_SCORED, wants=asks_pairs)
+@_stage(REGIME_TESTS, parents=_SCORED, wants=has_pairs)
 def regime_tests(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return McNemar's exact test of any two regimes on the same items, by model, dataset, run and decision."""
+    """Return McNemar's exact test of any two regimes on the same items.
+
+    Each model, dataset, run and decision has a row.
+    """
     from traps_pipeline.scoring.contrasts import regime_tests as mcnemar
 
     return mcnemar(_scored(workspace, "regime_tests")[1])
@@ -118,10 +133,13 @@ def regime_tests(workspace: Workspace, _: None) -> "pd.DataFrame":
             _none_of("standings.wrong_intervals", "intervals"),
         )
     ],
-    wants=asks_pairs,
+    wants=has_pairs,
 )
 def leaderboard(workspace: Workspace, _: None) -> StageOutput:
-    """Return every model under every regime, per dataset and overall: means, spreads, 95 % intervals, ranks."""
+    """Return every model under every regime, per dataset and overall.
+
+    Means, spreads, 95 % intervals and ranks are given.
+    """
     from traps_pipeline.report.leaderboard_page import leaderboard_markdown
     from traps_pipeline.scoring.bootstrap import intervals, resample
     from traps_pipeline.scoring.standings import leaderboard as rank
@@ -141,10 +159,12 @@ def leaderboard(workspace: Workspace, _: None) -> StageOutput:
             "robust_rows_hold", "Figures lie in [0, 1] and in their intervals.", _none_of("robust.wrong_rows", "rows")
         )
     ],
-    wants=asks_pairs,
+    wants=has_pairs,
 )
 def robust(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return conjunction, robust figure and inference of every model and regime with all four datasets and an arm.
+    """Return conjunction, robust figure and inference of each model and regime.
+
+    Only those with all four datasets and an arm have a row.
 
     The table is empty if no arm was run.
     """
@@ -168,7 +188,9 @@ def robust(workspace: Workspace, _: None) -> "pd.DataFrame":
     ],
 )
 def hypotheses(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return abstention and accuracy as one property of the pairs changes step by step, beside shortcut rules.
+    """Return abstention and accuracy as one property of pairs changes by steps.
+
+    Shortcut rules stand beside.
 
     The table is empty if no variation was run.
     """
@@ -197,7 +219,9 @@ def hypotheses(workspace: Workspace, _: None) -> "pd.DataFrame":
     ],
 )
 def graded(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return what every model and regime earns on graded cuts, against the true distribution over answers.
+    """Return what each model and regime earns on graded cuts.
+
+    It is scored against the true distribution over answers.
 
     The table is empty if no graded cut was run.
     """

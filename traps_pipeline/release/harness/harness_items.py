@@ -13,7 +13,10 @@ ITEMS, ABOUT, MEDIA = "items.jsonl", "about.json", "media"
 
 @cache
 def about() -> dict[str, Any]:
-    """Return name, version and canary of the benchmark, prompts by regime, and the protocol's parameters."""
+    """Return about the benchmark: name, version, canary, prompts and parameters.
+
+    Prompts are by regime, parameters are the protocol's.
+    """
     return json.loads((FOLDER / ABOUT).read_text(encoding="utf-8"))
 
 
@@ -30,7 +33,10 @@ def media_of(item: dict[str, Any]) -> list[Path]:
 
 
 def prompt(regime: str) -> str:
-    """Return the system prompt. Raises ValueError with the known regimes."""
+    """Return the system prompt.
+
+    Raises ValueError with the known regimes.
+    """
     prompts: dict[str, str] = about()["prompts"]
     if regime not in prompts:
         raise ValueError(f"regime {regime!r} is unknown; known: {', '.join(prompts)}")

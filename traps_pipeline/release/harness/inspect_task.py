@@ -1,5 +1,8 @@
 # pyright: reportMissingImports=false
-"""The benchmark as an inspect_ai task: `inspect eval traps_task.py -T regime=standard --model ...`."""
+"""Run the benchmark as an inspect_ai task.
+
+`inspect eval traps_task.py -T regime=standard --model ...`.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,10 @@ def traps(regime: str = "standard") -> Any:
 
 
 def evaluation(regime: str) -> Any:
-    """Return a task with all items under one regime, once: each run is a separate evaluation, as PECS is per run."""
+    """Return a task with all items under one regime, once.
+
+    Each run is a separate evaluation, as PECS is per run.
+    """
     system = prompt(regime)
     samples = [
         Sample(
@@ -62,7 +68,7 @@ def traps_figures() -> Any:
     """Return the metric: PECS and its factors, overall and by dataset."""
 
     def compute(scores: list[Any]) -> dict[str, float]:
-        results = figures(PanelDecision.of(one.score.metadata) for one in scores)
+        results = figures(PanelDecision.of(score.score.metadata) for score in scores)
         return {name: value for name, value in results.items() if value is not None}
 
     return compute
@@ -70,7 +76,10 @@ def traps_figures() -> Any:
 
 @scorer(metrics=[traps_figures()])
 def panel(regime: str) -> Any:
-    """Return the scorer: the rule panel gives 1 for a correct answer to a control and for abstention on a void."""
+    """Return the scorer, the rule panel.
+
+    It gives 1 for a correct answer to a control and for abstention on a void.
+    """
     known = {item["item_id"]: item for item in items()}
 
     async def score(state: Any, target: Any) -> Any:

@@ -1,4 +1,7 @@
-"""Score answers with only the standard library: read texts, apply the rule panel, and compute PECS."""
+"""Score answers with only the standard library.
+
+Texts are read, the rule panel applies, and PECS is computed.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +51,9 @@ class PanelDecision:
 
 
 def judge(item: Mapping[str, Any], outcome: str, text: str | None, regime: str) -> PanelDecision:
-    """Return the panel's decision about an answer. outcome: answer, truncated, empty, refused or error.
+    """Return the panel's decision about an answer.
+
+    outcome: answer, truncated, empty, refused or error.
 
     All three judges of the panel `rules` read by the same rules, so one reading is their majority.
     """

@@ -1,4 +1,7 @@
-"""Write the folder that lets inspect_ai and lmms-eval evaluate models on a release (`traps publish harness`)."""
+"""Write the folder for inspect_ai and lmms-eval (`traps publish harness`).
+
+They evaluate models on a release with it.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +46,10 @@ SHOWN: Mapping[Literal["images", "video"], MediaSpec] = {
 
 
 def media_settings(media: Literal["images", "video"], uniform: int | None = None) -> MediaSpec:
-    """Return the media settings of a clip: the protocol's 25 frames, or evenly spaced ones. Raises TrapsError."""
+    """Return the media settings of a clip.
+
+    The protocol's 25 frames, or evenly spaced ones. Raises TrapsError.
+    """
     if uniform is None:
         return SHOWN[media]
     if media == "video":
@@ -52,7 +58,9 @@ def media_settings(media: Literal["images", "video"], uniform: int | None = None
 
 
 def write_harness(release: Path, target: Path, media: MediaSpec = SHOWN["images"]) -> int:
-    """Write the harness of a released folder's pairs to an empty folder; return the number of items.
+    """Write the harness of a released folder's pairs to an empty folder.
+
+    Return the number of items.
 
     media: of `media_settings`: the JPEGs or the mp4 that the pipeline sends, byte for byte. Raises TrapsError for an
     altered release or one without answers, and for a folder that holds other files.
@@ -87,7 +95,10 @@ def write_harness(release: Path, target: Path, media: MediaSpec = SHOWN["images"
 
 
 def rewritten_source(source: str) -> str:
-    """Return the source of one of this package's modules, with imports rewritten for the harness."""
+    """Return the source of one of this package's modules, for the harness.
+
+    Its imports are rewritten.
+    """
     return _IMPORT.sub(lambda m: f"{m[1]}from {PACKAGE}.{m[2].rpartition('.')[2]} import ", source)
 
 

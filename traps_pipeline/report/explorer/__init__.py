@@ -1,1 +1,4 @@
-"""The explorer: pages to browse a study's answers, in a folder that opens from disk."""
+"""Build the explorer, pages to browse a study's answers.
+
+Its folder opens from disk.
+"""

@@ -1,4 +1,4 @@
-"""A study's answers, decisions and votes in the explorer's order.
+"""Order a study's answers, decisions and votes as the explorer shows them.
 
 Every answer has a row: sorted by item, then by evaluation. Items are sorted so that those of a pair, and the pairs of a
 family, follow each other; a shard holds the texts and votes of consecutive pairs, so that a page of one pair needs one
@@ -40,7 +40,10 @@ _VOTE_TEXTS = ("extracted_value", "confidence", "rationale")
 
 @dataclass(frozen=True)
 class Shard:
-    """The answers of some consecutive items: rows [first, first + answers) of `decisions`, their texts and votes."""
+    """The answers of some consecutive items.
+
+    Rows [first, first + answers) of `decisions`, their texts and votes.
+    """
 
     first: int
     texts: pa.Table
@@ -83,7 +86,10 @@ class StudyAnswers:
 
 
 def study_items(workspace: Workspace) -> pd.DataFrame:
-    """Return ITEMS rows with `family`, datasets in the benchmark's order. Raises TrapsError if there are none."""
+    """Return ITEMS rows with `family`, datasets in the benchmark's order.
+
+    Raises TrapsError if there are none.
+    """
     items, specs = workspace.tables.read_all(ITEMS), workspace.tables.read_all(SCENE_SPECS, ["scenario_id", "family"])
     if items.empty:
         raise TrapsError(f"{workspace.root}: has no items yet; run `traps run EXPERIMENT` in it first")
@@ -97,7 +103,10 @@ def study_items(workspace: Workspace) -> pd.DataFrame:
 
 
 def study_answers(workspace: Workspace) -> StudyAnswers:
-    """Return all answers to current items, with decisions and votes. Raises TrapsError without items."""
+    """Return all answers to current items, with decisions and votes.
+
+    Raises TrapsError without items.
+    """
     items = study_items(workspace)
     responses = _of_items(workspace, RESPONSES, ("outcome", "epoch", *_TEXTS), items)
     evaluations = _evaluations(responses)
@@ -106,9 +115,9 @@ def study_answers(workspace: Workspace) -> StudyAnswers:
     decided = ("outcome", "abstained", "correct", "unanimous")
     verdicts = _keyed(_of_items(workspace, VERDICTS, decided, items), evaluations)
     judged = verdicts["key"].to_numpy()
-    at = np.full(len(items) * max(len(evaluations), 1), -1, np.int64)
-    at[judged] = np.arange(len(judged))
-    places = at[keys]
+    positions = np.full(len(items) * max(len(evaluations), 1), -1, np.int64)
+    positions[judged] = np.arange(len(judged))
+    places = positions[keys]
     judged_as = pc.take(verdicts["outcome"], pa.array(places, mask=places < 0))
     is_unread = pc.fill_null(pc.equal(judged_as, UNREAD), False)
     outcomes, outcome = _coded(pc.if_else(is_unread, judged_as, responses["outcome"]))
@@ -123,9 +132,9 @@ def study_answers(workspace: Workspace) -> StudyAnswers:
         "unanimous": _decision(verdicts["unanimous"], places) == YES,
     }
     votes = _keyed(_of_items(workspace, VOTES, (*_VOTES, *_VOTE_TEXTS), items), evaluations)
-    at[:] = -1
-    at[keys] = np.arange(len(keys))
-    votes = votes.append_column("answer", pa.array(at[votes["key"].to_numpy()].astype(np.int32)))
+    positions[:] = -1
+    positions[keys] = np.arange(len(keys))
+    votes = votes.append_column("answer", pa.array(positions[votes["key"].to_numpy()].astype(np.int32)))
     votes = votes.filter(pc.greater_equal(votes["answer"], 0))
     votes = votes.sort_by([(name, "ascending") for name in ("answer", "task", "judge")])
     return StudyAnswers(
@@ -140,7 +149,10 @@ def study_answers(workspace: Workspace) -> StudyAnswers:
 
 
 def _of_items(workspace: Workspace, table: Table, columns: Sequence[str], items: pd.DataFrame) -> pa.Table:
-    """Return rows of a table whose item is in `items`, with the item's index as the column `item`."""
+    """Return a table's rows whose item is in `items`.
+
+    The column `item` is the item's index.
+    """
     rows = workspace.tables.read_arrow(table, ["item_id", *_EVALUATION, *columns])
     place = pc.index_in(rows["item_id"], value_set=pa.array(items["item_id"].tolist(), pa.string()))
     rows = rows.drop_columns("item_id").append_column("item", place)
@@ -148,14 +160,20 @@ def _of_items(workspace: Workspace, table: Table, columns: Sequence[str], items:
 
 
 def _evaluations(responses: pa.Table) -> list[Evaluation]:
-    """Return the evaluations with answers, by model, regime (in the benchmark's order) and run."""
+    """Return the evaluations with answers.
+
+    By model, regime (in the benchmark's order) and run.
+    """
     distinct = responses.group_by([*_EVALUATION]).aggregate([]).to_pylist()
     evaluations = [Evaluation(row["model"], row["regime"], row["run"]) for row in distinct]
     return sorted(evaluations, key=lambda e: (e.model, REGIMES.index(e.regime), e.run))
 
 
 def _keyed(rows: pa.Table, evaluations: Sequence[Evaluation]) -> pa.Table:
-    """Return the rows with `key`, the index of item and evaluation; without evaluations that have no answers."""
+    """Return the rows with `key`, the index of item and evaluation.
+
+    Evaluations that have no answers are left out.
+    """
     own = pc.binary_join_element_wise(*(rows[name].cast(pa.string()) for name in _EVALUATION), "|")
     known = pa.array([f"{e.model}|{e.regime}|{e.run}" for e in evaluations], pa.string())
     evaluation = pc.fill_null(pc.index_in(own, value_set=known), -1).to_numpy().astype(np.int64)

@@ -1,4 +1,7 @@
-"""Describe a scenario from its SCENE_SPECS row: its answer, the void's intervention, its certificates."""
+"""Describe a scenario from its SCENE_SPECS row.
+
+The words tell its answer, the void's intervention and its certificates.
+"""
 
 from __future__ import annotations
 
@@ -21,8 +24,8 @@ def answer_of_control(spec: Mapping[str, Any]) -> str:
 
 def intervention(spec: Mapping[str, Any]) -> str:
     """Return how the control's clip was changed to make the void."""
-    at = f"{spec['void_from_s']:.1f} s"
-    return f"hidden from {at}" if spec["void_kind"] == "occluder" else f"cut at {at}"
+    moment = f"{spec['void_from_s']:.1f} s"
+    return f"hidden from {moment}" if spec["void_kind"] == "occluder" else f"cut at {moment}"
 
 
 _PHRASES = {
@@ -42,7 +45,10 @@ _PHRASES = {
 
 
 def certificate_phrases(evidence: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Yield name and description of each number in a scenario's evidence for its certificates."""
+    """Yield name and description of each number in a scenario's evidence.
+
+    The evidence supports its certificates.
+    """
     for name, phrase in _PHRASES.items():
         if evidence.get(name) is not None:
             yield name, phrase.format(evidence[name])

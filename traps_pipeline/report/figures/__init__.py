@@ -1,1 +1,4 @@
-"""The figures of docs/spec.md 10, from any `Results`; equal frames give equal bytes."""
+"""Draw the figures of docs/spec.md 10, from any `Results`.
+
+Equal frames give equal bytes.
+"""

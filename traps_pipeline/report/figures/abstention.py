@@ -1,4 +1,7 @@
-"""Figures of abstention: visual against textual voids, standard against guided, doubt against conversion."""
+"""Draw figures of abstention.
+
+Visual against textual voids, standard against guided, doubt against conversion.
+"""
 
 from __future__ import annotations
 
@@ -23,8 +26,9 @@ PERCENT = (0, 25, 50, 75, 100)
 
 
 def visual_textual(results: Results) -> Figure:
-    """Return AbsRec on visual (x) against textual voids (y), one point per model, averaged over its taxonomies; a
-    second panel has the means by family.
+    """Return AbsRec on visual (x) against textual voids (y), one point per model.
+
+    Each is averaged over its taxonomies; a second panel has the means by family.
     """
     rates = results.rates
     if not len(rates):
@@ -54,7 +58,10 @@ def _draw_rates(axes: Axes, rates: pd.DataFrame) -> None:
 
 
 def _averaged(rates: pd.DataFrame) -> pd.Series | pd.DataFrame:
-    """Return whether a row has a model's rates pooled over taxonomies, or of its only taxonomy."""
+    """Return whether a model's row pools its rates over taxonomies.
+
+    Its only taxonomy counts, too.
+    """
     models = rates.loc[rates["taxonomy"] == "pooled", "model"]
     return rates["taxonomy"].eq("pooled") | ~rates["model"].isin(models)
 
@@ -86,8 +93,10 @@ def _draw_models_key(figure: Figure, models: list[str]) -> None:
 
 
 def abs_rec_by_model(results: Results) -> Figure:
-    """Return AbsRec of every model under standard (hollow) and guided (filled) with equal weights of datasets; bars are
-    the deviation over runs."""
+    """Return AbsRec of every model under standard (hollow) and guided (filled).
+
+    Datasets have equal weights; bars are the deviation over runs.
+    """
     overall = results.overall
     rows = overall.loc[overall["regime"].isin(PROMPTING) & overall["abs_rec"].notna()]
     if not len(rows):
@@ -131,9 +140,10 @@ def _abs_rec(sides: dict[tuple[str, str], Any], model: str, regime: str) -> floa
 
 
 def doubt(results: Results) -> Figure:
-    """Return doubt of each pair's thinking member (x) against its AbsRec minus the other's (y): a dot for each dataset,
-    and a large marker for the mean. Both figures must be of one epoch; other pairs are left out, and the title gives
-    the reason.
+    """Return doubt of a pair's thinking member (x) against its gain in AbsRec (y).
+
+    The gain is its AbsRec minus the other's: a dot for each dataset, and a large marker for the mean. Both figures must
+    be of one epoch; other pairs are left out, and the title gives the reason.
     """
     points, refused = doubt_points(results)
     if not len(points):
@@ -165,7 +175,9 @@ def _no_doubt(results: Results) -> str:
 
 
 def doubt_points(results: Results) -> tuple[pd.DataFrame, str]:
-    """Return thinking, other, dataset, doubt, gain (fractions) by pair and dataset; and reasons for refused pairs.
+    """Return thinking, other, dataset, doubt, gain (fractions) by pair and dataset.
+
+    Reasons for refused pairs follow.
 
     AbsRec is that of `results.rates` (standard), whose epoch must be that of the labels (docs/spec.md 9.2).
     """

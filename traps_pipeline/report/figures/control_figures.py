@@ -1,4 +1,7 @@
-"""Figures that test mechanistic claims: baselines of probes, gates in the PECS plane, patching, doses among nulls."""
+"""Draw figures that test mechanistic claims.
+
+Baselines of probes, gates in the PECS plane, patching, doses among nulls.
+"""
 
 from __future__ import annotations
 
@@ -40,11 +43,12 @@ GROUPS = ("system", "stamps", "changed", "unchanged", "question", "last", "all")
 
 
 def probe_baselines(results: Results) -> Figure:
-    """Return AUROC of each dataset's probe on itself and on the other datasets (black, with its interval), compared
-    with probes on raw inputs and on the output margin; grey is the floor of noise under the same split, mean ± 2
-    deviations. oc and ch are occlusion and chaotic, and with _ip their ill-posed questions; oc→ch is fitted on oc and
-    scored on ch; † is from fewer than ten items a side. A probe shows information of the states only as far as it
-    exceeds all coloured marks.
+    """Return AUROC of each dataset's probe on itself and on the other datasets.
+
+    It is black, with its interval, and compared with probes on raw inputs and on the output margin; grey is the floor
+    of noise under the same split, mean ± 2 deviations. oc and ch are occlusion and chaotic, and with _ip their
+    ill-posed questions; oc→ch is fitted on oc and scored on ch; † is from fewer than ten items a side. A probe shows
+    information of the states only as far as it exceeds all coloured marks.
     """
     rows = beside(results)
     if not len(rows):
@@ -89,10 +93,11 @@ def _baselines(ax: Axes, rows: pd.DataFrame) -> None:
 
 
 def gate_arrows(results: Results) -> Figure:
-    """Return each model's answers before the gate (hollow) and after it (filled) in the plane of Acc and J, for gates
-    on states and their controls (from other datasets, mid threshold, all datasets); and risk against coverage. J is
-    AbsRec minus FalseAbs: an arrow to the right means better separation of voids from controls, an arrow downwards a
-    loss of right answers.
+    """Return each model's answers before (hollow) and after (filled) the gate.
+
+    Arrows are drawn in the plane of Acc and J, for gates on states and their controls (from other datasets, mid
+    threshold, all datasets); and risk against coverage. J is AbsRec minus FalseAbs: an arrow to the right means better
+    separation of voids from controls, an arrow downwards a loss of right answers.
     """
     rows = results.gate
     rows = rows.loc[(rows["source"] == "other datasets") & (rows["threshold"] == "mid") & (rows["target"] == "all")]
@@ -147,11 +152,13 @@ def _risk(ax: Axes, rows: pd.DataFrame, regime: str, colour: dict[str, str]) -> 
 
 
 def patching(results: Results) -> Figure:
-    """Return the indirect effect of each group of positions at each layer, for patches from the void into the control
-    and back; 1 is the whole difference of the outcome. Framed cells were patched; the others are first-order estimates,
-    from one backward pass per pair. The residual stream is the whole output of a block; attention and MLP, where they
-    were patched, are one block's additions to it. stamps are the time stamps, changed and unchanged the visual tokens
-    whose pixels differ or agree between the sides; last is the last token.
+    """Return the indirect effect of each group of positions at each layer.
+
+    Patches go from the void into the control and back; 1 is the whole difference of the outcome. Framed cells were
+    patched; the others are first-order estimates, from one backward pass per pair. The residual stream is the whole
+    output of a block; attention and MLP, where they were patched, are one block's additions to it. stamps are the time
+    stamps, changed and unchanged the visual tokens whose pixels differ or agree between the sides; last is the last
+    token.
     """
     rows = results.patching
     rows = rows.loc[(rows["source"] == "pair") & rows["attributed"].notna()]
@@ -214,13 +221,15 @@ def _effects(ax: Axes, part: pd.DataFrame) -> Any:
 
 
 def doses_among_nulls(results: Results) -> Figure:
-    """Return abstention of each dataset's controls (+) and voids (−) along its own direction, by dose in units of the
-    class gap, on pairs that the direction does not come from; doses beyond the cap, in states, are left out. Right of
-    the line: the nulls, which are orthogonal to the direction, at the largest dose, added on controls (+) and
-    subtracted on voids (−); a larger dot means more draws. The direction has a specific effect where its line ends away
-    from the dots. oc and ch are occlusion and chaotic, and with _ip their ill-posed questions. n: answers of a side, †
-    fewer than ten. p: share of the draws of each null, in the order of the legend, with at least the direction's
-    effect, counting the direction itself; on controls, then on voids.
+    """Return abstention of controls (+) and voids (−) along a direction, by dose.
+
+    Each dataset has its own direction; the dose is in units of the class gap, on pairs that the direction does not come
+    from; doses beyond the cap, in states, are left out. Right of the line: the nulls, which are orthogonal to the
+    direction, at the largest dose, added on controls (+) and subtracted on voids (−); a larger dot means more draws.
+    The direction has a specific effect where its line ends away from the dots. oc and ch are occlusion and chaotic, and
+    with _ip their ill-posed questions. n: answers of a side, † fewer than ten. p: share of the draws of each null, in
+    the order of the legend, with at least the direction's effect, counting the direction itself; on controls, then on
+    voids.
     """
     rows = results.own_effects
     if not len(rows):
@@ -250,7 +259,10 @@ def doses_among_nulls(results: Results) -> Figure:
 
 
 def _p_values(nulls: pd.DataFrame, model: str, directions: str, regime: str, dataset: str) -> list[str]:
-    """Return the p of a direction among each of its nulls at the largest dose, one line per side."""
+    """Return the p of a direction among each of its nulls at the largest dose.
+
+    Each side has a line.
+    """
     of = nulls.loc[(nulls["model"] == model) & (nulls["directions"] == directions) & (nulls["regime"] == regime)]
     of = of.loc[(of["target"] == dataset) & (of["unit"] == "gap")]
     lines: list[str] = []

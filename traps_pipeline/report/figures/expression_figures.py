@@ -1,4 +1,7 @@
-"""Figures of encoding and expression: states against output item by item, and the margin by layer."""
+"""Draw figures of encoding and expression.
+
+States against output item by item, and the margin by layer.
+"""
 
 from __future__ import annotations
 
@@ -24,13 +27,14 @@ _LINES = dict(zip(PROMPTING, ("-", "--"), strict=True))
 
 
 def states_and_output(results: Results) -> Figure:
-    """Return every item by its scores from states and from output, both read under the standard VQA prompt. Up: the
-    score of a probe that has not seen the item's scenario, above its threshold for voids. Right: log-odds that the
-    answer begins with an abstention. A filled marker was answered under standard, a hollow one abstained on. Orange
-    filled markers above the line and left of it are encoded and not expressed. Above each panel: how well each score
-    separates voids from controls (AUROC), sentences being whole abstentions against the model's own answer, and the
-    floor of noise under the same split (mean and two deviations). There is a gap in AUROC, too, only if states exceed
-    the output by more than that.
+    """Return every item by its scores from states and from output.
+
+    Both are read under the standard VQA prompt. Up: the score of a probe that has not seen the item's scenario, above
+    its threshold for voids. Right: log-odds that the answer begins with an abstention. A filled marker was answered
+    under standard, a hollow one abstained on. Orange filled markers above the line and left of it are encoded and not
+    expressed. Above each panel: how well each score separates voids from controls (AUROC), sentences being whole
+    abstentions against the model's own answer, and the floor of noise under the same split (mean and two deviations).
+    There is a gap in AUROC, too, only if states exceed the output by more than that.
     """
     rows = scored_items(results)
     if not len(rows):
@@ -59,8 +63,9 @@ def states_and_output(results: Results) -> Figure:
 
 
 def scored_items(results: Results) -> pd.DataFrame:
-    """Return the items with both scores, and `sentence`: by how much an abstention is likelier (nats per token, or
-    NaN).
+    """Return the items with both scores, and `sentence`.
+
+    It is by how much an abstention is likelier (nats per token, or NaN).
     """
     rows, read = results.item_scores, results.sentences
     read = read.loc[read["prompt"] == STANDARD, ["model", "item_id", "abstention", "own"]]
@@ -70,7 +75,10 @@ def scored_items(results: Results) -> pd.DataFrame:
 
 
 def orders(rows: pd.DataFrame) -> dict[str, float]:
-    """Return the AUROC of states, of the output margin, and of whole sentences if available, on some items."""
+    """Return the AUROC of states, output margin and whole sentences on some items.
+
+    Sentences are left out if they are not available.
+    """
     void, areas = (rows["side"] == "void").to_numpy(), dict[str, float]()
     for name, column in (("states", "own"), ("margin", "margin"), ("sentences", "sentence")):
         values = rows[column].to_numpy(float)
@@ -97,9 +105,11 @@ def _scatter(ax: Axes, rows: pd.DataFrame) -> None:
 
 
 def lens(results: Results) -> Figure:
-    """Return mean log-odds of abstaining from the state of each layer through the model's own final norm and head
-    (logit lens), of voids (orange) and controls (blue), under both VQA prompts. Where the lines of a side separate, the
-    prompt decides; at the last layer they are the output. The dotted line is even odds.
+    """Return mean log-odds of abstaining from the state of each layer.
+
+    States pass through the model's own final norm and head (logit lens); shown are means of voids (orange) and controls
+    (blue), under both VQA prompts. Where the lines of a side separate, the prompt decides; at the last layer they are
+    the output. The dotted line is even odds.
     """
     rows = results.lens
     if not len(rows):

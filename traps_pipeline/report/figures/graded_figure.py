@@ -1,4 +1,7 @@
-"""The figure of graded cuts: abstention and stated probability against the probability of the likeliest answer."""
+"""Draw the figure of graded cuts.
+
+Abstention and stated probability against the probability of the likeliest answer.
+"""
 
 from __future__ import annotations
 
@@ -19,11 +22,13 @@ _APART = 0.008  # horizontal offset between models, since several abstain and st
 
 
 def graded(results: Results) -> Figure:
-    """Return the share of abstentions under regimes that ask for a decision (left), and the mean probability given to
-    the likeliest answer under regimes that ask for probabilities (right), over cuts with similar probability of the
-    likeliest answer. Grey: an ideal observer, which answers if the probability makes an answer worth its risk, and
-    states the true one. A shifted step means another threshold; another slope means other knowledge. Models are drawn
-    side by side.
+    """Return abstention and stated probability on graded cuts.
+
+    Left: the share of abstentions under regimes that ask for a decision. Right: the mean probability given to the
+    likeliest answer under regimes that ask for probabilities. Both over cuts with similar probability of the likeliest
+    answer. Grey: an ideal observer, which answers if the probability makes an answer worth its risk, and states the
+    true one. A shifted step means another threshold; another slope means other knowledge. Models are drawn side by
+    side.
     """
     from matplotlib.lines import Line2D
 

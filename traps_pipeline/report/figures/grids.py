@@ -1,4 +1,7 @@
-"""Grid figures: heatmaps over sub-scenarios, bars over the axes of confabulation, points of cues."""
+"""Draw grid figures.
+
+Heatmaps over sub-scenarios, bars over the axes of confabulation, points of cues.
+"""
 
 from __future__ import annotations
 
@@ -38,8 +41,9 @@ MOST_MODELS = 12  # maximum legible columns of a heatmap on a page's width
 
 
 def sub_scenarios(results: Results) -> Figure:
-    """Return AbsRec by sub-scenario (rows, by falling AbsRec under standard) and model (columns), standard beside
-    guided.
+    """Return AbsRec by sub-scenario and model (columns), standard beside guided.
+
+    Rows are sorted by falling AbsRec under standard.
 
     Columns are the models that take video, or all others if none of those was asked, 12 at most. The paper prints only
     means over models, so for its numbers the columns are the figures that it prints. Blue is good, orange is bad.
@@ -66,7 +70,10 @@ def sub_scenarios(results: Results) -> Figure:
 
 @dataclass(frozen=True)
 class Panel:
-    """A heatmap: values (sub-scenarios, columns) in percent, with a colour scale for good or for bad."""
+    """A heatmap of values (sub-scenarios, columns) in percent.
+
+    Its colour scale is for good or for bad.
+    """
 
     title: str
     columns: list[str]
@@ -100,7 +107,10 @@ def _means(rows: pd.DataFrame) -> list[Panel]:
 
 
 def _draw_grid(ax: Axes, panel: Panel, names: list[str], first: int) -> AxesImage:
-    """Draw one panel. A white line separates occlusion (the first rows) from chaotic; a dash means not run."""
+    """Draw one panel.
+
+    A white line separates occlusion (the first rows) from chaotic; a dash means not run.
+    """
     columns, values = panel.columns, panel.values
     image = ax.imshow(values, cmap="Blues" if panel.scale == GOOD else "Oranges", vmin=0, vmax=100, aspect="auto")
     ax.set_facecolor("#f2f4f7")
@@ -120,8 +130,9 @@ def _draw_grid(ax: Axes, panel: Panel, names: list[str], first: int) -> AxesImag
 
 
 def confabulation(results: Results) -> Figure:
-    """Return how often each axis applies to a model's sampled void failures, with 95 % Wilson intervals if the table
-    has them.
+    """Return how often each axis applies to a model's sampled void failures.
+
+    Bars have 95 % Wilson intervals if the table has them.
     """
     rows = results.confabulation
     if not len(rows):
@@ -157,7 +168,10 @@ def confabulation(results: Results) -> Figure:
 
 
 def shortcut_figure(table: pd.DataFrame) -> Figure:
-    """Return the accuracy of predicting the side by each cue, from `benchmark.shortcuts`, with a line at chance."""
+    """Return the accuracy of predicting the side by each cue.
+
+    table: of `benchmark.shortcuts`. A line stands at chance.
+    """
     datasets = [name for name in TITLES if name in set(table["dataset"])] or list(DATASETS)
     cues = list(dict.fromkeys(table["cue"]))
     with figure_style():

@@ -1,4 +1,4 @@
-"""Models in the plane of J and Acc, with contours of PECS (docs/spec.md 10)."""
+"""Draw models in the plane of J and Acc, with contours of PECS (docs/spec.md 10)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,10 @@ if TYPE_CHECKING:
 
 
 def landscape(results: Results) -> Figure:
-    """Return the PECS landscape of the overall figures, or of the first dataset if no model has all four."""
+    """Return the PECS landscape of the overall scores.
+
+    If no model has all four datasets, it is that of the first dataset.
+    """
     overall, cells = results.overall, results.cells
     if len(overall):
         return landscape_figure(overall, TITLES["overall"])
@@ -35,7 +38,9 @@ def landscape(results: Results) -> Figure:
 
 
 def landscape_figure(points: pd.DataFrame, scope: str) -> Figure:
-    """Return J (x) against Acc (y) of every model with iso-PECS contours, one column wide.
+    """Return J (x) against Acc (y) of every model with iso-PECS contours.
+
+    The figure is one column wide.
 
     points has the columns model, regime, acc, j, pecs, incomplete. Hollow is standard, filled guided, a dot json; thin
     bars are 95 % intervals. The dashed line is the frontier under guided, a ring each family's best PECS under guided.
@@ -57,7 +62,10 @@ def landscape_figure(points: pd.DataFrame, scope: str) -> Figure:
 
 
 def reasoning(results: Results) -> Figure:
-    """Return arrows from the model that thinks less to the one that thinks more, under standard and under guided."""
+    """Return arrows from the model that thinks less to the one that thinks more.
+
+    There is one under standard and one under guided.
+    """
     points = results.overall
     chains = [list(reversed(pair)) for pair in analyses.REASONING_PAIRS] + [list(analyses.REASONING_LADDER)]
     chains = [[m for m in chain if m in set(points["model"])] for chain in chains]
@@ -83,7 +91,10 @@ def reasoning(results: Results) -> Figure:
 
 
 def _draw_models(axes: Axes, points: pd.DataFrame) -> list[Label]:
-    """Draw the markers of every model; return one label per model, at its guided point or else at its first one."""
+    """Draw the markers of every model.
+
+    Return one label per model, at its guided point or else at its first one.
+    """
     labels, look = [], looks(points["model"])
     for model, rows in points.groupby("model", sort=True):
         colour, marker = look[str(model)]
@@ -111,7 +122,10 @@ def _draw_models(axes: Axes, points: pd.DataFrame) -> list[Label]:
 
 
 def _draw_intervals(axes: Axes, row: Mapping[Any, Any], colour: str) -> None:
-    """Draw the 95 % intervals of J and Acc if the row has them, clipped to possible values."""
+    """Draw the 95 % intervals of J and Acc if the row has them.
+
+    They are clipped to possible values.
+    """
     style: dict[str, Any] = {"color": colour, "linewidth": 0.6, "alpha": 0.55, "zorder": 1.8, "clip_on": False}
     for name, least in (("j", -1.0), ("acc", 0.0)):
         low, high = row.get(f"{name}_ci_low", np.nan), row.get(f"{name}_ci_high", np.nan)
@@ -122,7 +136,10 @@ def _draw_intervals(axes: Axes, row: Mapping[Any, Any], colour: str) -> None:
 
 
 def _draw_frontier(axes: Axes, guided: pd.DataFrame) -> None:
-    """Draw the frontier: dashed steps around the points that some model under guided equals or exceeds in Acc and J."""
+    """Draw the frontier.
+
+    Dashed steps around the points that some model under guided equals or exceeds in Acc and J.
+    """
     at = guided.sort_values(["acc", "j"], ascending=False)[["acc", "j"]].to_numpy(float)
     steps, best = [], 0.0
     for acc, j in at:

@@ -1,4 +1,7 @@
-"""The colour (by family) and marker of each model in all figures, and shared parts of figures in (Acc, J)."""
+"""Choose the colour (by family) and marker of each model in all figures.
+
+Figures in (Acc, J) share further parts.
+"""
 
 from __future__ import annotations
 
@@ -19,13 +22,16 @@ OWN, REFERENCE = "own", "reference"
 
 
 def family_of(model: str) -> str:
-    """Return the registry's family of a model; `own` if the model is not in the registry."""
+    """Return the registry's family of a model.
+
+    `own` if the model is not in the registry.
+    """
     entry = load_models().get(model)
     return entry.groups.family if entry else OWN
 
 
 def families() -> list[str]:
-    """Return all families: first the paper's, then the others in the registry's order, then `own`."""
+    """Return all families: the paper's, then the registry's others, then `own`."""
     known = [entry.groups for entry in load_models().values()]
     order = [g.family for g in known if g.group != "reference"] + [g.family for g in known if g.group == "reference"]
     return list(dict.fromkeys([*order, OWN]))
@@ -38,7 +44,10 @@ def family_colour(family: str) -> str:
 
 
 def looks(models: Iterable[str]) -> dict[str, tuple[str, str]]:
-    """Return colour (its family's) and marker of each model; up to 13 models of a family differ in their marker."""
+    """Return colour (its family's) and marker of each model.
+
+    Up to 13 models of a family differ in their marker.
+    """
     known = dict.fromkeys([*load_models(), *sorted(set(models))])
     colours = {model: family_colour(family_of(model)) for model in known}
     alike = {colour: [m for m in known if colours[m] == colour] for colour in COLOURS}
@@ -46,7 +55,9 @@ def looks(models: Iterable[str]) -> dict[str, tuple[str, str]]:
 
 
 def frame_plane(axes: Axes, points: pd.DataFrame, ylabel: str, *, intervals: bool = False) -> None:
-    """Set the limits around points (columns j and acc), at least half of each axis, and draw contours of PECS.
+    """Set the limits around points (columns j and acc), and draw PECS contours.
+
+    At least half of each axis is shown.
 
     intervals: whether the 95 % intervals of the points are drawn, too.
     """
@@ -68,14 +79,20 @@ def frame_plane(axes: Axes, points: pd.DataFrame, ylabel: str, *, intervals: boo
 
 
 def _values(points: pd.DataFrame, name: str, least: float, *, intervals: bool) -> np.ndarray:
-    """Return the values of a column, and the ends of their intervals, clipped to possible values."""
+    """Return a column's values and the ends of their intervals.
+
+    They are clipped to possible values.
+    """
     names = [name, *(end for end in (f"{name}_ci_low", f"{name}_ci_high") if intervals and end in points)]
     values = points[names].to_numpy(float).ravel()
     return np.clip(values[np.isfinite(values)], least, 1.0)
 
 
 def _limits(values: np.ndarray, low: float, least: float) -> tuple[float, float]:
-    """Return ends of an axis of fractions: tenths around the values, within [low, 1], the upper at least `least`."""
+    """Return ends of an axis of fractions: tenths around the values.
+
+    They lie within [low, 1], the upper at `least` or above.
+    """
     if not len(values):
         return low, 1.0
     bottom = low if least else max(low, float(np.floor(10 * values.min() - 0.8)) / 10)

@@ -1,4 +1,7 @@
-"""Figures of probes and steering: probe curves, the Cf->Cf strip, dose and response, cosines (docs/spec.md 10)."""
+"""Draw figures of probes and steering (docs/spec.md 10).
+
+Probe curves, the Cf->Cf strip, dose and response, cosines.
+"""
 
 from __future__ import annotations
 
@@ -50,9 +53,11 @@ def _bar_key(label: str, width: float = 2.2, color: str = SOFT) -> Line2D:
 
 
 def probe_curves(results: Results) -> Figure:
-    """Return AUROC by layer of the twelve ordered pairs, with a row per model and a column per transfer type. The band
-    shows label-shuffled probes within a dataset (mean ± 2 deviations over shuffles); a hollow marker is the layer
-    chosen without the target's labels."""
+    """Return AUROC by layer of the twelve ordered pairs.
+
+    Each model has a row, each transfer type a column. The band shows label-shuffled probes within a dataset (mean ± 2
+    deviations over shuffles); a hollow marker is the layer chosen without the target's labels.
+    """
     rows = results.probes
     curves = rows.loc[(rows["analysis"] == "transfer") & rows["value"].notna()]
     if not len(curves):
@@ -103,9 +108,11 @@ def _shuffled_band(ax: Axes, rows: pd.DataFrame) -> None:
 
 
 def confabulated_strip(results: Results) -> Figure:
-    """Return AUROC of every ordered pair on all samples (hollow) and on confabulated voids with their controls
-    (filled), both at the best layer of all samples; the bar is the median of the model's filled markers, the dashed
-    line is chance."""
+    """Return AUROC of every ordered pair on all samples and on confabulated voids.
+
+    Hollow: all samples. Filled: confabulated voids with their controls. Both are at the best layer of all samples; the
+    bar is the median of the model's filled markers, the dashed line is chance.
+    """
     rows = best_layers(results.probes)
     if not len(rows) or rows.loc[:, "cf_value"].isna().all():
         absent = "no dataset has confabulated voids" if len(rows) else why(results)
@@ -143,11 +150,12 @@ def _strip(ax: Axes, rows: pd.DataFrame) -> None:
 
 
 def dose_response(results: Results) -> Figure:
-    """Return abstention against α on controls (+α) and voids (−α), for each model and each of its path sets, along
-    directions of the standard prompt under guided inference if they were run. Directions of the occlusion family are
-    blue, those of the chaotic family red; of the transfer set, the four paths between the domains onto visual voids are
-    strong and the others faint. n is the number of answers of a marker. Grey is the mean over the paths with its 95 %
-    interval from resampled scenarios.
+    """Return abstention against α on controls (+α) and voids (−α).
+
+    Each model and each of its path sets has a panel, along directions of the standard prompt under guided inference if
+    they were run. Directions of the occlusion family are blue, those of the chaotic family red; of the transfer set,
+    the four paths between the domains onto visual voids are strong and the others faint. n is the number of answers of
+    a marker. Grey is the mean over the paths with its 95 % interval from resampled scenarios.
     """
     rows = effects.paths(results.effects)
     rows = rows.loc[rows["kind"] == "void"]
@@ -195,7 +203,10 @@ def _mean_band(ax: Axes, shares: pd.DataFrame) -> None:
 
 
 def _panels(rows: pd.DataFrame) -> Mapping[tuple[str, str], pd.DataFrame]:
-    """Return rows of each model and complete path set, of standard directions under guided if the model has them."""
+    """Return rows of each model and complete path set.
+
+    Of standard directions under guided if the model has them.
+    """
     panels: dict[tuple[str, str], pd.DataFrame] = {}
     for model, of in rows.groupby("model", sort=False):
         guided = (of["directions"] == "standard").astype(int) + 2 * (of["regime"] == "guided").astype(int)
@@ -222,11 +233,12 @@ def _doses(ax: Axes, part: pd.DataFrame, side: str, strong: Collection[tuple[str
 
 
 def cosine_heatmaps(results: Results) -> Figure:
-    """Return cosines of the four void directions at the steered layer, one panel per model (and VQA prompt), on one
-    scale of ±0.6. Below the diagonal: of the directions themselves. Above it: corrected for the noise of few pairs and
-    of shared controls, with a star if the 95 % interval excludes 0. On the diagonal: of the directions of two halves of
-    the pairs; if it is low, a small cosine is uninformative. A dash is a pair without a figure; the paper has one
-    figure per pair.
+    """Return cosines of the four void directions at the steered layer.
+
+    Each model (and VQA prompt) has a panel, on one scale of ±0.6. Below the diagonal: of the directions themselves.
+    Above it: corrected for the noise of few pairs and of shared controls, with a star if the 95 % interval excludes 0.
+    On the diagonal: of the directions of two halves of the pairs; if it is low, a small cosine is uninformative. A dash
+    is a pair without a figure; the paper has one figure per pair.
     """
     rows = results.cosines
     rows = rows.loc[rows["prompt"] == rows["other_prompt"]]

@@ -1,1 +1,1 @@
-"""The tables of docs/spec.md 10, from the `Results` of a study or of the paper."""
+"""Tabulate the `Results` of a study or of the paper (docs/spec.md 10)."""

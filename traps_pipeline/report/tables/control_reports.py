@@ -1,4 +1,7 @@
-"""Tables of controls for the mechanistic claims: baselines of probes, nulls of directions, PECS under gates."""
+"""Tabulate controls for the mechanistic claims.
+
+Baselines of probes, nulls of directions, PECS under gates.
+"""
 
 from __future__ import annotations
 
@@ -48,28 +51,36 @@ WHAT = {
 
 
 def probe_baselines(results: Results) -> list[PrintedTable]:
-    """Return the probe on states beside probes on raw inputs, the output margin and noise; also on look-alikes."""
+    """Return the probe on states beside baselines; also on look-alikes.
+
+    The baselines are raw inputs, the output margin and noise.
+    """
     return [_beside(results), _look_alikes(results)]
 
 
 def beside(results: Results) -> pd.DataFrame:
-    """Return one row per model and ordered pair of datasets, with the probe's figure and each baseline.
+    """Return the probe's score and each baseline, by model and ordered pair.
+
+    The pair is one of datasets.
 
     Pairs include a dataset on itself. The figure is at the target's chosen layer, with its interval. Within a taxonomy
     all are fitted without the scored scenario (`held_out`), otherwise on all of the source (`transfer`).
     """
     import pandas as pd
 
-    wanted = pd.DataFrame(
+    selected = pd.DataFrame(
         [(s, t, "held_out" if taxonomy_of(s) == taxonomy_of(t) else "transfer") for s in DATASETS for t in DATASETS],
         columns=pd.Index(["source", "target", "analysis"]),
     )
     probe = results.probes.loc[results.probes["chosen"].eq(True)]
-    return _with_baselines(results, probe.merge(wanted, on=["source", "target", "analysis"]))
+    return _with_baselines(results, probe.merge(selected, on=["source", "target", "analysis"]))
 
 
 def look_alikes(results: Results) -> pd.DataFrame:
-    """Return `beside` for items that only resemble voids, by probes of the datasets of their taxonomy."""
+    """Return `beside` for items that only resemble voids.
+
+    The probes are those of the datasets of their taxonomy.
+    """
     probe = results.probes.loc[results.probes["chosen"].eq(True) & results.probes["target"].isin([*WHAT])]
     own = [taxonomy_of(s) == probed_taxonomy(t) for s, t in zip(probe["source"], probe["target"], strict=True)]
     return _with_baselines(results, probe.loc[own])
@@ -142,7 +153,10 @@ AGAINST = {"answerable_void": "voids", "answerable_control": "controls", "time_s
 
 
 def steering_nulls(results: Results) -> list[PrintedTable]:
-    """Return void directions on their own datasets among nulls of their length, and PECS of the steered model."""
+    """Return void directions on their own datasets among nulls of their length.
+
+    PECS of the steered model follows.
+    """
     return [_nulls(results), _pecs(results)]
 
 
@@ -223,8 +237,9 @@ SOURCE_NAMES = {f"one:{name}": short for name, short in SHORT.items()}
 
 
 def gate(results: Results) -> list[PrintedTable]:
-    """Return PECS before and after probe gates, by source, threshold and features; and the change by them and by the
-    prompt.
+    """Return PECS before and after probe gates, by source, threshold and features.
+
+    The change by them and by the prompt stands beside.
     """
     return [_gate_sources(results), _gate_controls(results), _gate_answerable(results), _prompts(results)]
 
@@ -244,7 +259,10 @@ _GATE_NOTES = (
 
 
 def _gates(results: Results) -> pd.DataFrame:
-    """Return the rows of gates: on states first, from other datasets, at the mid threshold, over all datasets."""
+    """Return the rows of gates.
+
+    On states first, from other datasets, at the mid threshold, over all datasets.
+    """
     rows = results.gate
     firsts = {"features": "states", **DEFAULT_GATE, "target": "all"}
     later = {f"{name}_later": rows[name].astype(object) != first for name, first in firsts.items()}
@@ -309,7 +327,9 @@ def _gate_answerable(results: Results) -> PrintedTable:
 
 
 def prompts(results: Results) -> pd.DataFrame:
-    """Return one row per model and dataset, with AbsRec under standard and guided (shares) and their difference.
+    """Return AbsRec under standard and guided, by model and dataset.
+
+    They are shares; their difference stands beside.
 
     Also, for both prompts, the AUROC of the probe (at the dataset's chosen layer, fitted without the scored scenario)
     and of the output margin; those of the best raw input and of noise; n_answered, the fewest voids answered under

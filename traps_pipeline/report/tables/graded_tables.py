@@ -1,4 +1,7 @@
-"""Models' earnings on graded cuts, beside an ideal observer and strategies that know nothing of a clip."""
+"""Tabulate models' earnings on graded cuts.
+
+Beside an ideal observer and strategies that know nothing of a clip.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +20,10 @@ WHY = "graded cuts were not asked (name `graded` under datasets)"
 
 
 def graded(results: Results) -> list[PrintedTable]:
-    """Return the expected points of each model on cuts whose answers have known probabilities, and its losses by
-    ignorance, by rash answers and by needless abstention.
+    """Return the expected points of each model on graded cuts, and its losses.
+
+    The answers of such cuts have known probabilities; losses are by ignorance, by rash answers and by needless
+    abstention.
     """
     rows = results.graded
     rows = rows.loc[rows["scope"] == "all"]

@@ -1,4 +1,4 @@
-"""Tables of the paper's untested assumptions, dose by dose (docs/hypotheses.md)."""
+"""Tabulate the paper's untested assumptions, dose by dose (docs/hypotheses.md)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ _HEADINGS = {"acc": "Acc %", "false_abs": "FalseAbs %", "abs_rec": "AbsRec %", "
 
 
 def hypotheses(results: Results) -> list[PrintedTable]:
-    """Return how answers and abstentions change as one property changes step by step, beside shortcut rules."""
+    """Return how answers and abstentions change as one property changes by steps.
+
+    Shortcut rules stand beside.
+    """
     from traps_pipeline.scoring.doses import HYPOTHESES
 
     return [_of(results.hypotheses, hypothesis) for hypothesis in HYPOTHESES]
@@ -42,14 +45,14 @@ def _of(rows: pd.DataFrame, hypothesis: Hypothesis) -> PrintedTable:
     }
     rules = {f"{name}_shown": [_rule(row, name) for row in own.to_dict("records")] for name in ("value", "change")}
     own = own.assign(**shown, **{f"rule_{name}": values for name, values in rules.items()})
-    what = "J" if hypothesis.figure == "j" else "abstentions"
+    kind = "J" if hypothesis.figure == "j" else "abstentions"
     columns = [
         MODEL, REGIME, Column("dose", "Dose"), Column("counts_as", "Counts as"),
         Column("n_scenarios", "Scenarios", "count"),
         *[Column(f"{name}_shown", heading, "range") for name, heading in _HEADINGS.items()],
-        Column("change_shown", f"Change of {what}", "range", group=True),
+        Column("change_shown", f"Change of {kind}", "range", group=True),
         Column("chance", "Guess %", "percent", group=True),
-        Column("rule_value_shown", f"Best rule’s {what} %"), Column("rule_change_shown", "Largest change of a rule"),
+        Column("rule_value_shown", f"Best rule’s {kind} %"), Column("rule_change_shown", "Largest change of a rule"),
     ]  # fmt: skip
     notes = [
         f"change: in points, from “{hypothesis.doses[0].name}”, on the scenarios that both have; brackets: 95 % "

@@ -1,4 +1,6 @@
-"""Shared columns, marks and notes of tables about mechanistic analyses, and the baselines beside a probe's figures.
+"""Share columns, marks and notes of tables about mechanistic analyses.
+
+The baselines beside a probe's scores are here, too.
 
 The baselines are the best of the raw inputs, the output margin and the floor of noise.
 """
@@ -39,14 +41,20 @@ BASELINE_NOTES = (
 
 
 def why(results: Results, of_paper: str = "") -> str:
-    """Return why a frame of mechanistic analyses has no rows. of_paper: the reason for the paper's."""
+    """Return why a frame of mechanistic analyses has no rows.
+
+    of_paper: the reason for the paper's.
+    """
     if of_paper and not results.is_study:
         return of_paper
     return NO_MECHANISM if results.is_study and results.mechanism is None else results.why("probes")
 
 
 def few(rows: pd.DataFrame, *counts: str) -> list[str]:
-    """Return the mark of each row: a dagger if one of the counts is below FEW; empty for unknown counts."""
+    """Return the mark of each row: a dagger if one of the counts is below FEW.
+
+    Empty for unknown counts.
+    """
     import pandas as pd
 
     numbers = [pd.to_numeric(rows[name], errors="coerce") for name in counts]
@@ -54,7 +62,10 @@ def few(rows: pd.DataFrame, *counts: str) -> list[str]:
 
 
 def few_note(rows: pd.DataFrame, *marks: str, of: str = "controls or voids") -> list[str]:
-    """Return the meaning of the mark, if a row has it in one of these columns. of: the counted things."""
+    """Return the meaning of the mark, if a row has it in one of these columns.
+
+    of: the counted things.
+    """
     used = any((rows[name] == FEW_MARK).any() for name in marks or ("mark",) if name in rows)
     return [f"{FEW_MARK} fewer than {FEW} {of}: the value says little"] if used else []
 
@@ -78,7 +89,10 @@ def path_names(rows: pd.DataFrame) -> list[str]:
 
 
 def by_features(results: Results) -> pd.DataFrame:
-    """Return one row per AT of `probe_baselines`: the value of each of its features, and noise_spread."""
+    """Return one row per AT of `probe_baselines`.
+
+    The value of each of its features, and noise_spread.
+    """
     import pandas as pd
 
     rows = results.baselines
@@ -89,7 +103,10 @@ def by_features(results: Results) -> pd.DataFrame:
 
 
 def against(results: Results, analysis: str) -> pd.DataFrame:
-    """Return BESIDE of each model, source and target under an analysis: best raw input, output margin and noise."""
+    """Return BESIDE of each model, source and target under an analysis.
+
+    They are the best raw input, the output margin and noise.
+    """
     import pandas as pd
 
     rows = by_features(results)
@@ -101,7 +118,10 @@ def against(results: Results, analysis: str) -> pd.DataFrame:
 
 
 def best_name(values: Mapping[Any, float]) -> str:
-    """Return the feature with the highest AUROC; NO_RAW where none is above chance, empty where there is none."""
+    """Return the feature with the highest AUROC.
+
+    NO_RAW where none is above chance, empty where there is none.
+    """
     known = {str(name): value for name, value in values.items() if value == value}
     best = max(known, key=lambda name: known[name], default="")
     return NO_RAW if best and known[best] <= 0.5 else best
@@ -119,5 +139,8 @@ def baseline_columns(results: Results, prefix: str = "", head: str = "") -> list
 
 
 def baseline_notes(results: Results) -> list[str]:
-    """Return notes that explain the columns of BESIDE; empty for the paper, which has none."""
+    """Return notes that explain the columns of BESIDE.
+
+    Empty for the paper, which has none.
+    """
     return [*BASELINE_NOTES] if results.is_study else []

@@ -1,4 +1,7 @@
-"""Tables of the judges' agreement and bias, of confabulation, and of its validation (docs/spec.md 4.4 and 6)."""
+"""Tabulate judges' agreement and bias, and confabulation.
+
+Its validation is here, too (docs/spec.md 4.4 and 6).
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,10 @@ if TYPE_CHECKING:
 
 
 def agreement(results: Results) -> list[PrintedTable]:
-    """Return the panel's agreement by dataset and task, and the lowest agreement of any two of its judges."""
+    """Return the panel's agreement by dataset and task.
+
+    The lowest agreement of any two of its judges stands beside.
+    """
     rows = results.agreement
     pairs = rows.loc[rows["judges"] != "panel"].groupby(["dataset", "task"])["agreement"].min().rename("lowest_pair")
     rows = rows.loc[rows["judges"] == "panel"].merge(pairs.reset_index(), on=["dataset", "task"], how="left")
@@ -60,19 +66,23 @@ def judge_bias(results: Results) -> list[PrintedTable]:
         Column("dissent_yes", "Yes against it %", "percent", 2), Column("dissent_no", "No against it %", "percent", 2),
         Column("n_votes", "Votes", "count"), Column("n_invalid", "Invalid", "count"),
     ]  # fmt: skip
-    left = results.leave_one_out
-    left = left.loc[left["dataset"] == "overall"] if "overall" in set(left["dataset"]) else left
-    left = ordered(with_titles(left), ["model", "regime", "without"])
+    leave_one_out = results.leave_one_out
+    leave_one_out = (
+        leave_one_out.loc[leave_one_out["dataset"] == "overall"]
+        if "overall" in set(leave_one_out["dataset"])
+        else leave_one_out
+    )
+    leave_one_out = ordered(with_titles(leave_one_out), ["model", "regime", "without"])
     without = [
         MODEL, REGIME, DATASET, Column("without", "Without"),
         Column("pecs", "PECS of two", "fraction"), Column("pecs_panel", "PECS of three", "fraction"),
         Column("difference", "Difference", "fraction"), N, RUNS, MISSING,
     ]  # fmt: skip
-    notes = ["two judges: one against one is undecided and counts as missing", epochs(left)]
+    notes = ["two judges: one against one is undecided and counts as missing", epochs(leave_one_out)]
     why = results.why("bias")
     return [
         PrintedTable("judge_bias", "Each judge against the panel", bias, columns, [epochs(bias)], why, _task_trace),
-        PrintedTable("leave_one_judge_out", "PECS without one judge", left, without, notes, why, cell_trace),
+        PrintedTable("leave_one_judge_out", "PECS without one judge", leave_one_out, without, notes, why, cell_trace),
     ]
 
 

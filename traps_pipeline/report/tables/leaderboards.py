@@ -1,4 +1,4 @@
-"""Leaderboards: overall and by dataset (docs/spec.md 5.2 and 10)."""
+"""Tabulate leaderboards, overall and by dataset (docs/spec.md 5.2 and 10)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,10 @@ if TYPE_CHECKING:
 
 
 def overall(results: Results) -> list[PrintedTable]:
-    """Return the overall leaderboard: every model except the replication families, best PECS first."""
+    """Return the overall leaderboard, best PECS first.
+
+    It has every model except the replication families.
+    """
     return [_overall(results, "overall", "Overall leaderboard", replication=False)]
 
 
@@ -110,7 +113,10 @@ def _n(title: str, counts: pd.Series) -> str:
 
 
 def expanded(results: Results) -> list[PrintedTable]:
-    """Return twelve tables, one per dataset and regime: Acc, AbsRec, FalseAbs and PECS of every model."""
+    """Return twelve tables of every model, one per dataset and regime.
+
+    They give Acc, AbsRec, FalseAbs and PECS.
+    """
     cells = marked(results.cells)
     tables = []
     for dataset in DATASETS:

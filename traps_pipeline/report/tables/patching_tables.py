@@ -1,4 +1,4 @@
-"""Indirect effects of activation patching, beside their nulls."""
+"""Tabulate indirect effects of activation patching, beside their nulls."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ SITES = {"residual": "residual stream", "attention": "attention", "mlp": "MLP"}
 
 
 def patching(results: Results) -> list[PrintedTable]:
-    """Return indirect effects of activation patching, by site and group of positions, beside nulls."""
+    """Return indirect effects of activation patching, beside nulls.
+
+    Each site and group of positions has a row.
+    """
     rows = results.patching
     keys = ["model", "dataset", "into", "site", "layer", "group"]
     nulls = rows.loc[rows["source"] != "pair"]

@@ -1,4 +1,7 @@
-"""Tables of probes (docs/spec.md 7): transfer, Cf->Cf, within a dataset, layers, centroids; beside baselines."""
+"""Tabulate probes beside baselines (docs/spec.md 7).
+
+Transfer, Cf->Cf, within a dataset, layers, centroids.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +42,10 @@ if TYPE_CHECKING:
 
 
 def probes(results: Results) -> list[PrintedTable]:
-    """Return probes between datasets: best layers, Cf->Cf, means by type, layers without the target's labels."""
+    """Return probes between datasets.
+
+    Tables give best layers, Cf->Cf, means by type, and layers chosen without the target's labels.
+    """
     pairs = _pairs(results)
     tables = [_transfer(results, pairs), _confabulated(results, pairs), _means(results, pairs), _within(results)]
     return [*tables, _layers(results), _catch(results)]
@@ -51,7 +57,10 @@ APART = "not computed; held out: these datasets share no controls and no scenari
 
 
 class At(NamedTuple):
-    """A rule that selects a pair's row of PROBES (an analysis, at the layer with a flag), and its columns."""
+    """A rule that selects a pair's row of PROBES, and its columns.
+
+    The row is of an analysis, at the layer with a flag.
+    """
 
     analysis: str
     flag: str
@@ -73,7 +82,10 @@ BASELINES = {"": "transfer", "cf_": "confabulated", "held_": "held_out", "cf_hel
 
 
 def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return PAIR_FIGURES, one row per model and ordered pair: best and chosen layers, and Cf->Cf at both."""
+    """Return PAIR_FIGURES, one row per model and ordered pair.
+
+    They are best and chosen layers, and Cf->Cf at both.
+    """
     import pandas as pd
 
     def by_pair(analysis: str, chosen: Any) -> dict[tuple[str, ...], dict[str, Any]]:
@@ -82,17 +94,17 @@ def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
 
     transfers = by_pair("transfer", rows["model"].notna())
     known = rows["value"].notna()
-    figures = {name: by_pair(at.analysis, rows[at.flag].eq(True) & known) for name, at in PAIR_FIGURES.items()}
+    figures = {name: by_pair(rule.analysis, rows[rule.flag].eq(True) & known) for name, rule in PAIR_FIGURES.items()}
     notes = [by_pair(name, rows["note"].notna()) for name in ("confabulated", "confabulated_held_out")]
     table = [
         dict(zip(KEYS, key, strict=True))
         | {"path": path_name(*key[1:]), "transfer_type": transfer_type(*key[1:])}
         | {
             f"{name}_{c}": figures[name].get(key, {}).get(c, np.nan)
-            for name, at in PAIR_FIGURES.items()
-            for c in at.columns
+            for name, rule in PAIR_FIGURES.items()
+            for c in rule.columns
         }
-        | {"note": next((of[key]["note"] for of in notes if key in of), "")}
+        | {"note": next((notes_of[key]["note"] for notes_of in notes if key in notes_of), "")}
         for model in rows["model"].unique()
         for key in ((str(model), *pair) for pair in TRANSFER_PAIRS)
         if key in transfers
@@ -200,7 +212,10 @@ def _listed(names: pd.Series) -> str:
 
 
 def _held_out(results: Results, prefix: str = "", head: str = "") -> list[Column]:
-    """Return the figure without the scored scenario, and the floor of noise under that split."""
+    """Return the score without the scored scenario.
+
+    The floor of noise under that split stands beside.
+    """
     if not results.is_study:
         return []
     noise, spread = f"{prefix}held_noise", f"{prefix}held_noise_spread"
@@ -282,7 +297,10 @@ def _catch(results: Results) -> PrintedTable:
 
 
 def _caught_columns() -> Iterator[Column]:
-    """Yield the columns of each kind of baseline: the assigned share of look-alikes and of controls."""
+    """Yield the columns of each kind of baseline.
+
+    The assigned share of look-alikes and of controls.
+    """
     yield Column("raw", "Best raw input")
     for name, heading in (("raw", "catches %"), ("margin", "Output margin %"), ("noise", "Noise %")):
         yield Column(f"{name}_void", heading, "percent")
@@ -297,7 +315,9 @@ def _centroids(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _caught_beside(results: Results) -> pd.DataFrame:
-    """Return one row per model, target and sub-scenario: shares that the baselines assign to void.
+    """Return the shares that the baselines assign to void.
+
+    Each model, target and sub-scenario has a row.
 
     Baselines are the best raw input, the output margin and noise; shares, also of controls, are means over sources.
     """
@@ -348,9 +368,9 @@ def layer_curves(rows: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
     import pandas as pd
 
     parts, notes = [pd.DataFrame(columns=pd.Index(["model", "layer", "n_at_top"]))], list[str]()
-    for model, of in rows.groupby("model", sort=False):
-        curves = pair_curves({str(name): value for name, value in row.items()} for row in of.to_dict("records"))
-        within = of.loc[of["analysis"] == "within", ["source", "layer", "value"]]
+    for model, group in rows.groupby("model", sort=False):
+        curves = pair_curves({str(name): value for name, value in row.items()} for row in group.to_dict("records"))
+        within = group.loc[group["analysis"] == "within", ["source", "layer", "value"]]
         if not curves or not len(within):
             continue
         part = within.assign(top=within["value"] >= within.groupby("source")["value"].transform("max") - ROUNDING)

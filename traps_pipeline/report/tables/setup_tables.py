@@ -1,4 +1,7 @@
-"""Tables of a study's setup: models, their parameters, and the benchmark's composition (docs/spec.md 2 and 3)."""
+"""Tabulate a study's setup (docs/spec.md 2 and 3).
+
+Models, their parameters, and the benchmark's composition.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,10 @@ from traps_pipeline.storage.media import MediaSpec
 
 
 def models(results: Results) -> list[PrintedTable]:
-    """Return the evaluated models: provider, how a clip is shown, and the number of runs, from the registry."""
+    """Return the evaluated models, from the registry.
+
+    Each has its provider, how a clip is shown, and the number of runs.
+    """
     rows = []
     for entry in _entries(results):
         rows.append(
@@ -41,7 +47,10 @@ def _shown(media: MediaSpec | None) -> str:
 
 
 def hyperparameters(results: Results) -> list[PrintedTable]:
-    """Return the parameters that models and judges are sent, and where they depart from the protocol."""
+    """Return the parameters that models and judges are sent.
+
+    Departures from the protocol are marked.
+    """
     judges = [*load_judges().values()]
     if results.is_study:
         voted = set(results.bias["judge"])
@@ -64,14 +73,14 @@ def hyperparameters(results: Results) -> list[PrintedTable]:
 
 def _sent(entry: Entry, role: str) -> dict[str, Any]:
     named = ("temperature", "top_p", "max_tokens", "max_completion_tokens")
-    other = {name: value for name, value in entry.params.items() if name not in named}
+    other_params = {name: value for name, value in entry.params.items() if name not in named}
     return {
         "id": entry.id,
         "role": role,
         "temperature": entry.params.get("temperature"),
         "top_p": entry.params.get("top_p"),
         "max_tokens": entry.max_tokens or None,
-        "other": ", ".join(f"{name}: {_flat(value)}" for name, value in sorted(other.items())),
+        "other": ", ".join(f"{name}: {_flat(value)}" for name, value in sorted(other_params.items())),
         "concurrency": entry.limits.concurrency,
         "retries": entry.limits.retries,
         "waived": "; ".join(f"{name}: {reason}" for name, reason in sorted(entry.waivers.items())),

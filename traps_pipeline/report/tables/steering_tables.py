@@ -1,4 +1,4 @@
-"""Tables of directions and steering (docs/spec.md 8)."""
+"""Tabulate directions and steering (docs/spec.md 8)."""
 
 from __future__ import annotations
 
@@ -41,13 +41,14 @@ SETS = {"transfer": "transfer", "within_domain": "within domain"}
 
 
 def cosines(results: Results) -> list[PrintedTable]:
-    """Return cosines of void directions, of datasets under one prompt and of a dataset under both; and their
-    reliability.
+    """Return cosines of void directions, and their reliability.
+
+    Directions are of datasets under one prompt, and of a dataset under both.
     """
     rows = results.cosines
     order = [*SHORT]
-    place, other = ([order.index(name) for name in rows[column]] for column in ("dataset", "other_dataset"))
-    rows = rows.assign(step=np.subtract(other, place))
+    place, other_place = ([order.index(name) for name in rows[column]] for column in ("dataset", "other_dataset"))
+    rows = rows.assign(step=np.subtract(other_place, place))
     across = (rows["prompt"] == STANDARD) & (rows["other_prompt"] == GUIDED) & (rows["step"] == 0)
     rows = rows.loc[((rows["prompt"] == rows["other_prompt"]) & (rows["step"] > 0)) | across]
     own = ["model", "prompt", "dataset"]
@@ -86,7 +87,10 @@ def _place(values: pd.Series) -> pd.Series:
 
 
 def steering(results: Results) -> list[PrintedTable]:
-    """Return abstention under steering: overall, by regime, family and domain, at the top alpha, by alpha, by layer."""
+    """Return abstention under steering.
+
+    It is given overall, by regime, family and domain, at the top alpha, by alpha and by layer.
+    """
     return [
         _shares(results),
         _regimes(results, "steering_regimes", "Steering: direction regime against inference regime"),
@@ -195,12 +199,18 @@ _SIDES = (
 
 
 def _in_gaps(results: Results) -> list[Column]:
-    """Return the dose in units of the class gap of the direction's own dataset; the paper does not print its gaps."""
+    """Return the dose in units of the class gap of the direction's own dataset.
+
+    The paper does not print its gaps.
+    """
     return [Column("control_gaps", "in class gaps", "ratio", 2)] if results.is_study else []
 
 
 def _counts(results: Results) -> list[Column]:
-    """Return the numbers of answers behind a cell's two shares; the paper prints neither."""
+    """Return the numbers of answers behind a cell's two shares.
+
+    The paper prints neither.
+    """
     if not results.is_study:
         return []
     return [
@@ -210,7 +220,10 @@ def _counts(results: Results) -> list[Column]:
 
 
 def _cell_notes(results: Results) -> list[str]:
-    """Return notes on the maximum answers of a cell, and its consequence for figures made of cells."""
+    """Return notes on the maximum answers of a cell.
+
+    They name its consequence for scores made of cells.
+    """
     counts = results.effects["n"].dropna()
     if not len(counts):
         return []

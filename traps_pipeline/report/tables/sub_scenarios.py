@@ -1,4 +1,4 @@
-"""Tables of sub-scenarios of both taxonomies (docs/spec.md 2.2 and 5.4)."""
+"""Tabulate sub-scenarios of both taxonomies (docs/spec.md 2.2 and 5.4)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,10 @@ if TYPE_CHECKING:
 
 
 def occlusion_sub_scenarios(results: Results) -> list[PrintedTable]:
-    """Return means over models of every occlusion sub-scenario, and the hidden ones compared with the others."""
+    """Return means over models of every occlusion sub-scenario.
+
+    The hidden ones are compared with the others.
+    """
     rows = _sub_rows(results, "occlusion")
     tables = [_sub_table(results, rows, "occlusion_sub_scenarios", "Occlusion sub-scenarios")]
     hidden = analyses.hidden_against_others(rows) if len(rows) else rows
@@ -44,7 +47,10 @@ def occlusion_sub_scenarios(results: Results) -> list[PrintedTable]:
 
 
 def chaotic_sub_scenarios(results: Results) -> list[PrintedTable]:
-    """Return means over models of every chaotic family, and Acc by the control's answer."""
+    """Return means over models of every chaotic family.
+
+    Acc by the control's answer follows.
+    """
     rows = _sub_rows(results, "chaotic")
     labels = results.labels
     labels = with_titles(labels.loc[labels["dataset"].map(taxonomy_of) == "chaotic"])
@@ -83,7 +89,7 @@ def _sub_table(results: Results, rows: pd.DataFrame, name: str, title: str) -> P
     notes = [epochs(rows), f"means over models{left_out}", "standard, where no regime is named"]
     fewer = {"guided": "guided_n_models", "Δ": "uplift_n_models", "ill-posed": "ill_posed_n_models"}
     if any(((rows[name] != rows["n_models"]) & (rows[name] > 0)).any() for name in fewer.values()):
-        columns += [Column(name, f"Models, {what}", "count") for what, name in fewer.items()]
+        columns += [Column(name, f"Models, {words}", "count") for words, name in fewer.items()]
     notes += marks(rows)
     taxonomy = "occlusion" if name.startswith("occlusion") else "chaotic"
     return PrintedTable(name, title, rows, columns, notes, results.why("sub_scenarios"), _sub_trace(taxonomy))
