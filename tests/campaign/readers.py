@@ -16,7 +16,7 @@ from traps_pipeline.benchmark.composition import load_composition
 from traps_pipeline.benchmark.corrections import fold, read_corrections
 from traps_pipeline.benchmark.records import load_release, load_released
 from traps_pipeline.exchange.answer_exchange import checked_answers
-from traps_pipeline.judging.confabulation import load_protocol
+from traps_pipeline.judging.confabulation_protocol import load_protocol
 from traps_pipeline.judging.robustness import load_attacks
 from traps_pipeline.models.account_budget import AccountBudget
 from traps_pipeline.models.judges import load_judges, load_panel

@@ -16,20 +16,17 @@ from statsmodels.stats.proportion import proportion_confint
 from tests.judging.conftest import answered_study
 from tests.providers.server import Provider
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.judging import confabulation
+from traps_pipeline.judging import confabulation, confabulation_protocol
 from traps_pipeline.judging.confabulation import (
-    PROTOCOL_FILE,
-    VOID_KINDS,
     Labels,
-    Protocol,
     collect_labels,
     draw_sample,
-    load_protocol,
     render,
     sample_failures,
     sample_id,
     void_kind,
 )
+from traps_pipeline.judging.confabulation_protocol import PROTOCOL_FILE, VOID_KINDS, Protocol, load_protocol
 from traps_pipeline.judging.judging_rows import CONFABULATION, VERDICTS, VerdictRow
 from traps_pipeline.judging.panel import parse_judgement
 from traps_pipeline.models.judges import JudgeEntry
@@ -104,7 +101,7 @@ def labeller(
 ) -> Callable[..., JudgeEntry]:
     """The judge at the test provider, told what to say to texts that hold a phrase."""
     judge = judge_at(JUDGE)
-    monkeypatch.setattr(confabulation, "load_judges", lambda: {JUDGE: judge})
+    monkeypatch.setattr(confabulation_protocol, "load_judges", lambda: {JUDGE: judge})
 
     def told(script: dict[str, str]) -> JudgeEntry:
         provider.configure(scripts={JUDGE: script})

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from datetime import date
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -94,6 +94,14 @@ class Scenario:
         if self.released is None:
             raise ValueError(f"{self.scenario_id} was added; it has no released record")
         return apply_words(self.released, self.words, self.where)
+
+
+class _HasFamily(Protocol):
+    @property
+    def family(self) -> str: ...
+
+
+_OfFamily = TypeVar("_OfFamily", bound=_HasFamily)
 
 
 def apply_words(spec: SceneSpec, words: Mapping[str, Any], where: str) -> SceneSpec:
@@ -242,8 +250,8 @@ def corrected_scenarios() -> dict[str, Scenario]:
     return fold(load_released(), read_corrections())
 
 
-def subset(scenarios: Mapping[str, Scenario], study: Study) -> dict[str, Scenario]:
-    """Return the study's named scenarios, or the first n of each family, or all.
+def subset(scenarios: Mapping[str, _OfFamily], study: Study) -> dict[str, _OfFamily]:
+    """Return the study's named scenarios (or records of them), or the first n of each family, or all.
 
     Discarded scenarios are left out without replacement.
     """

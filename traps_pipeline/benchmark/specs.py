@@ -18,7 +18,7 @@ from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import CORRECTIONS, RELEASED, ROOT
-from traps_pipeline.benchmark.corrections import WORDS, Scenario, apply_words, fold, load_scenarios, subset
+from traps_pipeline.benchmark.corrections import WORDS, Scenario, apply_words, load_scenarios, subset
 from traps_pipeline.benchmark.records import load_released, parse_record
 from traps_pipeline.benchmark.versions import spec_content, version_of
 from traps_pipeline.scenes.family_registry import get_family
@@ -197,9 +197,9 @@ def expected_specs(workspace: Workspace, category: str) -> list[SceneSpecRow]:
 
 
 def released_in_study(workspace: Workspace, category: str) -> dict[str, SceneSpec]:
-    """Return a category's released records that the study has uncorrected."""
-    plain = subset(fold(load_released(), ()), workspace.study)
-    return {id_: s.released for id_, s in plain.items() if s.category == category and s.released is not None}
+    """Return the released records of a category that the study would have without any correction."""
+    records = subset(load_released(), workspace.study)
+    return {id_: spec for id_, spec in sorted(records.items()) if spec.category == category}
 
 
 def released_version(workspace: Workspace, category: str) -> str:

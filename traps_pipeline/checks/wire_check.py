@@ -31,7 +31,8 @@ from traps_pipeline.checks.wire_body import (
     flat,
     read_body,
 )
-from traps_pipeline.judging.confabulation import label_request, load_protocol
+from traps_pipeline.judging.confabulation import label_request
+from traps_pipeline.judging.confabulation_protocol import load_protocol
 from traps_pipeline.judging.panel import tasks_for, vote_request
 from traps_pipeline.models.judges import JudgeEntry, load_judges
 from traps_pipeline.models.prompts import system_prompt

@@ -12,119 +12,35 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import cache
-from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.digests import digest
-from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.progress import Tally
-from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml, within
+from traps_pipeline.judging.confabulation_protocol import (
+    OUTPUT,
+    SCHEMA,
+    TASK,
+    TRACE_AND_OUTPUT,
+    VOID_KINDS,
+    load_protocol,
+)
 from traps_pipeline.judging.judging_rows import CONFABULATION, VERDICTS, ConfabulationRow
 from traps_pipeline.judging.panel import Flag, about_answer, ask_judges, judge_request, parse_judgement, quote
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.ask import Call, SettledCell
-from traps_pipeline.models.judges import JudgeEntry, load_judges, thinking_of
+from traps_pipeline.models.judges import JudgeEntry, thinking_of
 from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.prompts import prompt
-from traps_pipeline.models.registry import NETWORK, get_model
 from traps_pipeline.models.request import Request
-from traps_pipeline.models.schemas import structured_output
-from traps_pipeline.protocol.cells import Cell, Evaluation
-from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed
+from traps_pipeline.protocol.cells import Cell
+from traps_pipeline.protocol.datasets import is_ill_posed
 from traps_pipeline.protocol.ratings import AXES
-from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
-
-PROTOCOL_FILE = ASSETS / "confabulation.yaml"
-TASK = "confabulation"
-# The parts of a failure's id, which people's labels refer to: another answer is another failure. They are in the
-# protocol's digest, so that the table is rebuilt when the parts change.
-SAMPLED = ("cell", "item", "answer", "trace that the judge sees")
-SCHEMA = structured_output(TASK, **{axis: {"type": "boolean"} for axis in AXES}, rationale={"type": "string"})
-TRACE_AND_OUTPUT, OUTPUT = "trace_and_output", "output"
-Evidence = Literal["trace_and_output", "output"]
-VOID_KINDS: Mapping[str, str] = {
-    "occluder": "an opaque wall hides the place where the outcome could be seen",
-    "truncation": "the clip ends before the outcome is decided",
-    "question": "the clip shows the whole event, but the question asks for what the clip cannot show, or takes for "
-    "granted something that is not in it",
-}
-
-
-class Validation(BaseModel):
-    """The selection of labelled failures that two people label too."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-    n: int = Field(ge=1)
-    models: list[str] = Field(min_length=1)
-
-
-class Protocol(BaseModel):
-    """The contents of `assets/confabulation.yaml`.
-
-    Each model's sample, each panel's judge, and the judge's prompt.
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-    n: int = Field(ge=1, description="failures per model; all if there are fewer")
-    seed: int
-    regime: str = Field(pattern=f"^({'|'.join(REGIMES)})$")
-    run: int = Field(ge=1)
-    judges: dict[str, str] = Field(description="judge by panel; for a panel that is not here nothing is labelled")
-    models: dict[str, Evidence] = Field(min_length=1)
-    validation: Validation
-
-    def cells(self, model: str) -> list[Cell]:
-        """Return the cells from which a model's failures are drawn."""
-        return [Cell(dataset, Evaluation(model, self.regime, self.run)) for dataset in DATASETS]
-
-    def judge(self, panel: str) -> JudgeEntry | None:
-        """Return the judge of a study with this panel; None if there is none."""
-        name = self.judges.get(panel)
-        return load_judges()[name] if name is not None else None
-
-
-@cache
-def load_protocol(path: Path = PROTOCOL_FILE) -> Protocol:
-    """Return the protocol.
-
-    Raises TrapsError naming the file and the wrong field, model or judge.
-    """
-    protocol = parse_yaml_model(Protocol, read_yaml(path), path)
-    with within(path):
-        runs = {model: get_model(model).runs for model in protocol.models}
-    for model, most in runs.items():
-        if protocol.run > most:
-            raise TrapsError(f"{path}: run is {protocol.run}, but {model} has only {most} runs")
-    strangers = [model for model in protocol.validation.models if model not in protocol.models]
-    if strangers:
-        raise TrapsError(f"{path}: validation.models: {', '.join(strangers)} must be among `models`")
-    for panel, name in protocol.judges.items():
-        judge = load_judges().get(name)
-        if judge is None or judge.backend != NETWORK:
-            known = ", ".join(entry.id for entry in load_judges().values() if entry.backend == NETWORK)
-            raise TrapsError(f"{path}: judges.{panel} is {name!r}; it must be a judge over the network: {known}")
-    return protocol
-
-
-def protocol_digest(panel: str) -> str:
-    """Return the digest of all but the answers that the labels depend on.
-
-    They are those of a study with this panel.
-    """
-    protocol = load_protocol()
-    judge = protocol.judge(panel)
-    call = [judge.id, judge.provider_id, judge.params, SCHEMA, prompt(f"judge_{TASK}"), VOID_KINDS] if judge else None
-    call = [*call, *judge.thinking] if call and judge and judge.thinking else call
-    return digest([protocol.model_dump(exclude={"judges"}), call, SAMPLED])[:16]
-
 
 # --- the sample -------------------------------------------------------------------------------------------------------
 

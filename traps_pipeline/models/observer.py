@@ -5,7 +5,6 @@ This is the ceiling row of a leaderboard.
 
 from __future__ import annotations
 
-import asyncio
 from functools import lru_cache
 from pathlib import Path
 
@@ -37,6 +36,8 @@ class ObserverBackend:
         """Return the outcome of one attempt; see `Backend`."""
         assert request.media is not None, "the observer is asked about clips"
         frames = observer_frames(dataset_of(str(request.about["item_id"])))
+        import asyncio
+
         answer = await asyncio.to_thread(observer_answer, request.media_digest, request.media, request.user, frames)
         text = phrase(answer, request)
         return Outcome("answer", text, finish_reason="stop", served_model=request.participant, cost_usd=0.0)

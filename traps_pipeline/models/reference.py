@@ -8,7 +8,6 @@ crash and a second run give the same answers.
 
 from __future__ import annotations
 
-import asyncio
 import json
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -125,6 +124,8 @@ class ReferenceBackend:
 
     async def ask(self, request: Request) -> Outcome:
         """Return the outcome of one attempt; see `Backend`."""
+        import asyncio
+
         await asyncio.sleep(0)
         misfortune = self._misfortune(request)
         if misfortune is not None:

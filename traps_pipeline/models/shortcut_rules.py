@@ -8,7 +8,6 @@ that has none the commonest answer of the sub-scenario: it abstains by its cue a
 
 from __future__ import annotations
 
-import asyncio
 import re
 from collections.abc import Callable, Mapping
 from functools import lru_cache
@@ -60,6 +59,8 @@ class RuleBackend:
     async def ask(self, request: Request) -> Outcome:
         """Return the outcome of one attempt; see `Backend`."""
         assert request.media is not None, "a rule is asked about clips"
+        import asyncio
+
         answer = await asyncio.to_thread(_answer, request, request.media)
         text = phrase(answer, request)
         return Outcome("answer", text, finish_reason="stop", served_model=request.participant, cost_usd=0.0)

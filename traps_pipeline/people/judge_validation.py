@@ -22,7 +22,8 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.sheets import no_formula
 from traps_pipeline.base.terminal import text_table
 from traps_pipeline.judging.agreement import cohen_kappa
-from traps_pipeline.judging.confabulation import TRACE_AND_OUTPUT, VOID_KINDS, draw_sample, load_protocol, sample_id
+from traps_pipeline.judging.confabulation import draw_sample, sample_id
+from traps_pipeline.judging.confabulation_protocol import TRACE_AND_OUTPUT, VOID_KINDS, load_protocol
 from traps_pipeline.judging.judging_rows import CONFABULATION, JUDGE_VALIDATION
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation

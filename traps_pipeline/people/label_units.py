@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml
-from traps_pipeline.judging.confabulation import load_protocol
+from traps_pipeline.judging.confabulation_protocol import load_protocol
 from traps_pipeline.judging.judging_rows import CONFABULATION, VERDICTS
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.judges import panel_id

@@ -18,7 +18,7 @@ from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.corrections import corrected_scenarios
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.judging.confabulation import load_protocol
+from traps_pipeline.judging.confabulation_protocol import load_protocol
 from traps_pipeline.models.judges import load_judges, load_panel
 from traps_pipeline.models.prompts import prompt, system_prompt, vqa_prompt
 from traps_pipeline.models.registry import load_accounts, load_models

@@ -12,7 +12,8 @@ from typing import Any
 
 from traps_pipeline.benchmark.corrections import load_scenarios
 from traps_pipeline.benchmark.items import expected_items
-from traps_pipeline.judging.confabulation import load_protocol, sample_failures
+from traps_pipeline.judging.confabulation import sample_failures
+from traps_pipeline.judging.confabulation_protocol import load_protocol
 from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.judging.panel import tasks_for, vote_requests
 from traps_pipeline.mechanism.cost import CARDS, Cost, Work, cost_of, passes_inside

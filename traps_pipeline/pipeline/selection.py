@@ -15,6 +15,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.pipeline.graph import name_of, the_graph
 from traps_pipeline.pipeline.lineage import Lineage
+from traps_pipeline.pipeline.study_status import failing_checks
 from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.storage.workspace import Workspace
 
@@ -54,10 +55,13 @@ def require_work(workspace: Workspace, experiment: str, until: str | None) -> No
 
 def failed_checks(workspace: Workspace, experiment: str | None) -> list[str]:
     """Return failed checks of wanted partitions, from this or any earlier run."""
+    failing: dict[tuple[str, str], list[str]] = {}
+    for check, of_stage, partition, _ in failing_checks(workspace):
+        failing.setdefault((of_stage, partition), []).append(check)
     partitions, problems = StudyPartitions(workspace, experiment), []
-    for stage in the_graph().stages:
+    for stage in the_graph().stages if failing else ():
         for key in stage.wanted(partitions):
-            for check in workspace.failed_checks(stage.name, key):
+            for check in sorted(failing.get((stage.name, key or stage.name), ())):
                 details = workspace.failure(stage.name, check, key)
                 problems.append(f"check {check} of {name_of((stage.name, key))} does not pass: {_unquoted(details)}")
     return problems

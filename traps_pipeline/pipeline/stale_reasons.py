@@ -41,10 +41,13 @@ def explain(workspace: Workspace, item_id: str) -> dict[str, Any]:
         truth = current["ground_truth"] if current["side"] == "control" else "none, it is void"
         clip = str(workspace.resolve(current["clip"]))
         explanation |= {"question": current["question"], "ground_truth": truth, "clip": clip}
+    asked = {*workspace.answers.evaluations()}
     for model, entry in load_models().items():
         for regime in REGIMES:
             for run in range(1, entry.runs + 1):
                 evaluation = Evaluation(model, regime, run)
+                if evaluation.key not in asked:
+                    continue
                 rows = [r for r in workspace.answers.read(evaluation.key).rows.values() if _about(r) == item_id]
                 if not rows:
                     continue

@@ -2,46 +2,24 @@
 
 Each has its function of `Results`, and the stages that it reads.
 
-An entry decides its asset, staleness and place on the report page and in `traps results export`.
+An entry decides its asset, staleness and place on the report page and in `traps results export`. It names functions,
+whose modules are imported when they are called: `traps status` reads the entries of all and calls none.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.models.judges import BY_RULES
-from traps_pipeline.report import findings, printed_tables
-from traps_pipeline.report.figures import (
-    abstention,
-    expression_figures,
-    graded_figure,
-    grids,
-    landscape,
-    steering_figures,
-)
-from traps_pipeline.report.figures import control_figures as figures_of_inside
-from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.tables import (
-    comparisons,
-    control_reports,
-    graded_tables,
-    human_tables,
-    hypothesis_tables,
-    judge_tables,
-    leaderboards,
-    patching_tables,
-    setup_tables,
-    sub_scenarios,
-)
-from traps_pipeline.report.tables import probe_tables as tables_of_probes
-from traps_pipeline.report.tables import steering_tables as tables_of_mechanism
-from traps_pipeline.report.tables.table_columns import printed
-from traps_pipeline.report.writing import SOFT, NotRun, PrintedTable, figure_files, figure_style, table_files
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from traps_pipeline.report.result_frames import Results
+    from traps_pipeline.report.writing import PrintedTable
 
 RIGHT_EDGE_IN = 0.14  # width for a line of text along the right edge of a figure
 PAPER = "published"  # folder below tables/ and figures/
@@ -59,16 +37,22 @@ JUDGED_STAGES = {
 class TableReport:
     """A table (or several that belong together).
 
-    reads: the stages whose tables it uses; paper: the paper's tables of this kind, as printed; recomputed: the names of
-    its tables that `make` also computes from the paper's tables, since the paper does not print their figures.
+    function: makes it (module.function of `report.tables`); reads: the stages whose tables it uses; paper: the function
+    of `report.printed_tables` with the paper's tables of this kind; recomputed: the names of its tables that `make`
+    also computes from the paper's tables, since the paper does not print their figures.
     """
 
     name: str
-    make: Callable[[Results], list[PrintedTable]]
+    function: str
     reads: tuple[str, ...]
-    paper: Callable[[], list[PrintedTable]] | None = None
+    paper: str = ""
     recomputed: tuple[str, ...] = ()
     title: str = ""  # title of several tables together; default: the first one's
+
+    @property
+    def make(self) -> Callable[[Results], list[PrintedTable]]:
+        """The function that makes it."""
+        return _function(f"tables.{self.function}")
 
     @property
     def doc(self) -> str:
@@ -78,7 +62,7 @@ class TableReport:
     @property
     def published(self) -> bool:
         """Whether the paper has anything to show here."""
-        return self.paper is not None or bool(self.recomputed)
+        return bool(self.paper or self.recomputed)
 
     def tables(self, results: Results) -> list[PrintedTable]:
         """Return the tables, cached.
@@ -90,6 +74,8 @@ class TableReport:
         return results.kept[self.name]
 
     def _tables(self, results: Results) -> list[PrintedTable]:
+        from traps_pipeline.report.tables.table_columns import printed
+
         if not results.is_study and not self.recomputed:
             return []
         remarks = [results.judged_by] if _is_judged(self.reads) else []
@@ -99,13 +85,15 @@ class TableReport:
 
     def as_printed(self) -> list[PrintedTable]:
         """Return the paper's own tables, and figures that only its text states."""
-        return [*(self.paper() if self.paper else []), *printed_tables.in_text(self.name)]
+        from traps_pipeline.report.printed_tables import in_text
+
+        of_paper = _function(f"printed_tables.{self.paper}")() if self.paper else []
+        return [*of_paper, *in_text(self.name)]
 
     def files(self, results: Results) -> dict[str, bytes]:
-        """Return files by path below `tables`.
+        """Return files by path below `tables`; for the paper below `tables/published` and `tables/recomputed`."""
+        from traps_pipeline.report.writing import table_files
 
-        For the paper they lie below `tables/published` and `tables/recomputed`.
-        """
         if results.is_study:
             parts = {"tables": self.tables(results)}
         else:
@@ -118,20 +106,30 @@ class TableReport:
 class FigureReport:
     """A figure.
 
-    reads: the stages whose tables it uses. published: whether the paper prints its numbers.
+    function: draws it (module.function of `report.figures`); reads: the stages whose tables it uses; published: whether
+    the paper prints its numbers; has_finding: whether `report.findings` has a function of its name.
     """
 
     name: str
     title: str
-    make: Callable[[Results], Figure]
+    function: str
     reads: tuple[str, ...]
     published: bool = True
-    finding: Callable[[Results], str] = lambda results: ""
+    has_finding: bool = False
+
+    @property
+    def make(self) -> Callable[[Results], Figure]:
+        """The function that draws it."""
+        return _function(f"figures.{self.function}")
 
     @property
     def doc(self) -> str:
         """The caption."""
         return _caption(self.make)
+
+    def finding(self, results: Results) -> str:
+        """Return one sentence per model about a study; empty if the figure has none."""
+        return _function(f"findings.{self.name}")(results) if self.has_finding else ""
 
     def note(self, results: Results) -> str:
         """Return the finding about a study, and the caption.
@@ -142,6 +140,8 @@ class FigureReport:
 
     def files(self, results: Results) -> dict[str, bytes]:
         """Return PDF, SVG and PNG by path; empty if the figure was not run."""
+        from traps_pipeline.report.writing import NotRun, figure_files
+
         try:
             files = figure_files(self.name, self.figure(results))
         except NotRun:
@@ -160,88 +160,89 @@ class FigureReport:
 
 
 TABLE_REPORTS: tuple[TableReport, ...] = (
-    TableReport("overall", leaderboards.overall, ("leaderboard",), printed_tables.overall, recomputed=("overall",)),
-    TableReport("replication_overall", leaderboards.replication_overall, ("leaderboard",),
-        printed_tables.replication_overall, recomputed=("replication_overall",)),
-    TableReport("per_dataset", leaderboards.per_dataset, ("leaderboard",), printed_tables.per_dataset),
-    TableReport("expanded", leaderboards.expanded, ("leaderboard",), printed_tables.expanded,
+    TableReport("overall", "leaderboards.overall", ("leaderboard",), paper="overall", recomputed=("overall",)),
+    TableReport("replication_overall", "leaderboards.replication_overall", ("leaderboard",),
+        paper="replication_overall", recomputed=("replication_overall",)),
+    TableReport("per_dataset", "leaderboards.per_dataset", ("leaderboard",), paper="per_dataset"),
+    TableReport("expanded", "leaderboards.expanded", ("leaderboard",), paper="expanded",
         title="By dataset and regime"),
-    TableReport("replication_per_dataset", leaderboards.replication_per_dataset, ("leaderboard",),
-        printed_tables.replication_per_dataset),
-    TableReport("guided_uplift", comparisons.uplift, ("leaderboard", "contrasts"),
+    TableReport("replication_per_dataset", "leaderboards.replication_per_dataset", ("leaderboard",),
+        paper="replication_per_dataset"),
+    TableReport("guided_uplift", "comparisons.uplift", ("leaderboard", "contrasts"),
         recomputed=("guided_uplift",)),
-    TableReport("visual_textual", comparisons.visual_textual, ("leaderboard",), printed_tables.visual_textual,
+    TableReport("visual_textual", "comparisons.visual_textual", ("leaderboard",), paper="visual_textual",
         recomputed=("visual_textual",)),
-    TableReport("reasoning_pairs", comparisons.reasoning, ("leaderboard", "contrasts"),
+    TableReport("reasoning_pairs", "comparisons.reasoning", ("leaderboard", "contrasts"),
         recomputed=("reasoning_pairs",)),
-    TableReport("frontier", comparisons.frontier, ("leaderboard",), recomputed=("frontier",)),
-    TableReport("pecs_naive", comparisons.naive, ("leaderboard",), printed_tables.naive, recomputed=("pecs_naive",)),
-    TableReport("zero_boundary", comparisons.zero_boundary, ("leaderboard",),
+    TableReport("frontier", "comparisons.frontier", ("leaderboard",), recomputed=("frontier",)),
+    TableReport("pecs_naive", "comparisons.naive", ("leaderboard",), paper="naive", recomputed=("pecs_naive",)),
+    TableReport("zero_boundary", "comparisons.zero_boundary", ("leaderboard",),
         recomputed=("zero_boundary",)),
-    TableReport("contrasts", comparisons.contrasts, ("leaderboard", "contrasts")),
-    TableReport("regime_tests", comparisons.regime_tests, ("regime_tests",)),
-    TableReport("run_spread", comparisons.spreads, ("leaderboard",), recomputed=("run_spread",)),
-    TableReport("degenerate_strategies", comparisons.degenerate, ("leaderboard",), printed_tables.degenerate),
-    TableReport("occlusion_sub_scenarios", sub_scenarios.occlusion_sub_scenarios, ("metrics", "items"),
-        printed_tables.occlusion_sub_scenarios, recomputed=("occlusion_sub_scenarios", "hidden_sub_scenarios")),
-    TableReport("chaotic_sub_scenarios", sub_scenarios.chaotic_sub_scenarios, ("metrics", "items"),
-        printed_tables.chaotic_sub_scenarios, recomputed=("chaotic_sub_scenarios",)),
-    TableReport("hypotheses", hypothesis_tables.hypotheses, ("hypotheses",), title="Hypotheses of the paper, by dose"),
-    TableReport("graded", graded_tables.graded, ("graded",)),
-    TableReport("judge_agreement", judge_tables.agreement, ("agreement",), printed_tables.agreement),
-    TableReport("judge_bias", judge_tables.judge_bias, ("judge_bias", "leave_one_out")),
-    TableReport("confabulation", judge_tables.confabulation, ("confabulation_prevalence",),
-        printed_tables.confabulation),
-    TableReport("people", human_tables.people, ("human_row", "human_agreement"), title="People"),
-    TableReport("judge_corrected", human_tables.judge_corrected, ("panel_errors", "corrected"),
+    TableReport("contrasts", "comparisons.contrasts", ("leaderboard", "contrasts")),
+    TableReport("regime_tests", "comparisons.regime_tests", ("regime_tests",)),
+    TableReport("run_spread", "comparisons.spreads", ("leaderboard",), recomputed=("run_spread",)),
+    TableReport("degenerate_strategies", "comparisons.degenerate", ("leaderboard",), paper="degenerate"),
+    TableReport("occlusion_sub_scenarios", "sub_scenarios.occlusion_sub_scenarios", ("metrics", "items"),
+        paper="occlusion_sub_scenarios", recomputed=("occlusion_sub_scenarios", "hidden_sub_scenarios")),
+    TableReport("chaotic_sub_scenarios", "sub_scenarios.chaotic_sub_scenarios", ("metrics", "items"),
+        paper="chaotic_sub_scenarios", recomputed=("chaotic_sub_scenarios",)),
+    TableReport("hypotheses", "hypothesis_tables.hypotheses", ("hypotheses",),
+        title="Hypotheses of the paper, by dose"),
+    TableReport("graded", "graded_tables.graded", ("graded",)),
+    TableReport("judge_agreement", "judge_tables.agreement", ("agreement",), paper="agreement"),
+    TableReport("judge_bias", "judge_tables.judge_bias", ("judge_bias", "leave_one_out")),
+    TableReport("confabulation", "judge_tables.confabulation", ("confabulation_prevalence",),
+        paper="confabulation"),
+    TableReport("people", "human_tables.people", ("human_row", "human_agreement"), title="People"),
+    TableReport("judge_corrected", "human_tables.judge_corrected", ("panel_errors", "corrected"),
         title="Corrected for judges’ errors"),
-    TableReport("judge_validation", judge_tables.validation, ("judge_validation",), printed_tables.validation),
-    TableReport("probes", tables_of_probes.probes, ("probes", "probe_baselines"), printed_tables.probes,
-        ("probe_means",), "Probes"),
-    TableReport("probe_baselines", control_reports.probe_baselines, ("probes", "probe_baselines"),
+    TableReport("judge_validation", "judge_tables.validation", ("judge_validation",), paper="validation"),
+    TableReport("probes", "probe_tables.probes", ("probes", "probe_baselines"), paper="probes",
+        recomputed=("probe_means",), title="Probes"),
+    TableReport("probe_baselines", "control_reports.probe_baselines", ("probes", "probe_baselines"),
         title="Probes and their baselines"),
-    TableReport("gate", control_reports.gate, ("gate", "probes", "probe_baselines"), title="Probe-gated abstention"),
-    TableReport("patching", patching_tables.patching, ("patching",)),
-    TableReport("cosines", tables_of_mechanism.cosines, ("cosines",), printed_tables.cosines,
+    TableReport("gate", "control_reports.gate", ("gate", "probes", "probe_baselines"), title="Probe-gated abstention"),
+    TableReport("patching", "patching_tables.patching", ("patching",)),
+    TableReport("cosines", "steering_tables.cosines", ("cosines",), paper="cosines",
         title="Void directions"),
-    TableReport("steering", tables_of_mechanism.steering, ("steering_effects", "steering_shares"),
-        printed_tables.steering, recomputed=("steering_regimes",), title="Steering"),
-    TableReport("steering_controls", control_reports.steering_nulls, ("steering_nulls", "steering_pecs"),
+    TableReport("steering", "steering_tables.steering", ("steering_effects", "steering_shares"),
+        paper="steering", recomputed=("steering_regimes",), title="Steering"),
+    TableReport("steering_controls", "control_reports.steering_nulls", ("steering_nulls", "steering_pecs"),
         title="Steering among its controls"),
-    TableReport("composition", setup_tables.composition, ("items",), printed_tables.composition),
-    TableReport("models", setup_tables.models, ("leaderboard",), printed_tables.models),
-    TableReport("hyperparameters", setup_tables.hyperparameters, ("leaderboard", "judge_bias"),
-        printed_tables.hyperparameters),
+    TableReport("composition", "setup_tables.composition", ("items",), paper="composition"),
+    TableReport("models", "setup_tables.models", ("leaderboard",), paper="models"),
+    TableReport("hyperparameters", "setup_tables.hyperparameters", ("leaderboard", "judge_bias"),
+        paper="hyperparameters"),
 )  # fmt: skip
 FIGURE_REPORTS: tuple[FigureReport, ...] = (
-    FigureReport("pecs_landscape", "PECS landscape", landscape.landscape, ("leaderboard",)),
-    FigureReport("visual_textual", "Visual against textual voids", abstention.visual_textual, ("leaderboard",)),
-    FigureReport("abs_rec", "AbsRec, standard and guided", abstention.abs_rec_by_model, ("leaderboard",)),
-    FigureReport("reasoning_arrows", "Reasoning in PECS space", landscape.reasoning, ("leaderboard",)),
-    FigureReport("doubt_conversion", "Doubt and conversion", abstention.doubt,
+    FigureReport("pecs_landscape", "PECS landscape", "landscape.landscape", ("leaderboard",)),
+    FigureReport("visual_textual", "Visual against textual voids", "abstention.visual_textual", ("leaderboard",)),
+    FigureReport("abs_rec", "AbsRec, standard and guided", "abstention.abs_rec_by_model", ("leaderboard",)),
+    FigureReport("reasoning_arrows", "Reasoning in PECS space", "landscape.reasoning", ("leaderboard",)),
+    FigureReport("doubt_conversion", "Doubt and conversion", "abstention.doubt",
         ("leaderboard", "confabulation_prevalence")),
-    FigureReport("sub_scenarios", "AbsRec by sub-scenario", grids.sub_scenarios, ("metrics", "items")),
-    FigureReport("graded", "Graded cuts", graded_figure.graded, ("graded",), published=False),
-    FigureReport("confabulation", "Prevalence of confabulation", grids.confabulation, ("confabulation_prevalence",)),
-    FigureReport("states_and_output", "States against output, item by item", expression_figures.states_and_output,
-        ("item_scores", "sentences", "probe_baselines"), published=False, finding=findings.states_and_output),
-    FigureReport("lens", "The margin by layer", expression_figures.lens, ("lens",), published=False,
-        finding=findings.lens),
-    FigureReport("probe_baselines", "Probes against their baselines", figures_of_inside.probe_baselines,
-        ("probes", "probe_baselines"), published=False, finding=findings.probe_baselines),
-    FigureReport("gate_arrows", "Probe-gated abstention", figures_of_inside.gate_arrows, ("gate", "risk_coverage"),
-        published=False, finding=findings.gate_arrows),
-    FigureReport("patching", "Activation patching", figures_of_inside.patching, ("patching",), published=False,
-        finding=findings.patching),
-    FigureReport("doses_among_nulls", "Doses among nulls", figures_of_inside.doses_among_nulls,
-        ("steering_effects", "steering_nulls"), published=False, finding=findings.doses_among_nulls),
-    FigureReport("probe_curves", "Probe transfer by layer", steering_figures.probe_curves, ("probes",),
+    FigureReport("sub_scenarios", "AbsRec by sub-scenario", "grids.sub_scenarios", ("metrics", "items")),
+    FigureReport("graded", "Graded cuts", "graded_figure.graded", ("graded",), published=False),
+    FigureReport("confabulation", "Prevalence of confabulation", "grids.confabulation", ("confabulation_prevalence",)),
+    FigureReport("states_and_output", "States against output, item by item", "expression_figures.states_and_output",
+        ("item_scores", "sentences", "probe_baselines"), published=False, has_finding=True),
+    FigureReport("lens", "The margin by layer", "expression_figures.lens", ("lens",), published=False,
+        has_finding=True),
+    FigureReport("probe_baselines", "Probes against their baselines", "control_figures.probe_baselines",
+        ("probes", "probe_baselines"), published=False, has_finding=True),
+    FigureReport("gate_arrows", "Probe-gated abstention", "control_figures.gate_arrows", ("gate", "risk_coverage"),
+        published=False, has_finding=True),
+    FigureReport("patching", "Activation patching", "control_figures.patching", ("patching",), published=False,
+        has_finding=True),
+    FigureReport("doses_among_nulls", "Doses among nulls", "control_figures.doses_among_nulls",
+        ("steering_effects", "steering_nulls"), published=False, has_finding=True),
+    FigureReport("probe_curves", "Probe transfer by layer", "steering_figures.probe_curves", ("probes",),
         published=False),
-    FigureReport("confabulated_strip", "Probes on confabulated voids", steering_figures.confabulated_strip,
+    FigureReport("confabulated_strip", "Probes on confabulated voids", "steering_figures.confabulated_strip",
         ("probes",)),
-    FigureReport("dose_response", "Steering: dose and response", steering_figures.dose_response,
+    FigureReport("dose_response", "Steering: dose and response", "steering_figures.dose_response",
         ("steering_effects", "steering_shares")),
-    FigureReport("cosines", "Cosines of void directions", steering_figures.cosine_heatmaps, ("cosines",)),
+    FigureReport("cosines", "Cosines of void directions", "steering_figures.cosine_heatmaps", ("cosines",)),
 )  # fmt: skip
 
 # Leading figures of a study with mechanistic analyses: the claim, and its possible refutations.
@@ -263,6 +264,8 @@ def _say_below(figure: Figure, text: str) -> None:
     """
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
+    from traps_pipeline.report.writing import SOFT, figure_style
+
     look: dict[str, Any] = {"fontsize": 6, "color": SOFT, "parse_math": False}
     engine = figure.get_layout_engine()
     with figure_style():
@@ -272,6 +275,12 @@ def _say_below(figure: Figure, text: str) -> None:
         if isinstance(engine, ConstrainedLayoutEngine):
             engine.set(rect=(0, 0, 1 - RIGHT_EDGE_IN / figure.get_figwidth(), 1))
         figure.text(0.995, 0.5, text, rotation=90, ha="right", va="center", **look)
+
+
+def _function(name: str) -> Callable[..., Any]:
+    """Return a function of this room by the name of its module and its own."""
+    module, _, function = name.rpartition(".")
+    return getattr(import_module(f"traps_pipeline.report.{module}"), function)
 
 
 def _is_judged(reads: Sequence[str]) -> bool:

@@ -3,13 +3,10 @@
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
+from importlib import import_module
 from typing import Any
 
 from traps_pipeline.base.progress import Tally
-from traps_pipeline.benchmark import filmed_arms, stored_evidence
-from traps_pipeline.benchmark import videos as clips
-from traps_pipeline.benchmark.composition import problems
-from traps_pipeline.benchmark.items import build_items
 from traps_pipeline.benchmark.specs import (
     build_specs,
     corrections_version,
@@ -52,8 +49,18 @@ def corrections(workspace: Workspace, category: str) -> str:
     return corrections_version(workspace, category)
 
 
-def _evidence(find: Callable[..., Any]) -> Callable[[Workspace, str | None, StageOutput], Any]:
-    return lambda workspace, key, output: find([item.spec for item in output.beside])
+def _of_specs(find: str) -> Callable[[Workspace, str | None, StageOutput], Any]:
+    """Return a check by what `find` (module.function of `benchmark`) finds wrong in the records of a table."""
+    module, _, name = find.partition(".")
+
+    def wrong(workspace: Workspace, key: str | None, output: StageOutput) -> Any:
+        function = getattr(import_module(f"traps_pipeline.benchmark.{module}"), name)
+        return function([item.spec for item in output.beside])
+
+    return wrong
+
+
+_unbalanced = _of_specs("composition.problems")
 
 
 @_stage(
@@ -74,28 +81,26 @@ def _evidence(find: Callable[..., Any]) -> Callable[[Workspace, str | None, Stag
             "control_certified",
             "By the evidence in each record, the control can be answered: its outcome is settled in time, with a "
             "margin, and legible.",
-            _evidence(stored_evidence.unanswerable_controls),
+            _of_specs("stored_evidence.unanswerable_controls"),
         ),
         Check(
             "void_certified",
             "By the evidence in each record, the void cannot be answered: the outcome is hidden without a trace and a "
             "twin has another answer (occlusion), or futures disagree (chaotic); nor can a control that an occluder "
             "closes be answered from its last frame. `traps benchmark certify` computes this again.",
-            _evidence(stored_evidence.answerable_voids),
+            _of_specs("stored_evidence.answerable_voids"),
         ),
         Check(
             "ill_posed_certified",
             "The inventory refutes each ill-posed question, or the question asks for what no video shows; neither "
             "holds for a well-posed question.",
-            _evidence(stored_evidence.answerable_ill_posed),
+            _of_specs("stored_evidence.answerable_ill_posed"),
         ),
         Check(
             "answers_balanced",
             "Within a family no answer and no ill-posed text is too frequent, and no scene occurs twice (whole "
             "benchmarks only).",
-            lambda workspace, key, output: (
-                [] if workspace.study.is_subset else problems([item.spec for item in output.beside])
-            ),
+            lambda workspace, key, output: [] if workspace.study.is_subset else _unbalanced(workspace, key, output),
             blocks=False,
         ),
     ],
@@ -110,8 +115,22 @@ def scene_specs(workspace: Workspace, category: str) -> StageOutput:
 
 
 def _render(workspace: Workspace, category: str, wait: bool) -> tuple[Tally, bool]:
-    frames, is_whole = clips.render_videos(workspace, category, wait=wait)
+    from traps_pipeline.benchmark.videos import render_videos
+
+    frames, is_whole = render_videos(workspace, category, wait=wait)
     return Tally(frames=frames), is_whole
+
+
+def _seconds_of_rendering(workspace: Workspace, category: str) -> float:
+    from traps_pipeline.benchmark.videos import seconds_left
+
+    return seconds_left(workspace, category)
+
+
+def _lost_clips(workspace: Workspace, category: str) -> list[str]:
+    from traps_pipeline.benchmark.videos import missing_clips
+
+    return [f"clip {path} is gone or damaged" for path in missing_clips(workspace, category)]
 
 
 def _alike(workspace: Workspace, key: str | None, output: StageOutput) -> list[str]:
@@ -126,8 +145,8 @@ def _alike(workspace: Workspace, key: str | None, output: StageOutput) -> list[s
     code="3",
     kinds=["parquet", "mp4"],
     takes=RENDERS,
-    shared=ConcurrentBuild(_render, clips.seconds_left),
-    lost=lambda workspace, key: [f"clip {path} is gone or damaged" for path in clips.missing_clips(workspace, key)],
+    shared=ConcurrentBuild(_render, _seconds_of_rendering),
+    lost=_lost_clips,
     checks=[
         Check(
             "occluder_hides",
@@ -142,13 +161,29 @@ def videos(workspace: Workspace, category: str) -> StageOutput:
 
     Each clip is rendered once, from its frozen trajectory, by one of the processes working on the category.
     """
-    rows, leaks = clips.build_videos(workspace, category)
+    from traps_pipeline.benchmark.videos import build_videos
+
+    rows, leaks = build_videos(workspace, category)
     return StageOutput(rows, shown={"megabytes": round(sum(row.size_bytes for row in rows) / 1e6, 2)}, beside=leaks)
 
 
 def _film(workspace: Workspace, category: str, wait: bool) -> tuple[Tally, bool]:
-    frames, is_whole = filmed_arms.film_arms(workspace, category, wait=wait)
+    from traps_pipeline.benchmark.filmed_arms import film_arms
+
+    frames, is_whole = film_arms(workspace, category, wait=wait)
     return Tally(frames=frames), is_whole
+
+
+def _seconds_of_filming(workspace: Workspace, category: str) -> float:
+    from traps_pipeline.benchmark.filmed_arms import seconds_left
+
+    return seconds_left(workspace, category)
+
+
+def _lost_arms(workspace: Workspace, category: str) -> list[str]:
+    from traps_pipeline.benchmark.filmed_arms import unmade
+
+    return unmade(workspace, category)
 
 
 @_stage(
@@ -159,16 +194,15 @@ def _film(workspace: Workspace, category: str, wait: bool) -> tuple[Tally, bool]
     code="3",
     kinds=["parquet", "mp4"],
     takes=RENDERS,
-    shared=ConcurrentBuild(_film, filmed_arms.seconds_left),
+    shared=ConcurrentBuild(_film, _seconds_of_filming),
     wants=lambda study, key: bool({*study.arms} & {*beside_of(taxonomy_of_category(str(key)))}),
-    lost=filmed_arms.unmade,
+    lost=_lost_arms,
 )
 def arms(workspace: Workspace, category: str) -> StageOutput:
-    """Return a category's arms and variations that the study asks for.
+    """Return the arms and variations that the study asks of a category: clips and questions beside the pairs."""
+    from traps_pipeline.benchmark.filmed_arms import build_arms
 
-    They are clips and questions beside the pairs.
-    """
-    rows = filmed_arms.build_arms(workspace, category)
+    rows = build_arms(workspace, category)
     admitted = sum(row.refused is None for row in rows)
     return StageOutput(rows, shown={"admitted": admitted, "refused": len(rows) - admitted})
 
@@ -204,9 +238,8 @@ def _odd_pairs(workspace: Workspace, key: str | None, output: StageOutput) -> di
     ],
 )
 def items(workspace: Workspace, dataset: str) -> StageOutput:
-    """Return the items that models are asked, two per pair.
+    """Return the items that models are asked, two per pair: the control, and the void that differs by one change."""
+    from traps_pipeline.benchmark.items import build_items
 
-    They are the control, and the void that differs by one change.
-    """
     rows = build_items(workspace, dataset)
     return StageOutput(rows, shown={"benchmark version": rows[0].benchmark_version})

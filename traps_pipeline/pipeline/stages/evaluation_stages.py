@@ -8,9 +8,7 @@ from functools import partial
 from typing import Any, cast
 
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES, VoteRow
-from traps_pipeline.judging.panel import collect_votes
 from traps_pipeline.models.answer_rows import RESPONSES, ResponseRow
-from traps_pipeline.models.answers import collect_answers
 from traps_pipeline.models.judges import panel_version
 from traps_pipeline.models.prompts import prompt_version
 from traps_pipeline.models.reading import READING
@@ -98,10 +96,9 @@ def _answers_missing(workspace: Workspace, key: str | None, output: StageOutput)
     side_by_side=True,
 )
 def responses(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
-    """Return a model's answers under a regime in a run, one row per item.
+    """Return a model's answers under a regime in a run, one row per item; answers in the ledger are reused."""
+    from traps_pipeline.models.answers import collect_answers
 
-    Answers in the ledger are reused.
-    """
     return _with_items(workspace, collect_answers(workspace, [Cell.parse(key) for key in keys]))
 
 
@@ -128,10 +125,9 @@ def _many_invalid(workspace: Workspace, key: str | None, output: StageOutput) ->
     side_by_side=True,
 )
 def votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
-    """Return votes of the study's panel on the answers of a cell.
+    """Return votes of the study's panel on the answers of a cell, one row per answer, judge and task."""
+    from traps_pipeline.judging.panel import collect_votes
 
-    There is one row per answer, judge and task.
-    """
     return _with_items(workspace, collect_votes(workspace, [Cell.parse(key) for key in keys]))
 
 

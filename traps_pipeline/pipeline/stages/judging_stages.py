@@ -7,7 +7,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.judging.confabulation import collect_labels, load_protocol, protocol_digest
+from traps_pipeline.judging.confabulation_protocol import load_protocol, protocol_digest
 from traps_pipeline.judging.judging_rows import AGREEMENT, CONFABULATION, JUDGE_BIAS, JUDGE_VALIDATION, VERDICTS, VOTES
 from traps_pipeline.models.judges import load_panel, panel_id
 from traps_pipeline.pipeline.graph import Check
@@ -127,6 +127,8 @@ def confabulation(workspace: Workspace, _: None) -> StageOutput:
 
     The table is empty if the study's panel has no such judge.
     """
+    from traps_pipeline.judging.confabulation import collect_labels
+
     return collect_labels(workspace)
 
 

@@ -11,21 +11,15 @@ from traps_pipeline.pipeline.graph import Parent
 from traps_pipeline.pipeline.pieces import Piece, make_pieces
 from traps_pipeline.pipeline.previews import Markdown
 from traps_pipeline.pipeline.stage import code_of, is_declared, of, source, stage
-from traps_pipeline.pipeline.stages import (
-    inside_stages,
-    judging_stages,
-    mechanism_stages,
-    people_stages,
-    scoring_stages,
-)
+from traps_pipeline.pipeline.stages import judging_stages, people_stages, scoring_stages
 from traps_pipeline.report.catalogue import FIGURE_REPORTS, TABLE_REPORTS
 from traps_pipeline.scoring.published import published_digest
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
 GROUP = "report"
-# Declared before this group, which reads their tables.
-READ = (judging_stages, people_stages, mechanism_stages, inside_stages, scoring_stages)
+# Declared before this group, which reads their tables, as the package's file does for the mechanism's.
+READ = (judging_stages, people_stages, scoring_stages)
 NAMES = 12  # names of pieces listed in an event
 SCORES = ("leaderboard", "robust", "human_row", "panel_errors")  # on the page and in the explorer
 ANSWERS = ("items", "videos", "responses", "votes", "verdicts")
