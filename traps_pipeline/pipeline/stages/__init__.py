@@ -1,6 +1,4 @@
-"""Declare the stages, one file per group.
-
-Importing this package declares all of them, without Dagster.
+"""Declare the stages on import, one file per group, without Dagster.
 
 A stage reads tables, calls a library function and returns the rows of its table.
 """

@@ -36,19 +36,13 @@ category_to_arms = to_keys(CATEGORY, DATASET, lambda category: beside_of(taxonom
 
 @_source()
 def released_specs(workspace: Workspace, category: str) -> str:
-    """Return the version of the frozen scenarios under scene_specs/released.
-
-    One resolved record each.
-    """
+    """Return the version of the frozen scenarios under scene_specs/released."""
     return released_version(workspace, category)
 
 
 @_source()
 def corrections(workspace: Workspace, category: str) -> str:
-    """Return the version of the review decisions under scene_specs/corrections.
-
-    They are folded over the released records.
-    """
+    """Return the version of the review decisions under scene_specs/corrections."""
     return corrections_version(workspace, category)
 
 
@@ -164,10 +158,7 @@ def _film(workspace: Workspace, category: str, wait: bool) -> tuple[Tally, bool]
     lost=filmed_arms.unmade,
 )
 def arms(workspace: Workspace, category: str) -> StageOutput:
-    """Return a category's arms and variations that the study asks for.
-
-    They are clips and questions beside the pairs.
-    """
+    """Return a category's clips and questions beside the pairs: arms and variations."""
     rows = filmed_arms.build_arms(workspace, category)
     admitted = sum(row.refused is None for row in rows)
     return StageOutput(rows, shown={"admitted": admitted, "refused": len(rows) - admitted})
@@ -204,9 +195,6 @@ def _odd_pairs(workspace: Workspace, key: str | None, output: StageOutput) -> di
     ],
 )
 def items(workspace: Workspace, dataset: str) -> StageOutput:
-    """Return the items that models are asked, two per pair.
-
-    They are the control, and the void that differs by one change.
-    """
+    """Return the items models are asked, a control and a changed void per pair."""
     rows = build_items(workspace, dataset)
     return StageOutput(rows, shown={"benchmark version": rows[0].benchmark_version})
