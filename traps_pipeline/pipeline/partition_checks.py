@@ -29,6 +29,7 @@ class StageChecks:
 
     A failure is stored in the workspace until the partition passes, so that each later run and `traps status` report it
     even if this run dies before it reports to Dagster.
+
     The evaluations are not `AssetCheckResult`s: if a blocking one of those fails, Dagster fails the step and skips
     everything downstream, including stages that do not need this partition. `Lineage.blocked` blocks the ones that do.
     """

@@ -68,6 +68,7 @@ def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]
     items, of 2 n_pairs (of n_pairs if the dataset is an arm of one side), that lack a decision: abstained or correct on
     a control, abstained on a void. BOUNDS show how far the missing decisions could move PECS; they are never null.
     Every share has its n and its Wilson interval.
+
     Raises ValueError if the verdicts are of several datasets, whose versions may differ (docs/spec.md 5.1).
     """
     datasets = sorted(verdicts["dataset"].unique())
