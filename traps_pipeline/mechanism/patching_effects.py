@@ -227,7 +227,7 @@ def _require_one_form(target: RecordedPass, source: RecordedPass) -> None:
 
 
 def _first_layer(model: LocalModel, patch: Patch) -> int:
-    """Return the layer to start a patched pass from. Raises TrapsError without a site."""
+    """Return the layer a patched pass starts from. Raises TrapsError for no such site."""
     if not 0 <= patch.layer <= model.n_layers or (patch.layer == 0 and patch.site != "residual"):
         raise TrapsError(f"no {patch.site} at layer {patch.layer}; there are blocks 1 to {model.n_layers}")
     return patch.layer if patch.site == "residual" else patch.layer - 1
