@@ -85,7 +85,7 @@ def _studio() -> Studio:
 
 
 def requests_of(entry: Entry) -> dict[str, Request]:
-    """Return the calls to an entry, by name, with the time so that none is reused."""
+    """Return the calls to an entry by name; they hold the time, so none is reused."""
     now = datetime.now(UTC).isoformat()
     if isinstance(entry, JudgeEntry):
         tasks: tuple[Task, ...] = ("abstention", "correctness")

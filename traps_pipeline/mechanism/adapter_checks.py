@@ -219,7 +219,7 @@ def _batches(subject: Subject) -> str:
 
 @contextmanager
 def _ending(model: LocalModel, token: int) -> Iterator[None]:
-    """Stop generation at a token of an early answer, so that a batch ends unevenly."""
+    """Stop generation at a token, so that rows of a batch end at different steps."""
     config = model.network.generation_config
     before, config.eos_token_id = config.eos_token_id, [token]
     try:

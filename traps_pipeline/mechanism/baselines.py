@@ -79,9 +79,9 @@ class AsItIs:
 
 
 def score_features(run: ProbeRun, features: Features, fit: Fit = fit_probe) -> list[Row]:
-    """Return the protocol's rows, with nearest centroids, on features for states.
+    """Return the protocol's rows on features in the place of states.
 
-    fit: another probe than the protocol's.
+    Those of nearest centroids are included. fit: another probe than the protocol's.
     """
     on = replace(run, read=lambda dataset, _: features[dataset], fit=fit)
     return on.comparable(0) + on.centroids(0)
@@ -140,7 +140,7 @@ def raw_features(
 
 
 def _seen(clip: Path, spec: MediaSpec) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return shown thumbnails (N, h, w, 3) in [0, 1], times (N,), and the last time."""
+    """Return thumbnails (N, h, w, 3) in [0, 1], times (N,), and the clip's last time."""
     import cv2
 
     try:

@@ -196,7 +196,7 @@ ITEM_SCORES = Table("item_scores", ItemScoreRow, partition_by=("model", "prompt"
 
 @dataclass(frozen=True, kw_only=True)
 class SentenceRow(Extracted):
-    """How likely an abstention is after an item's prompt, beside the own answer."""
+    """How likely an abstention is after an item's prompt, beside the model's answer."""
 
     item_id: shared.ItemId
     dataset: shared.Dataset

@@ -72,10 +72,7 @@ def split_half(of: PairDifferences, seed: Sequence[int]) -> float:
 
 
 def cosine_rows(workspace: Workspace) -> list[CosineRow]:
-    """Return COSINES: all pairs of a model's void directions (dataset, VQA prompt).
-
-    They are at one layer.
-    """
+    """Return COSINES of a model's void directions (dataset, VQA prompt) at one layer."""
     table = workspace.tables.read_all(DIRECTIONS, ["model", "prompt"])
     extractions = sorted({Extraction(str(m), str(p)) for m, p in zip(table["model"], table["prompt"], strict=True)})
     rows: list[CosineRow] = []

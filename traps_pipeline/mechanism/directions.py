@@ -37,20 +37,17 @@ SITE = "output of the block, before the next one (residual stream); layer 0: emb
 
 
 def seeded_order(scenarios: Sequence[str], seed: int) -> list[str]:
-    """Return scenarios by digest of seed and name, so that no loss moves the others."""
+    """Return scenarios ordered by seed and name alone, so that losing one moves none."""
     return sorted(scenarios, key=lambda name: digest([seed, name]))
 
 
 def steered_scenarios(scenarios: Sequence[str], n: int, seed: int) -> list[str]:
-    """Return the first n scenarios of the seeded order, which are steered.
-
-    A direction that comes from one of them does not steer it.
-    """
+    """Return the first n scenarios of the seeded order, to be steered."""
     return seeded_order(scenarios, seed)[:n]
 
 
 def direction_scenarios(scenarios: Sequence[str], n: int, seed: int) -> list[str]:
-    """Return the last n scenarios of the seeded order, which make the direction."""
+    """Return the last n scenarios of the seeded order, to compute a direction from."""
     return seeded_order(scenarios, seed)[-n:]
 
 
@@ -103,11 +100,12 @@ class Directions:
 def extract_directions(
     void: np.ndarray, control: np.ndarray, seed: Sequence[int], nulls: Sequence[str] = NULLS, draws: int = 1
 ) -> Directions:
-    """Return directions from states (layers, pairs, d) of both sides, in one order.
+    """Return directions from states (layers, pairs, d) of the two sides.
 
-    Each kind of null has several draws. A layer at which the sides do not differ at all (the embeddings of a last token
-    that is the same everywhere) has a zero vector, not a direction that consists of rounding errors; so has a null that
-    the projection leaves empty. Raises TrapsError with fewer than two pairs.
+    The pairs of both sides are in the same order. Each kind of null has several draws. A layer at which the sides do
+    not differ at all (the embeddings of a last token that is the same everywhere) has a zero vector, not a direction
+    that consists of rounding errors; so has a null that the projection leaves empty. Raises TrapsError with fewer than
+    two pairs.
     """
     if void.shape != control.shape or void.ndim != 3 or void.shape[1] < 2:
         raise TrapsError(
@@ -140,7 +138,7 @@ def _null_draws(kind: str, void: np.ndarray, control: np.ndarray, rng: np.random
 
 
 def _orthogonal(vectors: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """Return units of draws (draws, layers, d), without their part along (layers, d).
+    """Return unit vectors (draws, layers, d), less their part along unit (layers, d).
 
     Zero if hardly anything is left, and if `unit` itself is zero.
     """

@@ -87,10 +87,10 @@ def _regime_rows(effects: pd.DataFrame, family: Callable[[str], str]) -> pd.Data
 
 
 def domains(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return mean top-alpha control abstention per direction, in and across domains.
+    """Return control abstention at the largest alpha, within and across domains.
 
-    same: on the well-posed dataset of the source's own taxonomy; cross: on that of the other. Columns CELL, source,
-    alpha, same, cross.
+    It is a mean for each direction. same: on the well-posed dataset of the source's own taxonomy; cross: on that of the
+    other. Columns CELL, source, alpha, same, cross.
     """
     import pandas as pd
 

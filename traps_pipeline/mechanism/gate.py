@@ -65,12 +65,13 @@ class Decisions:
 
 
 def thresholds(score: np.ndarray, void: np.ndarray, false_abs: float) -> dict[str, float]:
-    """Return thresholds from calibrating scores (n,) and labels (n,), gated above.
+    """Return thresholds by name from calibrating scores and labels, (n,) each.
 
-    mid: half-way between the mean scores of voids and of controls. J: the cut with the largest AbsRec - FalseAbs,
-    half-way to the next score. conformal: the smallest control score that at most a share `false_abs` of new controls
-    from the same source exceeds, in expectation over sources (split conformal prediction: rank ceil((n + 1)(1 -
-    false_abs)) of n); with too few controls for that (18 at 0.05), no answer is gated.
+    A score above a threshold is gated. mid: half-way between the mean scores of voids and of controls. J: the cut with
+    the largest AbsRec - FalseAbs, half-way to the next score. conformal: the smallest control score that at most a
+    share `false_abs` of new controls from the same source exceeds, in expectation over sources (split conformal
+    prediction: rank ceil((n + 1)(1 - false_abs)) of n); with too few controls for that (18 at 0.05), no answer is
+    gated.
     """
     control = np.sort(score[~void])
     mid = (score[void].mean() + control.mean()) / 2

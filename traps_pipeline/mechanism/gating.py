@@ -68,7 +68,7 @@ class Gates:
 
 
 def gate_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> list[GateRow]:
-    """Return GATE rows of an extraction, by regime of the model's run 1.
+    """Return GATE rows of an extraction, for each regime evaluated in run 1.
 
     Raises TrapsError if the model has no verdicts yet.
     """

@@ -1,7 +1,7 @@
 """Compute the output margin: log-odds that an answer begins with an abstention.
 
-They are the first answer token's log-odds of the tokens that begin an abstention, against all others. A probe says
-something about a gap between representation and output only as far as it separates better than this.
+At the first answer token, the tokens that begin an abstention stand against all others. A probe says something about a
+gap between representation and output only as far as it separates better than this.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _FIRST_WORDS = frozenset(phrase.split()[0] for phrase in PHRASES)
 
 
 def is_abstention_start(token: str) -> bool:
-    """Return whether a token's text begins an abstention, by PHRASES or first words.
+    """Return whether a token begins an abstention: one of PHRASES or its first word.
 
     "I" counts, although other sentences begin with it too: the margin is a lower bound of the information in the first
     token.

@@ -117,7 +117,7 @@ def _sites(model: LocalModel) -> Iterator[tuple[Site, int, Module]]:
 
 
 def record(model: LocalModel, prompt: Prompt, tokens: Sequence[int], sites: Sequence[Site] = SITES) -> RecordedPass:
-    """Run one pass; keep the residual stream, and `sites`, that a patch may need.
+    """Run one pass; keep states of `sites` and of the residual stream for patches.
 
     tokens: those that begin an abstention. Raises TrapsError for a block that passes on more than the residual stream.
     """
@@ -227,7 +227,7 @@ def _require_one_form(target: RecordedPass, source: RecordedPass) -> None:
 
 
 def _first_layer(model: LocalModel, patch: Patch) -> int:
-    """Return the layer a patched pass starts from. Raises TrapsError for no such site."""
+    """Return the layer a patched pass starts from. Raises TrapsError for a wrong site."""
     if not 0 <= patch.layer <= model.n_layers or (patch.layer == 0 and patch.site != "residual"):
         raise TrapsError(f"no {patch.site} at layer {patch.layer}; there are blocks 1 to {model.n_layers}")
     return patch.layer if patch.site == "residual" else patch.layer - 1

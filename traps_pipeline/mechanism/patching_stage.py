@@ -67,7 +67,7 @@ Cell = tuple[str, Site, int, str]  # patched side, site, layer, group
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """A side of a pair: its prompt, and groups of positions of its own."""
+    """A side of a pair: its prompt and its own groups of positions."""
 
     prompt: Prompt
     parts: Mapping[str, np.ndarray]

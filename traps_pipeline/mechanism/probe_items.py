@@ -64,7 +64,7 @@ def other_clip(workspace: Workspace, row: Mapping[str, Any]) -> tuple[Path, str]
 
 
 def _answerable_item(spec: Mapping[str, Any], clip: Mapping[str, Any]) -> ProbeItemRow:
-    """Return the void clip with an answerable question, and so of side control."""
+    """Return the void clip with an answerable question, of side `control`."""
     pair = f"{ANSWERABLE}:{spec['scenario_id']}"
     return ProbeItemRow(
         **{name: spec[name] for name in ("scenario_id", "category", "sub_scenario", "benchmark_version")},

@@ -173,7 +173,7 @@ class ProbeRun:
         return [self._scored("confabulated", path, layer, restricted[path[1]], v) for path, v in scores.items()]
 
     def confabulated_held_out(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
-        """Return such pairs of one taxonomy by held-out probes, if scenarios suffice."""
+        """Return Cf->Cf within a taxonomy by held-out probes, null with few scenarios."""
         restricted, rows = self._confabulated(splits), []
         for source, target in self._pairs:
             if not {source, target} <= set(restricted) or taxonomy_of(source) != taxonomy_of(target):

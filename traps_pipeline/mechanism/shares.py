@@ -43,7 +43,7 @@ _PATH_SETS = {ALL: STEERING_PATHS, **PATH_SETS}
 
 
 def of_paper(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the paper's rows: void or unsteered, doses in alpha, signs by label."""
+    """Return rows of the paper's protocol: void or unsteered, alphas, signs by label."""
     return rows.loc[rows["kind"].isin(["void", UNSTEERED]) & (rows["unit"] == "alpha") & (rows["signs"] == "label")]
 
 

@@ -26,7 +26,7 @@ PROMPTS_KEPT = 128  # processed prompts in memory: each one is used for every di
 
 
 class SteeredBackend(LocalBackend):
-    """A local model with a direction added to one block, of its own for each row."""
+    """A local model that answers with a direction added to a block, one for each row."""
 
     def __init__(self, entry: Entry, vectors: Mapping[str, np.ndarray], shared: SharedAnswers) -> None:
         super().__init__(entry)

@@ -127,7 +127,7 @@ Dose = tuple[str, float]  # unit and number
 
 
 def _within(row: _Planned, of: Directions, layer: int, cap: float) -> Sequence[Dose]:
-    """Return a direction's doses without gaps beyond `cap` control states.
+    """Return a direction's doses, without class gaps beyond `cap` control states.
 
     A null has only the largest dose.
     """
@@ -346,10 +346,7 @@ def _steering_row(
 def collect_steering_votes(
     workspace: Workspace, cells: Sequence[SteeringCell]
 ) -> Iterator[tuple[SteeringCell, StageOutput]]:
-    """Ask the panel on abstention and controls' correctness; yield rows by cell.
-
-    The rows are STEERING_VOTES, of each finished cell.
-    """
+    """Ask the panel about steered answers; yield STEERING_VOTES of finished cells."""
     panel = load_panel(workspace.study.panel)
     calls = partial(wanted_steering_ballots, workspace, panel)
     yield from ask_judges(workspace, "steering_votes", panel, cells, calls, lambda settled: settled.output(_vote_row))

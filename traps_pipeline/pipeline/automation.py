@@ -55,7 +55,7 @@ INTERVAL_S = 30
 
 
 def reread_sources() -> None:
-    """Clear caches of specs, corrections, prompts and registries, to see edits.
+    """Clear caches of specs, corrections, prompts, registries, so that edits count.
 
     The set of evaluations stays: partition keys are built from it when the code location is loaded.
     """
@@ -138,7 +138,7 @@ def _report(instance: dg.DagsterInstance, stage: str, key: str | None, wrong: st
 def _requests(
     instance: dg.DagsterInstance, workspace: Workspace, lineage: Lineage, *, costs: bool
 ) -> list[dg.RunRequest]:
-    """Return runs of what is outdated and can be rebuilt now, dependents excluded."""
+    """Return runs of what is outdated and can be rebuilt now; dependents follow later."""
     graph, requests = the_graph(), list[dg.RunRequest]()
     for block in graph.blocks([stage.name for stage in _stages(costs)]):
         stages, keys = pending_in(block, lineage, History(instance, graph), StudyPartitions(workspace), existing=True)

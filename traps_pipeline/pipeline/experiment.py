@@ -152,7 +152,7 @@ class Experiment(BaseModel):
             )
 
     def cells(self) -> list[Cell]:
-        """Return all cells by model, up to its runs. Raises TrapsError if unknown."""
+        """Return cells by model, up to its runs. Raises TrapsError for an unknown model."""
         cells = []
         for model in self.models:
             available = get_model(model).runs

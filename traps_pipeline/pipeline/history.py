@@ -58,7 +58,7 @@ class History:
         return {key: key_tags[_VERSION] for key, key_tags in tags.items()}
 
     def observe(self, lineage: Lineage, sources: Iterable[str] | None = None) -> list[Node]:
-        """Report versions of sources (default: all) that Dagster lacks; return changes."""
+        """Report versions of sources (default: all) that Dagster lacks; return these."""
         changed = list[Node]()
         for name in self._graph.sources if sources is None else sources:
             now = {key: str(lineage.version(name, key)) for key in self._graph.keys(name)}

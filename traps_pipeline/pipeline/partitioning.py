@@ -84,7 +84,7 @@ EVERY, SAME = Every(), Same()
 
 @dataclass(frozen=True)
 class ByDimension:
-    """The partitions that agree in one dimension; only one side has another one."""
+    """Partitions that agree in one dimension; one side has only that, the other two."""
 
     name: str
 

@@ -118,7 +118,7 @@ def _parts(
 
 
 def _halves(sizes: np.ndarray, cuts: np.ndarray, better: set[int], count: int) -> tuple[int, int]:
-    """Return where to cut lines of these sizes in two, and the first half's parts.
+    """Return where to cut lines of these sizes, and how many parts come before.
 
     Prefer parts of equal size, then a place in `better`, then the middle.
     """

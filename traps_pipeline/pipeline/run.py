@@ -124,7 +124,7 @@ def _is_alive(pid: int) -> bool:
 def pending_in(
     block: Sequence[Stage], lineage: Lineage, history: History, partitions: StudyPartitions, *, existing: bool = False
 ) -> tuple[list[Stage], list[str | None]]:
-    """Return a block's stages with work, or downstream of such, with their keys.
+    """Return a block's stages with work, all downstream of them, and their keys.
 
     existing: only what exists, is outdated, and waits for nothing upstream.
     """

@@ -42,7 +42,7 @@ class Runs(ABC):
 
     @abstractmethod
     def ranges(self, stages: Sequence[Stage], keys: Sequence[str | None]) -> Sequence[Range]:
-        """Return ranges of the keys, one per run; runs may share one and skip its keys."""
+        """Return a range of keys per run; ranges may repeat, and hold unwanted keys."""
 
     @abstractmethod
     def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterable[RunOutcome]:

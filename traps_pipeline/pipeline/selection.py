@@ -38,7 +38,7 @@ def stages_until(until: str | None) -> set[str]:
 
 
 def require_work(workspace: Workspace, experiment: str, until: str | None) -> None:
-    """Raise TrapsError unless an experiment wants something of the stages or of any."""
+    """Raise TrapsError if an experiment wants nothing of the named stages (or of any)."""
     partitions, graph = StudyPartitions(workspace, experiment), the_graph()
     if not partitions.cells and not partitions.states:
         raise TrapsError(
@@ -109,7 +109,7 @@ def _read_note(workspace: Workspace) -> dict[str, Any]:
 
 
 def _history_state(workspace: Workspace) -> list[Any] | None:
-    """Return path, sizes and times of Dagster's local history; None if not a file."""
+    """Return path, sizes and times of Dagster's history; None if it is no local file."""
     home = Path(os.environ.get("DAGSTER_HOME") or workspace.dagster_home)
     index = home / _HISTORY
     if workspace.is_shared or not index.is_file():

@@ -85,7 +85,7 @@ def stage(
     shared: ConcurrentBuild | None = None,
     side_by_side: bool = False,
 ) -> Callable[[Callable[[Workspace, Any], Any]], Stage]:
-    """Declare the function that makes a table, or files for a name (`graph.Stage`).
+    """Declare the function behind a table or, given a name, files (`graph.Stage`).
 
     The description is the function's docstring, without its "Return"; the code is `code_of` the group, unless stated.
     It returns a StageOutput, or rows alone (figures and ids, never text that a model wrote), which are then shown.

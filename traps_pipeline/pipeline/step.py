@@ -146,7 +146,7 @@ class _Step:
             yield self.history.event(self.stage, key, version, self.provenance, about)
 
     def tell_unmade(self) -> Iterator[dg.AssetCheckEvaluation]:
-        """Report partitions that could not be built or that fail a check, new or old."""
+        """Report partitions that could not be built or fail a check, now or before."""
         unmade = self._maker.unmade
         if unmade:
             end_if_resumed(self.context.instance, self.context.run.run_id, _ATTEMPTS[self.context.run.run_id])

@@ -93,7 +93,7 @@ def probe_baselines(results: Results) -> Iterator[str]:
 
 @_joined
 def gate_arrows(results: Results) -> Iterator[str]:
-    """Yield the default gate's effect on PECS, and the best gate's without states."""
+    """Yield the default gate's effect on PECS, and the best gate on other features."""
     rows = results.gate
     rows = rows.loc[(rows["source"] == "other datasets") & (rows["threshold"] == "mid") & (rows["target"] == "all")]
     for model, group in _models(rows.loc[rows["pecs"].notna()]):

@@ -41,7 +41,7 @@ class Picture:
     kind: str = "webp"
 
     def figures(self) -> Mapping[str, Figure]:
-        """Return figures by file name. Raises NotRun, TrapsError for damaged clips."""
+        """Return figures by file name. Raises NotRun, or TrapsError for a damaged clip."""
         try:
             return self.make()
         except DamagedClip as error:

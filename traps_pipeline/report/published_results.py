@@ -105,7 +105,7 @@ def _cosines(results: Results) -> pd.DataFrame:
 
 
 def _effects(results: Results) -> pd.DataFrame:
-    """Return STEERING_EFFECTS rows of dose-response tables, regimes by caption."""
+    """Return STEERING_EFFECTS of dose-response tables, with their captions' regimes."""
     qwen = published("steering_dose_qwen").assign(model="qwen3-vl-8b", epoch="original")
     gemma = published("steering_dose_gemma").assign(model="gemma-4-e4b", epoch="verification")
     rows = _long(pd.concat([qwen, gemma], ignore_index=True))

@@ -59,7 +59,7 @@ _VOTED = (of(items, need="some"), of(votes, need="some"), judges)
 
 @_stage(AGREEMENT, parents=_VOTED, wants=has_pairs)
 def agreement(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return unanimity, Fleiss, Cohen, Krippendorff of panel and pairs, by task."""
+    """Return agreement (unanimity, Fleiss, Cohen, Krippendorff) by dataset and task."""
     from traps_pipeline.judging.agreement import agreement as rows_of
 
     return rows_of(_votes(workspace, "agreement"), _panel(workspace))
@@ -117,7 +117,7 @@ def confabulation(workspace: Workspace, _: None) -> StageOutput:
 
 @_stage(CONFABULATION_PREVALENCE, parents=[confabulation])
 def confabulation_prevalence(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return how often each axis applies to a model's sampled void failures, if any."""
+    """Return how often each axis applies to a model's sampled void failures."""
     from traps_pipeline.scoring.prevalence import prevalence
 
     return prevalence(workspace.tables.read(CONFABULATION, {}))

@@ -41,7 +41,7 @@ def has_pairs(partitions: StudyPartitions, key: str | None) -> bool:
 
 
 def _none_of(find: str, what: str) -> Callable[[Workspace, str | None, StageOutput], str]:
-    """Return a check that no row is wrong by `find`, a module.function of `scoring`."""
+    """Return a check that `find` (a module.function of `scoring`) counts no wrong row."""
 
     def wrong(workspace: Workspace, key: str | None, output: StageOutput) -> str:
         module, _, name = find.partition(".")

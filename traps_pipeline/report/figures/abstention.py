@@ -1,4 +1,4 @@
-"""Draw abstention: visual and textual voids, standard and guided, doubt and gain."""
+"""Draw figures of abstention: by kind of void, by prompt, and against doubt."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Draw tests of mechanistic claims: probe baselines, gates, patching, dose nulls."""
+"""Draw tests of mechanistic claims: baselines, gates, patching, doses and nulls."""
 
 from __future__ import annotations
 

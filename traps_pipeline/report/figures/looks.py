@@ -38,7 +38,7 @@ def family_colour(family: str) -> str:
 
 
 def looks(models: Iterable[str]) -> dict[str, tuple[str, str]]:
-    """Return each model's family colour, and marker; up to 13 of a family differ."""
+    """Return each model's colour (its family's) and marker (13 differ per family)."""
     known = dict.fromkeys([*load_models(), *sorted(set(models))])
     colours = {model: family_colour(family_of(model)) for model in known}
     alike = {colour: [m for m in known if colours[m] == colour] for colour in COLOURS}
@@ -75,7 +75,7 @@ def _values(points: pd.DataFrame, name: str, least: float, *, intervals: bool) -
 
 
 def _limits(values: np.ndarray, low: float, least: float) -> tuple[float, float]:
-    """Return ends of an axis in tenths around the values: in [low, 1], upper ≥ least."""
+    """Return axis limits in tenths around the values, within [low, 1], upper ≥ least."""
     if not len(values):
         return low, 1.0
     bottom = low if least else max(low, float(np.floor(10 * values.min() - 0.8)) / 10)

@@ -193,7 +193,7 @@ _SIDES = (
 
 
 def _in_gaps(results: Results) -> list[Column]:
-    """Return the dose column in class gaps of the own dataset, none for the paper."""
+    """Return the column of doses in units of the class gap, none for the paper."""
     return [Column("control_gaps", "in class gaps", "ratio", 2)] if results.is_study else []
 
 

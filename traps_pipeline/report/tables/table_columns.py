@@ -128,7 +128,7 @@ def best_first(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def ordered(rows: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
-    """Return rows sorted by these columns, datasets, regimes, models in own order."""
+    """Return rows sorted by columns; datasets, regimes, models in their own order."""
     orders: dict[str, Sequence[str]] = {"dataset": [*DATASETS, "overall"], "regime": REGIMES, "model": [*load_models()]}
 
     def place(values: pd.Series) -> pd.Series:
