@@ -177,10 +177,7 @@ def _listed(answer: Any) -> list[Any]:
 def findings(
     entry: Entry, account: Account, outcomes: Mapping[str, Outcome], reached: ServerCheck | None = None
 ) -> LiveResult:
-    """Return an entry's problems and notes, from outcomes of `requests_of`.
-
-    reached: the findings of the checks before them.
-    """
+    """Return an entry's problems and notes, from outcomes of `requests_of`."""
     problems, notes, before = list[str](), list[str](), reached or ServerCheck()
     answering = {(outcome.served_model or "").partition("@")[0] for outcome in outcomes.values()}  # @VERSION may follow
     if before.unlisted and model_name(entry) not in answering:

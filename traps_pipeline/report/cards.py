@@ -113,10 +113,7 @@ def paper_card(report: TableReport | FigureReport, sources: Sources) -> Card:
 
 
 def tables_html(tables: Sequence[PrintedTable], title: str, address: Address | None) -> list[Mapping[str, object]]:
-    """Return each table's title (empty if it is the card's), fragment and files.
-
-    The files are downloads, by name.
-    """
+    """Return each table's title (empty if the card's), fragment and downloads by name."""
     return [
         {
             "title": table.title if table.title != title else "",

@@ -79,10 +79,7 @@ def report_parts(sources: Sources, address: Address | None = explorer_address) -
 def report_files(
     study: Results, cards: Sequence[tuple[str, Card]], address: Address | None = explorer_address
 ) -> dict[str, bytes]:
-    """Return the report page and leaderboard (Markdown, JSON lines), by path.
-
-    cards: by chapter.
-    """
+    """Return report page and leaderboard (Markdown, JSON lines) by path, from cards."""
     remarks = said_by_people(study.human_row, study.panel_errors)
     paper = {card.name: card.html for chapter, card in cards if chapter == PAPER}
     figures, pictures, tables = (

@@ -101,10 +101,7 @@ def reading(answer: str, votes: Sequence[Mapping[Any, Any]], verdict: Mapping[An
 
 
 def example_figure(example: Example, root: Path) -> Figure:
-    """Draw control and void frames left of their text.
-
-    The figure is one page wide. Clips lie under root.
-    """
+    """Draw control and void frames left of their text, one page wide."""
     pair, words = example.pair, example.words
     with figure_style():
         block = moments_of(pair, root, FRAMES.moments)

@@ -60,7 +60,7 @@ def audit() -> pd.DataFrame:
 
 
 def audit_text(findings: pd.DataFrame, everything: bool = False) -> str:
-    """Return every claim, every difference, and counts; everything: all the rest, too."""
+    """Return claims, differences and counts as text; everything: list the rest, too."""
     lines = ["lines are those of the paper's LaTeX source"]
     for group, rows in findings.groupby("group", sort=False):
         counts = ", ".join(f"{n} {verdict}" for verdict, n in rows["verdict"].value_counts().items())
@@ -89,7 +89,7 @@ def counts_text(findings: pd.DataFrame) -> str:
 
 
 def claims() -> Iterator[AuditFinding]:
-    """Yield all of `claims.csv`. Raises KeyError where `claims` lacks the arithmetic."""
+    """Yield all statements of `claims.csv`. Raises KeyError without their arithmetic."""
     for claim in published("claims").to_dict("records"):
         printed, recomputed = str(claim["published"]), CLAIMS[str(claim["id"])]()
         is_same = _is_same_wording(printed, recomputed.words) if recomputed.agrees is None else recomputed.agrees

@@ -110,10 +110,7 @@ def interval(
 
 
 def with_interval(name: str, ends: np.ndarray, limits: tuple[float, float]) -> dict[str, float]:
-    """Return a score and its interval as columns, from ends (2, 1 + resamples).
-
-    The observed score is first.
-    """
+    """Return score and interval as columns; ends: (2, 1 + resamples), observed first."""
     low, high = interval(ends[:, 1:], ends[1, 0], limits)
     return {name: float(ends[1, 0]), f"{name}_ci_low": float(low), f"{name}_ci_high": float(high)}
 
@@ -236,9 +233,9 @@ def ends_of_mean(values: pd.Series, resampling: Resampling, named: str) -> np.nd
 
 
 def figures_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:
-    """Return scores of COUNTS, (.., 9, resamples) -> (2, .., RESAMPLED, resamples).
+    """Return scores from sums, (.., 9, resamples) -> (2, .., RESAMPLED, resamples).
 
-    in_mean: as in `shares_of`.
+    The sums are those of COUNTS with an unseen scenario. in_mean: as in `shares_of`.
     """
     return figures_of_shares(shares_of(sums, in_mean))
 

@@ -213,7 +213,7 @@ def _pairs(entries: Sequence[tuple[str, str, str]]) -> Iterator[tuple[str, str, 
 
 
 def least_p(scenarios: int) -> float:
-    """Return the smallest two-sided p of n paired differences, 2^(1 - n).
+    """Return the smallest two-sided p of n scenarios' paired differences, 2^(1 - n).
 
     It is that of a sign-flip test whose differences all have one sign. Pairs of one scenario go together, so they count
     once.

@@ -234,10 +234,10 @@ def _refusal(dose: pd.DataFrame, reference: pd.DataFrame) -> str | None:
 
 
 def _beside_rules(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return rows with the rules' highest value and largest change, by rule name.
+    """Return rows beside the shortcut rules' highest value and largest change.
 
-    They are for the same hypothesis and dose. A rule does not read the regime, so rows of another regime serve if there
-    are none.
+    Each comes with its rule's name, for the same hypothesis and dose. A rule does not read the regime, so rows of
+    another regime serve if there are none.
     """
     of_rules = rows.loc[rows["model"].isin(RULES)].to_dict("records")
     remarks = []

@@ -36,10 +36,7 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class GradedItem:
-    """A graded item, with the probability of each answer.
-
-    commonest: the sub-scenario's commonest answer.
-    """
+    """A graded item: its answers, their probabilities, the sub-scenario's commonest."""
 
     labels: Sequence[str]
     aliases: Mapping[str, str]
@@ -176,9 +173,9 @@ def _of_probabilities(item: GradedItem, stated: Mapping[str, float] | None) -> d
 
 
 def decided(item: GradedItem, label: str | None) -> dict[str, float]:
-    """Return expected points, and regret against an ideal observer, by its reasons.
+    """Return an answer's expected points, and its regret split by reason.
 
-    label: None for an abstention.
+    The regret is the loss against an ideal observer. label: None for an abstention.
     """
     posterior, even = item.posterior, dict.fromkeys(item.labels, 1 / len(item.labels))
     best, own = max(posterior.values()), 0.0 if label is None else posterior.get(label, 0.0)

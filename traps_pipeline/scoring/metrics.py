@@ -87,7 +87,7 @@ def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]
 
 
 def mean(values: pd.Series) -> float:
-    """Return the mean, or null if any value is null, so that no value goes missing."""
+    """Return the mean, or null if a value is null: no mean silently uses fewer values."""
     return float(np.mean(values.to_numpy(float)))
 
 

@@ -135,7 +135,7 @@ REGIME_TESTS = Table(
 @dataclass(frozen=True, kw_only=True)
 @with_neighbours
 class LeaderboardRow:
-    """A model under a regime on one dataset, or overall (equal-weight mean of all)."""
+    """A model under a regime on one dataset, or overall (equal-weight mean of four)."""
 
     model: shared.Model
     regime: shared.Regime
@@ -335,7 +335,7 @@ LEAVE_ONE_OUT = Table("leave_one_out", LeaveOneOutRow, partition_by=(), key=("mo
 @dataclass(frozen=True, kw_only=True)
 @with_neighbours
 class PrevalenceRow:
-    """How often each axis applies to a model's sampled void failures (else no row)."""
+    """How often each axis applies to a model's void failures (no row: not run)."""
 
     model: shared.Model
     evidence: Annotated[str, "what the judge saw: trace_and_output or output; both joined by + if traces were missing"]
