@@ -1,6 +1,4 @@
-"""Detect a changed model behind the same name.
-
-The canary asks twenty fixed items again in each epoch.
+"""Detect a changed model behind a name by twenty fixed items in each epoch.
 
 An epoch that is named in `study.yaml` is asked once. Rules read the answers, whichever panel judges the study: the same
 reader on both sides isolates changes of the model. Answers are sampled, so some changes are chance; the number of
@@ -60,10 +58,7 @@ CANARY = Table("canary", CanaryRow, partition_by=(), key=("model", "item_id", "e
 
 
 def canary_items(workspace: Workspace) -> list[dict[str, Any]]:
-    """Return the canary's items: of each dataset those with the smallest digests.
-
-    Raises TrapsError without items.
-    """
+    """Return each dataset's items of smallest digest. Raises TrapsError without items."""
     items = workspace.tables.read_all(ITEMS, dataset=DATASETS).to_dict("records")
     if not items:
         raise TrapsError("canary: no items yet; materialize items first")
@@ -82,10 +77,7 @@ class _Asked(Call):
 
 
 def ask_canary(workspace: Workspace, models: Sequence[str]) -> pd.DataFrame:
-    """Ask models for this epoch's missing items, and return rows of all epochs.
-
-    The CANARY table is written, too.
-    """
+    """Ask this epoch's missing items, write CANARY, and return rows of all epochs."""
     epoch, items = workspace.study.epoch, canary_items(workspace)
     entries = [entry for entry in map(get_model, models) if entry.backend == NETWORK]
     calls = [_Asked(_request(workspace, entry, item, epoch), entry, item) for entry in entries for item in items]
@@ -154,18 +146,12 @@ def _has_tokens(*rows: Mapping[str, Any]) -> bool:
 
 
 def _said(value: Any) -> str:
-    """Return a table's value in comparable form.
-
-    Null equals null in any representation.
-    """
+    """Return a table's value as text; null equals null in any representation."""
     return "" if pd.isna(value) else str(value)
 
 
 def changes_text(rows: pd.DataFrame) -> str:
-    """Return the changes as a table for people.
-
-    It is a sentence if no model was asked in two epochs.
-    """
+    """Return the changes as a table, or a sentence if no model has two epochs."""
     table = changes(rows)
     if table.empty:
         return "canary: asked in this epoch; name another epoch in study.yaml to ask again, and what changed is shown"

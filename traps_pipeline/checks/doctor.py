@@ -1,7 +1,4 @@
-"""Report which steps this machine can run (`traps doctor`).
-
-For the others it names what to install.
-"""
+"""Report which steps this machine can run, and what to install (`traps doctor`)."""
 
 from __future__ import annotations
 
@@ -59,10 +56,7 @@ def examine(place: Place) -> Iterator[Finding]:
 
 
 def examine_local(models: Sequence[str] = ()) -> Iterator[Finding]:
-    """Yield a finding for each requirement of local models.
-
-    They are tiny checkpoints, devices, weights and named models.
-    """
+    """Yield findings on tiny checkpoints, devices, weights and named models."""
     from traps_pipeline.mechanism import adapter_checks
     from traps_pipeline.models.local import selfcheck
     from traps_pipeline.models.local.adapter import load_local_model
@@ -139,9 +133,9 @@ def examine_files(place: Place) -> Iterator[Finding]:
 
 
 def examine_unused(place: Place, *, is_removed: bool) -> Finding:
-    """Return the old unreferenced objects in a study's store.
+    """Return a finding on old unreferenced objects, removed or not, in a shared store.
 
-    The finding tells whether they were removed. Raises TrapsError.
+    Raises TrapsError for a study that is not shared.
     """
     from traps_pipeline.storage.store import GRACE_DAYS
     from traps_pipeline.storage.workspace import Workspace
@@ -187,10 +181,7 @@ def _damaged_media(note: Path) -> str:
 
 
 def _damaged_history(path: Path) -> str:
-    """Return why a history is damaged.
-
-    The next command puts it aside and begins anew, so nothing is lost.
-    """
+    """Return why a history is damaged; the next command puts it aside, losing nothing."""
     try:
         with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as opened:
             (result,) = opened.execute("pragma quick_check(1)").fetchone()
@@ -200,10 +191,7 @@ def _damaged_history(path: Path) -> str:
 
 
 def _remove_unfinished(root: Path) -> str:
-    """Remove old unfinished files of killed runs.
-
-    A run may still be writing young ones.
-    """
+    """Remove killed runs' unfinished files, but no young ones a run may be writing."""
     old = [path for path in root.rglob(f".*{PART}") if time.time() - path.stat().st_mtime > UNFINISHED_AFTER_S]
     size = sum(path.stat().st_size for path in old)
     for path in old:
@@ -246,10 +234,7 @@ def _workspace(place: Place) -> str:
 
 
 def _keys() -> str:
-    """Return the missing keys with the entries that need them.
-
-    Raises TrapsError for one that no header can carry.
-    """
+    """Return missing keys and who needs them. Raises TrapsError for an unusable key."""
     from traps_pipeline.models.judges import load_judges
     from traps_pipeline.models.registry import load_accounts, load_models, missing_keys
 

@@ -1,9 +1,8 @@
 """Check models and judges with live calls before money is spent.
 
-`traps models check --live` and the preflight of a run do.
-
-Each model is asked about a clip that is red and then blue, once with the clip and once without, and in its JSON form;
-each judge votes on answers with known votes. Every problem is a sentence that names the cause and the remedy.
+`traps models check --live` and the preflight of a run do. Each model is asked about a clip that is red and then blue,
+once with the clip and once without, and in its JSON form; each judge votes on answers with known votes. Every problem
+is a sentence that names the cause and the remedy.
 """
 
 from __future__ import annotations
@@ -65,10 +64,7 @@ _ITEM: Mapping[str, Any] = {
 
 @dataclass(frozen=True)
 class LiveResult:
-    """The result for an entry.
-
-    problems: reasons why its answers are worthless. notes: other observations.
-    """
+    """An entry's result: problems, which make its answers worthless, and notes."""
 
     entry: Entry
     problems: Sequence[str]
@@ -89,10 +85,7 @@ def _studio() -> Studio:
 
 
 def requests_of(entry: Entry) -> dict[str, Request]:
-    """Return the calls to an entry, by name.
-
-    They contain the time, so that yesterday's answers are not reused.
-    """
+    """Return the calls to an entry by name; they hold the time, so none is reused."""
     now = datetime.now(UTC).isoformat()
     if isinstance(entry, JudgeEntry):
         tasks: tuple[Task, ...] = ("abstention", "correctness")
@@ -184,10 +177,7 @@ def _listed(answer: Any) -> list[Any]:
 def findings(
     entry: Entry, account: Account, outcomes: Mapping[str, Outcome], reached: ServerCheck | None = None
 ) -> LiveResult:
-    """Return the problems and notes of an entry's outcomes.
-
-    outcomes: of `requests_of`. reached: of the checks before them.
-    """
+    """Return an entry's problems and notes, from outcomes of `requests_of`."""
     problems, notes, before = list[str](), list[str](), reached or ServerCheck()
     answering = {(outcome.served_model or "").partition("@")[0] for outcome in outcomes.values()}  # @VERSION may follow
     if before.unlisted and model_name(entry) not in answering:

@@ -30,10 +30,7 @@ class _Loopback(Account):
 
 
 class _Notes(Progress):
-    """A collector of a backend's notes.
-
-    One may say why a client library refused to send.
-    """
+    """A collector of a backend's notes, such as why a client refused to send."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -49,10 +46,7 @@ _CAUGHT = (400, b'{"error": {"message": "caught", "type": "invalid_request_error
 
 @contextmanager
 def _listening(answers: Iterator[tuple[int, bytes]] | None = None) -> Iterator[tuple[str, list[WireBody]]]:
-    """Serve on this machine; yield address and requests.
-
-    Each request gets the next status and JSON, or a final 400.
-    """
+    """Serve here, yield address and requests; answer the next status and JSON, or 400."""
     caught: list[WireBody] = []
     replies = repeat(_CAUGHT) if answers is None else answers
 
@@ -80,10 +74,7 @@ def _listening(answers: Iterator[tuple[int, bytes]] | None = None) -> Iterator[t
 
 
 def replay(entry: Entry, requests: Sequence[Request], answers: Sequence[tuple[int, bytes]]) -> list[Outcome]:
-    """Return the outcome of each request when the provider answers like this.
-
-    answers: status and JSON.
-    """
+    """Return each request's outcome when the provider gives these (status, JSON)."""
     account = load_accounts()[str(entry.account)]
     with _listening(iter(answers)) as (address, _), reporting(_Notes()):
         loopback = _Loopback(base_url=address + urlsplit(account.base_url or "").path)

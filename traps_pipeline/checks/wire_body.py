@@ -1,7 +1,4 @@
-"""Parse request bodies of providers' APIs into one form.
-
-It also lists each API's fields for each parameter.
-"""
+"""Parse request bodies into one form; list each API's fields for parameters."""
 
 from __future__ import annotations
 
@@ -76,10 +73,7 @@ class ParsedBody:
 
 
 def read_body(wire: WireBody) -> ParsedBody:
-    """Return the parsed body.
-
-    Raises one of `UNKNOWN_FORM` if its form is unknown.
-    """
+    """Return the parsed body. Raises one of `UNKNOWN_FORM` if its form is unknown."""
     body = _camel(wire.body) if wire.api == "gemini" else dict(wire.body)
     model = body.pop("model", None) or wire.path.rsplit("/", 1)[-1].removesuffix(":generateContent")
     match wire.api:
@@ -100,10 +94,7 @@ def _turn(turn: Mapping[str, Any]) -> tuple[str, list[str | ClipPart | None]]:
 
 
 def _part(part: Mapping[str, Any]) -> str | ClipPart | None:
-    """Return a part of a turn in the one form.
-
-    None for an unknown kind of part.
-    """
+    """Return a part of a turn in the one form, None for an unknown kind."""
     match part:
         case {"text": str(text), **rest} if rest.keys() <= {"type"}:
             return text
@@ -124,10 +115,7 @@ def _clip(uri: str, fps: float | None = None) -> ClipPart:
 
 
 def _camel(value: Any) -> Any:
-    """Return the value with Gemini's names in camelCase.
-
-    Gemini accepts snake_case too, and litellm mixes both.
-    """
+    """Return Gemini's names in camelCase; snake_case is valid, and litellm mixes both."""
     if isinstance(value, list):
         return [_camel(element) for element in value]
     if not isinstance(value, dict):

@@ -80,10 +80,7 @@ def _studio() -> Studio:
 
 
 def requests_of(entry: Entry) -> dict[str, Request]:
-    """Return one request of every form that a study sends.
-
-    By regime for a model, by task and label for a judge.
-    """
+    """Return one request of every form: by regime, or by task and label for a judge."""
     if isinstance(entry, ModelEntry):
         media = _studio().prepare(entry.media) if entry.media else None
         return {regime: question(entry, regime, _QUESTION, media, {"regime": regime}) for regime in REGIMES}
@@ -129,10 +126,7 @@ def _short(value: Any) -> str:
 
 
 def _turn_problems(turns: Sequence[tuple[str, list[str | ClipPart | None]]], request: Request) -> Iterator[str]:
-    """Yield problems of the turns.
-
-    Prompt and question must be verbatim, the clip before the question, no more.
-    """
+    """Yield problems unless the turns hold prompt, clip and question verbatim."""
     roles = [role for role, _ in turns]
     if roles != ["system", "user"]:
         yield f"the turns are {roles}, not system and user"
@@ -228,10 +222,7 @@ def _examine_network(entry: Entry) -> CheckedEntry:
 
 
 def _protocol_problems(entry: ModelEntry, requests: Mapping[str, Request]) -> Iterator[str]:
-    """Yield departures from the protocol.
-
-    It applies to every model, whatever its entry says.
-    """
+    """Yield departures from the protocol, which applies whatever the entry says."""
     for regime, request in requests.items():
         if ("response_format" in request.params) != (entry.json_schema and bool(BY_NAME[regime].fields)):
             yield f"{regime}: structured output is for regimes that ask for an object, where the entry has json_schema"
@@ -257,10 +248,7 @@ def _fields(fields: Mapping[str, Any]) -> str:
 
 
 def _examine_local(entry: ModelEntry, spec: MediaSpec) -> CheckedEntry:
-    """Check the frames that a local model is shown.
-
-    Nothing is sent, but frames are picked and resized.
-    """
+    """Check the frames that a local model is shown; nothing is sent."""
     frames = sample(_studio().clip, spec)
     count, (height, width) = len(frames.frames), frames.frames.shape[1:3]
     times = " ".join(f"{time:g}" for time in frames.times_s[:3])
@@ -290,10 +278,7 @@ def participants() -> dict[str, Entry]:
 
 
 def check_named(names: Sequence[str]) -> Iterator[CheckedEntry]:
-    """Check the entries with these ids, or all that send or show something.
-
-    Raises TrapsError for an unknown id.
-    """
+    """Check these entries (default: all). Raises TrapsError for an unknown id."""
     known = participants()
     if unknown := [name for name in names if name not in known]:
         raise TrapsError(f"unknown model or judge {', '.join(unknown)}; known: {', '.join(known)}")

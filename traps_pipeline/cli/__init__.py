@@ -1,7 +1,4 @@
-"""Build the `traps` command: its parser and exit codes.
-
-Each other file defines one group of commands and their arguments.
-"""
+"""Build the `traps` command; each other file defines one group of commands."""
 
 from __future__ import annotations
 
@@ -82,10 +79,7 @@ def main(argv: Sequence[str] | None = None, parser: argparse.ArgumentParser | No
 
 
 def _run(argv: Sequence[str] | None, parser: argparse.ArgumentParser) -> int:
-    """Run a subcommand.
-
-    Raises BrokenPipeError if the reader of its output has gone.
-    """
+    """Run a subcommand. Raises BrokenPipeError if the reader of its output has gone."""
     try:
         arguments = parser.parse_args(argv)
         command: Run = arguments.command

@@ -178,10 +178,7 @@ def verify_commitment(arguments: argparse.Namespace) -> int:
 def _not_drawn(
     published: Commitment, problems: list[str], specs: dict[str, SceneSpec] | None, drawn: dict[str, SceneSpec]
 ) -> list[str]:
-    """Return what the seed does not reproduce here.
-
-    The second value is whether only this machine's arithmetic explains it.
-    """
+    """Return the problems of drawn scenes, and whether only their last digits differ."""
     from traps_pipeline.release.commitment import is_same_scene, other_arithmetic
 
     if (

@@ -1,6 +1,4 @@
-"""Share what all commands need.
-
-Exit codes, the parser, the workspace and the experiment of a command.
+"""Share what commands need: exit codes, parser, workspace, experiment.
 
 Only `errors`, `files` and `terminal` of the package are imported here before a command runs, so that `traps --help`
 answers at once.
@@ -38,10 +36,7 @@ Run = Callable[[argparse.Namespace], int]  # a command takes its parsed argument
 
 
 def integer(least: int, most: int) -> Callable[[str], int]:
-    """Return an argparse type for a whole number in plain digits.
-
-    It lies from `least` to `most`.
-    """
+    """Return an argparse type for a whole number in plain digits, `least` to `most`."""
 
     def parse(text: str) -> int:
         if not re.fullmatch(r"-?[0-9]{1,18}", text) or not least <= int(text) <= most:
@@ -52,10 +47,7 @@ def integer(least: int, most: int) -> Callable[[str], int]:
 
 
 def number(above: float, most: float) -> Callable[[str], float]:
-    """Return an argparse type for a number in plain digits.
-
-    It is above `above` and at most `most`.
-    """
+    """Return an argparse type for a number in plain digits, in (`above`, `most`]."""
 
     def parse(text: str) -> float:
         if not re.fullmatch(r"[0-9]{1,9}(\.[0-9]{1,9})?", text) or not above < float(text) <= most:
@@ -66,10 +58,7 @@ def number(above: float, most: float) -> Callable[[str], float]:
 
 
 class LineHelpFormatter(argparse.HelpFormatter):
-    """A help formatter that keeps line breaks.
-
-    It wraps each line to the terminal, so that examples can be copied.
-    """
+    """A help formatter that keeps line breaks, so that examples can be copied."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         lines = (line if line.startswith("example: ") else textwrap.fill(line, width) for line in text.splitlines())
@@ -77,9 +66,7 @@ class LineHelpFormatter(argparse.HelpFormatter):
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that suggests the nearest word.
-
-    It accepts commands of daily use without their group (`short`).
+    """A parser that suggests the nearest word, and accepts `short` names of commands.
 
     `commands` maps the name of every command below it, such as `study run`, to its parser.
     """
@@ -96,10 +83,7 @@ class Parser(argparse.ArgumentParser):
     def parse_args(  # pyright: ignore[reportIncompatibleMethodOverride] - it has overloads
         self, args: Iterable[str] | None = None, namespace: Any = None
     ) -> Any:
-        """See `argparse`.
-
-        The command that received an unknown option reports it.
-        """
+        """See `argparse`; the command that received an unknown option reports it."""
         words = [*(sys.argv[1:] if args is None else args)]
         if words and words[0] in self._short:
             words.insert(0, self._short[words[0]])
@@ -124,10 +108,7 @@ class Parser(argparse.ArgumentParser):
         super().error(message)
 
     def _print_message(self, message: str, file: Any = None) -> None:
-        """Write a message.
-
-        Raises BrokenPipeError, which `argparse` swallows from Python 3.11.3 on.
-        """
+        """Write a message; unlike `argparse` from 3.11.3 on, raise BrokenPipeError."""
         if message and (stream := file or sys.stderr):
             stream.write(message)
 
@@ -187,10 +168,7 @@ class Commands:
 
 
 def print_failure(text: str) -> None:
-    """Print an error to standard error line by line.
-
-    On a terminal, wrap between words.
-    """
+    """Print an error to standard error by line, on a terminal wrapped between words."""
     for line in f"traps: {text}".splitlines():
         print(wrapped(plain(line), sys.stderr), file=sys.stderr)
 
@@ -234,9 +212,7 @@ def add_listening(parser: argparse.ArgumentParser, *, port: int, variable: str) 
 def listening_of(
     arguments: argparse.Namespace, command: str, variable: str, *, danger: str, people: Sequence[str] = ()
 ) -> Listening:
-    """Return the address and tokens of a command that serves pages.
-
-    The token is one for all, or one per person.
+    """Return address and token (or tokens by person) of a command that serves pages.
 
     danger: what everybody who reaches the address could do. Raises TrapsError.
     """
@@ -253,10 +229,7 @@ def listening_of(
 
 
 def place_of(arguments: argparse.Namespace) -> Place:
-    """Return the location of a command's study, which need not exist.
-
-    Raises TrapsError for a wrong address.
-    """
+    """Return the location of a study, which need not exist. Raises TrapsError."""
     from traps_pipeline.storage import place
     from traps_pipeline.storage.workspace import Workspace
 
@@ -264,20 +237,14 @@ def place_of(arguments: argparse.Namespace) -> Place:
 
 
 def open_workspace(arguments: argparse.Namespace) -> Workspace:
-    """Return the study that a command works in.
-
-    Raises TrapsError with the remedy if there is none.
-    """
+    """Return a command's study. Raises TrapsError with a remedy if there is none."""
     from traps_pipeline.storage.workspace import Workspace
 
     return enter_workspace(Workspace.open(place_of(arguments)))
 
 
 def enter_workspace(workspace: Workspace) -> Workspace:
-    """Return the workspace after setting it in the environment.
-
-    Partition keys here and child processes read it there.
-    """
+    """Set the workspace in the environment, for keys and child processes; return it."""
     from traps_pipeline.models.user_registry import clear_caches
     from traps_pipeline.storage.workspace import VARIABLE
 
@@ -288,10 +255,7 @@ def enter_workspace(workspace: Workspace) -> Workspace:
 
 
 def load_definitions() -> None:
-    """Declare the pipeline's graph without importing Dagster.
-
-    Staleness is computed from it.
-    """
+    """Declare the pipeline's graph, for staleness, without importing Dagster."""
     import traps_pipeline.pipeline.stages  # noqa: F401 - its import is what declares the graph
 
 
@@ -312,10 +276,7 @@ def add_panel(parser: argparse.ArgumentParser) -> None:
 
 
 def experiment_of(arguments: argparse.Namespace) -> Experiment:
-    """Return the experiment that a command names.
-
-    Raises TrapsError with the known names.
-    """
+    """Return the experiment a command names. Raises TrapsError with known names."""
     from traps_pipeline.pipeline.experiment import load_experiment
 
     return load_experiment(arguments.experiment)

@@ -1,7 +1,4 @@
-"""Print a shell's completion script (`traps completion`).
-
-It completes commands, options, experiments and values.
-"""
+"""Print a shell's completion script (`traps completion`)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Exchange requests, answers and votes, to make calls elsewhere.
-
-`traps study export-requests`, `import-answers`, `export-votes`, `import-votes`.
-"""
+"""Export requests and votes, and import their answers, to make calls elsewhere."""
 
 from __future__ import annotations
 

@@ -36,9 +36,7 @@ def init(arguments: argparse.Namespace) -> int:
 
 
 def create(arguments: argparse.Namespace, experiment: Experiment, database: str | None = None) -> Workspace:
-    """Return the workspace that a command names, with the experiment in its study.
-
-    It is created if it is missing.
+    """Return the workspace with the experiment in its study, created if missing.
 
     database: the environment variable with the address of the study's database, if one is requested. Raises TrapsError
     if the existing study differs from the one that the experiment needs, or keeps its ledger elsewhere.

@@ -1,7 +1,4 @@
-"""Export, import and move a study's answers, votes and money.
-
-`traps study export-ledger`, `import-ledger`, `move`, `release-money`.
-"""
+"""Export, import and move a study's answers, votes and money."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Check that entries send what they declare and answer (`traps models`).
-
-`test-panel` checks that no answer can instruct a panel.
-"""
+"""Check what models and judges send and answer (`traps models`)."""
 
 from __future__ import annotations
 
@@ -57,9 +54,7 @@ def check(arguments: argparse.Namespace) -> int:
 
 
 def _named(arguments: argparse.Namespace) -> list[str]:
-    """Return the ids of the named models and judges.
-
-    Those of named panels and experiments are among them.
+    """Return ids of named models and judges, and those of panels and experiments.
 
     The workspace's own entries are known too. Raises TrapsError for a panel that cannot vote, named or not.
     """

@@ -1,7 +1,4 @@
-"""Serve review and labelling pages, and validate judges (`traps people`).
-
-Judges are validated against people's labels.
-"""
+"""Serve review and labelling pages, and validate judges (`traps people`)."""
 
 from __future__ import annotations
 

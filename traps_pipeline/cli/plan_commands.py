@@ -106,10 +106,7 @@ def _difference(least: float | None) -> str:
 
 
 def _print_forecasts(forecasts: Sequence[Forecast], minutes: float) -> None:
-    """Print tokens, dollars and minutes of the new calls over the network.
-
-    The sum leaves out unknown prices.
-    """
+    """Print tokens, dollars and minutes of new calls; sums omit unknown prices."""
     known = [row.dollars for row in forecasts if row.dollars is not None]
     total = (sum(d[0] for d in known), sum(d[1] for d in known), sum(d[2] for d in known))
     calls = sum(row.calls for row in forecasts)
@@ -137,10 +134,7 @@ def _print_forecasts(forecasts: Sequence[Forecast], minutes: float) -> None:
 
 
 def _print_local(costs: Sequence[Cost], card: str) -> None:
-    """Print passes, tokens, GPU-hours and memory of local models.
-
-    The sum leaves out models without a size.
-    """
+    """Print passes, tokens, GPU-hours and memory; sums omit models without a size."""
     rows = [
         (
             cost.model, cost.kind, f"{cost.passes:,}", f"{cost.tokens_in / 1e6:,.2f}, {cost.tokens_out / 1e6:,.2f}",

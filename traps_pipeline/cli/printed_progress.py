@@ -1,7 +1,4 @@
-"""Print a run's progress to standard error.
-
-A terminal gets a live region, anything else lines of text or JSON.
-"""
+"""Print a run's progress to standard error: a live region, text lines or JSON."""
 
 from __future__ import annotations
 
@@ -28,10 +25,7 @@ _OF_CALLS = 58  # columns of the live table beside the name
 
 
 def make_progress(form: Form = "auto", stream: TextIO | None = None) -> PrintedProgress:
-    """Return the progress that a command installs.
-
-    form: `auto` chooses a live region if the stream is a terminal.
-    """
+    """Return and start the progress of a form; `auto` is live on a terminal."""
     out: TextIO = stream or sys.stderr or Path(os.devnull).open("w")  # noqa: SIM115 - None where closed (`2>&-`)
     is_terminal = out.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown")
     kind = LiveProgress if form == "auto" and is_terminal else PrintedProgress
@@ -41,7 +35,7 @@ def make_progress(form: Form = "auto", stream: TextIO | None = None) -> PrintedP
 
 
 class PrintedProgress(Progress):
-    """Progress as text: one line for each stage that called, rendered or took long.
+    """Progress as text: a line per stage that called, rendered or took long.
 
     Another line stands for all others, and one comes every 30 s.
     """
@@ -93,10 +87,7 @@ class PrintedProgress(Progress):
             self.write(self.line())
 
     def write(self, text: str) -> None:
-        """Print text, which may hold a provider's words.
-
-        A closed stream ends the run as SIGTERM would.
-        """
+        """Print untrusted text; a closed stream ends the run as SIGTERM would."""
         try:
             with self._printing:
                 for each in text.split("\n"):
@@ -119,10 +110,7 @@ class PrintedProgress(Progress):
 
 
 class JsonProgress(PrintedProgress):
-    """Progress as lines of JSON.
-
-    `begin` and `end` of each stage, `progress` every 30 s, `note`.
-    """
+    """Progress as JSON lines: `begin` and `end` of stages, `progress`, `note`."""
 
     def stage(self, name: str, partitions: int) -> None:
         """See `Progress`."""
@@ -152,10 +140,7 @@ class JsonProgress(PrintedProgress):
 
 
 class LiveProgress(PrintedProgress):
-    """Show a region at the bottom of the terminal.
-
-    Lines of finished stages and notes scroll above it.
-    """
+    """A live region at the terminal's bottom, below scrolling lines of stages."""
 
     beat_s = 0.3
 
@@ -213,10 +198,7 @@ class LiveProgress(PrintedProgress):
         return Group(*lines, *([self._calls(now)] if now.calls else []))
 
     def _heading(self, now: StageProgress) -> str:
-        """Return the stage, its partitions, times and money.
-
-        At most 80 columns for names of up to 20.
-        """
+        """Return the stage, partitions, times and money, within 80 columns."""
         counts = f"  {now.done:,} of {now.partitions:,} made" if now.partitions else ""
         remaining = "" if now.left_s is None else f", {clock(now.left_s)} left"
         money = f"  {self.spent()}" if self.budget_usd and now.calls else ""

@@ -1,7 +1,4 @@
-"""Write and verify what a study publishes (`traps publish`).
-
-Releases, submissions, harness folders, results files and leaderboards.
-"""
+"""Write and verify releases, submissions and leaderboards (`traps publish`)."""
 
 from __future__ import annotations
 
@@ -105,10 +102,7 @@ def release(arguments: argparse.Namespace) -> int:
 
 
 def _date(text: str | None) -> str | None:
-    """Return a date unchanged.
-
-    Raises TrapsError if it is invalid.
-    """
+    """Return a date unchanged. Raises TrapsError if it is invalid."""
     from datetime import date
 
     try:

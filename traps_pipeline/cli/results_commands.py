@@ -1,7 +1,4 @@
-"""Write, audit and compare results (`traps results`).
-
-The explorer is one of them.
-"""
+"""Write, audit and compare results, with the explorer (`traps results`)."""
 
 from __future__ import annotations
 
@@ -59,10 +56,7 @@ def _megabytes(size: int) -> str:
 
 
 def audit_published(arguments: argparse.Namespace) -> int:
-    """See `traps results audit --help`.
-
-    Discrepancies of the published tables are findings, not failures.
-    """
+    """See `traps results audit --help`; discrepancies are findings, not failures."""
     from traps_pipeline.scoring.audit import audit, audit_text
 
     findings = audit()

@@ -157,10 +157,7 @@ def _print_work(report: RunReport, *, is_inside: bool) -> None:
 
 
 def _print_problems(problems: Sequence[str]) -> None:
-    """Print each cause once.
-
-    The cause behind most problems comes last: it is the one to fix first.
-    """
+    """Print each cause once, last the one behind most problems, to fix first."""
     alike = dict[str, list[str]]()
     for problem in problems:
         alike.setdefault(problem.partition(": ")[2] or problem, []).append(problem)
@@ -175,10 +172,7 @@ def _print_problems(problems: Sequence[str]) -> None:
 
 @contextmanager
 def _open_runs(arguments: argparse.Namespace, instance: DagsterInstance, workspace: Workspace) -> Iterator[Runs]:
-    """Open the executor of runs: this process, or a cluster's hosts.
-
-    Raises TrapsError if there is none.
-    """
+    """Open the executor of runs, here or on a cluster. Raises TrapsError without one."""
     from traps_pipeline.definitions import defs
     from traps_pipeline.pipeline.runs import RunsHere
 
@@ -191,9 +185,7 @@ def _open_runs(arguments: argparse.Namespace, instance: DagsterInstance, workspa
 
 
 def _allow(workspace: Workspace, experiment: Experiment, arguments: argparse.Namespace) -> Workspace:
-    """Return the workspace with the budgets of the command.
-
-    Otherwise those of the experiment.
+    """Return the workspace with the command's budgets, else the experiment's.
 
     Raises TrapsError for a wrong one.
     """

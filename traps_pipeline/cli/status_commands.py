@@ -79,10 +79,7 @@ def status(arguments: argparse.Namespace) -> int:
 
 
 def _command(workspace: Workspace, experiment: str | None) -> str:
-    """Return the command that refreshes stale partitions.
-
-    It names the given experiment, or the study's only one.
-    """
+    """Return `traps run` of the given experiment, else of the study's only one."""
     from traps_pipeline.pipeline.experiment import EXPERIMENTS
 
     names = [experiment] if experiment else [*workspace.study.experiments]

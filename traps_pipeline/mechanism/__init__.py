@@ -1,4 +1,1 @@
-"""Look inside local models.
-
-Hidden states, probes, void directions, steering (docs/spec.md 7 and 8).
-"""
+"""Look inside local models: states, probes, steering (docs/spec.md 7 and 8)."""

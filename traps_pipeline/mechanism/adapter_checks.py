@@ -1,6 +1,4 @@
-"""Check on any checkpoint what looking into a local model relies on.
-
-This takes seconds; docs/local.md has the table.
+"""Check in seconds what looking into a local model relies on (docs/local.md).
 
 `traps doctor --local` runs the checks on a tiny checkpoint of each family, and on named models. The tests go further
 (tests/models/local, tests/mechanism).
@@ -40,10 +38,7 @@ EXACT = ("float32",)  # in 16 bits rounding differs with the shape of a batch
 
 @dataclass(frozen=True)
 class Subject:
-    """A model and a clip for its questions.
-
-    frames: (N, H, W, 3) uint8 RGB, two or more, with their times in seconds.
-    """
+    """A model and a clip: frames (N ≥ 2, H, W, 3) uint8 RGB with their times in s."""
 
     model: LocalModel
     frames: np.ndarray
@@ -66,10 +61,7 @@ class Subject:
         return max(1, self.model.n_layers // 2)
 
     def steered(self, *alphas: float) -> Steering:
-        """Return steering by the random direction.
-
-        Its strength is in lengths of the state there.
-        """
+        """Return steering by the random direction; alphas are in lengths of the state."""
         length = float(np.linalg.norm(self.model.forward_states(self.prompts[0]).raw[self.layer]))
         return Steering(self.direction, self.layer, tuple(alpha * length for alpha in alphas))
 
@@ -88,10 +80,7 @@ class Check:
     exact: bool = True
 
     def found(self, subject: Subject) -> str:
-        """Run the check on a model and return its observation.
-
-        Raises TrapsError if the promise is broken.
-        """
+        """Run the check and return its observation. Raises TrapsError if it fails."""
         dtype = subject.model.params.dtype
         if self.exact and (dtype not in EXACT or subject.model.params.quantisation != "none"):
             return f"not looked at: in {dtype} rounding differs with the shape of a pass"
@@ -107,10 +96,7 @@ def _require(holds: bool, message: str) -> None:
 
 
 def _library_states(subject: Subject, prompt: Prompt) -> list[Tensor]:
-    """Return the library's own states of a prompt, (T, d) each.
-
-    Embeddings, block outputs, the last one normed.
-    """
+    """Return the library's states (T, d): embeddings, block outputs, last one normed."""
     import torch
 
     model = subject.model
@@ -233,10 +219,7 @@ def _batches(subject: Subject) -> str:
 
 @contextmanager
 def _ending(model: LocalModel, token: int) -> Iterator[None]:
-    """Stop generation within the block at a token from an early answer.
-
-    Rows of a batch then end at different tokens.
-    """
+    """Stop generation at a token, so that rows of a batch end at different steps."""
     config = model.network.generation_config
     before, config.eos_token_id = config.eos_token_id, [token]
     try:

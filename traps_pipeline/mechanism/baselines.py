@@ -1,6 +1,4 @@
-"""Compute baselines for probes.
-
-The same protocol runs on raw inputs, on the model's own output, and on noise.
+"""Compute baselines for probes: raw inputs, the model's own output, and noise.
 
 Every baseline replaces an item's states by other features and keeps the rest: the same items, folds, solver, intervals
 and targets (`probing.ProbeRun`). A probe on states says nothing about understanding if the question's words, the first
@@ -43,10 +41,7 @@ Features = Mapping[str, np.ndarray]  # dataset -> (n, columns), rows in the orde
 
 
 def baseline_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> list[ProbeBaselineRow]:
-    """Return rows of PROBE_BASELINES for the items of an extraction.
-
-    Raises TrapsError for a damaged clip.
-    """
+    """Return PROBE_BASELINES of an extraction. Raises TrapsError for a damaged clip."""
     settings = workspace.mechanism
     items = {name: probed_items(workspace, states, name) for name in dict.fromkeys(states.items["dataset"])}
     assert entry.media is not None, "local entries have media"
@@ -84,7 +79,7 @@ class AsItIs:
 
 
 def score_features(run: ProbeRun, features: Features, fit: Fit = fit_probe) -> list[Row]:
-    """Return the rows of the protocol on features in the place of states.
+    """Return the protocol's rows on features in the place of states.
 
     Those of nearest centroids are included. fit: another probe than the protocol's.
     """
@@ -145,10 +140,7 @@ def raw_features(
 
 
 def _seen(clip: Path, spec: MediaSpec) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return thumbnails and times of the shown frames, and the clip's last time.
-
-    Thumbnails (N, h, w, 3) in [0, 1], times (N,); the last time is that of the clip's last frame.
-    """
+    """Return thumbnails (N, h, w, 3) in [0, 1], times (N,), and the clip's last time."""
     import cv2
 
     try:
@@ -165,8 +157,6 @@ class NoMargin(TrapsError):
 
 def margin_tokens(entry: ModelEntry, states: StoredStates) -> tuple[LocalModel, list[int]]:
     """Return the model whose head reads stored states, and its abstention tokens.
-
-    These tokens begin an abstention.
 
     Raises NoMargin for states that are means over tokens, and for a model without such a token.
     """
@@ -200,9 +190,7 @@ def output_margins(entry: ModelEntry, states: StoredStates, datasets: Sequence[s
 
 
 def noise_floor(run: ProbeRun, seed: int, draws: int = NOISE_DRAWS) -> list[Row]:
-    """Return the protocol's rows on noise.
-
-    They are the mean over draws, with their standard deviation as `spread`.
+    """Return the protocol's rows on noise: means over draws, with deviation `spread`.
 
     Every distinct prompt has one vector of independent normal numbers, as wide as the states. Items with the same
     prompt (the controls of a taxonomy's two datasets) share it, as their states are equal. So `transfer` shows the

@@ -1,7 +1,4 @@
-"""Define tables of control analyses, which let a claim fail.
-
-The claims are about probes, directions and steered answers.
-"""
+"""Define tables of controls that let mechanistic claims fail."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -15,10 +12,7 @@ Share = Annotated[float | None, "share, 0 to 1"]
 
 @dataclass(frozen=True, kw_only=True)
 class SteeringNullRow(Steered):
-    """The effect of a void direction on its own dataset, among one null's draws.
-
-    It is taken at the largest dose and ranked.
-    """
+    """A void direction's largest-dose effect on its dataset, ranked among nulls."""
 
     target: Annotated[str, "dataset of the direction, which is also the one that was steered; all: mean over datasets"]
     layer: Block
@@ -49,10 +43,7 @@ STEERING_NULLS = Table(
 
 @dataclass(frozen=True, kw_only=True)
 class SteeringPecsRow(Steered):
-    """PECS and its parts of a steered model.
-
-    They are of one path at one dose under one sign policy.
-    """
+    """PECS and its parts of a steered model, by path, dose and sign policy."""
 
     source: Annotated[str, "dataset of the direction"]
     target: Annotated[str, "dataset that was steered"]
@@ -109,10 +100,7 @@ PROBE_BASELINES = Table(
 
 @dataclass(frozen=True, kw_only=True)
 class GateRow(Extracted):
-    """A model's scores on a target before and after a gate.
-
-    They are of one regime, one kind of features, one source and one threshold.
-    """
+    """Scores on a target before and after a gate, by features, source and threshold."""
 
     regime: Annotated[str, "system prompt of the answers that are gated"]
     features: Annotated[
@@ -150,10 +138,7 @@ GATE = Table(
 
 @dataclass(frozen=True, kw_only=True)
 class RiskCoverageRow(Extracted):
-    """A point of a risk-coverage curve over the four datasets.
-
-    Along it a gate gives up answers, from the riskiest on.
-    """
+    """A point of a risk-coverage curve, as a gate withholds the riskiest answers."""
 
     regime: Annotated[str, "system prompt of the answers"]
     features: Annotated[str, "as in gate; no gate: answers given up in no order, the risk of all"]
@@ -172,10 +157,7 @@ RISK_COVERAGE = Table(
 
 @dataclass(frozen=True, kw_only=True)
 class LensRow(Extracted):
-    """The margin of a dataset's states at a layer (logit lens).
-
-    States pass through the model's final norm and head.
-    """
+    """The margin of a dataset's states at a layer (logit lens: final norm and head)."""
 
     dataset: shared.Dataset
     layer: Annotated[int, "counted as in hidden_states; at the last one it is the output margin"]
@@ -214,10 +196,7 @@ ITEM_SCORES = Table("item_scores", ItemScoreRow, partition_by=("model", "prompt"
 
 @dataclass(frozen=True, kw_only=True)
 class SentenceRow(Extracted):
-    """How likely a model's abstention is behind an item, beside its own answer.
-
-    It is asked under the benchmark's prompt of that name.
-    """
+    """How likely an abstention is after an item's prompt, beside the model's answer."""
 
     item_id: shared.ItemId
     dataset: shared.Dataset
@@ -234,10 +213,7 @@ SENTENCES = Table("sentences", SentenceRow, partition_by=("model", "prompt"), ke
 
 @dataclass(frozen=True, kw_only=True)
 class PatchingRow(Extracted):
-    """The indirect effect of a group of positions at one site and layer.
-
-    It is taken over the pairs of a dataset.
-    """
+    """The indirect effect of a position group at a site and layer, over a dataset."""
 
     dataset: shared.Dataset
     into: Annotated[str, "side whose pass is changed: control (towards its void) or void (towards its control)"]

@@ -30,21 +30,16 @@ RESAMPLES, HALVINGS = 200, 50
 
 @dataclass(frozen=True, eq=False)
 class PairDifferences:
-    """Void minus control state of each pair of a direction, (n, d).
-
-    The scenario number of each pair is (n,).
-    """
+    """Void minus control state of each pair (n, d), and its scenario's number (n,)."""
 
     values: np.ndarray
     scenario: np.ndarray
 
 
 def apart(one: PairDifferences, other: PairDifferences, weights: np.ndarray) -> np.ndarray:
-    """Return the mean product of pairs of different scenarios, (draws,).
+    """Return unbiased products of two mean differences, (draws,).
 
-    It is an unbiased product of two mean differences.
-
-    weights: (draws, scenarios), the count of each scenario.
+    They are means over pairs of different scenarios. weights: (draws, scenarios), the count of each scenario.
     """
     products = one.values @ other.values.T
     differ = (one.scenario[:, None] != other.scenario).astype(float)
@@ -56,11 +51,9 @@ def apart(one: PairDifferences, other: PairDifferences, weights: np.ndarray) -> 
 
 
 def disattenuated(one: PairDifferences, other: PairDifferences, weights: np.ndarray) -> np.ndarray:
-    """Return the cosine of two mean differences, corrected for noise, (draws,).
+    """Return cosines of two mean differences, corrected for their noise, (draws,).
 
-    The noise is that of their pairs.
-
-    It may exceed 1, and is NaN if a mean difference is not longer than its noise.
+    A cosine may exceed 1, and is NaN if a mean difference is not longer than its noise.
     """
     lengths = apart(one, one, weights) * apart(other, other, weights)
     known = (lengths > 0) & (apart(one, one, weights) > 0)
@@ -68,10 +61,7 @@ def disattenuated(one: PairDifferences, other: PairDifferences, weights: np.ndar
 
 
 def split_half(of: PairDifferences, seed: Sequence[int]) -> float:
-    """Return the cosine between directions of two halves of the pairs.
-
-    It is averaged over random halvings.
-    """
+    """Return the cosine of two halves' directions, averaged over random halvings."""
     products, n = of.values @ of.values.T, len(of.values)
     rng = np.random.default_rng([*seed])
     first = np.stack([rng.permutation(np.arange(n) < n // 2) for _ in range(HALVINGS)]).astype(float)
@@ -82,10 +72,7 @@ def split_half(of: PairDifferences, seed: Sequence[int]) -> float:
 
 
 def cosine_rows(workspace: Workspace) -> list[CosineRow]:
-    """Return the rows of COSINES: all pairs of a model's void directions at one layer.
-
-    The pairs are over datasets and VQA prompts.
-    """
+    """Return COSINES of a model's void directions (dataset, VQA prompt) at one layer."""
     table = workspace.tables.read_all(DIRECTIONS, ["model", "prompt"])
     extractions = sorted({Extraction(str(m), str(p)) for m, p in zip(table["model"], table["prompt"], strict=True)})
     rows: list[CosineRow] = []
@@ -144,10 +131,7 @@ def _figures(one: PairDifferences, other: PairDifferences, weights: np.ndarray) 
 
 
 def _weights(taxonomies: Sequence[str], seed: int) -> np.ndarray:
-    """Return each scenario's count, (1 + RESAMPLES, scenarios).
-
-    The first are 1, the others resampled within its taxonomy.
-    """
+    """Return scenario counts (1 + RESAMPLES, scenarios): ones, then draws by taxonomy."""
     weights, taxonomy_of = np.ones((1 + RESAMPLES, len(taxonomies))), np.array(taxonomies)
     for number, taxonomy in enumerate(FAMILIES):
         if n := int(np.count_nonzero(taxonomy_of == taxonomy)):

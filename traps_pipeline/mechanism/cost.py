@@ -1,6 +1,4 @@
-"""Estimate the cost of local models for `traps plan`.
-
-Passes, tokens, GPU-hours and memory.
+"""Estimate passes, tokens, GPU-hours and memory of local models for `traps plan`.
 
 The estimate is arithmetic, not measurement: a pass takes 2 operations per parameter and token, and decoding steps are
 bound by the launch of each block's kernels or by reading the weights. docs/mechanism.md states the assumptions.
@@ -30,10 +28,7 @@ SOURCES = 4  # sources of patches: the other side, and three nulls
 
 @dataclass(frozen=True)
 class Card:
-    """A GPU's data sheet.
-
-    Dense operations a second in bfloat16, and memory bandwidth in bytes a second.
-    """
+    """A GPU's dense bfloat16 operations and memory bandwidth (bytes), per second."""
 
     operations: float
     bandwidth: float
@@ -49,10 +44,7 @@ CARDS = {
 
 @dataclass(frozen=True)
 class Work:
-    """Work of one kind: passes over prompts, and answers of a number of tokens.
-
-    0: none are generated.
-    """
+    """Passes over prompts, and tokens per answer (0: none are generated)."""
 
     kind: str
     passes: float
@@ -61,10 +53,7 @@ class Work:
 
 @dataclass(frozen=True)
 class Cost:
-    """The cost of one kind of work on one model.
-
-    Hours, gigabytes: None if the entry names no `size`.
-    """
+    """The cost of work on a model; hours, gigabytes: None if its entry has no `size`."""
 
     model: str
     kind: str
@@ -76,7 +65,7 @@ class Cost:
 
 
 def passes_inside(settings: MechanismSettings, datasets: Sequence[str], scenarios: Mapping[str, int]) -> list[Work]:
-    """Return the passes for states, sentences, random weights and patching.
+    """Return passes for states, sentences, random weights and patching.
 
     scenarios: their number by taxonomy.
     """
@@ -98,10 +87,7 @@ def passes_inside(settings: MechanismSettings, datasets: Sequence[str], scenario
 
 
 def cost_of(entry: ModelEntry, media: MediaSpec, work: Work, card: Card, *, quantised: bool) -> Cost:
-    """Return the cost of work on a model that is shown clips by `media`.
-
-    quantised: whether its weights are in NF4.
-    """
+    """Return the cost of work on a model shown clips by `media`; quantised: to NF4."""
     frames = media.uniform or min(media.most, round((media.fps or 1) * CLIP_S))
     prompt = frames * entry.tokens_per_frame + TEXT_TOKENS
     tokens_in, tokens_out = work.passes * prompt, work.passes * work.answer_tokens

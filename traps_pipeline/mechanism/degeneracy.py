@@ -1,7 +1,4 @@
-"""Detect degenerate steered texts.
-
-A judge could call one either abstention or answer.
-"""
+"""Detect degenerate steered texts, which judges could call abstention or answer."""
 
 from __future__ import annotations
 
@@ -42,9 +39,6 @@ def repeats(text: str) -> bool:
 
 
 def script(text: str) -> str:
-    """Return the script of most letters; empty for a text without letters.
-
-    It is the first word of their Unicode names (LATIN, CJK, CYRILLIC).
-    """
+    """Return the script of most letters, as in Unicode names (LATIN, CJK), or empty."""
     names = Counter(unicodedata.name(letter, "?").split()[0] for letter in text if letter.isalpha())
     return names.most_common(1)[0][0] if names else ""

@@ -1,7 +1,5 @@
 """Compute void directions and save them as files (docs/spec.md 8.1).
 
-A direction is the mean difference between voids and controls.
-
 A direction is the unit vector of mean(h_void) - mean(h_control) at one layer. Its nulls are unit vectors too, drawn
 from three distributions and made orthogonal to it, so that no null contains a part of the direction:
 
@@ -39,26 +37,17 @@ SITE = "output of the block, before the next one (residual stream); layer 0: emb
 
 
 def seeded_order(scenarios: Sequence[str], seed: int) -> list[str]:
-    """Return the scenarios in an order by seed and name alone.
-
-    So a discarded one does not move the others.
-    """
+    """Return scenarios ordered by seed and name alone, so that losing one moves none."""
     return sorted(scenarios, key=lambda name: digest([seed, name]))
 
 
 def steered_scenarios(scenarios: Sequence[str], n: int, seed: int) -> list[str]:
-    """Return the first n scenarios of a taxonomy's seeded order.
-
-    They are steered along every direction that does not come from them.
-    """
+    """Return the first n scenarios of the seeded order, to be steered."""
     return seeded_order(scenarios, seed)[:n]
 
 
 def direction_scenarios(scenarios: Sequence[str], n: int, seed: int) -> list[str]:
-    """Return the last n scenarios of the same order.
-
-    A direction is computed from them.
-    """
+    """Return the last n scenarios of the seeded order, to compute a direction from."""
     return seeded_order(scenarios, seed)[-n:]
 
 
@@ -67,10 +56,7 @@ def direction_scenarios(scenarios: Sequence[str], n: int, seed: int) -> list[str
 
 @dataclass(frozen=True)
 class Origin:
-    """The provenance of a set of directions.
-
-    It is written into the JSON file beside the tensors.
-    """
+    """The provenance of directions, as in the JSON file beside their tensors."""
 
     model: str
     checkpoint: str
@@ -116,11 +102,10 @@ def extract_directions(
 ) -> Directions:
     """Return directions from states (layers, pairs, d) of the two sides.
 
-    Each kind of null has several draws.
-
-    The pairs of both sides are in the same order. A layer at which the sides do not differ at all (the embeddings of a
-    last token that is the same everywhere) has a zero vector, not a direction that consists of rounding errors; so has
-    a null that the projection leaves empty. Raises TrapsError with fewer than two pairs.
+    The pairs of both sides are in the same order. Each kind of null has several draws. A layer at which the sides do
+    not differ at all (the embeddings of a last token that is the same everywhere) has a zero vector, not a direction
+    that consists of rounding errors; so has a null that the projection leaves empty. Raises TrapsError with fewer than
+    two pairs.
     """
     if void.shape != control.shape or void.ndim != 3 or void.shape[1] < 2:
         raise TrapsError(
@@ -153,9 +138,7 @@ def _null_draws(kind: str, void: np.ndarray, control: np.ndarray, rng: np.random
 
 
 def _orthogonal(vectors: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """Return unit vectors of draws without their part along `unit`.
-
-    Draws are (draws, layers, d), `unit` is (layers, d).
+    """Return unit vectors (draws, layers, d), less their part along unit (layers, d).
 
     Zero if hardly anything is left, and if `unit` itself is zero.
     """
@@ -188,9 +171,7 @@ def save_directions(path: Path, directions: Directions, origin: Origin) -> None:
 
 
 def load_directions(path: Path) -> tuple[Directions, dict[str, Any]]:
-    """Return the directions that `save_directions` wrote.
-
-    The content of their JSON file follows.
+    """Return saved directions and the content of their JSON file.
 
     Raises TrapsError if a file is missing, or if its digest differs from the one in the JSON file.
     """
@@ -217,10 +198,7 @@ def load_directions(path: Path) -> tuple[Directions, dict[str, Any]]:
 
 
 def cosine_matrix(vectors: np.ndarray) -> np.ndarray:
-    """Return cosines of unit vectors (k, d): (k, k).
-
-    NaN if either is zero.
-    """
+    """Return cosines of unit vectors, (k, d) -> (k, k); NaN if either is zero."""
     vectors = np.asarray(vectors, np.float64)
     lengths = np.linalg.norm(vectors, axis=1)
     with np.errstate(invalid="ignore"):

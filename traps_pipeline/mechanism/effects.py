@@ -1,6 +1,4 @@
-"""Compute the steering tables (docs/spec.md 8.4).
-
-They show abstention by path, strength and side.
+"""Compute steering tables: abstention by path, strength, side (docs/spec.md 8.4).
 
 Effects are rows of the `steering_effects` table, or the paper's in the same columns: model, directions, regime, source,
 target, kind, layer, alpha, side, abstention (a fraction).
@@ -28,21 +26,16 @@ REGIME_COLUMNS = (
 
 
 def on_both_sides(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return the effects at the steered layer.
-
-    Other layers of a sweep have only controls.
-    """
+    """Return effects at the steered layer; a sweep's other layers have only controls."""
     layers = effects.loc[effects["side"] == "void", [*CELL, "layer"]].drop_duplicates()
     return effects.merge(layers, on=[*CELL, "layer"])
 
 
 def paths(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return one row per path and strength at the steered layer.
+    """Return both sides' abstention by path and strength, at the steered layer.
 
-    It has transfer_type and both sides' abstention.
-
-    If the effects have intervals, counts, doses in class gaps or shares of degenerate answers, there are also columns
-    `control_low` and so on.
+    The column transfer_type is added. If the effects have intervals, counts, doses in class gaps or shares of
+    degenerate answers, there are also columns `control_low` and so on.
     """
     import pandas as pd
 
@@ -61,18 +54,15 @@ def paths(effects: pd.DataFrame) -> pd.DataFrame:
 
 
 def regime_matrix(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return REGIME_COLUMNS: mean abstention over the paths of each set.
+    """Return REGIME_COLUMNS: mean abstention of path sets at alpha 0 and the largest.
 
-    At alpha 0 and at the largest alpha, by direction regime, inference regime and kind of direction; family `all`.
+    It is by direction regime, inference regime and kind of direction; family `all`.
     """
     return _regime_rows(effects, lambda source: "all")
 
 
 def family_asymmetry(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return the columns of `regime_matrix` for guided directions and inference.
-
-    They are by source taxonomy (`family`).
-    """
+    """Return `regime_matrix` of guided directions and inference by source `family`."""
     guided = effects.loc[(effects["directions"] == GUIDED) & (effects["regime"] == GUIDED)]
     return _regime_rows(guided, taxonomy_of)
 
@@ -97,12 +87,10 @@ def _regime_rows(effects: pd.DataFrame, family: Callable[[str], str]) -> pd.Data
 
 
 def domains(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return control abstention at the largest alpha along each direction.
+    """Return control abstention at the largest alpha, within and across domains.
 
-    It is averaged within and across domains.
-
-    same: on the well-posed dataset of the source's own taxonomy; cross: on that of the other. Columns CELL, source,
-    alpha, same, cross.
+    It is a mean for each direction. same: on the well-posed dataset of the source's own taxonomy; cross: on that of the
+    other. Columns CELL, source, alpha, same, cross.
     """
     import pandas as pd
 
@@ -119,9 +107,7 @@ def domains(effects: pd.DataFrame) -> pd.DataFrame:
 
 
 def sweep(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return control abstention by layer and alpha.
-
-    It is averaged over each dataset's direction on its own controls.
+    """Return mean control abstention by layer and alpha, along own directions.
 
     Columns CELL, layer, alpha, control, n_splits. Empty if only one layer was steered.
     """
@@ -134,11 +120,10 @@ def sweep(effects: pd.DataFrame) -> pd.DataFrame:
 
 
 def own_effects(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return the effects of every dataset's own direction and its nulls.
+    """Return effects of each dataset's own direction and its nulls, signs by label.
 
-    Signs are by label, at the layer with both sides.
-
-    `gaps` holds the dose in units of the class gap; without a dose in that unit there are no rows.
+    They are at the layer with both sides. `gaps` holds the dose in units of the class gap; without a dose in that unit
+    there are no rows.
     """
     own = effects.loc[(effects["source"] == effects["target"]) & (effects["signs"] == "label")]
     both = own.loc[own["side"] == "void", ["model", "layer"]].drop_duplicates()
@@ -147,9 +132,7 @@ def own_effects(effects: pd.DataFrame) -> pd.DataFrame:
 
 
 def in_gaps(effects: pd.DataFrame, every: pd.DataFrame) -> pd.DataFrame:
-    """Return effects with `gaps`, their strength in class gaps.
-
-    The class gap is that of the direction's own dataset.
+    """Return effects with `gaps`, their strength in class gaps of their own dataset.
 
     The gap is inferred from the doses in that unit among `every` effect; NaN without any.
     """

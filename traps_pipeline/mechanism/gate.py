@@ -1,6 +1,4 @@
-"""Gate answers by a probe.
-
-A linear probe on the model's states decides whether the model's answer is kept.
+"""Gate answers: a linear probe on states decides whether an answer is kept.
 
 The paper's probes find that states separate what can be known from what cannot, while answers do not. A gate uses that:
 if the probe's score is above a threshold, the answer becomes an abstention. No call is made and no answer is judged
@@ -67,14 +65,13 @@ class Decisions:
 
 
 def thresholds(score: np.ndarray, void: np.ndarray, false_abs: float) -> dict[str, float]:
-    """Return the three thresholds from calibrating scores (n,) and labels (n,).
+    """Return thresholds by name from calibrating scores and labels, (n,) each.
 
-    A score above a threshold is gated.
-
-    mid: half-way between the mean scores of voids and of controls. J: the cut with the largest AbsRec - FalseAbs,
-    half-way to the next score. conformal: the smallest control score that at most a share `false_abs` of new controls
-    from the same source exceeds, in expectation over sources (split conformal prediction: rank ceil((n + 1)(1 -
-    false_abs)) of n); with too few controls for that (18 at 0.05), no answer is gated.
+    A score above a threshold is gated. mid: half-way between the mean scores of voids and of controls. J: the cut with
+    the largest AbsRec - FalseAbs, half-way to the next score. conformal: the smallest control score that at most a
+    share `false_abs` of new controls from the same source exceeds, in expectation over sources (split conformal
+    prediction: rank ceil((n + 1)(1 - false_abs)) of n); with too few controls for that (18 at 0.05), no answer is
+    gated.
     """
     control = np.sort(score[~void])
     mid = (score[void].mean() + control.mean()) / 2
@@ -87,19 +84,14 @@ def thresholds(score: np.ndarray, void: np.ndarray, false_abs: float) -> dict[st
 
 
 def sources_of_gate(source: str, target: str, datasets: Sequence[str] = DATASETS) -> list[str]:
-    """Return the datasets that a gate of a source is fitted on for a target.
-
-    source: one of SOURCES. datasets: those of the study.
-    """
+    """Return the datasets that a gate of a source is fitted on for a target."""
     if source == OTHER_DATASETS:
         return [name for name in datasets if name != target]
     return [name for name in datasets if source in (OTHER_FAMILIES, f"one:{name}")]
 
 
 def decide(items: Items, source: str, target: str, *, folds: int, seed: int, false_abs: float) -> Decisions:
-    """Return the decisions of a source's gates about every item of a target.
-
-    The target is a dataset.
+    """Return the decisions of a source's gates about every item of a dataset.
 
     A gate is fitted for each fold of the target's scenarios (each family, for `other families`) on source items of all
     other scenarios. Its thresholds come from cross-validated scores of those same source items, so that they are scores
@@ -129,10 +121,9 @@ def decide(items: Items, source: str, target: str, *, folds: int, seed: int, fal
 def fit_gate(
     train: Items, folds: int, seed: int, false_abs: float
 ) -> tuple[Scorer, dict[str, float], dict[str, float]]:
-    """Return a gate from its source's items.
+    """Return probe, thresholds, and shares of calibrating controls above each.
 
-    It is the probe, its thresholds by name, and the share of the calibrating controls above each. There must be both
-    sides, in two scenarios or more.
+    train: both sides, in two scenarios or more.
     """
     probe = fit_probe(train.features, train.void)
     calibrating, void = _own_scores(train, folds, seed)
@@ -151,10 +142,7 @@ def _held_groups(groups: np.ndarray, source: str, folds: int, seed: int) -> Iter
 
 
 def _own_scores(train: Items, folds: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return scores and labels of the source's distinct prompts.
-
-    Each score is by a probe that was not fitted on its scenario.
-    """
+    """Return held-out scores, by scenario, and labels of the distinct prompts."""
     fold = scenario_folds(train.table["scenario_id"].to_numpy(str), folds, seed)
     score = np.full(len(fold), np.nan)
     for k in range(folds):
@@ -170,20 +158,14 @@ def _own_scores(train: Items, folds: int, seed: int) -> tuple[np.ndarray, np.nda
 
 @dataclass(frozen=True, eq=False)
 class Outcomes:
-    """Verdicts of a target's items, (n,) each.
-
-    void; correct (of controls) and abstained, NaN if undecided.
-    """
+    """Verdicts (n,): void; correct (of controls) and abstained, NaN if undecided."""
 
     void: np.ndarray
     correct: np.ndarray
     abstained: np.ndarray
 
     def gated(self, gate: np.ndarray) -> Outcomes:
-        """Return the outcomes after a gate (n,) bool has turned answers into abstentions.
-
-        A gated undecided answer counts as an abstention.
-        """
+        """Return outcomes after a gate (n,) bool; a gated undecided answer abstains."""
         return Outcomes(self.void, np.where(gate, 0.0, self.correct), np.where(gate, 1.0, self.abstained))
 
     def figures(self) -> dict[str, float]:
@@ -195,10 +177,7 @@ class Outcomes:
         return {name: float(value) for name, value in shares.items()}
 
     def counts(self) -> np.ndarray:
-        """Return each item's numerators and denominators for Acc, FalseAbs and AbsRec.
-
-        (n, 6), as COUNTS.
-        """
+        """Return numerators and denominators of Acc, FalseAbs, AbsRec, (n, 6), as COUNTS."""
         parts = ((~self.void, self.correct), (~self.void, self.abstained), (self.void, self.abstained))
         decided = [side & np.isfinite(values) for side, values in parts]
         yes = [np.where(decision, values, 0.0) for decision, (_, values) in zip(decided, parts, strict=True)]
@@ -206,9 +185,7 @@ class Outcomes:
 
 
 def risk_coverage(score: np.ndarray, outcomes: Outcomes, coverages: Sequence[float]) -> list[tuple[float, float, int]]:
-    """Return (coverage, risk, answers kept) as answers are withheld.
-
-    They are withheld from the highest score down.
+    """Return (coverage, risk, answers kept) as the highest scores are withheld.
 
     Answered items are those on which the model did not abstain. Coverage is the share of all items that are answered
     and kept; risk is the share of kept answers that are wrong: every answer to a void, and every incorrect answer to a
@@ -227,17 +204,11 @@ def risk_coverage(score: np.ndarray, outcomes: Outcomes, coverages: Sequence[flo
 
 
 def separation(decisions: Decisions, void: np.ndarray) -> float:
-    """Return AUROC of a gate's scores on its target; NaN with one side alone.
-
-    The labels are void (n,).
-    """
+    """Return AUROC of a gate's scores against labels void (n,); NaN with one side."""
     known = np.isfinite(decisions.score)
     return float(auroc(void[known], decisions.score[known]))
 
 
 def families(items: pd.DataFrame) -> np.ndarray:
-    """Return the family of each item for `other families`.
-
-    It is its sub-scenario with its taxonomy.
-    """
+    """Return each item's family for `other families`: taxonomy and sub-scenario."""
     return np.array([f"{probed_taxonomy(d)}:{s}" for d, s in zip(items["dataset"], items["sub_scenario"], strict=True)])

@@ -1,7 +1,4 @@
-"""Build the rows of GATE and RISK_COVERAGE from stored states and verdicts.
-
-This is the gate stage.
-"""
+"""Build GATE and RISK_COVERAGE rows (gate stage) from stored states and verdicts."""
 
 from __future__ import annotations
 
@@ -71,9 +68,7 @@ class Gates:
 
 
 def gate_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> list[GateRow]:
-    """Return rows of GATE of an extraction, for each evaluated regime.
-
-    The model was evaluated in run 1.
+    """Return GATE rows of an extraction, for each regime evaluated in run 1.
 
     Raises TrapsError if the model has no verdicts yet.
     """
@@ -86,10 +81,7 @@ def gate_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> 
 
 
 def curve_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> list[RiskCoverageRow]:
-    """Return rows of RISK_COVERAGE of an extraction, for gates from other datasets.
-
-    Otherwise it works as `gate_rows`.
-    """
+    """Return RISK_COVERAGE rows, as `gate_rows`, for gates from other datasets."""
     return [
         row
         for regime, outcomes, gates, _, decided in _each(workspace, entry, states, (OTHER_DATASETS,))
@@ -124,20 +116,14 @@ def _each(
 
 
 def gate_table(states: StoredStates) -> pd.DataFrame:
-    """Return the items of all datasets in the form of `gate.Items.table`.
-
-    The order is that of `states.items`.
-    """
+    """Return all items as `gate.Items.table`, in the order of `states.items`."""
     items = states.items
     named = pd.DataFrame(items[["dataset", "scenario_id", "item_id"]])
     return named.assign(family=families(items), prompt=items["states_key"], void=items["side"] == "void")
 
 
 def chosen_layers(workspace: Workspace, states: StoredStates, targets: Iterable[str]) -> dict[str, int]:
-    """Return the layer of each target's gates.
-
-    It is chosen without its labels (`layer_choice`).
-    """
+    """Return the layer of each target's gates, by `layer_choice` without its labels."""
     rows = workspace.tables.read(PROBES, states.extraction.partition).to_dict("records")
     curves = pair_curves({str(name): value for name, value in row.items()} for row in rows)
     return {target: layer_choice(curves, target).layer for target in targets}
@@ -146,10 +132,7 @@ def chosen_layers(workspace: Workspace, states: StoredStates, targets: Iterable[
 def _kinds(
     workspace: Workspace, entry: ModelEntry, states: StoredStates, layers: Mapping[str, int], sources: Sequence[str]
 ) -> Iterator[Gates]:
-    """Yield states with every source, and control features with combined sources.
-
-    These combine several datasets.
-    """
+    """Yield states by every source, and control features by sources of many datasets."""
     names = [*dict.fromkeys(states.items["dataset"])]
     by_layer = {layer: read_states(states, names, layer) for layer in sorted({*layers.values()})}
     yield Gates(STATES, by_layer, sources)
@@ -177,10 +160,7 @@ def read_states(states: StoredStates, names: Sequence[str], layer: int) -> dict[
 def _decisions(
     workspace: Workspace, table: pd.DataFrame, gates: Gates, layers: Mapping[str, int]
 ) -> dict[tuple[str, str], tuple[Decisions, int]]:
-    """Return, by source and target, a gate's decisions and the layer of its states.
-
-    It is -1 for other features.
-    """
+    """Return decisions and states' layer (-1 for other features), by source, target."""
     settings, seed = workspace.mechanism, workspace.mechanism.seed
     about = {"folds": settings.probes.folds, "seed": seed, "false_abs": settings.gate.false_abs}
     decisions: dict[tuple[str, str], tuple[Decisions, int]] = {}
@@ -197,10 +177,7 @@ def _decisions(
 
 
 def gate_items(table: pd.DataFrame, features: Mapping[str, np.ndarray], shuffled: bool, seed: int) -> Items:
-    """Return the table with its features.
-
-    If shuffled, a scenario's sides are swapped with probability 0.5.
-    """
+    """Return the table with features; if shuffled, scenarios swap sides at random."""
     values = np.empty((len(table), next(iter(features.values())).shape[1]))
     for name, rows in features.items():
         values[(table["dataset"] == name).to_numpy()] = rows
@@ -211,9 +188,9 @@ def gate_items(table: pd.DataFrame, features: Mapping[str, np.ndarray], shuffled
 
 
 def outcomes_of(workspace: Workspace, model: str, regime: str, states: StoredStates) -> dict[str, Outcomes] | None:
-    """Return outcomes by dataset, in the order of the states.
+    """Return outcomes by dataset in states' order; None without any verdict.
 
-    None if the four datasets that have states have no verdicts. Items without verdicts (those that no model is asked)
+    The verdicts are those of the four datasets that have states. Items without verdicts (those that no model is asked)
     are undecided.
     """
     outcomes: dict[str, Outcomes] = {}
@@ -241,9 +218,9 @@ def _rows(
     resamples: int,
     seed: int,
 ) -> list[GateRow]:
-    """Return the rows of one gate on every target and over the four datasets.
+    """Return a gate's rows on every target, and over the four datasets.
 
-    The gate is of features, regime and source.
+    about: features, regime and source.
     """
     rows: list[GateRow] = []
     names = states.items["scenario_id"].to_numpy(str)
@@ -283,10 +260,10 @@ def _rows(
 
 
 def _resampled(outcomes: Outcomes, target: str, scenarios: np.ndarray, resamples: int, seed: int) -> np.ndarray:
-    """Return resampled sums of a dataset's outcomes with an unseen scenario.
+    """Return resampled sums of a dataset's outcomes, (9, 1 + resamples).
 
-    (9, 1 + resamples). The datasets of a taxonomy share their resamples, and taxonomies do not. scenarios: (n,), of
-    each item.
+    They have an unseen scenario. The datasets of a taxonomy share their resamples, and taxonomies do not. scenarios:
+    (n,), of each item.
     """
     about = {"dataset": target, "run": 1, "scenario_id": scenarios, "taxonomy": probed_taxonomy(target)}
     items = pd.DataFrame(outcomes.counts(), columns=pd.Index(COUNTS)).assign(**about)

@@ -157,9 +157,7 @@ def _look_for(folder: Path, known: dict[str, _Place]) -> None:
 
 
 def read_layer(folder: Path, layer: int | Literal["normed"]) -> tuple[pd.DataFrame, np.ndarray]:
-    """Return an extraction's items and their states at a layer, (n, d) float32.
-
-    Items have item_id, side, key and device.
+    """Return items (item_id, side, key, device) and states (n, d) float32 of a layer.
 
     layer: 0 (embeddings) to n_layers (the last block's output), or `normed` (the latter after the final norm). Raises
     TrapsError for an extraction that is not finished, a layer that does not exist, or a damaged shard.
@@ -178,10 +176,7 @@ def read_layer(folder: Path, layer: int | Literal["normed"]) -> tuple[pd.DataFra
 
 
 def read_record(folder: Path) -> dict[str, Any]:
-    """Return an extraction's model and settings: digest, precision, pooling and so on.
-
-    Raises TrapsError for an unfinished extraction.
-    """
+    """Return an extraction's settings. Raises TrapsError for an unfinished one."""
     return _ids(folder)[1]
 
 
@@ -196,10 +191,7 @@ def _make(
     tick: Callable[[int], None],
     known: dict[str, _Place],
 ) -> int:
-    """Run one pass per item and write a shard, also after an error or Ctrl-C.
-
-    Return the number of finished items.
-    """
+    """Run one pass per item; write a shard, even after an error; return items done."""
     shard: list[_Made] = []
     try:
         for finished, ((item, key), prompt) in enumerate(_prepared(missing), start=1):

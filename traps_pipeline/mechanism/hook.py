@@ -1,6 +1,4 @@
-"""Add alpha times a direction to the output of one block (docs/spec.md 8.1).
-
-This is the steering hook.
+"""Steer: add alpha times a direction to a block's output (docs/spec.md 8.1).
 
     with Steering(direction, layer=20, alphas=(5.0, -5.0)).applied(model): ...
 
@@ -68,8 +66,6 @@ class Steering:
     @contextmanager
     def applied(self, model: LocalModel) -> Iterator[None]:
         """Steer the model's passes inside the context.
-
-        The hook is always removed at its end.
 
         If every alpha is 0 there is no hook, and outputs equal the unsteered model's bit for bit. Raises TrapsError for
         a layer that the model lacks, and for a direction of another width or with values that are not finite.

@@ -1,6 +1,4 @@
-"""Compare a model's states and its output item by item, beside its verdict.
-
-A void may be encoded, and expressed or not.
+"""Compare states and output by item: a void may be encoded, expressed or not.
 
 Every score of states comes from a probe that was fitted without the item's scenario, at the layer chosen without the
 item's dataset, relative to the probe's own mid threshold (half-way between the sides' means).
@@ -25,10 +23,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 
 def item_score_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> list[ItemScoreRow]:
-    """Return the rows of ITEM_SCORES of an extraction.
-
-    Each item of a dataset of pairs has one.
-    """
+    """Return ITEM_SCORES of an extraction, a row per item of the pairs' datasets."""
     settings, table = workspace.mechanism, gate_table(states)
     present = [name for name in DATASETS if len(states.dataset(name))]
     layers = chosen_layers(workspace, states, present)

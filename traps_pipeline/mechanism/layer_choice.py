@@ -47,9 +47,7 @@ class LayerChoice:
 
 
 def pair_curves(rows: Iterable[Mapping[str, Any]]) -> Curves:
-    """Return AUROC by layer and ordered pair of datasets, from PROBES rows.
-
-    A dataset on itself is a pair, too.
+    """Return AUROC by layer and ordered pair (or dataset itself), from PROBES rows.
 
     Pairs of one taxonomy are scored without the scored scenario in the fit.
     """
@@ -64,9 +62,7 @@ def pair_curves(rows: Iterable[Mapping[str, Any]]) -> Curves:
 
 
 def layer_choice(curves: Curves, target: str = "") -> LayerChoice:
-    """Choose the layer of a target.
-
-    It is a dataset, a look-alike of one, or (empty) anything else.
+    """Choose the layer of a dataset, a look-alike, or (empty) anything else.
 
     In a study with fewer than three datasets no pair is left: then the other dataset's own held-out figure counts,
     which may tie at many layers, and in a study of one dataset its own. Raises TrapsError without any figure.

@@ -63,10 +63,7 @@ def lens_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> 
 
 
 def layer_margins(model: LocalModel, states: Any, tokens: list[int]) -> np.ndarray:
-    """Return the margins (n,) of a block's output states (n, d).
-
-    They pass through the final norm and the head.
-    """
+    """Return margins (n,) of block outputs (n, d), by the final norm and the head."""
     import torch
 
     with torch.inference_mode():

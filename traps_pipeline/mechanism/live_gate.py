@@ -1,7 +1,4 @@
-"""Fit a gate for live prompts in a notebook.
-
-It has the probe and threshold that the gate stage evaluates.
-"""
+"""Fit a gate for live prompts in a notebook, as the gate stage evaluates it."""
 
 from __future__ import annotations
 
@@ -39,10 +36,7 @@ class Gate:
     pooling: Pooling
 
     def score(self, model: LocalModel, prompt: Prompt) -> float:
-        """Return the probe's log-odds of void for a prompt.
-
-        One pass of the plain model is needed.
-        """
+        """Return the probe's log-odds of void for a prompt, by one plain pass."""
         with model.caching_clips():
             states = model.forward_states(prompt, self.pooling).raw[self.layer]
         return float(self.probe.scores(states[None])[0])
@@ -52,10 +46,7 @@ class Gate:
         return self.score(model, prompt) > self.threshold
 
     def answer(self, model: LocalModel, prompt: Prompt, max_new_tokens: int = 512) -> str:
-        """Return the model's greedy answer, or ABSTENTION if the gate abstains.
-
-        Then nothing is generated.
-        """
+        """Return the greedy answer, or ABSTENTION without generation if the gate abstains."""
         return ABSTENTION if self.abstains(model, prompt) else model.generate([prompt], max_new_tokens)[0].text
 
 
@@ -69,9 +60,7 @@ def fitted_gate(
     layer: int | None = None,
     without: Collection[str] = (),
 ) -> Gate:
-    """Return a gate of a source, fitted on the study's stored states.
-
-    source: one of `gate.SOURCES`.
+    """Return a gate of a source of `gate.SOURCES`, fitted on the study's states.
 
     target: the dataset that `other datasets` leaves out. layer: default: that of the gate stage. without: scenarios, or
     families as `gate.families` names them, to hold out. Raises TrapsError for another source or threshold, for a source

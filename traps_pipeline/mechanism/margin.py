@@ -1,7 +1,7 @@
 """Compute the output margin: log-odds that an answer begins with an abstention.
 
-It is computed from the first answer token: the log-odds of the tokens that begin an abstention against all others. A
-probe says something about a gap between representation and output only as far as it separates better than this.
+At the first answer token, the tokens that begin an abstention stand against all others. A probe says something about a
+gap between representation and output only as far as it separates better than this.
 """
 
 from __future__ import annotations
@@ -24,9 +24,7 @@ _FIRST_WORDS = frozenset(phrase.split()[0] for phrase in PHRASES)
 
 
 def is_abstention_start(token: str) -> bool:
-    """Return whether a token's text begins an abstention.
-
-    It begins with a phrase of PHRASES, or the first word of one.
+    """Return whether a token begins an abstention: one of PHRASES or its first word.
 
     "I" counts, although other sentences begin with it too: the margin is a lower bound of the information in the first
     token.
@@ -36,10 +34,7 @@ def is_abstention_start(token: str) -> bool:
 
 
 def abstention_tokens(model: LocalModel) -> list[int]:
-    """Return the tokens of a model's vocabulary that begin an abstention.
-
-    Raises TrapsError if there is none.
-    """
+    """Return tokens that begin an abstention. Raises TrapsError if there is none."""
     tokenizer = model.processor.tokenizer
     texts = tokenizer.batch_decode([[token] for token in range(len(tokenizer))])
     tokens = [token for token, text in enumerate(texts) if is_abstention_start(text)]
@@ -52,10 +47,7 @@ def abstention_tokens(model: LocalModel) -> list[int]:
 
 
 def margin_of(logits: Tensor, tokens: Sequence[int], never: Sequence[int] = ()) -> Tensor:
-    """Return the log-odds of `tokens` against all others except `never`.
-
-    logits (.., vocabulary) -> (..).
-    """
+    """Return log-odds of `tokens` against all but `never`, (.., vocabulary) -> (..)."""
     import torch
 
     is_abstention = torch.zeros(logits.shape[-1], dtype=torch.bool, device=logits.device)
@@ -68,9 +60,7 @@ def margin_of(logits: Tensor, tokens: Sequence[int], never: Sequence[int] = ()) 
 
 
 def first_token_margins(model: LocalModel, normed: Any, tokens: Sequence[int]) -> Tensor:
-    """Return the margins (n,) of normed states (n, d), on the CPU.
-
-    They are those at a prompt's last position.
+    """Return margins (n,) of normed states (n, d) at a prompt's end, on the CPU.
 
     Gradients pass: `patching_effects.attributed_changes` needs them.
     """

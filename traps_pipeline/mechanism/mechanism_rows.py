@@ -216,10 +216,7 @@ COSINES = Table(
 
 @dataclass(frozen=True, kw_only=True)
 class SteeringRow(SteeredCell):
-    """One answer of a steered model.
-
-    An answer at alpha 0 (the unsteered model) has one row for all directions.
-    """
+    """An answer of a steered model; at alpha 0 one row serves all directions."""
 
     alpha_relative: AlphaRelative
     item_id: shared.ItemId
@@ -319,10 +316,7 @@ STEERING_EFFECTS = Table(
 
 @dataclass(frozen=True, kw_only=True)
 class SteeringShareRow:
-    """Abstention on one side at one strength, over the paths of a set.
-
-    For one regime or all.
-    """
+    """Abstention on a side at a strength, over a path set, for one regime or all."""
 
     model: shared.Model
     path_set: Annotated[str, "transfer, within_domain, or all of both"]

@@ -1,7 +1,5 @@
 """Rank steering effects among nulls, and compute PECS by sign policy.
 
-Both come from STEERING_EFFECTS rows.
-
 The paper adds a direction on controls and subtracts it on voids, which requires knowing the sides. So PECS is also
 given for adding, or subtracting, on both sides.
 """
@@ -24,12 +22,7 @@ _AT = [*_CELL, "layer", "unit", "dose", "side"]
 
 
 def null_rows(effects: pd.DataFrame) -> list[SteeringNullRow]:
-    """Return STEERING_NULLS rows: every own direction, and the mean over datasets.
-
-    Every dataset is steered along its own direction.
-
-    Without nulls there are no rows.
-    """
+    """Return STEERING_NULLS: datasets' own directions and their mean, if nulls exist."""
     own = effects.loc[(effects["source"] == effects["target"]) & (effects["signs"] == "label")]
     moved = _moved(own)
     nulls = moved.loc[moved["kind"].isin(NULLS)]
@@ -41,11 +34,9 @@ def null_rows(effects: pd.DataFrame) -> list[SteeringNullRow]:
 
 
 def _moved(own: pd.DataFrame) -> pd.DataFrame:
-    """Return steered effects with `moved`.
+    """Return effects with `moved`, the change against unsteered answers.
 
-    It is the change against the unsteered answers in the claimed direction.
-
-    That is more abstention on controls, and less on voids.
+    It is in the claimed direction: more abstention on controls, and less on voids.
     """
     path = [*_CELL, "target", "kind", "draw", "layer", "unit", "side"]
     plain = own.loc[own["dose"] == 0, [*path, "abstention"]].rename(columns={"abstention": "plain"})
@@ -89,9 +80,7 @@ def nan_to_null(figures: Mapping[str, float]) -> dict[str, Any]:
 
 
 def pecs_rows(effects: pd.DataFrame) -> list[SteeringPecsRow]:
-    """Return STEERING_PECS rows: every path, dose and sign policy.
-
-    Void directions with both sides steered count.
+    """Return STEERING_PECS: void paths with both sides, by dose and sign policy.
 
     Figures without a decided answer are null.
     """

@@ -12,9 +12,7 @@ from traps_pipeline.mechanism.probes import Fit, Probe, Scorer, standardiser
 
 
 def mean_difference(states: np.ndarray, void: np.ndarray) -> Scorer:
-    """Return the probe whose weights are a difference of means.
-
-    It is that of the sides' standardised means.
+    """Return the probe along the difference of the sides' standardised means.
 
     A score of 0 lies half-way between them.
     """
@@ -26,9 +24,7 @@ def mean_difference(states: np.ndarray, void: np.ndarray) -> Scorer:
 
 
 def from_sklearn(make: Callable[[], Any]) -> Fit:
-    """Return a fit function for any scikit-learn classifier or pipeline.
-
-    make: returns a new one.
+    """Return a fit function for what `make` returns, a new scikit-learn classifier.
 
     Scores are its decision function, or the log-odds of its probabilities.
     """
@@ -51,9 +47,7 @@ class _Estimator:
 
 
 def erased(states: np.ndarray, void: np.ndarray) -> np.ndarray:
-    """Return states (n, d) from which no linear classifier can tell the sides.
-
-    void: (n,), the labels.
+    """Return states (n, d) in which no linear classifier finds the labels (n,).
 
     Least-squares concept erasure (LEACE, of Belrose et al. 2023) of these very states: the smallest change, in the
     metric of their own covariance, after which both sides have the same mean.

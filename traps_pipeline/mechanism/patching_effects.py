@@ -1,6 +1,4 @@
-"""Patch activations.
-
-Measure what a model answers when a part of one pass is replaced by that part of another.
+"""Patch activations: replace a part of one pass by another's, and measure answers.
 
 A pass over a target prompt (say, a control) is made again with the states of a source prompt (its void) at some
 positions of one site: the residual stream as it leaves block l (0: the embeddings), or the output of a block's
@@ -87,19 +85,13 @@ class RecordedPass:
 
     @property
     def visual(self) -> np.ndarray | None:
-        """The positions that deepstack features are added at, (T,) bool.
-
-        None for a model without any.
-        """
+        """Positions of deepstack features, (T,) bool; None for a model without any."""
         mask = self.inputs.get("visual_pos_masks")
         return None if mask is None else mask[0].cpu().numpy()
 
 
 def require_patchable(model: LocalModel) -> None:
-    """Raise TrapsError for a model that cannot be patched.
-
-    Its later blocks read more of earlier ones than this module replaces.
-    """
+    """Raise TrapsError if later blocks read more of earlier ones than is replaced."""
     unknown = unknown_path(model.network.config.get_text_config(), model.blocks[0])
     if unknown:
         raise TrapsError(
@@ -125,9 +117,7 @@ def _sites(model: LocalModel) -> Iterator[tuple[Site, int, Module]]:
 
 
 def record(model: LocalModel, prompt: Prompt, tokens: Sequence[int], sites: Sequence[Site] = SITES) -> RecordedPass:
-    """Run one pass and keep what a patch may need.
-
-    It is kept at the residual stream and at `sites`.
+    """Run one pass; keep states of `sites` and of the residual stream for patches.
 
     tokens: those that begin an abstention. Raises TrapsError for a block that passes on more than the residual stream.
     """
@@ -178,9 +168,7 @@ def record(model: LocalModel, prompt: Prompt, tokens: Sequence[int], sites: Sequ
 def patched_changes(
     model: LocalModel, target: RecordedPass, source: RecordedPass, patches: Sequence[Patch], tokens: Sequence[int]
 ) -> np.ndarray:
-    """Measure the change of the target's outcome by each patch from the source.
-
-    (patches,).
+    """Measure the change of the target's outcome by each patch, (patches,).
 
     Passes begin at the lowest patched block of their rows; the vision tower is not run again. Every pass has one row
     without a patch, and changes are relative to that row: a patch that replaces states by equal ones changes nothing,
@@ -204,9 +192,7 @@ def patched_changes(
 def attributed_changes(
     model: LocalModel, target: RecordedPass, source: RecordedPass, tokens: Sequence[int]
 ) -> dict[tuple[Site, int], np.ndarray]:
-    """Estimate the change of the target's outcome by patching each token alone.
-
-    (T,) by recorded site and layer.
+    """Estimate the outcome's change by each token's patch, (T,) by site and layer.
 
     One pass with gradients gives all of them, to first order; the estimate of a group of positions is its sum. Raises
     TrapsError as `patched_changes`.
@@ -241,10 +227,7 @@ def _require_one_form(target: RecordedPass, source: RecordedPass) -> None:
 
 
 def _first_layer(model: LocalModel, patch: Patch) -> int:
-    """Return the layer whose recorded state a patched pass can start from.
-
-    Raises TrapsError for an unknown site.
-    """
+    """Return the layer a patched pass starts from. Raises TrapsError for a wrong site."""
     if not 0 <= patch.layer <= model.n_layers or (patch.layer == 0 and patch.site != "residual"):
         raise TrapsError(f"no {patch.site} at layer {patch.layer}; there are blocks 1 to {model.n_layers}")
     return patch.layer if patch.site == "residual" else patch.layer - 1
@@ -262,19 +245,13 @@ def _masks(patches: Sequence[Patch], length: int, device: str) -> Weights:
 
 
 def _behind(weights: Weights, layer: int) -> Tensor | None:
-    """Return the weights of residual patches up to a layer.
-
-    They affect all later layers.
-    """
+    """Return the summed weights of residual patches up to a layer, None without any."""
     parts = [part for (site, patch_layer), part in weights.items() if site == "residual" and patch_layer <= layer]
     return reduce(operator.add, [part.to(parts[0].device) for part in parts]) if parts else None
 
 
 def _mixed(own: Tensor, theirs: Tensor, weights: Tensor) -> Tensor:
-    """Return states (rows, .., T, d), mixed with the source's by weights.
-
-    theirs: (T, d) or (1, .., T, d).
-    """
+    """Return states (rows, .., T, d), mixed with theirs, (T, d) or (1, .., T, d)."""
     import torch
 
     weights = weights.reshape(len(weights), *[1] * (own.ndim - 3), -1, 1).to(own.device)
@@ -291,10 +268,7 @@ def _margins(
     rows: int,
     tokens: Sequence[int],
 ) -> Tensor:
-    """Return the outcomes (rows,) of a pass over several copies of the target.
-
-    It starts from the state at layer `start`.
-    """
+    """Return outcomes (rows,) of a pass over copies of the target from layer `start`."""
     inputs = _repeated(target, rows)
     if ("residual", 0) in weights:
         inputs["inputs_embeds"] = _mixed(inputs["inputs_embeds"], source.states["residual", 0], weights["residual", 0])
@@ -328,10 +302,7 @@ def _repeated(target: RecordedPass, rows: int) -> dict[str, Any]:
 def _replacing(
     model: LocalModel, target: RecordedPass, source: RecordedPass, weights: Weights, start: int, rows: int
 ) -> Iterator[None]:
-    """Let passes start behind block `start` and replace states by the source's.
-
-    Undo everything at the end.
-    """
+    """Let passes start behind block `start`, replacing states, inside the context."""
 
     def replace(site: Site, layer: int, _: Module, __: Any, output: Any) -> Any:
         states = _mixed(first_tensor(output), source.states[site, layer], weights[site, layer])
@@ -341,10 +312,7 @@ def _replacing(
         return target.states["residual", layer].expand(rows, -1, -1) if layer == start else hidden_states
 
     def beside(below: int, block: Module, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Return the arguments of the block above `below` others.
-
-        They are the source's where the stream below was patched.
-        """
+        """Return the next block's arguments, the source's where the stream was patched."""
         own, behind = argument_of(block, PER_LAYER, args, kwargs), _behind(weights, below)
         if own is not None and behind is not None:
             args, kwargs = with_argument(block, PER_LAYER, _mixed(own, source.per_layer[below], behind), args, kwargs)

@@ -1,6 +1,4 @@
-"""Patch matched controls and voids of the well-posed datasets.
-
-This is the patching stage, whose rows are PATCHING.
+"""Patch matched controls and voids of well-posed datasets (PATCHING rows).
 
 One backward pass per pair estimates the effect of every site, layer and group of positions; the cells with the largest
 estimates are then patched, beside nulls. Each pair's result is written before the next one begins, so that an
@@ -69,20 +67,14 @@ Cell = tuple[str, Site, int, str]  # patched side, site, layer, group
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """One side of a pair: its prompt, and its groups of positions.
-
-    The groups do not depend on the other side.
-    """
+    """A side of a pair: its prompt and its own groups of positions."""
 
     prompt: Prompt
     parts: Mapping[str, np.ndarray]
 
 
 def patching_rows(workspace: Workspace, entry: ModelEntry, extraction: Extraction) -> list[PatchingRow]:
-    """Return the rows of PATCHING of a model under a VQA prompt.
-
-    Raises TrapsError if it cannot be patched.
-    """
+    """Return PATCHING rows of a model. Raises TrapsError if it cannot be patched."""
     from traps_pipeline.models.local.adapter import load_local_model
 
     settings = workspace.mechanism.patching
@@ -126,11 +118,9 @@ class Pairs:
         self._folder = workspace.root / "patching" / extraction.model / extraction.prompt / dataset
 
     def changes(self) -> tuple[list[Row], list[Row]]:
-        """Return the estimated effect of every patch, and measured effects.
+        """Return estimated effects of all patches, and measured ones of `best_cells`.
 
-        Measured are `best_cells` and their nulls.
-
-        There is a row for each pair, direction, source and cell.
+        Nulls are measured, too. There is a row for each pair, direction, source and cell.
         """
         paths = set[Path]()
         estimates = self._each("estimates", self._estimates, paths)
@@ -187,37 +177,25 @@ class Pairs:
             del plain  # before the other side's pass is recorded
 
     def _attributed(self, target: Side, own: Side) -> tuple[tuple[float, float], dict[tuple[Site, int], np.ndarray]]:
-        """Return the margins of both sides, and the estimated change by each token.
-
-        Free the states afterwards.
-        """
+        """Return both sides' margins and each token's estimate; free the states."""
         plain = record(self._model, target.prompt, self._tokens, ())
         source = record(self._model, own.prompt, self._tokens, self._settings.sites)
         return (plain.margin, source.margin), attributed_changes(self._model, plain, source, self._tokens)
 
     def _patched(self, target: RecordedPass, side: Side, patches: Sequence[Patch]) -> tuple[float, np.ndarray]:
-        """Return the margin of a source, and the changes by patches from it.
-
-        Free its states afterwards.
-        """
+        """Return a source's margin, and the changes by its patches; free its states."""
         source = record(self._model, side.prompt, self._tokens, self._settings.sites)
         return source.margin, patched_changes(self._model, target, source, patches, self._tokens)
 
     def _directions(self, name: str) -> Iterator[tuple[str, Side, Side, dict[str, np.ndarray] | None]]:
-        """Yield each side of a complete pair, with its source and groups of positions.
-
-        The source is the other side.
-        """
+        """Yield each side of a complete pair, with the other as source, and groups."""
         if all((name, side) in self._items for side in SIDES):
             for into, towards in (SIDES, SIDES[::-1]):
                 target, own = self._side(name, into), self._side(name, towards)
                 yield into, target, own, groups_of(target, own)
 
     def _source(self, name: str, into: str, kind: str) -> Side | None:
-        """Return the side that patches into a pair's side come from.
-
-        None if there is none of its form.
-        """
+        """Return the side whose states patch a pair's side; None without one of its form."""
         towards = SIDES[1 - SIDES.index(into)]
         where = {OWN: (name, towards, ""), TIMES: (name, into, towards)}
         if kind in where:
@@ -258,10 +236,7 @@ def _row(
     ends: tuple[float, float],
     change: float,
 ) -> Row:
-    """Return the effect of a patch on one pair.
-
-    ends: the outcomes of the patched side and of the other one.
-    """
+    """Return a patch's effect on a pair; ends: outcomes of patched and other side."""
     site, layer, group = cell
     about = {"scenario": scenario, "into": into, "source": source, "site": site, "layer": layer, "group": group}
     return about | {"before": ends[0], "there": ends[1], "change": change, "tokens": int(positions.sum())}
@@ -273,9 +248,7 @@ def _has_same_form(target: Mapping[str, np.ndarray], source: Mapping[str, np.nda
 
 
 def groups_of(target: Side, other: Side) -> dict[str, np.ndarray] | None:
-    """Return the groups of positions of a pair, (T,) bool each.
-
-    None if the two prompts have different forms.
+    """Return a pair's groups of positions, (T,) bool; None if prompts differ in form.
 
     A model whose pixels do not lie token by token (LLaVA-NeXT-Video, Gemma 4) has no group of unchanged visual tokens:
     all count as changed.
@@ -291,9 +264,7 @@ def groups_of(target: Side, other: Side) -> dict[str, np.ndarray] | None:
 
 
 def best_cells(estimates: Sequence[Row], settings: PatchingSettings, n_layers: int) -> list[Cell]:
-    """Return the cells to patch.
-
-    For each direction they are those with the largest estimates over all pairs.
+    """Return each direction's cells with the largest estimates over all pairs.
 
     Only every so many layers count. All positions of the residual stream together are left out; their effect is 1 by
     construction.
@@ -312,9 +283,7 @@ def best_cells(estimates: Sequence[Row], settings: PatchingSettings, n_layers: i
 def summarize_effects(
     estimates: Sequence[Row], patches: Sequence[Row], extraction: Extraction, dataset: str, seed: int
 ) -> Iterator[PatchingRow]:
-    """Yield the rows of a dataset: ratios of sums over pairs.
-
-    Measured patches have intervals by scenario.
+    """Yield a dataset's rows: ratios of sums over pairs, with intervals if measured.
 
     If all pairs were left out, a row without an effect says so.
     """
@@ -359,9 +328,7 @@ def summarize_effects(
 def effect_of(
     before: np.ndarray, after: np.ndarray, target: np.ndarray, seed: int
 ) -> tuple[float | None, float | None, float | None]:
-    """Return the indirect effect of pairs and its 95 % interval.
-
-    Scenarios are resampled (one pair each).
+    """Return the indirect effect of pairs and its 95 % interval over scenarios.
 
     It is sum(after - before) over sum(target - before), each (pairs,): a ratio of sums, since the ratio of a pair whose
     sides hardly differ is noise. One pair is unseen, with an effect of 0 or of 1, so that few pairs keep an interval's

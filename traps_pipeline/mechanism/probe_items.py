@@ -1,7 +1,4 @@
-"""List the clips and questions for which hidden states are extracted.
-
-They are pairs, and controls for shortcuts of probes.
-"""
+"""List clips and questions whose hidden states are read: pairs, and controls."""
 
 from __future__ import annotations
 
@@ -67,10 +64,7 @@ def other_clip(workspace: Workspace, row: Mapping[str, Any]) -> tuple[Path, str]
 
 
 def _answerable_item(spec: Mapping[str, Any], clip: Mapping[str, Any]) -> ProbeItemRow:
-    """Return the void clip with an answerable question.
-
-    Its side is control, since it must be answered.
-    """
+    """Return the void clip with an answerable question, of side `control`."""
     pair = f"{ANSWERABLE}:{spec['scenario_id']}"
     return ProbeItemRow(
         **{name: spec[name] for name in ("scenario_id", "category", "sub_scenario", "benchmark_version")},
@@ -87,9 +81,7 @@ def _answerable_item(spec: Mapping[str, Any], clip: Mapping[str, Any]) -> ProbeI
 
 
 def time_swapped(items: pd.DataFrame) -> list[ProbeItemRow]:
-    """Return chaotic's pairs with the frame times of the other side.
-
-    items: ITEMS rows of chaotic.
+    """Return chaotic's pairs (ITEMS rows) with the frame times of the other side.
 
     A probe that reads time stamps takes a control for a void and a void for a control. A scenario without both sides is
     left out.

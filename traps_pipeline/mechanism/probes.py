@@ -1,6 +1,4 @@
-"""Fit linear probes (docs/spec.md 7.2).
-
-Standardise, l2-regularised logistic regression, AUROC.
+"""Fit linear probes (docs/spec.md 7.2): l2 logistic regression, and AUROC.
 
 With fewer rows than columns the minimiser lies in the span of the rows, so the exact solver takes Newton steps on the
 Gram matrix. Its optimum equals scikit-learn's up to rounding and takes a fraction of the time.
@@ -21,10 +19,7 @@ _TOLERANCE, _MOST_STEPS = 1e-10, 200
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Items of one dataset at one layer.
-
-    states: (n, d). void: (n,) bool, the label. scenario: (n,) int, cluster.
-    """
+    """Items at a layer: states (n, d), labels void (n,) bool, scenario (n,) int."""
 
     states: np.ndarray
     void: np.ndarray
@@ -37,10 +32,7 @@ class Split:
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """A fitted probe.
-
-    Mean, scale, weights: (d,), from the source alone; weights apply to standardised states.
-    """
+    """A fitted probe: mean, scale, and weights (d,) that apply to standardised states."""
 
     mean: np.ndarray
     scale: np.ndarray
@@ -78,10 +70,7 @@ def standardiser(states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fit_probe(states: np.ndarray, void: np.ndarray) -> Probe:
-    """Return the probe of states (n, d) with labels (n,).
-
-    Raises TrapsError when one class has no item.
-    """
+    """Return the probe of states (n, d), labels (n,). Raises TrapsError for one class."""
     _check_labels(void)
     states = np.asarray(states, float)
     mean, scale = standardiser(states)
@@ -99,16 +88,15 @@ def _check_labels(void: np.ndarray) -> None:
 
 
 def solve_gram(gram: np.ndarray, void: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the logistic regression of a Gram matrix (n, n): dual and intercept.
+    """Return dual (n,) and intercept of logistic regression on a Gram matrix (n, n).
 
-    The intercept is unpenalised, and there are (n,) dual coefficients. The coefficients of the columns are the rows'
-    transpose times the dual.
+    The intercept is unpenalised. The coefficients of the columns are the rows' transpose times the dual.
 
-    At the minimum the dual is label - probability and sums to 0. Newton's step solves
-    (I + W gram) step + W intercept_step = residual of that condition, with W = p (1 - p), through
-    I + sqrt(W) gram sqrt(W), whose eigenvalues are at least 1 (Rasmussen and Williams, algorithm 3.1); it is halved
-    until the objective falls. A factorisation is used again while each step with it reduces the residual to a fifth or
-    less, since W hardly changes near the minimum. Raises TrapsError for states that are not finite.
+    At the minimum the dual is label - probability and sums to 0. Newton's step solves (I + W gram) step + W
+    intercept_step = residual of that condition, with W = p (1 - p), through I + sqrt(W) gram sqrt(W), whose eigenvalues
+    are at least 1 (Rasmussen and Williams, algorithm 3.1); it is halved until the objective falls. A factorisation is
+    used again while each step with it reduces the residual to a fifth or less, since W hardly changes near the minimum.
+    Raises TrapsError for states that are not finite.
     """
     from scipy.special import expit
 
@@ -164,10 +152,7 @@ class _NewtonStep:
         return right - self._root * cho_solve((self._factor, False), scaled, check_finite=False)
 
     def solve(self, missing: np.ndarray, dual_sum: float) -> tuple[np.ndarray, float]:
-        """Return the steps of the dual and of the intercept.
-
-        After its step the dual sums to 0.
-        """
+        """Return steps of dual and intercept, after which the dual sums to 0."""
         free = self._inverse(missing)
         intercept_step = float((free.sum() + dual_sum) / self._by_intercept.sum())
         return free - intercept_step * self._by_intercept, intercept_step
@@ -182,9 +167,7 @@ def _objective(dual: np.ndarray, intercept: float, logits: np.ndarray, label: np
 
 
 def auroc(void: np.ndarray, scores: np.ndarray) -> np.ndarray:
-    """Return the area under the ROC curve of scores against labels (n,).
-
-    Scores (n,) give a scalar, (n, k) give (k,).
+    """Return AUROC of scores, (n,) -> () or (n, k) -> (k,), against labels (n,).
 
     Ties count half, by mean ranks (Mann and Whitney). NaN if one class has no item.
     """
@@ -201,9 +184,7 @@ def auroc(void: np.ndarray, scores: np.ndarray) -> np.ndarray:
 def auroc_interval(
     void: np.ndarray, scores: np.ndarray, scenario: np.ndarray, weights: np.ndarray, level: float = 0.95
 ) -> tuple[float, float]:
-    """Return the percentile interval of the AUROC from resampled scenarios.
-
-    It has a minimum width.
+    """Return the AUROC's percentile interval over scenarios, with a minimum width.
 
     The probe is held fixed. If all resamples agree (a probe that separates 16 pairs), percentiles alone would claim
     certainty, so the exact binomial bound is the minimum: if a share s of n scenarios fails, none of them fails with
@@ -230,11 +211,9 @@ def auroc_interval(
 
 
 def scenario_folds(scenario: np.ndarray, folds: int, seed: int) -> np.ndarray:
-    """Return the fold of each item, (n,) int: a scenario's items share one.
+    """Return each item's fold, (n,) int; a scenario's items share one.
 
-    Fold sizes differ by at most one scenario.
-
-    Raises TrapsError if there are fewer scenarios than folds.
+    Fold sizes differ by at most one scenario. Raises TrapsError if there are fewer scenarios than folds.
     """
     names = np.unique(scenario)
     if len(names) < folds:
@@ -246,12 +225,11 @@ def scenario_folds(scenario: np.ndarray, folds: int, seed: int) -> np.ndarray:
 
 
 def swapped_labels(void: np.ndarray, scenario: np.ndarray, shuffles: int, seed: int) -> np.ndarray:
-    """Return labels (n, shuffles) with sides swapped within scenarios.
+    """Return labels (n, shuffles), with sides swapped at random within scenarios.
 
-    Each scenario is swapped with probability 0.5.
-
-    A swap keeps every fold balanced, and any labels of a held-out fold are as likely as their complement, so that the
-    expected AUROC is exactly 0.5. A free permutation, which unbalances the folds, would only approach 0.5.
+    Each scenario is swapped with probability 0.5. A swap keeps every fold balanced, and any labels of a held-out fold
+    are as likely as their complement, so that the expected AUROC is exactly 0.5. A free permutation, which unbalances
+    the folds, would only approach 0.5.
     """
     names, place = np.unique(scenario, return_inverse=True)
     coins = np.random.default_rng(seed).integers(0, 2, (len(names), shuffles)).astype(bool)
@@ -259,9 +237,7 @@ def swapped_labels(void: np.ndarray, scenario: np.ndarray, shuffles: int, seed: 
 
 
 def within_split(split: Split, labels: np.ndarray, folds: np.ndarray) -> np.ndarray:
-    """Return cross-validated AUROC of each labelling (n, k): (k,).
-
-    It is averaged over folds.
+    """Return cross-validated AUROC, averaged over folds: labels (n, k) -> (k,).
 
     Standardiser and probe use only the training folds; all labellings share the Gram matrix of a fold.
     """
@@ -282,9 +258,7 @@ def within_split(split: Split, labels: np.ndarray, folds: np.ndarray) -> np.ndar
 
 
 def nearest_centroid(source: Split, states: np.ndarray) -> np.ndarray:
-    """Return whether each of states (n, d) is assigned to void, (n,) bool.
-
-    The nearest centroid by cosine distance decides.
+    """Return whether states (n, d) lie nearer to the void centroid, by cosine, (n,).
 
     Standardiser and centroids are the source's; with equal distances a state is assigned to control.
     """
@@ -304,9 +278,7 @@ def nearest_centroid(source: Split, states: np.ndarray) -> np.ndarray:
 def transfer_scores(
     layer: Mapping[str, Split], pairs: Sequence[tuple[str, str]], fit: Fit = fit_probe
 ) -> dict[tuple[str, str], np.ndarray]:
-    """Return scores (n_target,) of each ordered pair at one layer.
-
-    A pair is (source, target), with one fit per source.
+    """Return scores (n_target,) of each (source, target) at a layer, a fit per source.
 
     No label of a target is read.
     """

@@ -149,10 +149,7 @@ class ProbeRun:
         return rows + (self.centroids(layer, splits) if layer == self.centroid_layer else [])
 
     def comparable(self, layer: int, splits: Mapping[str, Split] | None = None) -> list[Row]:
-        """Return the rows of one layer that baselines share.
-
-        These are transfer, held out, Cf->Cf, look-alikes and swapped times.
-        """
+        """Return one layer's rows that baselines share, from transfer to swapped times."""
         splits = splits or {name: self._split(name, layer) for name in self._datasets}
         unseen = {source: self._unseen_scores(source, splits) for source in self._own}
         rows = self.transfer(layer, splits) + self.held_out(layer, splits, unseen)
@@ -176,10 +173,7 @@ class ProbeRun:
         return [self._scored("confabulated", path, layer, restricted[path[1]], v) for path, v in scores.items()]
 
     def confabulated_held_out(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
-        """Return such pairs with shared controls, by probes that hold out the scenario.
-
-        A pair has no figure if too few scenarios are left to split.
-        """
+        """Return Cf->Cf within a taxonomy by held-out probes, null with few scenarios."""
         restricted, rows = self._confabulated(splits), []
         for source, target in self._pairs:
             if not {source, target} <= set(restricted) or taxonomy_of(source) != taxonomy_of(target):
@@ -259,10 +253,7 @@ class ProbeRun:
     def time_swapped(
         self, layer: int, splits: Mapping[str, Split], unseen: Mapping[str, Mapping[str, np.ndarray]]
     ) -> list[Row]:
-        """Return AUROC on chaotic's frames with the other side's times, by the frames.
-
-        It is 1 for a probe that reads the frames, 0 for one that reads the time stamps.
-        """
+        """Return AUROC on swapped times: 1 by reading frames, 0 by reading time stamps."""
         if TIME_SWAPPED not in splits:
             return []
         split = splits[TIME_SWAPPED]

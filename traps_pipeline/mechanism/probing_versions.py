@@ -1,7 +1,4 @@
-"""Version the inputs of the mechanistic stages, without importing torch.
-
-They are settings, prompts and precision.
-"""
+"""Version settings, prompts and precision of mechanistic stages, without torch."""
 
 from __future__ import annotations
 
@@ -25,10 +22,7 @@ SAMPLING = ("do_sample", "temperature", "top_p", "max_new_tokens")
 
 
 def loaded_params(entry: ModelEntry) -> dict[str, Any]:
-    """Return the parameters of a local model that its states depend on.
-
-    These are its entry's without sampling, in the precision in which states are read.
-    """
+    """Return a local model's parameters that its states depend on, without sampling."""
     inside, left_out = entry.inside_params(), (*SAMPLING, "nf4_skip")
     params = {name: value for name, value in effective_params(entry, "standard").items() if name not in left_out}
     skipped = {"nf4_skip": [*inside.nf4_skip]} if inside.nf4_skip else {}
@@ -36,10 +30,7 @@ def loaded_params(entry: ModelEntry) -> dict[str, Any]:
 
 
 def shown_inside(entry: ModelEntry, settings: MechanismSettings) -> ModelEntry:
-    """Return a model's entry with the study's media settings.
-
-    They are those of its mechanistic analyses.
-    """
+    """Return a model's entry with the media settings of the study's `mechanism`."""
     media = settings.models[entry.id].media
     return entry if media is None else entry.model_copy(update={"media": media})
 
@@ -50,10 +41,7 @@ def states_folder(workspace: Workspace, cell: StatesCell) -> Path:
 
 
 def has_states(workspace: Workspace, cell: StatesCell) -> bool:
-    """Return whether a partition's extraction is complete.
-
-    It was finished and all of its files still exist.
-    """
+    """Return whether an extraction is finished and all of its files still exist."""
     from traps_pipeline.storage.parquet import read_sealed
 
     folder = states_folder(workspace, cell)
@@ -73,10 +61,7 @@ def has_directions(workspace: Workspace, extraction: Extraction) -> bool:
 
 
 def extraction_version(workspace: Workspace, extraction: Extraction) -> str:
-    """Return the digest of the inputs of hidden states besides items.
-
-    These are checkpoint and precision, frames, VQA prompt and pooling.
-    """
+    """Return the digest of checkpoint, precision, frames, VQA prompt and pooling."""
     entry, settings = get_model(extraction.model), workspace.study.mechanism
     if settings is not None and entry.id in settings.models:
         entry = shown_inside(entry, settings)
@@ -90,10 +75,7 @@ def extraction_version(workspace: Workspace, extraction: Extraction) -> str:
 
 
 def probing_version(workspace: Workspace, extraction: Extraction) -> str:
-    """Return the digest of the study's settings for a model's probes.
-
-    They serve its directions, too.
-    """
+    """Return the digest of the study's settings for a model's probes and directions."""
     settings = workspace.study.mechanism
     if settings is None or extraction.model not in settings.models:
         return "none"
@@ -107,10 +89,7 @@ def probing_version(workspace: Workspace, extraction: Extraction) -> str:
 
 
 def sentence_version(workspace: Workspace, extraction: Extraction) -> str:
-    """Return the digest of the inputs of sentences besides items and answers.
-
-    These are the inputs of states, the sentences and the prompt.
-    """
+    """Return the digest of states' inputs, sentences and prompt, without items."""
     settings = workspace.study.mechanism
     if settings is None or extraction.model not in settings.models:
         return "none"
@@ -119,10 +98,7 @@ def sentence_version(workspace: Workspace, extraction: Extraction) -> str:
 
 
 def patching_version(workspace: Workspace, extraction: Extraction) -> str:
-    """Return the digest of the inputs of patching besides items.
-
-    Those of hidden states, pairs, sites and seed.
-    """
+    """Return the digest of states' inputs, pairs, sites and seed, without items."""
     settings = workspace.study.mechanism
     if settings is None or settings.patching is None or extraction.model not in settings.models:
         return "none"
@@ -131,10 +107,7 @@ def patching_version(workspace: Workspace, extraction: Extraction) -> str:
 
 
 def steering_version(workspace: Workspace, run: str) -> str:
-    """Return the digest of the inputs of steered answers besides items and directions.
-
-    These are the study's settings, the model and the prompt.
-    """
+    """Return the digest of the study's settings, model and prompt of steered answers."""
     model, _, regime = run.split("__")
     entry, settings = get_model(model), workspace.study.mechanism
     if settings is None or settings.steering is None or model not in settings.models:

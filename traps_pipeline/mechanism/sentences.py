@@ -1,6 +1,4 @@
-"""Score whole sentences: a model's likelihood of abstentions.
-
-That of its own answer stands beside it.
+"""Score whole sentences: a model's likelihood of abstentions and its own answer.
 
 The output margin covers only the first answer token, and shows nothing for a model that begins every answer with "The".
 Here every sentence of a set, and the model's own answer, follows the benchmark's prompt (teacher forcing), and the
@@ -31,9 +29,7 @@ OWN_TOKENS = 64  # tokens of the model's own answer, from its beginning
 
 
 def sentence_rows(workspace: Workspace, entry: ModelEntry, extraction: Extraction) -> list[SentenceRow]:
-    """Return the rows of SENTENCES, one for every item of the pairs.
-
-    Each has the model's answer of run 1.
+    """Return SENTENCES rows of every item of the pairs, with the answer of run 1.
 
     The prompt is the benchmark's of the extraction's name. Raises TrapsError for a model that was not evaluated under
     it.
@@ -83,10 +79,7 @@ def answer_tokens(model: LocalModel, text: str) -> list[int]:
 
 
 def mean_log_probability(model: LocalModel, prompt: Prompt, tokens: list[int]) -> float:
-    """Return the mean log-probability (nats per token) of tokens after a prompt.
-
-    One pass of batch size 1 is needed.
-    """
+    """Return tokens' mean log-probability after a prompt (nats per token); one pass."""
     import torch
 
     forced = prompt.followed_by(tokens)

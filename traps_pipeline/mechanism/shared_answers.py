@@ -1,6 +1,4 @@
-"""Share the generation of an evaluation's answers between processes.
-
-Only one of them may write the ledger.
+"""Share an evaluation's answers among processes; only one writes the ledger.
 
 The others generate answers meanwhile, in chunks from the end of the calls, and store them in the study; the writer
 takes these and generates the rest. A chunk is leased while it is generated, so none is made twice; leases of dead
@@ -28,10 +26,7 @@ Make = Callable[[Sequence[Request], Callable[[], bool]], list[Outcome]]  # (call
 
 @dataclass(frozen=True)
 class Chunk:
-    """Calls that one process answers together, by key.
-
-    Equal calls have the same chunk name in every process.
-    """
+    """Calls that a process answers together; all processes name equal calls alike."""
 
     name: str
     calls: Mapping[str, Request]
@@ -54,9 +49,7 @@ class SharedAnswers:
         return result
 
     def outcomes(self, requests: Sequence[Request], make: Make, stopped: Callable[[], bool]) -> list[Outcome]:
-        """Return the outcomes of calls of known chunks.
-
-        They come from another process or are generated here.
+        """Return outcomes of calls in known chunks, generated here or elsewhere.
 
         Waits while another process generates some of them, unless it is stopped.
         """
@@ -75,10 +68,7 @@ class SharedAnswers:
         return [known[request.key] for request in requests]
 
     def fill(self, chunk: Chunk, known: Callable[[Sequence[str]], set[str]], make: Make) -> int | None:
-        """Generate a chunk's unknown answers and return their number.
-
-        None if another process is working on it.
-        """
+        """Generate a chunk's unknown answers; return their number, None if it is leased."""
         lease = self._lease(chunk)
         if lease is None:
             return None
@@ -140,11 +130,9 @@ def make_meanwhile(
     make: Make,
     tick: Callable[[int, int], None],
 ) -> int:
-    """Generate answers from the end of these calls while another process writes.
+    """Generate answers from the end while another process writes; return how many.
 
-    It writes their evaluation.
-
-    Return their number. tick: receives the chunks done and their number.
+    tick: receives the chunks done and their number.
     """
     chunks, count = shared.chunks(wanted), 0
     for finished, chunk in enumerate(reversed(chunks), start=1):

@@ -1,6 +1,4 @@
-"""Compute abstention rates of a steered model (docs/spec.md 8.4).
-
-They are by path and over sets of paths.
+"""Compute a steered model's abstention by path and path set (docs/spec.md 8.4).
 
 They are computed from STEERING and STEERING_VOTES rows. A path asks each scenario once, so its Wilson interval covers
 the variation of scenarios. Several paths ask the same scenario, and one answer may count in several paths; intervals
@@ -45,18 +43,12 @@ _PATH_SETS = {ALL: STEERING_PATHS, **PATH_SETS}
 
 
 def of_paper(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows of answers, votes or effects that follow the paper's protocol.
-
-    These have void directions, doses in alpha, and signs by label. Unsteered answers (alpha 0) are among them.
-    """
+    """Return rows of the paper's protocol: void or unsteered, alphas, signs by label."""
     return rows.loc[rows["kind"].isin(["void", UNSTEERED]) & (rows["unit"] == "alpha") & (rows["signs"] == "label")]
 
 
 def answers_of_paths(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
-    """Return the answers with their verdicts, one row per path of an answer.
-
-    An unsteered answer (alpha 0) belongs to every path.
-    """
+    """Return answers with verdicts, one row per path; alpha 0 belongs to every path."""
     copied = ["side", "alpha", "scenario_id", "alpha_relative", "degenerate", "request_key", "epoch"]
     joined = _with_verdicts(pd.DataFrame(answers[[*_ANSWER, *copied]]), votes)
     steered = joined.loc[joined["kind"] != UNSTEERED]
@@ -82,10 +74,7 @@ def _with_verdicts(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
 
 
 def effect_rows(answers: pd.DataFrame, votes: pd.DataFrame) -> list[SteeringEffectRow]:
-    """Return rows of STEERING_EFFECTS: abstention by path and dose.
-
-    Also by kind, draw, layer, signs and side.
-    """
+    """Return STEERING_EFFECTS rows: abstention by path, dose, kind, draw, layer, side."""
     rows: list[SteeringEffectRow] = []
     for key, group in answers_of_paths(answers, votes).groupby(_EFFECT, sort=True):
         about = dict(zip(_EFFECT, cast(tuple[Any, ...], key), strict=True))
@@ -119,9 +108,7 @@ def effect_rows(answers: pd.DataFrame, votes: pd.DataFrame) -> list[SteeringEffe
 def share_rows(
     answers: pd.DataFrame, votes: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED
 ) -> list[SteeringShareRow]:
-    """Return rows of STEERING_SHARES: mean abstention over the paths of a set.
-
-    Of the paper's protocol alone.
+    """Return STEERING_SHARES rows: the paper's protocol, averaged over path sets.
 
     There are rows for each regime of directions and of answers and over all regimes, with an interval from resampled
     scenarios (all paths share the scenarios of a resample, and the unseen one).
@@ -154,9 +141,7 @@ def share_rows(
 
 
 def _shares(numbered: pd.DataFrame, n_paths: int, resamples: int, seed: int) -> np.ndarray:
-    """Return the ends of the share of each path, the observed ones first.
-
-    (2, paths, 1 + resamples).
+    """Return ends of each path's share, (2, paths, 1 + resamples), observed first.
 
     An answer in several paths is one answer, so all paths of a taxonomy have one unseen scenario.
     """
@@ -179,10 +164,7 @@ def _shares(numbered: pd.DataFrame, n_paths: int, resamples: int, seed: int) -> 
 
 
 def _pools(paths: pd.DataFrame) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-    """Yield the sets of paths to average.
-
-    Each is the columns that name it, and its rows of `paths`.
-    """
+    """Yield the path sets to average: their naming columns, and rows of `paths`."""
     pairs = pd.Series(list(zip(paths["source"], paths["dataset"], strict=True)), index=paths.index)
     every = {name: [ALL, *sorted(set(paths[name]))] for name in ("directions", "regime")}
     for (path_set, members), directions, regime in product(_PATH_SETS.items(), every["directions"], every["regime"]):

@@ -1,7 +1,4 @@
-"""Run the mechanistic stages: each reads tables and returns the rows of one.
-
-Other modules hold the numerics.
-"""
+"""Run the mechanistic stages; each reads tables and returns the rows of one."""
 
 from __future__ import annotations
 
@@ -53,9 +50,7 @@ if TYPE_CHECKING:
 
 
 def examined_model(workspace: Workspace, model: str) -> ModelEntry:
-    """Return the entry of a model in the study's `mechanism` section.
-
-    It has that section's media settings.
+    """Return a model's entry with the media settings of the `mechanism` section.
 
     Raises TrapsError if it is not local, or not in the section.
     """
@@ -75,10 +70,7 @@ def examined_model(workspace: Workspace, model: str) -> ModelEntry:
 
 
 def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[list[HiddenStatesRow], int]:
-    """Extract the missing states of a partition.
-
-    Return its rows, and the number of new states.
-    """
+    """Extract a partition's missing states; return its rows, and how many are new."""
     from traps_pipeline.mechanism.hidden_states import extract, read_layer, read_record
     from traps_pipeline.models.local.adapter import load_local_model
 
@@ -141,10 +133,7 @@ def unsound_layers(workspace: Workspace, cell: StatesCell, n_layers: int) -> lis
 
 
 def _check_layers(workspace: Workspace, model: str, n_layers: int) -> None:
-    """Raise TrapsError if the study names a layer that the model lacks.
-
-    This happens before the long extraction begins.
-    """
+    """Raise TrapsError, before a long extraction, for a layer that the model lacks."""
     layers = workspace.mechanism.models[model]
     for name, layer in (
         ("steering", layers.steering),
@@ -162,10 +151,7 @@ def _check_layers(workspace: Workspace, model: str, n_layers: int) -> None:
 
 
 def probe_rows(workspace: Workspace, extraction: Extraction) -> list[ProbeRow]:
-    """Return rows of an extraction's probes.
-
-    Reuse the existing rows if none of their inputs has changed.
-    """
+    """Return rows of an extraction's probes, the existing ones if no input changed."""
     examined_model(workspace, extraction.model)
     states, settings = StoredStates.of(workspace, extraction), workspace.mechanism
     confabulated = confabulations(workspace, extraction.model)
@@ -197,11 +183,9 @@ def _known_rows(workspace: Workspace, extraction: Extraction, made_of: str) -> l
 
 
 def confabulations(workspace: Workspace, model: str) -> Confabulated:
-    """Return, by dataset, the scenarios on whose void the model confabulated.
+    """Return the scenarios on whose void the model confabulated, by dataset.
 
-    It did so under Standard in run 1.
-
-    A dataset without any has the reason instead.
+    It did so under standard in run 1. A dataset without any has the reason instead.
     """
     scenarios: dict[str, frozenset[str]] = {}
     problems: dict[str, str] = {}
@@ -226,10 +210,7 @@ def directions_file(workspace: Workspace, extraction: Extraction, dataset: str) 
 
 
 def direction_rows(workspace: Workspace, extraction: Extraction) -> list[DirectionRow]:
-    """Compute and save the directions of every dataset with states.
-
-    Return rows of the directions table.
-    """
+    """Compute and save directions of every dataset with states; return their rows."""
     examined_model(workspace, extraction.model)
     states = StoredStates.of(workspace, extraction)
     rows: list[DirectionRow] = []
@@ -246,9 +227,7 @@ def direction_rows(workspace: Workspace, extraction: Extraction) -> list[Directi
 def direction_pairs(
     settings: MechanismSettings, dataset: str, items: pd.DataFrame
 ) -> tuple[list[str], list[int], list[int]]:
-    """Return the scenarios behind a dataset's direction, and its rows.
-
-    They are the rows of their voids and controls.
+    """Return a direction's scenarios, and the rows of their voids and controls.
 
     Raises TrapsError for a study without steering.
     """
@@ -314,10 +293,7 @@ def _dataset_directions(workspace: Workspace, states: StoredStates, dataset: str
 
 
 def saved_directions(workspace: Workspace, extraction: Extraction) -> dict[str, Directions]:
-    """Return the directions of an extraction by dataset.
-
-    Raises TrapsError for a file that differs from the table's.
-    """
+    """Return directions by dataset. Raises TrapsError if a file and the table differ."""
     table = workspace.tables.read(DIRECTIONS, extraction.partition)
     result = {}
     for path in sorted(set(table["path"])):

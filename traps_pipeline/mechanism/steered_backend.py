@@ -1,7 +1,5 @@
 """Answer steered requests on a local model.
 
-A direction is added to the output of one block.
-
 Requests of one layer are generated together; answers that another process of the machine has generated are reused
 (`shared_answers`).
 """
@@ -28,10 +26,7 @@ PROMPTS_KEPT = 128  # processed prompts in memory: each one is used for every di
 
 
 class SteeredBackend(LocalBackend):
-    """A local model that answers with a direction added to one block.
-
-    Each row has its own direction and alpha.
-    """
+    """A local model that answers with a direction added to a block, one for each row."""
 
     def __init__(self, entry: Entry, vectors: Mapping[str, np.ndarray], shared: SharedAnswers) -> None:
         super().__init__(entry)
@@ -43,9 +38,7 @@ class SteeredBackend(LocalBackend):
         return self._made.outcomes(batch.requests, self.generate, batch.abandoned.is_set)
 
     def generate(self, batch: Sequence[Request], stopped: Callable[[], bool]) -> list[Outcome]:
-        """Answer requests in groups.
-
-        Rows of one layer are generated together, and unsteered rows apart.
+        """Answer requests in groups by layer, unsteered ones apart.
 
         stopped: called at every token, ends generation early.
         """

@@ -127,11 +127,9 @@ Dose = tuple[str, float]  # unit and number
 
 
 def _within(row: _Planned, of: Directions, layer: int, cap: float) -> Sequence[Dose]:
-    """Return the doses of a direction within the cap.
+    """Return a direction's doses, without class gaps beyond `cap` control states.
 
-    Left out are those in class gaps beyond `cap` control states.
-
-    A null has only the largest one.
+    A null has only the largest dose.
     """
     longest = cap * float(of.residual_norms[layer]) * (1 + 1e-9)
     doses = [(unit, dose) for unit, dose in row.doses if unit == "alpha" or dose * float(of.gaps[layer]) <= longest]
@@ -139,10 +137,7 @@ def _within(row: _Planned, of: Directions, layer: int, cap: float) -> Sequence[D
 
 
 class _Planned(NamedTuple):
-    """A direction along which a target is steered, with sides and doses.
-
-    A null has only the largest dose.
-    """
+    """A direction to steer along, with sides and doses (only the top dose for a null)."""
 
     source: str
     kind: str
@@ -175,9 +170,7 @@ def _plan(target: str, layers: Layers, steering: SteeringSettings, sources: Cont
 def count_answers(
     settings: MechanismSettings, model: str, datasets: Sequence[str], scenarios: Mapping[str, int]
 ) -> dict[str, Counter[str]]:
-    """Return the number of answers that steering a model needs.
-
-    By inference regime and side.
+    """Return the number of steered answers by inference regime and side.
 
     An answer that cells share counts once. scenarios: their number by taxonomy.
     """
@@ -216,10 +209,7 @@ def wanted_steered(
     cell: SteeringCell,
     directions: Mapping[str, Directions],
 ) -> list[SteeredQuestion]:
-    """Return the calls for every answer of a cell.
-
-    Those with the same prompt come together, to share its clip.
-    """
+    """Return a cell's calls, those with the same prompt together, to share a clip."""
     settings = workspace.mechanism
     assert settings.steering is not None, "an experiment without steering has no steering cells"
     items = workspace.tables.read(ITEMS, {"dataset": cell.dataset})
@@ -244,10 +234,7 @@ def steered_request(
     strength: Strength,
     max_new_tokens: int,
 ) -> Request:
-    """Return the call for one steered answer.
-
-    The full benchmark prompt, greedy, in the precision of extraction.
-    """
+    """Return a steered call: full benchmark prompt, greedy, precision of extraction."""
     assert entry.media is not None, "local entries have media"
     clip = workspace.resolve(item["clip"])
     media = workspace.media.prepare(clip, item["media_digest"], entry.media)
@@ -269,10 +256,7 @@ def steered_request(
 
 
 def shared_item(item: Mapping[str, Any]) -> str:
-    """Return the item's id in the ledger.
-
-    A control is one item in both datasets of its taxonomy.
-    """
+    """Return an item's id in the ledger, one for a taxonomy's shared controls."""
     dataset = taxonomy_of(item["dataset"]) if item["side"] == "control" else item["dataset"]
     return f"{dataset}:{item['scenario_id']}:{item['side']}"
 
@@ -362,22 +346,14 @@ def _steering_row(
 def collect_steering_votes(
     workspace: Workspace, cells: Sequence[SteeringCell]
 ) -> Iterator[tuple[SteeringCell, StageOutput]]:
-    """Ask the panel whether each steered answer abstains or is correct.
-
-    Correctness is asked of controls.
-
-    Yields the STEERING_VOTES rows of each finished cell.
-    """
+    """Ask the panel about steered answers; yield STEERING_VOTES of finished cells."""
     panel = load_panel(workspace.study.panel)
     calls = partial(wanted_steering_ballots, workspace, panel)
     yield from ask_judges(workspace, "steering_votes", panel, cells, calls, lambda settled: settled.output(_vote_row))
 
 
 def wanted_steering_ballots(workspace: Workspace, panel: Sequence[JudgeEntry], cell: SteeringCell) -> list[Ballot]:
-    """Return the calls for every vote on the steered answers of a cell.
-
-    A ballot's item is the answer's row with the columns of its item.
-    """
+    """Return the calls for every vote on the steered answers of a cell."""
     ballots = []
     for answer, item in judged_answers(workspace, STEERING, cell):
         shared = item | {"item_id": shared_item(answer)}

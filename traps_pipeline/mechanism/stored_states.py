@@ -18,10 +18,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 @dataclass
 class StoredStates:
-    """The hidden states of one extraction: an id table, and a reader of layers.
-
-    Single layers are in the order of that table.
-    """
+    """An extraction's id table, and a reader of layers in the order of that table."""
 
     workspace: Workspace
     extraction: Extraction
@@ -29,10 +26,7 @@ class StoredStates:
 
     @staticmethod
     def of(workspace: Workspace, extraction: Extraction) -> StoredStates:
-        """Return the states of an extraction.
-
-        Raises TrapsError if nothing was extracted.
-        """
+        """Return an extraction's states. Raises TrapsError if nothing was extracted."""
         items = workspace.tables.read_all(HIDDEN_STATES, **extraction.partition)
         if items.empty:
             raise TrapsError(f"no hidden states of {extraction.key}; materialize hidden_states for it first")

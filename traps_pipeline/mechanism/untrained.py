@@ -1,6 +1,4 @@
-"""Extract states of an untrained network.
-
-It has the same class, sizes and prompts, with random weights.
+"""Extract states of an untrained network of the same class, sizes and prompts.
 
 A gate on them uses only the inputs, through features that no training chose.
 """
@@ -24,12 +22,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 
 def untrained_model(entry: ModelEntry, seed: int) -> LocalModel:
-    """Return the entry's network with random weights.
-
-    It is on its device and in its precision, unquantised.
-
-    It takes the memory of a second model.
-    """
+    """Return the entry's network with random, unquantised weights: a second model."""
     import torch
 
     trained = load_local_model(entry, inside=True)
@@ -50,10 +43,7 @@ def untrained_model(entry: ModelEntry, seed: int) -> LocalModel:
 def untrained_states(
     workspace: Workspace, entry: ModelEntry, states: StoredStates, items: Mapping[str, pd.DataFrame]
 ) -> dict[str, np.ndarray]:
-    """Return the states (n, d) of every item in the untrained network.
-
-    They are those of its middle block, pooled as in the study.
-    """
+    """Return the untrained network's states (n, d) of its middle block, by dataset."""
     model = untrained_model(entry, workspace.mechanism.seed)
     system, layer = states_prompt(workspace.mechanism.system, states.extraction.prompt), (model.n_layers + 1) // 2
     assert entry.media is not None, "local entries have media"

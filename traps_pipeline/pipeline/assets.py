@@ -40,10 +40,7 @@ class WorkspaceResource(dg.ConfigurableResource):
         self._steps.close()
 
     def open(self) -> Workspace:
-        """Return the workspace.
-
-        Raises TrapsError naming the remedy where there is none.
-        """
+        """Return the workspace. Raises TrapsError with a remedy where there is none."""
         return Workspace.open()
 
 

@@ -55,9 +55,7 @@ INTERVAL_S = 30
 
 
 def reread_sources() -> None:
-    """Clear the caches of specs, corrections, prompts and registries.
-
-    A long-lived server then sees edits.
+    """Clear caches of specs, corrections, prompts, registries, so that edits count.
 
     The set of evaluations stays: partition keys are built from it when the code location is loaded.
     """
@@ -67,10 +65,7 @@ def reread_sources() -> None:
 
 
 def jobs() -> list[Any]:
-    """Return a job for each part of the graph and one for all of it.
-
-    Call it after the stages are declared.
-    """
+    """Return a job per part of the graph and one for all, once stages are declared."""
     stages = the_graph().stages
     parts = {name: [s for s in stages if s.group in groups] for name, groups in JOB_GROUPS.items()}
     every = _job(EVERYTHING, "All that the study asks, from scenarios to the report.", stages)
@@ -107,9 +102,7 @@ def _stages(costs: bool) -> list[Stage]:
 
 
 def report_unseen(instance: dg.DagsterInstance, workspace: Workspace, lineage: Lineage, reported: set[str]) -> None:
-    """Fail the check `current` for altered or lost files.
-
-    It fails for stale assets without partitions, too.
+    """Fail the check `current` for altered, lost or (unpartitioned) stale assets.
 
     reported: the failures that this process has reported before.
     """
@@ -145,10 +138,7 @@ def _report(instance: dg.DagsterInstance, stage: str, key: str | None, wrong: st
 def _requests(
     instance: dg.DagsterInstance, workspace: Workspace, lineage: Lineage, *, costs: bool
 ) -> list[dg.RunRequest]:
-    """Return runs of what is outdated and can be rebuilt now.
-
-    Dependents are requested at a later tick.
-    """
+    """Return runs of what is outdated and can be rebuilt now; dependents follow later."""
     graph, requests = the_graph(), list[dg.RunRequest]()
     for block in graph.blocks([stage.name for stage in _stages(costs)]):
         stages, keys = pending_in(block, lineage, History(instance, graph), StudyPartitions(workspace), existing=True)
@@ -194,10 +184,7 @@ def _sensor(name: str, doc: str, *, costs: bool) -> dg.SensorDefinition:
 
 
 def sensors() -> list[dg.SensorDefinition]:
-    """Return the sensors that follow corrections.
-
-    Call it after the stages are declared.
-    """
+    """Return the sensors that follow corrections, once stages are declared."""
     return [
         _sensor(
             "follow_corrections",

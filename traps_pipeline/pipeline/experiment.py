@@ -1,7 +1,4 @@
-"""Read an experiment: the models and questions of a YAML file.
-
-It lies in `assets/experiments` or elsewhere.
-"""
+"""Read an experiment: models and questions of a YAML file."""
 
 from __future__ import annotations
 
@@ -57,10 +54,7 @@ class Experiment(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _what_the_file_describes_is_its_own(cls, data: Any) -> Any:
-        """Move described models, `judges`, `panels` and `accounts` to `own`.
-
-        A model may be named or described.
-        """
+        """Move described (not named) models, `judges`, `panels`, `accounts` to `own`."""
         if not isinstance(data, dict):
             return data
         if "own" in data:
@@ -128,9 +122,8 @@ class Experiment(BaseModel):
     def judged(self, study: Study | None, panel: str | None, *, judged_by_rules: bool = False) -> Study:
         """Return the study with the panel of the command, else of the experiment.
 
-        Without either it keeps the panel of `study` (None: a new study).
-
-        Raises TrapsError for no panel, for two, and if rules would judge models without an explicit request.
+        Without either it keeps the panel of `study` (None: a new study). Raises TrapsError for no panel, for two, and
+        if rules would judge models without an explicit request.
         """
         base = study or self.study
         if panel is not None and self.panel not in (None, panel):
@@ -147,10 +140,7 @@ class Experiment(BaseModel):
         return base.model_copy(update={"panel": named, "judged_by_rules": is_judged_by_rules})
 
     def check_study(self, study: Study, path: Path) -> None:
-        """Raise TrapsError if an existing study contradicts this experiment.
-
-        It may not have another panel, epoch or `mechanism` section.
-        """
+        """Raise TrapsError if a study has another panel, epoch or `mechanism` section."""
         for name in ("panel", "epoch"):
             old, new = getattr(study, name), getattr(self, name)
             if new is not None and new != old:
@@ -162,10 +152,7 @@ class Experiment(BaseModel):
             )
 
     def cells(self) -> list[Cell]:
-        """Return all cells, by model; a model with fewer runs has fewer cells.
-
-        Raises TrapsError for an unknown model.
-        """
+        """Return cells by model, up to its runs. Raises TrapsError for an unknown model."""
         cells = []
         for model in self.models:
             available = get_model(model).runs
@@ -185,10 +172,7 @@ def _known(values: list[str], known: tuple[str, ...]) -> list[str]:
 
 
 def load_experiment(name: str) -> Experiment:
-    """Return an experiment by name (`demo`) or path (`my.yaml`).
-
-    Raises TrapsError with the known names.
-    """
+    """Return an experiment by name or YAML path. Raises TrapsError with known names."""
     path = Path(name) if name.endswith((".yaml", ".yml")) else EXPERIMENTS / f"{name}.yaml"
     if not path.is_file():
         known = sorted(p.stem for p in EXPERIMENTS.glob("*.yaml"))

@@ -31,10 +31,7 @@ OpenRuns = Callable[["DagsterInstance", Workspace], AbstractContextManager["Runs
 
 @dataclass
 class RunReport:
-    """A run's result.
-
-    Problems as sentences, whether a budget ended it, seconds, and the work of each stage.
-    """
+    """A run's problems in sentences, whether a budget ended it, and its tallies."""
 
     problems: list[str] = field(default_factory=list)
     over_budget: bool = False
@@ -60,9 +57,7 @@ def run_experiment(
     look_at_machine: bool,
     open_runs: OpenRuns,
 ) -> RunReport:
-    """Materialize every missing or stale partition of an experiment.
-
-    Report to `progress.current()`.
+    """Materialize missing or stale partitions, reporting to `progress.current()`.
 
     until: comma-separated stages; only these and their upstream are materialized. preflight: receives a line about each
     model and judge, which are tried first unless it is None. open_runs: opens the executor of runs; called, like
@@ -94,10 +89,7 @@ def run_experiment(
 
 @dataclass(frozen=True)
 class _Participants:
-    """Models and judges with answers still missing.
-
-    Their libraries or keys may be missing here.
-    """
+    """Models and judges with answers missing, whose libraries or keys may be missing."""
 
     models: list[Entry]
     judges: list[Entry]
@@ -121,10 +113,7 @@ def _still_to_ask(workspace: Workspace, experiment: Experiment, stages: Collecti
 
 
 def _preflight(workspace: Workspace, participants: _Participants, say: Callable[[str], None]) -> None:
-    """Try the models and judges over the network first.
-
-    Raises TrapsError naming all problems.
-    """
+    """Try networked models and judges first. Raises TrapsError with all problems."""
     models = [entry for entry in participants.models if entry.backend == NETWORK]
     if not models and not participants.judges:
         return

@@ -1,7 +1,4 @@
-"""Plan an experiment (`traps plan`).
-
-It counts the calls, and forecasts tokens, dollars, minutes and GPU-hours.
-"""
+"""Plan an experiment (`traps plan`): calls, tokens, dollars, minutes, GPU-hours."""
 
 from __future__ import annotations
 
@@ -83,9 +80,7 @@ class Plan:
 
 
 def make_plan(workspace: Workspace | None, experiment: Experiment, study: Study, card: str = "H100") -> Plan:
-    """Count the calls of an experiment and forecast their cost.
-
-    Nothing is sent or written.
+    """Count an experiment's calls and forecast their cost; nothing is sent or written.
 
     study: the workspace's, or that of a new one, with the panel that judges. card: one of CARDS.
     """
@@ -145,10 +140,7 @@ def _local_costs(
     calls: Mapping[str, tuple[Count, Count]],
     steered: Mapping[str, tuple[Count, Count]],
 ) -> Iterator[Cost]:
-    """Yield each local model's GPU cost.
-
-    It covers new answers, and all passes for states and patches of a new model.
-    """
+    """Yield each local model's GPU cost: new answers, and passes for states, patches."""
     settings, scenarios = experiment.mechanism, load_scenarios(study).values()
     taxonomies = Counter(datasets_of_category(scenario.category)[0] for scenario in scenarios)
     for model in dict.fromkeys([*calls, *(settings.models if settings else ())]):
@@ -173,10 +165,7 @@ def _local_costs(
 
 
 def _count_labels(workspace: Workspace | None, experiment: Experiment, judge: JudgeEntry) -> Count:
-    """Return calls to the confabulation judge.
-
-    A model without verdicts counts with a full sample.
-    """
+    """Count confabulation labels, a full sample for models without verdicts."""
     protocol, cell_keys = load_protocol(), {cell.key for cell in experiment.cells()}
     labels, lineage = Count(), Lineage(workspace) if workspace else None
     for model in protocol.models:
@@ -229,10 +218,7 @@ def _count_calls(
 def _items(
     workspace: Workspace | None, lineage: Lineage | None, dataset: str, scenes: int, *, is_current: bool
 ) -> tuple[list[dict[str, Any]], Counter[str]]:
-    """Return a dataset's items in the next run.
-
-    The second value counts, by side, those that are unknown before that run.
-    """
+    """Return a dataset's items in the next run, and counts by side of unknown ones."""
     unmade = Counter(dict.fromkeys(sides_of(dataset), scenes))
     if workspace is None or lineage is None or lineage.state("items", dataset) is None:
         return [], unmade
@@ -256,10 +242,7 @@ def _count_cell(
     answers: Count,
     votes: Count,
 ) -> None:
-    """Count a cell's calls.
-
-    Votes on known answers are counted by their keys, and every vote on missing answers counts.
-    """
+    """Count a cell's calls: votes by key on known answers, and all on missing ones."""
     entry, folder = get_model(cell.evaluation.model), cell.evaluation.key
     keys = {  # an item without media was never asked
         item["item_id"]: answer_request(workspace, entry, item, cell.evaluation).key

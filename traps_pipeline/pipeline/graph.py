@@ -1,6 +1,4 @@
-"""Build the dependency graph.
-
-It knows each partition's upstream partitions, all keys, and the order of stages.
+"""Build the dependency graph: upstream partitions, all keys, the order of stages.
 
 `stage` and `source` (`pipeline.stage`) are the only declarations. Nothing here imports Dagster: `traps status`, `why`
 and `plan` read only this graph and the tables' footers, and `pipeline.assets` builds Dagster's assets from it.
@@ -38,9 +36,9 @@ GROUPS = tuple(group for groups in JOB_GROUPS.values() for group in groups)
 
 @dataclass(frozen=True)
 class Check:
-    """A check of each partition.
+    """A check of each partition; `blocks`: a failure blocks everything downstream.
 
-    wrong: returns the failure, or empty; blocks: a failure blocks everything downstream.
+    wrong: returns the failure, or empty.
     """
 
     name: str
@@ -64,10 +62,7 @@ class Parent:
 
 @dataclass(frozen=True)
 class Source:
-    """A file or setting that people edit.
-
-    version: returns its data version, by partition if it has any.
-    """
+    """A file or setting that people edit; `version` returns a key's data version."""
 
     name: str
     version: Callable[[Workspace, Any], str]
@@ -95,9 +90,7 @@ def _nothing(_: Workspace, __: Any, ___: bool) -> tuple[Tally, bool]:
 
 @dataclass(frozen=True)
 class ConcurrentBuild:
-    """How several runs build one partition.
-
-    They build its files together, and then one of them the partition itself.
+    """How several runs build one partition: its files together, then one builds it.
 
     The other runs adopt the finished partition. files: makes the files that no other run is making, optionally waits
     until none is missing, and returns the work done here and whether all exist. seconds: estimates one core's time for
@@ -110,9 +103,7 @@ class ConcurrentBuild:
 
 @dataclass(frozen=True)
 class Stage:
-    """The declaration of an asset that is built.
-
-    It is a table, or files for people (table: None).
+    """The declaration of an asset to build: a table, or files (table: None).
 
     make: returns the StageOutput of a key; if `side_by_side`, takes several keys and yields each with its own. code:
     the code version; raise it when the formula changes, so that existing partitions become stale. cost: the main
@@ -183,9 +174,7 @@ class Graph:
         return [name for name, declaration in self.declared.items() if isinstance(declaration, Source)]
 
     def blocks(self, names: Collection[str] | None = None) -> list[list[Stage]]:
-        """Return stages (default: all) in order, grouped into blocks.
-
-        One run can materialize a block.
+        """Return stages (default: all) in order, in blocks that one run can materialize.
 
         The stages of a block share a scheme, and no stage of another scheme lies between them. Ready stages follow the
         order of `GROUPS`.
@@ -259,10 +248,7 @@ def name_of(node: Node) -> str:
 
 @cache
 def the_graph() -> Graph:
-    """Return the graph of all declarations.
-
-    `traps_pipeline.pipeline.stages` must have been imported.
-    """
+    """Return the graph. Raises RuntimeError unless `pipeline.stages` is imported."""
     if not DECLARED:
         raise RuntimeError("no stage is declared yet: import traps_pipeline.pipeline.stages first")
     return Graph()

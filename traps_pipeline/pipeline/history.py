@@ -1,7 +1,4 @@
-"""Report partitions and sources to Dagster, and read back their data versions.
-
-Their provenance is read back, too.
-"""
+"""Report partitions and sources to Dagster, and read back versions and provenance."""
 
 from __future__ import annotations
 
@@ -31,20 +28,14 @@ class History:
     def event(
         self, stage: Stage, key: str | None, version: str, provenance: Mapping[str, str], metadata: Mapping[str, Any]
     ) -> dg.AssetMaterialization:
-        """Return the event that records a partition as materialized.
-
-        It carries the data version and provenance.
-        """
+        """Return the materialization of a partition, with data version and provenance."""
         tags = {_VERSION: version, _USER: "true", _CODE: stage.code, **provenance}
         return dg.AssetMaterialization(
             asset_key(stage.name), partition=key, metadata=visible_metadata(metadata), tags=tags
         )
 
     def provenance(self, stage: Stage) -> dict[str, str]:
-        """Return tags that name the parents' current events.
-
-        Call it before any input is read.
-        """
+        """Return tags that name the parents' current events; call before reading inputs."""
         tags: dict[str, str] = {}
         for parent in stage.parents:
             key = asset_key(parent)
@@ -56,10 +47,7 @@ class History:
         return tags
 
     def recorded(self, name: str) -> dict[str | None, str | None]:
-        """Return a stage's or source's data versions in Dagster's history.
-
-        By partition.
-        """
+        """Return a stage's or source's data versions in Dagster's history, by partition."""
         node = self._graph.declared[name]
         if node.scheme is None:
             records = self._fetch(name)(dg.AssetRecordsFilter(asset_key=asset_key(name)), limit=1).records
@@ -70,10 +58,7 @@ class History:
         return {key: key_tags[_VERSION] for key, key_tags in tags.items()}
 
     def observe(self, lineage: Lineage, sources: Iterable[str] | None = None) -> list[Node]:
-        """Report versions of sources that Dagster lacks; return the changed sources.
-
-        sources: all by default.
-        """
+        """Report versions of sources (default: all) that Dagster lacks; return these."""
         changed = list[Node]()
         for name in self._graph.sources if sources is None else sources:
             now = {key: str(lineage.version(name, key)) for key in self._graph.keys(name)}

@@ -1,6 +1,4 @@
-"""Compare each partition's recorded inputs with the current ones.
-
-This decides alone what is stale.
+"""Decide what is stale: compare partitions' recorded inputs with the current ones.
 
 The tables' footers hold the truth (`storage.parquet.State`): the versions of the inputs at the time of writing. A
 partition is stale when an input's version has changed. Dagster gets the same versions, so its UI agrees; this module
@@ -28,10 +26,7 @@ DAMAGED = "damaged"  # the version of damaged data
 
 @dataclass(frozen=True)
 class Status:
-    """A partition's status: fresh, missing or stale.
-
-    A stale one has changed inputs and a number of failed calls.
-    """
+    """A partition's status, its changed inputs, and its number of failed calls."""
 
     kind: Literal["fresh", "stale", "missing"]
     outdated: tuple[str, ...] = ()
@@ -44,7 +39,7 @@ class Status:
 
 
 class Lineage:
-    """A snapshot view of a workspace, which looks each version up once.
+    """A snapshot of a workspace that looks each version up once.
 
     thorough: read every table in full.
     """
@@ -89,10 +84,7 @@ class Lineage:
         return self._workspace.store.changed_ns(path)
 
     def blocked(self, name: str, key: str | None, *, current: bool) -> str:
-        """Return why a partition cannot be materialized, in words; empty if it can.
-
-        current: require fresh parents.
-        """
+        """Return why a partition cannot be built, or empty; current: need fresh parents."""
         stage = self.graph[name]
         for parent, keys in self.graph.parents(name, key).items():
             if self.graph.source(parent) is not None:
@@ -147,10 +139,7 @@ class Lineage:
         return f"does not pass its check {failed[0]}" if failed else ""
 
     def _keys_there(self, name: str) -> Set[str] | None:
-        """Return the keys of a table's files, which are few.
-
-        None for an asset without partitions in a table.
-        """
+        """Return the keys with a file, None for an asset without partitions in a table."""
         if self.graph.source(name) is not None or (stage := self.graph[name]).table is None or stage.scheme is None:
             return None
         files = (tuple(partition.values()) for partition in self._workspace.tables.partitions(stage.table))
@@ -196,10 +185,7 @@ def write_report_state(workspace: Workspace, stage: Stage, state: State) -> None
 
 
 def read_report_state(workspace: Workspace, stage: Stage) -> State | None:
-    """Return the state that `write_report_state` wrote.
-
-    None if the files do not exist.
-    """
+    """Return the state that `write_report_state` wrote, None if the files are gone."""
     path = _report_state(workspace, stage)
     if not workspace.store.has(path):
         return None

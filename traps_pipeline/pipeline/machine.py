@@ -1,7 +1,4 @@
-"""Check before a run that the machine has what the coming stages need.
-
-This takes seconds.
-"""
+"""Check in seconds, before a run, that the machine has what coming stages need."""
 
 from __future__ import annotations
 
@@ -33,19 +30,13 @@ Parts = Mapping[str, Sequence[str | None]]  # by stage: the partitions that a ru
 
 
 def wanted_parts(workspace: Workspace, stages: Collection[str], experiment: str | None = None) -> Parts:
-    """Return the partitions of these stages that a study wants.
-
-    Or those that one of its experiments wants.
-    """
+    """Return the partitions of these stages that a study, or its experiment, wants."""
     partitions = StudyPartitions(workspace, experiment)
     return {stage.name: stage.wanted(partitions) for stage in the_graph().stages if stage.name in stages}
 
 
 def parts_of_run(context: dg.AssetExecutionContext, stage: Stage, partitions: StudyPartitions) -> Parts:
-    """Return the stages of a Dagster run with their wanted keys.
-
-    They share a step's partitions.
-    """
+    """Return stages of a Dagster run that share a step's partitions, with wanted keys."""
     keys = {str(key) for key in context.partition_keys} if stage.scheme else {None}
     selected = context.run.asset_selection or context.job_def.asset_layer.executable_asset_keys
     names = {key.path[-1] for key in selected}
@@ -66,10 +57,9 @@ def why_nothing(keys: Sequence[str | None], tags: Mapping[str, str], workspace: 
 def require_machine(workspace: Workspace, parts: Parts) -> None:
     """Raise TrapsError unless the machine can build what is still missing.
 
-    Disk, OpenGL, codecs, proxies and certificates are checked as far as these partitions need them.
-
-    Raises TrapsError, one sentence, for the first that is missing or that a variable breaks. A study whose clips exist
-    needs no OpenGL, and one whose answers and votes exist needs no network.
+    Disk, OpenGL, codecs, proxies and certificates are checked as far as these partitions need them; the error names the
+    first that is missing or that a variable breaks. A study whose clips exist needs no OpenGL, and one whose answers
+    and votes exist needs no network.
     """
     check_disk(workspace.root, LEAST_GB)
     if any(entry.backend == NETWORK for entry in _asked(workspace, parts)):

@@ -63,10 +63,7 @@ class PartitionMaker:
     # --- beside other runs --------------------------------------------------------------------------------------------
 
     def _beside_others(self, shared: ConcurrentBuild, inputs: Inputs) -> Iterator[tuple[str | None, StageOutput]]:
-        """Make files that no other run is making, and wait for theirs.
-
-        The lease holder builds the partition.
-        """
+        """Make files beside other runs, then build the partition as its lease holder."""
         store, later, lineage = self._workspace.store, dict[str | None, Tally](), Lineage(self._workspace)
         self._made_at = {key: lineage.made_at(self._stage.name, key) for key in inputs}
         with kept_workers():
@@ -87,10 +84,7 @@ class PartitionMaker:
                             yield from self._one(key, tally)
 
     def _make_files(self, shared: ConcurrentBuild, key: str | None, tally: Tally, *, wait: bool) -> bool:
-        """Make a partition's files, and return whether all exist.
-
-        The work is added to the tally.
-        """
+        """Make a partition's files, add the work to the tally, return whether all exist."""
         try:
             count, is_whole = shared.files(self._workspace, key, wait)
         except TrapsError as error:
@@ -100,10 +94,7 @@ class PartitionMaker:
         return is_whole
 
     def _takes_over(self, key: str | None, inputs: Mapping[str, str], tally: Tally) -> bool:
-        """Return whether another run has built and reported a partition.
-
-        It must have been built from the same inputs.
-        """
+        """Return whether another run built and reported a partition of equal inputs."""
         stage, lineage = self._stage, Lineage(self._workspace)
         state = lineage.state(stage.name, key)
         if state is None or lineage.made_at(stage.name, key) == self._made_at[key]:

@@ -1,7 +1,4 @@
-"""Translate metadata of Dagster's events.
-
-Hidden characters in models' and providers' texts become visible.
-"""
+"""Translate event metadata; make hidden characters of models' texts visible."""
 
 from __future__ import annotations
 
@@ -23,10 +20,7 @@ RANKED = ("pecs", "conjunction")  # columns by which the rows of a table are bet
 
 
 def visible_metadata(value: Any) -> Any:
-    """Return a value of an event's metadata with hidden characters visible.
-
-    The value may be a mapping or a list.
-    """
+    """Return a metadata value, mapping or list with hidden characters visible."""
     if isinstance(value, str):
         return visible(value)
     if isinstance(value, Markdown):
@@ -59,9 +53,9 @@ def partition_metadata(workspace: Workspace, stage: Stage, output: StageOutput) 
 
 
 def preview(table: Table, output: StageOutput) -> dict[str, dg.TableMetadataValue]:
-    """Return a preview: the best and worst rows, or the first ones.
+    """Return a preview: best and worst rows of a ranked table, else the first rows.
 
-    Only a table that ranks has best rows. Columns that do not differ and long texts are left out.
+    Columns that do not differ and long texts are left out.
     """
     import pandas as pd
 
@@ -88,10 +82,7 @@ def preview(table: Table, output: StageOutput) -> dict[str, dg.TableMetadataValu
 
 
 def _is_telling(kind: Any, values: Sequence[Any]) -> bool:
-    """Return whether a column is worth a preview.
-
-    Its values are numbers or short texts, and not all alike.
-    """
+    """Return whether a column has numbers or short texts that are not all alike."""
     longest = max((len(value) for value in values if isinstance(value, str)), default=0)
     is_shown = kind in (int, float, bool) or 0 < longest <= SHORT
     return is_shown and (len(values) == 1 or len({str(value) for value in values}) > 1)

@@ -1,7 +1,4 @@
-"""Evaluate the checks of a stage's partitions.
-
-Dagster and the run's final report show them.
-"""
+"""Evaluate the checks of a stage's partitions, for Dagster and a run's report."""
 
 from __future__ import annotations
 
@@ -42,10 +39,7 @@ class StageChecks:
         self._failing: dict[tuple[str, str | None], Mapping[str, Any]] = {}
 
     def of_parents(self, lineage: Lineage, key: str | None) -> Iterator[dg.AssetCheckEvaluation]:
-        """Evaluate the parents whose content was altered.
-
-        This happens before anything is built from them.
-        """
+        """Evaluate parents whose content was altered, before anything is built from them."""
         for parent, keys in self._graph.parents(self._stage.name, key).items():
             if self._graph.source(parent) is None:
                 for above in keys:
@@ -76,10 +70,7 @@ class StageChecks:
         return self._evaluate(CURRENT, key, {"not made": str(error), REACHED: isinstance(error, BudgetReached)})
 
     def still_failing(self, lineage: Lineage, seen: Collection[str | None]) -> Iterator[dg.AssetCheckEvaluation]:
-        """Re-evaluate failing checks, including unchanged ones.
-
-        Dagster shows only a check's newest result.
-        """
+        """Re-evaluate failing checks of all keys; Dagster shows only the newest result."""
         name = self._stage.name
         for key in self._graph.keys(name):
             if key not in seen:

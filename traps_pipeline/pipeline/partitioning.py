@@ -44,10 +44,7 @@ class Partitioning:
         return {tuple(map(str, self.columns(key).values())): key for key in self.keys}
 
     def between(self, first: str, last: str) -> Sequence[str]:
-        """Return the keys of a range as Dagster defines it.
-
-        In two dimensions it is the rectangle between two corners.
-        """
+        """Return the keys of a range, in two dimensions a rectangle, as Dagster does."""
         spans = []
         for keys, start, end in zip(
             self.dimensions.values(), first.split(SEPARATOR), last.split(SEPARATOR), strict=True
@@ -60,10 +57,7 @@ class KeyMapping(Protocol):
     """Selects the upstream partitions of a partition."""
 
     def above(self, key: str | None, below: Partitioning | None, above: Partitioning) -> Sequence[str]:
-        """Return the parent's keys for a downstream key.
-
-        None if that stage has no partitions.
-        """
+        """Return the parent's keys for a downstream key (None: no partitions)."""
         ...
 
 
@@ -90,10 +84,7 @@ EVERY, SAME = Every(), Same()
 
 @dataclass(frozen=True)
 class ByDimension:
-    """The partitions that agree in one dimension.
-
-    One side has only that dimension, the other has two.
-    """
+    """Partitions that agree in one dimension; one side has only that, the other two."""
 
     name: str
 
@@ -108,10 +99,7 @@ class ByDimension:
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Partitions that are listed one by one.
-
-    below: the downstream keys of each parent partition.
-    """
+    """Partitions listed one by one: the downstream keys of each parent partition."""
 
     below: Mapping[str, Sequence[str]]
 

@@ -29,12 +29,11 @@ _DATE = (1980, 1, 1, 0, 0, 0)  # date of every member, so that equal pieces give
 
 @dataclass(frozen=True)
 class Piece:
-    """One part of an asset.
+    """A part of an asset.
 
-    reads: the stages and sources whose versions decide whether it is rebuilt.
-
-    inputs: if only part of a table matters, that part as JSON, which is compared instead of versions. is_shared:
-    whether all studies have the same; it is then built once per user.
+    reads: the stages and sources whose versions decide whether it is rebuilt. inputs: if only part of a table matters,
+    that part as JSON, which is compared instead of versions. is_shared: whether all studies have the same; it is then
+    built once per user.
     """
 
     name: str
@@ -47,10 +46,7 @@ class Piece:
 def make_pieces(
     workspace: Workspace, stage: str, code: str, pieces: Sequence[Piece]
 ) -> tuple[dict[str, bytes], list[str]]:
-    """Return the content of all pieces, and the names of the rebuilt ones.
-
-    A piece is rebuilt if its inputs or its code changed.
-    """
+    """Return all pieces' content, and names of those rebuilt for new inputs or code."""
     path = workspace.reports / ".state" / f"{stage}.pieces.zip"
     former = _read(workspace.store.here(path).read_bytes()) if workspace.store.has(path) else {}
     versions, shared = Lineage(workspace).inputs(stage, None), _Shared(stage)
@@ -115,10 +111,7 @@ def _archive(inputs: Mapping[str, str], contents: Mapping[str, bytes]) -> bytes:
 
 
 def _read(data: bytes) -> dict[str, tuple[str, bytes]]:
-    """Return the input digest and content of each piece.
-
-    Empty if the archive is damaged.
-    """
+    """Return input digest and content of each piece, empty if the archive is damaged."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             inputs = json.loads(archive.read(NOTES))

@@ -1,8 +1,6 @@
 """Show extra content of a partition beside its rows.
 
-`metadata` translates it for Dagster.
-
-A `StageOutput.shown` holds plain values, texts and these classes.
+A `StageOutput.shown` holds plain values, texts and these classes; `metadata` translates them for Dagster.
 """
 
 from __future__ import annotations
@@ -21,10 +19,7 @@ STUDY_URL = "/study"  # route of `traps ui` to the study's report, site and clip
 
 @dataclass(frozen=True)
 class Markdown:
-    """Text that is rendered.
-
-    Use it only for figures and ids, never for text that a model wrote.
-    """
+    """Rendered text; use it for figures and ids, never for text that a model wrote."""
 
     text: str
 
@@ -38,10 +33,7 @@ class Records:
 
 @dataclass(frozen=True)
 class StudyFile:
-    """A file that a browser opens.
-
-    path: below the workspace's root. view: the part of its address after #.
-    """
+    """A file below the workspace's root that a browser opens; view: address after #."""
 
     path: str
     view: str = ""
@@ -53,10 +45,7 @@ class StudyFile:
 
 
 def rows_shown(frame: pd.DataFrame, rows: int = 60) -> Markdown | str:
-    """Return the first rows as a Markdown table.
-
-    Use it only for figures and ids, never for text that a model wrote.
-    """
+    """Return the first rows as Markdown; never use it for text that a model wrote."""
     if frame.empty:
         return "not run"
     lines = [[*map(str, frame.columns)], ["---"] * len(frame.columns)]

@@ -20,10 +20,7 @@ WORTH_S = 120.0  # minimum work per run, since each takes 12 to 20 s to start
 
 @dataclass(frozen=True)
 class _Grid:
-    """The keys of a scheme as cells of two dimensions.
-
-    A one-dimensional scheme is a single row.
-    """
+    """A scheme's keys as cells of two dimensions, with a single row for one dimension."""
 
     rows: Sequence[str]
     columns: Sequence[str]
@@ -75,9 +72,7 @@ def _spans(numbers: Sequence[int]) -> list[tuple[int, int]]:
 
 
 def cut(scheme: Partitioning | None, keys: Sequence[str | None], most: int) -> list[Range]:
-    """Return up to `most` ranges with about equally many keys, none twice.
-
-    Or one range per key.
+    """Return up to `most` ranges of about equally many keys, none twice.
 
     A range may contain other keys. Cells of one model stay together if there are fewer runs than models, since each run
     loads its models anew; otherwise cells of one evaluation do.
@@ -96,11 +91,9 @@ def cut(scheme: Partitioning | None, keys: Sequence[str | None], most: int) -> l
 def _parts(
     wanted: np.ndarray, heads: np.ndarray, top: int, left: int, count: int, *, by_model: bool
 ) -> Iterator[tuple[int, int, int, int]]:
-    """Yield rectangles around the wanted cells of one rectangle.
+    """Yield rectangles around wanted cells: first and last row, first and last column.
 
-    Each is first and last row, first and last column.
-
-    top, left: its first cell. heads: the model of each column; by_model: cut between models if there are enough.
+    top, left: the first cell. heads: the model of each column; by_model: cut between models if there are enough.
     """
     rows, columns = np.flatnonzero(wanted.any(axis=1)), np.flatnonzero(wanted.any(axis=0))
     down, across = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
@@ -125,9 +118,7 @@ def _parts(
 
 
 def _halves(sizes: np.ndarray, cuts: np.ndarray, better: set[int], count: int) -> tuple[int, int]:
-    """Return where to cut lines of these sizes in two.
-
-    The second number is how many of the parts go to the first half.
+    """Return where to cut lines of these sizes, and how many parts come before.
 
     Prefer parts of equal size, then a place in `better`, then the middle.
     """
@@ -142,9 +133,7 @@ def _halves(sizes: np.ndarray, cuts: np.ndarray, better: set[int], count: int) -
 def shared_out(
     scheme: Partitioning | None, keys: Sequence[str | None], seconds: Mapping[str | None, float], most: int
 ) -> list[Range]:
-    """Return at most `most` ranges of runs that share the work of each key.
-
-    They are few enough to keep each run busy.
+    """Return at most `most` ranges that share the keys' work and keep each run busy.
 
     Up to the number of keys, each run works through all of them; beyond that, the runs of a range share one key.
     """

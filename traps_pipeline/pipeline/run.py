@@ -1,7 +1,4 @@
-"""Walk the graph and materialize what is missing or stale.
-
-One Dagster run builds one block of stages.
-"""
+"""Materialize what is missing or stale, one Dagster run per block of stages."""
 
 from __future__ import annotations
 
@@ -34,10 +31,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 @dataclass
 class WalkResult:
-    """The result of a walk.
-
-    Problems in sentences, including failed checks, and whether a budget ended it.
-    """
+    """A walk's problems in sentences, whether a budget ended it, and its seconds."""
 
     problems: list[str] = field(default_factory=list)
     over_budget: bool = False
@@ -46,9 +40,7 @@ class WalkResult:
 
 @contextmanager
 def dagster_history(workspace: Workspace) -> Iterator[dg.DagsterInstance]:
-    """Open this workspace's Dagster history, one process at a time.
-
-    Concurrent first openings would corrupt it.
+    """Open the workspace's Dagster history, locked: concurrent openings corrupt it.
 
     Runs whose process was killed are marked as failed, since a queue would count them forever. A lost history begins
     anew, and so does an unreadable one, which is kept beside it: the tables are authoritative. Raises TrapsError if the
@@ -112,10 +104,7 @@ def _opened(workspace: Workspace, home: Path) -> dg.DagsterInstance:
 
 
 def _instance(home: Path, *, is_captured: bool) -> dg.DagsterInstance:
-    """Open a folder's instance.
-
-    is_captured: write steps' output to Dagster's files, as runs on other hosts must.
-    """
+    """Open a folder's instance; is_captured: keep steps' output, as other hosts must."""
     if is_captured:
         return dg.DagsterInstance.from_config(str(home))
     silent = {"module": "dagster._core.storage.noop_compute_log_manager", "class": "NoOpComputeLogManager"}
@@ -135,9 +124,7 @@ def _is_alive(pid: int) -> bool:
 def pending_in(
     block: Sequence[Stage], lineage: Lineage, history: History, partitions: StudyPartitions, *, existing: bool = False
 ) -> tuple[list[Stage], list[str | None]]:
-    """Return a block's stages that must run, and the keys of these.
-
-    They have work to do or lie downstream of such a stage.
+    """Return a block's stages with work, all downstream of them, and their keys.
 
     existing: only what exists, is outdated, and waits for nothing upstream.
     """

@@ -1,7 +1,4 @@
-"""Execute Dagster runs in this process or on the hosts of a cluster.
-
-In this process they follow one another.
-"""
+"""Execute Dagster runs, one after another here or on the hosts of a cluster."""
 
 from __future__ import annotations
 
@@ -45,10 +42,7 @@ class Runs(ABC):
 
     @abstractmethod
     def ranges(self, stages: Sequence[Stage], keys: Sequence[str | None]) -> Sequence[Range]:
-        """Return the keys cut into ranges, one per run.
-
-        Several runs may share a range, and each skips its unwanted keys.
-        """
+        """Return a range of keys per run; ranges may repeat, and hold unwanted keys."""
 
     @abstractmethod
     def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterable[RunOutcome]:
@@ -56,10 +50,7 @@ class Runs(ABC):
 
 
 class RunsHere(Runs):
-    """Runs in this process, of the job of all assets.
-
-    parent: the run that starts them. log: receives each.
-    """
+    """Runs of the job of all assets in this process; parent: the run that starts them."""
 
     def __init__(
         self,
@@ -115,10 +106,7 @@ class RunsHere(Runs):
 
 
 def range_tags(one: Range, *, always: bool = False) -> dict[str, str]:
-    """Return the tags of a range's run.
-
-    A single key needs none unless `always`, for runs that get no key otherwise.
-    """
+    """Return a range's tags; a single key has none unless `always`."""
     first, last = one
     if first is None or (first == last and not always):
         return {}
@@ -126,10 +114,7 @@ def range_tags(one: Range, *, always: bool = False) -> dict[str, str]:
 
 
 def range_of(tags: Mapping[str, str]) -> Range:
-    """Return a run's partitions from its tags.
-
-    They are those of `range_tags`, or Dagster's own of a single key.
-    """
+    """Return a run's partitions from `range_tags`, or Dagster's tag of a single key."""
     single = tags.get("dagster/partition")
     return tags.get(_RANGE[0], single), tags.get(_RANGE[1], single)
 
@@ -148,10 +133,7 @@ def problems_of(failures: Sequence[dg.DagsterEvent]) -> RunOutcome:
 
 
 def is_broken_off(run: dg.DagsterRun, failures: Sequence[dg.DagsterEvent]) -> bool:
-    """Return whether a run or step ended without stating a reason.
-
-    Host, network or database failed.
-    """
+    """Return whether a run failed without a reason, as when host or network fails."""
     named = [{error.cls_name for error in _causes(event)} for event in failures]
     is_interrupted = any(names & {*_INTERRUPTS} for names in named)
     unnamed = not failures or any(not names & {*_SENTENCES} for names in named)
@@ -172,10 +154,7 @@ def _chain(error: Any) -> list[Any]:
 
 
 def reason(error: Any) -> str:
-    """Return the message of a Dagster error.
-
-    It is our own sentence if it contains one, else its innermost cause.
-    """
+    """Return a Dagster error's message: our own sentence, else its innermost cause."""
     chain = _chain(error)
     readable = [link for link in chain if link.cls_name in _SENTENCES]
     if not readable:

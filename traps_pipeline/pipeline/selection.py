@@ -24,9 +24,9 @@ _HISTORY = Path("history", "runs", "index.db")  # all events of Dagster's SQLite
 
 
 def stages_until(until: str | None) -> set[str]:
-    """Return all stages, or those named by `until` and their upstream.
+    """Return all stages, or those of `until` (comma-separated) and their upstream.
 
-    until: comma-separated. Raises TrapsError.
+    Raises TrapsError for an unknown stage.
     """
     graph = the_graph()
     if until is None:
@@ -39,10 +39,7 @@ def stages_until(until: str | None) -> set[str]:
 
 
 def require_work(workspace: Workspace, experiment: str, until: str | None) -> None:
-    """Check that an experiment wants something of the named stages.
-
-    Without names, of any stage. Raises TrapsError.
-    """
+    """Raise TrapsError if an experiment wants nothing of the named stages (or of any)."""
     partitions, graph = StudyPartitions(workspace, experiment), the_graph()
     if not partitions.cells and not partitions.states:
         raise TrapsError(
@@ -75,10 +72,7 @@ def _unquoted(details: str) -> str:
 
 
 def note_versions(workspace: Workspace, stages: Collection[str], experiment: str | None) -> None:
-    """Record the versions in Dagster's history after a run without problems.
-
-    The state of the history is recorded, too.
-    """
+    """Record versions and the history's state after a run without problems."""
     if (history := _history_state(workspace)) is None:
         return
     lineage, partitions = Lineage(workspace), StudyPartitions(workspace, experiment)
@@ -96,10 +90,7 @@ def note_versions(workspace: Workspace, stages: Collection[str], experiment: str
 
 
 def is_nothing_to_do(workspace: Workspace, stages: Collection[str], experiment: str | None) -> bool:
-    """Return whether a run would find nothing to do.
-
-    Every wanted partition is fresh and recorded, and the last run's history is unchanged.
-    """
+    """Return whether all wanted partitions are fresh and recorded, history unchanged."""
     note = _read_note(workspace)
     if not note or note.get("history") != _history_state(workspace):
         return False
@@ -122,10 +113,7 @@ def _read_note(workspace: Workspace) -> dict[str, Any]:
 
 
 def _history_state(workspace: Workspace) -> list[Any] | None:
-    """Return the path of Dagster's history, and its files' sizes and times.
-
-    None if it is not a local file.
-    """
+    """Return path, sizes and times of Dagster's history; None if it is no local file."""
     home = Path(os.environ.get("DAGSTER_HOME") or workspace.dagster_home)
     index = home / _HISTORY
     if workspace.is_shared or not index.is_file():

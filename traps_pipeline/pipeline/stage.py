@@ -52,10 +52,7 @@ def is_declared(name: str) -> bool:
 
 
 def of(parent: Stage | Source | str, mapping: KeyMapping | None = None, *, need: UpstreamPolicy = "every") -> Parent:
-    """Return a stage's dependency on a parent.
-
-    It says which of the parent's partitions, and how many of them, are needed.
-    """
+    """Return a stage's dependency on a parent, with its mapping and what it needs."""
     return Parent(parent if isinstance(parent, str) else parent.name, mapping, need)
 
 
@@ -88,9 +85,7 @@ def stage(
     shared: ConcurrentBuild | None = None,
     side_by_side: bool = False,
 ) -> Callable[[Callable[[Workspace, Any], Any]], Stage]:
-    """Declare the function that makes a table or files (see `graph.Stage`).
-
-    It makes files for people if only a name is given.
+    """Declare the function behind a table or, given a name, files (`graph.Stage`).
 
     The description is the function's docstring, without its "Return"; the code is `code_of` the group, unless stated.
     It returns a StageOutput, or rows alone (figures and ids, never text that a model wrote), which are then shown.
@@ -129,10 +124,7 @@ def stage(
 
 
 def _with_preview(table: Table, rows: Any) -> StageOutput:
-    """Return the rows as a frame, with a preview of the first.
-
-    rows: a frame, or values of the table's dataclass.
-    """
+    """Return a frame (or values of the table's dataclass) with a preview."""
     import pandas as pd
 
     frame = rows if isinstance(rows, pd.DataFrame) else pd.DataFrame(list(rows), columns=pd.Index(table.names))
@@ -144,10 +136,7 @@ def _doc(function: Callable[..., Any]) -> str:
 
 
 def _result(doc: str) -> str:
-    """Return what a docstring says that a function returns.
-
-    In Dagster it describes what is made.
-    """
+    """Return what a docstring says that a function returns, for Dagster."""
     text = doc.removeprefix("Return ").removeprefix("Yield ").removeprefix("the version of ")
     return text[:1].upper() + text[1:]
 

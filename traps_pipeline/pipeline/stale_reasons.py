@@ -1,7 +1,4 @@
-"""Explain which answers to an item are valid (`traps why`).
-
-The others would be asked again.
-"""
+"""Explain which answers to an item are valid and which are stale (`traps why`)."""
 
 from __future__ import annotations
 
@@ -27,9 +24,7 @@ _OF_VOTE = ("item_id", "task", "abstained", "correct", "valid", "judge", "ration
 
 
 def explain(workspace: Workspace, item_id: str) -> dict[str, Any]:
-    """Return an item's question and clip, and the state of its answers.
-
-    The clip is given if it is still in the benchmark.
+    """Return an item's question, clip if it is current, and the state of its answers.
 
     For every evaluation that has asked it: whether its answer is valid or which component of the key changed, with the
     answer and its votes. Raises TrapsError for an unknown item.

@@ -1,12 +1,9 @@
-"""Run one stage in one Dagster run.
-
-Its partitions are built and reported to Dagster.
+"""Build a stage's partitions in one Dagster run, and report them.
 
 `run_step` is the whole protocol, in the only sound order. It records the inputs' versions before it reads anything. It
 skips, with a reason, what cannot be built yet or would be built from something damaged. Each partition is written, read
 back, checked and reported to Dagster as soon as it is done. The step then ends without an error, so that everything
 downstream that does not need the missing partitions is built; the last step of a run raises for all of them (`checks`).
-
 A partition of a range gets an `AssetMaterialization` with a data version of its own, since the versions of a
 `MaterializeResult` hold for all partitions of a step (Dagster's issues 21072 and 34013). An asset without partitions
 gets a `MaterializeResult`.
@@ -74,10 +71,7 @@ def run_step(stage: Stage, context: dg.AssetExecutionContext, workspace: Workspa
 
 
 class _Step:
-    """The state and the phases of `run_step`.
-
-    Its methods are called in the order of their definition.
-    """
+    """The state and phases of `run_step`; methods are called in order of definition."""
 
     def __init__(self, stage: Stage, context: dg.AssetExecutionContext, workspace: Workspace) -> None:
         self.stage, self.context, self.workspace, self.graph = stage, context, workspace, the_graph()
@@ -97,10 +91,7 @@ class _Step:
         self._wanted, self._unwanted = [k for k in keys if k in wanted_keys], [k for k in keys if k not in wanted_keys]
 
     def tell_unwanted(self) -> Iterator[dg.AssetMaterialization]:
-        """Report unwanted cells as done, so that a backfill ends.
-
-        A range may contain some.
-        """
+        """Report unwanted cells of the range as done, so that a backfill ends."""
         if MAKE_TAG in self.tags:
             return
         if self.stage.scheme and not self._wanted and BACKFILL_TAG not in self.tags:
@@ -111,10 +102,7 @@ class _Step:
             yield self.history.event(self.stage, key, "not wanted", self.provenance, about)
 
     def to_make(self) -> list[str | None]:
-        """Return this run's keys to build.
-
-        All that are wanted, or those that its tag selects.
-        """
+        """Return the wanted keys, or those among them that the run's tag selects."""
         if MAKE_TAG not in self.tags:
             return self._wanted
         recorded, existing = self.history.recorded(self.stage.name), self.tags[MAKE_TAG] == OUTDATED
@@ -158,10 +146,7 @@ class _Step:
             yield self.history.event(self.stage, key, version, self.provenance, about)
 
     def tell_unmade(self) -> Iterator[dg.AssetCheckEvaluation]:
-        """Report partitions that could not be built or that fail a check.
-
-        The failure may be of this run or of one before.
-        """
+        """Report partitions that could not be built or fail a check, now or before."""
         unmade = self._maker.unmade
         if unmade:
             end_if_resumed(self.context.instance, self.context.run.run_id, _ATTEMPTS[self.context.run.run_id])
@@ -170,9 +155,7 @@ class _Step:
         yield from self.checks.still_failing(self.lineage, {*self._inputs, *unmade} - self._maker.taken.keys())
 
     def hand_on(self, result: dg.MaterializeResult | None) -> Iterator[dg.Output | dg.MaterializeResult]:
-        """Yield the result of an asset without partitions, or its outputs.
-
-        Dagster writes no event of its own for these outputs.
+        """Yield the result of an asset without partitions, or outputs that write no event.
 
         Dagster skips everything downstream of a step without outputs, and would write one event, with one version, for
         all partitions. Observable sources, which report their own versions too, carry this mark.
@@ -189,9 +172,7 @@ class _Step:
 
 
 def guard_events(events: Events, context: dg.AssetExecutionContext) -> Events:
-    """Forward a step's events, with progress in Dagster's log.
-
-    The traceback that Dagster stores gets no keys.
+    """Forward a step's events; log progress, and keep keys out of stored tracebacks.
 
     A run stopped by a signal is canceled; Dagster, which did not stop it itself, would call it a failure.
     """
@@ -212,9 +193,7 @@ def guard_events(events: Events, context: dg.AssetExecutionContext) -> Events:
 
 
 def end_if_resumed(instance: dg.DagsterInstance, run_id: str, attempts: int) -> None:
-    """End this process if its run has been resumed elsewhere.
-
-    Its host was stopped and presumed dead.
+    """End this process if its run has been resumed elsewhere, its host presumed dead.
 
     Another process builds what this one could not, so this one must not report a failed run to Dagster.
     """

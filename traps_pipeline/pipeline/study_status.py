@@ -1,7 +1,4 @@
-"""Compute a study's fresh, stale and missing partitions (`traps status`).
-
-The reasons are given.
-"""
+"""Compute fresh, stale (with reasons) and missing partitions (`traps status`)."""
 
 from __future__ import annotations
 
@@ -15,9 +12,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 @dataclass(frozen=True)
 class StageStatus:
-    """The partitions of a stage.
-
-    Numbers of fresh, stale (with reasons) and missing ones.
+    """A stage's partitions: fresh (their number), stale (with reasons), missing.
 
     A stage without partitions has one, of its own name.
     """
@@ -36,10 +31,7 @@ class StageStatus:
 
 
 def stage_statuses(workspace: Workspace, lineage: Lineage, experiment: str | None) -> Iterator[StageStatus]:
-    """Yield the status of every stage.
-
-    It covers the partitions that the study or one of its experiments wants.
-    """
+    """Yield each stage's status over what the study, or one experiment, wants."""
     partitions = StudyPartitions(workspace, experiment)
     for stage in lineage.graph.stages:
         statuses = {key or stage.name: lineage.status(stage.name, key) for key in stage.wanted(partitions)}

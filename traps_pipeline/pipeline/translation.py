@@ -20,10 +20,7 @@ for _category in (dg.BetaWarning, dg.PreviewWarning):
 
 
 def asset_key(name: str) -> dg.AssetKey:
-    """Return the asset key of a stage or source.
-
-    It is its name, after the study's if studies share one history.
-    """
+    """Return a stage's or source's asset key, prefixed if studies share one history."""
     return dg.AssetKey([*_prefix(), name])
 
 

@@ -1,6 +1,4 @@
-"""Compute which partitions a study wants.
-
-They are what its experiments ask about its scenarios.
+"""Compute the wanted partitions: what a study's experiments ask of its scenarios.
 
 Partition keys, `traps run`, `traps status`, Dagster's buttons and its automation all use this module, so nothing asks a
 model that no experiment of the study names.
@@ -103,10 +101,7 @@ class StudyPartitions:
 
     @cached_property
     def _inside(self) -> tuple[list[str], MechanismSettings | None] | None:
-        """Datasets (no arms) and settings of the mechanistic analyses.
-
-        None if there are none.
-        """
+        """Datasets (no arms) and settings of mechanistic analyses, or None without any."""
         if self._workspace is None:
             return [*DATASETS], None
         settings = self._workspace.study.mechanism
@@ -192,10 +187,7 @@ class StudyPartitions:
 
 
 def _evaluations(experiment: Asked) -> list[Evaluation]:
-    """Return the experiment's evaluations for which a model has enough runs.
-
-    All of its runs if none are named.
-    """
+    """Return evaluations of named runs (default: all) that a model's run count allows."""
     evaluations = []
     for model in experiment.models:
         available = range(1, get_model(model).runs + 1)

@@ -1,10 +1,9 @@
 """Run Dagster's web server behind a guard (`traps ui`).
 
-`webguard` guards it; its daemon and their code server run beside it.
-
-Dagster's own server accepts any request that reaches its port: a page of another site, opened in the same browser,
-could launch runs, which spend money, and wipe history. `dagster dev` starts that server, and leaves processes behind if
-SIGINT is ignored; `serve_with_dagster` avoids both.
+`webguard` guards it; its daemon and their code server run beside it. Dagster's own server accepts any request that
+reaches its port: a page of another site, opened in the same browser, could launch runs, which spend money, and wipe
+history. `dagster dev` starts that server, and leaves processes behind if SIGINT is ignored; `serve_with_dagster` avoids
+both.
 """
 
 from __future__ import annotations
@@ -41,9 +40,7 @@ SERVED_FOLDERS = ("reports", "site", "clips")
 
 
 def serve_with_dagster(host: str, port: int, token: str) -> NoReturn:
-    """Run web server, daemon and their code server until KeyboardInterrupt.
-
-    Then stop all their processes.
+    """Run web server, daemon, code server until KeyboardInterrupt, then stop them all.
 
     Raises TrapsError if one of them ends by itself.
     """
@@ -69,10 +66,7 @@ def serve_with_dagster(host: str, port: int, token: str) -> NoReturn:
 
 
 def _start(module: str, *arguments: str, token: str | None = None) -> int:
-    """Start a module as a program and return its process id.
-
-    token: passed in its environment.
-    """
+    """Start a module and return its process id; token: passed in its environment."""
     environment = _PATIENCE | os.environ | {"DAGSTER_IS_DEV_CLI": "1"} | ({TOKEN_VARIABLE: token} if token else {})
     return subprocess.Popen([sys.executable, "-m", module, *arguments], env=environment).pid
 
@@ -87,10 +81,7 @@ def _wait_for_socket(address: str, started: dict[int, str]) -> None:
 
 
 def study_route(workspace: Workspace) -> Route:
-    """Return a route to the study's report, site and clips.
-
-    Dagster's pages link to them.
-    """
+    """Return a route to the study's report, site and clips, which Dagster links to."""
     from starlette.responses import FileResponse, PlainTextResponse, Response
     from starlette.routing import Route
 
@@ -107,10 +98,7 @@ def study_route(workspace: Workspace) -> Route:
 
 
 def main() -> None:
-    """Serve Dagster's pages behind the guard.
-
-    Arguments: a Dagster workspace file, host, port.
-    """
+    """Serve Dagster's pages behind the guard; arguments: workspace file, host, port."""
     import uvicorn
     from dagster import DagsterInstance
     from dagster._core.workspace.context import WorkspaceProcessContext

@@ -1,4 +1,1 @@
-"""Make output for people.
-
-The leaderboard, tables, figures, contact sheets and the report page.
-"""
+"""Make output for people: leaderboard, tables, figures, explorer and report page."""

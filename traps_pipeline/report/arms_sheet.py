@@ -1,7 +1,4 @@
-"""Draw contact sheets of one scenario with all its arms.
-
-Each arm has its clip, and the right answer to it.
-"""
+"""Draw contact sheets of one scenario: every arm's clip and its right answer."""
 
 from __future__ import annotations
 
@@ -67,10 +64,7 @@ def _moments(clip: Path) -> np.ndarray:
 
 
 def _rows(sides: pd.DataFrame, arms: pd.DataFrame, scenario: str, root: Path, times: np.ndarray) -> Iterator[Row]:
-    """Yield control and void, then the arms.
-
-    First those that must be answered, then those that must be abstained on.
-    """
+    """Yield control and void, then arms to be answered, then arms to be abstained on."""
     pair = sides.loc[sides["scenario_id"] == scenario].sort_values("side")
     own = arms.loc[arms["scenario_id"] == scenario].sort_values(["side", "arm"])
     for row in (*pair.to_dict("records"), *own.to_dict("records")):
@@ -83,9 +77,9 @@ def _rows(sides: pd.DataFrame, arms: pd.DataFrame, scenario: str, root: Path, ti
 
 
 def _sheet(scenario: str, rows: list[Row], times: np.ndarray) -> Figure:
-    """Return a figure with one row per clip.
+    """Draw one row per clip: its caption, then frames at the control's times.
 
-    Captions on the left, frames at the control's times, hatched after its end.
+    Frames after a clip's end are hatched.
     """
     _, tall, wide, _ = rows[0].clip.frames.shape
     row_in = FRAME_IN * tall / wide + GAP_IN

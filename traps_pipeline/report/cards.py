@@ -1,7 +1,4 @@
-"""Build the cards of the report page.
-
-Tables, figures and pictures of pairs, each beside the paper's.
-"""
+"""Build the report page's cards: tables, figures and pictures beside the paper's."""
 
 from __future__ import annotations
 
@@ -101,10 +98,7 @@ def table_card(report: TableReport, sources: Sources, address: Address | None = 
 
 
 def paper_card(report: TableReport | FigureReport, sources: Sources) -> Card:
-    """Return the card with the paper's tables or figure of this kind.
-
-    Empty if it has none.
-    """
+    """Return the card of the paper's tables or figure, empty if it has none."""
     if isinstance(report, FigureReport):
         try:
             pictures = {"The paper’s": _picture(f"{report.name}_published", report.figure(sources.paper))}
@@ -119,10 +113,7 @@ def paper_card(report: TableReport | FigureReport, sources: Sources) -> Card:
 
 
 def tables_html(tables: Sequence[PrintedTable], title: str, address: Address | None) -> list[Mapping[str, object]]:
-    """Return each table's title, fragment and downloads by file name.
-
-    The title is left out if it is the card's.
-    """
+    """Return each table's title (empty if the card's), fragment and downloads by name."""
     return [
         {
             "title": table.title if table.title != title else "",

@@ -65,10 +65,7 @@ class TableReport:
         return bool(self.paper or self.recomputed)
 
     def tables(self, results: Results) -> list[PrintedTable]:
-        """Return the tables, cached.
-
-        For the paper they are the recomputed ones, without empty columns.
-        """
+        """Return the tables, cached; of the paper, those recomputed without empty columns."""
         if self.name not in results.kept:
             results.kept[self.name] = self._tables(results)
         return results.kept[self.name]
@@ -132,10 +129,7 @@ class FigureReport:
         return _function(f"findings.{self.name}")(results) if self.has_finding else ""
 
     def note(self, results: Results) -> str:
-        """Return the finding about a study, and the caption.
-
-        The finding has one sentence per model, if there is one.
-        """
+        """Return the finding about a study (one sentence per model) and the caption."""
         return f"{self.finding(results)} {self.doc}".strip()
 
     def files(self, results: Results) -> dict[str, bytes]:
@@ -149,10 +143,7 @@ class FigureReport:
         return {f"{folder('figures', results)}/{name}": content for name, content in files.items()}
 
     def figure(self, results: Results) -> Figure:
-        """Return the figure, with a note if rules judged.
-
-        Raises NotRun without data.
-        """
+        """Return the figure, with a note if rules judged. Raises NotRun without data."""
         figure = self.make(results)
         if BY_RULES in results.judged_by.lower() and _is_judged(self.reads):
             _say_below(figure, BY_RULES)
@@ -250,18 +241,12 @@ INSIDE = ("states_and_output", "lens", "probe_baselines", "gate_arrows", "patchi
 
 
 def folder(kind: str, results: Results) -> str:
-    """Return the folder of a kind, `tables` or `figures`.
-
-    The paper's files are in a subfolder of it.
-    """
+    """Return a kind's folder, `tables` or `figures`; the paper's is a subfolder of it."""
     return kind if results.is_study else f"{kind}/{PAPER}"
 
 
 def _say_below(figure: Figure, text: str) -> None:
-    """Write a line at the foot of a figure.
-
-    It goes along the right edge if the layout leaves no room there.
-    """
+    """Write a line at a figure's foot, or along its right edge if there is no room."""
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     from traps_pipeline.report.writing import SOFT, figure_style

@@ -1,7 +1,4 @@
-"""Draw pairs of clips: frames of controls above frames of voids.
-
-See docs/spec.md 10.
-"""
+"""Draw pairs of clips (docs/spec.md 10): control frames above void frames."""
 
 from __future__ import annotations
 
@@ -57,10 +54,7 @@ PAGE = Layout()
 
 @dataclass(frozen=True)
 class SampledClip:
-    """Frames (moments, H, W, 3) uint8 at the control's times (s).
-
-    From index `known` on they lie after the clip's end.
-    """
+    """Frames (moments, H, W, 3) uint8; from index `known` on, after the clip's end."""
 
     frames: np.ndarray
     known: int
@@ -68,9 +62,7 @@ class SampledClip:
 
 
 def pairs_figure(items: pd.DataFrame, root: Path, layout: Layout = PAGE) -> Figure:
-    """Return a row of control frames above a row of void frames, for each pair.
-
-    The times are the same. items: ITEMS rows.
+    """Draw each pair of ITEMS rows: control frames above void frames of equal times.
 
     Clips lie under root. Times after a truncated void's end are hatched. Raises DamagedClip.
     """
@@ -93,9 +85,7 @@ def pairs_figure(items: pd.DataFrame, root: Path, layout: Layout = PAGE) -> Figu
 
 
 def six_pairs(items: pd.DataFrame) -> pd.DataFrame:
-    """Return ITEMS rows of six visual pairs for a figure like the paper's.
-
-    Each taxonomy has three.
+    """Return ITEMS rows of six visual pairs, three per taxonomy, as in the paper.
 
     No two are of one sub-scenario, and their categories differ if possible; fewer if there are fewer sub-scenarios.
     """
@@ -110,10 +100,7 @@ def six_pairs(items: pd.DataFrame) -> pd.DataFrame:
 
 
 def whole_pairs(items: pd.DataFrame) -> list[pd.DataFrame]:
-    """Return the complete pairs, occlusion first.
-
-    Each is a frame of two rows indexed by side.
-    """
+    """Return complete pairs as frames of two rows indexed by side, occlusion first."""
     complete = items.loc[items.groupby("pair_id")["side"].transform("nunique") == 2]
     complete = complete.assign(place=complete["dataset"].map(DATASETS.index)).sort_values(
         ["place", "sub_scenario", "pair_id"]
@@ -122,10 +109,7 @@ def whole_pairs(items: pd.DataFrame) -> list[pd.DataFrame]:
 
 
 def moments_of(pair: pd.DataFrame, root: Path, moments: int) -> tuple[SampledClip, SampledClip, np.ndarray]:
-    """Return control, void and informative times of the control.
-
-    The times are (moments,), in seconds.
-    """
+    """Return control, void and the control's informative times (moments,) in seconds."""
     control, times_s = decode(root / str(pair.at["control", "clip"]))
     void, void_at = decode(root / str(pair.at["void", "clip"]))
     times = telling_times(control, times_s, moments)
@@ -144,10 +128,7 @@ def telling_times(frames: np.ndarray, at: np.ndarray, moments: int) -> np.ndarra
 
 
 def sampled(frames: np.ndarray, at: np.ndarray, times: np.ndarray) -> SampledClip:
-    """Return the frames nearest to the times.
-
-    A clip ends one frame after its last frame begins.
-    """
+    """Return the frames nearest to the times; a clip ends a frame after its last one."""
     step = float(at[1] - at[0]) if len(at) > 1 else 0.0
     end = float(at[-1]) + step
     nearest = np.abs(at[:, None] - times).argmin(axis=0)
@@ -163,10 +144,7 @@ def ratio_of(clip: SampledClip) -> float:
 def draw_pair(
     axes: Axes, pair: pd.DataFrame, control: SampledClip, void: SampledClip, times: np.ndarray, layout: Layout
 ) -> None:
-    """Draw the result of `moments_of`: frames below the texts of `pair`.
-
-    Each frame has its time.
-    """
+    """Draw the result of `moments_of`: timed frames below the texts of `pair`."""
     from matplotlib.patches import Rectangle
 
     moments, height, width, _ = control.frames.shape
@@ -221,10 +199,7 @@ def _draw_header(axes: Axes, pair: pd.DataFrame, layout: Layout) -> None:
 
 
 def _fitted(frame: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Return the frame resized to the control's size.
-
-    Clips of different sizes are then aligned.
-    """
+    """Return the frame resized to the control's size, so that clips align."""
     if frame.shape[:2] == (height, width):
         return frame
     import cv2

@@ -1,7 +1,4 @@
-"""State findings of the leading mechanistic figures, one sentence per model.
-
-They come from the figures' frames.
-"""
+"""State findings of the leading mechanistic figures, one sentence per model."""
 
 from __future__ import annotations
 
@@ -37,10 +34,7 @@ def _models(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
 
 @_joined
 def states_and_output(results: Results) -> Iterator[str]:
-    """Return how many answered voids states and output classify as voids.
-
-    It also says how well each orders the sides.
-    """
+    """Yield how many answered voids states and output detect, and their AUROC."""
     for model, group in _models(scored_items(results)):
         voids = group.loc[(group["side"] == "void") & group["abstained_standard"].eq(False)]
         controls = group.loc[group["side"] == "control"]
@@ -62,10 +56,7 @@ def states_and_output(results: Results) -> Iterator[str]:
 
 @_joined
 def lens(results: Results) -> Iterator[str]:
-    """Yield how far the guided prompt moves each side's margin at the last layers.
-
-    These are the last one and the one before.
-    """
+    """Yield how far guided prompting moves each side's margin at the last two layers."""
     for model, group in _models(results.lens):
         means = group.groupby(["prompt", "layer"], observed=True).agg(
             voids=("voids", "mean"), controls=("controls", "mean")
@@ -88,10 +79,7 @@ def lens(results: Results) -> Iterator[str]:
 
 @_joined
 def probe_baselines(results: Results) -> Iterator[str]:
-    """Yield on how many pairs states beat every raw input, the margin and the noise.
-
-    Pairs within and across datasets are counted apart.
-    """
+    """Yield on how many pairs, within and across datasets, states beat all baselines."""
     for model, group in _models(beside(results)):
         states, noise, spread = (group[name].to_numpy(float) for name in ("value", "noise", "noise_spread"))
         beaten = np.column_stack([group[[*SHORTCUTS, "output margin"]].to_numpy(float), noise + 2 * spread])
@@ -105,10 +93,7 @@ def probe_baselines(results: Results) -> Iterator[str]:
 
 @_joined
 def gate_arrows(results: Results) -> Iterator[str]:
-    """Return the default gate's effect on PECS.
-
-    Beside it, the best gate on features other than states.
-    """
+    """Yield the default gate's effect on PECS, and the best gate on other features."""
     rows = results.gate
     rows = rows.loc[(rows["source"] == "other datasets") & (rows["threshold"] == "mid") & (rows["target"] == "all")]
     for model, group in _models(rows.loc[rows["pecs"].notna()]):
@@ -126,10 +111,7 @@ def gate_arrows(results: Results) -> Iterator[str]:
 
 @_joined
 def doses_among_nulls(results: Results) -> Iterator[str]:
-    """Return where void directions do more than 19 of 20 draws of every null.
-
-    Controls and voids are counted apart.
-    """
+    """Yield where directions exceed 19 of 20 draws of every null, by side."""
     rows = results.nulls
     for model, group in _models(rows.loc[rows["target"] != "all"]):
         cells: dict[tuple[Any, ...], list[dict[str, Any]]] = {}

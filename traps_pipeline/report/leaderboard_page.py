@@ -1,6 +1,4 @@
-"""Show the leaderboard of a study (docs/spec.md 5 and 10).
-
-It goes to a terminal, a README, Dagster and a page.
+"""Show the leaderboard (docs/spec.md 5 and 10) as text, Markdown and HTML tables.
 
 Model ids, epochs and versions are untrusted text: each medium escapes them.
 """
@@ -113,18 +111,12 @@ LEGEND = {
 
 
 def leaderboard_text(board: pd.DataFrame, robust: pd.DataFrame | None = None, notes: Sequence[str] = ()) -> str:
-    """Return LEADERBOARD rows as text: a table per panel, best first.
-
-    ROBUST figures and further notes are added.
-    """
+    """Return LEADERBOARD rows as text, a table per panel, with ROBUST and notes."""
     return "\n".join(table_text(table) for table in leaderboards(board, robust, notes, brief=True))
 
 
 def leaderboard_markdown(board: pd.DataFrame, robust: pd.DataFrame | None = None, notes: Sequence[str] = ()) -> str:
-    """Return LEADERBOARD rows as Markdown with its legend, best first.
-
-    ROBUST figures and further notes are added.
-    """
+    """Return LEADERBOARD rows as Markdown, with ROBUST, notes and a legend."""
     terms = [f"- **{term}**: {meaning}" for term, meaning in legend(board, robust).items()]
     tables = leaderboards(board, robust, notes, brief=True)
     return "\n".join([*map(table_markdown, tables), *terms]) + "\n"
@@ -133,12 +125,10 @@ def leaderboard_markdown(board: pd.DataFrame, robust: pd.DataFrame | None = None
 def leaderboards(
     board: pd.DataFrame, robust: pd.DataFrame | None = None, notes: Sequence[str] = (), *, brief: bool = False
 ) -> list[PrintedTable]:
-    """Return tables of LEADERBOARD rows for each panel.
+    """Return each panel's tables of LEADERBOARD rows: ranking, then other datasets.
 
-    One ranks the entries, then one follows per other dataset.
-
-    The first is `overall`, or the board's first dataset if no model has all four. An entry without a row comes last.
-    notes: further notes of the first table. brief: only the first table of each panel, with fewer columns.
+    The ranking is of `overall`, or the board's first dataset if no model has all four. An entry without a row comes
+    last. notes: further notes of the first table. brief: only the first table of each panel, with fewer columns.
     """
     panels = [_of_one_panel(part, robust, brief, suffix) for suffix, part in _by_panel(board)]
     tables = [table for of_panel in panels for table in of_panel[: 1 if brief else None]]
@@ -146,10 +136,7 @@ def leaderboards(
 
 
 def _by_panel(board: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
-    """Return the rows by panel, with the suffix of their tables' names.
-
-    Entries of several panels come last.
-    """
+    """Return rows by panel, with their tables' suffix; entries of several come last."""
     if board.empty:
         return [("", board)]
     of_entry = board.groupby(["model", "regime"])["panel"].transform(joined_epochs)
@@ -181,10 +168,7 @@ def legend(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> dict[str,
 
 
 def provenance(board: pd.DataFrame) -> str:
-    """Return a sentence with panels, benchmark versions and epochs of the board.
-
-    They are those of its figures.
-    """
+    """Return a sentence with the board's panels, benchmark versions and epochs."""
     versions = _distinct(board["benchmark_version"].unique(), " + ")
     epochs = _distinct(board["epoch"].unique(), "+")
     return (
@@ -194,10 +178,7 @@ def provenance(board: pd.DataFrame) -> str:
 
 
 def judged_by(board: pd.DataFrame) -> str:
-    """Return a sentence that names the panels, and which are not comparable.
-
-    It says so of their figures.
-    """
+    """Return a sentence that names the panels, and warns against comparing them."""
     panels = _distinct(board["panel"].unique(), "+")
     names = [_panel_in_words(panel) for panel in panels]
     several = len(panels) > 1
@@ -259,10 +240,7 @@ def _with_robust(rows: pd.DataFrame, beside: Robust) -> pd.DataFrame:
 
 
 def _notes_on_arms(beside: Robust) -> list[str]:
-    """Return notes on the arms of each entry.
-
-    They also say why pairs and arms are not joined.
-    """
+    """Return notes on each entry's arms, and on why pairs and arms are not joined."""
     entries: dict[tuple[str, ...], list[str]] = {}
     for (model, regime), row in beside.items():
         entries.setdefault(tuple(row["arms"]), []).append(f"{model} {regime}")
@@ -328,10 +306,7 @@ def _bounds(row: Mapping[str, Any]) -> str:
 
 
 def _rank(entry: Mapping[str, Any]) -> tuple[bool, float, str, int]:
-    """Return the sort key: best PECS first, nulls last.
-
-    Ties by model, then in the order of the regimes.
-    """
+    """Return the sort key: best PECS first, nulls last, ties by model and regime."""
     pecs = float(entry.get("pecs", float("nan")))
     null = pecs != pecs
     regimes = (*REGIMES, entry["regime"])

@@ -13,9 +13,7 @@ _PRINTED_NUMBER = re.compile(r"([+−-]?(?:\d+(?:\.\d*)?|\.\d+))(%?)")
 
 
 def as_numbers(values: pd.Series) -> pd.Series:
-    """Return a column of the paper's printed numbers as numbers, a dash as missing.
-
-    Other columns are unchanged.
+    """Return a printed column as numbers, a dash as missing; text stays unchanged.
 
     A number in percent stays in percent in a field whose name ends in `_pct`, and becomes a fraction in any other.
     """

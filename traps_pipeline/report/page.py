@@ -1,7 +1,4 @@
-"""Render the report page (docs/report.md).
-
-Findings, the leaderboard, the results, and a list of what was not run.
-"""
+"""Render the report page (docs/report.md): findings, leaderboard, results, gaps."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Draw pictures of pairs for the report.
-
-Six pairs, one scenario with its arms, a worked example, shortcuts.
-"""
+"""Draw pictures of pairs: six pairs, a scenario's arms, an example, shortcuts."""
 
 from __future__ import annotations
 
@@ -44,10 +41,7 @@ class Picture:
     kind: str = "webp"
 
     def figures(self) -> Mapping[str, Figure]:
-        """Return the figures by file name.
-
-        Raises NotRun, and TrapsError for a damaged clip.
-        """
+        """Return figures by file name. Raises NotRun, or TrapsError for a damaged clip."""
         try:
             return self.make()
         except DamagedClip as error:
@@ -118,8 +112,5 @@ class PairPictures:
 
 
 def _as_json(rows: pd.DataFrame) -> str:
-    """Return the rows as JSON without the benchmark's version.
-
-    It also changes in rows that a correction leaves alone.
-    """
+    """Return rows as JSON without the version, which changes in uncorrected rows, too."""
     return str(rows.drop(columns=["benchmark_version"], errors="ignore").to_json(orient="records"))

@@ -27,10 +27,7 @@ PATH, TYPE = Column("path", "Source → target"), Column("transfer_type", "Trans
 
 
 def of_paper(name: str, rows: pd.DataFrame, columns: Sequence[Column]) -> PrintedTable:
-    """Return the paper's table `name`.
-
-    Title, place in the paper and notes come from `tables.csv`.
-    """
+    """Return the paper's table `name`, with title, place and notes of `tables.csv`."""
     (about,) = as_printed("tables").query("name == @name").to_dict("records")
     where = f"as the paper prints it (line {about['line']} of its LaTeX source)"
     notes = [where, *([str(about["note"])] if about["note"] else [])]
@@ -46,10 +43,7 @@ def figures(names: Mapping[str, str]) -> list[Column]:
 
 
 def in_text(card: str) -> list[PrintedTable]:
-    """Return the scores of this card that only the paper's text states.
-
-    No table if there are none.
-    """
+    """Return a table of this card's scores that only the paper's text states, if any."""
     rows = as_printed("other").query("card == @card")
     columns = [Column("model", "Model"), Column("quantity", "Quantity")]
     columns += figures({"printed": "Value", "line": "Line"})
@@ -79,10 +73,7 @@ def replication_overall() -> list[PrintedTable]:
 
 
 def _cells(group: str) -> pd.DataFrame:
-    """Return the cells of a group's models.
-
-    They are `figure ± spread` where a spread is printed.
-    """
+    """Return the cells of a group's models, `figure ± spread` where both are printed."""
     cells: pd.DataFrame = as_printed("behavioral_per_dataset")
     cells = cells.loc[cells["model"].isin(models_of(group=group))].copy()
     for field, spread in zip(SHARES, SPREADS, strict=True):
@@ -161,10 +152,7 @@ def occlusion_sub_scenarios() -> list[PrintedTable]:
 
 
 def chaotic_sub_scenarios() -> list[PrintedTable]:
-    """Return the original benchmark's three chaotic sub-scenarios.
-
-    Their uplift under guided stands beside them.
-    """
+    """Return the original three chaotic sub-scenarios, beside their uplift."""
     rows = as_printed("chaotic_subscenarios")
     names = {"acc_pct": "Acc", "false_abs_pct": "FA", "abs_rec_pct": "AR", "pecs": "PECS"}
     names |= {"abs_rec_ill_posed_pct": "AR, ill-posed"}
@@ -236,10 +224,7 @@ def confabulation() -> list[PrintedTable]:
 
 
 def probes() -> list[PrintedTable]:
-    """Return probe transfer of the three families.
-
-    By ordered pair, and means by transfer type.
-    """
+    """Return probe transfer of the three families by pair, and means by transfer type."""
     pairs = _paths(as_printed("probe_transfer"))
     pairs["best_layer"] = "L" + pairs["best_layer"]
     wide: pd.DataFrame = pairs.loc[:, ["transfer_type", "path"]].drop_duplicates()
@@ -270,10 +255,7 @@ def cosines() -> list[PrintedTable]:
 
 
 def steering() -> list[PrintedTable]:
-    """Return steering by regimes and families.
-
-    The tables are at alpha 10, by alpha, and within or across domains.
-    """
+    """Return steering by regime and family (alpha 10), by alpha, and by domain."""
     return [_regimes(), _top(), _domains(), _dose("qwen"), _dose("gemma")]
 
 
@@ -328,10 +310,7 @@ def _paths(rows: pd.DataFrame) -> pd.DataFrame:
 
 @cache
 def audit_table() -> PrintedTable:
-    """Return every statement that differs from the paper's tables.
-
-    Its line and the arithmetic stand beside it.
-    """
+    """Return statements that differ from the paper's tables, with line and arithmetic."""
     from traps_pipeline.scoring.audit import DECLARED, DIFFERS, audit, counts_text  # pandas takes long to import
 
     findings = audit()

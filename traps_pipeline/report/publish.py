@@ -1,7 +1,4 @@
-"""Write the report, and all tables and figures to a folder.
-
-The latter is `traps results export`.
-"""
+"""Write the report, and all tables and figures (`traps results export`)."""
 
 from __future__ import annotations
 
@@ -55,10 +52,7 @@ class Part:
 
 
 def report_parts(sources: Sources, address: Address | None = explorer_address) -> list[Part]:
-    """Return all parts of a study's report, in the order of the page.
-
-    With `address`, numbers are links.
-    """
+    """Return a report's parts in page order; with `address`, numbers are links."""
     # A study with mechanistic analyses leads with the figures that could refute its claims.
     first = INSIDE if sources.workspace.study.mechanism else ()
     figures = [
@@ -85,10 +79,7 @@ def report_parts(sources: Sources, address: Address | None = explorer_address) -
 def report_files(
     study: Results, cards: Sequence[tuple[str, Card]], address: Address | None = explorer_address
 ) -> dict[str, bytes]:
-    """Return the report page and the leaderboard (Markdown and JSON lines), by path.
-
-    cards: by chapter.
-    """
+    """Return report page and leaderboard (Markdown, JSON lines) by path, from cards."""
     remarks = said_by_people(study.human_row, study.panel_errors)
     paper = {card.name: card.html for chapter, card in cards if chapter == PAPER}
     figures, pictures, tables = (
@@ -105,17 +96,12 @@ def report_files(
 
 
 def metrics_lines(board: pd.DataFrame) -> str:
-    """Return LEADERBOARD rows as JSON lines, with null for missing scores.
-
-    Experiment trackers read them.
-    """
+    """Return LEADERBOARD rows as JSON lines for trackers, null for missing scores."""
     return str(board.to_json(orient="records", lines=True, double_precision=15))
 
 
 def export(workspace: Workspace, target: Path, say: Callable[[str], None] = lambda line: None) -> int:
-    """Write every table, every available figure and the report page to a folder.
-
-    Return the number of files.
+    """Write all tables, available figures and the report page; return the file count.
 
     Each file is written atomically, `index.html`, which lists them, last. say: receives a line per file.
     """

@@ -1,7 +1,4 @@
-"""Read the paper's results, in the same frames as a study's results.
-
-They lie in `assets/published`.
-"""
+"""Read the paper's results (`assets/published`) in the same frames as a study's."""
 
 from __future__ import annotations
 
@@ -59,10 +56,7 @@ def _rates(results: Results) -> pd.DataFrame:
 
 
 def _none(*columns: str) -> pd.DataFrame:
-    """Return a frame without rows.
-
-    It stands for frames that the paper's tables do not determine.
-    """
+    """Return a frame without rows, for what the paper's tables do not determine."""
     return pd.DataFrame(columns=pd.Index(columns))
 
 
@@ -98,10 +92,7 @@ def _probes(results: Results) -> pd.DataFrame:
 
 
 def _cosines(results: Results) -> pd.DataFrame:
-    """Return COSINES rows.
-
-    The matrix of qwen3-vl-8b, and the few values of other models in the paper's text.
-    """
+    """Return COSINES rows: qwen3-vl-8b's matrix, and other models' values in the text."""
     matrix = published("cosine_qwen").assign(model="qwen3-vl-8b")
     few = published("other")
     few = few.loc[few["id"].str.fullmatch(r"cos-(gemma|llava)-\w+-\w+")]
@@ -114,10 +105,7 @@ def _cosines(results: Results) -> pd.DataFrame:
 
 
 def _effects(results: Results) -> pd.DataFrame:
-    """Return STEERING_EFFECTS rows of the dose-response tables.
-
-    They have the regimes that their captions state.
-    """
+    """Return STEERING_EFFECTS of dose-response tables, with their captions' regimes."""
     qwen = published("steering_dose_qwen").assign(model="qwen3-vl-8b", epoch="original")
     gemma = published("steering_dose_gemma").assign(model="gemma-4-e4b", epoch="verification")
     rows = _long(pd.concat([qwen, gemma], ignore_index=True))
@@ -140,9 +128,7 @@ def _as(table: Table, parts: list[pd.DataFrame]) -> pd.DataFrame:
 
 
 class PublishedResults(Results):
-    """The paper's numbers, for figures and further tables.
-
-    As shipped in `assets/published`.
+    """The paper's numbers, as shipped in `assets/published`, for figures and tables.
 
     `report.printed_tables` shows the tables that the paper prints. A frame without such use has no rows.
     """

@@ -1,7 +1,5 @@
 """Prepare the frames behind tables and figures, for a study or the paper.
 
-They are tidy, with the same columns.
-
 A frame without rows means that its part was not run. Shares are fractions; every frame with figures has a column
 `epoch`.
 """
@@ -64,10 +62,7 @@ SUB_COLUMNS = (
 
 
 def own(what: str) -> cached_property[pd.DataFrame]:
-    """Return a frame that a study's and the paper's results each make of their own.
-
-    what: it has, in words.
-    """
+    """Declare a frame of `what` that each kind of results must override."""
 
     def make(results: Results) -> pd.DataFrame:
         raise NotImplementedError(f"{type(results).__name__} makes no frame with {what}")
@@ -151,10 +146,7 @@ class Results:
         return pd.DataFrame(columns=pd.Index([column.name for column in table.columns]))
 
     def refusal(self, dataset: str, left: tuple[str, str], right: tuple[str, str]) -> str | None:
-        """Return why two entries (model, regime) may not be compared on a dataset.
-
-        None if they may.
-        """
+        """Return why two entries (model, regime) are not comparable on a dataset, or None."""
         return self._refusals.get((dataset, frozenset((left, right))))
 
     @cached_property

@@ -1,7 +1,4 @@
-"""State a study's main findings in sentences, for the top of its report page.
-
-Every number is in one of its tables.
-"""
+"""State a study's main findings in sentences whose numbers are in its tables."""
 
 from __future__ import annotations
 
@@ -52,10 +49,7 @@ def study_findings(results: Results) -> list[StudyFinding]:
 
 
 def _best(rows: pd.DataFrame) -> Iterator[StudyFinding]:
-    """Yield the best model of each regime.
-
-    It names how many others the contrasts cannot separate from it.
-    """
+    """Yield each regime's best model, and how many are not separable from it."""
     for regime in [name for name in REGIMES if name in {*rows["regime"]}]:
         part = rows.loc[rows["regime"] == regime].sort_values(["pecs", "model"], ascending=[False, True])
         first = part.to_dict("records")[0]
@@ -94,10 +88,7 @@ def _abstention(rows: pd.DataFrame) -> Iterator[StudyFinding]:
 
 
 def _accuracy(rows: pd.DataFrame) -> Iterator[StudyFinding]:
-    """Yield how guided prompting changes Acc and AbsRec.
-
-    Only models with both regimes count.
-    """
+    """Yield how guided prompting changes Acc and AbsRec of models with both regimes."""
     wide = rows.loc[rows["regime"].isin(PROMPTING)].pivot(index="model", columns="regime", values=["acc", "abs_rec"])
     if {*PROMPTING} <= {*wide.columns.get_level_values(1)} and len(wide := wide.dropna()):
         changes = {name: wide[name][GUIDED] - wide[name][STANDARD] for name in ("acc", "abs_rec")}
@@ -109,10 +100,7 @@ def _accuracy(rows: pd.DataFrame) -> Iterator[StudyFinding]:
 
 
 def _gaps(results: Results, rows: pd.DataFrame) -> Iterator[StudyFinding]:
-    """Yield visual against textual voids.
-
-    The part of PECS that may come from shortcuts follows.
-    """
+    """Yield visual against textual voids, and how much PECS may come from shortcuts."""
     rates = results.rates
     pooled = rates.loc[rates["taxonomy"].eq("pooled") & rates["model"].isin(rows["model"])] if len(rates) else rates
     pooled = pooled.dropna(subset=["visual", "textual"])
@@ -166,10 +154,7 @@ def _missing(rows: pd.DataFrame) -> Iterator[StudyFinding]:
 
 
 def _span(shares: pd.Series) -> str:
-    """Return the smallest and the largest share in percent.
-
-    Once if they print the same.
-    """
+    """Return the smallest and largest share in percent, once if they print the same."""
     low, high = (percent(value, 0) for value in (shares.min(), shares.max()))
     return f"{low} %" if low == high else f"{low} to {high} %"
 

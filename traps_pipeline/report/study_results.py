@@ -30,10 +30,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 
 def _of_panel(results: StudyResults, rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows that the panel of the tables decided.
-
-    Scores of two panels are never shown together.
-    """
+    """Return rows that the tables' panel decided; panels are never shown together."""
     return rows.loc[rows["panel"] == results.panel].reset_index(drop=True)
 
 
@@ -107,10 +104,7 @@ def _cosines(results: StudyResults) -> pd.DataFrame:
 
 
 def _effects(results: StudyResults) -> pd.DataFrame:
-    """Return the rows of the paper's protocol.
-
-    They have the dose in class gaps and the share of degenerate answers.
-    """
+    """Return the paper's protocol rows, with dose in class gaps and degenerate share."""
     every = results.rows(STEERING_EFFECTS)
     rows = in_gaps(of_paper(every), every)
     answers = rows["n"].astype(float) + rows["n_missing"].astype(float)
@@ -122,10 +116,7 @@ def _ill_posed(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _without_references(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows without reference strategies, if other models were asked.
-
-    Means are taken over these.
-    """
+    """Return rows without reference strategies, if other models were asked."""
     kept_rows = rows.loc[~rows["model"].isin(analyses.models_of(group="reference"))]
     return kept_rows if len(kept_rows) else rows
 
@@ -154,10 +145,7 @@ class StudyResults(Results):
 
     @cached_property
     def panel(self) -> str:
-        """The panel of all tables and figures: the study's, if it decided any.
-
-        Else it is the first that did.
-        """
+        """The panel of all tables and figures: the study's, else the first that decided."""
         decided = self.board if len(self.board) else self.tables.read_all(METRICS, ["panel"], dataset=DATASETS)
         panels = sorted({*decided["panel"]}, key=lambda name: ("+" in name, name))
         own = panel_id(self._panel)

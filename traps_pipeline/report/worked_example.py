@@ -1,7 +1,4 @@
-"""Draw the worked example, one pair with its answers, votes and verdict.
-
-A model answers each side, and the panel votes.
-"""
+"""Draw the worked example: one pair with answers, judges' votes and verdict."""
 
 from __future__ import annotations
 
@@ -32,10 +29,7 @@ WORDS_IN, LETTERS, MOST_LINES = 3.1, 66, 6  # width of the text column beside th
 
 @dataclass(frozen=True)
 class Example:
-    """A pair (ITEMS rows indexed by side), a model, and lines of text.
-
-    The lines stand beside each side's frames.
-    """
+    """A pair (ITEMS rows indexed by side), a model, and lines beside its frames."""
 
     pair: pd.DataFrame
     model: str
@@ -43,10 +37,7 @@ class Example:
 
 
 def worked_example(workspace: Workspace) -> Example | None:
-    """Return the example that `chosen_example` selects from verdicts under standard.
-
-    None if there is none.
-    """
+    """Return the `chosen_example` of verdicts under standard, or None without one."""
     verdicts = workspace.tables.read_all(VERDICTS, None, dataset=("occlusion", "chaotic"), regime="standard")
     chosen = chosen_example(verdicts)
     if chosen is None:
@@ -69,9 +60,8 @@ def worked_example(workspace: Workspace) -> Example | None:
 def chosen_example(verdicts: pd.DataFrame) -> dict[Any, Any] | None:
     """Return the control's VERDICTS row of a telling pair; None without one.
 
-    Its control is correct, and its void is decided.
-
-    Seesaws come first, then models that are no reference strategy, then voids abstained on.
+    The control is correct and the void decided. Seesaws come first, then models that are no reference strategy, then
+    voids abstained on.
     """
     decided = verdicts.dropna(subset=["abstained"])
     voids = {
@@ -94,10 +84,7 @@ def chosen_example(verdicts: pd.DataFrame) -> dict[Any, Any] | None:
 
 
 def reading(answer: str, votes: Sequence[Mapping[Any, Any]], verdict: Mapping[Any, Any]) -> list[str]:
-    """Return the lines beside the frames of a side.
-
-    The answer, the judges' votes, and the verdict.
-    """
+    """Return the lines beside a side's frames: answer, judges' votes, and verdict."""
     valid = [vote for vote in votes if vote["valid"]]
     on_abstention = [vote for vote in valid if vote["task"] == "abstention"]
     abstained = sum(bool(vote["abstained"]) for vote in on_abstention)
@@ -114,10 +101,7 @@ def reading(answer: str, votes: Sequence[Mapping[Any, Any]], verdict: Mapping[An
 
 
 def example_figure(example: Example, root: Path) -> Figure:
-    """Draw frames of control and void on the left, the text on the right.
-
-    The figure is one page wide. Clips lie under root.
-    """
+    """Draw control and void frames left of their text, one page wide."""
     pair, words = example.pair, example.words
     with figure_style():
         block = moments_of(pair, root, FRAMES.moments)

@@ -42,10 +42,7 @@ _EQUAL = 12  # decimals at which two means count as equal: below any printed dig
 
 
 def study_cells(leaderboard: pd.DataFrame) -> pd.DataFrame:
-    """Return a study's cells from its LEADERBOARD rows.
-
-    Further columns are `_std` over runs, n_pairs, n_runs etc.
-    """
+    """Return cells from LEADERBOARD rows, with `_std` over runs, n_pairs, n_runs etc."""
     rows = of_several_runs(leaderboard.loc[leaderboard["dataset"] != "overall"])
     spread = [f"{share}_std" for share in SHARES]
     columns = [*_ENTRY, "epoch", "n_pairs", "n_runs", "n_missing", "incomplete", *SHARES, *spread]
@@ -74,10 +71,7 @@ def scoped_cells(metrics: pd.DataFrame, scope: str) -> pd.DataFrame:
 
 
 def models_of(group: str | None = None, family: str | None = None, media: str | None = None) -> list[str]:
-    """Return the ids of the registry's models, filtered.
-
-    The filters are group (main, replication, ..), family and input media.
-    """
+    """Return ids of the registry's models by group (main, ..), family and input media."""
     criteria = {"group": group, "family": family, "input": media}
     return [
         entry.id
@@ -90,12 +84,10 @@ def models_of(group: str | None = None, family: str | None = None, media: str | 
 
 
 def overall(cells: pd.DataFrame) -> pd.DataFrame:
-    """Return equal-weight means over datasets.
+    """Return equal-weight means over datasets, a row per (model, regime).
 
-    Columns: model, regime, acc, abs_rec, false_abs, pecs.
-
-    PECS is averaged too, not recomputed from the means. A (model, regime) that lacks one of the datasets in `cells` has
-    no row, so that all rows average the same datasets.
+    Columns: model, regime, acc, abs_rec, false_abs, pecs. PECS is averaged too, not recomputed from the means. A
+    (model, regime) that lacks one of the datasets in `cells` has no row, so that all rows average the same datasets.
     """
     cells = _checked(cells)
     groups = cells.groupby(["model", "regime"], sort=False)
@@ -104,9 +96,7 @@ def overall(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def uplift(cells: pd.DataFrame, means: pd.DataFrame | None = None) -> pd.DataFrame:
-    """Return AbsRec under guided over AbsRec under standard: columns model, ratio.
-
-    Each is averaged over its datasets.
+    """Return mean AbsRec under guided over that under standard: columns model, ratio.
 
     There is one row per model that has both regimes. means: a study's own `overall` rows, which leave out runs without
     all datasets; by default the means of `cells`. The ratio is infinite where standard is 0 and guided is not, and null
@@ -124,9 +114,7 @@ def uplift(cells: pd.DataFrame, means: pd.DataFrame | None = None) -> pd.DataFra
 
 
 def spread(cells: pd.DataFrame, column: str = "pecs_std") -> pd.DataFrame:
-    """Return quartiles of the standard deviations over runs, over all cells.
-
-    One row with q25, median, q75, n.
+    """Return quartiles of deviations over runs, over all cells: q25, median, q75, n.
 
     Cells with a single run have no deviation and are left out. The paper does not say which metric its quartiles
     describe; the default is PECS.
@@ -142,20 +130,16 @@ def spread(cells: pd.DataFrame, column: str = "pecs_std") -> pd.DataFrame:
 
 
 def pareto_frontier(cells: pd.DataFrame) -> pd.DataFrame:
-    """Return the models on the frontier in (Acc, J) after averaging over datasets.
+    """Return `frontier` of `overall`, in (acc, j).
 
-    The column j is added.
-
-    This is `frontier` of `overall`. It orders models and computes no ratio or gap, so epochs may differ.
+    It orders models and computes no ratio or gap, so epochs may differ.
     """
     means = overall(cells)
     return frontier(means.assign(j=means["abs_rec"] - means["false_abs"]))
 
 
 def frontier(means: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows that no other row of the same regime dominates in acc and j.
-
-    They are sorted by decreasing Acc.
+    """Return rows not dominated in acc and j within their regime, by decreasing Acc.
 
     A model dominates another if it is at least as good in both figures and better in one. Two equal models are both on
     the frontier; a model without Acc or J is not on it.
@@ -177,10 +161,7 @@ def _dominated(points: pd.DataFrame) -> np.ndarray:
 
 
 def naive_gap(cells: pd.DataFrame, threshold: float = 0.03) -> pd.DataFrame:
-    """Return the cells whose Acc x AbsRec exceeds PECS by more than `threshold`.
-
-    Columns naive and gap are added.
-    """
+    """Return cells whose naive (Acc x AbsRec) exceeds PECS by a gap above `threshold`."""
     cells = _checked(cells)
     cells["naive"] = cells["acc"] * cells["abs_rec"]
     cells["gap"] = cells["naive"] - cells["pecs"]
@@ -188,10 +169,7 @@ def naive_gap(cells: pd.DataFrame, threshold: float = 0.03) -> pd.DataFrame:
 
 
 def zero_boundary(cells: pd.DataFrame) -> pd.DataFrame:
-    """Return the cells with PECS 0.
-
-    No run abstains more on voids than on controls, or no answer is correct.
-    """
+    """Return cells with PECS 0: in no run are Acc and J both above 0."""
     cells = _checked(cells)
     return cells.loc[cells["pecs"] == 0].reset_index(drop=True)
 
@@ -224,15 +202,13 @@ def degenerate_strategies() -> pd.DataFrame:
 
 
 def visual_textual_gap(cells: pd.DataFrame, taxonomies: Sequence[str] = TAXONOMIES) -> pd.DataFrame:
-    """Return textual over visual AbsRec.
+    """Return textual over visual AbsRec, by model, regime and taxonomy.
 
-    Columns: model, regime, taxonomy, visual, textual, gap.
-
-    taxonomy: occlusion, chaotic or pooled. Visual is the AbsRec on the taxonomy's own dataset, textual that on its
-    ill-posed one. `pooled` is the mean of the two textual values over the mean of the two visual ones, if both
-    taxonomies are in `cells`. The gap is infinite where visual is 0 and textual is not, and null where both are 0.
-    Raises EpochMismatch if the two datasets of a taxonomy are of different epochs, like the paper's own chaotic
-    datasets, whose gaps it prints from an earlier epoch (`visual_vs_textual.csv`).
+    Columns: model, regime, taxonomy, visual, textual, gap. taxonomy: occlusion, chaotic or pooled. Visual is the AbsRec
+    on the taxonomy's own dataset, textual that on its ill-posed one. `pooled` is the mean of the two textual values
+    over the mean of the two visual ones, if both taxonomies are in `cells`. The gap is infinite where visual is 0 and
+    textual is not, and null where both are 0. Raises EpochMismatch if the two datasets of a taxonomy are of different
+    epochs, like the paper's own chaotic datasets, whose gaps it prints from an earlier epoch (`visual_vs_textual.csv`).
     """
     import pandas as pd
 
@@ -334,9 +310,7 @@ def hidden_against_others(table: pd.DataFrame, columns: Sequence[str] = ("abs_re
 
 
 def accuracy_by_label(cells: pd.DataFrame) -> pd.DataFrame:
-    """Return mean Acc under standard by the control's answer.
-
-    It is taken over the models that have an Acc.
+    """Return mean Acc (standard) by the control's answer, over models that have it.
 
     cells: `scoped_cells(metrics, "label")`. Columns dataset, sub_scenario, label, acc, n_pairs, n_models, n_missing
     (items of both sides, over these models).
@@ -356,10 +330,7 @@ def accuracy_by_label(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def ratio(numerator: pd.Series | pd.DataFrame, denominator: pd.Series | pd.DataFrame) -> np.ndarray:
-    """Divide elementwise.
-
-    Infinite where only the denominator is 0, NaN where both are.
-    """
+    """Divide elementwise: infinite where the denominator is 0, NaN where both are."""
     top, bottom = numerator.to_numpy(float), denominator.to_numpy(float)
     with np.errstate(divide="ignore", invalid="ignore"):
         return top / bottom
@@ -375,10 +346,7 @@ def _means(groups: DataFrameGroupBy, columns: Sequence[str]) -> pd.DataFrame:
 
 
 def _checked(cells: pd.DataFrame, more: Sequence[str] = (), datasets: Sequence[str] = DATASETS) -> pd.DataFrame:
-    """Return a copy of the cells.
-
-    Raises ValueError where a column is missing or a cell has two rows.
-    """
+    """Return a copy of cells. Raises ValueError for lacking columns or repeated rows."""
     missing = [name for name in (*_ENTRY, *SHARES, "epoch", *more) if name not in cells]
     if missing:
         raise ValueError(f"cells lack the columns {missing}")

@@ -1,6 +1,4 @@
-"""Recompute published values from other published values, and compare.
-
-This is `traps results audit`.
+"""Recompute published values from other published values (`traps results audit`).
 
 Every statement gets a verdict: `agrees` (equal at the printed digits), `within rounding` (the printed result is
 possible if each printed input may be rounded in its last digit), `declared` (different, and the paper says why) or
@@ -32,10 +30,7 @@ _AGREEING = (AGREES, ROUNDING)
 
 @dataclass(frozen=True)
 class AuditFinding:
-    """A published statement and its recomputed value, with its line in the source.
-
-    The value comes from the published tables; the source is the paper's.
-    """
+    """A published statement, its recomputed value, and its line in the paper's source."""
 
     group: str
     statement: str
@@ -47,10 +42,7 @@ class AuditFinding:
 
 
 def audit() -> pd.DataFrame:
-    """Return every finding, one row each.
-
-    Columns: group, statement, published, recomputed, verdict, reason, line.
-    """
+    """Return one row per finding, with the fields of AuditFinding as columns."""
     groups: Sequence[Callable[[], Iterator[AuditFinding]]] = (
         claims,
         overall_means,
@@ -68,12 +60,7 @@ def audit() -> pd.DataFrame:
 
 
 def audit_text(findings: pd.DataFrame, everything: bool = False) -> str:
-    """Return the findings as text.
-
-    Every claim, every difference, and counts of the rest.
-
-    everything: list the rest, too.
-    """
+    """Return claims, differences and counts as text; everything: list the rest, too."""
     lines = ["lines are those of the paper's LaTeX source"]
     for group, rows in findings.groupby("group", sort=False):
         counts = ", ".join(f"{n} {verdict}" for verdict, n in rows["verdict"].value_counts().items())
@@ -89,10 +76,7 @@ def audit_text(findings: pd.DataFrame, everything: bool = False) -> str:
 
 
 def counts_text(findings: pd.DataFrame) -> str:
-    """Return a sentence with the counts of statements by verdict.
-
-    They agree, differ as declared, or differ.
-    """
+    """Return a sentence with the counts of statements by verdict."""
     count = {verdict: np.count_nonzero(findings["verdict"] == verdict) for verdict in (*_AGREEING, DECLARED, DIFFERS)}
     agreeing = sum(count[verdict] for verdict in _AGREEING)
     return (
@@ -105,10 +89,7 @@ def counts_text(findings: pd.DataFrame) -> str:
 
 
 def claims() -> Iterator[AuditFinding]:
-    """Yield every statement of `claims.csv`.
-
-    Raises KeyError for a statement whose arithmetic is not in `claims`.
-    """
+    """Yield all statements of `claims.csv`. Raises KeyError without their arithmetic."""
     for claim in published("claims").to_dict("records"):
         printed, recomputed = str(claim["published"]), CLAIMS[str(claim["id"])]()
         is_same = _is_same_wording(printed, recomputed.words) if recomputed.agrees is None else recomputed.agrees
@@ -132,10 +113,7 @@ def _is_same_wording(printed: str, recomputed: str) -> bool:
 
 
 def _names(words: str) -> set[str]:
-    """Return the whole names in a text.
-
-    So a model's id is not found at the beginning of a longer id.
-    """
+    """Return whole names in a text, so that no id matches the start of a longer one."""
     return set(re.findall(r"[a-z][\w.-]*\w", _NUMBER.sub(" ", words))) - {"to", "and", "of"}
 
 
@@ -172,10 +150,7 @@ def _line(table: str) -> str:
 
 
 def overall_means() -> Iterator[AuditFinding]:
-    """Yield the overall leaderboard against means of the per-dataset table.
-
-    They have equal weights and are compared cell by cell.
-    """
+    """Yield the overall leaderboard against means of the per-dataset table, by cell."""
     cells = published_cells()
     ours = overall(cells).set_index(["model", "regime"]).to_dict("index")
     of_entry = dict(iter(cells.groupby(["model", "regime"])))
@@ -200,9 +175,7 @@ _REPLICATION = models_of(group="replication")
 
 
 def pecs_factors() -> Iterator[AuditFinding]:
-    """Yield PECS of every cell against its printed factors.
-
-    It must lie within averaging and rounding errors.
+    """Yield each cell's PECS against its factors, within averaging and rounding.
 
     PECS is computed per run and then averaged, so it differs from Acc x max(0, J) of the averages. With the printed
     deviations the mean of max(0, J) lies between max(0, J) and (J + sqrt(J^2 + s_J^2)) / 2, s_J is at most the sum of
@@ -238,10 +211,7 @@ def _pecs_range(cell: Mapping[Hashable, Any], shares: Mapping[str, float]) -> tu
 
 
 def gaps() -> Iterator[AuditFinding]:
-    """Yield the printed gaps against the printed rates.
-
-    Each rate may have been rounded in its last digit.
-    """
+    """Yield printed gaps against printed rates, each rate within its rounding."""
     for row in published("visual_vs_textual").to_dict("records"):
         for taxonomy in ("occlusion", "chaotic"):
             visual, textual = float(row[f"{taxonomy}_visual_pct"]), float(row[f"{taxonomy}_textual_pct"])
@@ -263,10 +233,7 @@ def gaps() -> Iterator[AuditFinding]:
 
 
 def probe_means() -> Iterator[AuditFinding]:
-    """Yield the printed four-path means against the means of the printed pairs.
-
-    Each may have been rounded in its last digit.
-    """
+    """Yield printed four-path means against means of the pairs, within rounding."""
     columns = {"auroc": "all items", "auroc_confabulated": "confabulated items"}
     for row in published_rows("probe_means"):
         pairs = published_rows("probe_transfer", model=row["model"], transfer_type=row["transfer_type"])
@@ -319,9 +286,7 @@ def steering_means() -> Iterator[AuditFinding]:
 
 
 def steering_families() -> Iterator[AuditFinding]:
-    """Yield the regime table's means over all paths against those of its families.
-
-    These are its two source families of four paths.
+    """Yield the regime table's means over all paths against its families' means.
 
     The table does not name the prompt of the families' directions; the guided ones are assumed.
     """
@@ -344,10 +309,7 @@ def steering_families() -> Iterator[AuditFinding]:
 
 
 def validation_scores() -> Iterator[AuditFinding]:
-    """Yield F1 of the confabulation judge against printed precision and recall.
-
-    Each may have been rounded in its last digit.
-    """
+    """Yield the judge's F1 against printed precision and recall, within rounding."""
     for row in published("judge_validation").to_dict("records"):
         precision, recall, printed = float(row["precision"]), float(row["recall"]), float(row["f1"])
         ours = _f1(precision, recall)
@@ -365,10 +327,7 @@ def _f1(precision: float, recall: float) -> float:
 
 
 def composition_sums() -> Iterator[AuditFinding]:
-    """Yield category counts against the totals that the paper states.
-
-    These are 202 occlusion and 500 chaotic pairs.
-    """
+    """Yield category counts against the paper's 202 occlusion and 500 chaotic pairs."""
     counts: dict[str, int] = {}
     for row in published_rows("composition"):
         counts[row["dataset"]] = counts.get(row["dataset"], 0) + row["n"]
@@ -383,10 +342,7 @@ def composition_sums() -> Iterator[AuditFinding]:
 
 
 def contradictions() -> Iterator[AuditFinding]:
-    """Yield statements that contradict another place of the paper's text.
-
-    No arithmetic decides which is right.
-    """
+    """Yield statements that contradict another place; no arithmetic decides between."""
     for row in published_rows("contradictions"):
         lines = f"{row['line']} and {row['other_line']}"
         yield AuditFinding("contradictions", row["id"], row["statement"], row["against"], DIFFERS, line=lines)

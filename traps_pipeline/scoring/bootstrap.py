@@ -1,6 +1,4 @@
-"""Compute confidence intervals of scores by a Bayesian bootstrap.
-
-It runs over scenarios, with one unseen scenario.
+"""Compute confidence intervals of scores by a Bayesian bootstrap over scenarios.
 
 See docs/scoring.md, "Intervals". A scenario is one draw of the world: its pairs in both datasets of its taxonomy, in
 every run, model and regime, stay together. All cells of a taxonomy share one weight matrix, so two entries' resamples
@@ -82,10 +80,7 @@ def resample(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEE
 
 
 def intervals(resampled: ResampledFigures, level: float = _LEVEL) -> pd.DataFrame:
-    """Return 95 % intervals: columns ENTRY and INTERVAL_COLUMNS, one row per entry.
-
-    Null where nothing is decided.
-    """
+    """Return 95 % intervals (ENTRY, INTERVAL_COLUMNS) by entry, null where undecided."""
     ends = [
         interval(resampled.figure(name), resampled.observed[:, k], limits_of(name), level)
         for k, name in enumerate(RESAMPLED)
@@ -96,22 +91,17 @@ def intervals(resampled: ResampledFigures, level: float = _LEVEL) -> pd.DataFram
 
 
 def limits_of(figure: str) -> tuple[float, float]:
-    """Return the minimum and maximum of a score.
-
-    [-1, 1] for J, [0, 1] for all others.
-    """
+    """Return the minimum and maximum of a score: [-1, 1] for J, [0, 1] for all others."""
     return (-1.0, 1.0) if figure == "j" else (0.0, 1.0)
 
 
 def interval(
     ends: np.ndarray, observed: np.ndarray | float, limits: tuple[float, float], level: float = _LEVEL
 ) -> np.ndarray:
-    """Return the interval of scores from their resampled ends.
+    """Return intervals from resampled ends, (.., 2, resamples) -> (.., 2).
 
-    (.., 2, resamples) -> (.., 2).
-
-    Every interval of a score comes from here. It contains `observed` (..) and lies within the limits; a NaN among
-    the resamples is left out, and the interval is NaN where all are.
+    Every interval of a score comes from here. It contains `observed` (..) and lies within the limits; a NaN among the
+    resamples is left out, and the interval is NaN where all are.
     """
     low = np.fmin(quantile(ends[..., 0, :], (1 - level) / 2), observed)
     high = np.fmax(quantile(ends[..., 1, :], (1 + level) / 2), observed)
@@ -120,37 +110,23 @@ def interval(
 
 
 def with_interval(name: str, ends: np.ndarray, limits: tuple[float, float]) -> dict[str, float]:
-    """Return a score and its interval as columns.
-
-    ends: (2, 1 + resamples), the observed score first.
-    """
+    """Return score and interval as columns; ends: (2, 1 + resamples), observed first."""
     low, high = interval(ends[:, 1:], ends[1, 0], limits)
     return {name: float(ends[1, 0]), f"{name}_ci_low": float(low), f"{name}_ci_high": float(high)}
 
 
 def difference(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return the ends of left - right, (.., 2, resamples) each.
-
-    An unseen scenario may be the worst for one side and the best for the other.
-    """
+    """Return ends of left - right, (.., 2, resamples): worst - best, best - worst."""
     return left - right[..., ::-1, :]
 
 
 def percentiles(draws: np.ndarray, level: float = _LEVEL) -> np.ndarray:
-    """Return the central interval over the last axis, ignoring NaN.
-
-    (.., resamples) -> (.., 2).
-
-    NaN where all values are NaN.
-    """
+    """Return central intervals over the last axis, (.., n) -> (.., 2), ignoring NaN."""
     return np.stack([quantile(draws, q) for q in ((1 - level) / 2, (1 + level) / 2)], axis=-1)
 
 
 def quantile(draws: np.ndarray, q: float) -> np.ndarray:
-    """Return a quantile over the last axis, ignoring NaN.
-
-    (.., resamples) -> (..). It is NaN where all values are NaN.
-    """
+    """Return a quantile over the last axis, (.., n) -> (..), ignoring NaN."""
     flat = draws.reshape(-1, draws.shape[-1])
     is_complete = ~np.isnan(flat).any(axis=1)
     values = np.full(len(flat), np.nan)
@@ -163,9 +139,7 @@ def quantile(draws: np.ndarray, q: float) -> np.ndarray:
 
 
 def scenario_weights(scenarios: int, resamples: int, seed: int | list[int]) -> np.ndarray:
-    """Return how often each scenario is drawn in each resample.
-
-    (resamples, scenarios) float32.
+    """Return counts of each scenario by resample, (resamples, scenarios) float32.
 
     Each row sums to the number of scenarios.
     """
@@ -188,9 +162,7 @@ class Resampling:
     seed: int
 
     def unseen(self, figures_of: str, decisions: int) -> np.ndarray:
-        """Return weights of an unseen scenario for each decision.
-
-        (decisions, 1 + resamples) float64.
+        """Return an unseen scenario's weights, (decisions, 1 + resamples) float64.
 
         They are the same for the same name, and independent for two names.
         """
@@ -210,9 +182,7 @@ def draw_scenarios(items: pd.DataFrame, resamples: int, seed: int) -> Resampling
 
 
 def resampled_sums(weights: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Return weighted sums of counts for every cell and resample.
-
-    (cells, kinds, resamples).
+    """Return weighted sums of counts, (cells, kinds, resamples).
 
     weights is (resamples, scenarios), counts is (scenarios, cells, kinds), such as the six of COUNTS. Sums of integer
     counts stay below 2^16, so float32 products are exact; weighted counts are summed in float64.
@@ -250,11 +220,9 @@ def shares_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:
 
 
 def ends_of_mean(values: pd.Series, resampling: Resampling, named: str) -> np.ndarray:
-    """Return the ends of the mean of values in [0, 1].
+    """Return ends (2, 1 + resamples) of the mean of scenarios' values in [0, 1].
 
-    There is one value per scenario of the index. Shape (2, 1 + resamples).
-
-    named: as in `run_sums`.
+    values: one per scenario of the index. named: as in `run_sums`.
     """
     sums = np.zeros((1, 2, 1 + resampling.resamples))
     for scenarios, weights in resampling.scenarios.values():
@@ -265,19 +233,17 @@ def ends_of_mean(values: pd.Series, resampling: Resampling, named: str) -> np.nd
 
 
 def figures_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:
-    """Return RESAMPLED scores from sums of COUNTS.
+    """Return scores from sums, (.., 9, resamples) -> (2, .., RESAMPLED, resamples).
 
-    (.., 9, resamples) -> (2, .., RESAMPLED, resamples).
-
-    in_mean: as in `shares_of`.
+    The sums are those of COUNTS with an unseen scenario. in_mean: as in `shares_of`.
     """
     return figures_of_shares(shares_of(sums, in_mean))
 
 
 def figures_of_shares(shares: np.ndarray) -> np.ndarray:
-    """Return RESAMPLED figures from the ends of Acc, FalseAbs and AbsRec.
+    """Return scores, (2, .., 3, resamples) -> (2, .., RESAMPLED, resamples).
 
-    (2, .., 3, resamples) -> (2, .., RESAMPLED, resamples).
+    The three are the ends of Acc, FalseAbs and AbsRec.
     """
     acc, false_abs, abs_rec = np.moveaxis(shares, -2, 0)
     j = abs_rec - false_abs[::-1]
@@ -294,9 +260,7 @@ def ends_of_pecs(acc: np.ndarray, j: np.ndarray) -> np.ndarray:
 
 
 def run_sums(group: pd.DataFrame, resampling: Resampling, named: str) -> dict[tuple[str, int], np.ndarray]:
-    """Return (dataset, run) -> sums of COUNTS with an unseen scenario.
-
-    Each is (9, 1 + resamples).
+    """Return sums of COUNTS and an unseen scenario (9, 1 + resamples) by dataset, run.
 
     group: the items of one model and regime. A dataset (an arm) may have items of both taxonomies. named: identifies
     the items' unseen scenarios.

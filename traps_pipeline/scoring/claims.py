@@ -1,7 +1,4 @@
-"""Compute every statement in `claims.csv` from the published tables.
-
-`audit` compares the results.
-"""
+"""Compute every statement in `claims.csv` from published tables, for `audit`."""
 
 from __future__ import annotations
 

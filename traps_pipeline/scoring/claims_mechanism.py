@@ -1,7 +1,4 @@
-"""Compute the statements in `claims.csv` about probes and steering.
-
-They come from the published tables.
-"""
+"""Compute `claims.csv`'s statements on probes and steering from published tables."""
 
 from __future__ import annotations
 
@@ -21,9 +18,7 @@ DOSE_AGAINST_REGIME = (
 
 @dataclass(frozen=True)
 class Recomputed:
-    """A recomputed statement in the published wording.
-
-    It has the reason why it may differ.
+    """A recomputed statement in the published wording, and why it may differ.
 
     agrees: the verdict on a statement in words; None if the audit compares the numbers and names of both texts.
     """

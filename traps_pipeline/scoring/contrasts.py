@@ -1,11 +1,9 @@
 """Compare models and regimes in pairs, with Holm's correction.
 
-See docs/scoring.md, "Intervals".
-
-Two entries of the leaderboard share their resamples (`bootstrap`), so the difference of their draws is a paired
-difference, in which the difficulty of the scenarios cancels. McNemar's test compares two regimes item by item. Answers
-to different items, or to one item in different epochs, are not compared (`epochs`): the row gives the reason and no
-difference.
+See docs/scoring.md, "Intervals". Two entries of the leaderboard share their resamples (`bootstrap`), so the difference
+of their draws is a paired difference, in which the difficulty of the scenarios cancels. McNemar's test compares two
+regimes item by item. Answers to different items, or to one item in different epochs, are not compared (`epochs`): the
+row gives the reason and no difference.
 """
 
 from __future__ import annotations
@@ -45,9 +43,7 @@ _Side = tuple[str, str]  # model, regime
 
 
 def contrasts(resampled: ResampledFigures, metrics: pd.DataFrame, verdicts: pd.DataFrame) -> pd.DataFrame:
-    """Return CONTRASTS rows from the bootstrap.
-
-    The METRICS and VERDICTS rows behind it are needed, too.
+    """Return CONTRASTS rows, from the bootstrap and the rows behind it.
 
     METRICS rows give the figures, VERDICTS rows the items and epochs. The rows compare every pair of models under each
     regime and every pair of regimes of each model, in PECS and in J, on each dataset, and overall if both sides have a
@@ -75,9 +71,7 @@ def contrasts(resampled: ResampledFigures, metrics: pd.DataFrame, verdicts: pd.D
 
 
 def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RESAMPLES) -> pd.DataFrame:
-    """Return the change between two studies on their common pairs.
-
-    They may be two versions of the benchmark.
+    """Return the change between two studies (or versions) on their common pairs.
 
     The change is now minus then; both are VERDICTS rows. A pair that is incomplete in either study, in the same run and
     cell, is left out. Columns: model, regime, dataset (and `overall`), figure, n_pairs per run, n_scenarios, then, now,
@@ -127,10 +121,7 @@ def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RE
 
 
 def _whole_pairs_of_both(then: pd.DataFrame, now: pd.DataFrame) -> list[pd.DataFrame]:
-    """Return each study's rows of the pairs that both studies have completely.
-
-    Pairs are counted by model, regime and run.
-    """
+    """Return each study's rows of pairs (by model, regime, run) complete in both."""
     key = [*CELL, "pair_id"]
     common = then[[*key, "item_id"]].merge(now[[*key, "item_id"]], on=[*key, "item_id"])
     pairs = common.groupby(key).size()
@@ -146,7 +137,7 @@ def _standings(verdicts: pd.DataFrame) -> pd.DataFrame:
 
 
 def regime_tests(verdicts: pd.DataFrame) -> pd.DataFrame:
-    """Return REGIME_TESTS rows: McNemar's exact test for every pair of regimes.
+    """Return REGIME_TESTS rows: McNemar's exact test of every pair of regimes.
 
     Each model, dataset, run and decision is tested.
     """
@@ -178,9 +169,7 @@ def regime_tests(verdicts: pd.DataFrame) -> pd.DataFrame:
 def _decisions(
     verdicts: pd.DataFrame, column: str
 ) -> dict[tuple[str, str, int], dict[str, dict[str, tuple[bool, Origin]]]]:
-    """Return a column's decisions with their origins.
-
-    By (dataset, model, run), regime and item.
+    """Return decisions with origins by (dataset, model, run), regime and item.
 
     Undecided items are left out.
     """
@@ -195,20 +184,14 @@ def _decisions(
 
 
 def mcnemar_p(only_left: int, only_right: int) -> float:
-    """Return McNemar's exact two-sided p.
-
-    It comes from the numbers of items that differ in either direction.
-    """
+    """Return McNemar's exact two-sided p from the items that differ in each direction."""
     differing = only_left + only_right
     tail = sum(comb(differing, k) for k in range(min(only_left, only_right) + 1))
     return min(1.0, 2 * tail / 2**differing)
 
 
 def holm(p: np.ndarray) -> np.ndarray:
-    """Return Holm's step-down correction of (n,) p-values.
-
-    A NaN is not counted and stays NaN.
-    """
+    """Return Holm's step-down correction of p-values (n,); NaN stays, uncounted."""
     corrected = np.full(len(p), np.nan)
     valid = np.flatnonzero(~np.isnan(p))
     order = valid[np.argsort(p[valid], kind="stable")]
@@ -230,9 +213,7 @@ def _pairs(entries: Sequence[tuple[str, str, str]]) -> Iterator[tuple[str, str, 
 
 
 def least_p(scenarios: int) -> float:
-    """Return the smallest two-sided p of paired differences of n scenarios.
-
-    It is 2^(1 - n).
+    """Return the smallest two-sided p of n scenarios' paired differences, 2^(1 - n).
 
     It is that of a sign-flip test whose differences all have one sign. Pairs of one scenario go together, so they count
     once.
@@ -241,10 +222,7 @@ def least_p(scenarios: int) -> float:
 
 
 def _scenarios(verdicts: pd.DataFrame) -> dict[tuple[str, str, str], int]:
-    """Return the number of scenarios of every (model, regime, dataset).
-
-    `overall` has those of all its datasets.
-    """
+    """Return scenario counts by (model, regime, dataset); `overall` spans datasets."""
     rows = verdicts[[*ENTRY, "scenario_id"]]
     counts = pd.concat([rows, rows.assign(dataset="overall")]).groupby(ENTRY)["scenario_id"].nunique()
     return cast(dict[tuple[str, str, str], int], counts.to_dict())
@@ -253,9 +231,7 @@ def _scenarios(verdicts: pd.DataFrame) -> dict[tuple[str, str, str], int]:
 def _difference(
     figure: str, sides: Sequence[np.ndarray], observed: Sequence[float], scenarios: int
 ) -> dict[str, float]:
-    """Return the columns of a paired difference over a number of scenarios.
-
-    They are its interval and two-sided p.
+    """Return a paired difference over scenarios with its interval and two-sided p.
 
     sides: the resampled ends of the left and the right, (2, resamples) each. If every resample is NaN, there is no p.
     """

@@ -1,6 +1,4 @@
-"""Test the paper's untested assumptions.
-
-They say how abstention changes as one property of the pairs changes by steps.
+"""Test how abstention changes as one property of the pairs changes by steps.
 
 See docs/hypotheses.md. Each hypothesis has doses; the first is the reference for the others, on the scenarios that both
 have. Beside every figure of a model stands the score of shortcut rules, which read one cue and understand nothing, and
@@ -43,7 +41,7 @@ _KEPT = ["model", "regime", "dataset", "run", "item_id", "scenario_id", "side", 
 
 @dataclass(frozen=True)
 class Dose:
-    """One step.
+    """A step of a hypothesis.
 
     datasets: where it is asked. side: None for both. counts_as: the sides that its items count as.
     """
@@ -56,10 +54,7 @@ class Dose:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A hypothesis.
-
-    figure: J, or the share of abstentions on any side. doses: the first one is the reference.
-    """
+    """A hypothesis on J or the share of abstentions; its first dose is the reference."""
 
     name: str
     figure: Literal["j", "abstains"]
@@ -207,9 +202,7 @@ def _row(
 
 
 def _figures(items: pd.DataFrame, resampling: Resampling, named: str) -> np.ndarray:
-    """Return the ends of RESAMPLED scores and of the share of abstentions.
-
-    (2, RESAMPLED + 1, draws).
+    """Return ends of RESAMPLED and of abstentions, (2, RESAMPLED + 1, draws).
 
     They are computed over all items of a run, then averaged over runs.
     """
@@ -231,10 +224,7 @@ def _ends(name: str) -> list[str]:
 
 
 def _refusal(dose: pd.DataFrame, reference: pd.DataFrame) -> str | None:
-    """Return why a dose cannot be compared with its reference, or None.
-
-    They have other campaigns (docs/spec.md 9.2), panels or runs.
-    """
+    """Return why a dose and its reference are not comparable: epoch, panel or runs."""
     for word, column in (("epoch", "epoch"), ("panel", "panel")):
         dose_epochs, reference_epochs = (joined_epochs(some[column]) for some in (dose, reference))
         if dose_epochs != reference_epochs or "+" in dose_epochs:
@@ -244,12 +234,10 @@ def _refusal(dose: pd.DataFrame, reference: pd.DataFrame) -> str | None:
 
 
 def _beside_rules(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows with the shortcut rules beside them.
+    """Return rows beside the shortcut rules' highest value and largest change.
 
-    They are the rules' highest value and largest change for the same hypothesis and dose.
-
-    Each comes with the name of its rule. A rule does not read the regime, so rows of another regime serve if there are
-    none.
+    Each comes with its rule's name, for the same hypothesis and dose. A rule does not read the regime, so rows of
+    another regime serve if there are none.
     """
     of_rules = rows.loc[rows["model"].isin(RULES)].to_dict("records")
     remarks = []

@@ -1,7 +1,4 @@
-"""Decide which scores may be compared.
-
-The rule of epochs (docs/spec.md 9.2) and the panel decide.
-"""
+"""Decide which scores may be compared, by epochs (docs/spec.md 9.2) and panel."""
 
 from __future__ import annotations
 
@@ -17,10 +14,7 @@ if TYPE_CHECKING:
 
 
 class Origin(NamedTuple):
-    """The campaigns of a decision's answers and the panels of its votes.
-
-    Each is joined by +.
-    """
+    """Campaigns of a decision's answers and panels of its votes, each joined by +."""
 
     epoch: str
     panel: str
@@ -53,11 +47,9 @@ def require_one_epoch(epochs: pd.DataFrame, what: str) -> None:
 
 
 def answered_items(verdicts: pd.DataFrame) -> dict[tuple[str, str, str], Answered]:
-    """Return the items that each (model, regime, dataset) answered over its runs.
+    """Return the items, with origins, answered by each (model, regime, dataset).
 
-    Their origin stands beside them.
-
-    `overall` covers the runs with all four datasets, and is left out if there is none.
+    Runs are pooled. `overall` covers the runs with all four datasets, and is left out if there is none.
     """
     is_complete = verdicts.groupby(["model", "regime", "run"])["dataset"].transform("nunique") == len(DATASETS)
     columns = ["model", "regime", "dataset", "item_id", "epoch", "panel"]
@@ -94,9 +86,6 @@ def refusal(left: Answered, right: Answered) -> str | None:
 
 
 def _named(items: list[str]) -> str:
-    """Return the first of these items with its dataset, in words.
-
-    The number of the others follows.
-    """
+    """Return the first item with its dataset, and the number of others, in words."""
     dataset, more = items[0].partition(":")[0], len(items) - 1
     return f"{dataset}: {items[0]}" + (f" and {more} more items are" if more else " is")

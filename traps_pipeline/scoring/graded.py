@@ -1,9 +1,8 @@
 """Score answers to graded cuts against the true distribution over answers.
 
-See docs/scoring.md, "Graded cuts".
-
-A right answer earns 1 point, a wrong one costs WRONG_COSTS, an abstention earns nothing. The expected points of an
-answer follow from the posterior of its cut, so no figure here depends on which of the futures was filmed.
+See docs/scoring.md, "Graded cuts". A right answer earns 1 point, a wrong one costs WRONG_COSTS, an abstention earns
+nothing. The expected points of an answer follow from the posterior of its cut, so no figure here depends on which of
+the futures was filmed.
 """
 
 from __future__ import annotations
@@ -37,10 +36,7 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class GradedItem:
-    """A graded item. posterior: the probability of each possible answer.
-
-    commonest: the sub-scenario's commonest answer.
-    """
+    """A graded item: its answers, their probabilities, the sub-scenario's commonest."""
 
     labels: Sequence[str]
     aliases: Mapping[str, str]
@@ -49,10 +45,7 @@ class GradedItem:
     posterior: Mapping[str, float]
 
     def label_of(self, value: str | None) -> str | None:
-        """Return the answer that a value names, by the rules of correctness.
-
-        None if it names none.
-        """
+        """Return the answer that a value names by the rules of correctness, or None."""
         of = self.answer_type, self.labels, self.aliases
         return next((label for label in self.labels if is_correct(value, label, *of)), None)
 
@@ -81,9 +74,7 @@ class GradedItem:
         return {label: stated[label] / sum(stated.values()) for label in self.labels}
 
     def read_first_token(self, alternatives: object) -> dict[str, float] | None:
-        """Return each answer's probability from the log-probabilities of the first token.
-
-        None without them.
+        """Return each answer's probability by first-token log-probabilities, if any.
 
         A token counts for the answer that it names, or for the only answer with a name that starts with it; the
         remaining probability is shared evenly.
@@ -112,10 +103,7 @@ def graded(
     resamples: int = RESAMPLES,
     seed: int = SEED,
 ) -> pd.DataFrame:
-    """Return GRADED_CUTS rows of graded items, given by id.
-
-    They come from VERDICTS, VOTES and RESPONSES rows.
-    """
+    """Return GRADED_CUTS rows from verdicts, votes, responses and items by id."""
     labels, by_answer = _labels(votes, questions), responses.set_index(_ANSWER)
     texts, first_tokens = by_answer["text"].to_dict(), by_answer["first_token"].to_dict()
     rows = []
@@ -148,11 +136,9 @@ def _name(scope: int) -> str:
 
 
 def _labels(votes: pd.DataFrame, questions: Mapping[str, GradedItem]) -> dict[tuple[Any, ...], str]:
-    """Return the answer of each response by more than half of its judges.
+    """Return each response's answer by a majority of its judges, if there is one.
 
     It is "" for an answer that the item does not offer.
-
-    There is no entry without such a majority.
     """
     cast_votes = votes.loc[votes["task"].eq("correctness"), [*_ANSWER, "valid", "extracted_value"]]
     chosen = dict[tuple[Any, ...], str]()
@@ -187,11 +173,9 @@ def _of_probabilities(item: GradedItem, stated: Mapping[str, float] | None) -> d
 
 
 def decided(item: GradedItem, label: str | None) -> dict[str, float]:
-    """Return the scores of one answer, or of an abstention (None).
+    """Return an answer's expected points, and its regret split by reason.
 
-    They are its expected points and its regret.
-
-    The regret is the loss against an ideal observer, with its reasons.
+    The regret is the loss against an ideal observer. label: None for an abstention.
     """
     posterior, even = item.posterior, dict.fromkeys(item.labels, 1 / len(item.labels))
     best, own = max(posterior.values()), 0.0 if label is None else posterior.get(label, 0.0)
@@ -235,10 +219,7 @@ def _commonest(posterior: Mapping[str, float]) -> str:
 
 
 def _row(items: pd.DataFrame, named: str, resampling: Resampling) -> dict[str, Any]:
-    """Return the scores of a model's and regime's items.
-
-    A scenario counts once, with the mean over its runs.
-    """
+    """Return scores of a model's and regime's items, each scenario counting once."""
     with_decision = items.loc[items["points"].notna()]
     scenario_means = with_decision.groupby("scenario_id")[_FIGURES].mean()
     row: dict[str, Any] = {

@@ -1,7 +1,4 @@
-"""Compute PECS without one judge (docs/spec.md 4.1 and 5.1).
-
-It shows the influence of each judge of the panel.
-"""
+"""Compute PECS without one judge (docs/spec.md 4.1, 5.1), to show its influence."""
 
 from __future__ import annotations
 
@@ -24,11 +21,9 @@ def leave_one_out(
 ) -> pd.DataFrame:
     """Return LEAVE_ONE_OUT rows from VERDICTS and VOTES rows of the same cells.
 
-    board: their LEADERBOARD rows.
-
-    PECS by the two other judges is computed as PECS by the panel: per run, then averaged; overall over the four
-    datasets. The rows cover entries of the board, over the cells on which these judges (default: all) voted. A panel of
-    one judge has no rows.
+    board: their LEADERBOARD rows. PECS by the two other judges is computed as PECS by the panel: per run, then
+    averaged; overall over the four datasets. The rows cover entries of the board, over the cells on which these judges
+    (default: all) voted. A panel of one judge has no rows.
     """
     panel = board.rename(columns={"pecs": "pecs_panel", "n_missing": "n_missing_panel"})
     panel = panel.loc[:, [*ENTRY, "pecs_panel", "n_missing_panel"]]

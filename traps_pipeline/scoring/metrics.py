@@ -1,7 +1,4 @@
-"""Compute the metrics of every cell from the panel's verdicts.
-
-They are Acc, FalseAbs, AbsRec, J, PECS and Naive (docs/spec.md 5.1).
-"""
+"""Compute each cell's Acc, FalseAbs, AbsRec, J, PECS, Naive (docs/spec.md 5.1)."""
 
 from __future__ import annotations
 
@@ -37,11 +34,9 @@ SCOPED_BY: Mapping[str, tuple[str, ...]] = {
 
 
 def decision_counts(verdicts: pd.DataFrame) -> pd.DataFrame:
-    """Return COUNTS of every verdict, 0 or 1 each, on the verdicts' index.
+    """Return COUNTS of every verdict, 0 or 1 each, (items, 6) int64.
 
-    (items, 6) int64.
-
-    A null decision counts in no denominator: shares are over decided items.
+    The index is that of the verdicts. A null decision counts in no denominator: shares are over decided items.
     """
     import pandas as pd
 
@@ -66,8 +61,6 @@ def pecs_of(acc: np.ndarray, j: np.ndarray) -> np.ndarray:
 
 def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]] = SCOPED_BY) -> pd.DataFrame:
     """Return METRICS rows of one dataset, from its VERDICTS rows.
-
-    The rows may be of any models, regimes and runs.
 
     There is one row per cell and scope: `all`, `category:x`, `sub_scenario:x`, and `label:x/y` (y: the control's answer
     in the sub-scenario x; both sides of the pair); `scoped_by` (prefix to columns) may name fewer. Figures are
@@ -94,34 +87,22 @@ def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]
 
 
 def mean(values: pd.Series) -> float:
-    """Return the mean, or null if any value is null.
-
-    So no mean silently uses fewer values.
-    """
+    """Return the mean, or null if a value is null: no mean silently uses fewer values."""
     return float(np.mean(values.to_numpy(float)))
 
 
 def joined_epochs(epochs: Iterable[str]) -> str:
-    """Return the distinct campaigns or panels, sorted and joined by `+`.
-
-    An input may itself be such a list.
-    """
+    """Return distinct campaigns or panels, split at `+`, sorted and joined by `+`."""
     return "+".join(sorted({part for epoch in set(epochs) for part in epoch.split("+") if part}))
 
 
 def joined_versions(versions: Iterable[str]) -> str:
-    """Return the distinct versions of the benchmark, sorted and joined.
-
-    An input may itself be such a list.
-    """
+    """Return distinct benchmark versions, split at ` + `, sorted and joined."""
     return " + ".join(sorted({part for version in versions for part in version.split(" + ")}))
 
 
 def _scoped(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]]) -> pd.DataFrame:
-    """Return every verdict with its counts once per scope.
-
-    ((1 + len(scoped_by)) x items) rows.
-    """
+    """Return verdicts with counts, once per scope: (1 + len(scoped_by)) x items rows."""
     import pandas as pd
 
     counts = decision_counts(verdicts)
@@ -156,9 +137,7 @@ def _figures(sums: pd.DataFrame) -> dict[str, np.ndarray]:
 
 
 def _bounds(sums: pd.DataFrame) -> dict[str, np.ndarray]:
-    """Return BOUNDS of every cell: PECS if every missing decision were bad or good.
-
-    (cells,) each: at their worst, and at their best.
+    """Return PECS if every missing decision were bad, and if good, (cells,) each.
 
     Each decision is bounded separately, since an item may lack only one; PECS rises with Acc and AbsRec and falls with
     FalseAbs, so that these two are its exact extremes. If nothing is missing both equal PECS bit for bit.
@@ -175,12 +154,7 @@ def _bounds(sums: pd.DataFrame) -> dict[str, np.ndarray]:
 
 
 def wilson(yes: np.ndarray, of: np.ndarray, z: float = 1.959963984540054) -> tuple[np.ndarray, np.ndarray]:
-    """Return Wilson's score interval of each share yes / of, (n,) each.
-
-    95 % by default.
-
-    NaN where nothing was decided.
-    """
+    """Return Wilson's (95 %) interval of yes / of, (n,) each; NaN where of is 0."""
     of = np.where(of > 0, of, np.nan)
     share, square = yes / of, z**2 / of
     centre = (share + square / 2) / (1 + square)

@@ -1,6 +1,4 @@
-"""Predict a study's precision.
-
-It is the width of PECS's interval, and the smallest detectable difference.
+"""Predict the width of a study's PECS interval, and its detectable difference.
 
 Simulated studies of a model have independent answers, and each is resampled as in `bootstrap`, with its unseen
 scenarios. That holds at J = 0 as well, where PECS is clipped, and with few pairs. The overall figure is the mean over
@@ -28,12 +26,7 @@ STUDIES, RESAMPLES, SEED = 400, 400, 7  # 0.3 s; the width is off by less than 2
 
 @dataclass(frozen=True)
 class Shares:
-    """A model's assumed shares.
-
-    Controls answered correctly and abstained on, and voids abstained on.
-
-    The defaults lie in the middle of the paper's models.
-    """
+    """A model's assumed shares; the defaults lie in the middle of the paper's models."""
 
     acc: float = 0.6
     abs_rec: float = 0.5
@@ -61,11 +54,9 @@ class Precision:
 
 
 def precision(pairs: Mapping[str, int], shares: Shares | None = None, models: int = 2) -> Precision:
-    """Return the precision of the mean over datasets in a study of several models.
+    """Return the precision of the mean over datasets, in a study of several models.
 
-    pairs: the number of each dataset.
-
-    Datasets without a pair are left out. Raises ValueError if no dataset has a pair.
+    pairs: the number of each dataset; datasets without a pair are left out. Raises ValueError if no dataset has a pair.
     """
     counts = [pairs.get(name, 0) for name in DATASETS if pairs.get(name, 0)]
     if not counts:
@@ -79,10 +70,7 @@ def precision(pairs: Mapping[str, int], shares: Shares | None = None, models: in
 
 
 def _studies(counts: Sequence[int], shares: Shares, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Simulate studies of a model: return the PECS of each and its ends.
-
-    (STUDIES,) and (STUDIES, 2, RESAMPLES).
-    """
+    """Simulate studies: PECS (STUDIES,), and its ends (STUDIES, 2, RESAMPLES)."""
     rng, s = np.random.default_rng(seed), shares
     control, void = [s.acc, s.false_abs, max(0.0, 1 - s.acc - s.false_abs)], [s.abs_rec, 1 - s.abs_rec]
     observed, ends = np.zeros(STUDIES), np.zeros((STUDIES, 2, RESAMPLES))
@@ -96,10 +84,7 @@ def _studies(counts: Sequence[int], shares: Shares, seed: int) -> tuple[np.ndarr
 
 
 def _better(shares: Shares, by: float) -> Shares:
-    """Return a model whose PECS is higher by `by`.
-
-    It abstains on more voids, then answers more controls correctly.
-    """
+    """Return shares of a PECS higher by `by`: abstain on more voids, then raise Acc."""
     goal = shares.pecs + by
     abs_rec = min(1.0, shares.false_abs + goal / shares.acc) if shares.acc else 1.0
     j = abs_rec - shares.false_abs
@@ -111,9 +96,7 @@ def _better(shares: Shares, by: float) -> Shares:
 def _detectable(
     counts: Sequence[int], shares: Shares, studies: tuple[np.ndarray, np.ndarray], scenarios: int, comparisons: int
 ) -> float | None:
-    """Return the smallest difference that 80 % of studies detect.
-
-    It is that of a better model.
+    """Return the smallest gain in PECS that 80 % of studies detect, or None.
 
     Tests are at 5 % divided by the number of comparisons; a difference is detected if its lower end is above 0.
     """
@@ -131,9 +114,8 @@ def _detectable(
 def _pecs(answers: np.ndarray, unseen: np.ndarray, in_mean: bool) -> np.ndarray:
     """Return the ends of PECS, (studies, 2, draws).
 
-    answers: weighted numbers of pairs (studies, 6, draws).
-
-    The six kinds of pairs: control right, abstained or wrong, each with a void that was abstained on or not.
+    answers: weighted numbers of pairs (studies, 6, draws). The six kinds of pairs: control right, abstained or wrong,
+    each with a void that was abstained on or not.
     """
     all_pairs = answers.sum(axis=1)
     yes = answers[:, :2].sum(axis=1), answers[:, 2:4].sum(axis=1), answers[:, ::2].sum(axis=1)

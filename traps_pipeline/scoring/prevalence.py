@@ -1,7 +1,4 @@
-"""Count how often each axis of confabulation applies to void failures.
-
-Each model has its own count (docs/spec.md 6.2).
-"""
+"""Count each axis of confabulation in a model's void failures (docs/spec.md 6.2)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Read the paper's published results in the units of the study's own tables.
-
-They are shipped in `assets/published`.
-"""
+"""Read the paper's results (`assets/published`) in the units of a study's tables."""
 
 from __future__ import annotations
 
@@ -31,34 +28,24 @@ def published(name: str) -> pd.DataFrame:
 def as_printed(name: str) -> pd.DataFrame:
     """Return one published file as texts, with the digits that the paper prints.
 
-    An empty cell is an empty text.
-
-    Raises TrapsError that lists the files for another name.
+    An empty cell is an empty text. Raises TrapsError that lists the files for another name.
     """
     return _read(name, texts=True).copy()
 
 
 def published_rows(name: str, /, **where: object) -> list[dict[str, Any]]:
-    """Return rows of one published file as numbers and texts.
-
-    where: the required values of some columns.
-    """
+    """Return a published file's rows with these values, as numbers and texts."""
     return [dict(row) for row in _records(name) if all(row[column] == value for column, value in where.items())]
 
 
 def published_digest() -> str:
-    """Return the digest of `assets/published`.
-
-    It is the source of the paper's tables and figures.
-    """
+    """Return the digest of `assets/published`, behind the paper's tables and figures."""
     files = {file.name: file.read_text(encoding="utf-8") for file in sorted(PUBLISHED.glob("*.csv"))}
     return digest(files)[:16]
 
 
 def published_cells() -> pd.DataFrame:
-    """Return the per-dataset table as cells for `analyses`.
-
-    One row per (model, dataset, regime), shares as fractions.
+    """Return the per-dataset table as cells for `analyses`, shares as fractions.
 
     Columns model, dataset, regime, epoch, n_pairs, acc, abs_rec, false_abs, pecs, and their `_std` over runs (null for
     the single greedy run of qwen3-vl-8b). A cell has one epoch: `corrected`; on chaotic_ill_posed it is `original`, or
@@ -73,7 +60,7 @@ def published_cells() -> pd.DataFrame:
 
 
 def published_overall() -> pd.DataFrame:
-    """Return the overall leaderboard as printed, shares as fractions.
+    """Return the printed overall leaderboard, shares as fractions.
 
     Columns: model, regime, acc, abs_rec, false_abs, pecs.
     """

@@ -1,9 +1,8 @@
 """Compute PECS of abstention that follows from clip and question together.
 
-See docs/scoring.md, "Beyond PECS".
-
-The conjunction requires every decision about a scenario to be right. The robust figure is PECS over kinds: sets of
-items that are all answerable, or all void, for one reason. Arms whose outcome must be inferred enter neither.
+See docs/scoring.md, "Beyond PECS". The conjunction requires every decision about a scenario to be right. The robust
+figure is PECS over kinds: sets of items that are all answerable, or all void, for one reason. Arms whose outcome must
+be inferred enter neither.
 """
 
 from __future__ import annotations
@@ -74,9 +73,7 @@ def robust(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED)
 
 
 def _runs_and_arms(group: pd.DataFrame) -> tuple[list[int], tuple[str, ...]]:
-    """Return the runs of a model and regime that its entry uses, and their arms.
-
-    The largest set of arms is taken.
+    """Return the largest set of arms of a model and regime, and the runs that have it.
 
     Among sets of the same size it is the one that most runs have, then the first in the order of ARMS.
     """
@@ -130,9 +127,7 @@ def _row(items: pd.DataFrame, named: str, arms: Sequence[str], resampling: Resam
 
 
 def robust_ends(cells: Mapping[str, np.ndarray], scenarios: Mapping[str, int]) -> np.ndarray:
-    """Return the ends of the robust score of one run, (2, draws).
-
-    NaN if it has no robust arm.
+    """Return a run's ends of the robust score, (2, draws); NaN without robust arms.
 
     cells: the ends of RESAMPLED, (2, RESAMPLED, draws), of the four datasets and the robust arms. scenarios: the number
     of scenarios in each of them.
@@ -152,11 +147,10 @@ def robust_ends(cells: Mapping[str, np.ndarray], scenarios: Mapping[str, int]) -
 
 
 def conjunction_of(items: pd.DataFrame) -> pd.Series:
-    """Return whether every decision about a scenario is right (1 or 0).
+    """Return whether all decisions about a scenario are right, 1 or 0, by scenario.
 
-    Scenarios were asked all of CONJUNCTION.
-
-    items: VERDICTS rows of one run with COUNTS. NaN if a decision is missing and none is wrong.
+    Scenarios were asked all of CONJUNCTION. items: VERDICTS rows of one run with COUNTS. NaN if a decision is missing
+    and none is wrong.
     """
     control, dataset = items["side"].eq("control"), items["dataset"]
     right = items["correct"].where(control, items["abs_rec"]).astype(float)
@@ -171,12 +165,7 @@ def conjunction_of(items: pd.DataFrame) -> pd.Series:
 
 
 def _conjunction(items: pd.DataFrame, resampling: Resampling, named: str) -> tuple[np.ndarray, int]:
-    """Return the ends of the share of scenarios that `conjunction_of` finds right.
-
-    The number of decided scenarios follows.
-
-    The ends are (2, draws).
-    """
+    """Return ends (2, draws) of the conjunction's share, and its number of scenarios."""
     decided = conjunction_of(items).dropna()
     return ends_of_mean(decided, resampling, named), len(decided)
 
@@ -189,10 +178,7 @@ def _missing(items: pd.DataFrame) -> int:
 
 
 def _refusal(items: pd.DataFrame) -> str | None:
-    """Return why no score may join pairs and arms, or None.
-
-    They have other campaigns (docs/spec.md 9.2), or other panels.
-    """
+    """Return why no score may join pairs and arms (epochs or panels differ), or None."""
     of_arms = items["dataset"].isin(ARMS)
     if "+" in (panels := joined_epochs(items["panel"])):
         return f"judged by {panels.replace('+', ' and ')}; figures of different panels are never put in one figure"
@@ -203,10 +189,7 @@ def _refusal(items: pd.DataFrame) -> str | None:
 
 
 def wrong_rows(table: pd.DataFrame) -> int:
-    """Return how many ROBUST rows break their definition.
-
-    A score is outside [0, 1] or its interval (null is right).
-    """
+    """Return how many ROBUST rows have a score outside [0, 1] or its interval."""
     shares = table[[*WITH_INTERVAL, "inference_acc", "inference_abstains"]].to_numpy(float)
     wrong = ((shares < 0) | (shares > 1)).any(axis=1)
     for name in WITH_INTERVAL:

@@ -72,10 +72,7 @@ METRICS = Table("metrics", MetricsRow, partition_by=("dataset",), key=("dataset"
 
 @dataclass(frozen=True, kw_only=True)
 class ContrastRow:
-    """A paired comparison of two leaderboard entries on one score.
-
-    The entries are two models, or two regimes of one model.
-    """
+    """A paired comparison of two models, or two regimes of one model, on one score."""
 
     kind: Annotated[str, "models (of one regime) or regimes (of one model)"]
     dataset: DatasetOrOverall
@@ -111,10 +108,7 @@ CONTRASTS = Table(
 
 @dataclass(frozen=True, kw_only=True)
 class RegimeTestRow:
-    """A McNemar test of two regimes on the same items.
-
-    It is of one decision of one model in one run of a dataset.
-    """
+    """A McNemar test of two regimes on one decision about the same items, in one run."""
 
     dataset: shared.Dataset
     model: shared.Model
@@ -141,10 +135,7 @@ REGIME_TESTS = Table(
 @dataclass(frozen=True, kw_only=True)
 @with_neighbours
 class LeaderboardRow:
-    """A model under a regime on one dataset, or overall.
-
-    Overall is the equal-weight mean over the four.
-    """
+    """A model under a regime on one dataset, or overall (equal-weight mean of four)."""
 
     model: shared.Model
     regime: shared.Regime
@@ -198,10 +189,7 @@ LEADERBOARD = Table("leaderboard", LeaderboardRow, partition_by=(), key=("model"
 @dataclass(frozen=True, kw_only=True)
 @with_neighbours
 class RobustRow:
-    """A model under a regime when clip and question must be read together.
-
-    It was asked the four datasets with these arms.
-    """
+    """A model under a regime, on four datasets and arms (clip and question together)."""
 
     model: shared.Model
     regime: shared.Regime
@@ -237,10 +225,7 @@ ROBUST = Table("robust", RobustRow, partition_by=(), key=("model", "regime"))
 @dataclass(frozen=True, kw_only=True)
 @with_neighbours
 class HypothesisRow:
-    """A model under a regime at one dose of a hypothesis (docs/hypotheses.md).
-
-    It is no part of PECS or of ROBUST.
-    """
+    """A model under a regime at one dose (docs/hypotheses.md), apart from PECS."""
 
     model: shared.Model
     regime: shared.Regime
@@ -319,10 +304,7 @@ GRADED_CUTS = Table("graded", GradedRow, partition_by=(), key=("model", "regime"
 
 @dataclass(frozen=True, kw_only=True)
 class LeaveOneOutRow:
-    """A model under a regime, scored by the other two judges.
-
-    On one dataset, or overall; 1-1 is undecided.
-    """
+    """A model under a regime on a dataset or overall, scored without one judge."""
 
     model: shared.Model
     regime: shared.Regime
@@ -353,10 +335,7 @@ LEAVE_ONE_OUT = Table("leave_one_out", LeaveOneOutRow, partition_by=(), key=("mo
 @dataclass(frozen=True, kw_only=True)
 @with_neighbours
 class PrevalenceRow:
-    """How often each axis applies to one model's sampled void failures.
-
-    A missing row means not run.
-    """
+    """How often each axis applies to a model's void failures (no row: not run)."""
 
     model: shared.Model
     evidence: Annotated[str, "what the judge saw: trace_and_output or output; both joined by + if traces were missing"]

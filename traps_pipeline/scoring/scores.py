@@ -1,7 +1,4 @@
-"""Compute all scores of a leaderboard from verdicts.
-
-The stages of the scoring group do so one after another.
-"""
+"""Compute a leaderboard's scores from verdicts, as the scoring stages do in turn."""
 
 from __future__ import annotations
 
@@ -24,10 +21,7 @@ class Scores:
 
 
 def score(verdicts: pd.DataFrame) -> Scores:
-    """Return the METRICS and LEADERBOARD rows of VERDICTS rows of the pairs.
-
-    The rows may be of any models, regimes and runs.
-    """
+    """Return METRICS and LEADERBOARD rows from the pairs' VERDICTS rows."""
     cells = pd.concat([cell_metrics(rows) for _, rows in verdicts.groupby("dataset", sort=True)], ignore_index=True)
     resampled = resample(verdicts)
     paired = contrasts(resampled, cells, verdicts)

@@ -1,7 +1,4 @@
-"""Average over runs, per dataset and overall (docs/spec.md 5.2).
-
-Deviations and intervals stand beside the means.
-"""
+"""Average over runs, per dataset and overall, with deviations (docs/spec.md 5.2)."""
 
 from __future__ import annotations
 
@@ -32,24 +29,19 @@ _SUMMED = ["n_missing", "n_items", *COUNTED]
 
 
 def leaderboard(metrics: pd.DataFrame, intervals: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:
-    """Return LEADERBOARD rows.
-
-    They are `standings` with their `bootstrap.intervals` and ranks from CONTRASTS rows.
-    """
+    """Return LEADERBOARD rows: `standings` with intervals, and ranks from CONTRASTS."""
     board = standings(metrics).merge(intervals, on=ENTRY, how="left", validate="one_to_one")
     return board.join(_ranks(board, contrasts)).loc[:, LEADERBOARD.names]
 
 
 def standings(metrics: pd.DataFrame) -> pd.DataFrame:
-    """Return every score of the leaderboard except intervals and ranks.
+    """Return the leaderboard's scores, without intervals and ranks.
 
-    metrics: METRICS rows of scope `all`.
-
-    Rows of other scopes are ignored. Mean and population standard deviation (ddof 0) over runs. `overall` takes the
-    equal-weight mean over the four datasets within each run first; a run that lacks a dataset is left out of it, and a
-    model and regime without a complete run has no overall row. A figure that is null in one run is null here, so that
-    every mean is over `n_runs` runs. Items without a text count in no figure; if there are too many of them, the entry
-    is `incomplete`.
+    metrics: METRICS rows of the scopes `all` and, for `pecs_by_family`, `sub_scenario:`; others are ignored. Mean and
+    population standard deviation (ddof 0) over runs. `overall` takes the equal-weight mean over the four datasets
+    within each run first; a run that lacks a dataset is left out of it, and a model and regime without a complete run
+    has no overall row. A figure that is null in one run is null here, so that every mean is over `n_runs` runs. Items
+    without a text count in no figure; if there are too many of them, the entry is `incomplete`.
     """
     groups = _runs(metrics).groupby(ENTRY, sort=True)
     means, deviations = (groups[CELL_FIGURES].agg(f) for f in (mean, _deviation))
@@ -70,27 +62,19 @@ def standings(metrics: pd.DataFrame) -> pd.DataFrame:
 
 
 def means_over_runs(metrics: pd.DataFrame) -> pd.DataFrame:
-    """Return CELL_FIGURES of every entry as on the leaderboard, indexed by ENTRY.
-
-    They come from METRICS rows.
-    """
+    """Return CELL_FIGURES by ENTRY from METRICS rows, as on the leaderboard."""
     return pd.DataFrame(_runs(metrics).groupby(ENTRY, sort=True)[CELL_FIGURES].agg(mean))
 
 
 def _runs(metrics: pd.DataFrame) -> pd.DataFrame:
-    """Return one row per (model, regime, dataset or `overall`, run).
-
-    The columns are those of METRICS and n_items.
-    """
+    """Return METRICS rows with n_items, by model, regime, dataset (or overall), run."""
     cells = metrics.loc[metrics["scope"] == "all"]
     cells = cells.assign(n_items=2 * cells["n_pairs"]).merge(_by_family(metrics), on=CELL, how="left")
     return pd.concat([cells, _overall_runs(cells)], ignore_index=True)
 
 
 def _by_family(metrics: pd.DataFrame) -> pd.DataFrame:
-    """Return CELL and `pecs_by_family`.
-
-    It is PECS of Acc, AbsRec and FalseAbs with families weighted equally.
+    """Return CELL and `pecs_by_family`: PECS of means that weigh families equally.
 
     The paper calls a family a sub-scenario.
     """
@@ -101,10 +85,7 @@ def _by_family(metrics: pd.DataFrame) -> pd.DataFrame:
 
 
 def _overall_runs(cells: pd.DataFrame) -> pd.DataFrame:
-    """Return one row per (model, regime, run) that has all four datasets.
-
-    The columns are those of METRICS.
-    """
+    """Return METRICS of each (model, regime, run) that has all four datasets."""
     groups = cells.groupby(_RUN, sort=True)
     complete_runs = cells.loc[groups["dataset"].transform("nunique") == len(DATASETS)].groupby(_RUN, sort=True)
     counts = cast(pd.DataFrame, complete_runs[["n_pairs", *_SUMMED]].sum())
@@ -117,10 +98,7 @@ def _overall_runs(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def _anywhere(wrong: pd.Series) -> pd.Series:
-    """Return flags of entries, on the index ENTRY.
-
-    Those of `overall` are set if any dataset's is.
-    """
+    """Return flags by ENTRY; those of `overall` are set if any dataset's is."""
     anywhere = cast(pd.Series, wrong.groupby(level=["model", "regime"]).transform("any")).astype(bool)
     return wrong | (anywhere & (wrong.index.get_level_values("dataset") == "overall"))
 
@@ -130,9 +108,7 @@ def _deviation(values: pd.Series) -> float:
 
 
 def _ranks(board: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:
-    """Return every row's rank, rank_low and rank_high on `board`'s index.
-
-    They count among the rows of its panel.
+    """Return rank, rank_low and rank_high within the panel, on `board`'s index.
 
     Null without PECS, and if the row is of several panels.
     """
@@ -155,12 +131,7 @@ def _ranks(board: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:
 
 
 def wrong_intervals(board: pd.DataFrame) -> int:
-    """Return how many intervals of LEADERBOARD rows are impossible.
-
-    They are out of order or outside [0, 1] (J: [-1, 1]).
-
-    Null is not wrong.
-    """
+    """Return how many intervals are out of order or outside their score's limits."""
     wrong = 0
     for figure in RESAMPLED:
         low, high = (board[f"{figure}_ci_{end}"].to_numpy(float) for end in ("low", "high"))

@@ -1,7 +1,6 @@
-"""The DAG: one file per group of stages; importing this package declares all that the study uses, without Dagster.
+"""Declare the stages on import, one file per group, without Dagster.
 
-A stage reads tables, calls a library function and returns the rows of its table. It imports that function where it
-calls it: `traps status` imports the declarations alone.
+A stage reads tables, calls a library function and returns the rows of its table.
 """
 
 from traps_pipeline.pipeline.schemes import LEFT_OUT

@@ -33,19 +33,13 @@ category_to_arms = to_keys(CATEGORY, DATASET, lambda category: beside_of(taxonom
 
 @_source()
 def released_specs(workspace: Workspace, category: str) -> str:
-    """Return the version of the frozen scenarios under scene_specs/released.
-
-    One resolved record each.
-    """
+    """Return the version of the frozen scenarios under scene_specs/released."""
     return released_version(workspace, category)
 
 
 @_source()
 def corrections(workspace: Workspace, category: str) -> str:
-    """Return the version of the review decisions under scene_specs/corrections.
-
-    They are folded over the released records.
-    """
+    """Return the version of the review decisions under scene_specs/corrections."""
     return corrections_version(workspace, category)
 
 
@@ -199,10 +193,8 @@ def _lost_arms(workspace: Workspace, category: str) -> list[str]:
     lost=_lost_arms,
 )
 def arms(workspace: Workspace, category: str) -> StageOutput:
-    """Return the arms and variations that the study asks of a category: clips and questions beside the pairs."""
-    from traps_pipeline.benchmark.filmed_arms import build_arms
-
-    rows = build_arms(workspace, category)
+    """Return a category's clips and questions beside the pairs: arms and variations."""
+    rows = filmed_arms.build_arms(workspace, category)
     admitted = sum(row.refused is None for row in rows)
     return StageOutput(rows, shown={"admitted": admitted, "refused": len(rows) - admitted})
 
@@ -238,8 +230,6 @@ def _odd_pairs(workspace: Workspace, key: str | None, output: StageOutput) -> di
     ],
 )
 def items(workspace: Workspace, dataset: str) -> StageOutput:
-    """Return the items that models are asked, two per pair: the control, and the void that differs by one change."""
-    from traps_pipeline.benchmark.items import build_items
-
+    """Return the items that models are asked: per pair, a control and a changed void."""
     rows = build_items(workspace, dataset)
     return StageOutput(rows, shown={"benchmark version": rows[0].benchmark_version})

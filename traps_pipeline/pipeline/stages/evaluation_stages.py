@@ -1,7 +1,4 @@
-"""Declare the evaluation group: answers, votes of judges, verdicts of the panel.
-
-A cell is dataset x evaluation.
-"""
+"""Declare evaluation: answers, votes and verdicts by cell (dataset x evaluation)."""
 
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -31,10 +28,7 @@ _stage, _source = partial(stage, group="evaluation", scheme=CELL), partial(sourc
 
 @_source(kinds=["yaml"], scheme=EVALUATION)
 def models(workspace: Workspace, key: str) -> str:
-    """Return the version of a model's entry in assets/models.yaml.
-
-    It covers the settings that the model's answers depend on.
-    """
+    """Return the version of a model's settings in assets/models.yaml."""
     return answering_version(Evaluation.parse(key))
 
 
@@ -47,10 +41,7 @@ def prompts(workspace: Workspace, key: str) -> str:
 
 @_source(kinds=["yaml"])
 def judges(workspace: Workspace, _: None) -> str:
-    """Return the version of the study's panel.
-
-    It covers assets/judges.yaml and the judges' prompts.
-    """
+    """Return the version of the panel: assets/judges.yaml and judges' prompts."""
     return panel_version(workspace.study.panel)
 
 
@@ -64,10 +55,7 @@ def _with_items(
 
 
 def _items_shown(workspace: Workspace, cell: Cell, rows: Sequence[ResponseRow | VoteRow]) -> dict[str, Any]:
-    """Return metadata about a cell's items.
-
-    A table of those without an answer, and the explorer's view of all.
-    """
+    """Return metadata: items without an answer, and the explorer's view of all."""
     from traps_pipeline.report.cards import explorer_address
     from traps_pipeline.report.writing import SourceItems
 
@@ -125,9 +113,7 @@ def _many_invalid(workspace: Workspace, key: str | None, output: StageOutput) ->
     side_by_side=True,
 )
 def votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
-    """Return votes of the study's panel on the answers of a cell, one row per answer, judge and task."""
-    from traps_pipeline.judging.panel import collect_votes
-
+    """Return the panel's votes on a cell's answers, a row per answer, judge and task."""
     return _with_items(workspace, collect_votes(workspace, [Cell.parse(key) for key in keys]))
 
 

@@ -1,7 +1,4 @@
-"""Declare the mechanism group's controls.
-
-They are baselines of probes, the gate, nulls of steering, and patching.
-"""
+"""Declare the mechanism group's controls: baselines, gate, nulls, patching."""
 
 from functools import partial
 from typing import TYPE_CHECKING
@@ -43,19 +40,13 @@ _GATED = these_keys(CELL, [Cell(d, Evaluation(m, r, 1)).key for d in _ASKED for 
 
 @_source()
 def patching_settings(workspace: Workspace, key: str) -> str:
-    """Return the version of the settings of patching.
-
-    They are checkpoint, precision, prompt, pairs and sites.
-    """
+    """Return the version of patching's checkpoint, precision, prompt, pairs, sites."""
     return patching_version(workspace, Extraction.parse(key))
 
 
 @_source()
 def sentence_settings(workspace: Workspace, key: str) -> str:
-    """Return the version of the settings of sentences.
-
-    They are checkpoint, precision, prompt and the study's sentences.
-    """
+    """Return the version of sentences' checkpoint, precision, prompt and texts."""
     return sentence_version(workspace, Extraction.parse(key))
 
 
@@ -83,20 +74,14 @@ def _examined(workspace: Workspace, key: str) -> "tuple[ModelEntry, StoredStates
     wants=lambda study, key: Extraction.parse(key).prompt in study.probed_prompts,
 )
 def probe_baselines(workspace: Workspace, key: str) -> StageOutput:
-    """Return the probing protocol on other inputs than states.
-
-    They are raw inputs, the model's output margin and noise.
-    """
+    """Return probes on raw inputs, the output margin and noise instead of states."""
     from traps_pipeline.mechanism.baselines import baseline_rows
 
     return StageOutput(baseline_rows(workspace, *_examined(workspace, key)))
 
 
 def _is_gated(partitions: StudyPartitions, key: str) -> bool:
-    """Return whether the model of an extraction is also evaluated.
-
-    Otherwise a gate has no answers to change.
-    """
+    """Return whether the model is also evaluated, so that a gate has answers."""
     extraction = Extraction.parse(key)
     evaluations = {(e.model, e.regime) for e in partitions.evaluations}
     return extraction.prompt == PROBE_PROMPT and any((extraction.model, r) in evaluations for r in PROMPTING)
@@ -112,9 +97,7 @@ _gates = partial(
 
 @_gates(tables.GATE)
 def gate(workspace: Workspace, key: str) -> StageOutput:
-    """Return the model's scores before and after a gate.
-
-    The gate turns answers into abstentions.
+    """Return scores before and after a gate, which turns answers into abstentions.
 
     The gate is a probe on the model's states, compared with gates on raw inputs, on the output margin and with shuffled
     labels.
@@ -126,10 +109,7 @@ def gate(workspace: Workspace, key: str) -> StageOutput:
 
 @_gates(tables.RISK_COVERAGE)
 def risk_coverage(workspace: Workspace, key: str) -> StageOutput:
-    """Return risk against coverage as a gate withholds more answers.
-
-    It is computed over the four datasets.
-    """
+    """Return risk against coverage over four datasets, as a gate withholds answers."""
     from traps_pipeline.mechanism.gating import curve_rows
 
     return StageOutput(curve_rows(workspace, *_examined(workspace, key)))
@@ -137,10 +117,7 @@ def risk_coverage(workspace: Workspace, key: str) -> StageOutput:
 
 @_stage(tables.LENS, parents=[_STATES, probing_settings])
 def lens(workspace: Workspace, key: str) -> StageOutput:
-    """Return the output margin of stored states at every layer.
-
-    They pass through the model's final norm and head.
-    """
+    """Return the output margin of stored states at every layer (final norm and head)."""
     from traps_pipeline.mechanism.lens import lens_rows
 
     return StageOutput(lens_rows(workspace, *_examined(workspace, key)))
@@ -152,10 +129,7 @@ def lens(workspace: Workspace, key: str) -> StageOutput:
     wants=_is_gated,
 )
 def item_scores(workspace: Workspace, key: str) -> StageOutput:
-    """Return each item's scores from states and from output, with verdicts.
-
-    The probes were trained without its scenario.
-    """
+    """Return items' scores from states and output, with verdicts; probes are held-out."""
     from traps_pipeline.mechanism.item_scores import item_score_rows
 
     return StageOutput(item_score_rows(workspace, *_examined(workspace, key)))
@@ -173,10 +147,7 @@ def _has_sentences(partitions: StudyPartitions, key: str) -> bool:
     wants=_has_sentences,
 )
 def sentences(workspace: Workspace, key: str) -> StageOutput:
-    """Return a model's likelihood of whole abstentions after every item.
-
-    Its own answers stand beside them.
-    """
+    """Return log-likelihoods of whole abstentions, and own answers, after every item."""
     from traps_pipeline.mechanism.sentences import sentence_rows
 
     return StageOutput(sentence_rows(workspace, *_model(workspace, key)))
@@ -189,10 +160,7 @@ def sentences(workspace: Workspace, key: str) -> StageOutput:
     kinds=["parquet", "pytorch"],
 )
 def patching(workspace: Workspace, key: str) -> StageOutput:
-    """Return indirect effects of groups of positions by layer, beside nulls.
-
-    States are exchanged between matched controls and voids.
-    """
+    """Return indirect effects of exchanged states by layer and group, beside nulls."""
     from traps_pipeline.mechanism.patching_stage import patching_rows
 
     return StageOutput(patching_rows(workspace, *_model(workspace, key)))
@@ -203,10 +171,7 @@ _of_effects = partial(stage, group=GROUP, parents=[steering_effects], wants=stee
 
 @_of_effects(tables.STEERING_NULLS)
 def steering_nulls(workspace: Workspace, _: None) -> list[tables.SteeringNullRow]:
-    """Return the effect of every void direction on its own dataset.
-
-    It is ranked among nulls that are orthogonal to it.
-    """
+    """Return each void direction's effect on its dataset among orthogonal nulls."""
     from traps_pipeline.mechanism.nulls import null_rows
 
     return null_rows(workspace.tables.read(STEERING_EFFECTS, {}))
@@ -214,10 +179,7 @@ def steering_nulls(workspace: Workspace, _: None) -> list[tables.SteeringNullRow
 
 @_of_effects(tables.STEERING_PECS)
 def steering_pecs(workspace: Workspace, _: None) -> list[tables.SteeringPecsRow]:
-    """Return PECS of the steered model under each sign policy.
-
-    The share of degenerate answers stands beside it.
-    """
+    """Return the steered model's PECS by sign policy, and share of degenerate answers."""
     from traps_pipeline.mechanism.nulls import pecs_rows
 
     return pecs_rows(workspace.tables.read(STEERING_EFFECTS, {}))

@@ -1,7 +1,4 @@
-"""Declare the judging group.
-
-Agreement of the panel, bias of its judges, and confabulation in void failures.
-"""
+"""Declare judging: panel agreement, judge bias, confabulation in void failures."""
 
 from functools import partial
 from typing import TYPE_CHECKING
@@ -39,10 +36,7 @@ def confabulation_protocol(workspace: Workspace, _: None) -> str:
 
 @_source(kinds=["parquet"])
 def judge_validation(workspace: Workspace, _: None) -> str:
-    """Return the version of the comparison of the judge with two annotators.
-
-    `traps people validate` writes it.
-    """
+    """Return the version of `traps people validate`: the judge against two annotators."""
     state = workspace.tables.state(JUDGE_VALIDATION, {})
     return state.version if state else "not run"
 
@@ -52,10 +46,7 @@ def _panel(workspace: Workspace) -> list[str]:
 
 
 def _votes(workspace: Workspace, name: str) -> "pd.DataFrame":
-    """Return the votes of the study's panel as it is now.
-
-    Raises TrapsError if there is none.
-    """
+    """Return votes of the study's current panel. Raises TrapsError without any."""
     cast = current_rows(workspace, VOTES, [*VOTE_COLUMNS, "panel"])
     cast = cast.loc[cast["panel"] == panel_id(workspace.study.panel)]
     if cast.empty:
@@ -68,10 +59,7 @@ _VOTED = (of(items, need="some"), of(votes, need="some"), judges)
 
 @_stage(AGREEMENT, parents=_VOTED, wants=has_pairs)
 def agreement(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return agreement of the panel and any two judges by dataset and task.
-
-    The measures are unanimity, Fleiss, Cohen and Krippendorff.
-    """
+    """Return agreement (unanimity, Fleiss, Cohen, Krippendorff) by dataset and task."""
     from traps_pipeline.judging.agreement import agreement as rows_of
 
     return rows_of(_votes(workspace, "agreement"), _panel(workspace))
@@ -123,21 +111,13 @@ _SAMPLED = these_keys(CELL, [c.key for m in load_protocol().models for c in load
     ],
 )
 def confabulation(workspace: Workspace, _: None) -> StageOutput:
-    """Return void failures of the sampled models, labelled on four axes by one judge.
-
-    The table is empty if the study's panel has no such judge.
-    """
-    from traps_pipeline.judging.confabulation import collect_labels
-
+    """Return void failures labelled on four axes by the panel's judge, if it has one."""
     return collect_labels(workspace)
 
 
 @_stage(CONFABULATION_PREVALENCE, parents=[confabulation])
 def confabulation_prevalence(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return how often each axis applies to a model's sampled void failures.
-
-    It is empty if nothing was labelled.
-    """
+    """Return how often each axis applies to a model's sampled void failures."""
     from traps_pipeline.scoring.prevalence import prevalence
 
     return prevalence(workspace.tables.read(CONFABULATION, {}))

@@ -1,7 +1,4 @@
-"""Declare the mechanism group (docs/spec.md 7 and 8).
-
-Hidden states of local models, probes, void directions, steering.
-"""
+"""Declare mechanism: states, probes, directions, steering (docs/spec.md 7 and 8)."""
 
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -60,28 +57,19 @@ _OCCLUSION = to_keys(CATEGORY, PROBED, lambda key: [ANSWERABLE] if taxonomy_of_c
 
 @_source(scheme=EXTRACTION)
 def extraction_settings(workspace: Workspace, key: str) -> str:
-    """Return the version of the settings of hidden states.
-
-    They are checkpoint, precision and prompt.
-    """
+    """Return the version of checkpoint, precision and prompt of hidden states."""
     return versions.extraction_version(workspace, Extraction.parse(key))
 
 
 @_source(scheme=EXTRACTION)
 def probing_settings(workspace: Workspace, key: str) -> str:
-    """Return the version of the study's settings of probes and directions.
-
-    Each model has its own.
-    """
+    """Return the version of a model's settings of probes and directions."""
     return versions.probing_version(workspace, Extraction.parse(key))
 
 
 @_source(scheme=schemes.STEERED)
 def steering_settings(workspace: Workspace, key: str) -> str:
-    """Return the version of the settings of steering.
-
-    They are the study's settings, the model and its prompt.
-    """
+    """Return the version of the study's steering settings, the model and its prompt."""
     return versions.steering_version(workspace, key)
 
 
@@ -131,10 +119,7 @@ def _lost_states(workspace: Workspace, key: str) -> list[str]:
     checks=[Check("states_finite", "Every number of the first and last layer is finite.", _unsound_layers)],
 )
 def hidden_states(workspace: Workspace, key: str) -> StageOutput:
-    """Return a local model's hidden states at every layer, one row per item.
-
-    The model is frozen, and only missing states are extracted.
-    """
+    """Return a frozen local model's hidden states at every layer, one row per item."""
     from traps_pipeline.mechanism.stages import extract_states
 
     rows, new = extract_states(workspace, StatesCell.parse(key))
@@ -161,10 +146,7 @@ def _outside_shares(workspace: Workspace, key: str | None, output: StageOutput) 
     checks=[Check("shares_are_shares", "Every figure and interval lies in [0, 1].", _outside_shares)],
 )
 def probes(workspace: Workspace, key: str) -> StageOutput:
-    """Return probes of every dataset on every other, by layer.
-
-    They measure transfer, Cf->Cf, within, label-shuffled and centroids.
-    """
+    """Return probes by layer: transfer, Cf->Cf, within, label-shuffled, centroids."""
     from traps_pipeline.mechanism.stages import probe_rows
 
     return StageOutput(probe_rows(workspace, Extraction.parse(key)))
@@ -183,10 +165,7 @@ def _lost_directions(workspace: Workspace, key: str) -> list[str]:
     lost=_lost_directions,
 )
 def directions(workspace: Workspace, key: str) -> StageOutput:
-    """Return each dataset's void direction at every layer, with draws of its nulls.
-
-    They are files.
-    """
+    """Return files of each dataset's void direction at every layer, and of its nulls."""
     from traps_pipeline.mechanism.stages import direction_rows
 
     return StageOutput(direction_rows(workspace, Extraction.parse(key)))
@@ -194,10 +173,7 @@ def directions(workspace: Workspace, key: str) -> StageOutput:
 
 @_stage(COSINES, code="2", parents=[of(directions, need="some"), of(hidden_states, need="some")], wants=steers)
 def cosines(workspace: Workspace, _: None) -> list[CosineRow]:
-    """Return cosines of any two void directions of a model at one layer.
-
-    Each has its reliability beside it.
-    """
+    """Return cosines, with reliability, of a model's void directions at one layer."""
     from traps_pipeline.mechanism.cosines import cosine_rows
 
     return cosine_rows(workspace)
@@ -237,10 +213,7 @@ def steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | 
     side_by_side=True,
 )
 def steering_votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
-    """Yield the panel's votes on each steered answer.
-
-    They say whether it abstains, and whether a control's is correct.
-    """
+    """Yield the panel's votes on steered answers: abstention, and correct controls."""
     from traps_pipeline.mechanism.steering import collect_steering_votes
 
     for finished, output in collect_steering_votes(workspace, [SteeringCell.parse(key) for key in keys]):

@@ -1,7 +1,4 @@
-"""Declare the group of people's labels.
-
-The labels, their agreement, people's scores, and scores corrected by them.
-"""
+"""Declare people's labels, agreement, scores, and scores corrected by them."""
 
 from functools import partial
 from typing import TYPE_CHECKING
@@ -28,10 +25,7 @@ _stage, _source = partial(stage, group="people"), partial(source, group="people"
 
 @_source(kinds=["json"])
 def people(workspace: Workspace, _: None) -> str:
-    """Return the version of people's labels, in order of submission.
-
-    People gave them on the pages of `traps people annotate`.
-    """
+    """Return the version of labels submitted on the pages of `traps people annotate`."""
     return labels_version(workspace.labels)
 
 
@@ -49,9 +43,7 @@ _LABELLED = tuple(of(one, need="none") for one in (items, responses, verdicts, c
 
 @_stage(HUMAN_LABELS, parents=[*_LABELLED, people, annotation_protocol, judges])
 def human_labels(workspace: Workspace, _: None) -> StageOutput:
-    """Return people's labels of the study's clips and answers.
-
-    Each has its item and the panel's decision beside it.
+    """Return people's labels of clips and answers, with item and panel's decision.
 
     The table is empty until somebody has labelled.
     """
@@ -70,10 +62,7 @@ def human_agreement(workspace: Workspace, _: None) -> "pd.DataFrame":
 
 @_stage(HUMAN_ROW, code="2", parents=[human_labels])
 def human_row(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return people's Acc, AbsRec, FalseAbs and PECS with intervals.
-
-    Their agreement and seconds per clip stand beside.
-    """
+    """Return people's Acc, AbsRec, FalseAbs, PECS, agreement and seconds per clip."""
     from traps_pipeline.people.human_scores import human_row as rows_of
 
     return rows_of(workspace.tables.read(HUMAN_LABELS, {}))

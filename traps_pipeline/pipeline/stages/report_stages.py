@@ -1,7 +1,4 @@
-"""Declare the report group: the report page, and the explorer beside it.
-
-Both lie in the study's folder `reports`.
-"""
+"""Declare the report group: report page and explorer in the folder `reports`."""
 
 from __future__ import annotations
 
@@ -39,11 +36,10 @@ def _parents(*names: str) -> list[Parent]:
 
 @_stage("report_page", parents=_parents(*ANSWERS, "arms", *SCORES, *_REPORTED, "published"))
 def report_page(workspace: Workspace, _: None) -> StageOutput:
-    """Return findings, leaderboard, figures and tables on one page.
+    """Return findings, leaderboard, figures and tables beside the paper's on one page.
 
-    It shows the paper's beside them, and opens from disk.
-
-    Every number links into the explorer. A table or figure is rebuilt only when a table that it reads changes.
+    It opens from disk, and every number links into the explorer. A table or figure is rebuilt only when a table that it
+    reads changes.
     """
     from traps_pipeline.report.cards import Card, Sources
     from traps_pipeline.report.publish import MARKDOWN, PAPER, report_files, report_parts
@@ -71,10 +67,7 @@ def report_page(workspace: Workspace, _: None) -> StageOutput:
 
 @_stage("site", parents=_parents(*ANSWERS, "scene_specs", *SCORES, "contrasts", "regime_tests"))
 def site(workspace: Workspace, _: None) -> StageOutput:
-    """Return the explorer: all answers with their votes and clips.
-
-    Its pages open from disk.
-    """
+    """Return the explorer: all answers with votes and clips, opened from disk."""
     from traps_pipeline.report.explorer.site import site_files
 
     files = site_files(workspace)

@@ -41,10 +41,7 @@ def has_pairs(partitions: StudyPartitions, key: str | None) -> bool:
 
 
 def _none_of(find: str, what: str) -> Callable[[Workspace, str | None, StageOutput], str]:
-    """Return a check that counts a table's wrong rows.
-
-    find: module.function of `scoring` that finds them.
-    """
+    """Return a check that `find` (a module.function of `scoring`) counts no wrong row."""
 
     def wrong(workspace: Workspace, key: str | None, output: StageOutput) -> str:
         module, _, name = find.partition(".")
@@ -67,10 +64,7 @@ def _none_of(find: str, what: str) -> Callable[[Workspace, str | None, StageOutp
     ],
 )
 def metrics(workspace: Workspace, dataset: str) -> StageOutput:
-    """Return Acc, FalseAbs, AbsRec, J and PECS of every cell of a dataset.
-
-    Each scope has a row (docs/spec.md 5.1).
-    """
+    """Return Acc, FalseAbs, AbsRec, J and PECS of a dataset, by cell and scope."""
     from traps_pipeline.scoring.metrics import cell_metrics
 
     judged = current_rows(workspace, VERDICTS, dataset=dataset)
@@ -80,10 +74,7 @@ def metrics(workspace: Workspace, dataset: str) -> StageOutput:
 
 
 def _scored(workspace: Workspace, name: str) -> "tuple[pd.DataFrame, pd.DataFrame]":
-    """Return all METRICS rows of the pairs, and the VERDICTS rows behind them.
-
-    Without arms.
-    """
+    """Return METRICS rows of the pairs, without arms, and their VERDICTS rows."""
     cells = workspace.tables.read_all(METRICS, dataset=DATASETS)
     if cells.empty:
         raise TrapsError(f"{name}: no metrics yet; materialize metrics for a dataset first")
@@ -97,10 +88,7 @@ _SCORED = (of(metrics, need="some"), of(verdicts, need="some"), judges)
 
 @_stage(CONTRASTS, parents=_SCORED, wants=has_pairs)
 def contrasts(workspace: Workspace, _: None) -> StageOutput:
-    """Return paired differences between models and between regimes.
-
-    They have intervals and Holm's correction.
-    """
+    """Return paired differences of models and regimes, with intervals and Holm's p."""
     from traps_pipeline.scoring.bootstrap import resample
     from traps_pipeline.scoring.contrasts import contrasts as paired
 
@@ -114,10 +102,7 @@ def contrasts(workspace: Workspace, _: None) -> StageOutput:
 
 @_stage(REGIME_TESTS, parents=_SCORED, wants=has_pairs)
 def regime_tests(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return McNemar's exact test of any two regimes on the same items.
-
-    Each model, dataset, run and decision has a row.
-    """
+    """Return McNemar's exact test of two regimes, by dataset, model, run and decision."""
     from traps_pipeline.scoring.contrasts import regime_tests as mcnemar
 
     return mcnemar(_scored(workspace, "regime_tests")[1])
@@ -136,10 +121,7 @@ def regime_tests(workspace: Workspace, _: None) -> "pd.DataFrame":
     wants=has_pairs,
 )
 def leaderboard(workspace: Workspace, _: None) -> StageOutput:
-    """Return every model under every regime, per dataset and overall.
-
-    Means, spreads, 95 % intervals and ranks are given.
-    """
+    """Return means, spreads, 95 % intervals and ranks by model, regime and dataset."""
     from traps_pipeline.report.leaderboard_page import leaderboard_markdown
     from traps_pipeline.scoring.bootstrap import intervals, resample
     from traps_pipeline.scoring.standings import leaderboard as rank
@@ -162,11 +144,9 @@ def leaderboard(workspace: Workspace, _: None) -> StageOutput:
     wants=has_pairs,
 )
 def robust(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return conjunction, robust figure and inference of each model and regime.
+    """Return conjunction, robust PECS and inference by model and regime with an arm.
 
-    Only those with all four datasets and an arm have a row.
-
-    The table is empty if no arm was run.
+    Only those with all four datasets have a row; the table is empty if no arm was run.
     """
     from traps_pipeline.scoring.robust import robust as without_shortcuts
 
@@ -188,9 +168,7 @@ def robust(workspace: Workspace, _: None) -> "pd.DataFrame":
     ],
 )
 def hypotheses(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return abstention and accuracy as one property of pairs changes by steps.
-
-    Shortcut rules stand beside.
+    """Return abstention and accuracy by steps of one property, beside shortcut rules.
 
     The table is empty if no variation was run.
     """
@@ -219,9 +197,7 @@ def hypotheses(workspace: Workspace, _: None) -> "pd.DataFrame":
     ],
 )
 def graded(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return what each model and regime earns on graded cuts.
-
-    It is scored against the true distribution over answers.
+    """Return what models earn on graded cuts, by the true distribution over answers.
 
     The table is empty if no graded cut was run.
     """

@@ -1,4 +1,1 @@
-"""Build the explorer, pages to browse a study's answers.
-
-Its folder opens from disk.
-"""
+"""Build the explorer: pages to browse a study's answers, opened from disk."""

@@ -40,9 +40,9 @@ _VOTE_TEXTS = ("extracted_value", "confidence", "rationale")
 
 @dataclass(frozen=True)
 class Shard:
-    """The answers of some consecutive items.
+    """The texts and votes of consecutive items.
 
-    Rows [first, first + answers) of `decisions`, their texts and votes.
+    Its rows are [first, first + answers) of `decisions`.
     """
 
     first: int
@@ -86,10 +86,7 @@ class StudyAnswers:
 
 
 def study_items(workspace: Workspace) -> pd.DataFrame:
-    """Return ITEMS rows with `family`, datasets in the benchmark's order.
-
-    Raises TrapsError if there are none.
-    """
+    """Return ITEMS rows with `family`, by dataset. Raises TrapsError without items."""
     items, specs = workspace.tables.read_all(ITEMS), workspace.tables.read_all(SCENE_SPECS, ["scenario_id", "family"])
     if items.empty:
         raise TrapsError(f"{workspace.root}: has no items yet; run `traps run EXPERIMENT` in it first")
@@ -103,10 +100,7 @@ def study_items(workspace: Workspace) -> pd.DataFrame:
 
 
 def study_answers(workspace: Workspace) -> StudyAnswers:
-    """Return all answers to current items, with decisions and votes.
-
-    Raises TrapsError without items.
-    """
+    """Return answers to current items, with votes. Raises TrapsError without items."""
     items = study_items(workspace)
     responses = _of_items(workspace, RESPONSES, ("outcome", "epoch", *_TEXTS), items)
     evaluations = _evaluations(responses)
@@ -149,10 +143,7 @@ def study_answers(workspace: Workspace) -> StudyAnswers:
 
 
 def _of_items(workspace: Workspace, table: Table, columns: Sequence[str], items: pd.DataFrame) -> pa.Table:
-    """Return a table's rows whose item is in `items`.
-
-    The column `item` is the item's index.
-    """
+    """Return the rows whose item is in `items`; their column `item` is its index."""
     rows = workspace.tables.read_arrow(table, ["item_id", *_EVALUATION, *columns])
     place = pc.index_in(rows["item_id"], value_set=pa.array(items["item_id"].tolist(), pa.string()))
     rows = rows.drop_columns("item_id").append_column("item", place)
@@ -160,20 +151,14 @@ def _of_items(workspace: Workspace, table: Table, columns: Sequence[str], items:
 
 
 def _evaluations(responses: pa.Table) -> list[Evaluation]:
-    """Return the evaluations with answers.
-
-    By model, regime (in the benchmark's order) and run.
-    """
+    """Return evaluations with answers by model, regime (benchmark's order) and run."""
     distinct = responses.group_by([*_EVALUATION]).aggregate([]).to_pylist()
     evaluations = [Evaluation(row["model"], row["regime"], row["run"]) for row in distinct]
     return sorted(evaluations, key=lambda e: (e.model, REGIMES.index(e.regime), e.run))
 
 
 def _keyed(rows: pa.Table, evaluations: Sequence[Evaluation]) -> pa.Table:
-    """Return the rows with `key`, the index of item and evaluation.
-
-    Evaluations that have no answers are left out.
-    """
+    """Return rows of known evaluations with `key`, the index of item and evaluation."""
     own = pc.binary_join_element_wise(*(rows[name].cast(pa.string()) for name in _EVALUATION), "|")
     known = pa.array([f"{e.model}|{e.regime}|{e.run}" for e in evaluations], pa.string())
     evaluation = pc.fill_null(pc.index_in(own, value_set=known), -1).to_numpy().astype(np.int64)

@@ -1,7 +1,4 @@
-"""Describe a scenario from its SCENE_SPECS row.
-
-The words tell its answer, the void's intervention and its certificates.
-"""
+"""Describe a scenario's answer, intervention and certificates from SCENE_SPECS."""
 
 from __future__ import annotations
 
@@ -45,10 +42,7 @@ _PHRASES = {
 
 
 def certificate_phrases(evidence: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Yield name and description of each number in a scenario's evidence.
-
-    The evidence supports its certificates.
-    """
+    """Yield name and description of each number that supports the certificates."""
     for name, phrase in _PHRASES.items():
         if evidence.get(name) is not None:
             yield name, phrase.format(evidence[name])

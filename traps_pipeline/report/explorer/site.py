@@ -86,9 +86,7 @@ def site_files(workspace: Workspace) -> dict[str, bytes]:
 
 
 def write_site(workspace: Workspace, folder: Path, *, clips: bool = True) -> SiteSummary:
-    """Write a study's explorer and report to a folder, and return a summary.
-
-    The folder is self-contained.
+    """Write a study's explorer and report to a self-contained folder.
 
     Files of an earlier site in the folder are replaced, or removed if they are no longer needed; `index.html` is
     written last. clips: include clips, as hard links if the file system allows it, else as copies. Raises TrapsError if
@@ -120,10 +118,7 @@ def _files(
     workspace: Workspace, answers: StudyAnswers, scenarios: list[dict[str, Any]], clips: set[str], clips_at: str, *,
     report: bool,
 ) -> dict[str, bytes]:  # fmt: skip
-    """Return the files by path, the index last.
-
-    clips: the playable ones, below the folder clips_at.
-    """
+    """Return the files by path, the index last; clips are those below clips_at."""
     contents = _contents(workspace, answers, scenarios, clips)
     stamp = _digest(contents)
     files = {f"{DATA}/{name}.js": data_script(name, stamp, content) for name, content in contents.items()}
@@ -131,10 +126,7 @@ def _files(
 
 
 def _former_files(folder: Path) -> set[str]:
-    """Return the files of an earlier site in the folder.
-
-    Raises TrapsError if the folder holds something else.
-    """
+    """Return an earlier site's files. Raises TrapsError if the folder is no site."""
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return set()
     try:
@@ -153,10 +145,7 @@ def _is_inside(name: str) -> bool:
 
 
 def _put_clip(source: Path, target: Path) -> int:
-    """Link or copy a clip; return its bytes.
-
-    A clip's name identifies its content, so an existing one is right.
-    """
+    """Link or copy a clip unless it exists (names identify content); return its bytes."""
     size = source.stat().st_size
     if not (target.is_file() and target.stat().st_size == size):
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -174,10 +163,7 @@ def _put_clip(source: Path, target: Path) -> int:
 def _contents(
     workspace: Workspace, answers: StudyAnswers, scenarios: list[dict[str, Any]], clips: set[str]
 ) -> dict[str, dict[str, Any]]:
-    """Return every data file by name.
-
-    JSON values, and Parquet files under the name of their table.
-    """
+    """Return every data file by name: JSON values, or Parquet by its table's name."""
     import pyarrow as pa
 
     contents: dict[str, dict[str, Any]] = {}
@@ -262,18 +248,12 @@ BOARD_COMES_S = 0.6  # maximum time for which an occluder is visible on its way
 
 
 def _seconds(closes: int | None, clip: Mapping[str, Any] | None) -> float | None:
-    """Return the last moment before a control's occluder becomes visible.
-
-    Such an occluder closes the control; null without one.
-    """
+    """Return the last moment (s) before a control's closing occluder, None without."""
     return None if closes is None or clip is None else (closes - 0.5) / clip["fps"] - BOARD_COMES_S
 
 
 def _clip_names(items: pd.DataFrame, scenarios: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Return the clips shown on the pages.
-
-    Names that lead out of the folder are left out.
-    """
+    """Return the clips that pages show, without names that lead out of the folder."""
     named = {*items["clip"], *(row["twin_clip"] for row in scenarios)}
     return sorted(name for name in named if name and Path(name).parts[0] == CLIPS and _is_inside(name))
 
@@ -293,10 +273,7 @@ def _digest(contents: Mapping[str, Mapping[str, Any]]) -> str:
 
 @cache
 def script() -> str:
-    """Return the script: bundled libraries, then our sources.
-
-    Raises TrapsError for an unknown bundle.
-    """
+    """Return bundled libraries and our sources. Raises TrapsError if a bundle changed."""
     library = LIBRARY.read_bytes()
     expected_sha256 = LIBRARY.with_name("parquet.js.sha256").read_text(encoding="ascii").split()[0]
     if hashlib.sha256(library).hexdigest() != expected_sha256:
@@ -306,10 +283,7 @@ def script() -> str:
 
 
 def index_page(workspace: Workspace, stamp: str, clips_at: str = "", *, report: bool = False) -> str:
-    """Return the page that opens the explorer.
-
-    It may load scripts and clips of its own folder, and nothing else.
-    """
+    """Return the index, which may load only scripts and clips of its own folder."""
     style = (WEB / "style.css").read_text(encoding="utf-8")
     digest = b64encode(hashlib.sha256(style.encode()).digest()).decode("ascii")
     return environment(WEB).get_template("index.html.j2").render(

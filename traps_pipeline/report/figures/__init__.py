@@ -1,4 +1,1 @@
-"""Draw the figures of docs/spec.md 10, from any `Results`.
-
-Equal frames give equal bytes.
-"""
+"""Draw the figures of docs/spec.md 10; equal frames give equal bytes."""

@@ -1,7 +1,4 @@
-"""Draw figures of abstention.
-
-Visual against textual voids, standard against guided, doubt against conversion.
-"""
+"""Draw figures of abstention: by kind of void, by prompt, and against doubt."""
 
 from __future__ import annotations
 
@@ -58,10 +55,7 @@ def _draw_rates(axes: Axes, rates: pd.DataFrame) -> None:
 
 
 def _averaged(rates: pd.DataFrame) -> pd.Series | pd.DataFrame:
-    """Return whether a model's row pools its rates over taxonomies.
-
-    Its only taxonomy counts, too.
-    """
+    """Return which rows pool a model's taxonomies, or are of its only taxonomy."""
     models = rates.loc[rates["taxonomy"] == "pooled", "model"]
     return rates["taxonomy"].eq("pooled") | ~rates["model"].isin(models)
 
@@ -175,11 +169,10 @@ def _no_doubt(results: Results) -> str:
 
 
 def doubt_points(results: Results) -> tuple[pd.DataFrame, str]:
-    """Return thinking, other, dataset, doubt, gain (fractions) by pair and dataset.
+    """Return doubt and gain by reasoning pair and dataset, and reasons for refusals.
 
-    Reasons for refused pairs follow.
-
-    AbsRec is that of `results.rates` (standard), whose epoch must be that of the labels (docs/spec.md 9.2).
+    Columns: thinking, other, dataset, doubt, gain (fractions). AbsRec is that of `results.rates` (standard), whose
+    epoch must be that of the labels (docs/spec.md 9.2).
     """
     import pandas as pd
 

@@ -1,7 +1,4 @@
-"""Draw figures that test mechanistic claims.
-
-Baselines of probes, gates in the PECS plane, patching, doses among nulls.
-"""
+"""Draw tests of mechanistic claims: baselines, gates, patching, doses and nulls."""
 
 from __future__ import annotations
 
@@ -259,10 +256,7 @@ def doses_among_nulls(results: Results) -> Figure:
 
 
 def _p_values(nulls: pd.DataFrame, model: str, directions: str, regime: str, dataset: str) -> list[str]:
-    """Return the p of a direction among each of its nulls at the largest dose.
-
-    Each side has a line.
-    """
+    """Return a direction's p among each null at the largest dose, one line per side."""
     of = nulls.loc[(nulls["model"] == model) & (nulls["directions"] == directions) & (nulls["regime"] == regime)]
     of = of.loc[(of["target"] == dataset) & (of["unit"] == "gap")]
     lines: list[str] = []

@@ -1,7 +1,4 @@
-"""Draw figures of encoding and expression.
-
-States against output item by item, and the margin by layer.
-"""
+"""Draw encoding against expression: states and output by item, margin by layer."""
 
 from __future__ import annotations
 
@@ -63,9 +60,9 @@ def states_and_output(results: Results) -> Figure:
 
 
 def scored_items(results: Results) -> pd.DataFrame:
-    """Return the items with both scores, and `sentence`.
+    """Return items with both scores, and `sentence`.
 
-    It is by how much an abstention is likelier (nats per token, or NaN).
+    `sentence`: by how much an abstention is likelier than the model's own answer (nats per token, or NaN).
     """
     rows, read = results.item_scores, results.sentences
     read = read.loc[read["prompt"] == STANDARD, ["model", "item_id", "abstention", "own"]]
@@ -75,10 +72,7 @@ def scored_items(results: Results) -> pd.DataFrame:
 
 
 def orders(rows: pd.DataFrame) -> dict[str, float]:
-    """Return the AUROC of states, output margin and whole sentences on some items.
-
-    Sentences are left out if they are not available.
-    """
+    """Return the AUROC of states, margin and, if all are known, whole sentences."""
     void, areas = (rows["side"] == "void").to_numpy(), dict[str, float]()
     for name, column in (("states", "own"), ("margin", "margin"), ("sentences", "sentence")):
         values = rows[column].to_numpy(float)

@@ -1,7 +1,4 @@
-"""Draw the figure of graded cuts.
-
-Abstention and stated probability against the probability of the likeliest answer.
-"""
+"""Draw abstention and stated probability on graded cuts against the true one."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Draw grid figures.
-
-Heatmaps over sub-scenarios, bars over the axes of confabulation, points of cues.
-"""
+"""Draw heatmaps over sub-scenarios, bars of confabulation axes, points of cues."""
 
 from __future__ import annotations
 
@@ -70,10 +67,7 @@ def sub_scenarios(results: Results) -> Figure:
 
 @dataclass(frozen=True)
 class Panel:
-    """A heatmap of values (sub-scenarios, columns) in percent.
-
-    Its colour scale is for good or for bad.
-    """
+    """A heatmap of values (sub-scenarios, columns) in percent, on a good or bad scale."""
 
     title: str
     columns: list[str]
@@ -107,10 +101,7 @@ def _means(rows: pd.DataFrame) -> list[Panel]:
 
 
 def _draw_grid(ax: Axes, panel: Panel, names: list[str], first: int) -> AxesImage:
-    """Draw one panel.
-
-    A white line separates occlusion (the first rows) from chaotic; a dash means not run.
-    """
+    """Draw a panel: a white line ends occlusion's rows, a dash means not run."""
     columns, values = panel.columns, panel.values
     image = ax.imshow(values, cmap="Blues" if panel.scale == GOOD else "Oranges", vmin=0, vmax=100, aspect="auto")
     ax.set_facecolor("#f2f4f7")
@@ -168,9 +159,9 @@ def confabulation(results: Results) -> Figure:
 
 
 def shortcut_figure(table: pd.DataFrame) -> Figure:
-    """Return the accuracy of predicting the side by each cue.
+    """Return the accuracy of predicting the side by each cue, with a line at chance.
 
-    table: of `benchmark.shortcuts`. A line stands at chance.
+    table: of `benchmark.shortcuts`.
     """
     datasets = [name for name in TITLES if name in set(table["dataset"])] or list(DATASETS)
     cues = list(dict.fromkeys(table["cue"]))

@@ -26,10 +26,7 @@ class Label:
 
 
 def merged_labels(labels: Sequence[Label], axes: Axes) -> list[Label]:
-    """Return the labels, with those of coinciding points joined.
-
-    One name per line, in a neutral colour.
-    """
+    """Join labels of coinciding points: one name per line, in a neutral colour."""
     size = np.array([np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())])
     merged: list[Label] = []
     for label in labels:
@@ -42,9 +39,7 @@ def merged_labels(labels: Sequence[Label], axes: Axes) -> list[Label]:
 
 
 def place_labels(axes: Axes, labels: Sequence[Label], markers: np.ndarray) -> None:
-    """Put every label near its point without overlaps.
-
-    It avoids markers, labels and, if possible nearby, lines.
+    """Put every label near its point, clear of labels and markers and mostly of lines.
 
     A leader line connects a label to its point if they are apart, or if several names share a point. markers: (n, 2),
     data units.
@@ -82,10 +77,7 @@ def place_labels(axes: Axes, labels: Sequence[Label], markers: np.ndarray) -> No
 
 
 def _offsets() -> np.ndarray:
-    """Return candidate offsets (n, 2) in points of a label from its marker.
-
-    The nearest come first, and sides before diagonals.
-    """
+    """Return candidate offsets (n, 2) of a label in points: near first, sides first."""
     angles = np.deg2rad([0, 180, 90, 270, 30, 330, 150, 210, 60, 120, 240, 300])
     rings = np.array([5, 9, 14, 20, 28, 38, 50, 64, 80])
     return np.round(rings[:, None, None] * np.column_stack([np.cos(angles), np.sin(angles)]), 3).reshape(-1, 2)
@@ -97,10 +89,7 @@ def _side(offset: float, positive: str, negative: str) -> str:
 
 
 def _boxes(anchors: np.ndarray, offsets: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Return extents (n, 4) in pixels of a text of that size (2,) at each anchor.
-
-    It is aligned by `_side`.
-    """
+    """Return pixel extents (n, 4) of a text of that size (2,), aligned by `_side`."""
     low = anchors - size * (1 - np.sign(offsets)) / 2
     return np.hstack([low, low + size])
 
@@ -111,10 +100,7 @@ def _around(spots: np.ndarray, half: float) -> np.ndarray:
 
 
 def _along_lines(axes: Axes, step: float) -> np.ndarray:
-    """Return pixel positions (n, 2) along the lines that join a model's points.
-
-    They are `step` pixels apart.
-    """
+    """Return pixels (n, 2), `step` apart, along the lines that join a model's points."""
     points = [np.empty((0, 2))]
     for line in axes.lines:
         ends = axes.transData.transform(line.get_xydata())

@@ -40,8 +40,6 @@ def landscape(results: Results) -> Figure:
 def landscape_figure(points: pd.DataFrame, scope: str) -> Figure:
     """Return J (x) against Acc (y) of every model with iso-PECS contours.
 
-    The figure is one column wide.
-
     points has the columns model, regime, acc, j, pecs, incomplete. Hollow is standard, filled guided, a dot json; thin
     bars are 95 % intervals. The dashed line is the frontier under guided, a ring each family's best PECS under guided.
     PECS is averaged per run and dataset, so it can differ from the contours. Coinciding points share one label.
@@ -62,10 +60,7 @@ def landscape_figure(points: pd.DataFrame, scope: str) -> Figure:
 
 
 def reasoning(results: Results) -> Figure:
-    """Return arrows from the model that thinks less to the one that thinks more.
-
-    There is one under standard and one under guided.
-    """
+    """Return arrows from less to more thinking models, under standard and guided."""
     points = results.overall
     chains = [list(reversed(pair)) for pair in analyses.REASONING_PAIRS] + [list(analyses.REASONING_LADDER)]
     chains = [[m for m in chain if m in set(points["model"])] for chain in chains]
@@ -91,10 +86,7 @@ def reasoning(results: Results) -> Figure:
 
 
 def _draw_models(axes: Axes, points: pd.DataFrame) -> list[Label]:
-    """Draw the markers of every model.
-
-    Return one label per model, at its guided point or else at its first one.
-    """
+    """Draw all markers; return a label per model at its guided or else first point."""
     labels, look = [], looks(points["model"])
     for model, rows in points.groupby("model", sort=True):
         colour, marker = look[str(model)]
@@ -122,10 +114,7 @@ def _draw_models(axes: Axes, points: pd.DataFrame) -> list[Label]:
 
 
 def _draw_intervals(axes: Axes, row: Mapping[Any, Any], colour: str) -> None:
-    """Draw the 95 % intervals of J and Acc if the row has them.
-
-    They are clipped to possible values.
-    """
+    """Draw the 95 % intervals of J and Acc, clipped to possible values, if known."""
     style: dict[str, Any] = {"color": colour, "linewidth": 0.6, "alpha": 0.55, "zorder": 1.8, "clip_on": False}
     for name, least in (("j", -1.0), ("acc", 0.0)):
         low, high = row.get(f"{name}_ci_low", np.nan), row.get(f"{name}_ci_high", np.nan)
@@ -136,10 +125,7 @@ def _draw_intervals(axes: Axes, row: Mapping[Any, Any], colour: str) -> None:
 
 
 def _draw_frontier(axes: Axes, guided: pd.DataFrame) -> None:
-    """Draw the frontier.
-
-    Dashed steps around the points that some model under guided equals or exceeds in Acc and J.
-    """
+    """Draw dashed steps around the points that a model equals or exceeds in Acc and J."""
     at = guided.sort_values(["acc", "j"], ascending=False)[["acc", "j"]].to_numpy(float)
     steps, best = [], 0.0
     for acc, j in at:

@@ -1,7 +1,4 @@
-"""Choose the colour (by family) and marker of each model in all figures.
-
-Figures in (Acc, J) share further parts.
-"""
+"""Choose each model's colour (by family) and marker; frame figures in (Acc, J)."""
 
 from __future__ import annotations
 
@@ -22,10 +19,7 @@ OWN, REFERENCE = "own", "reference"
 
 
 def family_of(model: str) -> str:
-    """Return the registry's family of a model.
-
-    `own` if the model is not in the registry.
-    """
+    """Return a model's family in the registry, or `own` if it is not there."""
     entry = load_models().get(model)
     return entry.groups.family if entry else OWN
 
@@ -44,10 +38,7 @@ def family_colour(family: str) -> str:
 
 
 def looks(models: Iterable[str]) -> dict[str, tuple[str, str]]:
-    """Return colour (its family's) and marker of each model.
-
-    Up to 13 models of a family differ in their marker.
-    """
+    """Return each model's colour (its family's) and marker (13 differ per family)."""
     known = dict.fromkeys([*load_models(), *sorted(set(models))])
     colours = {model: family_colour(family_of(model)) for model in known}
     alike = {colour: [m for m in known if colours[m] == colour] for colour in COLOURS}
@@ -55,11 +46,9 @@ def looks(models: Iterable[str]) -> dict[str, tuple[str, str]]:
 
 
 def frame_plane(axes: Axes, points: pd.DataFrame, ylabel: str, *, intervals: bool = False) -> None:
-    """Set the limits around points (columns j and acc), and draw PECS contours.
+    """Limit the axes to points (columns j, acc), and draw PECS contours.
 
-    At least half of each axis is shown.
-
-    intervals: whether the 95 % intervals of the points are drawn, too.
+    At least half of each axis is shown. intervals: whether the limits include the points' 95 % intervals.
     """
     acc, j = (_values(points, name, least, intervals=intervals) for name, least in (("acc", 0.0), ("j", -1.0)))
     low, high = _limits(acc, 0.0, 0.0)
@@ -79,20 +68,14 @@ def frame_plane(axes: Axes, points: pd.DataFrame, ylabel: str, *, intervals: boo
 
 
 def _values(points: pd.DataFrame, name: str, least: float, *, intervals: bool) -> np.ndarray:
-    """Return a column's values and the ends of their intervals.
-
-    They are clipped to possible values.
-    """
+    """Return a column's values and interval ends, clipped to possible values."""
     names = [name, *(end for end in (f"{name}_ci_low", f"{name}_ci_high") if intervals and end in points)]
     values = points[names].to_numpy(float).ravel()
     return np.clip(values[np.isfinite(values)], least, 1.0)
 
 
 def _limits(values: np.ndarray, low: float, least: float) -> tuple[float, float]:
-    """Return ends of an axis of fractions: tenths around the values.
-
-    They lie within [low, 1], the upper at `least` or above.
-    """
+    """Return axis limits in tenths around the values, within [low, 1], upper ≥ least."""
     if not len(values):
         return low, 1.0
     bottom = low if least else max(low, float(np.floor(10 * values.min() - 0.8)) / 10)

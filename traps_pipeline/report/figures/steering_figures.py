@@ -1,7 +1,4 @@
-"""Draw figures of probes and steering (docs/spec.md 10).
-
-Probe curves, the Cf->Cf strip, dose and response, cosines.
-"""
+"""Draw probe curves, the Cf->Cf strip, dose and response, and cosines."""
 
 from __future__ import annotations
 
@@ -203,10 +200,7 @@ def _mean_band(ax: Axes, shares: pd.DataFrame) -> None:
 
 
 def _panels(rows: pd.DataFrame) -> Mapping[tuple[str, str], pd.DataFrame]:
-    """Return rows of each model and complete path set.
-
-    Of standard directions under guided if the model has them.
-    """
+    """Return rows by model and complete path set, of standard under guided if any."""
     panels: dict[tuple[str, str], pd.DataFrame] = {}
     for model, of in rows.groupby("model", sort=False):
         guided = (of["directions"] == "standard").astype(int) + 2 * (of["regime"] == "guided").astype(int)

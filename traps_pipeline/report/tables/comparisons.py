@@ -1,7 +1,4 @@
-"""Tabulate analyses of cells (docs/spec.md 5.4).
-
-Gaps, uplifts, pairs, frontier, boundary.
-"""
+"""Tabulate analyses of cells (docs/spec.md 5.4): uplifts, frontier, contrasts."""
 
 from __future__ import annotations
 
@@ -49,10 +46,7 @@ NAIVE_THRESHOLD = 0.03
 
 
 def visual_textual(results: Results) -> list[PrintedTable]:
-    """Return AbsRec under standard on visual and ill-posed voids, and their ratio.
-
-    Rows are by taxonomy and pooled.
-    """
+    """Return standard AbsRec on visual and ill-posed voids and its ratio by taxonomy."""
     rates = marked(results.rates)
     rows = rates.drop_duplicates("model", keep="last").loc[
         :, ["model", *COUNTED, "mark"]
@@ -93,10 +87,7 @@ def _rate_trace(row: Mapping[str, Any], field: str) -> SourceItems:
 
 
 def uplift(results: Results) -> list[PrintedTable]:
-    """Return AbsRec under guided and standard, their ratio, and PECS of both.
-
-    Datasets have equal weights.
-    """
+    """Return AbsRec under both prompts, its ratio, and PECS; datasets weigh equally."""
     rows, refused, both = [], [], PROMPTING
     for model, means in marked(results.overall).groupby("model", sort=False):
         sides = {row["regime"]: row for row in means.to_dict("records") if row["regime"] in both}
@@ -136,10 +127,7 @@ def _regime_trace(row: Mapping[str, Any], field: str) -> SourceItems:
 
 
 def naive(results: Results) -> list[PrintedTable]:
-    """Return cells under guided, by the difference between Acc x AbsRec and PECS.
-
-    The product ignores false abstention.
-    """
+    """Return guided cells by Acc x AbsRec minus PECS; the product ignores FalseAbs."""
     cells = results.cells.loc[results.cells["regime"] == GUIDED]
     rows = marked(analyses.naive_gap(cells, -np.inf)).dropna(subset=["gap"])
     above = analyses.naive_gap(cells, NAIVE_THRESHOLD)
@@ -162,10 +150,7 @@ def naive(results: Results) -> list[PrintedTable]:
 
 
 def zero_boundary(results: Results) -> list[PrintedTable]:
-    """Return cells with PECS 0.
-
-    Voids are not told from controls, or no control is answered correctly.
-    """
+    """Return cells with PECS 0: voids not told from controls, or Acc 0."""
     rows = ordered(with_titles(marked(analyses.zero_boundary(results.cells))), ["regime", "dataset", "model"])
     columns = [MODEL, DATASET, REGIME, *SHARES, PECS, *COUNTS, EPOCH]
     n_cells = results.cells.groupby("regime", sort=False).size()
@@ -178,10 +163,7 @@ def zero_boundary(results: Results) -> list[PrintedTable]:
 
 
 def frontier(results: Results) -> list[PrintedTable]:
-    """Return the Pareto frontier in (Acc, J) under each regime.
-
-    It is taken after averaging over datasets.
-    """
+    """Return the Pareto frontier in (Acc, J), averaged over datasets, by regime."""
     rows = ordered(marked(analyses.frontier(results.overall)), ["regime"])
     columns = [REGIME, MODEL, SHARES[0], J, PECS, *COUNTS]
     notes = ["no other model is as good in both Acc and J and better in one", epochs(results.cells), *marks(rows)]
@@ -226,10 +208,7 @@ TOO_FEW = "too few"
 
 
 def contrasts(results: Results) -> list[PrintedTable]:
-    """Return paired contrasts of overall PECS (Holm).
-
-    They compare models under one regime, and regimes of one model.
-    """
+    """Return paired contrasts of overall PECS (Holm) between models and regimes."""
     rows = results.contrasts
     rows = rows.loc[(rows["dataset"] == "overall") & (rows["figure"] == "pecs")]
     known = rows["separable"].map({True: "yes", False: "no"}).astype(object)
@@ -253,10 +232,7 @@ def contrasts(results: Results) -> list[PrintedTable]:
 
 
 def regime_tests(results: Results) -> list[PrintedTable]:
-    """Return McNemar's test of two regimes on the same items.
-
-    Each dataset, model and run has a row.
-    """
+    """Return McNemar's test of two regimes on equal items, by dataset, model and run."""
     rows = ordered(with_titles(results.regime_tests), ["dataset", "model", "run", "decision"])
     columns = [
         DATASET, MODEL, Column("run", "Run", "count"), Column("decision", "Decision"),
@@ -292,10 +268,7 @@ def spreads(results: Results) -> list[PrintedTable]:
 
 
 def degenerate(results: Results) -> list[PrintedTable]:
-    """Return the expected scores of strategies that do not discriminate.
-
-    Their measured scores in this study stand beside.
-    """
+    """Return expected and measured scores of strategies that do not discriminate."""
     rows = analyses.degenerate_strategies()
     columns = [
         Column("strategy", "Strategy"), *SHARES, Column("j", "J", "fraction"), Column("naive", "Naive", "fraction"),

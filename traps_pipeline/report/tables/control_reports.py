@@ -1,7 +1,4 @@
-"""Tabulate controls for the mechanistic claims.
-
-Baselines of probes, nulls of directions, PECS under gates.
-"""
+"""Tabulate controls of mechanistic claims: baselines, nulls, PECS under gates."""
 
 from __future__ import annotations
 
@@ -51,17 +48,12 @@ WHAT = {
 
 
 def probe_baselines(results: Results) -> list[PrintedTable]:
-    """Return the probe on states beside baselines; also on look-alikes.
-
-    The baselines are raw inputs, the output margin and noise.
-    """
+    """Return the probe beside raw inputs, margin and noise; also on look-alikes."""
     return [_beside(results), _look_alikes(results)]
 
 
 def beside(results: Results) -> pd.DataFrame:
-    """Return the probe's score and each baseline, by model and ordered pair.
-
-    The pair is one of datasets.
+    """Return the probe's score and each baseline, by model and pair of datasets.
 
     Pairs include a dataset on itself. The figure is at the target's chosen layer, with its interval. Within a taxonomy
     all are fitted without the scored scenario (`held_out`), otherwise on all of the source (`transfer`).
@@ -77,10 +69,7 @@ def beside(results: Results) -> pd.DataFrame:
 
 
 def look_alikes(results: Results) -> pd.DataFrame:
-    """Return `beside` for items that only resemble voids.
-
-    The probes are those of the datasets of their taxonomy.
-    """
+    """Return `beside` for look-alikes of voids, by probes of their own taxonomy."""
     probe = results.probes.loc[results.probes["chosen"].eq(True) & results.probes["target"].isin([*WHAT])]
     own = [taxonomy_of(s) == probed_taxonomy(t) for s, t in zip(probe["source"], probe["target"], strict=True)]
     return _with_baselines(results, probe.loc[own])
@@ -153,10 +142,7 @@ AGAINST = {"answerable_void": "voids", "answerable_control": "controls", "time_s
 
 
 def steering_nulls(results: Results) -> list[PrintedTable]:
-    """Return void directions on their own datasets among nulls of their length.
-
-    PECS of the steered model follows.
-    """
+    """Return void directions on their own datasets among nulls, then steered PECS."""
     return [_nulls(results), _pecs(results)]
 
 
@@ -237,10 +223,7 @@ SOURCE_NAMES = {f"one:{name}": short for name, short in SHORT.items()}
 
 
 def gate(results: Results) -> list[PrintedTable]:
-    """Return PECS before and after probe gates, by source, threshold and features.
-
-    The change by them and by the prompt stands beside.
-    """
+    """Return PECS before and after gates and prompts, by source, threshold, features."""
     return [_gate_sources(results), _gate_controls(results), _gate_answerable(results), _prompts(results)]
 
 
@@ -259,10 +242,7 @@ _GATE_NOTES = (
 
 
 def _gates(results: Results) -> pd.DataFrame:
-    """Return the rows of gates.
-
-    On states first, from other datasets, at the mid threshold, over all datasets.
-    """
+    """Return gate rows; states, other datasets, mid threshold, all datasets first."""
     rows = results.gate
     firsts = {"features": "states", **DEFAULT_GATE, "target": "all"}
     later = {f"{name}_later": rows[name].astype(object) != first for name, first in firsts.items()}
@@ -327,9 +307,7 @@ def _gate_answerable(results: Results) -> PrintedTable:
 
 
 def prompts(results: Results) -> pd.DataFrame:
-    """Return AbsRec under standard and guided, by model and dataset.
-
-    They are shares; their difference stands beside.
+    """Return AbsRec (shares) under standard and guided, by model and dataset.
 
     Also, for both prompts, the AUROC of the probe (at the dataset's chosen layer, fitted without the scored scenario)
     and of the output margin; those of the best raw input and of noise; n_answered, the fewest voids answered under

@@ -1,7 +1,4 @@
-"""Tabulate models' earnings on graded cuts.
-
-Beside an ideal observer and strategies that know nothing of a clip.
-"""
+"""Tabulate earnings on graded cuts beside an ideal observer and blind strategies."""
 
 from __future__ import annotations
 
@@ -20,10 +17,9 @@ WHY = "graded cuts were not asked (name `graded` under datasets)"
 
 
 def graded(results: Results) -> list[PrintedTable]:
-    """Return the expected points of each model on graded cuts, and its losses.
+    """Return expected points of each model on graded cuts, and its losses.
 
-    The answers of such cuts have known probabilities; losses are by ignorance, by rash answers and by needless
-    abstention.
+    Losses are by ignorance, by rash answers and by needless abstention.
     """
     rows = results.graded
     rows = rows.loc[rows["scope"] == "all"]

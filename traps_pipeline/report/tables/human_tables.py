@@ -1,7 +1,4 @@
-"""Tabulate people's scores and agreement (docs/people.md).
-
-Scores corrected for the panel's errors are here, too.
-"""
+"""Tabulate people's scores and agreement, and scores corrected for panel errors."""
 
 from __future__ import annotations
 
@@ -30,10 +27,7 @@ _PERCENT = (*SHARES, "sensitivity", "specificity")
 
 
 def people(results: Results) -> list[PrintedTable]:
-    """Return people's scores on the clips, by dataset.
-
-    Their agreement about clips and answers follows.
-    """
+    """Return people's scores by dataset, and their agreement on clips and answers."""
     rows = ordered(with_titles(results.human_row), ["dataset"])
     rows = _with_intervals(rows, [*_FIGURES])
     figures = [Column(f"{field}_shown", heading, "range") for field, heading in _FIGURES.items()]
@@ -64,10 +58,7 @@ def people(results: Results) -> list[PrintedTable]:
 
 
 def judge_corrected(results: Results) -> list[PrintedTable]:
-    """Return the panel against people, and the corrected leaderboard.
-
-    The leaderboard is shown as judged and corrected for the panel's errors.
-    """
+    """Return the panel against people, and the leaderboard corrected for its errors."""
     errors = _with_intervals(results.panel_errors, ["sensitivity", "specificity"])
     of_panel = [
         Column("task", "Task"), Column("sensitivity_shown", "Sensitivity %", "range"),
@@ -111,10 +102,7 @@ def _shown(row: Mapping[Any, Any], field: str) -> str:
 
 
 def said_by_people(human_row: pd.DataFrame, panel_errors: pd.DataFrame) -> list[str]:
-    """Return notes beside a leaderboard.
-
-    People's scores, and whether the panel was validated.
-    """
+    """Return leaderboard notes: people's scores, and whether the panel was validated."""
     return [f"people: {_score_of_people(human_row)}", f"the panel: {_validated(panel_errors)}"]
 
 

@@ -26,10 +26,7 @@ _HEADINGS = {"acc": "Acc %", "false_abs": "FalseAbs %", "abs_rec": "AbsRec %", "
 
 
 def hypotheses(results: Results) -> list[PrintedTable]:
-    """Return how answers and abstentions change as one property changes by steps.
-
-    Shortcut rules stand beside.
-    """
+    """Return answers and abstentions by steps of one property, beside shortcut rules."""
     from traps_pipeline.scoring.doses import HYPOTHESES
 
     return [_of(results.hypotheses, hypothesis) for hypothesis in HYPOTHESES]

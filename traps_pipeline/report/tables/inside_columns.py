@@ -1,6 +1,4 @@
-"""Share columns, marks and notes of tables about mechanistic analyses.
-
-The baselines beside a probe's scores are here, too.
+"""Share columns, marks, notes and probe baselines of mechanistic tables.
 
 The baselines are the best of the raw inputs, the output margin and the floor of noise.
 """
@@ -41,20 +39,14 @@ BASELINE_NOTES = (
 
 
 def why(results: Results, of_paper: str = "") -> str:
-    """Return why a frame of mechanistic analyses has no rows.
-
-    of_paper: the reason for the paper's.
-    """
+    """Return why a mechanistic frame has no rows; of_paper: why the paper's has none."""
     if of_paper and not results.is_study:
         return of_paper
     return NO_MECHANISM if results.is_study and results.mechanism is None else results.why("probes")
 
 
 def few(rows: pd.DataFrame, *counts: str) -> list[str]:
-    """Return the mark of each row: a dagger if one of the counts is below FEW.
-
-    Empty for unknown counts.
-    """
+    """Return each row's mark: a dagger if a known count is below FEW, else empty."""
     import pandas as pd
 
     numbers = [pd.to_numeric(rows[name], errors="coerce") for name in counts]
@@ -62,10 +54,7 @@ def few(rows: pd.DataFrame, *counts: str) -> list[str]:
 
 
 def few_note(rows: pd.DataFrame, *marks: str, of: str = "controls or voids") -> list[str]:
-    """Return the meaning of the mark, if a row has it in one of these columns.
-
-    of: the counted things.
-    """
+    """Return the mark's meaning if a row has it; `of` names the counted things."""
     used = any((rows[name] == FEW_MARK).any() for name in marks or ("mark",) if name in rows)
     return [f"{FEW_MARK} fewer than {FEW} {of}: the value says little"] if used else []
 
@@ -89,10 +78,7 @@ def path_names(rows: pd.DataFrame) -> list[str]:
 
 
 def by_features(results: Results) -> pd.DataFrame:
-    """Return one row per AT of `probe_baselines`.
-
-    The value of each of its features, and noise_spread.
-    """
+    """Return the value of each feature and noise_spread, one row per AT."""
     import pandas as pd
 
     rows = results.baselines
@@ -103,10 +89,7 @@ def by_features(results: Results) -> pd.DataFrame:
 
 
 def against(results: Results, analysis: str) -> pd.DataFrame:
-    """Return BESIDE of each model, source and target under an analysis.
-
-    They are the best raw input, the output margin and noise.
-    """
+    """Return BESIDE by model, source and target: best raw input, margin and noise."""
     import pandas as pd
 
     rows = by_features(results)
@@ -118,10 +101,7 @@ def against(results: Results, analysis: str) -> pd.DataFrame:
 
 
 def best_name(values: Mapping[Any, float]) -> str:
-    """Return the feature with the highest AUROC.
-
-    NO_RAW where none is above chance, empty where there is none.
-    """
+    """Return the feature of highest AUROC, NO_RAW if ≤ 0.5, empty if none is known."""
     known = {str(name): value for name, value in values.items() if value == value}
     best = max(known, key=lambda name: known[name], default="")
     return NO_RAW if best and known[best] <= 0.5 else best
@@ -139,8 +119,5 @@ def baseline_columns(results: Results, prefix: str = "", head: str = "") -> list
 
 
 def baseline_notes(results: Results) -> list[str]:
-    """Return notes that explain the columns of BESIDE.
-
-    Empty for the paper, which has none.
-    """
+    """Return notes on the columns of BESIDE, none for the paper."""
     return [*BASELINE_NOTES] if results.is_study else []

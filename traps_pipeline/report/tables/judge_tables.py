@@ -1,7 +1,4 @@
-"""Tabulate judges' agreement and bias, and confabulation.
-
-Its validation is here, too (docs/spec.md 4.4 and 6).
-"""
+"""Tabulate judges' agreement, bias and confabulation (docs/spec.md 4.4 and 6)."""
 
 from __future__ import annotations
 
@@ -28,10 +25,7 @@ if TYPE_CHECKING:
 
 
 def agreement(results: Results) -> list[PrintedTable]:
-    """Return the panel's agreement by dataset and task.
-
-    The lowest agreement of any two of its judges stands beside.
-    """
+    """Return panel agreement by dataset and task, and the lowest between two judges."""
     rows = results.agreement
     pairs = rows.loc[rows["judges"] != "panel"].groupby(["dataset", "task"])["agreement"].min().rename("lowest_pair")
     rows = rows.loc[rows["judges"] == "panel"].merge(pairs.reset_index(), on=["dataset", "task"], how="left")

@@ -37,10 +37,7 @@ if TYPE_CHECKING:
 
 
 def overall(results: Results) -> list[PrintedTable]:
-    """Return the overall leaderboard, best PECS first.
-
-    It has every model except the replication families.
-    """
+    """Return the overall leaderboard by PECS, without the replication families."""
     return [_overall(results, "overall", "Overall leaderboard", replication=False)]
 
 
@@ -113,10 +110,7 @@ def _n(title: str, counts: pd.Series) -> str:
 
 
 def expanded(results: Results) -> list[PrintedTable]:
-    """Return twelve tables of every model, one per dataset and regime.
-
-    They give Acc, AbsRec, FalseAbs and PECS.
-    """
+    """Return Acc, AbsRec, FalseAbs, PECS of every model, by dataset and regime."""
     cells = marked(results.cells)
     tables = []
     for dataset in DATASETS:

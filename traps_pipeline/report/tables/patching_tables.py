@@ -11,10 +11,7 @@ SITES = {"residual": "residual stream", "attention": "attention", "mlp": "MLP"}
 
 
 def patching(results: Results) -> list[PrintedTable]:
-    """Return indirect effects of activation patching, beside nulls.
-
-    Each site and group of positions has a row.
-    """
+    """Return indirect effects of patching by site and position group, beside nulls."""
     rows = results.patching
     keys = ["model", "dataset", "into", "site", "layer", "group"]
     nulls = rows.loc[rows["source"] != "pair"]

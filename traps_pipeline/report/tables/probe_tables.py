@@ -1,7 +1,4 @@
-"""Tabulate probes beside baselines (docs/spec.md 7).
-
-Transfer, Cf->Cf, within a dataset, layers, centroids.
-"""
+"""Tabulate probes (docs/spec.md 7): transfer, Cf->Cf, within a dataset, layers."""
 
 from __future__ import annotations
 
@@ -42,10 +39,7 @@ if TYPE_CHECKING:
 
 
 def probes(results: Results) -> list[PrintedTable]:
-    """Return probes between datasets.
-
-    Tables give best layers, Cf->Cf, means by type, and layers chosen without the target's labels.
-    """
+    """Return probes between datasets at best and chosen layers, Cf->Cf, and means."""
     pairs = _pairs(results)
     tables = [_transfer(results, pairs), _confabulated(results, pairs), _means(results, pairs), _within(results)]
     return [*tables, _layers(results), _catch(results)]
@@ -57,10 +51,7 @@ APART = "not computed; held out: these datasets share no controls and no scenari
 
 
 class At(NamedTuple):
-    """A rule that selects a pair's row of PROBES, and its columns.
-
-    The row is of an analysis, at the layer with a flag.
-    """
+    """A rule that selects a pair's PROBES row (analysis, layer flag), and its columns."""
 
     analysis: str
     flag: str
@@ -82,10 +73,7 @@ BASELINES = {"": "transfer", "cf_": "confabulated", "held_": "held_out", "cf_hel
 
 
 def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return PAIR_FIGURES, one row per model and ordered pair.
-
-    They are best and chosen layers, and Cf->Cf at both.
-    """
+    """Return PAIR_FIGURES by model and pair: best, chosen layers, and Cf->Cf at both."""
     import pandas as pd
 
     def by_pair(analysis: str, chosen: Any) -> dict[tuple[str, ...], dict[str, Any]]:
@@ -212,10 +200,7 @@ def _listed(names: pd.Series) -> str:
 
 
 def _held_out(results: Results, prefix: str = "", head: str = "") -> list[Column]:
-    """Return the score without the scored scenario.
-
-    The floor of noise under that split stands beside.
-    """
+    """Return columns of the held-out score and of the noise floor under its split."""
     if not results.is_study:
         return []
     noise, spread = f"{prefix}held_noise", f"{prefix}held_noise_spread"
@@ -297,10 +282,7 @@ def _catch(results: Results) -> PrintedTable:
 
 
 def _caught_columns() -> Iterator[Column]:
-    """Yield the columns of each kind of baseline.
-
-    The assigned share of look-alikes and of controls.
-    """
+    """Yield each baseline's columns: the assigned share of look-alikes and controls."""
     yield Column("raw", "Best raw input")
     for name, heading in (("raw", "catches %"), ("margin", "Output margin %"), ("noise", "Noise %")):
         yield Column(f"{name}_void", heading, "percent")
@@ -315,9 +297,7 @@ def _centroids(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _caught_beside(results: Results) -> pd.DataFrame:
-    """Return the shares that the baselines assign to void.
-
-    Each model, target and sub-scenario has a row.
+    """Return shares that baselines assign to void, by model, target, sub-scenario.
 
     Baselines are the best raw input, the output margin and noise; shares, also of controls, are means over sources.
     """

@@ -1,7 +1,4 @@
-"""Tabulate a study's setup (docs/spec.md 2 and 3).
-
-Models, their parameters, and the benchmark's composition.
-"""
+"""Tabulate a study's models, parameters and benchmark (docs/spec.md 2 and 3)."""
 
 from __future__ import annotations
 
@@ -17,10 +14,7 @@ from traps_pipeline.storage.media import MediaSpec
 
 
 def models(results: Results) -> list[PrintedTable]:
-    """Return the evaluated models, from the registry.
-
-    Each has its provider, how a clip is shown, and the number of runs.
-    """
+    """Return evaluated models: provider, how a clip is shown, and number of runs."""
     rows = []
     for entry in _entries(results):
         rows.append(
@@ -47,10 +41,7 @@ def _shown(media: MediaSpec | None) -> str:
 
 
 def hyperparameters(results: Results) -> list[PrintedTable]:
-    """Return the parameters that models and judges are sent.
-
-    Departures from the protocol are marked.
-    """
+    """Return parameters sent to models and judges; protocol departures are marked."""
     judges = [*load_judges().values()]
     if results.is_study:
         voted = set(results.bias["judge"])

@@ -41,10 +41,7 @@ SETS = {"transfer": "transfer", "within_domain": "within domain"}
 
 
 def cosines(results: Results) -> list[PrintedTable]:
-    """Return cosines of void directions, and their reliability.
-
-    Directions are of datasets under one prompt, and of a dataset under both.
-    """
+    """Return void directions' cosines across datasets or prompts, and reliability."""
     rows = results.cosines
     order = [*SHORT]
     place, other_place = ([order.index(name) for name in rows[column]] for column in ("dataset", "other_dataset"))
@@ -87,10 +84,7 @@ def _place(values: pd.Series) -> pd.Series:
 
 
 def steering(results: Results) -> list[PrintedTable]:
-    """Return abstention under steering.
-
-    It is given overall, by regime, family and domain, at the top alpha, by alpha and by layer.
-    """
+    """Return abstention under steering by regime, family, domain, alpha and layer."""
     return [
         _shares(results),
         _regimes(results, "steering_regimes", "Steering: direction regime against inference regime"),
@@ -199,18 +193,12 @@ _SIDES = (
 
 
 def _in_gaps(results: Results) -> list[Column]:
-    """Return the dose in units of the class gap of the direction's own dataset.
-
-    The paper does not print its gaps.
-    """
+    """Return the column of doses in units of the class gap, none for the paper."""
     return [Column("control_gaps", "in class gaps", "ratio", 2)] if results.is_study else []
 
 
 def _counts(results: Results) -> list[Column]:
-    """Return the numbers of answers behind a cell's two shares.
-
-    The paper prints neither.
-    """
+    """Return columns of answer counts behind a cell's shares, none for the paper."""
     if not results.is_study:
         return []
     return [
@@ -220,10 +208,7 @@ def _counts(results: Results) -> list[Column]:
 
 
 def _cell_notes(results: Results) -> list[str]:
-    """Return notes on the maximum answers of a cell.
-
-    They name its consequence for scores made of cells.
-    """
+    """Return notes on a cell's largest n, and what it means for scores of cells."""
     counts = results.effects["n"].dropna()
     if not len(counts):
         return []

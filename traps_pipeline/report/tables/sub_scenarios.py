@@ -27,10 +27,7 @@ if TYPE_CHECKING:
 
 
 def occlusion_sub_scenarios(results: Results) -> list[PrintedTable]:
-    """Return means over models of every occlusion sub-scenario.
-
-    The hidden ones are compared with the others.
-    """
+    """Return means over models by occlusion sub-scenario, and hidden against others."""
     rows = _sub_rows(results, "occlusion")
     tables = [_sub_table(results, rows, "occlusion_sub_scenarios", "Occlusion sub-scenarios")]
     hidden = analyses.hidden_against_others(rows) if len(rows) else rows
@@ -47,10 +44,7 @@ def occlusion_sub_scenarios(results: Results) -> list[PrintedTable]:
 
 
 def chaotic_sub_scenarios(results: Results) -> list[PrintedTable]:
-    """Return means over models of every chaotic family.
-
-    Acc by the control's answer follows.
-    """
+    """Return means over models by chaotic family, and Acc by the control's answer."""
     rows = _sub_rows(results, "chaotic")
     labels = results.labels
     labels = with_titles(labels.loc[labels["dataset"].map(taxonomy_of) == "chaotic"])

@@ -39,10 +39,7 @@ COUNTED = ("n_pairs", "n_runs", "n_missing", "incomplete")
 
 
 def cell_trace(row: Mapping[str, Any], field: str) -> SourceItems | None:
-    """Return the items behind a number, by the row's model and regime.
-
-    The dataset counts, if the row has one.
-    """
+    """Return the items behind a number by model, regime and, if any, dataset."""
     if field.startswith("published"):
         return None
     dataset = row.get("dataset")
@@ -51,10 +48,7 @@ def cell_trace(row: Mapping[str, Any], field: str) -> SourceItems | None:
 
 
 def marked(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows with `mark`.
-
-    ‡ on incomplete rows, † on other rows with missing items.
-    """
+    """Return the rows with `mark`: ‡ if incomplete, else † if items are missing."""
     incomplete = rows["incomplete"].eq(True).to_numpy(bool)
     missing = rows["n_missing"].fillna(0).to_numpy(float) > 0
     return rows.assign(mark=np.where(incomplete, INCOMPLETE_MARK, np.where(missing, MISSING_MARK, "")))
@@ -66,10 +60,7 @@ def with_titles(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def together(sides: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return COUNTED for a comparison of entries.
-
-    The minimum of pairs and runs, the sum of missing items.
-    """
+    """Return COUNTED of a comparison: fewest pairs and runs, sum of missing items."""
     if not sides:
         return dict.fromkeys(COUNTED)
     counts = {name: min(side[name] for side in sides) for name in ("n_pairs", "n_runs")}
@@ -109,10 +100,7 @@ def meanings(marks: Iterable[str]) -> list[str]:
 
 
 def epochs(rows: pd.DataFrame) -> str:
-    """Return the note on epochs: the only epoch, or how epochs are mixed.
-
-    Empty without rows.
-    """
+    """Return a note on the only epoch, or on mixed ones; empty without rows."""
     known = rows.dropna(subset=["epoch"]) if "epoch" in rows else rows.iloc[:0]
     single = sorted({part for epoch in known["epoch"] for part in str(epoch).split("+")})
     if len(single) <= 1:
@@ -140,10 +128,7 @@ def best_first(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def ordered(rows: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
-    """Return the rows sorted by these columns.
-
-    Datasets, regimes and models in their own order.
-    """
+    """Return rows sorted by columns; datasets, regimes, models in their own order."""
     orders: dict[str, Sequence[str]] = {"dataset": [*DATASETS, "overall"], "regime": REGIMES, "model": [*load_models()]}
 
     def place(values: pd.Series) -> pd.Series:
@@ -181,10 +166,7 @@ def frame(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> pd.DataF
 
 
 def rightly_empty(table: PrintedTable, run: bool) -> PrintedTable:
-    """Return the table.
-
-    If it was run and has no rows, it prints its reason `why` instead of "not run".
-    """
+    """Return the table; if run and without rows, it prints `why`, not "not run"."""
     return replace(table, none=table.why) if run and not len(table.rows) else table
 
 
