@@ -194,7 +194,9 @@ def _lost_arms(workspace: Workspace, category: str) -> list[str]:
 )
 def arms(workspace: Workspace, category: str) -> StageOutput:
     """Return a category's clips and questions beside the pairs: arms and variations."""
-    rows = filmed_arms.build_arms(workspace, category)
+    from traps_pipeline.benchmark.filmed_arms import build_arms
+
+    rows = build_arms(workspace, category)
     admitted = sum(row.refused is None for row in rows)
     return StageOutput(rows, shown={"admitted": admitted, "refused": len(rows) - admitted})
 
@@ -231,5 +233,7 @@ def _odd_pairs(workspace: Workspace, key: str | None, output: StageOutput) -> di
 )
 def items(workspace: Workspace, dataset: str) -> StageOutput:
     """Return the items that models are asked: per pair, a control and a changed void."""
+    from traps_pipeline.benchmark.items import build_items
+
     rows = build_items(workspace, dataset)
     return StageOutput(rows, shown={"benchmark version": rows[0].benchmark_version})
