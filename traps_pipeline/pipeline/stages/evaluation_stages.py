@@ -114,6 +114,8 @@ def _many_invalid(workspace: Workspace, key: str | None, output: StageOutput) ->
 )
 def votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
     """Return the panel's votes on a cell's answers, a row per answer, judge and task."""
+    from traps_pipeline.judging.panel import collect_votes
+
     return _with_items(workspace, collect_votes(workspace, [Cell.parse(key) for key in keys]))
 
 

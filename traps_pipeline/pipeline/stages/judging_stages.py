@@ -112,6 +112,8 @@ _SAMPLED = these_keys(CELL, [c.key for m in load_protocol().models for c in load
 )
 def confabulation(workspace: Workspace, _: None) -> StageOutput:
     """Return void failures labelled on four axes by the panel's judge, if it has one."""
+    from traps_pipeline.judging.confabulation import collect_labels
+
     return collect_labels(workspace)
 
 
