@@ -232,7 +232,7 @@ def _odd_pairs(workspace: Workspace, key: str | None, output: StageOutput) -> di
     ],
 )
 def items(workspace: Workspace, dataset: str) -> StageOutput:
-    """Return the items that models are asked: per pair, a control and a changed void."""
+    """Return the items that models are asked, a control and a changed void per pair."""
     from traps_pipeline.benchmark.items import build_items
 
     rows = build_items(workspace, dataset)
