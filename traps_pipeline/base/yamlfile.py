@@ -119,7 +119,7 @@ def read_yaml(path: Path) -> Any:
         json.dumps(value, ensure_ascii=False).encode()  # halves of surrogate pairs
         return value
     except (yaml.YAMLError, ValueError, TypeError, RecursionError, OverflowError) as error:
-        raise TrapsError(f"{path}: not valid YAML ({_said(error)}); correct the file") from error
+        raise TrapsError(f"{path}: not valid YAML ({_complaint(error)}); correct the file") from error
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
@@ -144,7 +144,7 @@ def within(path: Path) -> Iterator[None]:
         raise TrapsError(f"{path}: {error}") from error
 
 
-def _said(error: Exception) -> str:
+def _complaint(error: Exception) -> str:
     """Return a parser's complaint on one line."""
     mark = getattr(error, "problem_mark", None)
     where = f"line {mark.line + 1}: " if mark is not None else ""

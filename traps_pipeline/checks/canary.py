@@ -143,7 +143,7 @@ def changes(rows: pd.DataFrame) -> pd.DataFrame:
             tokens = [new["prompt_tokens"] - old["prompt_tokens"] for old, new in both if _has_tokens(old, new)]
             changed.append(
                 {"model": model, "from": earlier, "to": later, "served": " -> ".join(served), "n": len(both)}
-                | {name: sum(_said(old[name]) != _said(new[name]) for old, new in both) for name in COMPARED}
+                | {name: sum(_words(old[name]) != _words(new[name]) for old, new in both) for name in COMPARED}
                 | {"tokens": sum(tokens) / len(tokens) if tokens else float("nan")}
             )
     return pd.DataFrame(changed, columns=pd.Index(["model", "from", "to", "served", "n", *COMPARED, "tokens"]))
@@ -153,7 +153,7 @@ def _has_tokens(*rows: Mapping[str, Any]) -> bool:
     return all(not pd.isna(row["prompt_tokens"]) for row in rows)
 
 
-def _said(value: Any) -> str:
+def _words(value: Any) -> str:
     """Return a table's value in comparable form.
 
     Null equals null in any representation.

@@ -216,7 +216,7 @@ def findings(
     if isinstance(entry, JudgeEntry):
         problems += _wrong_votes(entry, outcomes)
     elif isinstance(entry, ModelEntry):
-        problems += [*_wrong_answers(entry, outcomes), *_seen(entry, outcomes, notes)]
+        problems += [*_wrong_answers(entry, outcomes), *_clip_problems(entry, outcomes, notes)]
     if entry.prices is None:
         notes.append("its price is unknown: no budget bounds it, and a run needs --allow-unknown-prices")
     return LiveResult(entry, list(dict.fromkeys(problems)), notes)
@@ -295,7 +295,7 @@ def _wrong_answers(entry: ModelEntry, outcomes: Mapping[str, Outcome]) -> list[s
     return wrong
 
 
-def _seen(entry: ModelEntry, outcomes: Mapping[str, Outcome], notes: list[str]) -> list[str]:
+def _clip_problems(entry: ModelEntry, outcomes: Mapping[str, Outcome], notes: list[str]) -> list[str]:
     """Return whether the clip arrives, from the answer's colours or counted tokens."""
     clip, blank = outcomes.get("clip"), outcomes.get("no clip")
     if clip is None or blank is None or clip.kind not in WITH_TEXT:

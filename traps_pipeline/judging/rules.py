@@ -27,12 +27,12 @@ _GUESS = re.compile(
 )
 # Sentences that decline, in the form of `_words`.
 _TO, _IT = "(?:know|tell|say|determine|answer)", "(?:it|this|that|which 1|answer|outcome|result|(?:this )?question)"
-_FROM = "(?: (?:from|based on|in) (?:this )?(?:video|clip|footage|frames))?"
+_FROM_VIDEO = "(?: (?:from|based on|in) (?:this )?(?:video|clip|footage|frames))?"
 _DECLINES = re.compile(
     f"(?:sorry )?(?:(?:i do not|i could not|i am not able to|(?:i )?cannot|(?:i am )?unable to) {_TO}(?: {_IT})?"
     f"|it is (?:impossible|not possible) to {_TO}(?: {_IT})?"
     f"|(?:{_IT} )?cannot be (?:determined|known|answered)"
-    f"|(?:there is )?(?:not enough|insufficient) (?:information|evidence)(?: to {_TO}(?: {_IT})?)?){_FROM}"
+    f"|(?:there is )?(?:not enough|insufficient) (?:information|evidence)(?: to {_TO}(?: {_IT})?)?){_FROM_VIDEO}"
     f"|(?:{_IT} is )?(?:unanswerable|unknown)"
     "|i do not know this cannot be determined from video"  # the pocket model
 )

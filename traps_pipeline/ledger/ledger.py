@@ -122,7 +122,9 @@ class Ledger:
         Raises TrapsError.
         """
         has_rows = sa.exists().where(ROWS.c.evaluation == EVALUATIONS.c.id)
-        query = sa.select(EVALUATIONS.c.name).where(self._mine(EVALUATIONS), has_rows).order_by(EVALUATIONS.c.name)
+        query = (
+            sa.select(EVALUATIONS.c.name).where(self._is_own_kind(EVALUATIONS), has_rows).order_by(EVALUATIONS.c.name)
+        )
         return [row.name for row in self._select(query)]
 
     def totals(self) -> dict[str, Totals]:
@@ -133,13 +135,13 @@ class Ledger:
         Raises TrapsError.
         """
         totals = dict[str, Totals]()
-        for row in self._select(sa.select(TOTALS).where(self._mine(TOTALS))):
+        for row in self._select(sa.select(TOTALS).where(self._is_own_kind(TOTALS))):
             sums = {name: (getattr(row, f"{name}_sum"), getattr(row, f"{name}_n")) for name in AVERAGED}
             means = {name: its for name, its in sums.items() if its[1]}
             totals[row.participant] = Totals(row.dollars, row.failed, row.dearest, row.unknown, means)
         return totals
 
-    def _mine(self, table: sa.Table) -> sa.ColumnElement[bool]:
+    def _is_own_kind(self, table: sa.Table) -> sa.ColumnElement[bool]:
         study = sa.select(STUDIES.c.id).where(STUDIES.c.name == self.database.study_name).scalar_subquery()
         return (table.c.study == study) & (table.c.kind == self.kind)
 
@@ -158,7 +160,7 @@ class Ledger:
                 raise sentence(error, self.database.place) from error
 
     def _rows(self, evaluation: str, wanted: Collection[str] | None = None) -> Iterator[sa.Row[Any]]:
-        ids = sa.select(EVALUATIONS.c.id).where(self._mine(EVALUATIONS), EVALUATIONS.c.name == evaluation)
+        ids = sa.select(EVALUATIONS.c.id).where(self._is_own_kind(EVALUATIONS), EVALUATIONS.c.name == evaluation)
         query = sa.select(ROWS).where(ROWS.c.evaluation == ids.scalar_subquery()).order_by(ROWS.c.id)
         if wanted is None:
             yield from self._select(query)
@@ -247,7 +249,7 @@ class Ledger:
         return lock
 
     def _holder(self, evaluation: str) -> str:
-        query = sa.select(EVALUATIONS.c.holder).where(self._mine(EVALUATIONS), EVALUATIONS.c.name == evaluation)
+        query = sa.select(EVALUATIONS.c.holder).where(self._is_own_kind(EVALUATIONS), EVALUATIONS.c.name == evaluation)
         return next((row.holder for row in self._select(query) if row.holder), "another process")
 
 

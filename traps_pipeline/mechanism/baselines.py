@@ -121,7 +121,7 @@ def raw_features(
     questions = [question for rows in items.values() for question in rows["question"]]
     words = CountVectorizer(ngram_range=(1, 2), binary=True, token_pattern=r"(?u)\b\w+\b").fit(questions)
     clips = {clip for rows in items.values() for name in ("clip", "times_clip") for clip in rows[name].dropna()}
-    clip_frames = {clip: _seen(resolve(clip), spec) for clip in sorted(clips)}
+    clip_frames = {clip: _thumbnails(resolve(clip), spec) for clip in sorted(clips)}
     most = max(len(frames) for frames, _, _ in clip_frames.values())
 
     def pixels(clip: str) -> np.ndarray:
@@ -144,7 +144,7 @@ def raw_features(
     return dict(features)
 
 
-def _seen(clip: Path, spec: MediaSpec) -> tuple[np.ndarray, np.ndarray, float]:
+def _thumbnails(clip: Path, spec: MediaSpec) -> tuple[np.ndarray, np.ndarray, float]:
     """Return thumbnails and times of the shown frames, and the clip's last time.
 
     Thumbnails (N, h, w, 3) in [0, 1], times (N,); the last time is that of the clip's last frame.

@@ -39,7 +39,7 @@ class PairDifferences:
     scenario: np.ndarray
 
 
-def apart(one: PairDifferences, other: PairDifferences, weights: np.ndarray) -> np.ndarray:
+def cross_product(one: PairDifferences, other: PairDifferences, weights: np.ndarray) -> np.ndarray:
     """Return the mean product of pairs of different scenarios, (draws,).
 
     It is an unbiased product of two mean differences.
@@ -62,9 +62,9 @@ def disattenuated(one: PairDifferences, other: PairDifferences, weights: np.ndar
 
     It may exceed 1, and is NaN if a mean difference is not longer than its noise.
     """
-    lengths = apart(one, one, weights) * apart(other, other, weights)
-    known = (lengths > 0) & (apart(one, one, weights) > 0)
-    return np.where(known, apart(one, other, weights) / np.sqrt(np.where(known, lengths, 1)), np.nan)
+    lengths = cross_product(one, one, weights) * cross_product(other, other, weights)
+    known = (lengths > 0) & (cross_product(one, one, weights) > 0)
+    return np.where(known, cross_product(one, other, weights) / np.sqrt(np.where(known, lengths, 1)), np.nan)
 
 
 def split_half(of: PairDifferences, seed: Sequence[int]) -> float:

@@ -261,7 +261,7 @@ def _masks(patches: Sequence[Patch], length: int, device: str) -> Weights:
     return {key: mask.to(device) for key, mask in masks.items()}
 
 
-def _behind(weights: Weights, layer: int) -> Tensor | None:
+def _residual_weights(weights: Weights, layer: int) -> Tensor | None:
     """Return the weights of residual patches up to a layer.
 
     They affect all later layers.
@@ -300,7 +300,7 @@ def _margins(
         inputs["inputs_embeds"] = _mixed(inputs["inputs_embeds"], source.states["residual", 0], weights["residual", 0])
     for number, source_embeds in enumerate(source.inputs.get("deepstack_visual_embeds") or ()):
         # Features number k are added to what block k + 1 puts out: behind the sites up to there.
-        behind, features = _behind(weights, number + 1), inputs["deepstack_visual_embeds"]
+        behind, features = _residual_weights(weights, number + 1), inputs["deepstack_visual_embeds"]
         if behind is not None and target.visual is not None:
             own = features[number].unflatten(0, (rows, -1))
             features[number] = _mixed(own, source_embeds, behind[:, target.visual]).flatten(0, 1)
@@ -345,7 +345,7 @@ def _replacing(
 
         They are the source's where the stream below was patched.
         """
-        own, behind = argument_of(block, PER_LAYER, args, kwargs), _behind(weights, below)
+        own, behind = argument_of(block, PER_LAYER, args, kwargs), _residual_weights(weights, below)
         if own is not None and behind is not None:
             args, kwargs = with_argument(block, PER_LAYER, _mixed(own, source.per_layer[below], behind), args, kwargs)
         shared = argument_of(block, SHARED, args, kwargs)  # one mapping, shared by all blocks

@@ -115,7 +115,7 @@ def strengths(
                 f"the {row.kind} direction of {row.source} at layer {layer} is zero, since the sides do not differ "
                 "there; name another layer in the experiment and in study.yaml"
             )
-        for unit, dose in _within(row, vectors, layer, steering.cap):
+        for unit, dose in _doses_within(row, vectors, layer, steering.cap):
             alpha = dose * float(vectors.gaps[layer]) if unit == "gap" else dose
             relative = float(alpha / vectors.residual_norms[layer]) if vectors.residual_norms[layer] > 0 else None
             along = (row.source, row.kind, layer, alpha, vector_digest(vector), relative)
@@ -126,7 +126,7 @@ def strengths(
 Dose = tuple[str, float]  # unit and number
 
 
-def _within(row: _Planned, of: Directions, layer: int, cap: float) -> Sequence[Dose]:
+def _doses_within(row: _Planned, of: Directions, layer: int, cap: float) -> Sequence[Dose]:
     """Return the doses of a direction within the cap.
 
     Left out are those in class gaps beyond `cap` control states.

@@ -32,8 +32,8 @@ from traps_pipeline.storage.posteriors import posteriors
 from traps_pipeline.storage.workspace import Workspace
 
 # The columns of an item that requests, responses and votes use.
-_ASKED = ("item_id", "pair_id", "side", "labels", "question", "ground_truth", "commonest_answer", "clip")
-_ASKED += ("media_digest", "benchmark_version", "aliases", "answer_type")
+_ITEM_COLUMNS = ("item_id", "pair_id", "side", "labels", "question", "ground_truth", "commonest_answer", "clip")
+_ITEM_COLUMNS += ("media_digest", "benchmark_version", "aliases", "answer_type")
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ def asked_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
     Equal texts share one copy: a cell of 100,000 items may have a hundred questions.
     """
     copies: dict[str, str] = {}
-    rows = workspace.tables.read_all(ITEMS, _ASKED, dataset=dataset).to_dict("records")
+    rows = workspace.tables.read_all(ITEMS, _ITEM_COLUMNS, dataset=dataset).to_dict("records")
     return with_posteriors(
         workspace,
         dataset,

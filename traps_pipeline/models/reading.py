@@ -38,7 +38,7 @@ _DECODER = json.JSONDecoder(strict=False)
 _WORD = re.compile(r"\w+")
 _LONGEST_UNIT, _LEAST_REPEATS, _LEAST_SHARE = 40, 6, 0.5  # words, times, of the text's words
 _LEAST_WORDS, _FEW_CHARACTERS = 12, 30
-_SHOWN = 60  # characters of a finish reason in a sentence
+_MOST_REASON = 60  # characters of a finish reason in a sentence
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def read_answer(
         finish = row.get("finish_reason")
         outcome = {"complete": JUDGED[0], "truncated": "truncated"}.get(ending_of(finish), UNFINISHED)
         if outcome == UNFINISHED:
-            return Reading(outcome, None, reasoning, why=f"ended for the unknown reason {str(finish)[:_SHOWN]!r}")
+            return Reading(outcome, None, reasoning, why=f"ended for the unknown reason {str(finish)[:_MOST_REASON]!r}")
     if outcome == "empty" and ending_of(row.get("finish_reason")) == "truncated":
         return Reading("truncated", None, reasoning, False if fields else None, "cut off before its answer began")
     if outcome not in WITH_TEXT or not isinstance(text, str):

@@ -36,7 +36,7 @@ YES_WORDS, NO_WORDS = ("1", "true", "yes"), ("0", "false", "no")
 DEGENERATE_SHARE = 0.02
 POOLED = "pooled"
 RESAMPLES, SEED = 10_000, 20260101
-_SHOWN = 5
+_MOST_PROBLEMS = 5
 
 
 @dataclass(frozen=True)
@@ -185,8 +185,8 @@ def _paired(path: Path, by_sample: Mapping[tuple[str, str], tuple[int, list[bool
 
 def _refuse(wrong: Sequence[str]) -> None:
     if wrong:
-        more = f"\n... and {len(wrong) - _SHOWN} more" if len(wrong) > _SHOWN else ""
-        raise TrapsError("\n".join(wrong[:_SHOWN]) + more)
+        more = f"\n... and {len(wrong) - _MOST_PROBLEMS} more" if len(wrong) > _MOST_PROBLEMS else ""
+        raise TrapsError("\n".join(wrong[:_MOST_PROBLEMS]) + more)
 
 
 # --- the comparison ---------------------------------------------------------------------------------------------------

@@ -28,7 +28,7 @@ from traps_pipeline.models.request import JUDGED
 from traps_pipeline.pipeline.experiment import Experiment
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.protocol.cells import Cell, SteeredEvaluation
-from traps_pipeline.protocol.datasets import BESIDE, DATASETS, all_datasets_of, datasets_of_category, sides_of
+from traps_pipeline.protocol.datasets import DATASETS, UNPAIRED, all_datasets_of, datasets_of_category, sides_of
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.tables import Table
@@ -241,7 +241,7 @@ def _items(
         state = lineage.state(stage, key)
         if lineage.damage(stage, key) or (state and state.code != lineage.graph[stage].code):
             return [], unmade
-    if dataset in BESIDE:  # not every scenario admits all
+    if dataset in UNPAIRED:  # not every scenario admits all
         unmade = Counter(workspace.tables.read_all(ITEMS, ["side"], dataset=dataset)["side"])
     items = expected_items(workspace, dataset)
     return items, unmade - Counter(item["side"] for item in items)

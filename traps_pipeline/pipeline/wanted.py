@@ -18,12 +18,12 @@ from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction, StatesCe
 from traps_pipeline.protocol.datasets import (
     ALL_CATEGORIES,
     ANSWERABLE,
-    BESIDE,
     CATEGORIES,
     DATASETS,
     PROBED_ARMS,
     PROBED_DATASETS,
     TIME_SWAPPED,
+    UNPAIRED,
     all_datasets_of,
 )
 from traps_pipeline.protocol.regimes import PROBE_PROMPT, REGIMES, VQA_PROMPTS
@@ -42,7 +42,7 @@ class StudyPartitions:
         self._workspace = workspace
         if workspace is None:
             every = Asked(
-                datasets=(*DATASETS, *BESIDE), models=tuple(load_models()), regimes=REGIMES, runs=(), mechanism=True
+                datasets=(*DATASETS, *UNPAIRED), models=tuple(load_models()), regimes=REGIMES, runs=(), mechanism=True
             )
             self._asked: Sequence[Asked] = [every]
         else:
@@ -68,7 +68,7 @@ class StudyPartitions:
     @cached_property
     def arms(self) -> list[str]:
         """The arms and variations among `datasets`."""
-        return [dataset for dataset in self.datasets if dataset in BESIDE]
+        return [dataset for dataset in self.datasets if dataset in UNPAIRED]
 
     @cached_property
     def has_pairs(self) -> bool:
@@ -78,7 +78,7 @@ class StudyPartitions:
     def _datasets(self, experiments: Iterable[Asked]) -> list[str]:
         present = {dataset for category in self._present for dataset in all_datasets_of(category)}
         named = {dataset for experiment in experiments for dataset in experiment.datasets}
-        return [dataset for dataset in (*DATASETS, *BESIDE) if dataset in present & named]
+        return [dataset for dataset in (*DATASETS, *UNPAIRED) if dataset in present & named]
 
     @cached_property
     def evaluations(self) -> list[Evaluation]:

@@ -21,8 +21,8 @@ CELL = ["dataset", "model", "regime", "run"]
 CELL_FIGURES = ["acc", "abs_rec", "false_abs", "j", "pecs", "naive"]
 BOUNDS = ["pecs_low", "pecs_high"]
 # The outcomes in each count of items. An item is answered if its answer is judged, even if the judges are undecided.
-BROKEN = {f"n_{name}": (name,) for name in ("empty", "truncated", "unfinished", "degenerate", "unread")}
-OUTCOMES = {"n_answered": JUDGED, "n_refused": ("refused",), **BROKEN, "n_errors": ("error", "malformed")}
+BROKEN_COUNTS = {f"n_{name}": (name,) for name in ("empty", "truncated", "unfinished", "degenerate", "unread")}
+OUTCOMES = {"n_answered": JUDGED, "n_refused": ("refused",), **BROKEN_COUNTS, "n_errors": ("error", "malformed")}
 COUNTED = [*OUTCOMES, "n_not_json"]
 REJECTS = ["n_rejects", "n_rejects_answered"]  # counts of decisions that not every panel is asked for: null otherwise
 # For each decision, how often it was yes (numerator) and how often it was made (denominator, `_of`); every figure is

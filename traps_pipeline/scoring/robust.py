@@ -111,7 +111,7 @@ def _row(items: pd.DataFrame, named: str, arms: Sequence[str], resampling: Resam
     row: dict[str, Any] = {
         "n_runs": len(runs),
         "n_items": max(rows["item_id"].nunique() for rows in runs.values()),
-        "n_missing": _missing(items),
+        "n_missing": _missing_decisions(items),
         "n_conjunction": max(n for _, n in conjunctions),
         "epoch": joined_epochs(items["epoch"]),
         "panel": joined_epochs(items["panel"]),
@@ -181,7 +181,7 @@ def _conjunction(items: pd.DataFrame, resampling: Resampling, named: str) -> tup
     return ends_of_mean(decided, resampling, named), len(decided)
 
 
-def _missing(items: pd.DataFrame) -> int:
+def _missing_decisions(items: pd.DataFrame) -> int:
     """Return the number of items, over runs, that lack a decision of their side."""
     control = items["side"] == "control"
     decided = np.where(control, items["correct_of"] & items["false_abs_of"], items["abs_rec_of"])

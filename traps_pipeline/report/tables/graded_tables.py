@@ -16,7 +16,7 @@ from traps_pipeline.report.writing import Column, PrintedTable, fraction
 if TYPE_CHECKING:
     import pandas as pd
 
-WHY = "graded cuts were not asked (name `graded` under datasets)"
+WHY_EMPTY = "graded cuts were not asked (name `graded` under datasets)"
 
 
 def graded(results: Results) -> list[PrintedTable]:
@@ -43,7 +43,7 @@ def graded(results: Results) -> list[PrintedTable]:
         Column("abstains_wrong", "wrongly %", "percent"),
         Column("brier_shown", "Brier", "range", group=True),
     ]  # fmt: skip
-    return [PrintedTable("graded", "Graded cuts", rows, columns, _notes(rows) if len(rows) else [], WHY)]
+    return [PrintedTable("graded", "Graded cuts", rows, columns, _notes(rows) if len(rows) else [], WHY_EMPTY)]
 
 
 def _notes(rows: pd.DataFrame) -> list[str]:

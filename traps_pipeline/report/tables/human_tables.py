@@ -102,11 +102,11 @@ def judge_corrected(results: Results) -> list[PrintedTable]:
 
 def _with_intervals(rows: pd.DataFrame, fields: list[str]) -> pd.DataFrame:
     """Return the rows with `FIELD_shown`: the figure and its interval as printed."""
-    columns = {f"{field}_shown": [_shown(row, field) for row in rows.to_dict("records")] for field in fields}
+    columns = {f"{field}_shown": [_ranged(row, field) for row in rows.to_dict("records")] for field in fields}
     return rows.assign(**columns)
 
 
-def _shown(row: Mapping[Any, Any], field: str) -> str:
+def _ranged(row: Mapping[Any, Any], field: str) -> str:
     return figure_with_interval(row, field, percent if field.removesuffix("_corrected") in _PERCENT else fraction)
 
 
@@ -125,7 +125,7 @@ def _score_of_people(rows: pd.DataFrame) -> str:
     row = by_dataset.get("overall", {})
     if not row or row["pecs"] != row["pecs"]:
         return f"{NOT_RUN} in full, since PECS needs labels of both sides of all four datasets"
-    figures = ", ".join(f"{heading.removesuffix(' %')} {_shown(row, field)}" for field, heading in _FIGURES.items())
+    figures = ", ".join(f"{heading.removesuffix(' %')} {_ranged(row, field)}" for field, heading in _FIGURES.items())
     return f"{figures} ({row['n_people']} people, {row['n_clips']} clips, {row['seconds']:.0f} s a clip)"
 
 
@@ -133,7 +133,7 @@ def _validated(rows: pd.DataFrame) -> str:
     if rows.empty:
         return "not validated, people have labelled none of its answers (run traps people annotate)"
     remarks = [
-        f"{row['task']} sensitivity {_shown(row, 'sensitivity')} %, specificity {_shown(row, 'specificity')} %"
+        f"{row['task']} sensitivity {_ranged(row, 'sensitivity')} %, specificity {_ranged(row, 'specificity')} %"
         for row in rows.to_dict("records")
     ]
     lacking = " (the other task is not validated)" if len(remarks) == 1 else ""
