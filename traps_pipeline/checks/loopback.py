@@ -80,7 +80,7 @@ def _listening(answers: Iterator[tuple[int, bytes]] | None = None) -> Iterator[t
 
 
 def replay(entry: Entry, requests: Sequence[Request], answers: Sequence[tuple[int, bytes]]) -> list[Outcome]:
-    """Return the outcome of each request when the provider answers like this.
+    """Return each request's outcome when the provider sends the given answer.
 
     answers: status and JSON.
     """

@@ -238,7 +238,10 @@ def _shared(axis: str, failures: int, human: HumanLabels) -> dict[str, Any]:
 
 
 def _axis_row(axis: str, judge: np.ndarray, labels: np.ndarray, human: HumanLabels) -> dict[str, Any]:
-    """Return the row of an axis. judge: (failures,); labels: (2, failures)."""
+    """Return the row of an axis.
+
+    judge: (failures,); labels: (2, failures).
+    """
     first, second = labels
     hits = int((labels & judge).sum())
     precision, recall = _share(hits, 2 * int(judge.sum())), _share(hits, int(labels.sum()))

@@ -37,7 +37,9 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class GradedItem:
-    """A graded item. posterior: the probability of each possible answer.
+    """A graded item.
+
+    posterior: the probability of each possible answer.
 
     commonest: the sub-scenario's commonest answer.
     """

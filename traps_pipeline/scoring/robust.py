@@ -171,7 +171,7 @@ def conjunction_of(items: pd.DataFrame) -> pd.Series:
 
 
 def _conjunction(items: pd.DataFrame, resampling: Resampling, named: str) -> tuple[np.ndarray, int]:
-    """Return the ends of the share of scenarios that `conjunction_of` finds right.
+    """Return the share of scenarios that `conjunction_of` finds right, with its ends.
 
     The number of decided scenarios follows.
 

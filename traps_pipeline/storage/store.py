@@ -48,7 +48,10 @@ class UnusedObject:
 
 
 class Store(ABC):
-    """The files of one study. root: the local folder below which every path lies."""
+    """The files of one study.
+
+    root: the local folder below which every path lies.
+    """
 
     def __init__(self, root: Path) -> None:
         self.root = root
