@@ -45,13 +45,13 @@ class _Strict(_SAFE):
     yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012 - the loader's own way to say it
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        seen = set[str]()
+        keys_so_far = set[str]()
         for key, _ in node.value:
             if not isinstance(key, yaml.ScalarNode):
                 raise yaml.MarkedYAMLError(None, None, "a key is a word or a number", key.start_mark)
-            if key.value in seen:
+            if key.value in keys_so_far:
                 raise yaml.MarkedYAMLError(None, None, f"{key.value!r} stands there twice", key.start_mark)
-            seen.add(key.value)
+            keys_so_far.add(key.value)
         return super().construct_mapping(node, deep)
 
 

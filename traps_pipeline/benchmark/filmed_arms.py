@@ -230,7 +230,7 @@ def _is_made(spec: SceneSpec, arm: str, clip: Path) -> bool:
 
 def film(job: Job) -> int:
     """Render and certify a scenario's missing arms; return the number of frames."""
-    scenario, drawn = Scenario.of_record(job.spec, job.qpos, job.twin), 0
+    scenario, frame_count = Scenario.of_record(job.spec, job.qpos, job.twin), 0
     for arm, clip in job.clips.items():
         of = _record_digest(job.spec, arm)
         try:
@@ -238,12 +238,12 @@ def film(job: Job) -> int:
             known.ask(job.spec)
             take = known.film(scenario)
             if take.frames:
-                drawn += save_clip(clip, take.frames, scenario.fps)
+                frame_count += save_clip(clip, take.frames, scenario.fps)
             finding = ArmResult(of, None, take.evidence, len(take.frames))
         except Rejected as why:
             finding = ArmResult(of, str(why), {})
         write_text(_finding_of(clip), json.dumps(asdict(finding)))
-    return drawn
+    return frame_count
 
 
 def _rows(

@@ -284,10 +284,10 @@ def _wrong_answers(entry: ModelEntry, outcomes: Mapping[str, Outcome]) -> list[s
             wrong.append(marked)
             continue
         row = {"outcome": outcome.kind, "text": text}
-        read = read_answer(row, None, "json" if name == "schema" else "standard", thinking=entry.thinking)
-        if read.outcome == "degenerate":
+        reading = read_answer(row, None, "json" if name == "schema" else "standard", thinking=entry.thinking)
+        if reading.outcome == "degenerate":
             wrong.append(f"its answer is {plain(text)[:40]!r}, which {degenerate(text)}")
-        elif read.is_json is False and read.outcome == "answer":
+        elif reading.is_json is False and reading.outcome == "answer":
             wrong.append(
                 "it ignores the schema (its answer in the JSON regime is no such object): say `json_schema: false` and "
                 "why under waivers"
@@ -380,8 +380,8 @@ def preflight(workspace: Workspace, models: Sequence[Entry], judges: Sequence[En
         if problem := reached[entry.id].problem:
             problems.append(LiveResult(entry, [problem]))
         else:
-            mine = {name: outcomes[request.key] for name, request in requests[entry.id].items()}
-            problems.append(findings(entry, accounts[entry.id], mine, reached[entry.id]))
+            own_outcomes = {name: outcomes[request.key] for name, request in requests[entry.id].items()}
+            problems.append(findings(entry, accounts[entry.id], own_outcomes, reached[entry.id]))
     return problems
 
 

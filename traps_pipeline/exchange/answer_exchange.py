@@ -233,11 +233,11 @@ def import_answers(
         raise TrapsError(_said_of_errors(path, {key: answers[key] for key in like_errors}, requested))
     for key in like_errors if errors == "drop" else ():
         del answers[key]
-    stored = [
+    outcomes = [
         _Stored(requested[key], answer.as_outcome(get_model(requested[key].participant)), answer.latency_s)
         for key, answer in answers.items()
     ]
-    new = asyncio.run(_store(workspace, workspace.answers, stored))
+    new = asyncio.run(_store(workspace, workspace.answers, outcomes))
     failed = f"{n_failed} samples of the log" if n_failed else ""
     return ImportResult(new, len(answers) - new, failed, dropped=len(like_errors) if errors == "drop" else 0)
 
@@ -314,13 +314,13 @@ def _import_batch(
     returned = read_batch(path, requested)
     if not returned:
         raise TrapsError(f"{path}: holds no answers; nothing was imported")
-    stored = [
+    outcomes = [
         _Stored(request, _at_batch_price(entries[request.participant], outcome), 0.0)
         for request, outcome in outcomes_of(entries, requested, returned)
     ]
-    new = asyncio.run(_store(workspace, ledger, stored))
-    failed = sum(answer.outcome.kind in ("error", "malformed") for answer in stored)
-    return ImportResult(new, len(stored) - new - failed, failures([answer.outcome for answer in stored]))
+    new = asyncio.run(_store(workspace, ledger, outcomes))
+    failed = sum(answer.outcome.kind in ("error", "malformed") for answer in outcomes)
+    return ImportResult(new, len(outcomes) - new - failed, failures([answer.outcome for answer in outcomes]))
 
 
 def checked_answers(path: Path, requested: Mapping[str, Request]) -> dict[str, Answer]:

@@ -77,8 +77,8 @@ class RuleJudge:
         if response is None:
             return Outcome("error", error="no response between markers")
         before = request.user[: response.start()]
-        asked, truth = _QUESTION.search(before), _TRUTH.search(before)
-        statement = read_statement(response.group(2), asked.group(1) if asked else "")
+        question, truth = _QUESTION.search(before), _TRUTH.search(before)
+        statement = read_statement(response.group(2), question.group(1) if question else "")
         text = UNREAD if statement is None else json.dumps(_vote(statement, truth.group(1) if truth else None))
         return Outcome("answer", text, finish_reason="stop", served_model=request.participant, cost_usd=0.0)
 

@@ -173,14 +173,14 @@ class Ledger:
         self, evaluation: str, keys: Collection[str] | None
     ) -> Iterator[tuple[str, dict[str, Any] | None, str | None]]:
         """Yield each row's place, the row, and a note about it."""
-        for stored in self._rows(evaluation, keys):
-            if not _is_whole(stored):
-                yield self._place(stored), None, f"{NOT_WHOLE}: it is not believed; its answer is asked again"
+        for entry in self._rows(evaluation, keys):
+            if not _is_whole(entry):
+                yield self._place(entry), None, f"{NOT_WHOLE}: it is not believed; its answer is asked again"
                 continue
-            row = json.loads(stored.content)
+            row = json.loads(entry.content)
             healed = heal(row)
             yield (
-                self._place(stored),
+                self._place(entry),
                 row,
                 f"{', '.join(healed)}: no possible value, counted as unknown" if healed else None,
             )
@@ -218,11 +218,11 @@ class Ledger:
         async with AsyncExitStack() as stack:
             writers = {name: await stack.enter_async_context(self.writing(name, waiting)) for name in sorted(rows)}
             new = {
-                name: [stored for stored in rows[name] if stored[0]["key"] not in known]
+                name: [entry for entry in rows[name] if entry[0]["key"] not in known]
                 for name in writers
                 if (known := self.read(name, {row["key"] for row, _ in rows[name]}).settled) is not None
             }
-            contents = [(writers[name], _Content.of(*stored)) for name in new for stored in new[name]]
+            contents = [(writers[name], _Content.of(*entry)) for name in new for entry in new[name]]
 
             def change(batch: Batch) -> None:
                 for writer in writers.values():  # before the first row: all of them or none
@@ -232,7 +232,7 @@ class Ledger:
 
             await asyncio.wrap_future(self.database.submit(change))
             await asyncio.to_thread(self.database.sync)
-        return sum(settles(row) for mine in new.values() for row, _ in mine)
+        return sum(settles(row) for entries in new.values() for row, _ in entries)
 
     async def _lock(self, evaluation: str, waiting: Waiting, give_up: GiveUp) -> Lock:
         is_told = False
@@ -302,8 +302,8 @@ class Writer:
         nothing was stored, and ValueError for a row that JSON cannot hold.
         """
         content = _Content.of(row, beside)
-        stored = self._database.submit(lambda batch: self.add(batch, content, paid_by))
-        await asyncio.shield(asyncio.wrap_future(stored))  # store what was paid for even if the caller is cancelled
+        future = self._database.submit(lambda batch: self.add(batch, content, paid_by))
+        await asyncio.shield(asyncio.wrap_future(future))  # store what was paid for even if the caller is cancelled
         self._is_synced = False
 
     async def write_all(self, rows: Iterable[Mapping[str, Any]]) -> None:

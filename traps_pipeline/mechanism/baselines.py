@@ -135,12 +135,12 @@ def raw_features(
 
     features: dict[str, dict[str, np.ndarray]] = {name: {} for name in RAW}
     for dataset, rows in items.items():
-        shown = records(rows)
+        shown_items = records(rows)
         features["question words"][dataset] = words.transform(rows["question"]).toarray().astype(float)
-        features["first frame"][dataset] = np.stack([clip_frames[row["clip"]][0][0].ravel() for row in shown])
-        features["all frames"][dataset] = np.stack([pixels(row["clip"]) for row in shown])
-        features["length"][dataset] = np.array([[clip_frames[row["clip"]][2]] for row in shown])
-        features["time stamps"][dataset] = np.array([stamps(row) for row in shown])
+        features["first frame"][dataset] = np.stack([clip_frames[row["clip"]][0][0].ravel() for row in shown_items])
+        features["all frames"][dataset] = np.stack([pixels(row["clip"]) for row in shown_items])
+        features["length"][dataset] = np.array([[clip_frames[row["clip"]][2]] for row in shown_items])
+        features["time stamps"][dataset] = np.array([stamps(row) for row in shown_items])
     return dict(features)
 
 

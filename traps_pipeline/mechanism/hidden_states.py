@@ -213,9 +213,9 @@ def _make(
 
 def item_states(model: LocalModel, item: Item, prompt: Prompt, pooling: Pooling) -> States:
     """Return the states of an item, pooled over the tokens that the pooling names."""
-    chosen = _pooled_tokens(model, prompt, item, pooling)
+    positions = _pooled_tokens(model, prompt, item, pooling)
     with model.caching_clips():
-        return model.forward_states(prompt, pooling, chosen=chosen)
+        return model.forward_states(prompt, pooling, chosen=positions)
 
 
 def _pooled_tokens(model: LocalModel, prompt: Prompt, item: Item, pooling: Pooling) -> np.ndarray | None:

@@ -223,8 +223,8 @@ def wanted_steered(
     settings = workspace.mechanism
     assert settings.steering is not None, "an experiment without steering has no steering cells"
     items = workspace.tables.read(ITEMS, {"dataset": cell.dataset})
-    chosen = steered_scenarios(sorted(set(items["scenario_id"])), settings.steering.pairs, settings.seed)
-    rows = items.loc[items["scenario_id"].isin(chosen)].to_dict("records")
+    scenarios = steered_scenarios(sorted(set(items["scenario_id"])), settings.steering.pairs, settings.seed)
+    rows = items.loc[items["scenario_id"].isin(scenarios)].to_dict("records")
     plan = strengths(cell.dataset, settings.models[entry.id], settings, directions)
     most = settings.steering.max_new_tokens
     return [

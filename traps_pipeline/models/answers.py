@@ -160,7 +160,7 @@ def _secret(entry: ModelEntry, item: Mapping[str, Any]) -> dict[str, Any]:
 def response_row(cell: Cell, item: Mapping[str, Any], row: Row, reasoning: str | None) -> ResponseRow:
     """Return one row of the responses table."""
     thinking = get_model(cell.evaluation.model).thinking
-    read = read_answer(row, reasoning, cell.evaluation.regime, thinking=thinking, dataset=cell.dataset)
+    reading = read_answer(row, reasoning, cell.evaluation.regime, thinking=thinking, dataset=cell.dataset)
     copied = ("finish_reason", "served_model", "client", "prompt_tokens", "completion_tokens")
     copied += ("reasoning_tokens", "cost_usd", "latency_s", "attempts")
     return ResponseRow(
@@ -168,12 +168,12 @@ def response_row(cell: Cell, item: Mapping[str, Any], row: Row, reasoning: str |
         **cell.partition,
         **{name: row[name] for name in copied},
         **when_asked(row),
-        outcome=read.outcome,
-        text=read.text,
-        reasoning=read.reasoning,
-        is_json=read.is_json,
+        outcome=reading.outcome,
+        text=reading.text,
+        reasoning=reading.reasoning,
+        is_json=reading.is_json,
         first_token=row.get("first_token"),
-        error=read.why or row["error"],
+        error=reading.why or row["error"],
         request_key=row["key"],
     )
 

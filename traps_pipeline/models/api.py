@@ -166,12 +166,12 @@ class ApiBackend:
 
     async def ask(self, request: Request) -> Outcome:
         """Return the outcome of one attempt; see `Backend`."""
-        asked = messages(self._entry, request)
+        prompt = messages(self._entry, request)
         _internal_call().set(True)
         with watching() as exchange:
             exchange.sent = False  # until the wire says otherwise
             try:
-                await self._litellm.acompletion(messages=asked, **request.params, **self._fixed)
+                await self._litellm.acompletion(messages=prompt, **request.params, **self._fixed)
             except Exception as error:  # noqa: BLE001 - litellm's, the SDKs' and httpx's errors
                 if not exchange.is_answered or exchange.content is None:
                     return self._failure(error, exchange)

@@ -67,8 +67,8 @@ def sheet_rows(workspace: Workspace) -> list[dict[str, str]]:
     labels = labels.loc[labels["model"].isin(protocol.validation.models)].set_index("sample_id")
     if labels.empty:
         raise TrapsError(f"no labelled failure of {', '.join(protocol.validation.models)}; run the study first")
-    chosen = draw_sample(protocol.seed, protocol.validation.n, [(str(sample), "sheet") for sample in labels.index])
-    return [_sheet_row(workspace, sample, labels.loc[sample].to_dict()) for sample, _ in chosen]
+    drawn_keys = draw_sample(protocol.seed, protocol.validation.n, [(str(sample), "sheet") for sample in labels.index])
+    return [_sheet_row(workspace, sample, labels.loc[sample].to_dict()) for sample, _ in drawn_keys]
 
 
 def annotation_sheet(workspace: Workspace) -> list[dict[str, str]]:

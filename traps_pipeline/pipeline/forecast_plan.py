@@ -210,7 +210,7 @@ def _count_calls(
     }
     for cell in experiment.cells():
         answers, votes = plan[cell.evaluation.model]
-        asked, unmade = items[cell.dataset]
+        cell_items, unmade = items[cell.dataset]
         answers.add(unmade.total(), 0)
         votes.add(len(panel) * sum(len(tasks_for(side)) * n for side, n in unmade.items()), 0)
         if workspace is None or lineage is None:
@@ -221,7 +221,7 @@ def _count_calls(
             answers.add(answered, answered)
             votes.add(cast, cast)
         else:
-            _count_cell(workspace, panel, cell, asked, answers, votes)
+            _count_cell(workspace, panel, cell, cell_items, answers, votes)
     return plan, sorted(dataset for dataset, (_, unmade) in items.items() if unmade)
 
 

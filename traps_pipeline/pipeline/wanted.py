@@ -92,9 +92,9 @@ class StudyPartitions:
         """Keys of the requested cells."""
         named = {
             Cell(dataset, evaluation).key
-            for asked in self._asked
-            for dataset in self._datasets([asked])
-            for evaluation in _evaluations(asked)
+            for experiment in self._asked
+            for dataset in self._datasets([experiment])
+            for evaluation in _evaluations(experiment)
         }
         every = (Cell(dataset, evaluation).key for dataset, evaluation in product(self.datasets, self.evaluations))
         return [key for key in every if key in named]
@@ -143,8 +143,8 @@ class StudyPartitions:
     def probed(self) -> list[str]:
         """Datasets whose hidden states are extracted."""
         datasets = self._inside[0] if self._inside else []
-        asked = self._datasets(experiment for experiment in self._asked if experiment.mechanism)
-        existing = {*datasets, *(arm for arm in PROBED_ARMS if self._inside and arm in asked)}
+        asked_datasets = self._datasets(experiment for experiment in self._asked if experiment.mechanism)
+        existing = {*datasets, *(arm for arm in PROBED_ARMS if self._inside and arm in asked_datasets)}
         existing |= {
             dataset for dataset, origin in ((ANSWERABLE, "occlusion"), (TIME_SWAPPED, "chaotic")) if origin in existing
         }

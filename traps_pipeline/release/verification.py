@@ -153,8 +153,8 @@ def _strangers(items: Mapping[str, Row], release: Path) -> Iterator[str]:
             yield f"item {id_}: its clip is not the released one"
         elif known[id_][0] != row["item_hash"]:
             yield f"item {id_}: its question, choices or answer are not the released ones"
-    lacking = sorted(id_ for id_ in known if id_.partition(":")[0] in DATASETS and id_ not in items)
-    for id_ in lacking:
+    missing_ids = sorted(id_ for id_ in known if id_.partition(":")[0] in DATASETS and id_ not in items)
+    for id_ in missing_ids:
         yield f"item {id_}: is in the release and was not asked"
 
 

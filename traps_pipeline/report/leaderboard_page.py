@@ -165,10 +165,10 @@ def _of_one_panel(board: pd.DataFrame, robust: pd.DataFrame | None, brief: bool,
     rows = []
     if robust is not None and ranked == "overall":
         rows = records(robust)
-    beside = {(row["model"], row["regime"]): row for row in rows}
+    row_of = {(row["model"], row["regime"]): row for row in rows}
     entries = {*zip(board["model"], board["regime"], strict=True)}
-    beside = {key: row for key, row in beside.items() if key in entries}
-    return [_leaderboard(board, ranked, other_datasets, beside, brief, suffix), *own]
+    row_of = {key: row for key, row in row_of.items() if key in entries}
+    return [_leaderboard(board, ranked, other_datasets, row_of, brief, suffix), *own]
 
 
 def legend(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> dict[str, str]:

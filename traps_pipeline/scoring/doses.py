@@ -166,8 +166,8 @@ def _in_pairs(hypothesis: Hypothesis) -> set[Dose]:
 
 
 def _items_of(group: pd.DataFrame, dose: Dose) -> pd.DataFrame:
-    chosen = group["dataset"].isin(dose.datasets)
-    return group.loc[chosen if dose.side is None else chosen & (group["side"] == dose.side)]
+    in_dose = group["dataset"].isin(dose.datasets)
+    return group.loc[in_dose if dose.side is None else in_dose & (group["side"] == dose.side)]
 
 
 def _row(
@@ -202,17 +202,17 @@ def _row(
     if dose is hypothesis.doses[0] or reference.empty:
         return row
     shared = reference.loc[reference["scenario_id"].isin(items["scenario_id"])]
-    mine = items.loc[items["scenario_id"].isin(shared["scenario_id"])]
+    own_items = items.loc[items["scenario_id"].isin(shared["scenario_id"])]
     if shared.empty:
         return row
-    row["refused"] = _refusal(mine, shared)
+    row["refused"] = _refusal(own_items, shared)
     if row["refused"] is None:
         names = (hypothesis.doses[0].name, dose.name)
         before, after = (
             _compared(hypothesis, _figures(some, resampling, f"{named}|{name}"))
-            for some, name in zip((shared, mine), names, strict=True)
+            for some, name in zip((shared, own_items), names, strict=True)
         )
-        row |= {"n_compared": mine["scenario_id"].nunique(), "at_reference": before[1, 0]}
+        row |= {"n_compared": own_items["scenario_id"].nunique(), "at_reference": before[1, 0]}
         row |= with_interval("change", difference(after, before), _CHANGE)
     return row
 

@@ -103,11 +103,11 @@ class Annotation:
         It is the unit that waits for a label, else the first of their queue. None if all are labelled, or if the rest
         belong to scenarios that they met in this sitting.
         """
-        own, seen = self.samples[task], self.store.shown(who)
-        waiting = [each.unit for each in seen if each.task == task and each.waits and each.unit in own.index]
+        own, shown_units = self.samples[task], self.store.shown(who)
+        waiting = [each.unit for each in shown_units if each.task == task and each.waits and each.unit in own.index]
         since = time.time() - 3600 * annotation_protocol().sitting_hours
-        met = {each.scenario_id for each in seen if each.at > since}  # in any task, since answers reveal clips
-        finished = {each.unit for each in seen if each.task == task} | {*self.store.labelled(who, task)}
+        met = {each.scenario_id for each in shown_units if each.at > since}  # in any task, since answers reveal clips
+        finished = {each.unit for each in shown_units if each.task == task} | {*self.store.labelled(who, task)}
         blind = task != "answerability"
         open_units = (
             unit

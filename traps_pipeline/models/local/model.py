@@ -253,8 +253,8 @@ class LocalModel:
                 rows = pending.pop()
                 generated = self._fitting(prompts, rows, max_new_tokens, sampling, steering, stopped)
                 if generated is None:
-                    half = len(rows) // 2
-                    pending += [rows[half:], rows[:half]]
+                    middle = len(rows) // 2
+                    pending += [rows[middle:], rows[:middle]]
                 else:
                     answers.update(zip(rows, generated, strict=True))
         return [answers[i] for i in range(len(prompts))]

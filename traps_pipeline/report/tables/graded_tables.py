@@ -28,11 +28,11 @@ def graded(results: Results) -> list[PrintedTable]:
     rows = results.graded
     rows = rows.loc[rows["scope"] == "all"]
     two_digits = partial(fraction, digits=2)
-    shown = {
+    columns_of = {
         f"{name}_shown": [figure_with_interval(row, name, two_digits) for row in rows.to_dict("records")]
         for name in ("points", "brier")
     }
-    rows = ordered(rows.assign(**shown), ["regime", "model"])
+    rows = ordered(rows.assign(**columns_of), ["regime", "model"])
     columns = [
         MODEL, REGIME, Column("n_items", "Cuts", "count"), Column("n_missing", "Missing", "count"),
         Column("coverage", "Answers %", "percent"), Column("risk", "Wrong %", "percent"),

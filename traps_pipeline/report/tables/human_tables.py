@@ -77,8 +77,8 @@ def judge_corrected(results: Results) -> list[PrintedTable]:
     ]  # fmt: skip
     rows = results.corrected
     overall = rows.loc[rows["dataset"] == "overall"] if "overall" in set(rows["dataset"]) else rows
-    shown = _with_intervals(overall, [f"{name}{end}" for name in _FIGURES for end in ("", "_corrected")])
-    shown = ordered(with_titles(shown), ["dataset", "model", "regime"])
+    entries = _with_intervals(overall, [f"{name}{end}" for name in _FIGURES for end in ("", "_corrected")])
+    entries = ordered(with_titles(entries), ["dataset", "model", "regime"])
     figures = [
         Column(f"{field}{end}_shown", f"{heading}{', corrected' if end else ''}", "range", group=not end)
         for field, heading in _FIGURES.items()
@@ -94,8 +94,8 @@ def judge_corrected(results: Results) -> list[PrintedTable]:
     return [
         PrintedTable("panel_errors", "The panel against people", errors, of_panel, reasons, why),
         PrintedTable(
-            "judge_corrected", "Judged, and corrected for the panel’s errors", shown,
-            [MODEL, REGIME, DATASET, *figures, RUNS], notes if len(shown) else [], why,
+            "judge_corrected", "Judged, and corrected for the panel’s errors", entries,
+            [MODEL, REGIME, DATASET, *figures, RUNS], notes if len(entries) else [], why,
         ),
     ]  # fmt: skip
 
@@ -136,5 +136,5 @@ def _validated(rows: pd.DataFrame) -> str:
         f"{row['task']} sensitivity {_ranged(row, 'sensitivity')} %, specificity {_ranged(row, 'specificity')} %"
         for row in rows.to_dict("records")
     ]
-    lacking = " (the other task is not validated)" if len(remarks) == 1 else ""
-    return f"against people {'; '.join(remarks)}{lacking}"
+    remainder = " (the other task is not validated)" if len(remarks) == 1 else ""
+    return f"against people {'; '.join(remarks)}{remainder}"

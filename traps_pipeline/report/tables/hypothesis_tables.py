@@ -39,12 +39,12 @@ def _hypothesis_table(rows: pd.DataFrame, hypothesis: Hypothesis) -> PrintedTabl
     own = rows.loc[rows["hypothesis"] == hypothesis.name]
     place = {dose.name: k for k, dose in enumerate(hypothesis.doses)}
     own = own.assign(place=own["dose"].map(place))
-    shown = {
+    columns_of = {
         f"{name}_shown": [figure_with_interval(row, name, percent) for row in own.to_dict("records")]
         for name in (*_HEADINGS, "change")
     }
     rules = {f"{name}_shown": [_rule(row, name) for row in own.to_dict("records")] for name in ("value", "change")}
-    own = own.assign(**shown, **{f"rule_{name}": values for name, values in rules.items()})
+    own = own.assign(**columns_of, **{f"rule_{name}": values for name, values in rules.items()})
     kind = "J" if hypothesis.figure == "j" else "abstentions"
     columns = [
         MODEL, REGIME, Column("dose", "Dose"), Column("counts_as", "Counts as"),

@@ -179,8 +179,8 @@ def _confabulated(results: Results, pairs: pd.DataFrame) -> PrintedTable:
 
 def _means(results: Results, rows: pd.DataFrame) -> PrintedTable:
     if len(rows):
-        beside = [f"{prefix}{name}" for prefix in ("", "cf_") for name in ("raw_value", "margin", "noise")]
-        figures = [*(f"{name}_value" for name in PAIR_FIGURES), *beside, "held_noise", "cf_held_noise"]
+        baseline_names = [f"{prefix}{name}" for prefix in ("", "cf_") for name in ("raw_value", "margin", "noise")]
+        figures = [*(f"{name}_value" for name in PAIR_FIGURES), *baseline_names, "held_noise", "cf_held_noise"]
         sides = ("best_n_voids", "best_n_controls", "cf_n_voids", "cf_n_controls")
         by = (
             dict[str, Any].fromkeys(figures, "mean") | {"raw": _listed, "cf_raw": _listed} | dict.fromkeys(sides, "min")
