@@ -64,7 +64,7 @@ def certify_all(
             report(
                 f"{finished} of {len(cases)} examined: {verdict.scenario_id} {'passes' if verdict.passed else 'FAILS'}"
             )
-    failures = [f"{v.scenario_id}: {name}: {why}" for v in verdicts for name, why in v.failures.items()]
+    failures = [f"{v.scenario_id}: {name}: {reason}" for v in verdicts for name, reason in v.failures.items()]
     is_complete = families is None and (folder / "composition.yaml").is_file()
     failures += problems(specs, load_composition(folder / "composition.yaml") if is_complete else None)
     return verdicts, failures + _alike(verdicts) + foreseeable(specs, verdicts)

@@ -211,8 +211,8 @@ def findings(
         elif outcome.kind == UNFINISHED:
             problems.append(f"{name}: it ends its answers for a reason that is not known ({outcome.finish_reason!r})")
         elif outcome.kind == "refused":
-            why = outcome.finish_reason or f"{outcome.error}; what it said stands above"
-            problems.append(f"{name}: it refuses to answer ({why})")
+            reason = outcome.finish_reason or f"{outcome.error}; what it said stands above"
+            problems.append(f"{name}: it refuses to answer ({reason})")
     if isinstance(entry, JudgeEntry):
         problems += _wrong_votes(entry, outcomes)
     elif isinstance(entry, ModelEntry):

@@ -31,10 +31,10 @@ def fail_lost_runs(instance: dg.DagsterInstance, lost_s: float = LOST_S) -> list
     failed = list[str]()
     for record in instance.get_run_records(dg.RunsFilter(statuses=_UNSTARTED)):
         run, is_old = record.dagster_run, time.time() - record.update_timestamp.timestamp() > lost_s
-        if why := _why_lost(instance, run, is_old=is_old):
+        if reason := _why_lost(instance, run, is_old=is_old):
             now = instance.get_run_by_id(run.run_id)
             if now is not None and now.status == run.status:  # it may have begun in the meantime
-                instance.report_run_failed(now, f"the run will not begin: {why}")
+                instance.report_run_failed(now, f"the run will not begin: {reason}")
                 failed.append(run.run_id)
     return failed
 

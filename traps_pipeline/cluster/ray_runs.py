@@ -254,8 +254,8 @@ class RayRuns(Runs):
         if run.status != dg.DagsterRunStatus.SUCCESS and not outcome.problems:
             message = " ".join(self._last_message(run_id).split())
             # The beginning names what failed, and at its end a log has the cause.
-            why = message if len(message) <= 2 * ENDS else f"{message[:ENDS]} ... {message[-ENDS:]}"
-            ended = f"{name} ended as {run.status.value.lower()} ({why}); see its log in `traps ui`"
+            reason = message if len(message) <= 2 * ENDS else f"{message[:ENDS]} ... {message[-ENDS:]}"
+            ended = f"{name} ended as {run.status.value.lower()} ({reason}); see its log in `traps ui`"
             outcome.problems.append(message if REFUSED_TAG in run.tags else ended)
         return outcome
 

@@ -149,11 +149,12 @@ class Money:
             ]
         ).result()
 
-    def _dead(self, batch: Batch) -> set[str]:
+    def _dead_sessions(self, batch: Batch) -> set[str]:
         return {session for session in _other_sessions(batch) if self._database.is_dead(session)}
 
     def _releasable(self, batch: Batch) -> dict[str, Releasable]:
-        dead, in_flight, failed = self._dead(batch), defaultdict[str, float](float), defaultdict[str, float](float)
+        dead = self._dead_sessions(batch)
+        in_flight, failed = defaultdict[str, float](float), defaultdict[str, float](float)
         query = sa.select(RESERVATIONS).where(RESERVATIONS.c.study == batch.study, RESERVATIONS.c.session.in_(dead))
         for row in batch.connection.execute(query):
             in_flight[row.participant] += row.usd
@@ -169,7 +170,7 @@ class Money:
         query = sa.select(RESERVATIONS).where(
             RESERVATIONS.c.study == batch.study,
             RESERVATIONS.c.participant == participant,
-            RESERVATIONS.c.session.in_(self._dead(batch)),
+            RESERVATIONS.c.session.in_(self._dead_sessions(batch)),
         )
         for row in batch.connection.execute(query.order_by(RESERVATIONS.c.id)).all():
             rest = max(0.0, row.usd - usd)

@@ -243,9 +243,9 @@ class ApiBackend:
         from traps_pipeline.models.wire import cause_of
 
         if exchange.is_unsent:
-            why = redact(plain(exchange.problem or cause_of(error)))
-            self._tell(UNREACHABLE, why, passes=True)
-            raise TransientError(UNREACHABLE, billed=False, why=why) from None
+            reason = redact(plain(exchange.problem or cause_of(error)))
+            self._tell(UNREACHABLE, reason, passes=True)
+            raise TransientError(UNREACHABLE, billed=False, why=reason) from None
         reported = read_error(exchange.content)
         if reported is not None or (exchange.status is not None and not exchange.is_answered):
             return self._reported(reported, exchange)

@@ -226,8 +226,8 @@ async def _send(participant: Participant, request: Request, allowed: CallContext
             return outcome
         except TimeoutError:
             if exchange.is_unsent:
-                why = f"no connection was made within {entry.limits.timeout_s:g} s"
-                raise TransientError(UNREACHABLE, billed=False, why=why) from None
+                reason = f"no connection was made within {entry.limits.timeout_s:g} s"
+                raise TransientError(UNREACHABLE, billed=False, why=reason) from None
             raise TransientError("timeout") from None
         except TransientError as failure:
             cost_usd = _believed(failure.cost_usd, worst_usd) if failure.billed else 0.0

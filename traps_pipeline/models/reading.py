@@ -87,10 +87,10 @@ def read_answer(
             return Reading("empty", None, reasoning, False if fields else None, "only thinks")
     is_json = _is_json(text, fields) if fields else None
     if mark := undeclared_mark(text):
-        why = f"thinks between marks in its text; say `{how_to_declare(mark)}` in its entry"
-        return Reading("degenerate", None, reasoning, is_json, why)
-    if why := degenerate(text):
-        return Reading("degenerate", None, reasoning, is_json, why)
+        reason = f"thinks between marks in its text; say `{how_to_declare(mark)}` in its entry"
+        return Reading("degenerate", None, reasoning, is_json, reason)
+    if reason := degenerate(text):
+        return Reading("degenerate", None, reasoning, is_json, reason)
     if is_cut_off and not _has_final_answer(text):
         return Reading("truncated", None, reasoning, is_json, "cut off at the limit of tokens before a final answer")
     return Reading(JUDGED[0], text, reasoning, is_json)

@@ -144,9 +144,9 @@ def _errors_row(labels: pd.DataFrame, task: TaskName, draws: np.ndarray, panel: 
     decided = answers.dropna(subset=["truth"])
     n_yes = int(decided["truth"].to_numpy(bool).sum())
     if n_yes in (0, len(decided)):
-        why = f"people say {'yes' if n_yes else 'no'} of every answer"
+        reason = f"people say {'yes' if n_yes else 'no'} of every answer"
     else:
-        why = None if draws[0, :, 0].sum() > 1 else NO_BETTER
+        reason = None if draws[0, :, 0].sum() > 1 else NO_BETTER
     return {
         "task": task,
         "n_answers": len(decided),
@@ -154,7 +154,7 @@ def _errors_row(labels: pd.DataFrame, task: TaskName, draws: np.ndarray, panel: 
         "n_people": labels.loc[labels["task"] == task, "annotator"].nunique(),
         "n_yes": n_yes,
         **with_intervals(("sensitivity", "specificity"), draws),
-        "undefined": why,
+        "undefined": reason,
         "panel": panel,
     }
 

@@ -159,7 +159,7 @@ def human_agreement(labels: pd.DataFrame) -> pd.DataFrame:
 def _agreement(task: TaskName, decision: str, labels: pd.DataFrame) -> dict[str, Any]:
     values = matrix(labels, decision)
     n_shared, agreed, alpha = agreement_of(values)
-    why = "every label is the same" if n_shared else "nothing was labelled by two people"
+    reason = "every label is the same" if n_shared else "nothing was labelled by two people"
     return {
         "task": task,
         "decision": decision,
@@ -169,7 +169,7 @@ def _agreement(task: TaskName, decision: str, labels: pd.DataFrame) -> dict[str,
         "n_shared": n_shared,
         "agreement": agreed,
         "alpha": alpha,
-        "undefined": why if np.isnan(alpha) else None,
+        "undefined": reason if np.isnan(alpha) else None,
         "seconds": float(np.median(labels["seconds"].to_numpy(float))),
     }
 

@@ -145,7 +145,7 @@ def _report(instance: dg.DagsterInstance, stage: str, key: str | None, wrong: st
 def _requests(
     instance: dg.DagsterInstance, workspace: Workspace, lineage: Lineage, *, costs: bool
 ) -> list[dg.RunRequest]:
-    """Return runs of what is outdated and can be rebuilt now.
+    """Return runs that rebuild outdated partitions, as far as possible now.
 
     Dependents are requested at a later tick.
     """

@@ -49,13 +49,13 @@ def _transaction(engine: db.Engine) -> Iterator[db.Connection]:
         with engine.begin() as connection:
             yield connection
     except DBAPIError as error:
-        why, remedy, is_unwritable = reason_and_remedy(error)
+        reason, remedy, is_unwritable = reason_and_remedy(error)
         if not is_unwritable or error.orig is None:
             raise
         unwritable = HistoryUnwritable(None, None, error.orig)
         unwritable.sentence = (
-            f"{engine.url.database}: Dagster's history could not be written ({why}); {remedy} and run the same command "
-            "again: tables are whole, no answer is lost"
+            f"{engine.url.database}: Dagster's history could not be written ({reason}); {remedy} and run the same "
+            "command again: tables are whole, no answer is lost"
         )
         raise unwritable from None
 

@@ -178,8 +178,8 @@ def _wrong_answers(answers: Sequence[Row], items: Mapping[str, Row]) -> Iterator
         text = row["text"] or ""
         if (row["outcome"] in JUDGED) != bool(text.strip()):
             yield f"answer of {_named(row)}: outcome {row['outcome']!r} does not go with its text"
-        elif row["outcome"] in JUDGED and (why := degenerate(text)):
-            yield f"answer of {_named(row)}: {why}, so it is none"
+        elif row["outcome"] in JUDGED and (reason := degenerate(text)):
+            yield f"answer of {_named(row)}: {reason}, so it is none"
     expected = dict[str, set[str]]()
     for id_, item in items.items():
         expected.setdefault(item["dataset"], set()).add(id_)

@@ -271,7 +271,7 @@ def _notes_on_arms(beside: Robust) -> list[str]:
         for arms, names in entries.items()
     ]
     refused = dict.fromkeys(row["refused"] for row in beside.values() if row["refused"])
-    return [*notes, *(f"no conjunction and no robust figure: {why}" for why in refused)]
+    return [*notes, *(f"no conjunction and no robust figure: {reason}" for reason in refused)]
 
 
 def _trace(row: Mapping[str, Any], field: str) -> SourceItems | None:

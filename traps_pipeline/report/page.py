@@ -63,7 +63,7 @@ def report_html(
             figures=[card for card in run[0] if card.name != FIRST_CARD],
             pictures=run[1],
             appendix=run[2],
-            absent={why: list(dict.fromkeys(titles)) for why, titles in absent.items()},
+            absent={reason: list(dict.fromkeys(titles)) for reason, titles in absent.items()},
             shown={"leaderboard", *(card.name for cards in run for card in cards)},
             legend={**legend(board, robust), **(terms or {})},
             script=script,

@@ -89,13 +89,13 @@ def judge_corrected(results: Results) -> list[PrintedTable]:
         "judged and corrected in the same resamples of scenarios; a correction assumes that the panel errs alike on "
         "the answers of all models"
     ]
-    why = "not validated: people labelled no answers (run traps people annotate)"
+    reason = "not validated: people labelled no answers (run traps people annotate)"
     reasons = sorted(set(results.panel_errors["undefined"].dropna()))
     return [
-        PrintedTable("panel_errors", "The panel against people", errors, of_panel, reasons, why),
+        PrintedTable("panel_errors", "The panel against people", errors, of_panel, reasons, reason),
         PrintedTable(
             "judge_corrected", "Judged, and corrected for the panel’s errors", entries,
-            [MODEL, REGIME, DATASET, *figures, RUNS], notes if len(entries) else [], why,
+            [MODEL, REGIME, DATASET, *figures, RUNS], notes if len(entries) else [], reason,
         ),
     ]  # fmt: skip
 
