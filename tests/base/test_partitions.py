@@ -9,10 +9,10 @@ from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.cells import Cell, Evaluation, SteeringCell
 from traps_pipeline.protocol.datasets import (
     ALL_CATEGORIES,
-    BESIDE,
     CATEGORIES,
     DATASETS,
     EXTENSION_CATEGORIES,
+    UNPAIRED,
     datasets_of_category,
     is_ill_posed,
     taxonomy_of,
@@ -29,7 +29,7 @@ def test_every_key_of_the_registry_is_parsed_back_and_legal_in_dagster() -> None
 
 
 def test_steering_keys_of_a_study_with_arms_are_read_though_no_arm_is_steered() -> None:
-    cells = [SteeringCell.make(dataset, "pocket", "standard", "guided") for dataset in (*DATASETS, *BESIDE)]
+    cells = [SteeringCell.make(dataset, "pocket", "standard", "guided") for dataset in (*DATASETS, *UNPAIRED)]
     assert all(SteeringCell.parse(cell.key) == cell for cell in cells)
     with raises(ValueError, "protocol.cells.SteeringCell.parse"):
         SteeringCell.parse("pachinko|pocket__standard__guided")

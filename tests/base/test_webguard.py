@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import Any
 
-from traps_pipeline.base.webguard import WHO, Guard, personal_tokens
+from traps_pipeline.base.webguard import TOKEN_OWNER, Guard, personal_tokens
 
 PEOPLE = {who: token for token, who in personal_tokens("one secret of sixteen", ["jd", "ab"]).items()}
 
@@ -13,7 +13,7 @@ PEOPLE = {who: token for token, who in personal_tokens("one secret of sixteen", 
 async def who_asks(scope: Any, receive: Any, send: Any) -> None:
     """An app that says whose request it got."""
     await send({"type": "http.response.start", "status": 200, "headers": []})
-    await send({"type": "http.response.body", "body": scope[WHO].encode()})
+    await send({"type": "http.response.body", "body": scope[TOKEN_OWNER].encode()})
 
 
 def ask(query: str = "", behind: str = "", method: str = "GET", **headers: str) -> tuple[int, str, dict[str, str]]:

@@ -15,7 +15,7 @@ from tests.objectstore import S3
 from tests.postgres import Postgres
 from tests.remedies.remedied import remedied
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.storage.store_move import LEFT, move_to_store
+from traps_pipeline.storage.store_move import MOVED_STUDY, move_to_store
 from traps_pipeline.storage.workspace import DATABASE, Workspace
 
 pytestmark = pytest.mark.slow
@@ -51,7 +51,7 @@ def test_a_finished_study_moves_into_a_store_where_nothing_is_asked_or_made_agai
     assert compare(one_regime.workspace, workspace.root) == 0
 
     left = study.traps("status")
-    assert left.code == 1 and "no such workspace" in left.err and (study.workspace / LEFT).is_file()
+    assert left.code == 1 and "no such workspace" in left.err and (study.workspace / MOVED_STUDY).is_file()
     with pytest.raises(TrapsError, match=rf"^{ADDRESS}: the study's ledger lies in {ADDRESS}, and not in a folder"):
         move_to_store(workspace, "s3://lab/elsewhere")
     other = copy_of(one_regime, tmp_path / "other")

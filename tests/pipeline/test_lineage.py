@@ -14,6 +14,7 @@ from traps_pipeline.pipeline.automation import report_unseen
 from traps_pipeline.pipeline.graph import the_graph
 from traps_pipeline.pipeline.lineage import Lineage, Status
 from traps_pipeline.pipeline.partition_checks import CURRENT
+from traps_pipeline.pipeline.study_status import StageStatus
 from traps_pipeline.scoring.score_rows import METRICS
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.study import Asked, Study
@@ -111,3 +112,8 @@ def test_another_formula_makes_metrics_stale(study: Workspace) -> None:
     score(study, "another")
     [reason] = status(study).reasons
     assert reason.startswith("its code has version ") and reason.endswith("it was made by version another")
+
+
+def test_partitions_that_lost_their_own_parent_are_one_line_of_the_status():
+    stale = {key: (f"responses/{key} is gone", "judges changed") for key in ("occlusion|a__json__run1", "chaotic|b")}
+    assert StageStatus("votes", 0, stale, []).by_reason() == {"responses is gone; judges changed": [*stale]}

@@ -22,7 +22,7 @@ from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.pipeline.experiment import load_experiment
 from traps_pipeline.release.harness.scoring import figures, judge
-from traps_pipeline.release.harness.write import SHOWN, media_settings, rewritten_source, write_harness
+from traps_pipeline.release.harness.write import MEDIA_SETTINGS, media_settings, rewritten_source, write_harness
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.media import payload
 from traps_pipeline.storage.workspace import Workspace
@@ -92,7 +92,7 @@ def test_its_items_prompts_and_frames_are_those_that_a_model_is_sent(
     asked = workspace.tables.read_all(ITEMS).to_dict("records")
     assert {*items} == {row["item_id"] for row in asked}
     for row in asked[::16]:
-        sent = workspace.media.prepare(workspace.resolve(row["clip"]), row["media_digest"], SHOWN["images"])
+        sent = workspace.media.prepare(workspace.resolve(row["clip"]), row["media_digest"], MEDIA_SETTINGS["images"])
         assert [(package / name).read_bytes() for name in items[row["item_id"]]["media"]] == payload(sent)
         assert items[row["item_id"]]["question"] == row["question"]
 

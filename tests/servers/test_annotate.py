@@ -15,7 +15,7 @@ from traps_pipeline.base.webguard import personal_tokens, public_name
 from traps_pipeline.cli import main
 from traps_pipeline.judging.judging_rows import JUDGE_VALIDATION
 from traps_pipeline.protocol.ratings import AXES
-from traps_pipeline.servers.annotate import Annotation, Sent
+from traps_pipeline.servers.annotate import Annotation, SubmittedLabel
 from traps_pipeline.servers.server import Listening
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
@@ -39,7 +39,7 @@ def test_labels_of_confabulation_go_from_the_pages_to_the_comparison(
             assert MODEL not in json.dumps(shown) and "void" not in json.dumps(shown)
             seen.add(shown["answer"])
             label = dict.fromkeys(AXES, False) | {"hallucinated_premise": True}
-            annotation.record(who, Sent(handle=shown["handle"], label=label))
+            annotation.record(who, SubmittedLabel(handle=shown["handle"], label=label))
     assert seen == set(TEXTS)
     assert annotation.progress("bob", "confabulation") == (3, 3)
     assert "You have labelled all 3" in annotation.unit_page("bob", "confabulation")

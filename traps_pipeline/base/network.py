@@ -18,7 +18,7 @@ from urllib.parse import urlsplit
 from traps_pipeline.base.errors import TrapsError
 
 PROXIES = ("http_proxy", "https_proxy", "all_proxy")  # in small or capital letters
-_READ = tuple(name for low in (*PROXIES, "no_proxy") for name in (low, low.upper()))
+_VARIABLES = tuple(name for low in (*PROXIES, "no_proxy") for name in (low, low.upper()))
 PROXY_SCHEMES = ("http", "https")  # SOCKS takes a package of its own, in every client library
 TLS_VARIABLES = ("SSL_CERT_FILE", "SSL_CERT_DIR")  # read by calls
 CERTIFICATES = (*TLS_VARIABLES, "REQUESTS_CA_BUNDLE", "CURL_CA_BUNDLE")  # read by some library
@@ -81,7 +81,7 @@ def proxy_of(url: str) -> Proxy | None:
     Loopback addresses never have one.
     """
     parts = urlsplit(url)
-    return _proxy_of(parts.scheme, parts.hostname or "", tuple(os.environ.get(name) for name in _READ))
+    return _proxy_of(parts.scheme, parts.hostname or "", tuple(os.environ.get(name) for name in _VARIABLES))
 
 
 @lru_cache(maxsize=256)

@@ -204,8 +204,8 @@ def _spans(text: str, pieces: dict[str, list[tuple[str, int]]], is_decoded: bool
     for piece, (form, place) in ((piece, each) for piece, every in pieces.items() for each in every):
         start = searched.find(piece)
         while start >= 0:
-            before, behind = searched[max(0, start - place) : start], searched[start : start + len(form) - place]
-            first, last = start - _alike(before[::-1], form[:place][::-1]), start + _alike(behind, form[place:])
+            before, candidate = searched[max(0, start - place) : start], searched[start : start + len(form) - place]
+            first, last = start - _alike(before[::-1], form[:place][::-1]), start + _alike(candidate, form[place:])
             is_part = last - first >= min(2 * _PIECE, len(form))
             if is_part:
                 yield places[first][0], places[last - 1][1]
@@ -214,8 +214,8 @@ def _spans(text: str, pieces: dict[str, list[tuple[str, int]]], is_decoded: bool
 
 def _alike(text: str, other: str) -> int:
     """Return how many characters two texts have in common at their beginnings."""
-    differing = (k for k, (char, other_char) in enumerate(zip(text, other, strict=False)) if char != other_char)
-    return next(differing, min(len(text), len(other)))
+    differences = (k for k, (char, other_char) in enumerate(zip(text, other, strict=False)) if char != other_char)
+    return next(differences, min(len(text), len(other)))
 
 
 def _merged(spans: list[tuple[int, int]]) -> list[tuple[int, int]]:

@@ -19,7 +19,7 @@ from urllib.parse import parse_qsl, quote, urlencode, urlsplit
 from traps_pipeline.base.errors import TrapsError
 
 LEAST_TOKEN = 16  # characters
-WHO = "traps.who"  # key of a request's scope: the owner of its token
+TOKEN_OWNER = "traps.who"  # key of a request's scope: the owner of its token
 LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 _SAFE_METHODS = ("GET", "HEAD")
 _OWN_SITE = (b"same-origin", b"none")
@@ -87,10 +87,10 @@ def personal_tokens(token: str, people: Sequence[str]) -> dict[str, str]:
     Tokens are stable over restarts, and none reveals another.
     """
 
-    def own(who: str) -> str:
+    def token_of(who: str) -> str:
         return urlsafe_b64encode(hmac.digest(token.encode(), who.encode(), "sha256")[:18]).decode()
 
-    return {own(who): who for who in people}
+    return {token_of(who): who for who in people}
 
 
 class Guard:
@@ -129,8 +129,8 @@ class Guard:
         refused = self._refusal(scope, headers)
         if refused is None and scope["type"] == "http" and self._has_token(scope):
             await self._enter(scope, send)
-        elif refused is None and (person := self._whose(headers)) is not None:
-            scope[WHO] = person
+        elif refused is None and (person := self._header_owner(headers)) is not None:
+            scope[TOKEN_OWNER] = person
         elif refused is None:
             refused = 403, f"open the address that `{self._command}` printed: the token in it lets this browser in"
         if refused is not None:
@@ -180,7 +180,7 @@ class Guard:
                 owner = person
         return owner
 
-    def _whose(self, headers: Mapping[bytes, bytes]) -> str | None:
+    def _header_owner(self, headers: Mapping[bytes, bytes]) -> str | None:
         """Return the owner of a request's cookie or bearer token, if any.
 
         The header is `Authorization: Bearer TOKEN`.
@@ -228,8 +228,8 @@ async def _answer(send: Send, status: int, body: bytes, headers: Iterable[tuple[
 def _with_headers(send: Send) -> Send:
     async def sending(message: Message) -> None:
         if message["type"] == "http.response.start":
-            own = {name for name, _ in _HEADERS if name != b"cache-control"}
-            headers = [(name, value) for name, value in message.get("headers", ()) if name.lower() not in own]
+            token_of = {name for name, _ in _HEADERS if name != b"cache-control"}
+            headers = [(name, value) for name, value in message.get("headers", ()) if name.lower() not in token_of]
             cached = any(name.lower() == b"cache-control" for name, _ in headers)
             message["headers"] = [*headers, *(each for each in _HEADERS if not cached or each[0] != b"cache-control")]
         await send(message)

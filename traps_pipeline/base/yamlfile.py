@@ -45,13 +45,13 @@ class _Strict(_SAFE):
     yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012 - the loader's own way to say it
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        seen = set[str]()
+        keys_so_far = set[str]()
         for key, _ in node.value:
             if not isinstance(key, yaml.ScalarNode):
                 raise yaml.MarkedYAMLError(None, None, "a key is a word or a number", key.start_mark)
-            if key.value in seen:
+            if key.value in keys_so_far:
                 raise yaml.MarkedYAMLError(None, None, f"{key.value!r} stands there twice", key.start_mark)
-            seen.add(key.value)
+            keys_so_far.add(key.value)
         return super().construct_mapping(node, deep)
 
 
@@ -119,7 +119,7 @@ def read_yaml(path: Path) -> Any:
         json.dumps(value, ensure_ascii=False).encode()  # halves of surrogate pairs
         return value
     except (yaml.YAMLError, ValueError, TypeError, RecursionError, OverflowError) as error:
-        raise TrapsError(f"{path}: not valid YAML ({_said(error)}); correct the file") from error
+        raise TrapsError(f"{path}: not valid YAML ({_complaint(error)}); correct the file") from error
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
@@ -144,7 +144,7 @@ def within(path: Path) -> Iterator[None]:
         raise TrapsError(f"{path}: {error}") from error
 
 
-def _said(error: Exception) -> str:
+def _complaint(error: Exception) -> str:
     """Return a parser's complaint on one line."""
     mark = getattr(error, "problem_mark", None)
     where = f"line {mark.line + 1}: " if mark is not None else ""

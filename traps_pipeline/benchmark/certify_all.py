@@ -64,7 +64,7 @@ def certify_all(
             report(
                 f"{finished} of {len(cases)} examined: {verdict.scenario_id} {'passes' if verdict.passed else 'FAILS'}"
             )
-    failures = [f"{v.scenario_id}: {name}: {why}" for v in verdicts for name, why in v.failures.items()]
+    failures = [f"{v.scenario_id}: {name}: {reason}" for v in verdicts for name, reason in v.failures.items()]
     is_complete = families is None and (folder / "composition.yaml").is_file()
     failures += problems(specs, load_composition(folder / "composition.yaml") if is_complete else None)
     return verdicts, failures + _alike(verdicts) + foreseeable(specs, verdicts)
@@ -159,13 +159,13 @@ def family_table(folder: Path, verdicts: Sequence[Verdict]) -> str:
         *("margin m", "twins", "CPU s", "other physics"),
     )
     rows = []
-    for family, mine in sorted(members.items()):
-        twins = sum("twin" not in v.failures and "record" not in v.failures for v in mine)
+    for family, group in sorted(members.items()):
+        twins = sum("twin" not in v.failures and "record" not in v.failures for v in group)
         rejected = tallies.get(family, Tally(0, 0)).rejected.total()
-        changed = sum(not v.same_physics for v in mine)
-        spans = (_span(mine, "entropy_bits", 2), _span(mine, "top_share", 2), _span(mine, "margin_m", 3))
-        seconds = f"{np.median([v.cpu_s for v in mine]):.1f}"
-        rows.append((family, len(mine), sum(v.passed for v in mine), rejected, *spans, twins, seconds, changed))
+        changed = sum(not v.same_physics for v in group)
+        spans = (_span(group, "entropy_bits", 2), _span(group, "top_share", 2), _span(group, "margin_m", 3))
+        seconds = f"{np.median([v.cpu_s for v in group]):.1f}"
+        rows.append((family, len(group), sum(v.passed for v in group), rejected, *spans, twins, seconds, changed))
     lines = [text_table(headings, rows)]
     if any(not v.same_physics for v in verdicts):
         lines.append(

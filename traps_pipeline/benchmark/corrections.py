@@ -268,8 +268,8 @@ def subset(scenarios: Mapping[str, _OfFamily], study: Study) -> dict[str, _OfFam
     by_family: dict[str, list[str]] = {}
     for id_, family in sorted(families.items()):
         by_family.setdefault(family, []).append(id_)
-    chosen = {id_ for ids in by_family.values() for id_ in ids[: study.per_family]}
-    return {id_: scenario for id_, scenario in scenarios.items() if id_ in chosen}
+    scenario_ids = {id_ for ids in by_family.values() for id_ in ids[: study.per_family]}
+    return {id_: scenario for id_, scenario in scenarios.items() if id_ in scenario_ids}
 
 
 def _ever_known() -> set[str]:

@@ -36,9 +36,9 @@ from traps_pipeline.storage.benchmark_tables import ARMS, SCENE_SPECS, VIDEOS, A
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.video.encode import DamagedClip
 
-KNOWN: Mapping[str, Arm] = {**OF_SHORTCUTS, GRADED: GRADED_CUT, **VARIATIONS}
+ARMS_BY_NAME: Mapping[str, Arm] = {**OF_SHORTCUTS, GRADED: GRADED_CUT, **VARIATIONS}
 SECONDS_AN_ARM = 2.0  # mean of one core per arm, which is a clip, or two questions, or a proof that it is refused
-_FOUND = ".arm.json"  # suffix of the files with an arm's result
+_RESULT_SUFFIX = ".arm.json"  # suffix of the files with an arm's result
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tupl
 
     def missing(rows: Sequence[Row]) -> list[Row]:
         every = [file for row in rows for file in files(row)]
-        workspace.store.bring(file for file in every if file.name.endswith(_FOUND))
+        workspace.store.bring(file for file in every if file.name.endswith(_RESULT_SUFFIX))
         existing = workspace.store.there(every)
         return [row for row in rows if _is_missing(row, _clips(workspace, row, arms), existing)]
 
@@ -161,14 +161,16 @@ def _is_missing(row: Row, clips: Mapping[str, Path], existing: set[Path]) -> boo
     """Return whether the study lacks files of these arms of a scenario."""
     spec = spec_of(row)
     for arm, clip in clips.items():
-        finding = ArmResult.read(_finding_of(clip), _of(spec, arm)) if _finding_of(clip) in existing else None
+        finding = (
+            ArmResult.read(_finding_of(clip), _record_digest(spec, arm)) if _finding_of(clip) in existing else None
+        )
         if finding is None or (finding.frames and not {clip, note_of(clip)} <= existing):
             return True
     return False
 
 
 def _finding_of(clip: Path) -> Path:
-    return clip.with_suffix(_FOUND)
+    return clip.with_suffix(_RESULT_SUFFIX)
 
 
 def _files(clip: Path) -> tuple[Path, ...]:
@@ -194,7 +196,7 @@ def arm_of(spec: SceneSpec, arm: str) -> Arm:
 
     For crossed questions it has its partner in the benchmark.
     """
-    return crossed(_partners(spec.family).get(spec.scenario_id)) if arm == CROSSED else KNOWN[arm]
+    return crossed(_partners(spec.family).get(spec.scenario_id)) if arm == CROSSED else ARMS_BY_NAME[arm]
 
 
 @cache
@@ -212,7 +214,7 @@ def _partners(family: str) -> dict[str, SceneSpec]:
     return {id_: specs[partner] for id_, partner in partners(specs.values()).items()}
 
 
-def _of(spec: SceneSpec, arm: str) -> str:
+def _record_digest(spec: SceneSpec, arm: str) -> str:
     partner = _partners(spec.family).get(spec.scenario_id) if arm == CROSSED else None
     return digest([spec.spec_hash, arm, _code(arm), partner and partner.spec_hash])[:24]
 
@@ -222,26 +224,26 @@ def _is_made(spec: SceneSpec, arm: str, clip: Path) -> bool:
 
     Raises DamagedClip.
     """
-    finding = ArmResult.read(_finding_of(clip), _of(spec, arm))
+    finding = ArmResult.read(_finding_of(clip), _record_digest(spec, arm))
     return finding is not None and (not finding.frames or read_clip(clip) is not None)
 
 
 def film(job: Job) -> int:
     """Render and certify a scenario's missing arms; return the number of frames."""
-    scenario, drawn = Scenario.of_record(job.spec, job.qpos, job.twin), 0
+    scenario, frame_count = Scenario.of_record(job.spec, job.qpos, job.twin), 0
     for arm, clip in job.clips.items():
-        of = _of(job.spec, arm)
+        of = _record_digest(job.spec, arm)
         try:
             known = arm_of(job.spec, arm)
             known.ask(job.spec)
             take = known.film(scenario)
             if take.frames:
-                drawn += save_clip(clip, take.frames, scenario.fps)
+                frame_count += save_clip(clip, take.frames, scenario.fps)
             finding = ArmResult(of, None, take.evidence, len(take.frames))
         except Rejected as why:
             finding = ArmResult(of, str(why), {})
         write_text(_finding_of(clip), json.dumps(asdict(finding)))
-    return drawn
+    return frame_count
 
 
 def _rows(
@@ -254,7 +256,7 @@ def _rows(
 ) -> Iterator[ArmRow]:
     spec = spec_of(row)
     path = workspace.clip(spec.scenario_id, arm, row["scene_hash"])
-    finding, clip = ArmResult.read(_finding_of(path), _of(spec, arm)), known.get(path)
+    finding, clip = ArmResult.read(_finding_of(path), _record_digest(spec, arm)), known.get(path)
     if finding is None or (finding.frames and clip is None):
         raise TrapsError(f"{path}: was not filmed; run again")
     empty = ArmRow(
@@ -283,16 +285,16 @@ def _rows(
             columns = _shown_in_pair(of_pairs[spec.scenario_id, of_pair])
         else:
             assert clip is not None, "what shows a clip of its own has frames"
-            columns = _shown(workspace.relative(path), clip)
-        yield replace(empty, **columns, **_asked(question, spec))
+            columns = _clip_columns(workspace.relative(path), clip)
+        yield replace(empty, **columns, **_question_columns(question, spec))
 
 
-def _asked(question: Question, spec: SceneSpec) -> dict[str, Any]:
+def _question_columns(question: Question, spec: SceneSpec) -> dict[str, Any]:
     labels = list(question.labels or spec.labels)
     return {"side": question.side, "question": question.text, "labels": labels, "ground_truth": question.answer}
 
 
-def _shown(path: str, clip: Clip) -> dict[str, Any]:
+def _clip_columns(path: str, clip: Clip) -> dict[str, Any]:
     return {
         "clip": path,
         "media_digest": clip.file_sha256,

@@ -17,10 +17,10 @@ from traps_pipeline.benchmark.specs import expected_specs, released_in_study
 from traps_pipeline.benchmark.versions import item_content, spec_record, version_of
 from traps_pipeline.protocol.datasets import (
     ALL_CATEGORIES,
-    BESIDE,
     CROSSED,
     GRADED,
     SIDES,
+    UNPAIRED,
     all_datasets_of,
     is_ill_posed,
 )
@@ -54,14 +54,14 @@ def build_items(workspace: Workspace, dataset: str) -> list[ItemRow]:
             clips[row["scenario_id"], row["side"]] = row
     if not specs:
         raise TrapsError(f"items {dataset}: no scene_specs yet; materialize scene_specs and videos first")
-    if dataset not in BESIDE:
+    if dataset not in UNPAIRED:
         _check_clips(workspace, dataset, specs, clips)
     released = [s for c in categories_of_dataset(dataset) for s in released_in_study(workspace, c).values()]
     version = version_of(
         (item_content(dataset, spec_record(spec)) for spec in released), (item_content(dataset, row) for row in specs)
     )
     commonest = commonest_answers(specs)
-    if dataset in BESIDE:
+    if dataset in UNPAIRED:
         return _of_arm(workspace, dataset, {spec["scenario_id"]: spec for spec in specs}, commonest, version)
     return [_item(dataset, spec, side, clips, commonest, version) for spec in specs for side in SIDES]
 
@@ -73,7 +73,7 @@ def expected_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
     scenarios. Raises TrapsError.
     """
     specs = [asdict(row) for category in categories_of_dataset(dataset) for row in expected_specs(workspace, category)]
-    if dataset in BESIDE:
+    if dataset in UNPAIRED:
         former = workspace.tables.read_all(SCENE_SPECS, ["spec_hash"])["spec_hash"]
         unchanged = {spec["scenario_id"] for spec in specs if spec["spec_hash"] in {*former}}
         rows = workspace.tables.read_all(ITEMS, dataset=dataset).to_dict("records")

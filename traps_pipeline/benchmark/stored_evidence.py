@@ -24,7 +24,7 @@ def unanswerable_controls(specs: Iterable[SceneSpec]) -> list[str]:
 
     One sentence per lost certificate.
     """
-    return list(_lost(specs, "control"))
+    return list(_lost_certificates(specs, "control"))
 
 
 def answerable_voids(specs: Iterable[SceneSpec]) -> list[str]:
@@ -32,10 +32,10 @@ def answerable_voids(specs: Iterable[SceneSpec]) -> list[str]:
 
     One sentence per lost certificate.
     """
-    return list(_lost(specs, "void", "twin", "worlds"))
+    return list(_lost_certificates(specs, "void", "twin", "worlds"))
 
 
-def _lost(specs: Iterable[SceneSpec], *about: About) -> Iterator[str]:
+def _lost_certificates(specs: Iterable[SceneSpec], *about: About) -> Iterator[str]:
     for spec in specs:
         evidence, claim = stored_evidence(spec), Claim.of_record(spec)
         for certificate in certificates_for(spec.void_kind, *about):

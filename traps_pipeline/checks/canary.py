@@ -63,11 +63,11 @@ def canary_items(workspace: Workspace) -> list[dict[str, Any]]:
     if not items:
         raise TrapsError("canary: no items yet; materialize items first")
     datasets = [name for name in DATASETS if any(item["dataset"] == name for item in items)]
-    chosen = list[dict[str, Any]]()
+    selection = list[dict[str, Any]]()
     for dataset in datasets:
-        mine = sorted((i for i in items if i["dataset"] == dataset), key=lambda item: digest(item["item_id"]))
-        chosen += mine[: N_ITEMS // len(datasets)]
-    return chosen
+        dataset_items = sorted((i for i in items if i["dataset"] == dataset), key=lambda item: digest(item["item_id"]))
+        selection += dataset_items[: N_ITEMS // len(datasets)]
+    return selection
 
 
 @dataclass(frozen=True)
@@ -102,14 +102,14 @@ def _request(workspace: Workspace, entry: ModelEntry, item: Mapping[str, Any], e
 
 
 def _row(call: _Asked, row: Row, epoch: str) -> CanaryRow:
-    read = read_answer(row, None, REGIME, thinking=call.entry.thinking)
-    statement = None if read.text is None else read_statement(read.text, call.item["question"])
+    reading = read_answer(row, None, REGIME, thinking=call.entry.thinking)
+    statement = None if reading.text is None else read_statement(reading.text, call.item["question"])
     return CanaryRow(
         model=call.entry.id,
         item_id=call.item["item_id"],
         served_model=row["served_model"],
-        outcome=UNREAD if read.text is not None and statement is None else read.outcome,
-        text=read.text,
+        outcome=UNREAD if reading.text is not None and statement is None else reading.outcome,
+        text=reading.text,
         abstained=statement and statement.value is None,
         value=statement and statement.value,
         prompt_tokens=row["prompt_tokens"],
@@ -135,7 +135,7 @@ def changes(rows: pd.DataFrame) -> pd.DataFrame:
             tokens = [new["prompt_tokens"] - old["prompt_tokens"] for old, new in both if _has_tokens(old, new)]
             changed.append(
                 {"model": model, "from": earlier, "to": later, "served": " -> ".join(served), "n": len(both)}
-                | {name: sum(_said(old[name]) != _said(new[name]) for old, new in both) for name in COMPARED}
+                | {name: sum(_words(old[name]) != _words(new[name]) for old, new in both) for name in COMPARED}
                 | {"tokens": sum(tokens) / len(tokens) if tokens else float("nan")}
             )
     return pd.DataFrame(changed, columns=pd.Index(["model", "from", "to", "served", "n", *COMPARED, "tokens"]))
@@ -145,8 +145,11 @@ def _has_tokens(*rows: Mapping[str, Any]) -> bool:
     return all(not pd.isna(row["prompt_tokens"]) for row in rows)
 
 
-def _said(value: Any) -> str:
-    """Return a table's value as text; null equals null in any representation."""
+def _words(value: Any) -> str:
+    """Return a table's value in comparable form.
+
+    Null equals null in any representation.
+    """
     return "" if pd.isna(value) else str(value)
 
 

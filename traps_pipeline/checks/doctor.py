@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 MIN_FREE_GB = 1.0
 STATES = ("*.safetensors", "*.parquet")  # files of an extraction
 FOLDERS = ("tables", "clips", "media", "trajectories", "states", "directions", "reports")
-SHOWN = 5  # damaged files named per kind
+MOST_FILES = 5  # damaged files named per kind
 UNFINISHED_AFTER_S = 24 * 3600.0  # longer than the writing of any file
 
 
@@ -116,7 +116,7 @@ def examine_files(place: Place) -> Iterator[Finding]:
     for folder in FOLDERS:
         workspace.bring_folder(workspace.root / folder)
     if workspace.is_shared:
-        yield Finding(not missing, "store", "; ".join(missing[:SHOWN]) or "every object is what was written")
+        yield Finding(not missing, "store", "; ".join(missing[:MOST_FILES]) or "every object is what was written")
     for topic, files, damage_of in (
         ("tables", sorted((workspace.root / "tables").rglob("*.parquet")), altered),
         ("clips", sorted((workspace.root / "clips").rglob("*.mp4")), _damaged_clip),
@@ -125,10 +125,12 @@ def examine_files(place: Place) -> Iterator[Finding]:
         ("history", sorted(workspace.dagster_home.rglob("*.db")), _damaged_history),
     ):
         damaged = [message for path in files if (message := damage_of(path))]
-        summary = "; ".join(damaged[:SHOWN]) + (f"; and {len(damaged) - SHOWN} more" if len(damaged) > SHOWN else "")
+        summary = "; ".join(damaged[:MOST_FILES]) + (
+            f"; and {len(damaged) - MOST_FILES} more" if len(damaged) > MOST_FILES else ""
+        )
         yield Finding(not damaged, topic, summary or f"{len(files)} files are what was written")
     message = [*workspace.answers.damage(), *workspace.votes.damage()]
-    yield Finding(not message, "ledger", "; ".join(message[:SHOWN]) or "all rows are what was written")
+    yield Finding(not message, "ledger", "; ".join(message[:MOST_FILES]) or "all rows are what was written")
     yield Finding(True, "unfinished", _remove_unfinished(workspace.root))
 
 
@@ -149,8 +151,8 @@ def examine_unused(place: Place, *, is_removed: bool) -> Finding:
     unused = workspace.store.unused(is_removed=is_removed)
     volume = f"{len(unused)} objects ({sum(item.size for item in unused) / 1e6:.1f} MB)"
     if unused:
-        volume += f", the oldest of {unused[0].at:%Y-%m-%d}: {', '.join(item.name for item in unused[:SHOWN])}"
-        volume += ", .." * (len(unused) > SHOWN)
+        volume += f", the oldest of {unused[0].at:%Y-%m-%d}: {', '.join(item.name for item in unused[:MOST_FILES])}"
+        volume += ", .." * (len(unused) > MOST_FILES)
     effect = "removed" if is_removed else "would be removed by `traps doctor --unused remove`"
     return Finding(
         True, "unused", f"{effect}, since nobody names them and they are older than {GRACE_DAYS:.0f} days: {volume}"

@@ -201,12 +201,12 @@ def findings(
         elif outcome.kind == UNFINISHED:
             problems.append(f"{name}: it ends its answers for a reason that is not known ({outcome.finish_reason!r})")
         elif outcome.kind == "refused":
-            why = outcome.finish_reason or f"{outcome.error}; what it said stands above"
-            problems.append(f"{name}: it refuses to answer ({why})")
+            reason = outcome.finish_reason or f"{outcome.error}; what it said stands above"
+            problems.append(f"{name}: it refuses to answer ({reason})")
     if isinstance(entry, JudgeEntry):
         problems += _wrong_votes(entry, outcomes)
     elif isinstance(entry, ModelEntry):
-        problems += [*_wrong_answers(entry, outcomes), *_seen(entry, outcomes, notes)]
+        problems += [*_wrong_answers(entry, outcomes), *_clip_problems(entry, outcomes, notes)]
     if entry.prices is None:
         notes.append("its price is unknown: no budget bounds it, and a run needs --allow-unknown-prices")
     return LiveResult(entry, list(dict.fromkeys(problems)), notes)
@@ -274,10 +274,10 @@ def _wrong_answers(entry: ModelEntry, outcomes: Mapping[str, Outcome]) -> list[s
             wrong.append(marked)
             continue
         row = {"outcome": outcome.kind, "text": text}
-        read = read_answer(row, None, "json" if name == "schema" else "standard", thinking=entry.thinking)
-        if read.outcome == "degenerate":
+        reading = read_answer(row, None, "json" if name == "schema" else "standard", thinking=entry.thinking)
+        if reading.outcome == "degenerate":
             wrong.append(f"its answer is {plain(text)[:40]!r}, which {degenerate(text)}")
-        elif read.is_json is False and read.outcome == "answer":
+        elif reading.is_json is False and reading.outcome == "answer":
             wrong.append(
                 "it ignores the schema (its answer in the JSON regime is no such object): say `json_schema: false` and "
                 "why under waivers"
@@ -285,7 +285,7 @@ def _wrong_answers(entry: ModelEntry, outcomes: Mapping[str, Outcome]) -> list[s
     return wrong
 
 
-def _seen(entry: ModelEntry, outcomes: Mapping[str, Outcome], notes: list[str]) -> list[str]:
+def _clip_problems(entry: ModelEntry, outcomes: Mapping[str, Outcome], notes: list[str]) -> list[str]:
     """Return whether the clip arrives, from the answer's colours or counted tokens."""
     clip, blank = outcomes.get("clip"), outcomes.get("no clip")
     if clip is None or blank is None or clip.kind not in WITH_TEXT:
@@ -370,8 +370,8 @@ def preflight(workspace: Workspace, models: Sequence[Entry], judges: Sequence[En
         if problem := reached[entry.id].problem:
             problems.append(LiveResult(entry, [problem]))
         else:
-            mine = {name: outcomes[request.key] for name, request in requests[entry.id].items()}
-            problems.append(findings(entry, accounts[entry.id], mine, reached[entry.id]))
+            own_outcomes = {name: outcomes[request.key] for name, request in requests[entry.id].items()}
+            problems.append(findings(entry, accounts[entry.id], own_outcomes, reached[entry.id]))
     return problems
 
 

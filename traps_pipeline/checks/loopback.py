@@ -74,7 +74,10 @@ def _listening(answers: Iterator[tuple[int, bytes]] | None = None) -> Iterator[t
 
 
 def replay(entry: Entry, requests: Sequence[Request], answers: Sequence[tuple[int, bytes]]) -> list[Outcome]:
-    """Return each request's outcome when the provider gives these (status, JSON)."""
+    """Return each request's outcome when the provider sends the given answer.
+
+    answers: status and JSON.
+    """
     account = load_accounts()[str(entry.account)]
     with _listening(iter(answers)) as (address, _), reporting(_Notes()):
         loopback = _Loopback(base_url=address + urlsplit(account.base_url or "").path)

@@ -153,12 +153,12 @@ def _clip_problems(clips: Sequence[ClipPart], media: Media) -> Iterator[str]:
         hasher.update(clip.data)
     if hasher.hexdigest() != media.sha256:
         yield "media: the bytes that arrive are not those that were prepared"
-    for name, seen, declared in (
+    for name, actual, declared in (
         ("type", {clip.mime for clip in clips}, _MIMES[media.profile]),
         ("fps", {clip.fps for clip in clips}, media.fps),
     ):
-        if seen != {declared}:
-            yield f"media.{name}: {declared} is declared, {', '.join(map(str, seen))} arrives"
+        if actual != {declared}:
+            yield f"media.{name}: {declared} is declared, {', '.join(map(str, actual))} arrives"
 
 
 def _wire_problems(entry: Entry, request: Request, wire: WireBody) -> Iterator[str]:
@@ -243,8 +243,8 @@ def _line(entry: Entry, wire: WireBody | str, media: Media | None) -> str:
 
 
 def _fields(fields: Mapping[str, Any]) -> str:
-    shown = {name: "schema" if name in SCHEMAS else _short(value) for name, value in fields.items()}
-    return " ".join(f"{name.removeprefix('generationConfig.')}={value}" for name, value in shown.items())
+    words = {name: "schema" if name in SCHEMAS else _short(value) for name, value in fields.items()}
+    return " ".join(f"{name.removeprefix('generationConfig.')}={value}" for name, value in words.items())
 
 
 def _examine_local(entry: ModelEntry, spec: MediaSpec) -> CheckedEntry:

@@ -160,10 +160,10 @@ def verify_commitment(arguments: argparse.Namespace) -> int:
         problems += sealed.broken_seals(published, reveal, specs)
         proven.append(f"the records of {arguments.specs} are the committed ones")
     if not arguments.without_drawing and not problems:
-        drawn = sealed.drawn_again(
+        sample = sealed.drawn_again(
             published, reveal, workers=arguments.workers, report=lambda line: print(line, flush=True)
         )
-        problems += _not_drawn(published, sealed.broken_seals(published, reveal, drawn), specs, drawn)
+        problems += _not_drawn(published, sealed.broken_seals(published, reveal, sample), specs, sample)
         proven.append("the revealed seed draws them")
     for problem in problems:
         print(problem)

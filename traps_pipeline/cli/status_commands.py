@@ -60,20 +60,20 @@ def status(arguments: argparse.Namespace) -> int:
     print(f"workspace {workspace.place}")
     for check, stage, partition, reason in checks:
         print(wrapped(plain(f"check {check} of {stage} {partition} does not pass: {reason}")))
-    total, behind = sum(row.fresh for row in rows), [row for row in rows if row.stale or row.missing]
-    if not behind:
+    total, unfresh = sum(row.fresh for row in rows), [row for row in rows if row.stale or row.missing]
+    if not unfresh:
         print(f"all {total:,} partitions of {len(rows)} stages are fresh")
         return OK
-    table = [(row.stage, row.fresh, len(row.stale), len(row.missing)) for row in behind]
+    table = [(row.stage, row.fresh, len(row.stale), len(row.missing)) for row in unfresh]
     lines = text_table(("stage", "fresh", "stale", "missing"), table).splitlines()
-    print("\n".join(lines[: -len(behind)]))
-    for line, row in zip(lines[-len(behind) :], behind, strict=True):
+    print("\n".join(lines[: -len(unfresh)]))
+    for line, row in zip(lines[-len(unfresh) :], unfresh, strict=True):
         print(line)
         for reason, keys in row.by_reason().items():
             more = f" and {len(keys) - MOST_KEYS} more" if len(keys) > MOST_KEYS else ""
             prefix = "" if keys == [row.stage] else f"{', '.join(keys[:MOST_KEYS])}{more}: "
             print(wrapped(plain(f"    {prefix}{reason[:MOST_REASON]}")))
-    count = sum(len(row.stale) + len(row.missing) for row in behind)
+    count = sum(len(row.stale) + len(row.missing) for row in unfresh)
     print(f"{count:,} of {total + count:,} partitions are not fresh; `{command}` makes them")
     return OK
 

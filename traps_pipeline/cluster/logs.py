@@ -49,7 +49,9 @@ def uploading(workspace: Workspace, run_id: str) -> Iterator[None]:
 
 
 def upload(bucket: Bucket, folder: Path, run_id: str, sizes: dict[Path, int]) -> None:
-    """Upload files of a run's logs that have grown. sizes: uploaded bytes, by file.
+    """Upload files of a run's logs that have grown.
+
+    sizes: uploaded bytes, by file.
 
     An unreachable store does not end the run.
     """

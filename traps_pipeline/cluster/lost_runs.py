@@ -20,7 +20,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 LOST_S = 90  # a run unknown to Ray for so long was never submitted, or Ray's head lost it
 INTERVAL_S = 15
-_BEFORE = [dg.DagsterRunStatus.STARTING, dg.DagsterRunStatus.NOT_STARTED]
+_UNSTARTED = [dg.DagsterRunStatus.STARTING, dg.DagsterRunStatus.NOT_STARTED]
 
 
 def fail_lost_runs(instance: dg.DagsterInstance, lost_s: float = LOST_S) -> list[str]:
@@ -29,12 +29,12 @@ def fail_lost_runs(instance: dg.DagsterInstance, lost_s: float = LOST_S) -> list
     Raises OSError while Ray's head does not answer.
     """
     failed = list[str]()
-    for record in instance.get_run_records(dg.RunsFilter(statuses=_BEFORE)):
+    for record in instance.get_run_records(dg.RunsFilter(statuses=_UNSTARTED)):
         run, is_old = record.dagster_run, time.time() - record.update_timestamp.timestamp() > lost_s
-        if why := _why_lost(instance, run, is_old=is_old):
+        if reason := _why_lost(instance, run, is_old=is_old):
             now = instance.get_run_by_id(run.run_id)
             if now is not None and now.status == run.status:  # it may have begun in the meantime
-                instance.report_run_failed(now, f"the run will not begin: {why}")
+                instance.report_run_failed(now, f"the run will not begin: {reason}")
                 failed.append(run.run_id)
     return failed
 

@@ -20,7 +20,7 @@ from sqlalchemy.dialects.postgresql import insert
 
 from traps_pipeline.cluster.cluster_database import Database
 
-MANY = ("clips/", "media/")  # folders whose names are only looked up one by one: there may be millions
+LARGE_FOLDERS = ("clips/", "media/")  # folders whose names are only looked up one by one: there may be millions
 FRESH_S = 0.5  # minimum age of the last look before the rows are read again
 REMOVAL_S = 15.0  # a process that held its lock for longer was suspended, and removes nothing
 _TABLES_LOCK = 7_206_551_933  # PostgreSQL's lock while a process creates the tables
@@ -88,7 +88,7 @@ class ObjectNames:
             def work(connection: sa.Connection) -> tuple[Any, Sequence[Any]]:
                 # Read the number first: later commits are seen now or, once more, the next time.
                 change = connection.execute(sa.select(_CHANGES).where(_CHANGES.c.study == self._study)).one_or_none()
-                few = sa.and_(*(~_OBJECTS.c.name.startswith(folder) for folder in MANY))
+                few = sa.and_(*(~_OBJECTS.c.name.startswith(folder) for folder in LARGE_FOLDERS))
                 return change, self._select(connection, few if is_first else _OBJECTS.c.number > self._number)
 
             change, rows = self._database.run(work)
@@ -116,7 +116,7 @@ class ObjectNames:
         """Return the current objects of these names, if they have one."""
         with self._guard:
             self.look(FRESH_S)
-            if new := sorted({name for name in names if name.startswith(MANY)} - self._asked):
+            if new := sorted({name for name in names if name.startswith(LARGE_FOLDERS)} - self._asked):
                 self._take(self._database.run(lambda c: self._select(c, _OBJECTS.c.name.in_(new))))
                 self._asked |= {*new}
             return {name: self._rows[name] for name in names if name in self._rows}
@@ -126,7 +126,7 @@ class ObjectNames:
         start, end = f"{folder}/", f"{folder}0"  # 0 comes after /
         with self._guard:
             self.look(FRESH_S)
-            if start.startswith(MANY):
+            if start.startswith(LARGE_FOLDERS):
                 condition = _OBJECTS.c.name.startswith(start, autoescape=True)
                 self._take(self._database.run(lambda c: self._select(c, condition)))
             return self._sorted[bisect_left(self._sorted, start) : bisect_left(self._sorted, end)]

@@ -76,7 +76,7 @@ class ObjectStore(Store):
         Their dependents are then rebuilt.
         """
         lost_digests = {*lost}
-        self._stored = {seen for seen in self._stored if seen[0] not in lost_digests}
+        self._stored = {entry for entry in self._stored if entry[0] not in lost_digests}
         named = self.names.naming(lost_digests)
         self._change({self.root / name: None for name in named}, self.names.removals)
 
@@ -260,7 +260,7 @@ class ObjectStore(Store):
                 f"study {self._study}; see that its variable has the address of the study's own database: nothing was "
                 "removed"
             )
-        unnamed = (digest for digest, stored in objects.items() if digest not in named and stored.at < before)
+        unnamed = (digest for digest, content in objects.items() if digest not in named and content.at < before)
         old = sorted(unnamed, key=lambda digest: objects[digest].at)
         if is_removed:
             batches = [old[first : first + BATCH] for first in range(0, len(old), BATCH)]

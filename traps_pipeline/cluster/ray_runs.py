@@ -109,8 +109,8 @@ class RayRuns(Runs):
 
     def wait_for_earlier(self) -> None:
         """Wait for runs of earlier commands."""
-        ours = dg.RunsFilter(statuses=[*_UNFINISHED], tags={STUDY_TAG: self._workspace.study.name})
-        if runs := [*self._instance.get_runs(ours)]:
+        filters = dg.RunsFilter(statuses=[*_UNFINISHED], tags={STUDY_TAG: self._workspace.study.name})
+        if runs := [*self._instance.get_runs(filters)]:
             progress.current().note(f"{len(runs)} runs of this study go on that were left; waiting for them first")
             progress.current().stage("runs that were left", sum(map(_partitions, runs)))
             self._watch([], [run.run_id for run in runs])
@@ -236,13 +236,15 @@ class RayRuns(Runs):
                 if event.is_step_failure:
                     self._failures.setdefault(run_id, []).append(event)
                     continue
-                stored = event.step_materialization_data.materialization
-                if TALLY in stored.metadata:
-                    tally = progress.Tally(**json.loads(str(stored.metadata[TALLY].value)))
-                    if TAKEN in stored.metadata:
-                        progress.current().helped(stored.asset_key.path[-1], tally)
+                materialization = event.step_materialization_data.materialization
+                if TALLY in materialization.metadata:
+                    tally = progress.Tally(**json.loads(str(materialization.metadata[TALLY].value)))
+                    if TAKEN in materialization.metadata:
+                        progress.current().helped(materialization.asset_key.path[-1], tally)
                     else:
-                        progress.current().partition(stored.asset_key.path[-1], stored.partition or "", tally)
+                        progress.current().partition(
+                            materialization.asset_key.path[-1], materialization.partition or "", tally
+                        )
 
     def _ended(self, run_id: str, run: dg.DagsterRun | None, failures: Sequence[dg.DagsterEvent]) -> RunOutcome:
         name = f"run {run_id[:8]} of the study {self._workspace.study.name}"
@@ -252,8 +254,8 @@ class RayRuns(Runs):
         if run.status != dg.DagsterRunStatus.SUCCESS and not outcome.problems:
             message = " ".join(self._last_message(run_id).split())
             # The beginning names what failed, and at its end a log has the cause.
-            why = message if len(message) <= 2 * ENDS else f"{message[:ENDS]} ... {message[-ENDS:]}"
-            ended = f"{name} ended as {run.status.value.lower()} ({why}); see its log in `traps ui`"
+            reason = message if len(message) <= 2 * ENDS else f"{message[:ENDS]} ... {message[-ENDS:]}"
+            ended = f"{name} ended as {run.status.value.lower()} ({reason}); see its log in `traps ui`"
             outcome.problems.append(message if REFUSED_TAG in run.tags else ended)
         return outcome
 

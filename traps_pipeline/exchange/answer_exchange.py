@@ -50,7 +50,7 @@ _ERROR_TEXT = re.compile(
     re.IGNORECASE,
 )
 MOST_LOOKED_AT = 200  # characters of a text
-SHOWN = 5  # number of wrong lines that an error names
+MOST_LINES = 5  # number of wrong lines that an error names
 
 
 class Answer(BaseModel):
@@ -138,7 +138,7 @@ def export_requests(workspace: Workspace, experiment: Experiment, out: Path) -> 
     prepare_media(workspace, _cells(workspace, experiment))
     count = 0
     with replacing(out / REQUESTS) as part, part.open("w", encoding="utf-8") as stream:
-        for request in _missing(workspace, experiment):
+        for request in _missing_requests(workspace, experiment):
             stream.write(json.dumps(_line(request, out), ensure_ascii=False) + "\n")
             count += 1
     return count
@@ -155,7 +155,7 @@ def _cells(workspace: Workspace, experiment: Experiment) -> list[Cell]:
     return cells
 
 
-def _missing(workspace: Workspace, experiment: Experiment) -> Iterator[Request]:
+def _missing_requests(workspace: Workspace, experiment: Experiment) -> Iterator[Request]:
     known: dict[Evaluation, set[str]] = {}
     for cell in _cells(workspace, experiment):
         evaluation = cell.evaluation
@@ -233,11 +233,11 @@ def import_answers(
         raise TrapsError(_said_of_errors(path, {key: answers[key] for key in like_errors}, requested))
     for key in like_errors if errors == "drop" else ():
         del answers[key]
-    stored = [
+    outcomes = [
         _Stored(requested[key], answer.as_outcome(get_model(requested[key].participant)), answer.latency_s)
         for key, answer in answers.items()
     ]
-    new = asyncio.run(_store(workspace, workspace.answers, stored))
+    new = asyncio.run(_store(workspace, workspace.answers, outcomes))
     failed = f"{n_failed} samples of the log" if n_failed else ""
     return ImportResult(new, len(answers) - new, failed, dropped=len(like_errors) if errors == "drop" else 0)
 
@@ -245,7 +245,7 @@ def import_answers(
 def _said_of_errors(path: Path, answers: Mapping[str, Answer], requested: Mapping[str, Request]) -> str:
     """Return a message about texts that look like errors, with number and examples."""
     examples = [f"{requested[key].about['item_id']}: {plain(answer.text)[:60]!r}" for key, answer in answers.items()][
-        :SHOWN
+        :MOST_LINES
     ]
     return (
         f"{path}: {len(answers)} of its texts look like error messages and no answers ({'; '.join(examples)}): say "
@@ -262,7 +262,7 @@ def export_request_batches(
     """
     prepare_media(workspace, _cells(workspace, experiment))
     missing: dict[str, list[Request]] = {}
-    for request in _missing(workspace, experiment):
+    for request in _missing_requests(workspace, experiment):
         missing.setdefault(request.participant, []).append(request)
     return export_batches({name: (get_model(name), requests) for name, requests in missing.items()}, out, media_at)
 
@@ -314,13 +314,13 @@ def _import_batch(
     returned = read_batch(path, requested)
     if not returned:
         raise TrapsError(f"{path}: holds no answers; nothing was imported")
-    stored = [
+    outcomes = [
         _Stored(request, _at_batch_price(entries[request.participant], outcome), 0.0)
         for request, outcome in outcomes_of(entries, requested, returned)
     ]
-    new = asyncio.run(_store(workspace, ledger, stored))
-    failed = sum(answer.outcome.kind in ("error", "malformed") for answer in stored)
-    return ImportResult(new, len(stored) - new - failed, failures([answer.outcome for answer in stored]))
+    new = asyncio.run(_store(workspace, ledger, outcomes))
+    failed = sum(answer.outcome.kind in ("error", "malformed") for answer in outcomes)
+    return ImportResult(new, len(outcomes) - new - failed, failures([answer.outcome for answer in outcomes]))
 
 
 def checked_answers(path: Path, requested: Mapping[str, Request]) -> dict[str, Answer]:
@@ -341,8 +341,8 @@ def checked_answers(path: Path, requested: Mapping[str, Request]) -> dict[str, A
         elif answers.setdefault(answer.key, answer) != answer:
             wrong.append(f"{path}:{number}: gives another answer to the key of an earlier line")
     if wrong:
-        more = f"\n... and {len(wrong) - SHOWN} more" if len(wrong) > SHOWN else ""
-        raise TrapsError("\n".join(wrong[:SHOWN]) + more + "\nnothing was imported")
+        more = f"\n... and {len(wrong) - MOST_LINES} more" if len(wrong) > MOST_LINES else ""
+        raise TrapsError("\n".join(wrong[:MOST_LINES]) + more + "\nnothing was imported")
     return answers
 
 
@@ -381,8 +381,8 @@ def _by_item(
         except TypeError as error:
             wrong.append(f"{logged.where}: {plain(error)[:200]}")
     if wrong:
-        more = f"\n... and {len(wrong) - SHOWN} more" if len(wrong) > SHOWN else ""
-        raise TrapsError("\n".join(map(plain, wrong[:SHOWN])) + more + "\nnothing was imported")
+        more = f"\n... and {len(wrong) - MOST_LINES} more" if len(wrong) > MOST_LINES else ""
+        raise TrapsError("\n".join(map(plain, wrong[:MOST_LINES])) + more + "\nnothing was imported")
     return answers, len(failed - answers.keys())
 
 

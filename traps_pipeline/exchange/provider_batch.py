@@ -37,7 +37,7 @@ LIMITS: Mapping[Api, tuple[int, int]] = {
     "gemini": (50_000, 1900 * 2**20),
     "anthropic": (100_000, 240 * 2**20),
 }
-SHOWN = 5
+MOST_LINES = 5
 FAILED = 400  # lowest status of a failure
 
 
@@ -191,8 +191,8 @@ def read_batch(path: Path, wanted: Mapping[str, Request]) -> dict[str, BatchResu
         elif answers.setdefault(key, returned) != returned:
             wrong.append(f"{path}:{number}: gives another answer to the key of an earlier line")
     if wrong:
-        more = f"\n... and {len(wrong) - SHOWN} more" if len(wrong) > SHOWN else ""
-        raise TrapsError("\n".join(wrong[:SHOWN]) + more + "\nnothing was imported")
+        more = f"\n... and {len(wrong) - MOST_LINES} more" if len(wrong) > MOST_LINES else ""
+        raise TrapsError("\n".join(wrong[:MOST_LINES]) + more + "\nnothing was imported")
     return answers
 
 

@@ -53,8 +53,8 @@ def _groups(ratings_of_study: Ratings) -> Iterator[tuple[dict[str, Any], Ratings
     """
     for dataset in DATASETS:
         for task in TASKS:
-            chosen = (ratings_of_study.answers["dataset"] == dataset) & (ratings_of_study.answers["task"] == task)
-            group = ratings_of_study.select(chosen.to_numpy(bool))
+            in_group = (ratings_of_study.answers["dataset"] == dataset) & (ratings_of_study.answers["task"] == task)
+            group = ratings_of_study.select(in_group.to_numpy(bool))
             if len(group.values):
                 versions = {
                     name: _joined(group.answers[name].unique(), separator) for name, separator in _JOINS.items()

@@ -88,10 +88,10 @@ def sample_failures(workspace: Workspace, judge: JudgeEntry, model: str) -> dict
     """
     protocol = load_protocol()
     cells = [cell for cell in protocol.cells(model) if workspace.tables.state(ITEMS, {"dataset": cell.dataset})]
-    lacking = [cell.key for cell in cells if workspace.tables.state(VERDICTS, cell.partition) is None]
-    if lacking:
-        if len(lacking) < len(cells):
-            progress.current().note(f"confabulation: {model} is sampled only after {', '.join(lacking)} is judged")
+    missing_keys = [cell.key for cell in cells if workspace.tables.state(VERDICTS, cell.partition) is None]
+    if missing_keys:
+        if len(missing_keys) < len(cells):
+            progress.current().note(f"confabulation: {model} is sampled only after {', '.join(missing_keys)} is judged")
         return {}
     failures = {(model, row["item_id"]): (cell, row) for cell in cells for row in _void_failures(workspace, cell)}
     sample: dict[Cell, list[Failure]] = {}

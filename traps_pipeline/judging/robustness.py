@@ -188,9 +188,10 @@ def summary(rows: pd.DataFrame) -> str:
     Results by judge come first, then every vote that an attack changed.
     """
     counts = []
-    for judge, of_judge in rows.groupby("judge", sort=False):
-        counts.append([judge, len(of_judge), *(of_judge["result"].tolist().count(name) for name in RESULTS)])
+    for judge, votes in rows.groupby("judge", sort=False):
+        counts.append([judge, len(votes), *(votes["result"].tolist().count(name) for name in RESULTS)])
     lines = [text_table(["judge", "votes", *RESULTS], counts)]
     moved = rows.loc[rows["result"].isin(["flipped", "broken"]) & (rows["judge"] != PANEL)]
-    lines += [f"{r['judge']}: {r['attack']} ({r['kind']}) {r['result']} {r['task']}" for r in moved.to_dict("records")]
+    for (attack, kind, result, task), votes in moved.groupby(["attack", "kind", "result", "task"], sort=False):
+        lines.append(f"{', '.join(votes['judge'])}: {attack} ({kind}) {result} {task}")
     return "\n".join(lines)

@@ -27,12 +27,12 @@ _GUESS = re.compile(
 )
 # Sentences that decline, in the form of `_words`.
 _TO, _IT = "(?:know|tell|say|determine|answer)", "(?:it|this|that|which 1|answer|outcome|result|(?:this )?question)"
-_FROM = "(?: (?:from|based on|in) (?:this )?(?:video|clip|footage|frames))?"
+_FROM_VIDEO = "(?: (?:from|based on|in) (?:this )?(?:video|clip|footage|frames))?"
 _DECLINES = re.compile(
     f"(?:sorry )?(?:(?:i do not|i could not|i am not able to|(?:i )?cannot|(?:i am )?unable to) {_TO}(?: {_IT})?"
     f"|it is (?:impossible|not possible) to {_TO}(?: {_IT})?"
     f"|(?:{_IT} )?cannot be (?:determined|known|answered)"
-    f"|(?:there is )?(?:not enough|insufficient) (?:information|evidence)(?: to {_TO}(?: {_IT})?)?){_FROM}"
+    f"|(?:there is )?(?:not enough|insufficient) (?:information|evidence)(?: to {_TO}(?: {_IT})?)?){_FROM_VIDEO}"
     f"|(?:{_IT} is )?(?:unanswerable|unknown)"
     "|i do not know this cannot be determined from video"  # the pocket model
 )
@@ -77,8 +77,8 @@ class RuleJudge:
         if response is None:
             return Outcome("error", error="no response between markers")
         before = request.user[: response.start()]
-        asked, truth = _QUESTION.search(before), _TRUTH.search(before)
-        statement = read_statement(response.group(2), asked.group(1) if asked else "")
+        question, truth = _QUESTION.search(before), _TRUTH.search(before)
+        statement = read_statement(response.group(2), question.group(1) if question else "")
         text = UNREAD if statement is None else json.dumps(_vote(statement, truth.group(1) if truth else None))
         return Outcome("answer", text, finish_reason="stop", served_model=request.participant, cost_usd=0.0)
 

@@ -60,11 +60,11 @@ def decide(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) ->
     on_control = (rows["side"] == "control").to_numpy()
     abstention, has_abstention = cast.on(rows, ABSTENTION)
     correctness, has_correctness = cast.on(rows, CORRECTNESS)
-    lacking = judged & ~(has_abstention & (has_correctness | ~on_control))
+    is_missing = judged & ~(has_abstention & (has_correctness | ~on_control))
     if len(cast.judges) not in PANEL_SIZES:
-        lacking = judged
+        is_missing = judged
     sizes = " or ".join(map(str, PANEL_SIZES))
-    _refuse(rows, lacking, f"item {{}} does not have the votes of {sizes} judges per task", "votes")
+    _refuse(rows, is_missing, f"item {{}} does not have the votes of {sizes} judges per task", "votes")
     abstained, correct = majority(abstention), majority(correctness)
     undecided = (abstained == INVALID) | (on_control & (correct == INVALID))
     rows["abstained"], rows["correct"] = decided(abstained), decided(correct)

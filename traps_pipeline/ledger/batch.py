@@ -114,17 +114,17 @@ class Batch:
         for (kind, participant), its in self.totals.items():
             self._add_totals(kind, participant, its)
         for participant, usd in self.more_usd.items():
-            mine = {"of_study": self.study, "of_participant": participant}
-            if not self.connection.execute(_ADD_SPENT, {**mine, "more_usd": usd}).rowcount:
+            key = {"of_study": self.study, "of_participant": participant}
+            if not self.connection.execute(_ADD_SPENT, {**key, "more_usd": usd}).rowcount:
                 self.connection.execute(sa.insert(SPENT).values(study=self.study, participant=participant, usd=usd))
 
     def _add_totals(self, kind: str, participant: str, its: Totals) -> None:
         values: dict[str, float] = {"dollars": its.dollars, "failed": its.failed, "unknown": its.unknown}
         for column in AVERAGED:
             values[f"{column}_sum"], values[f"{column}_n"] = its.means.get(column, (0.0, 0))
-        mine = {"of_study": self.study, "of_kind": kind, "of_participant": participant}
+        key = {"of_study": self.study, "of_kind": kind, "of_participant": participant}
         more = {f"more_{name}": value for name, value in values.items()}
-        if not self.connection.execute(_ADD_TOTALS, {**mine, **more, "its_dearest": its.dearest}).rowcount:
+        if not self.connection.execute(_ADD_TOTALS, {**key, **more, "its_dearest": its.dearest}).rowcount:
             new = {"study": self.study, "kind": kind, "participant": participant, "dearest": its.dearest}
             self.connection.execute(sa.insert(TOTALS).values(**new, **values))
 
@@ -158,9 +158,9 @@ def claim(batch: Batch, kind: str, name: str) -> int:
 
     Return the evaluation's number.
     """
-    mine = {"study": batch.study, "kind": kind, "name": name}
-    here = sa.and_(*(EVALUATIONS.c[column] == value for column, value in mine.items()))
+    own_key = {"study": batch.study, "kind": kind, "name": name}
+    here = sa.and_(*(EVALUATIONS.c[column] == value for column, value in own_key.items()))
     values: Mapping[str, Any] = {"writer": batch.session, "holder": holder()}
     if not batch.connection.execute(sa.update(EVALUATIONS).where(here).values(**values)).rowcount:
-        batch.connection.execute(sa.insert(EVALUATIONS).values(**mine, **values))
+        batch.connection.execute(sa.insert(EVALUATIONS).values(**own_key, **values))
     return batch.connection.execute(sa.select(EVALUATIONS.c.id).where(here)).scalar_one()

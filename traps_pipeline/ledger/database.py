@@ -281,8 +281,8 @@ class Database(ABC):
 
         def work(connection: sa.Connection) -> list[Any]:
             connection.execute(sa.select(STUDIES.c.id).where(STUDIES.c.id == self.study).with_for_update())
-            mine = (SESSIONS.c.id == self.session) & (SESSIONS.c.batch == number - 1)
-            if not connection.execute(sa.update(SESSIONS).where(mine).values(batch=number)).rowcount and results:
+            is_own = (SESSIONS.c.id == self.session) & (SESSIONS.c.batch == number - 1)
+            if not connection.execute(sa.update(SESSIONS).where(is_own).values(batch=number)).rowcount and results:
                 return results  # committed before the connection broke
             results.clear()
             batch = Batch(connection, self.study, self.session)

@@ -122,7 +122,9 @@ class Ledger:
         Raises TrapsError.
         """
         has_rows = sa.exists().where(ROWS.c.evaluation == EVALUATIONS.c.id)
-        query = sa.select(EVALUATIONS.c.name).where(self._mine(EVALUATIONS), has_rows).order_by(EVALUATIONS.c.name)
+        query = (
+            sa.select(EVALUATIONS.c.name).where(self._is_own_kind(EVALUATIONS), has_rows).order_by(EVALUATIONS.c.name)
+        )
         return [row.name for row in self._select(query)]
 
     def totals(self) -> dict[str, Totals]:
@@ -133,13 +135,13 @@ class Ledger:
         Raises TrapsError.
         """
         totals = dict[str, Totals]()
-        for row in self._select(sa.select(TOTALS).where(self._mine(TOTALS))):
+        for row in self._select(sa.select(TOTALS).where(self._is_own_kind(TOTALS))):
             sums = {name: (getattr(row, f"{name}_sum"), getattr(row, f"{name}_n")) for name in AVERAGED}
             means = {name: its for name, its in sums.items() if its[1]}
             totals[row.participant] = Totals(row.dollars, row.failed, row.dearest, row.unknown, means)
         return totals
 
-    def _mine(self, table: sa.Table) -> sa.ColumnElement[bool]:
+    def _is_own_kind(self, table: sa.Table) -> sa.ColumnElement[bool]:
         study = sa.select(STUDIES.c.id).where(STUDIES.c.name == self.database.study_name).scalar_subquery()
         return (table.c.study == study) & (table.c.kind == self.kind)
 
@@ -158,7 +160,7 @@ class Ledger:
                 raise sentence(error, self.database.place) from error
 
     def _rows(self, evaluation: str, wanted: Collection[str] | None = None) -> Iterator[sa.Row[Any]]:
-        ids = sa.select(EVALUATIONS.c.id).where(self._mine(EVALUATIONS), EVALUATIONS.c.name == evaluation)
+        ids = sa.select(EVALUATIONS.c.id).where(self._is_own_kind(EVALUATIONS), EVALUATIONS.c.name == evaluation)
         query = sa.select(ROWS).where(ROWS.c.evaluation == ids.scalar_subquery()).order_by(ROWS.c.id)
         if wanted is None:
             yield from self._select(query)
@@ -171,14 +173,14 @@ class Ledger:
         self, evaluation: str, keys: Collection[str] | None
     ) -> Iterator[tuple[str, dict[str, Any] | None, str | None]]:
         """Yield each row's place, the row, and a note about it."""
-        for stored in self._rows(evaluation, keys):
-            if not _is_whole(stored):
-                yield self._place(stored), None, f"{NOT_WHOLE}: it is not believed; its answer is asked again"
+        for entry in self._rows(evaluation, keys):
+            if not _is_whole(entry):
+                yield self._place(entry), None, f"{NOT_WHOLE}: it is not believed; its answer is asked again"
                 continue
-            row = json.loads(stored.content)
+            row = json.loads(entry.content)
             healed = heal(row)
             yield (
-                self._place(stored),
+                self._place(entry),
                 row,
                 f"{', '.join(healed)}: no possible value, counted as unknown" if healed else None,
             )
@@ -216,11 +218,11 @@ class Ledger:
         async with AsyncExitStack() as stack:
             writers = {name: await stack.enter_async_context(self.writing(name, waiting)) for name in sorted(rows)}
             new = {
-                name: [stored for stored in rows[name] if stored[0]["key"] not in known]
+                name: [entry for entry in rows[name] if entry[0]["key"] not in known]
                 for name in writers
                 if (known := self.read(name, {row["key"] for row, _ in rows[name]}).settled) is not None
             }
-            contents = [(writers[name], _Content.of(*stored)) for name in new for stored in new[name]]
+            contents = [(writers[name], _Content.of(*entry)) for name in new for entry in new[name]]
 
             def change(batch: Batch) -> None:
                 for writer in writers.values():  # before the first row: all of them or none
@@ -230,7 +232,7 @@ class Ledger:
 
             await asyncio.wrap_future(self.database.submit(change))
             await asyncio.to_thread(self.database.sync)
-        return sum(settles(row) for mine in new.values() for row, _ in mine)
+        return sum(settles(row) for entries in new.values() for row, _ in entries)
 
     async def _lock(self, evaluation: str, waiting: Waiting, give_up: GiveUp) -> Lock:
         is_told = False
@@ -247,7 +249,7 @@ class Ledger:
         return lock
 
     def _holder(self, evaluation: str) -> str:
-        query = sa.select(EVALUATIONS.c.holder).where(self._mine(EVALUATIONS), EVALUATIONS.c.name == evaluation)
+        query = sa.select(EVALUATIONS.c.holder).where(self._is_own_kind(EVALUATIONS), EVALUATIONS.c.name == evaluation)
         return next((row.holder for row in self._select(query) if row.holder), "another process")
 
 
@@ -300,8 +302,8 @@ class Writer:
         nothing was stored, and ValueError for a row that JSON cannot hold.
         """
         content = _Content.of(row, beside)
-        stored = self._database.submit(lambda batch: self.add(batch, content, paid_by))
-        await asyncio.shield(asyncio.wrap_future(stored))  # store what was paid for even if the caller is cancelled
+        future = self._database.submit(lambda batch: self.add(batch, content, paid_by))
+        await asyncio.shield(asyncio.wrap_future(future))  # store what was paid for even if the caller is cancelled
         self._is_synced = False
 
     async def write_all(self, rows: Iterable[Mapping[str, Any]]) -> None:

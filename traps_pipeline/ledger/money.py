@@ -67,9 +67,9 @@ class Money:
 
         def change(batch: Batch) -> str | CapExhausted:
             for slot in slots:
-                committed = sum(sum(_of(its, slot)) for its in (batch.spent, batch.reserved))
+                committed = sum(sum(_slot_dollars(its, slot)) for its in (batch.spent, batch.reserved))
                 if caps[slot] - committed < usd - CENT:
-                    return CapExhausted(slot, committed, _others(batch))
+                    return CapExhausted(slot, committed, _other_sessions(batch))
             batch.reserve(reservation, participant, usd)
             return reservation
 
@@ -149,11 +149,12 @@ class Money:
             ]
         ).result()
 
-    def _dead(self, batch: Batch) -> set[str]:
-        return {session for session in _others(batch) if self._database.is_dead(session)}
+    def _dead_sessions(self, batch: Batch) -> set[str]:
+        return {session for session in _other_sessions(batch) if self._database.is_dead(session)}
 
     def _releasable(self, batch: Batch) -> dict[str, Releasable]:
-        dead, in_flight, failed = self._dead(batch), defaultdict[str, float](float), defaultdict[str, float](float)
+        dead = self._dead_sessions(batch)
+        in_flight, failed = defaultdict[str, float](float), defaultdict[str, float](float)
         query = sa.select(RESERVATIONS).where(RESERVATIONS.c.study == batch.study, RESERVATIONS.c.session.in_(dead))
         for row in batch.connection.execute(query):
             in_flight[row.participant] += row.usd
@@ -169,7 +170,7 @@ class Money:
         query = sa.select(RESERVATIONS).where(
             RESERVATIONS.c.study == batch.study,
             RESERVATIONS.c.participant == participant,
-            RESERVATIONS.c.session.in_(self._dead(batch)),
+            RESERVATIONS.c.session.in_(self._dead_sessions(batch)),
         )
         for row in batch.connection.execute(query.order_by(RESERVATIONS.c.id)).all():
             rest = max(0.0, row.usd - usd)
@@ -177,10 +178,10 @@ class Money:
             batch.settle(row.id, participant, row.usd, rest)
 
 
-def _of(dollars: Mapping[str, float], slot: str | None) -> list[float]:
+def _slot_dollars(dollars: Mapping[str, float], slot: str | None) -> list[float]:
     return [*dollars.values()] if slot is None else [dollars.get(slot, 0.0)]
 
 
-def _others(batch: Batch) -> frozenset[str]:
+def _other_sessions(batch: Batch) -> frozenset[str]:
     query = sa.select(RESERVATIONS.c.session).where(RESERVATIONS.c.study == batch.study).distinct()
     return frozenset({*batch.connection.execute(query).scalars()} - {batch.session})

@@ -291,11 +291,11 @@ class PostgresDatabase(Database):
         """Raise TrapsError if this host's clock and the database's are too far apart."""
         before = time.time()
         server_s = self.now_s(connection)
-        apart = max(server_s - time.time(), before - server_s)
-        if apart > SKEW_S:
-            behind = "behind" if server_s > before else "ahead of"
+        gap_s = max(server_s - time.time(), before - server_s)
+        if gap_s > SKEW_S:
+            order = "behind" if server_s > before else "ahead of"
             raise TrapsError(
-                f"the clock of the host {socket.gethostname()} is {apart:.0f} s {behind} that of the database at "
+                f"the clock of the host {socket.gethostname()} is {gap_s:.0f} s {order} that of the database at "
                 f"{self.place}, and hosts of the study {self.study_name} may be {SKEW_S} s apart; set the clocks of "
                 "both by NTP, then run the same command again"
             )

@@ -80,15 +80,15 @@ def copy_ledger(source: Database, target: Database, settle: Callable[[], None] =
 
 
 def _copy(source: Database, batch: Batch, place: str, mark: str) -> int:
-    mine = sa.select(EVALUATIONS.c.id).where(EVALUATIONS.c.study == batch.study)
-    unmarked = mine.where(EVALUATIONS.c.writer.is_distinct_from(mark))
+    evaluations = sa.select(EVALUATIONS.c.id).where(EVALUATIONS.c.study == batch.study)
+    unmarked = evaluations.where(EVALUATIONS.c.writer.is_distinct_from(mark))
     if batch.connection.execute(sa.select(ROWS.c.id).where(ROWS.c.evaluation.in_(unmarked)).limit(1)).first():
         raise TrapsError(
             f"{place}: holds rows of this study already; import into a study that has none, or bring answers into it "
             "one by one with `traps study import-answers`"
         )
     # Remove leftovers of a killed copy, and evaluations without a row.
-    batch.connection.execute(sa.delete(ROWS).where(ROWS.c.evaluation.in_(mine)))
+    batch.connection.execute(sa.delete(ROWS).where(ROWS.c.evaluation.in_(evaluations)))
     for table in (TOTALS, SPENT, RELEASES, RESERVATIONS):
         batch.connection.execute(sa.delete(table).where(table.c.study == batch.study))
     batch.connection.execute(sa.delete(EVALUATIONS).where(EVALUATIONS.c.study == batch.study))

@@ -48,7 +48,7 @@ def is_count(value: Any) -> bool:
 
 
 # A provider's fields, with a test for possible values; anything else is unknown.
-_SAID: dict[str, Callable[[Any], bool]] = {
+_CHECKS: dict[str, Callable[[Any], bool]] = {
     **dict.fromkeys(("text", "finish_reason", "error", "served_model", "client", "first_token"), _is_text),
     **dict.fromkeys(("prompt_tokens", "completion_tokens", "reasoning_tokens"), is_count),
     "cost_usd": is_cost,
@@ -63,7 +63,7 @@ def heal(row: dict[str, Any]) -> list[str]:
     A text loses the characters that cannot be stored.
     """
     healed = []
-    for name, fits in _SAID.items():
+    for name, fits in _CHECKS.items():
         value = row.get(name)
         if value is not None and not fits(value):
             row[name] = value.encode("utf-8", "replace").decode() if isinstance(value, str) and name == "text" else None

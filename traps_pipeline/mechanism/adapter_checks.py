@@ -108,8 +108,8 @@ def _library_states(subject: Subject, prompt: Prompt) -> list[Tensor]:
 def _states(subject: Subject) -> str:
     prompt = subject.prompts[0]
     own, hooked = _library_states(subject, prompt), subject.model.forward_states(prompt)
-    ours = [*hooked.raw[:-1], hooked.normed]
-    wrong = [layer for layer, (a, b) in enumerate(zip(ours, own, strict=True)) if (a != b[-1].numpy()).any()]
+    hooked_states = [*hooked.raw[:-1], hooked.normed]
+    wrong = [layer for layer, (a, b) in enumerate(zip(hooked_states, own, strict=True)) if (a != b[-1].numpy()).any()]
     _require(not wrong, f"hooked states differ from the library's own at layers {wrong}")
     return f"{len(own)} states, bit for bit"
 
@@ -160,10 +160,10 @@ def _parts(subject: Subject) -> str:
 
 def _pooled(subject: Subject) -> str:
     prompt = subject.prompts[1]
-    chosen = spans(subject.model, prompt, SYSTEM, QUESTIONS[1])["question"]
-    ours = subject.model.forward_states(prompt, "question", chosen=chosen).raw[subject.layer]
-    own = _library_states(subject, prompt)[subject.layer][chosen].mean(dim=0).numpy()
-    _require(np.abs(ours - own).max() <= CLOSE * np.abs(own).max(), "the mean over the question is another one")
+    positions = spans(subject.model, prompt, SYSTEM, QUESTIONS[1])["question"]
+    pooled = subject.model.forward_states(prompt, "question", chosen=positions).raw[subject.layer]
+    own = _library_states(subject, prompt)[subject.layer][positions].mean(dim=0).numpy()
+    _require(np.abs(pooled - own).max() <= CLOSE * np.abs(own).max(), "the mean over the question is another one")
     return "equal"
 
 
@@ -187,12 +187,12 @@ def _patching(subject: Subject) -> str:
     gap = source.margin - target.margin
     far = np.abs(patched_changes(model, target, source, everywhere, tokens) / gap - 1)
     _require(bool(gap and far.max() <= CLOSE), f"patching all positions misses the source's outcome by {far.max():.1e}")
-    beside = {
+    side_paths = {
         "deepstack features": target.visual is not None,
         "shared keys and values": bool(target.shared),
         "per-layer inputs": bool(target.per_layer),
     }
-    also = ", ".join(name for name, differs in beside.items() if differs)
+    also = ", ".join(name for name, differs in side_paths.items() if differs)
     return "exactly 0, and 1" + (f" with {also}" if also else "")
 
 

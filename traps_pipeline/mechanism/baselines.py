@@ -116,7 +116,7 @@ def raw_features(
     questions = [question for rows in items.values() for question in rows["question"]]
     words = CountVectorizer(ngram_range=(1, 2), binary=True, token_pattern=r"(?u)\b\w+\b").fit(questions)
     clips = {clip for rows in items.values() for name in ("clip", "times_clip") for clip in rows[name].dropna()}
-    clip_frames = {clip: _seen(resolve(clip), spec) for clip in sorted(clips)}
+    clip_frames = {clip: _thumbnails(resolve(clip), spec) for clip in sorted(clips)}
     most = max(len(frames) for frames, _, _ in clip_frames.values())
 
     def pixels(clip: str) -> np.ndarray:
@@ -130,17 +130,20 @@ def raw_features(
 
     features: dict[str, dict[str, np.ndarray]] = {name: {} for name in RAW}
     for dataset, rows in items.items():
-        shown = records(rows)
+        shown_items = records(rows)
         features["question words"][dataset] = words.transform(rows["question"]).toarray().astype(float)
-        features["first frame"][dataset] = np.stack([clip_frames[row["clip"]][0][0].ravel() for row in shown])
-        features["all frames"][dataset] = np.stack([pixels(row["clip"]) for row in shown])
-        features["length"][dataset] = np.array([[clip_frames[row["clip"]][2]] for row in shown])
-        features["time stamps"][dataset] = np.array([stamps(row) for row in shown])
+        features["first frame"][dataset] = np.stack([clip_frames[row["clip"]][0][0].ravel() for row in shown_items])
+        features["all frames"][dataset] = np.stack([pixels(row["clip"]) for row in shown_items])
+        features["length"][dataset] = np.array([[clip_frames[row["clip"]][2]] for row in shown_items])
+        features["time stamps"][dataset] = np.array([stamps(row) for row in shown_items])
     return dict(features)
 
 
-def _seen(clip: Path, spec: MediaSpec) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return thumbnails (N, h, w, 3) in [0, 1], times (N,), and the clip's last time."""
+def _thumbnails(clip: Path, spec: MediaSpec) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return thumbnails and times of the shown frames, and the clip's last time.
+
+    Thumbnails (N, h, w, 3) in [0, 1], times (N,); the last time is that of the clip's last frame.
+    """
     import cv2
 
     try:

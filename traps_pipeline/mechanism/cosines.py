@@ -36,10 +36,12 @@ class PairDifferences:
     scenario: np.ndarray
 
 
-def apart(one: PairDifferences, other: PairDifferences, weights: np.ndarray) -> np.ndarray:
-    """Return unbiased products of two mean differences, (draws,).
+def cross_product(one: PairDifferences, other: PairDifferences, weights: np.ndarray) -> np.ndarray:
+    """Return the mean product of pairs of different scenarios, (draws,).
 
-    They are means over pairs of different scenarios. weights: (draws, scenarios), the count of each scenario.
+    It is an unbiased product of two mean differences.
+
+    weights: (draws, scenarios), the count of each scenario.
     """
     products = one.values @ other.values.T
     differ = (one.scenario[:, None] != other.scenario).astype(float)
@@ -55,9 +57,9 @@ def disattenuated(one: PairDifferences, other: PairDifferences, weights: np.ndar
 
     A cosine may exceed 1, and is NaN if a mean difference is not longer than its noise.
     """
-    lengths = apart(one, one, weights) * apart(other, other, weights)
-    known = (lengths > 0) & (apart(one, one, weights) > 0)
-    return np.where(known, apart(one, other, weights) / np.sqrt(np.where(known, lengths, 1)), np.nan)
+    lengths = cross_product(one, one, weights) * cross_product(other, other, weights)
+    known = (lengths > 0) & (cross_product(one, one, weights) > 0)
+    return np.where(known, cross_product(one, other, weights) / np.sqrt(np.where(known, lengths, 1)), np.nan)
 
 
 def split_half(of: PairDifferences, seed: Sequence[int]) -> float:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 CELL = ["model", "directions", "regime"]
-BESIDE = ("n", "gaps", "broken")  # answers, dose in class gaps, share of degenerate answers
+EXTRA_COLUMNS = ("n", "gaps", "broken")  # answers, dose in class gaps, share of degenerate answers
 REGIME_COLUMNS = (
     *("model", "path_set", "family", "directions", "regime", "kind", "n_paths", "alpha"),
     *("control_0", "control_top", "void_0", "void_top"),
@@ -42,7 +42,7 @@ def paths(effects: pd.DataFrame) -> pd.DataFrame:
     keys = [*CELL, "source", "target", "kind", "layer", "alpha"]
     rows, columns = on_both_sides(effects), keys.copy()
     parts: list[pd.DataFrame] = []
-    for value, suffix in [("abstention", ""), *((name, f"_{name}") for name in ("low", "high", *BESIDE))]:
+    for value, suffix in [("abstention", ""), *((name, f"_{name}") for name in ("low", "high", *EXTRA_COLUMNS))]:
         if value in rows:
             means = rows.groupby([*keys, "side"], observed=True, dropna=False)[value].mean()
             wide = cast("pd.Series", means).unstack("side")

@@ -89,12 +89,12 @@ def curve_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) ->
     ]
 
 
-Made = Mapping[str, tuple[Decisions, int]]  # target -> decisions and layer
+DecisionsByTarget = Mapping[str, tuple[Decisions, int]]  # target -> decisions and layer
 
 
 def _each(
     workspace: Workspace, entry: ModelEntry, states: StoredStates, sources: Sequence[str]
-) -> Iterator[tuple[str, Mapping[str, Outcomes], str, str, Made]]:
+) -> Iterator[tuple[str, Mapping[str, Outcomes], str, str, DecisionsByTarget]]:
     """Yield regime, its outcomes, features, source and decisions of every gate."""
     outcomes = {
         regime: known for regime in PROMPTING if (known := outcomes_of(workspace, entry.id, regime, states)) is not None
@@ -213,7 +213,7 @@ def outcomes_of(workspace: Workspace, model: str, regime: str, states: StoredSta
 def _rows(
     states: StoredStates,
     about: tuple[str, str, str],
-    decided: Made,
+    decided: DecisionsByTarget,
     outcomes: Mapping[str, Outcomes],
     resamples: int,
     seed: int,
@@ -296,7 +296,7 @@ def _curves(
     states: StoredStates,
     features: str,
     regime: str,
-    decided: Made,
+    decided: DecisionsByTarget,
     outcomes: Mapping[str, Outcomes],
 ) -> list[RiskCoverageRow]:
     """Return risk against coverage over the four datasets together.

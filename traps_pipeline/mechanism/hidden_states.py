@@ -68,7 +68,7 @@ class Item:
     other: Callable[[], Prompt] | None = None
 
 
-_Made = tuple[Item, str, "States"]  # an item, its key, its states
+_ItemStates = tuple[Item, str, "States"]  # an item, its key, its states
 _Place = tuple[str, int, str]  # shard, row and device of an item's states
 
 
@@ -192,7 +192,7 @@ def _make(
     known: dict[str, _Place],
 ) -> int:
     """Run one pass per item; write a shard, even after an error; return items done."""
-    shard: list[_Made] = []
+    shard: list[_ItemStates] = []
     try:
         for finished, ((item, key), prompt) in enumerate(_prepared(missing), start=1):
             shard.append((item, key, item_states(model, item, prompt, pooling)))
@@ -205,12 +205,12 @@ def _make(
 
 def item_states(model: LocalModel, item: Item, prompt: Prompt, pooling: Pooling) -> States:
     """Return the states of an item, pooled over the tokens that the pooling names."""
-    chosen = _chosen(model, prompt, item, pooling)
+    positions = _pooled_tokens(model, prompt, item, pooling)
     with model.caching_clips():
-        return model.forward_states(prompt, pooling, chosen=chosen)
+        return model.forward_states(prompt, pooling, chosen=positions)
 
 
-def _chosen(model: LocalModel, prompt: Prompt, item: Item, pooling: Pooling) -> np.ndarray | None:
+def _pooled_tokens(model: LocalModel, prompt: Prompt, item: Item, pooling: Pooling) -> np.ndarray | None:
     """Return the tokens over which states are pooled, or None if there is no mask."""
     if pooling not in OF_PARTS:
         return None
@@ -251,7 +251,9 @@ def _prepared(missing: Sequence[tuple[Item, str]]) -> Iterator[tuple[tuple[Item,
                 prompt.cancel()
 
 
-def _flush(folder: Path, shard: Sequence[_Made], model: LocalModel, pooling: Pooling, known: dict[str, _Place]) -> None:
+def _flush(
+    folder: Path, shard: Sequence[_ItemStates], model: LocalModel, pooling: Pooling, known: dict[str, _Place]
+) -> None:
     """Write a shard under the next free number, tensors first, and note its items."""
     if not shard:
         return

@@ -18,7 +18,7 @@ from traps_pipeline.scoring.metrics import joined_epochs, pecs_of
 
 ALL = "all"
 _CELL = ["model", "directions", "regime"]
-_AT = [*_CELL, "layer", "unit", "dose", "side"]
+_CONDITION = [*_CELL, "layer", "unit", "dose", "side"]
 
 
 def null_rows(effects: pd.DataFrame) -> list[SteeringNullRow]:
@@ -46,8 +46,8 @@ def _moved(own: pd.DataFrame) -> pd.DataFrame:
 
 
 def _ranked(moved: pd.DataFrame, target: str) -> Iterator[SteeringNullRow]:
-    for key, group in moved.groupby(_AT, sort=True):
-        about: dict[str, Any] = dict(zip(_AT, key if isinstance(key, tuple) else (key,), strict=True))
+    for key, group in moved.groupby(_CONDITION, sort=True):
+        about: dict[str, Any] = dict(zip(_CONDITION, key if isinstance(key, tuple) else (key,), strict=True))
         void = group.loc[group["kind"] == VOID]
         for null in NULLS:
             draws = group.loc[group["kind"] == null].groupby("draw")

@@ -180,12 +180,12 @@ def patched_changes(
     _require_one_form(target, source)
     changes, rows = np.empty(len(patches)), max(1, min(ROWS, TOKENS // target.length))
     order = sorted(range(len(patches)), key=lambda i: _first_layer(model, patches[i]))
-    for chosen in (order[k : k + rows] for k in range(0, len(order), rows)):
-        batch = [patches[i] for i in chosen]
+    for numbers in (order[k : k + rows] for k in range(0, len(order), rows)):
+        batch = [patches[i] for i in numbers]
         weights = _masks(batch, target.length, model.inputs_device)
         with torch.inference_mode():
             margins = _margins(model, target, source, weights, _first_layer(model, batch[0]), 1 + len(batch), tokens)
-        changes[chosen] = (margins[1:] - margins[0]).double().numpy()
+        changes[numbers] = (margins[1:] - margins[0]).double().numpy()
     return changes
 
 
@@ -244,8 +244,11 @@ def _masks(patches: Sequence[Patch], length: int, device: str) -> Weights:
     return {key: mask.to(device) for key, mask in masks.items()}
 
 
-def _behind(weights: Weights, layer: int) -> Tensor | None:
-    """Return the summed weights of residual patches up to a layer, None without any."""
+def _residual_weights(weights: Weights, layer: int) -> Tensor | None:
+    """Return the weights of residual patches up to a layer.
+
+    They affect all later layers.
+    """
     parts = [part for (site, patch_layer), part in weights.items() if site == "residual" and patch_layer <= layer]
     return reduce(operator.add, [part.to(parts[0].device) for part in parts]) if parts else None
 
@@ -274,10 +277,10 @@ def _margins(
         inputs["inputs_embeds"] = _mixed(inputs["inputs_embeds"], source.states["residual", 0], weights["residual", 0])
     for number, source_embeds in enumerate(source.inputs.get("deepstack_visual_embeds") or ()):
         # Features number k are added to what block k + 1 puts out: behind the sites up to there.
-        behind, features = _behind(weights, number + 1), inputs["deepstack_visual_embeds"]
-        if behind is not None and target.visual is not None:
+        weight, features = _residual_weights(weights, number + 1), inputs["deepstack_visual_embeds"]
+        if weight is not None and target.visual is not None:
             own = features[number].unflatten(0, (rows, -1))
-            features[number] = _mixed(own, source_embeds, behind[:, target.visual]).flatten(0, 1)
+            features[number] = _mixed(own, source_embeds, weight[:, target.visual]).flatten(0, 1)
     with _replacing(model, target, source, weights, start, rows):
         last = model.network.get_decoder()(**inputs).last_hidden_state[:, -1]
     return first_token_margins(model, last, tokens)
@@ -313,9 +316,9 @@ def _replacing(
 
     def beside(below: int, block: Module, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """Return the next block's arguments, the source's where the stream was patched."""
-        own, behind = argument_of(block, PER_LAYER, args, kwargs), _behind(weights, below)
-        if own is not None and behind is not None:
-            args, kwargs = with_argument(block, PER_LAYER, _mixed(own, source.per_layer[below], behind), args, kwargs)
+        own, weight = argument_of(block, PER_LAYER, args, kwargs), _residual_weights(weights, below)
+        if own is not None and weight is not None:
+            args, kwargs = with_argument(block, PER_LAYER, _mixed(own, source.per_layer[below], weight), args, kwargs)
         shared = argument_of(block, SHARED, args, kwargs)  # one mapping, shared by all blocks
         if shared is not None and below == start:
             for name, (maker, *pair) in target.shared.items():

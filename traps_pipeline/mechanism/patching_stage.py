@@ -334,13 +334,13 @@ def effect_of(
     sides hardly differ is noise. One pair is unseen, with an effect of 0 or of 1, so that few pairs keep an interval's
     width. None if the sides do not differ at all.
     """
-    moved, apart = after - before, target - before
-    if not apart.sum():
+    change, gap = after - before, target - before
+    if not gap.sum():
         return None, None, None
-    effect = float(moved.sum() / apart.sum())
-    pairs = pd.DataFrame({"scenario_id": np.arange(len(moved)), "taxonomy": TAXONOMIES[0]})
+    effect = float(change.sum() / gap.sum())
+    pairs = pd.DataFrame({"scenario_id": np.arange(len(change)), "taxonomy": TAXONOMIES[0]})
     resampling = draw_scenarios(pairs, RESAMPLES, seed)
-    sums = resampling.scenarios[TAXONOMIES[0]][1] @ np.stack([moved, apart], axis=-1)
-    ends = shares_of(with_unseen(sums.T, np.array([len(moved)]), resampling.unseen("effect", decisions=1)))
+    sums = resampling.scenarios[TAXONOMIES[0]][1] @ np.stack([change, gap], axis=-1)
+    ends = shares_of(with_unseen(sums.T, np.array([len(change)]), resampling.unseen("effect", decisions=1)))
     low, high = interval(ends[:, 0, 1:], effect, (-np.inf, np.inf))
     return effect, float(low), float(high)

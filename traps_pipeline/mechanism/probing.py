@@ -242,10 +242,10 @@ class ProbeRun:
                 ("answerable_void", (of_extra, True), (extra, None)),
                 ("answerable_control", (extra, None), (of_extra, False)),
             ):
-                chosen = [self._side(splits, unseen[source], *side) for side in (positive, negative)]
-                labels = np.repeat([True, False], [len(values) for values, _ in chosen])
-                values = np.concatenate([values for values, _ in chosen])
-                scenario = np.concatenate([places for _, places in chosen])
+                sides = [self._side(splits, unseen[source], *side) for side in (positive, negative)]
+                labels = np.repeat([True, False], [len(values) for values, _ in sides])
+                values = np.concatenate([values for values, _ in sides])
+                scenario = np.concatenate([places for _, places in sides])
                 split = Split(values[:, None], labels, scenario)
                 rows.append(self._scored(analysis, (source, extra), layer, split, values))
         return rows
@@ -302,8 +302,8 @@ class ProbeRun:
             for (scope, mask), (analysis, side) in product(
                 scopes.items(), (("centroid_void", True), ("centroid_control", False))
             ):
-                chosen = mask & (split.void == side)
-                share = assigned[chosen].mean() if chosen.any() else None
+                is_selected = mask & (split.void == side)
+                share = assigned[is_selected].mean() if is_selected.any() else None
                 rows.append(_row(analysis, (source, target), layer, share, split.rows(mask), scope=scope))
         return rows
 
@@ -373,7 +373,7 @@ def mark_layers(rows: Sequence[Row]) -> list[Row]:
     best = {key: min(curve, key=lambda layer: (-curve[layer], layer)) for key, curve in curves.items()}
     of_pairs = pair_curves(rows)
     targets = {row["target"] for row in rows if row["analysis"] in CURVES}
-    chosen = {target: layer_choice(of_pairs, target).layer for target in targets} if of_pairs else {}
+    layers = {target: layer_choice(of_pairs, target).layer for target in targets} if of_pairs else {}
     return [
         row
         if row["analysis"] not in CURVES
@@ -381,7 +381,7 @@ def mark_layers(rows: Sequence[Row]) -> list[Row]:
         | {
             "own_best": best.get((row["analysis"], row["source"], row["target"])) == row["layer"],
             "all_sample_best": best.get(("transfer", row["source"], row["target"])) == row["layer"],
-            "chosen": chosen.get(row["target"]) == row["layer"],
+            "chosen": layers.get(row["target"]) == row["layer"],
         }
         for row in rows
     ]

@@ -102,8 +102,8 @@ def patching_version(workspace: Workspace, extraction: Extraction) -> str:
     settings = workspace.study.mechanism
     if settings is None or settings.patching is None or extraction.model not in settings.models:
         return "none"
-    chosen = settings.patching.model_dump(mode="json"), settings.seed
-    return digest([extraction_version(workspace, extraction), *chosen])[:16]
+    inputs = settings.patching.model_dump(mode="json"), settings.seed
+    return digest([extraction_version(workspace, extraction), *inputs])[:16]
 
 
 def steering_version(workspace: Workspace, run: str) -> str:
@@ -113,6 +113,6 @@ def steering_version(workspace: Workspace, run: str) -> str:
     if settings is None or settings.steering is None or model not in settings.models:
         return "none"
     entry = shown_inside(entry, settings)
-    chosen = settings.steering.model_dump(mode="json"), settings.models[model].model_dump(mode="json"), settings.seed
+    inputs = settings.steering.model_dump(mode="json"), settings.models[model].model_dump(mode="json"), settings.seed
     media = profile_digest(entry.media) if entry.media else None
-    return digest([*chosen, loaded_params(entry), media, system_prompt(regime)])[:16]
+    return digest([*inputs, loaded_params(entry), media, system_prompt(regime)])[:16]

@@ -73,13 +73,13 @@ class SharedAnswers:
         if lease is None:
             return None
         with closing(lease):
-            stored = self._read(chunk)
-            settled = known(list(chunk.calls)) | {*stored}
+            chunk_outcomes = self._read(chunk)
+            settled = known(list(chunk.calls)) | {*chunk_outcomes}
             missing = [request for key, request in chunk.calls.items() if key not in settled]
             if missing:
                 outcomes = make(missing, lambda: False)
-                stored |= zip([each.key for each in missing], outcomes, strict=True)
-                content = json.dumps({key: asdict(each) for key, each in stored.items()})
+                chunk_outcomes |= zip([each.key for each in missing], outcomes, strict=True)
+                content = json.dumps({key: asdict(each) for key, each in chunk_outcomes.items()})
                 self._store.write({self._path(chunk): content.encode()})
             return len(missing)
 

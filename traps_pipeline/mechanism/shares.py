@@ -120,9 +120,9 @@ def share_rows(
         paths = pd.DataFrame(of_model[_PATH]).drop_duplicates(ignore_index=True)
         numbered = of_model.merge(paths.reset_index(names="path"), on=_PATH)
         ends = _shares(numbered, len(paths), resamples, seed)
-        for pool, chosen in _pools(paths):
-            of_pool = numbered.loc[np.isin(numbered["path"], chosen)]
-            of_mean = ends[:, chosen].mean(axis=1)
+        for pool, members in _pools(paths):
+            of_pool = numbered.loc[np.isin(numbered["path"], members)]
+            of_mean = ends[:, members].mean(axis=1)
             low, high = interval(of_mean[:, 1:], of_mean[0, 0], (0.0, 1.0))
             rows.append(
                 SteeringShareRow(
@@ -151,15 +151,15 @@ def _shares(numbered: pd.DataFrame, n_paths: int, resamples: int, seed: int) -> 
     for taxonomy in TAXONOMIES:
         of_taxonomy = numbered.loc[numbered["taxonomy"] == taxonomy]
         names, weights = resampling.scenarios[taxonomy]
-        path, chosen = pd.factorize(of_taxonomy["path"])
-        counts = np.zeros((len(names), len(chosen), 2))
+        path, path_names = pd.factorize(of_taxonomy["path"])
+        counts = np.zeros((len(names), len(path_names), 2))
         places = names.get_indexer(pd.Index(of_taxonomy["scenario_id"])), path
         np.add.at(counts[..., 0], places, of_taxonomy["abstained"].to_numpy(bool))
         np.add.at(counts[..., 1], places, 1)
         sums = with_unseen(
             resampled_sums(weights, counts), (counts[..., 1:] > 0).sum(axis=0), resampling.unseen(taxonomy, decisions=1)
         )
-        ends[:, chosen] = shares_of(sums)[:, :, 0]
+        ends[:, path_names] = shares_of(sums)[:, :, 0]
     return ends
 
 

@@ -237,18 +237,18 @@ def direction_pairs(
             "study.yaml: mechanism.steering is null, so the number of pairs for a direction is not known; set it there "
             "and in the experiment"
         )
-    chosen = direction_scenarios(sorted(set(items["scenario_id"])), steering.direction_pairs(dataset), settings.seed)
+    selection = direction_scenarios(sorted(set(items["scenario_id"])), steering.direction_pairs(dataset), settings.seed)
     place = {
         (name, side): row for row, (name, side) in enumerate(zip(items["scenario_id"], items["side"], strict=True))
     }
-    voids, controls = ([place[name, side] for name in chosen] for side in ("void", "control"))
-    return chosen, voids, controls
+    voids, controls = ([place[name, side] for name in selection] for side in ("void", "control"))
+    return selection, voids, controls
 
 
 def _dataset_directions(workspace: Workspace, states: StoredStates, dataset: str) -> list[DirectionRow]:
     settings, items = workspace.mechanism, states.dataset(dataset)
     steering = settings.steering
-    chosen, *sides = direction_pairs(settings, dataset, items)
+    scenarios, *sides = direction_pairs(settings, dataset, items)
     assert steering is not None, "direction_pairs refuses a study that steers nothing"
     layers = [states.read(dataset, layer) for layer in range(states.n_layers)]
     voids, controls = (np.stack([layer_states[rows] for layer_states in layers]) for rows in sides)
@@ -257,14 +257,14 @@ def _dataset_directions(workspace: Workspace, states: StoredStates, dataset: str
     kinds, draws = (nulls.kinds, nulls.draws) if nulls else ((), 1)
     directions = extract_directions(voids, controls, seed, kinds, draws)
     path = directions_file(workspace, states.extraction, dataset)
-    used = items.loc[items["scenario_id"].isin(chosen)]
+    used = items.loc[items["scenario_id"].isin(scenarios)]
     first = used.iloc[0]
     origin = Origin(
         **states.extraction.partition,
         **{name: str(first[name]) for name in ("checkpoint", "checkpoint_digest", "dtype", "quantisation", "pooling")},
         dataset=dataset,
         seed=settings.seed,
-        scenarios=tuple(chosen),
+        scenarios=tuple(scenarios),
         states_digest=digest(sorted(used["states_key"])),
     )
     save_directions(path, directions, origin)
@@ -277,7 +277,7 @@ def _dataset_directions(workspace: Workspace, states: StoredStates, dataset: str
             kind=kind,
             draw=draw,
             layer=layer,
-            n_pairs=len(chosen),
+            n_pairs=len(scenarios),
             norm=float(directions.gaps[layer]),
             cosine=float(vectors[layer] @ directions.void[layer]),
             residual_norm=float(directions.residual_norms[layer]),

@@ -52,7 +52,7 @@ class SteeredBackend(LocalBackend):
         model = self._model()
         for group, numbers in groups.items():
             requests = [batch[number] for number in numbers]
-            prompts = [self._prompt(*_asked(request)) for request in requests]
+            prompts = [self._prompt(*_prompt_parts(request)) for request in requests]
             hook = None
             if group is not None:
                 along = [request.params["steering"] for request in requests]
@@ -77,6 +77,6 @@ class SteeredBackend(LocalBackend):
         return self._model().prompt(system, user, frames.frames, frames.times_s.tolist())
 
 
-def _asked(request: Request) -> tuple[Any, str | None, str, str]:
+def _prompt_parts(request: Request) -> tuple[Any, str | None, str, str]:
     """Return the part of a request that its prompt depends on."""
     return request.media, request.media_digest, request.system, request.user

@@ -115,7 +115,7 @@ def strengths(
                 f"the {row.kind} direction of {row.source} at layer {layer} is zero, since the sides do not differ "
                 "there; name another layer in the experiment and in study.yaml"
             )
-        for unit, dose in _within(row, vectors, layer, steering.cap):
+        for unit, dose in _doses_within(row, vectors, layer, steering.cap):
             alpha = dose * float(vectors.gaps[layer]) if unit == "gap" else dose
             relative = float(alpha / vectors.residual_norms[layer]) if vectors.residual_norms[layer] > 0 else None
             along = (row.source, row.kind, layer, alpha, vector_digest(vector), relative)
@@ -126,10 +126,12 @@ def strengths(
 Dose = tuple[str, float]  # unit and number
 
 
-def _within(row: _Planned, of: Directions, layer: int, cap: float) -> Sequence[Dose]:
-    """Return a direction's doses, without class gaps beyond `cap` control states.
+def _doses_within(row: _Planned, of: Directions, layer: int, cap: float) -> Sequence[Dose]:
+    """Return the doses of a direction within the cap.
 
-    A null has only the largest dose.
+    Left out are those in class gaps beyond `cap` control states.
+
+    A null has only the largest one.
     """
     longest = cap * float(of.residual_norms[layer]) * (1 + 1e-9)
     doses = [(unit, dose) for unit, dose in row.doses if unit == "alpha" or dose * float(of.gaps[layer]) <= longest]
@@ -213,8 +215,8 @@ def wanted_steered(
     settings = workspace.mechanism
     assert settings.steering is not None, "an experiment without steering has no steering cells"
     items = workspace.tables.read(ITEMS, {"dataset": cell.dataset})
-    chosen = steered_scenarios(sorted(set(items["scenario_id"])), settings.steering.pairs, settings.seed)
-    rows = items.loc[items["scenario_id"].isin(chosen)].to_dict("records")
+    scenarios = steered_scenarios(sorted(set(items["scenario_id"])), settings.steering.pairs, settings.seed)
+    rows = items.loc[items["scenario_id"].isin(scenarios)].to_dict("records")
     plan = strengths(cell.dataset, settings.models[entry.id], settings, directions)
     most = settings.steering.max_new_tokens
     return [

@@ -32,8 +32,8 @@ from traps_pipeline.storage.posteriors import posteriors
 from traps_pipeline.storage.workspace import Workspace
 
 # The columns of an item that requests, responses and votes use.
-_ASKED = ("item_id", "pair_id", "side", "labels", "question", "ground_truth", "commonest_answer", "clip")
-_ASKED += ("media_digest", "benchmark_version", "aliases", "answer_type")
+_ITEM_COLUMNS = ("item_id", "pair_id", "side", "labels", "question", "ground_truth", "commonest_answer", "clip")
+_ITEM_COLUMNS += ("media_digest", "benchmark_version", "aliases", "answer_type")
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ def asked_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
     Equal texts share one copy: a cell of 100,000 items may have a hundred questions.
     """
     copies: dict[str, str] = {}
-    rows = workspace.tables.read_all(ITEMS, _ASKED, dataset=dataset).to_dict("records")
+    rows = workspace.tables.read_all(ITEMS, _ITEM_COLUMNS, dataset=dataset).to_dict("records")
     return with_posteriors(
         workspace,
         dataset,
@@ -160,7 +160,7 @@ def _secret(entry: ModelEntry, item: Mapping[str, Any]) -> dict[str, Any]:
 def response_row(cell: Cell, item: Mapping[str, Any], row: Row, reasoning: str | None) -> ResponseRow:
     """Return one row of the responses table."""
     thinking = get_model(cell.evaluation.model).thinking
-    read = read_answer(row, reasoning, cell.evaluation.regime, thinking=thinking, dataset=cell.dataset)
+    reading = read_answer(row, reasoning, cell.evaluation.regime, thinking=thinking, dataset=cell.dataset)
     copied = ("finish_reason", "served_model", "client", "prompt_tokens", "completion_tokens")
     copied += ("reasoning_tokens", "cost_usd", "latency_s", "attempts")
     return ResponseRow(
@@ -168,12 +168,12 @@ def response_row(cell: Cell, item: Mapping[str, Any], row: Row, reasoning: str |
         **cell.partition,
         **{name: row[name] for name in copied},
         **when_asked(row),
-        outcome=read.outcome,
-        text=read.text,
-        reasoning=read.reasoning,
-        is_json=read.is_json,
+        outcome=reading.outcome,
+        text=reading.text,
+        reasoning=reading.reasoning,
+        is_json=reading.is_json,
         first_token=row.get("first_token"),
-        error=read.why or row["error"],
+        error=reading.why or row["error"],
         request_key=row["key"],
     )
 

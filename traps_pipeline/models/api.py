@@ -166,12 +166,12 @@ class ApiBackend:
 
     async def ask(self, request: Request) -> Outcome:
         """Return the outcome of one attempt; see `Backend`."""
-        asked = messages(self._entry, request)
+        prompt = messages(self._entry, request)
         _internal_call().set(True)
         with watching() as exchange:
             exchange.sent = False  # until the wire says otherwise
             try:
-                await self._litellm.acompletion(messages=asked, **request.params, **self._fixed)
+                await self._litellm.acompletion(messages=prompt, **request.params, **self._fixed)
             except Exception as error:  # noqa: BLE001 - litellm's, the SDKs' and httpx's errors
                 if not exchange.is_answered or exchange.content is None:
                     return self._failure(error, exchange)
@@ -243,9 +243,9 @@ class ApiBackend:
         from traps_pipeline.models.wire import cause_of
 
         if exchange.is_unsent:
-            why = redact(plain(exchange.problem or cause_of(error)))
-            self._tell(UNREACHABLE, why, passes=True)
-            raise TransientError(UNREACHABLE, billed=False, why=why) from None
+            reason = redact(plain(exchange.problem or cause_of(error)))
+            self._tell(UNREACHABLE, reason, passes=True)
+            raise TransientError(UNREACHABLE, billed=False, why=reason) from None
         reported = read_error(exchange.content)
         if reported is not None or (exchange.status is not None and not exchange.is_answered):
             return self._reported(reported, exchange)

@@ -141,8 +141,8 @@ class _Asking:
         attempted = await attempt(participant, request, allowed)
         if attempted is None:
             return False
-        row, beside = ledger_row(request, *attempted, self.work.epoch)
-        await self.writer.write(row, beside, [reservation.id for reservation in allowed.paid_by])
+        row, side_texts = ledger_row(request, *attempted, self.work.epoch)
+        await self.writer.write(row, side_texts, [reservation.id for reservation in allowed.paid_by])
         self.rows[request.key] = _Held(row)
         progress.current().called(name, not settles(row), row["latency_s"], row["cost_usd"] or 0.0)
         participant.breaker.watch(attempted[0])
@@ -262,10 +262,10 @@ async def settle(
 
     async def one_model(evaluations: Sequence[tuple[Evaluation, list[AnyCell]]]) -> None:
         try:
-            for evaluation, mine in evaluations:
+            for evaluation, evaluation_cells in evaluations:
                 if stop.is_set():
                     return
-                async for settled in settle_evaluation(work, evaluation, mine, stop):
+                async for settled in settle_evaluation(work, evaluation, evaluation_cells, stop):
                     await turn.acquire()
                     finished.put_nowait(settled)
                     del settled
@@ -277,9 +277,10 @@ async def settle(
             finished.put_nowait(None)
 
     ordered = sorted(cells, key=lambda cell: (cell.evaluation, cell.dataset))
-    by_evaluation = [(e, list(mine)) for e, mine in groupby(ordered, key=lambda cell: cell.evaluation)]
+    by_evaluation = [(e, list(group)) for e, group in groupby(ordered, key=lambda cell: cell.evaluation)]
     tasks = [
-        asyncio.create_task(one_model(list(mine))) for _, mine in groupby(by_evaluation, key=lambda pair: pair[0].model)
+        asyncio.create_task(one_model(list(group)))
+        for _, group in groupby(by_evaluation, key=lambda pair: pair[0].model)
     ]
     try:
         open_tasks = len(tasks)

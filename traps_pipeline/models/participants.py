@@ -226,8 +226,8 @@ async def _send(participant: Participant, request: Request, allowed: CallContext
             return outcome
         except TimeoutError:
             if exchange.is_unsent:
-                why = f"no connection was made within {entry.limits.timeout_s:g} s"
-                raise TransientError(UNREACHABLE, billed=False, why=why) from None
+                reason = f"no connection was made within {entry.limits.timeout_s:g} s"
+                raise TransientError(UNREACHABLE, billed=False, why=reason) from None
             raise TransientError("timeout") from None
         except TransientError as failure:
             cost_usd = _believed(failure.cost_usd, worst_usd) if failure.billed else 0.0
@@ -267,7 +267,7 @@ def ledger_row(
     They are the reasoning trace and a malformed answer.
     """
     fields = asdict(outcome)
-    beside = {name: text for name in SIDE_TEXTS if (text := fields.pop(name)) is not None}
+    side_texts = {name: text for name in SIDE_TEXTS if (text := fields.pop(name)) is not None}
     if fields["first_token"] is None:
         del fields["first_token"]  # few calls have it, so it is left out otherwise
     row = {
@@ -278,7 +278,7 @@ def ledger_row(
         "latency_s": round(latency_s, 6),
     }
     row |= {"epoch": epoch, "created_at": datetime.now(UTC).isoformat(), "components": request.components}
-    return row, beside
+    return row, side_texts
 
 
 def when_asked(row: Row) -> Row:

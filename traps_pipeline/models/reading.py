@@ -38,7 +38,7 @@ _DECODER = json.JSONDecoder(strict=False)
 _WORD = re.compile(r"\w+")
 _LONGEST_UNIT, _LEAST_REPEATS, _LEAST_SHARE = 40, 6, 0.5  # words, times, of the text's words
 _LEAST_WORDS, _FEW_CHARACTERS = 12, 30
-_SHOWN = 60  # characters of a finish reason in a sentence
+_MOST_REASON = 60  # characters of a finish reason in a sentence
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def read_answer(
         finish = row.get("finish_reason")
         outcome = {"complete": JUDGED[0], "truncated": "truncated"}.get(ending_of(finish), UNFINISHED)
         if outcome == UNFINISHED:
-            return Reading(outcome, None, reasoning, why=f"ended for the unknown reason {str(finish)[:_SHOWN]!r}")
+            return Reading(outcome, None, reasoning, why=f"ended for the unknown reason {str(finish)[:_MOST_REASON]!r}")
     if outcome == "empty" and ending_of(row.get("finish_reason")) == "truncated":
         return Reading("truncated", None, reasoning, False if fields else None, "cut off before its answer began")
     if outcome not in WITH_TEXT or not isinstance(text, str):
@@ -87,10 +87,10 @@ def read_answer(
             return Reading("empty", None, reasoning, False if fields else None, "only thinks")
     is_json = _is_json(text, fields) if fields else None
     if mark := undeclared_mark(text):
-        why = f"thinks between marks in its text; say `{how_to_declare(mark)}` in its entry"
-        return Reading("degenerate", None, reasoning, is_json, why)
-    if why := degenerate(text):
-        return Reading("degenerate", None, reasoning, is_json, why)
+        reason = f"thinks between marks in its text; say `{how_to_declare(mark)}` in its entry"
+        return Reading("degenerate", None, reasoning, is_json, reason)
+    if reason := degenerate(text):
+        return Reading("degenerate", None, reasoning, is_json, reason)
     if is_cut_off and not _has_final_answer(text):
         return Reading("truncated", None, reasoning, is_json, "cut off at the limit of tokens before a final answer")
     return Reading(JUDGED[0], text, reasoning, is_json)

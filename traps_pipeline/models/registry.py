@@ -273,10 +273,10 @@ def read_entries(path: Path, key: str, kind: type[_Entry]) -> dict[str, _Entry]:
     if not isinstance(entries, list):
         raise TrapsError(f"{path}: must hold a list `{key}:`")
     context = {"accounts": load_accounts()}
-    read: dict[str, _Entry] = {}
+    entries_by_id: dict[str, _Entry] = {}
     for number, raw in enumerate(entries, start=1):
-        _add(read, kind, raw, path, f"{key.rstrip('s')} {number}", context)
-    return read
+        _add(entries_by_id, kind, raw, path, f"{key.rstrip('s')} {number}", context)
+    return entries_by_id
 
 
 def _add(

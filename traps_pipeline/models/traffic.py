@@ -195,14 +195,14 @@ class Breaker:
         self._window.append(outcome.kind in ("error", "malformed"))
         errors = sum(self._window)
         if self._in_a_row >= SAME_REFUSALS:
-            why = f"{self._in_a_row} refusals in a row ({refusal})"
+            reason = f"{self._in_a_row} refusals in a row ({refusal})"
         elif self._malformed >= MALFORMED_IN_A_ROW:
-            why = f"{self._malformed} answers in a row are out of order (they lie in the ledger, beside its rows)"
+            reason = f"{self._malformed} answers in a row are out of order (they lie in the ledger, beside its rows)"
         elif len(self._window) == ERROR_WINDOW and errors > ERROR_SHARE * ERROR_WINDOW:
-            why = f"{errors} of its last {ERROR_WINDOW} calls failed (last: {outcome.error or 'an answer'})"
+            reason = f"{errors} of its last {ERROR_WINDOW} calls failed (last: {outcome.error or 'an answer'})"
         else:
             return
-        self._stop(why)
+        self._stop(reason)
 
     def _stop(self, why: str) -> NoReturn:
         message = (

@@ -76,9 +76,9 @@ def read_usage(fields: Mapping[str, Any], sizes: Sizes) -> Usage | None:
 
     It is not believed if it is incomplete, impossible, or below our own count for prompt and text.
     """
-    for (prompt, completion, total), apart in _FORMS:
+    for (prompt, completion, total), separate in _FORMS:
         if prompt in fields:
-            usage = _whole(fields, prompt, completion, total, apart)
+            usage = _complete_usage(fields, prompt, completion, total, separate)
             return usage if usage and not sizes.contradict(usage) else _at_least(fields)
     return _at_least(fields)
 
@@ -92,7 +92,7 @@ def _at_least(fields: Mapping[str, Any]) -> Usage | None:
     return Usage(prompt, max(completion, total - prompt), believed=False) if counts else None
 
 
-def _whole(
+def _complete_usage(
     fields: Mapping[str, Any], prompt: str, completion: str, total: str | None, apart: Mapping[str, bool]
 ) -> Usage | None:
     counts = {name: fields[name] for name in (prompt, completion, total, *apart) if name and name in fields}

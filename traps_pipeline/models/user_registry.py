@@ -135,7 +135,7 @@ def accounts() -> Mapping[str, dict[str, Any]]:
 def entries(kind: Kind) -> Iterable[tuple[Path, dict[str, Any]]]:
     """Return the added models or judges, completed, each with its file."""
     newest = {raw["id"]: (path, raw) for path, own in sources() for raw in getattr(own, kind)}
-    return ((path, _whole(raw, kind)) for path, raw in newest.values())
+    return ((path, _entry_fields(raw, kind)) for path, raw in newest.values())
 
 
 def _read(path: Path) -> UserRegistry:
@@ -156,7 +156,7 @@ def _account(entry: Mapping[str, Any]) -> str:
     return f"own-{entry['id']}"
 
 
-def _whole(raw: Mapping[str, Any], kind: Kind) -> dict[str, Any]:
+def _entry_fields(raw: Mapping[str, Any], kind: Kind) -> dict[str, Any]:
     """Return a possibly short entry with all fields of a registry's entry."""
     entry = {name: value for name, value in raw.items() if name not in SHORT}
     if "base_url" not in raw:

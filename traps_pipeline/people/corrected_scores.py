@@ -51,7 +51,7 @@ def panel_errors(
     """
     rows = []
     if _is_labelled(labels):
-        resampling = _drawn(verdicts, resamples, seed)
+        resampling = _resampling(verdicts, resamples, seed)
         rows = [
             _errors_row(labels, task, draws, joined_epochs(verdicts["panel"]))
             for task, draws in _errors(labels, resampling).items()
@@ -70,7 +70,7 @@ def corrected(
     nothing = pd.DataFrame(columns=pd.Index(CORRECTED.names))
     if not _is_labelled(labels):
         return nothing
-    resampling = _drawn(verdicts, resamples, seed)
+    resampling = _resampling(verdicts, resamples, seed)
     errors = _errors(labels, resampling)
     if len(errors) < len(ABOUT_ANSWERS):
         return nothing
@@ -110,7 +110,7 @@ def _is_labelled(labels: pd.DataFrame) -> bool:
     return bool(labels["task"].isin(list(ABOUT_ANSWERS)).any())
 
 
-def _drawn(verdicts: pd.DataFrame, resamples: int, seed: int) -> Resampling:
+def _resampling(verdicts: pd.DataFrame, resamples: int, seed: int) -> Resampling:
     items = verdicts[["scenario_id"]].assign(taxonomy=[taxonomy_of(dataset) for dataset in verdicts["dataset"]])
     return draw_scenarios(items, resamples, seed)
 
@@ -144,9 +144,9 @@ def _errors_row(labels: pd.DataFrame, task: TaskName, draws: np.ndarray, panel: 
     decided = answers.dropna(subset=["truth"])
     n_yes = int(decided["truth"].to_numpy(bool).sum())
     if n_yes in (0, len(decided)):
-        why = f"people say {'yes' if n_yes else 'no'} of every answer"
+        reason = f"people say {'yes' if n_yes else 'no'} of every answer"
     else:
-        why = None if draws[0, :, 0].sum() > 1 else NO_BETTER
+        reason = None if draws[0, :, 0].sum() > 1 else NO_BETTER
     return {
         "task": task,
         "n_answers": len(decided),
@@ -154,7 +154,7 @@ def _errors_row(labels: pd.DataFrame, task: TaskName, draws: np.ndarray, panel: 
         "n_people": labels.loc[labels["task"] == task, "annotator"].nunique(),
         "n_yes": n_yes,
         **with_intervals(("sensitivity", "specificity"), draws),
-        "undefined": why,
+        "undefined": reason,
         "panel": panel,
     }
 

@@ -37,7 +37,7 @@ YES_WORDS, NO_WORDS = ("1", "true", "yes"), ("0", "false", "no")
 DEGENERATE_SHARE = 0.02
 POOLED = "pooled"
 RESAMPLES, SEED = 10_000, 20260101
-_SHOWN = 5
+_MOST_PROBLEMS = 5
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,8 @@ def sheet_rows(workspace: Workspace) -> list[dict[str, str]]:
     labels = labels.loc[labels["model"].isin(protocol.validation.models)].set_index("sample_id")
     if labels.empty:
         raise TrapsError(f"no labelled failure of {', '.join(protocol.validation.models)}; run the study first")
-    chosen = draw_sample(protocol.seed, protocol.validation.n, [(str(sample), "sheet") for sample in labels.index])
-    return [_sheet_row(workspace, sample, labels.loc[sample].to_dict()) for sample, _ in chosen]
+    drawn_keys = draw_sample(protocol.seed, protocol.validation.n, [(str(sample), "sheet") for sample in labels.index])
+    return [_sheet_row(workspace, sample, labels.loc[sample].to_dict()) for sample, _ in drawn_keys]
 
 
 def annotation_sheet(workspace: Workspace) -> list[dict[str, str]]:
@@ -186,8 +186,8 @@ def _paired(path: Path, by_sample: Mapping[tuple[str, str], tuple[int, list[bool
 
 def _refuse(wrong: Sequence[str]) -> None:
     if wrong:
-        more = f"\n... and {len(wrong) - _SHOWN} more" if len(wrong) > _SHOWN else ""
-        raise TrapsError("\n".join(wrong[:_SHOWN]) + more)
+        more = f"\n... and {len(wrong) - _MOST_PROBLEMS} more" if len(wrong) > _MOST_PROBLEMS else ""
+        raise TrapsError("\n".join(wrong[:_MOST_PROBLEMS]) + more)
 
 
 # --- the comparison ---------------------------------------------------------------------------------------------------
@@ -239,7 +239,10 @@ def _shared(axis: str, failures: int, human: HumanLabels) -> dict[str, Any]:
 
 
 def _axis_row(axis: str, judge: np.ndarray, labels: np.ndarray, human: HumanLabels) -> dict[str, Any]:
-    """Return the row of an axis. judge: (failures,); labels: (2, failures)."""
+    """Return the row of an axis.
+
+    judge: (failures,); labels: (2, failures).
+    """
     first, second = labels
     hits = int((labels & judge).sum())
     precision, recall = _share(hits, 2 * int(judge.sum())), _share(hits, int(labels.sum()))

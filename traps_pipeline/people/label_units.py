@@ -151,8 +151,8 @@ def sample(workspace: Workspace, task: TaskName) -> pd.DataFrame:
     if population.empty:
         return population
     if task == "confabulation":
-        chosen = {row["sample_id"] for row in sheet_rows(workspace)}
-        return population.loc[population["unit"].isin(sorted(chosen))].reset_index(drop=True)
+        sample_ids = {row["sample_id"] for row in sheet_rows(workspace)}
+        return population.loc[population["unit"].isin(sorted(sample_ids))].reset_index(drop=True)
     protocol = annotation_protocol()
     size = getattr(protocol.sizes, task)
     picked = [drawn_units(group, size, protocol) for _, group in population.groupby("group", sort=True)]

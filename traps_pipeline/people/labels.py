@@ -87,11 +87,11 @@ def label_lines(folder: Path) -> list[Line]:
         if not line.whole:
             raise TrapsError(f"{path}:{line.number}: is {NOT_WHOLE}; restore the file from a copy")
         try:
-            read = Line.model_validate_json(line.content)
-            LABELS[read.task].model_validate(read.label)
+            parsed = Line.model_validate_json(line.content)
+            LABELS[parsed.task].model_validate(parsed.label)
         except ValidationError as error:
             raise TrapsError(f"{path}:{line.number}: {explain(error)}") from error
-        lines.append(read)
+        lines.append(parsed)
     return lines
 
 
@@ -135,13 +135,13 @@ def _with_answers(workspace: Workspace, rows: pd.DataFrame) -> pd.DataFrame:
         aliases = json.loads(item["aliases"])
         return is_correct(row["answer"], item["ground_truth"], item["answer_type"], list(item["labels"]), aliases)
 
-    read = []
+    answers = []
     for row in rows.to_dict("records"):
         if row["task"] == "answerability":
             row["abstained"] = row["answer"] is None
             row["correct"] = right(row) if row["side"] == "control" else None
-        read.append(row)
-    return pd.DataFrame(read, columns=pd.Index(HUMAN_LABELS.names))
+        answers.append(row)
+    return pd.DataFrame(answers, columns=pd.Index(HUMAN_LABELS.names))
 
 
 # --- agreement --------------------------------------------------------------------------------------------------------
@@ -159,7 +159,7 @@ def human_agreement(labels: pd.DataFrame) -> pd.DataFrame:
 def _agreement(task: TaskName, decision: str, labels: pd.DataFrame) -> dict[str, Any]:
     values = matrix(labels, decision)
     n_shared, agreed, alpha = agreement_of(values)
-    why = "every label is the same" if n_shared else "nothing was labelled by two people"
+    reason = "every label is the same" if n_shared else "nothing was labelled by two people"
     return {
         "task": task,
         "decision": decision,
@@ -169,7 +169,7 @@ def _agreement(task: TaskName, decision: str, labels: pd.DataFrame) -> dict[str,
         "n_shared": n_shared,
         "agreement": agreed,
         "alpha": alpha,
-        "undefined": why if np.isnan(alpha) else None,
+        "undefined": reason if np.isnan(alpha) else None,
         "seconds": float(np.median(labels["seconds"].to_numpy(float))),
     }
 

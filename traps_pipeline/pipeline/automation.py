@@ -138,7 +138,10 @@ def _report(instance: dg.DagsterInstance, stage: str, key: str | None, wrong: st
 def _requests(
     instance: dg.DagsterInstance, workspace: Workspace, lineage: Lineage, *, costs: bool
 ) -> list[dg.RunRequest]:
-    """Return runs of what is outdated and can be rebuilt now; dependents follow later."""
+    """Return runs that rebuild outdated partitions, as far as possible now.
+
+    Dependents are requested at a later tick.
+    """
     graph, requests = the_graph(), list[dg.RunRequest]()
     for block in graph.blocks([stage.name for stage in _stages(costs)]):
         stages, keys = pending_in(block, lineage, History(instance, graph), StudyPartitions(workspace), existing=True)

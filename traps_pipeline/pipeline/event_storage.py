@@ -41,13 +41,13 @@ def _transaction(engine: db.Engine) -> Iterator[db.Connection]:
         with engine.begin() as connection:
             yield connection
     except DBAPIError as error:
-        why, remedy, is_unwritable = reason_and_remedy(error)
+        reason, remedy, is_unwritable = reason_and_remedy(error)
         if not is_unwritable or error.orig is None:
             raise
         unwritable = HistoryUnwritable(None, None, error.orig)
         unwritable.sentence = (
-            f"{engine.url.database}: Dagster's history could not be written ({why}); {remedy} and run the same command "
-            "again: tables are whole, no answer is lost"
+            f"{engine.url.database}: Dagster's history could not be written ({reason}); {remedy} and run the same "
+            "command again: tables are whole, no answer is lost"
         )
         raise unwritable from None
 
@@ -110,7 +110,10 @@ class _RunStorage(SqliteRunStorage):
 
 
 class SqliteStorage(DagsterSqliteStorage):
-    """See the module. base_dir: `$DAGSTER_HOME`."""
+    """See the module.
+
+    base_dir: `$DAGSTER_HOME`.
+    """
 
     def __init__(self, base_dir: str, inst_data: Any = None) -> None:
         super().__init__(base_dir, inst_data)

@@ -16,7 +16,7 @@ from traps_pipeline.models.judges import require_panel
 from traps_pipeline.models.registry import LOCAL, get_model, local_models
 from traps_pipeline.models.user_registry import UserRegistry, add_entries
 from traps_pipeline.protocol.cells import Cell, Evaluation
-from traps_pipeline.protocol.datasets import BESIDE, DATASETS, SCHEMAS
+from traps_pipeline.protocol.datasets import DATASETS, SCHEMAS, UNPAIRED
 from traps_pipeline.protocol.regimes import BY_NAME, PAPER_REGIMES, REGIMES
 from traps_pipeline.storage.study import Asked, MechanismSettings, Study
 
@@ -75,12 +75,12 @@ class Experiment(BaseModel):
     @field_validator("datasets")
     @classmethod
     def _datasets(cls, values: list[str]) -> list[str]:
-        return _known(values, (*DATASETS, *BESIDE))
+        return _known_names(values, (*DATASETS, *UNPAIRED))
 
     @field_validator("regimes")
     @classmethod
     def _regimes(cls, values: list[str]) -> list[str]:
-        return _known(values, REGIMES)
+        return _known_names(values, REGIMES)
 
     @field_validator("models", "datasets", "regimes", "runs")
     @classmethod
@@ -163,7 +163,7 @@ class Experiment(BaseModel):
         return cells
 
 
-def _known(values: list[str], known: tuple[str, ...]) -> list[str]:
+def _known_names(values: list[str], known: tuple[str, ...]) -> list[str]:
     unknown = [value for value in values if value not in known]
     if unknown or not values:
         near = did_you_mean(unknown[0], known) if unknown else ""

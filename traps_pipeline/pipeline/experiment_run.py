@@ -103,12 +103,12 @@ def _still_to_ask(workspace: Workspace, experiment: Experiment, stages: Collecti
         keys = cells if stage in stages else ()
         return (key for key in keys if lineage.status(stage, key).kind != "fresh")
 
-    asked = {name: entry for name in experiment.models if (entry := get_model(name)).backend in (LOCAL, NETWORK)}
+    entries = {name: entry for name in experiment.models if (entry := get_model(name)).backend in (LOCAL, NETWORK)}
     panel = load_panel(workspace.study.panel) if "votes" in stages else ()
     judges: list[Entry] = [judge for judge in panel if judge.backend == NETWORK]
     # Whether a cell is behind is looked up for the sake of these alone.
-    names = {Cell.parse(key).evaluation.model for key in behind("responses")} if asked else set[str]()
-    models: list[Entry] = [entry for name, entry in asked.items() if name in names]
+    names = {Cell.parse(key).evaluation.model for key in behind("responses")} if entries else set[str]()
+    models: list[Entry] = [entry for name, entry in entries.items() if name in names]
     return _Participants(models, judges if judges and any(behind("votes")) else [])
 
 

@@ -26,7 +26,7 @@ from traps_pipeline.models.request import JUDGED
 from traps_pipeline.pipeline.experiment import Experiment
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.protocol.cells import Cell, SteeredEvaluation
-from traps_pipeline.protocol.datasets import BESIDE, DATASETS, all_datasets_of, datasets_of_category, sides_of
+from traps_pipeline.protocol.datasets import DATASETS, UNPAIRED, all_datasets_of, datasets_of_category, sides_of
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.tables import Table
@@ -200,7 +200,7 @@ def _count_calls(
     }
     for cell in experiment.cells():
         answers, votes = plan[cell.evaluation.model]
-        asked, unmade = items[cell.dataset]
+        cell_items, unmade = items[cell.dataset]
         answers.add(unmade.total(), 0)
         votes.add(len(panel) * sum(len(tasks_for(side)) * n for side, n in unmade.items()), 0)
         if workspace is None or lineage is None:
@@ -211,7 +211,7 @@ def _count_calls(
             answers.add(answered, answered)
             votes.add(cast, cast)
         else:
-            _count_cell(workspace, panel, cell, asked, answers, votes)
+            _count_cell(workspace, panel, cell, cell_items, answers, votes)
     return plan, sorted(dataset for dataset, (_, unmade) in items.items() if unmade)
 
 
@@ -228,7 +228,7 @@ def _items(
         state = lineage.state(stage, key)
         if lineage.damage(stage, key) or (state and state.code != lineage.graph[stage].code):
             return [], unmade
-    if dataset in BESIDE:  # not every scenario admits all
+    if dataset in UNPAIRED:  # not every scenario admits all
         unmade = Counter(workspace.tables.read_all(ITEMS, ["side"], dataset=dataset)["side"])
     items = expected_items(workspace, dataset)
     return items, unmade - Counter(item["side"] for item in items)

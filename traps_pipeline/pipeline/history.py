@@ -15,7 +15,7 @@ from traps_pipeline.pipeline.translation import asset_key
 
 _VERSION, _USER, _CODE = "dagster/data_version", "dagster/data_version_is_user_provided", "dagster/code_version"
 _INPUT_VERSION, _INPUT_POINTER = "dagster/input_data_version", "dagster/input_event_pointer"
-_MADE = dg.DagsterEventType.ASSET_MATERIALIZATION
+_MATERIALIZATION = dg.DagsterEventType.ASSET_MATERIALIZATION
 NEVER = "INITIAL"  # Dagster's word for the version of what was never made
 
 
@@ -53,7 +53,7 @@ class History:
             records = self._fetch(name)(dg.AssetRecordsFilter(asset_key=asset_key(name)), limit=1).records
             return {None: _version_of(records[0])} if records else {}
         # One query over the index of tags: ten thousand events take seconds to deserialize.
-        kind = dg.DagsterEventType.ASSET_OBSERVATION if self._graph.source(name) else _MADE
+        kind = dg.DagsterEventType.ASSET_OBSERVATION if self._graph.source(name) else _MATERIALIZATION
         tags = self._instance.event_log_storage.get_latest_tags_by_partition(asset_key(name), kind, [_VERSION])
         return {key: key_tags[_VERSION] for key, key_tags in tags.items()}
 

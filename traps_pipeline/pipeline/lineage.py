@@ -90,14 +90,16 @@ class Lineage:
             if self.graph.source(parent) is not None:
                 continue
             wanted_keys = [k for k in keys if k in self._wanted(parent)]
-            wrong = {k: why for k in wanted_keys if (why := self._unusable(parent, k, current))}
+            wrong = {k: reason for k in wanted_keys if (reason := self._unusable(parent, k, current))}
             need = stage.parents[parent].need
             if need == "none" or (need == "some" and len(wrong) < len(wanted_keys)):
-                wrong = {k: why for k, why in wrong.items() if self.damage(parent, k)}  # it would be read with the rest
+                wrong = {
+                    k: reason for k, reason in wrong.items() if self.damage(parent, k)
+                }  # it would be read with the rest
             if wrong:
-                first, why = next(iter(wrong.items()))
+                first, reason = next(iter(wrong.items()))
                 more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
-                return f"{name_of((parent, first))} {why}{more}"
+                return f"{name_of((parent, first))} {reason}{more}"
             if need == "some" and not wanted_keys:
                 return f"the study wants no {parent}"
         return ""

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     import dagster as dg
 
 LEAST_GB = 0.1  # less would run out before the first tables are written
-SHOWN = 5  # partitions in a sentence
+MOST_PARTITIONS = 5  # partitions in a sentence
 CLIPS = "mp4"  # the kind of a stage that renders
 
 Parts = Mapping[str, Sequence[str | None]]  # by stage: the partitions that a run is to make
@@ -49,7 +49,9 @@ def parts_of_run(context: dg.AssetExecutionContext, stage: Stage, partitions: St
 def why_nothing(keys: Sequence[str | None], tags: Mapping[str, str], workspace: Workspace) -> str:
     """Return in words why a run whose keys are all unwanted has nothing to do."""
     if keys:
-        return f"no experiment in {workspace.root / 'study.yaml'} asks for {', '.join(map(str, keys[:SHOWN]))}"
+        return (
+            f"no experiment in {workspace.root / 'study.yaml'} asks for {', '.join(map(str, keys[:MOST_PARTITIONS]))}"
+        )
     first, last = (tags.get(f"dagster/asset_partition_range_{end}", "its end") for end in ("start", "end"))
     return f"no partition lies between {first} and {last}; exchange the two"
 
@@ -62,7 +64,7 @@ def require_machine(workspace: Workspace, parts: Parts) -> None:
     and votes exist needs no network.
     """
     check_disk(workspace.root, LEAST_GB)
-    if any(entry.backend == NETWORK for entry in _asked(workspace, parts)):
+    if any(entry.backend == NETWORK for entry in _asked_entries(workspace, parts)):
         check_network()
     graph = the_graph()
     drawing = ((graph[name].shared, key) for name, keys in parts.items() for key in keys if CLIPS in graph[name].kinds)
@@ -71,7 +73,7 @@ def require_machine(workspace: Workspace, parts: Parts) -> None:
         _check_rendering(*opengl_variables().items())
 
 
-def _asked(workspace: Workspace, parts: Parts) -> Iterator[Entry]:
+def _asked_entries(workspace: Workspace, parts: Parts) -> Iterator[Entry]:
     """Yield the models and judges of cells whose answers or votes are missing."""
     lineage = Lineage(workspace)
     for name, keys in parts.items():

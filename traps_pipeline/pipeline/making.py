@@ -37,7 +37,7 @@ class PartitionMaker:
             yield from self._side_by_side([*inputs])
         elif self._stage.shared is None:
             for key in inputs:
-                yield from self._one(key, Tally())
+                yield from self._make_partition(key, Tally())
         else:
             yield from self._beside_others(self._stage.shared, inputs)
 
@@ -50,8 +50,11 @@ class PartitionMaker:
         except TrapsError as error:
             self.unmade |= dict.fromkeys(pending, error)
 
-    def _one(self, key: str | None, tally: Tally) -> Iterator[tuple[str | None, StageOutput]]:
-        """Build one partition. tally: the work that was done for it before."""
+    def _make_partition(self, key: str | None, tally: Tally) -> Iterator[tuple[str | None, StageOutput]]:
+        """Build one partition.
+
+        tally: the work that was done for it before.
+        """
         try:
             output = self._stage.make(self._workspace, key)
         except TrapsError as error:
@@ -76,12 +79,12 @@ class PartitionMaker:
                     continue
                 with closing(lease):
                     if not self._takes_over(key, inputs[key], tally):
-                        yield from self._one(key, tally)
+                        yield from self._make_partition(key, tally)
             for key, tally in later.items():
                 if key not in self.unmade and self._make_files(shared, key, tally, wait=True):
                     with alone(store, f"{self._stage.name}/{key}"):
                         if not self._takes_over(key, inputs[key], tally):
-                            yield from self._one(key, tally)
+                            yield from self._make_partition(key, tally)
 
     def _make_files(self, shared: ConcurrentBuild, key: str | None, tally: Tally, *, wait: bool) -> bool:
         """Make a partition's files, add the work to the tally, return whether all exist."""

@@ -70,8 +70,8 @@ def preview(table: Table, output: StageOutput) -> dict[str, dg.TableMetadataValu
         samples = {
             "first rows": first.to_dict("records") if hasattr(content, "head") else [asdict(row) for row in first]
         }
-    shown = [row for rows in samples.values() for row in rows]
-    telling = [c.name for c in table.columns if _is_telling(c.type, [row.get(c.name) for row in shown])]
+    preview_rows = [row for rows in samples.values() for row in rows]
+    telling = [c.name for c in table.columns if _is_telling(c.type, [row.get(c.name) for row in preview_rows])]
     names = [*table.key, *([ranked] if ranked else []), *telling]
     names = [name for name in dict.fromkeys(names) if name not in table.partition_by]
     tables = {

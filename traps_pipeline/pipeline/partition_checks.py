@@ -21,7 +21,7 @@ CURRENT = "current"  # the check that every stage has
 CURRENT_DOC = "Made from what is there now, whole, with no failed call: read again after writing."
 REACHED = "a budget is reached"  # in a check's metadata
 STILL = "still failing"  # in a check's metadata: set for a partition that the run did not touch
-SHOWN = 12  # unmade partitions named in an error
+MOST_NAMED = 12  # unmade partitions named in an error
 
 
 class StageChecks:
@@ -106,9 +106,9 @@ def raise_for_run(context: dg.AssetExecutionContext, graph: Graph, last: str) ->
             alike.setdefault((node[0], line.replace(name_of(node), "")), []).append(line)
     if alike:
         lines = [f"{first} (and {len(more)} more)" if more else first for first, *more in alike.values()]
-        rest = [f"... and {len(lines) - SHOWN} more"] if len(lines) > SHOWN else []
+        rest = [f"... and {len(lines) - MOST_NAMED} more"] if len(lines) > MOST_NAMED else []
         reached = any(e.metadata[REACHED].value for e in failed.values() if REACHED in e.metadata)
-        raise (BudgetReached if reached else TrapsError)("\n".join([*lines[:SHOWN], *rest]))
+        raise (BudgetReached if reached else TrapsError)("\n".join([*lines[:MOST_NAMED], *rest]))
 
 
 def _evaluation(stage: str, check: str, key: str | None, wrong: Mapping[str, Any]) -> dg.AssetCheckEvaluation:

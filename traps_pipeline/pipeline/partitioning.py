@@ -71,7 +71,7 @@ class Every:
 
 
 @dataclass(frozen=True)
-class Same:
+class SameKeys:
     """The partition of the same key."""
 
     def above(self, key: str | None, below: Partitioning | None, above: Partitioning) -> Sequence[str]:
@@ -79,7 +79,7 @@ class Same:
         return [key] if key in above.known and key is not None else []
 
 
-EVERY, SAME = Every(), Same()
+EVERY, SAME = Every(), SameKeys()
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class Pairs:
 
 
 @dataclass(frozen=True)
-class These:
+class FixedKeys:
     """The same partitions of the parent for every key."""
 
     keys: Sequence[str]

@@ -64,13 +64,13 @@ def dagster_history(workspace: Workspace) -> Iterator[dg.DagsterInstance]:
     except Exception as error:
         cause = database_error(error)
         if isinstance(error, OSError):
-            why, hint = error.strerror or "its file cannot be used", remedy(error)
+            reason, hint = error.strerror or "its file cannot be used", remedy(error)
         elif cause is not None:
-            why, hint, _ = reason_and_remedy(cause)
+            reason, hint, _ = reason_and_remedy(cause)
         else:
             raise
         raise TrapsError(
-            f"{home}: Dagster's history cannot be read or written ({why}); {hint} and run the same command again: "
+            f"{home}: Dagster's history cannot be read or written ({reason}); {hint} and run the same command again: "
             "tables are whole, no answer is lost"
         ) from error
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
-from traps_pipeline.pipeline.partitioning import ByDimension, Pairs, Partitioning, These
+from traps_pipeline.pipeline.partitioning import ByDimension, FixedKeys, Pairs, Partitioning
 from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.cells import Cell, Extraction, StatesCell, SteeringCell
 from traps_pipeline.storage.workspace import Workspace
@@ -16,18 +16,20 @@ def study_here() -> Workspace | None:
     return Workspace.open(place) if Workspace.is_there(place) else None
 
 
-_HERE = StudyPartitions(study_here())
+_PARTITIONS = StudyPartitions(study_here())
 
 
 # Groups of assets that the study does not use: Dagster does not show them, and nothing materializes them.
 LEFT_OUT = frozenset(
-    group for group, used in (("mechanism", _HERE.has_mechanism), ("arms", bool(_HERE.arms))) if not used
+    group for group, used in (("mechanism", _PARTITIONS.has_mechanism), ("arms", bool(_PARTITIONS.arms))) if not used
 )
 
-CATEGORY = Partitioning({"category": _HERE.categories}, lambda key: {"category": key}, lambda study: study.categories)
-DATASET = Partitioning({"dataset": _HERE.datasets}, lambda key: {"dataset": key}, lambda study: study.datasets)
+CATEGORY = Partitioning(
+    {"category": _PARTITIONS.categories}, lambda key: {"category": key}, lambda study: study.categories
+)
+DATASET = Partitioning({"dataset": _PARTITIONS.datasets}, lambda key: {"dataset": key}, lambda study: study.datasets)
 EVALUATION = Partitioning(
-    {"evaluation": [e.key for e in _HERE.evaluations]},
+    {"evaluation": [e.key for e in _PARTITIONS.evaluations]},
     lambda key: {},
     lambda study: [e.key for e in study.evaluations],
 )
@@ -35,9 +37,9 @@ CELL = Partitioning(
     {**DATASET.dimensions, **EVALUATION.dimensions}, lambda key: Cell.parse(key).partition, lambda study: study.cells
 )
 # Inside local models: datasets and occlusion's answerable questions; model__prompt; model__directions__regime.
-PROBED = Partitioning({"dataset": _HERE.probed}, lambda key: {"dataset": key}, lambda study: study.probed)
+PROBED = Partitioning({"dataset": _PARTITIONS.probed}, lambda key: {"dataset": key}, lambda study: study.probed)
 EXTRACTION = Partitioning(
-    {"extraction": [e.key for e in _HERE.extractions]},
+    {"extraction": [e.key for e in _PARTITIONS.extractions]},
     lambda key: Extraction.parse(key).partition,
     lambda study: [e.key for e in study.extractions],
 )
@@ -46,7 +48,7 @@ STATES = Partitioning(
     lambda key: StatesCell.parse(key).partition,
     lambda study: study.states,
 )
-STEERED = Partitioning({"steering": _HERE.steered}, lambda key: {}, lambda study: study.steered)
+STEERED = Partitioning({"steering": _PARTITIONS.steered}, lambda key: {}, lambda study: study.steered)
 STEERING = Partitioning(
     {**DATASET.dimensions, **STEERED.dimensions},
     lambda key: SteeringCell.parse(key).partition,
@@ -65,6 +67,6 @@ def to_keys(above: Partitioning, below: Partitioning, mapping: Callable[[str], I
     return Pairs({key: keys for key, keys in pairs.items() if keys})
 
 
-def these_keys(above: Partitioning, keys: Iterable[str]) -> These:
+def these_keys(above: Partitioning, keys: Iterable[str]) -> FixedKeys:
     """Return the upstream partitions among these keys that the study has."""
-    return These([key for key in keys if key in above.known])
+    return FixedKeys([key for key in keys if key in above.known])

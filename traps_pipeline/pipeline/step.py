@@ -95,8 +95,8 @@ class _Step:
         if MAKE_TAG in self.tags:
             return
         if self.stage.scheme and not self._wanted and BACKFILL_TAG not in self.tags:
-            why = why_nothing(self._unwanted, self.tags, self.workspace)
-            raise TrapsError(f"{self.stage.name}: nothing is made: {why}")
+            reason = why_nothing(self._unwanted, self.tags, self.workspace)
+            raise TrapsError(f"{self.stage.name}: nothing is made: {reason}")
         about = {"made": f"nothing: no experiment in {self.workspace.root / 'study.yaml'} asks for it"}
         for key in self._unwanted:
             yield self.history.event(self.stage, key, "not wanted", self.provenance, about)

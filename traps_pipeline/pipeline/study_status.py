@@ -23,10 +23,14 @@ class StageStatus:
     missing: Sequence[str]
 
     def by_reason(self) -> Mapping[str, list[str]]:
-        """Return the partitions that are not fresh, by their reasons."""
+        """Return the partitions that are not fresh, by their reasons.
+
+        A reason leaves out the partition's own key, so that many partitions share it.
+        """
         groups = dict[str, list[str]]()
         for key, reasons in self.stale.items():
-            groups.setdefault("; ".join(reasons), []).append(key)
+            shared = [reason.replace(f"/{key} ", " ") for reason in reasons]
+            groups.setdefault("; ".join(shared), []).append(key)
         return groups | ({"not made yet": [*self.missing]} if self.missing else {})
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import dagster as dg
 
 from traps_pipeline.pipeline.graph import Graph
-from traps_pipeline.pipeline.partitioning import ByDimension, KeyMapping, Pairs, Partitioning, Same, These
+from traps_pipeline.pipeline.partitioning import ByDimension, FixedKeys, KeyMapping, Pairs, Partitioning, SameKeys
 from traps_pipeline.pipeline.schemes import study_here
 
 # Partition mappings over one dimension, observable sources and backfill policies are in beta, partitioned checks in
@@ -53,13 +53,13 @@ def asset_deps(graph: Graph, name: str) -> list[dg.AssetDep]:
 
 def _mapping(mapping: KeyMapping) -> dg.PartitionMapping:
     match mapping:
-        case Same():
+        case SameKeys():
             return dg.IdentityPartitionMapping()
         case ByDimension():
             return dg.MultiToSingleDimensionPartitionMapping(mapping.name)
         case Pairs():
             return dg.StaticPartitionMapping({key: [*below] for key, below in mapping.below.items()})
-        case These():
+        case FixedKeys():
             return dg.SpecificPartitionsPartitionMapping([*mapping.keys])
         case _:
             return dg.AllPartitionMapping()

@@ -16,12 +16,12 @@ from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction, StatesCe
 from traps_pipeline.protocol.datasets import (
     ALL_CATEGORIES,
     ANSWERABLE,
-    BESIDE,
     CATEGORIES,
     DATASETS,
     PROBED_ARMS,
     PROBED_DATASETS,
     TIME_SWAPPED,
+    UNPAIRED,
     all_datasets_of,
 )
 from traps_pipeline.protocol.regimes import PROBE_PROMPT, REGIMES, VQA_PROMPTS
@@ -40,7 +40,7 @@ class StudyPartitions:
         self._workspace = workspace
         if workspace is None:
             every = Asked(
-                datasets=(*DATASETS, *BESIDE), models=tuple(load_models()), regimes=REGIMES, runs=(), mechanism=True
+                datasets=(*DATASETS, *UNPAIRED), models=tuple(load_models()), regimes=REGIMES, runs=(), mechanism=True
             )
             self._asked: Sequence[Asked] = [every]
         else:
@@ -66,7 +66,7 @@ class StudyPartitions:
     @cached_property
     def arms(self) -> list[str]:
         """The arms and variations among `datasets`."""
-        return [dataset for dataset in self.datasets if dataset in BESIDE]
+        return [dataset for dataset in self.datasets if dataset in UNPAIRED]
 
     @cached_property
     def has_pairs(self) -> bool:
@@ -76,7 +76,7 @@ class StudyPartitions:
     def _datasets(self, experiments: Iterable[Asked]) -> list[str]:
         present = {dataset for category in self._present for dataset in all_datasets_of(category)}
         named = {dataset for experiment in experiments for dataset in experiment.datasets}
-        return [dataset for dataset in (*DATASETS, *BESIDE) if dataset in present & named]
+        return [dataset for dataset in (*DATASETS, *UNPAIRED) if dataset in present & named]
 
     @cached_property
     def evaluations(self) -> list[Evaluation]:
@@ -90,9 +90,9 @@ class StudyPartitions:
         """Keys of the requested cells."""
         named = {
             Cell(dataset, evaluation).key
-            for asked in self._asked
-            for dataset in self._datasets([asked])
-            for evaluation in _evaluations(asked)
+            for experiment in self._asked
+            for dataset in self._datasets([experiment])
+            for evaluation in _evaluations(experiment)
         }
         every = (Cell(dataset, evaluation).key for dataset, evaluation in product(self.datasets, self.evaluations))
         return [key for key in every if key in named]
@@ -138,8 +138,8 @@ class StudyPartitions:
     def probed(self) -> list[str]:
         """Datasets whose hidden states are extracted."""
         datasets = self._inside[0] if self._inside else []
-        asked = self._datasets(experiment for experiment in self._asked if experiment.mechanism)
-        existing = {*datasets, *(arm for arm in PROBED_ARMS if self._inside and arm in asked)}
+        asked_datasets = self._datasets(experiment for experiment in self._asked if experiment.mechanism)
+        existing = {*datasets, *(arm for arm in PROBED_ARMS if self._inside and arm in asked_datasets)}
         existing |= {
             dataset for dataset, origin in ((ANSWERABLE, "occlusion"), (TIME_SWAPPED, "chaotic")) if origin in existing
         }

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from traps_pipeline.base.names import check_name
-from traps_pipeline.protocol.datasets import BESIDE, DATASETS, PROBED_DATASETS
+from traps_pipeline.protocol.datasets import DATASETS, PROBED_DATASETS, UNPAIRED
 from traps_pipeline.protocol.regimes import REGIMES, VQA_PROMPTS
 
 _EVALUATION = re.compile(r"(?P<model>.+?)__(?P<regime>[a-z]+)__run(?P<run>[1-9][0-9]*)")
@@ -72,8 +72,8 @@ class Cell:
         Raises ValueError that says what is wrong.
         """
         dataset, _, evaluation = key.partition("|")
-        if dataset not in (*DATASETS, *BESIDE):
-            raise ValueError(f"cell key {key!r}: dataset {dataset!r} is not one of {(*DATASETS, *BESIDE)}")
+        if dataset not in (*DATASETS, *UNPAIRED):
+            raise ValueError(f"cell key {key!r}: dataset {dataset!r} is not one of {(*DATASETS, *UNPAIRED)}")
         return Cell(dataset, Evaluation.parse(evaluation))
 
 
@@ -192,7 +192,7 @@ class SteeringCell(Cell):
         dataset, _, run = key.partition("|")
         parts = run.split("__")
         # The graph has a key for each dataset of its study, arms too; only those of pairs are ever wanted.
-        if dataset not in (*DATASETS, *BESIDE) or len(parts) != 3 or not {parts[1], parts[2]} <= set(VQA_PROMPTS):
+        if dataset not in (*DATASETS, *UNPAIRED) or len(parts) != 3 or not {parts[1], parts[2]} <= set(VQA_PROMPTS):
             raise ValueError(
                 f"steering key {key!r} is not dataset|model__directions__regime with regimes of {VQA_PROMPTS}"
             )

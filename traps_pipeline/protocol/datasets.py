@@ -39,7 +39,7 @@ OCCLUDER_DOSES = ("occluder_alpha_50",)  # the occluder lets the outcome through
 SCHEMAS = ("schema_answer", "schema_reason", "schema_abstain")
 FRAMINGS = ("frames_later", "frames_few", "frames_all")
 VARIATIONS = (*LABEL_DOSES, *OCCLUDER_LOOKS, *OCCLUDER_DOSES, *SCHEMAS, *FRAMINGS)
-BESIDE = (*ARMS, GRADED, *VARIATIONS)  # all that is no dataset of the pairs
+UNPAIRED = (*ARMS, GRADED, *VARIATIONS)  # all that is no dataset of the pairs
 _ONE_TAXONOMY = {
     **dict.fromkeys(("decoy", "removed", "late_occluder", *OCCLUDER_LOOKS, *OCCLUDER_DOSES), "occlusion"),
     **dict.fromkeys(("length_matched", "predictable_cut", GRADED), "chaotic"),
@@ -94,7 +94,7 @@ def arms_of(taxonomy: str) -> tuple[str, ...]:
 
 def beside_of(taxonomy: str) -> tuple[str, ...]:
     """Return the arms and variations that scenarios of a taxonomy may have."""
-    return tuple(name for name in BESIDE if _ONE_TAXONOMY.get(name, taxonomy) == taxonomy)
+    return tuple(name for name in UNPAIRED if _ONE_TAXONOMY.get(name, taxonomy) == taxonomy)
 
 
 def all_datasets_of(category: str) -> tuple[str, ...]:

@@ -108,8 +108,8 @@ def majority(values: np.ndarray) -> np.ndarray:
 
     INVALID without such a majority.
     """
-    half = values.shape[1] / 2
-    is_yes, is_no = ((values == vote).sum(axis=1) > half for vote in (YES, NO))
+    half_of_judges = values.shape[1] / 2
+    is_yes, is_no = ((values == vote).sum(axis=1) > half_of_judges for vote in (YES, NO))
     return np.where(is_yes, YES, np.where(is_no, NO, INVALID)).astype(np.int8)
 
 

@@ -191,11 +191,11 @@ def certificate_rows(content: Content) -> list[CertificateRow]:
 def _certificates(spec: SceneSpec, canary: str) -> Iterable[CertificateRow]:
     import numpy as np
 
-    stored, claim = stored_evidence(spec), Claim.of_record(spec)
+    record_evidence, claim = stored_evidence(spec), Claim.of_record(spec)
     nothing = np.empty((0, 0), np.float32)  # words are certified without a trajectory
     for certificate in certificates_for(spec.void_kind):
         words = certificate.about == "words"
-        evidence = {**certificate.measured(pair_of(spec, nothing, nothing))} if words else stored
+        evidence = {**certificate.measured(pair_of(spec, nothing, nothing))} if words else record_evidence
         failure = certificate.failure(evidence, claim)
         numbers = {n.name: evidence[n.name] for n in certificate.numbers if n.name in evidence}
         yield CertificateRow(

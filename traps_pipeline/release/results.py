@@ -31,7 +31,7 @@ from traps_pipeline.storage.benchmark_tables import current_rows
 from traps_pipeline.storage.workspace import Workspace
 
 HUB, EVER, PARQUET = "eval_results", "data", "leaderboard.parquet"
-OURS = "traps-pipeline"  # developer of the reference models
+OWN_DEVELOPER = "traps-pipeline"  # developer of the reference models
 EVER_SCHEMA = "0.3.0"  # schema version of Every Eval Ever
 _REPOSITORY = re.compile(r"[\w.-]+/[\w.-]+")
 _UNKNOWN = {"deployment_type": "unknown", "model_availability": "unknown"}
@@ -50,7 +50,7 @@ class Attribution:
 
     def developer_of(self, model: str) -> str:
         """Return a model's developer."""
-        return OURS if is_reference(model) else self.developer
+        return OWN_DEVELOPER if is_reference(model) else self.developer
 
 
 def write_results(workspace: Workspace, target: Path, dataset: str, who: Attribution) -> list[str]:

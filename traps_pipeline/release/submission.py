@@ -88,7 +88,10 @@ class About(_Strict):
 
 @dataclass(frozen=True)
 class Submission:
-    """A submission in memory. altered: tables whose digest differs from `about`."""
+    """A submission in memory.
+
+    altered: tables whose digest differs from `about`.
+    """
 
     path: Path
     about: About

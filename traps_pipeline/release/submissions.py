@@ -113,8 +113,8 @@ def gather(paths: Iterable[Path], release: Path | None = None, say: Callable[[st
     if twice:
         raise TrapsError(f"two submissions are called {twice[0]!r}; pack one of them again with another --name")
     if not board.accepted:
-        why = "; ".join(f"{entry.name}: {entry.problems[0]}" for entry in board.refused[:3])
-        raise TrapsError(f"no submission holds, so there is nothing to rank ({why})")
+        reason = "; ".join(f"{entry.name}: {entry.problems[0]}" for entry in board.refused[:3])
+        raise TrapsError(f"no submission holds, so there is nothing to rank ({reason})")
     groups: dict[tuple[str, str], list[AcceptedSubmission]] = {}
     for entry in board.accepted:
         groups.setdefault(entry.group, []).append(entry)

@@ -41,9 +41,9 @@ from traps_pipeline.scoring.scores import Scores, score
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.tables import Table, records
 
-SHOWN = 10  # sentences per kind; further ones are counted
+MOST_SENTENCES = 10  # sentences per kind; further ones are counted
 CLOSE = 1e-9  # tolerance: linear algebra of another machine may differ in the last digits
-_SAME = ("side", "pair_id", "dataset", "benchmark_version")  # columns that an answer has from its item
+_ITEM_COLUMNS = ("side", "pair_id", "dataset", "benchmark_version")  # columns that an answer has from its item
 Row = Mapping[str, Any]
 
 
@@ -65,9 +65,9 @@ class Verification:
         """Record a check and its problems: keep the first ones and count the others."""
         problems = list(complaints)
         self.checked.append(what)
-        self.problems += problems[:SHOWN]
-        if len(problems) > SHOWN:
-            self.problems.append(f"... and {len(problems) - SHOWN} more of this kind")
+        self.problems += problems[:MOST_SENTENCES]
+        if len(problems) > MOST_SENTENCES:
+            self.problems.append(f"... and {len(problems) - MOST_SENTENCES} more of this kind")
 
 
 def verify(submission: Submission, release: Path | None = None) -> Verification:
@@ -153,8 +153,8 @@ def _strangers(items: Mapping[str, Row], release: Path) -> Iterator[str]:
             yield f"item {id_}: its clip is not the released one"
         elif known[id_][0] != row["item_hash"]:
             yield f"item {id_}: its question, choices or answer are not the released ones"
-    lacking = sorted(id_ for id_ in known if id_.partition(":")[0] in DATASETS and id_ not in items)
-    for id_ in lacking:
+    missing_ids = sorted(id_ for id_ in known if id_.partition(":")[0] in DATASETS and id_ not in items)
+    for id_ in missing_ids:
         yield f"item {id_}: is in the release and was not asked"
 
 
@@ -173,13 +173,13 @@ def _wrong_answers(answers: Sequence[Row], items: Mapping[str, Row]) -> Iterator
             yield f"answer of {_named(row)}: there is no such item"
             continue
         items_of.setdefault((row["dataset"], row["model"], row["regime"], row["run"]), set()).add(row["item_id"])
-        if any(row[name] != item[name] for name in _SAME):
+        if any(row[name] != item[name] for name in _ITEM_COLUMNS):
             yield f"answer of {_named(row)}: its pair, side, dataset or version is not its item's"
         text = row["text"] or ""
         if (row["outcome"] in JUDGED) != bool(text.strip()):
             yield f"answer of {_named(row)}: outcome {row['outcome']!r} does not go with its text"
-        elif row["outcome"] in JUDGED and (why := degenerate(text)):
-            yield f"answer of {_named(row)}: {why}, so it is none"
+        elif row["outcome"] in JUDGED and (reason := degenerate(text)):
+            yield f"answer of {_named(row)}: {reason}, so it is none"
     expected = dict[str, set[str]]()
     for id_, item in items.items():
         expected.setdefault(item["dataset"], set()).add(id_)

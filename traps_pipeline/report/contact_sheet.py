@@ -90,13 +90,13 @@ def six_pairs(items: pd.DataFrame) -> pd.DataFrame:
     No two are of one sub-scenario, and their categories differ if possible; fewer if there are fewer sub-scenarios.
     """
     visual = items.loc[items["dataset"].isin(["occlusion", "chaotic"])]
-    chosen: list[str] = []
+    pair_ids: list[str] = []
     for _, rows in visual.groupby("taxonomy", sort=True):
         pairs = rows.drop_duplicates("pair_id").sort_values(["category", "sub_scenario", "pair_id"])
         pairs = pairs.drop_duplicates("sub_scenario")
         firsts = [*pairs.drop_duplicates("category")["pair_id"], *pairs["pair_id"]]
-        chosen += list(dict.fromkeys(firsts))[:3]
-    return visual.loc[visual["pair_id"].isin(chosen)]
+        pair_ids += list(dict.fromkeys(firsts))[:3]
+    return visual.loc[visual["pair_id"].isin(pair_ids)]
 
 
 def whole_pairs(items: pd.DataFrame) -> list[pd.DataFrame]:
@@ -122,9 +122,9 @@ def telling_times(frames: np.ndarray, at: np.ndarray, moments: int) -> np.ndarra
     If an occluder closes the clip (frames, RGB), the last one is just before it, and of four or more the clip's last
     time is also included.
     """
-    seen = len(before_occluder(frames))
-    closed = [len(at) - 1] if seen < len(at) and moments > 3 else []
-    return at[np.append(np.linspace(0, seen - 1, moments - len(closed)).round(), closed).astype(int)]
+    visible_frames = len(before_occluder(frames))
+    closed = [len(at) - 1] if visible_frames < len(at) and moments > 3 else []
+    return at[np.append(np.linspace(0, visible_frames - 1, moments - len(closed)).round(), closed).astype(int)]
 
 
 def sampled(frames: np.ndarray, at: np.ndarray, times: np.ndarray) -> SampledClip:

@@ -152,10 +152,10 @@ def _of_one_panel(board: pd.DataFrame, robust: pd.DataFrame | None, brief: bool,
     rows = []
     if robust is not None and ranked == "overall":
         rows = records(robust)
-    beside = {(row["model"], row["regime"]): row for row in rows}
+    row_of = {(row["model"], row["regime"]): row for row in rows}
     entries = {*zip(board["model"], board["regime"], strict=True)}
-    beside = {key: row for key, row in beside.items() if key in entries}
-    return [_leaderboard(board, ranked, other_datasets, beside, brief, suffix), *own]
+    row_of = {key: row for key, row in row_of.items() if key in entries}
+    return [_leaderboard(board, ranked, other_datasets, row_of, brief, suffix), *own]
 
 
 def legend(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> dict[str, str]:
@@ -249,7 +249,7 @@ def _notes_on_arms(beside: Robust) -> list[str]:
         for arms, names in entries.items()
     ]
     refused = dict.fromkeys(row["refused"] for row in beside.values() if row["refused"])
-    return [*notes, *(f"no conjunction and no robust figure: {why}" for why in refused)]
+    return [*notes, *(f"no conjunction and no robust figure: {reason}" for reason in refused)]
 
 
 def _trace(row: Mapping[str, Any], field: str) -> SourceItems | None:

@@ -13,7 +13,7 @@ from traps_pipeline.report.leaderboard_page import leaderboards, legend, provena
 from traps_pipeline.report.study_findings import StudyFinding
 from traps_pipeline.report.writing import TEMPLATES, environment
 
-FIRST = "figure-pecs_landscape"  # beside the leaderboard
+FIRST_CARD = "figure-pecs_landscape"  # beside the leaderboard
 
 
 def report_html(
@@ -56,11 +56,11 @@ def report_html(
             explorer=explorer,
             findings=findings,
             boards=[{**table, "title": each.title} for each in ranked for table in tables_html([each], "", address)],
-            first=[card for card in run[0] if card.name == FIRST],
-            figures=[card for card in run[0] if card.name != FIRST],
+            first=[card for card in run[0] if card.name == FIRST_CARD],
+            figures=[card for card in run[0] if card.name != FIRST_CARD],
             pictures=run[1],
             appendix=run[2],
-            absent={why: list(dict.fromkeys(titles)) for why, titles in absent.items()},
+            absent={reason: list(dict.fromkeys(titles)) for reason, titles in absent.items()},
             shown={"leaderboard", *(card.name for cards in run for card in cards)},
             legend={**legend(board, robust), **(terms or {})},
             script=script,

@@ -82,7 +82,7 @@ def _cells(group: str) -> pd.DataFrame:
     return cells
 
 
-def _of(cells: pd.DataFrame, dataset: str, regime: str) -> pd.DataFrame:
+def _cells_of(cells: pd.DataFrame, dataset: str, regime: str) -> pd.DataFrame:
     return cells.loc[(cells["dataset"] == dataset) & (cells["regime"] == regime)]
 
 
@@ -94,7 +94,7 @@ def per_dataset() -> list[PrintedTable]:
     for dataset in DATASETS:
         for regime in PRINTED_REGIMES:
             name = f"{dataset}_{regime}"
-            part = _of(cells, dataset, regime).loc[:, ["model", "pecs"]].rename(columns={"pecs": name})
+            part = _cells_of(cells, dataset, regime).loc[:, ["model", "pecs"]].rename(columns={"pecs": name})
             wide = wide.merge(part, on="model")
             columns += figures({name: f"{TITLES[dataset]}, {regime[0].upper()}"})
     return [of_paper("per_dataset", wide, columns)]
@@ -105,7 +105,7 @@ def expanded() -> list[PrintedTable]:
     cells = _cells("main")
     columns = [MODEL, *figures({field: SHARES[field] for field in ("acc_pct", "false_abs_pct", "abs_rec_pct", "pecs")})]
     keys = [(dataset, regime) for dataset in DATASETS for regime in PRINTED_REGIMES]
-    return [of_paper(f"expanded_{'_'.join(key)}", _of(cells, *key), columns) for key in keys]
+    return [of_paper(f"expanded_{'_'.join(key)}", _cells_of(cells, *key), columns) for key in keys]
 
 
 def replication_per_dataset() -> list[PrintedTable]:

@@ -18,7 +18,7 @@ from traps_pipeline.scoring.analyses import models_of
 if TYPE_CHECKING:
     import pandas as pd
 
-ASKED = {STANDARD: "Asked plainly (standard)", GUIDED: "Told not to guess (guided)"}
+REGIME_WORDS = {STANDARD: "Asked plainly (standard)", GUIDED: "Told not to guess (guided)"}
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ def study_findings(results: Results) -> list[StudyFinding]:
     inside = [(report.name, report.finding(results)) for report in FIGURE_REPORTS] if results.mechanism else []
     return [
         *_best(own), *_abstention(own), *_accuracy(own), *_gaps(results, own), *_separable(results, own),
-        *_missing(own), *(StudyFinding(text, f"figure-{name}") for name, text in inside if text),
+        *_missing_answers(own), *(StudyFinding(text, f"figure-{name}") for name, text in inside if text),
     ]  # fmt: skip
 
 
@@ -75,7 +75,7 @@ def _names(models: list[str]) -> str:
 
 
 def _abstention(rows: pd.DataFrame) -> Iterator[StudyFinding]:
-    for regime, words in ASKED.items():
+    for regime, words in REGIME_WORDS.items():
         part = rows.loc[rows["regime"] == regime]
         if len(part):
             subject = f"the {len(part)} models abstain" if len(part) > 1 else f"{part['model'].iloc[0]} abstains"
@@ -141,7 +141,7 @@ def _separable(results: Results, rows: pd.DataFrame) -> Iterator[StudyFinding]:
             )
 
 
-def _missing(rows: pd.DataFrame) -> Iterator[StudyFinding]:
+def _missing_answers(rows: pd.DataFrame) -> Iterator[StudyFinding]:
     missing = int(np.nansum(rows["n_missing"].to_numpy(float)))
     if missing:
         answers = 2 * int((rows["n_pairs"].to_numpy(int) * rows["n_runs"].to_numpy(int)).sum())

@@ -39,22 +39,22 @@ class Example:
 def worked_example(workspace: Workspace) -> Example | None:
     """Return the `chosen_example` of verdicts under standard, or None without one."""
     verdicts = workspace.tables.read_all(VERDICTS, None, dataset=("occlusion", "chaotic"), regime="standard")
-    chosen = chosen_example(verdicts)
-    if chosen is None:
+    verdict = chosen_example(verdicts)
+    if verdict is None:
         return None
-    cell = Cell(chosen["dataset"], Evaluation(chosen["model"], "standard", int(chosen["run"])))
+    cell = Cell(verdict["dataset"], Evaluation(verdict["model"], "standard", int(verdict["run"])))
     tables = workspace.tables
     items = tables.read(ITEMS, {"dataset": cell.dataset})
-    pair = items.loc[items["pair_id"] == chosen["pair_id"]].set_index("side")
+    pair = items.loc[items["pair_id"] == verdict["pair_id"]].set_index("side")
     answers = {row["item_id"]: row for row in tables.read(RESPONSES, cell.partition).to_dict("records")}
     votes = tables.read_all(VOTES, None, **cell.partition).to_dict("records")
-    rows = {row["item_id"]: row for row in verdicts.to_dict("records") if row["model"] == chosen["model"]}
+    rows = {row["item_id"]: row for row in verdicts.to_dict("records") if row["model"] == verdict["model"]}
     words = {}
     for side in ("control", "void"):
         item = str(pair.at[side, "item_id"])
         on_item = [vote for vote in votes if vote["item_id"] == item]
         words[side] = reading(str(answers[item]["text"] or ""), on_item, rows[item])
-    return Example(pair, str(chosen["model"]), words)
+    return Example(pair, str(verdict["model"]), words)
 
 
 def chosen_example(verdicts: pd.DataFrame) -> dict[Any, Any] | None:
@@ -88,16 +88,16 @@ def reading(answer: str, votes: Sequence[Mapping[Any, Any]], verdict: Mapping[An
     valid = [vote for vote in votes if vote["valid"]]
     on_abstention = [vote for vote in valid if vote["task"] == "abstention"]
     abstained = sum(bool(vote["abstained"]) for vote in on_abstention)
-    read = f"{abstained} of {len(on_abstention)} judges read an abstention"
+    summary = f"{abstained} of {len(on_abstention)} judges read an abstention"
     values = [str(vote["extracted_value"]) for vote in valid if vote["task"] == "correctness"]
     if values:
-        read += f"; they extract {', '.join(dict.fromkeys(values))}"
+        summary += f"; they extract {', '.join(dict.fromkeys(values))}"
     outcome = "abstained" if verdict["abstained"] else "answered"
     if verdict["side"] == "control":
         outcome += ", correct" if verdict["correct"] else ", wrong"
     else:
         outcome += ", as it should" if verdict["abstained"] else ", though the outcome cannot be known"
-    return [f"Answer: {answer}", f"Reading: {read}.", f"Verdict: {outcome}."]
+    return [f"Answer: {answer}", f"Reading: {summary}.", f"Verdict: {outcome}."]
 
 
 def example_figure(example: Example, root: Path) -> Figure:

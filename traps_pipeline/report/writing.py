@@ -280,8 +280,8 @@ def table_html(table: PrintedTable, address: Callable[[SourceItems], str] | None
 
     def link(row: Mapping[str, Any], column: Column, figure: str) -> str | None:
         is_figure = column.is_number and figure not in ("", NONE)
-        behind = table.trace(row, column.field) if is_figure and table.trace and address else None
-        return address(behind) if behind and address else None
+        trace = table.trace(row, column.field) if is_figure and table.trace and address else None
+        return address(trace) if trace and address else None
 
     return environment().get_template("table.html.j2").render(table=table, marked=table.marked, link=link)
 

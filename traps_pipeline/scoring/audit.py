@@ -152,16 +152,16 @@ def _line(table: str) -> str:
 def overall_means() -> Iterator[AuditFinding]:
     """Yield the overall leaderboard against means of the per-dataset table, by cell."""
     cells = published_cells()
-    ours = overall(cells).set_index(["model", "regime"]).to_dict("index")
+    own_means = overall(cells).set_index(["model", "regime"]).to_dict("index")
     of_entry = dict(iter(cells.groupby(["model", "regime"])))
     for row in published_overall().to_dict("records"):
         model, regime = row["model"], row["regime"]
         for share in SHARES:
             scale, digits, unit = (1, 3, 0.001) if share == "pecs" else (100, int(share == "false_abs"), 0.1)
-            value, printed_value = float(ours[model, regime][share]) * scale, float(row[share]) * scale
-            off, half = abs(value - printed_value), 0.5 * 10.0**-digits
+            value, printed_value = float(own_means[model, regime][share]) * scale, float(row[share]) * scale
+            off, half_unit = abs(value - printed_value), 0.5 * 10.0**-digits
             verdict: Verdict = (
-                AGREES if off <= half + _SLACK else ROUNDING if off <= half + unit / 2 + _SLACK else DIFFERS
+                AGREES if off <= half_unit + _SLACK else ROUNDING if off <= half_unit + unit / 2 + _SLACK else DIFFERS
             )
             parts = of_entry[model, regime][share] * scale
             sums = " + ".join(f"{part:.{3 if share == 'pecs' else 1}f}" for part in parts)
@@ -198,16 +198,16 @@ def pecs_factors() -> Iterator[AuditFinding]:
 
 
 def _pecs_range(cell: Mapping[Hashable, Any], shares: Mapping[str, float]) -> tuple[float, float]:
-    half = 0.0005  # half the last digit of a printed 0.1 %
-    deviation = {name: float(cell[f"{name}_std"]) + half for name in ("acc", "abs_rec", "false_abs")}
+    half_unit = 0.0005  # half the last digit of a printed 0.1 %
+    deviation = {name: float(cell[f"{name}_std"]) + half_unit for name in ("acc", "abs_rec", "false_abs")}
     if not (cell["acc_std"] or cell["abs_rec_std"] or cell["false_abs_std"]):  # a single run has no deviation
         deviation = dict.fromkeys(deviation, 0.0)
     s_j = deviation["abs_rec"] + deviation["false_abs"]
-    j_low, j_high = (shares["abs_rec"] - shares["false_abs"] + sign * 2 * half for sign in (-1, 1))
+    j_low, j_high = (shares["abs_rec"] - shares["false_abs"] + sign * 2 * half_unit for sign in (-1, 1))
     most = (j_high + float(np.hypot(j_high, s_j))) / 2
     covariance = deviation["acc"] * s_j
-    low = max(0.0, (shares["acc"] - half) * max(0.0, j_low) - covariance)
-    return low, (shares["acc"] + half) * most + covariance
+    low = max(0.0, (shares["acc"] - half_unit) * max(0.0, j_low) - covariance)
+    return low, (shares["acc"] + half_unit) * most + covariance
 
 
 def gaps() -> Iterator[AuditFinding]:
@@ -216,20 +216,24 @@ def gaps() -> Iterator[AuditFinding]:
         for taxonomy in ("occlusion", "chaotic"):
             visual, textual = float(row[f"{taxonomy}_visual_pct"]), float(row[f"{taxonomy}_textual_pct"])
             printed = float(row[f"{taxonomy}_gap"])
-            ours = textual / visual if visual else np.inf
-            half = 0.05 if printed < 10 and printed != round(printed) else 0.5
+            own_value = textual / visual if visual else np.inf
+            half_unit = 0.05 if printed < 10 and printed != round(printed) else 0.5
             lowest, highest = (
                 (textual - 0.05) / (visual + 0.05),
                 (textual + 0.05) / (visual - 0.05) if visual > 0.05 else np.inf,
             )
-            agrees = ours == printed or abs(ours - printed) <= half + _SLACK
-            reachable = lowest - half <= printed <= highest + half
+            agrees = own_value == printed or abs(own_value - printed) <= half_unit + _SLACK
+            reachable = lowest - half_unit <= printed <= highest + half_unit
             verdict: Verdict = AGREES if agrees else ROUNDING if reachable else DIFFERS
             reason = (
-                "" if agrees else f"{textual:g} / {visual:g} = {ours:.2f}; rounding allows {lowest:.2f}-{highest:.2f}"
+                ""
+                if agrees
+                else f"{textual:g} / {visual:g} = {own_value:.2f}; rounding allows {lowest:.2f}-{highest:.2f}"
             )
             name = f"textual over visual, {taxonomy}, {row['model']}"
-            yield AuditFinding("gaps", name, f"{printed:g}", f"{ours:.2f}", verdict, reason, _line("visual_textual"))
+            yield AuditFinding(
+                "gaps", name, f"{printed:g}", f"{own_value:.2f}", verdict, reason, _line("visual_textual")
+            )
 
 
 def probe_means() -> Iterator[AuditFinding]:
@@ -250,13 +254,13 @@ def transfer_types() -> Iterator[AuditFinding]:
     """Yield printed transfer types against their definitions."""
     for name, table in (("probe_transfer", "probe_transfer"), ("steering_alpha10_qwen", "steering_top")):
         for row in published(name).to_dict("records"):
-            ours, printed = transfer_type(LONG[row["source"]], LONG[row["target"]]), str(row["transfer_type"])
+            own_type, printed = transfer_type(LONG[row["source"]], LONG[row["target"]]), str(row["transfer_type"])
             where = f"{name}: type of {row['source']} to {row['target']}" + (
                 f", {row['model']}" if "model" in row else ""
             )
-            reason = "" if ours == printed else f"{row['source']} and {row['target']} share the taxonomy"
-            verdict: Verdict = AGREES if ours == printed else DIFFERS
-            yield AuditFinding("transfer types", where, printed, ours, verdict, reason, _line(table))
+            reason = "" if own_type == printed else f"{row['source']} and {row['target']} share the taxonomy"
+            verdict: Verdict = AGREES if own_type == printed else DIFFERS
+            yield AuditFinding("transfer types", where, printed, own_type, verdict, reason, _line(table))
 
 
 def steering_means() -> Iterator[AuditFinding]:
@@ -270,8 +274,10 @@ def steering_means() -> Iterator[AuditFinding]:
     for side in ("control", "void"):
         for alpha in (0, 10):
             printed_value = printed[f"{side}_alpha{alpha}"]
-            ours = fmean(row[f"{side}_abstention_pct"] for row in published_rows("steering_dose_gemma", alpha=alpha))
-            is_same, below = abs(ours - printed_value) <= 0.5 + _SLACK, ours < printed_value
+            own_mean = fmean(
+                row[f"{side}_abstention_pct"] for row in published_rows("steering_dose_gemma", alpha=alpha)
+            )
+            is_same, below = abs(own_mean - printed_value) <= 0.5 + _SLACK, own_mean < printed_value
             verdict: Verdict = AGREES if is_same else DECLARED if below else DIFFERS
             where = (
                 "as the paper declares of the verification run" if below else "though the paper says that it lies below"
@@ -279,10 +285,10 @@ def steering_means() -> Iterator[AuditFinding]:
             reason = (
                 ""
                 if is_same
-                else f"lies {abs(ours - printed_value):.3g} points {'below' if below else 'above'}, {where}"
+                else f"lies {abs(own_mean - printed_value):.3g} points {'below' if below else 'above'}, {where}"
             )
             statement = f"gemma-4-e4b: mean {side} abstention at alpha {alpha} over the eight paths"
-            yield AuditFinding("steering", statement, f"{printed_value:g}", f"{ours:g}", verdict, reason, "1418")
+            yield AuditFinding("steering", statement, f"{printed_value:g}", f"{own_mean:g}", verdict, reason, "1418")
 
 
 def steering_families() -> Iterator[AuditFinding]:
@@ -297,14 +303,14 @@ def steering_families() -> Iterator[AuditFinding]:
             column = f"{side}_alpha10"
             printed_value = float(by_family.loc["all", column])
             families = [float(by_family.loc[family, column]) for family in ("oc", "ch")]
-            ours = sum(families) / 2
+            own_mean = sum(families) / 2
             # Three roundings to a whole.
-            verdict: Verdict = AGREES if abs(ours - printed_value) <= 1 + _SLACK else DIFFERS
-            sums = f"({families[0]:g} + {families[1]:g}) / 2 = {ours:g}"
+            verdict: Verdict = AGREES if abs(own_mean - printed_value) <= 1 + _SLACK else DIFFERS
+            sums = f"({families[0]:g} + {families[1]:g}) / 2 = {own_mean:g}"
             reason = "" if verdict == AGREES else f"{sums}: the families are not halves of the paths averaged in `all`"
             statement = f"{model}: {side} abstention at alpha 10, all paths, guided directions and inference"
             yield AuditFinding(
-                "steering", statement, f"{printed_value:g}", f"{ours:g}", verdict, reason, _line("steering_regimes")
+                "steering", statement, f"{printed_value:g}", f"{own_mean:g}", verdict, reason, _line("steering_regimes")
             )
 
 
@@ -312,13 +318,13 @@ def validation_scores() -> Iterator[AuditFinding]:
     """Yield the judge's F1 against printed precision and recall, within rounding."""
     for row in published("judge_validation").to_dict("records"):
         precision, recall, printed = float(row["precision"]), float(row["recall"]), float(row["f1"])
-        ours = _f1(precision, recall)
+        own_f1 = _f1(precision, recall)
         lowest, highest = _f1(precision - 0.005, recall - 0.005), _f1(min(1.0, precision + 0.005), recall + 0.005)
-        agrees = abs(ours - printed) <= 0.005 + _SLACK
+        agrees = abs(own_f1 - printed) <= 0.005 + _SLACK
         reachable = lowest - 0.005 <= printed <= highest + 0.005
         verdict: Verdict = AGREES if agrees else ROUNDING if reachable else DIFFERS
         reason = "" if agrees else f"rounding of precision and recall allows {lowest:.3f} to {highest:.3f}"
-        figures = f"{printed:.2f}", f"{ours:.3f}"
+        figures = f"{printed:.2f}", f"{own_f1:.3f}"
         yield AuditFinding("validation", f"F1, {row['category']}", *figures, verdict, reason, _line("judge_validation"))
 
 
@@ -332,10 +338,10 @@ def composition_sums() -> Iterator[AuditFinding]:
     for row in published_rows("composition"):
         counts[row["dataset"]] = counts.get(row["dataset"], 0) + row["n"]
     for taxonomy in ("occlusion", "chaotic"):
-        printed, ours = counts[f"{taxonomy}_ill_posed"], counts[taxonomy]
-        verdict: Verdict = AGREES if ours == printed else DIFFERS
-        shown = str(printed), str(ours)
-        yield AuditFinding("composition", f"pairs of {taxonomy}", *shown, verdict, line=_line("composition"))
+        printed, own_count = counts[f"{taxonomy}_ill_posed"], counts[taxonomy]
+        verdict: Verdict = AGREES if own_count == printed else DIFFERS
+        words = str(printed), str(own_count)
+        yield AuditFinding("composition", f"pairs of {taxonomy}", *words, verdict, line=_line("composition"))
 
 
 # --- the text against itself ------------------------------------------------------------------------------------------

@@ -63,13 +63,13 @@ def _zeros(regime: str) -> Recomputed:
 
 def _spread(models: Sequence[str]) -> Recomputed:
     cells = published_cells()
-    chosen = cells.loc[cells["model"].isin(models)]
-    row = spread(chosen).iloc[0]
-    quartiles = [f"{name} {r.q25:.4f}-{r.q75:.4f}" for name, r in _other_spreads(chosen)]
+    model_cells = cells.loc[cells["model"].isin(models)]
+    row = spread(model_cells).iloc[0]
+    quartiles = [f"{name} {r.q25:.4f}-{r.q75:.4f}" for name, r in _other_spreads(model_cells)]
     return Recomputed(
         f"{row['q25']:.4f} to {row['q75']:.4f}",
         f"quartiles over the {int(row['n'])} cells with a spread; other metrics give {', '.join(quartiles)}, and PECS "
-        f"on each dataset {', '.join(_dataset_spreads(chosen))}: the published selection of cells is not stated",
+        f"on each dataset {', '.join(_dataset_spreads(model_cells))}: the published selection of cells is not stated",
     )
 
 
@@ -239,8 +239,8 @@ def _textual_ratio(sub_scenario: str) -> Recomputed:
     visual, textual = row["abs_rec_pct"], row["abs_rec_ill_posed_pct"]
     low, high = (textual - 0.05) / (visual + 0.05), (textual + 0.05) / (visual - 0.05)
     (printed,) = published_rows("other", id=f"{sub_scenario}-ratio")
-    half = 0.05 if "." in printed["value"] else 0.5
-    agrees = low - half <= float(printed["value"]) <= high + half
+    half_unit = 0.05 if "." in printed["value"] else 0.5
+    agrees = low - half_unit <= float(printed["value"]) <= high + half_unit
     return Recomputed(f"{textual / visual:.2f}", f"rounding of the rates allows {low:.1f} to {high:.1f}", agrees=agrees)
 
 

@@ -33,10 +33,21 @@ from traps_pipeline.scoring.score_rows import HYPOTHESES as TABLE
 
 VISUAL = ("occlusion", "chaotic")
 RULES = ("occluder-rule", "length-rule", "wording-rule")  # each abstains by a single cue
-SHOWN = ("acc", "false_abs", "abs_rec", "j")
+SHARES = ("acc", "false_abs", "abs_rec", "j")
 _SUMS = (*COUNTS, *(f"{name}_unseen" for name in COUNTS[::2]))  # columns of `with_unseen`
 _CHANGE = (-2.0, 2.0)  # the limits of a change of J
-_KEPT = ["model", "regime", "dataset", "run", "item_id", "scenario_id", "side", "epoch", "panel", "benchmark_version"]
+_ITEM_COLUMNS = [
+    "model",
+    "regime",
+    "dataset",
+    "run",
+    "item_id",
+    "scenario_id",
+    "side",
+    "epoch",
+    "panel",
+    "benchmark_version",
+]
 
 
 @dataclass(frozen=True)
@@ -128,7 +139,7 @@ def hypotheses(
     number of answers to choose from in each item's question, by item id. Figures are computed per run, then averaged;
     their intervals resample scenarios, each with all its doses.
     """
-    items = pd.concat([verdicts[_KEPT], decision_counts(verdicts)], axis=1)
+    items = pd.concat([verdicts[_ITEM_COLUMNS], decision_counts(verdicts)], axis=1)
     items["taxonomy"] = [datasets_of_category(category)[0] for category in verdicts["category"]]
     items["offered"] = [offered[id_] for id_ in items["item_id"]]
     resampling = draw_scenarios(items, resamples, seed)
@@ -150,8 +161,8 @@ def _in_pairs(hypothesis: Hypothesis) -> set[Dose]:
 
 
 def _items_of(group: pd.DataFrame, dose: Dose) -> pd.DataFrame:
-    chosen = group["dataset"].isin(dose.datasets)
-    return group.loc[chosen if dose.side is None else chosen & (group["side"] == dose.side)]
+    in_dose = group["dataset"].isin(dose.datasets)
+    return group.loc[in_dose if dose.side is None else in_dose & (group["side"] == dose.side)]
 
 
 def _row(
@@ -180,23 +191,23 @@ def _row(
         "at_reference": None,
         **dict.fromkeys(_ends("change")),
     }
-    for name in SHOWN:
+    for name in SHARES:
         row |= with_interval(name, figures[:, RESAMPLED.index(name)], limits_of(name))
     row["value"] = _compared(hypothesis, figures)[1, 0]
     if dose is hypothesis.doses[0] or reference.empty:
         return row
     shared = reference.loc[reference["scenario_id"].isin(items["scenario_id"])]
-    mine = items.loc[items["scenario_id"].isin(shared["scenario_id"])]
+    own_items = items.loc[items["scenario_id"].isin(shared["scenario_id"])]
     if shared.empty:
         return row
-    row["refused"] = _refusal(mine, shared)
+    row["refused"] = _refusal(own_items, shared)
     if row["refused"] is None:
         names = (hypothesis.doses[0].name, dose.name)
         before, after = (
             _compared(hypothesis, _figures(some, resampling, f"{named}|{name}"))
-            for some, name in zip((shared, mine), names, strict=True)
+            for some, name in zip((shared, own_items), names, strict=True)
         )
-        row |= {"n_compared": mine["scenario_id"].nunique(), "at_reference": before[1, 0]}
+        row |= {"n_compared": own_items["scenario_id"].nunique(), "at_reference": before[1, 0]}
         row |= with_interval("change", difference(after, before), _CHANGE)
     return row
 
@@ -267,7 +278,7 @@ def wrong_rows(table: pd.DataFrame) -> int:
     change over all scenarios is not the difference of the two values.
     """
     wrong = np.zeros(len(table), bool)
-    for name in (*SHOWN, "change"):
+    for name in (*SHARES, "change"):
         figure, low, high = (table[column].to_numpy(float) for column in _ends(name))
         least, most = _CHANGE if name == "change" else limits_of(name)
         wrong |= (figure < least) | (figure > most) | (low > high) | (low < least) | (high > most)

@@ -36,7 +36,12 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class GradedItem:
-    """A graded item: its answers, their probabilities, the sub-scenario's commonest."""
+    """A graded item.
+
+    posterior: the probability of each possible answer.
+
+    commonest: the sub-scenario's commonest answer.
+    """
 
     labels: Sequence[str]
     aliases: Mapping[str, str]
@@ -141,7 +146,7 @@ def _labels(votes: pd.DataFrame, questions: Mapping[str, GradedItem]) -> dict[tu
     It is "" for an answer that the item does not offer.
     """
     cast_votes = votes.loc[votes["task"].eq("correctness"), [*_ANSWER, "valid", "extracted_value"]]
-    chosen = dict[tuple[Any, ...], str]()
+    label_of = dict[tuple[Any, ...], str]()
     for key, own in cast(Any, cast_votes.groupby(_ANSWER)):
         labels = [
             questions[key[0]].label_of(value if isinstance(value, str) else None) or ""
@@ -149,8 +154,8 @@ def _labels(votes: pd.DataFrame, questions: Mapping[str, GradedItem]) -> dict[tu
         ]
         label, n = Counter(labels).most_common(1)[0] if labels else ("", 0)
         if n > len(own) / 2:
-            chosen[key] = label
-    return chosen
+            label_of[key] = label
+    return label_of
 
 
 def _of_verdict(item: GradedItem, abstained: object, label: str | None) -> dict[str, float]:
@@ -210,8 +215,8 @@ def brier(posterior: Mapping[str, float], stated: Mapping[str, float]) -> float:
     For each answer, weighted by its true probability, sum the squared distances of the stated probabilities from 1 for
     that answer and from 0 for all others.
     """
-    apart = sum((stated.get(label, 0.0) - posterior.get(label, 0.0)) ** 2 for label in {*stated, *posterior})
-    return apart + 1 - sum(p**2 for p in posterior.values())
+    distance = sum((stated.get(label, 0.0) - posterior.get(label, 0.0)) ** 2 for label in {*stated, *posterior})
+    return distance + 1 - sum(p**2 for p in posterior.values())
 
 
 def _commonest(posterior: Mapping[str, float]) -> str:

@@ -18,8 +18,8 @@ CELL = ["dataset", "model", "regime", "run"]
 CELL_FIGURES = ["acc", "abs_rec", "false_abs", "j", "pecs", "naive"]
 BOUNDS = ["pecs_low", "pecs_high"]
 # The outcomes in each count of items. An item is answered if its answer is judged, even if the judges are undecided.
-BROKEN = {f"n_{name}": (name,) for name in ("empty", "truncated", "unfinished", "degenerate", "unread")}
-OUTCOMES = {"n_answered": JUDGED, "n_refused": ("refused",), **BROKEN, "n_errors": ("error", "malformed")}
+BROKEN_COUNTS = {f"n_{name}": (name,) for name in ("empty", "truncated", "unfinished", "degenerate", "unread")}
+OUTCOMES = {"n_answered": JUDGED, "n_refused": ("refused",), **BROKEN_COUNTS, "n_errors": ("error", "malformed")}
 COUNTED = [*OUTCOMES, "n_not_json"]
 REJECTS = ["n_rejects", "n_rejects_answered"]  # counts of decisions that not every panel is asked for: null otherwise
 # For each decision, how often it was yes (numerator) and how often it was made (denominator, `_of`); every figure is
@@ -144,9 +144,9 @@ def _bounds(sums: pd.DataFrame) -> dict[str, np.ndarray]:
     """
     pairs = sums["n_pairs"].to_numpy(float)
     decided = {name: sums[name].to_numpy(float) for name in ("correct", "false_abs", "abs_rec")}
-    lacking = {name: pairs - sums[f"{name}_of"].to_numpy(float) for name in decided}
+    undecided = {name: pairs - sums[f"{name}_of"].to_numpy(float) for name in decided}
     least = {name: decided[name] / pairs for name in decided}
-    most = {name: (decided[name] + lacking[name]) / pairs for name in decided}
+    most = {name: (decided[name] + undecided[name]) / pairs for name in decided}
     return {
         "pecs_low": pecs_of(least["correct"], least["abs_rec"] - most["false_abs"]),
         "pecs_high": pecs_of(most["correct"], most["abs_rec"] - least["false_abs"]),
@@ -158,8 +158,8 @@ def wilson(yes: np.ndarray, of: np.ndarray, z: float = 1.959963984540054) -> tup
     of = np.where(of > 0, of, np.nan)
     share, square = yes / of, z**2 / of
     centre = (share + square / 2) / (1 + square)
-    half = z / (1 + square) * np.sqrt(share * (1 - share) / of + square / (4 * of))
-    return np.maximum(centre - half, 0.0), np.minimum(centre + half, 1.0)
+    half_width = z / (1 + square) * np.sqrt(share * (1 - share) / of + square / (4 * of))
+    return np.maximum(centre - half_width, 0.0), np.minimum(centre + half_width, 1.0)
 
 
 def _wilson(sums: pd.DataFrame) -> dict[str, np.ndarray]:

@@ -105,9 +105,9 @@ def _detectable(
     smallest, (observed, ends) = 0.0, studies
     for seed in range(SEED + 1, SEED + 1 + ROUNDS):
         better, better_ends = _studies(counts, _better(shares, smallest), seed)
-        apart, low = better - observed, better_ends[:, 0] - ends[:, 1]
+        difference, low = better - observed, better_ends[:, 0] - ends[:, 1]
         below = np.quantile(low.mean(axis=1, keepdims=True) - low, 1 - SEPARABLE_BELOW / 2 / comparisons)
-        smallest = float(apart.mean() - low.mean() + below + NormalDist().inv_cdf(POWER) * apart.std())
+        smallest = float(difference.mean() - low.mean() + below + NormalDist().inv_cdf(POWER) * difference.std())
     return smallest if smallest <= 1 else None
 
 

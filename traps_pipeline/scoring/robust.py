@@ -59,8 +59,8 @@ def robust(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED)
     for key, group in items.groupby(["model", "regime"], sort=True):
         runs, arms = _runs_and_arms(group)
         if runs:
-            chosen = group["run"].isin(runs) & group["dataset"].isin([*DATASETS, *arms])
-            entries[key] = arms, group.loc[chosen]
+            in_entry = group["run"].isin(runs) & group["dataset"].isin([*DATASETS, *arms])
+            entries[key] = arms, group.loc[in_entry]
     if not entries:
         return pd.DataFrame(columns=pd.Index(ROBUST.names))
     # A scenario is drawn with its items in all datasets and arms.
@@ -108,7 +108,7 @@ def _row(items: pd.DataFrame, named: str, arms: Sequence[str], resampling: Resam
     row: dict[str, Any] = {
         "n_runs": len(runs),
         "n_items": max(rows["item_id"].nunique() for rows in runs.values()),
-        "n_missing": _missing(items),
+        "n_missing": _missing_decisions(items),
         "n_conjunction": max(n for _, n in conjunctions),
         "epoch": joined_epochs(items["epoch"]),
         "panel": joined_epochs(items["panel"]),
@@ -156,21 +156,29 @@ def conjunction_of(items: pd.DataFrame) -> pd.Series:
     right = items["correct"].where(control, items["abs_rec"]).astype(float)
     right = right.where(items["correct_of"].where(control, items["abs_rec_of"]) > 0)
     decision = items["side"].where(dataset.isin(VISUAL), dataset + " " + items["side"])
-    asked = pd.DataFrame({"scenario": items["scenario_id"], "decision": decision, "right": right})
-    asked = asked.loc[decision.isin(CONJUNCTION)]
-    decisions = asked.groupby("scenario")["decision"].nunique()
-    asked = asked.loc[asked["scenario"].isin(decisions.index[decisions == len(CONJUNCTION)])]
-    worst, undecided = asked.groupby("scenario")["right"].min(), asked["right"].isna().groupby(asked["scenario"]).any()
+    decision_table = pd.DataFrame({"scenario": items["scenario_id"], "decision": decision, "right": right})
+    decision_table = decision_table.loc[decision.isin(CONJUNCTION)]
+    decisions = decision_table.groupby("scenario")["decision"].nunique()
+    decision_table = decision_table.loc[decision_table["scenario"].isin(decisions.index[decisions == len(CONJUNCTION)])]
+    worst, undecided = (
+        decision_table.groupby("scenario")["right"].min(),
+        decision_table["right"].isna().groupby(decision_table["scenario"]).any(),
+    )
     return worst.where((worst == 0) | ~undecided)
 
 
 def _conjunction(items: pd.DataFrame, resampling: Resampling, named: str) -> tuple[np.ndarray, int]:
-    """Return ends (2, draws) of the conjunction's share, and its number of scenarios."""
+    """Return the share of scenarios that `conjunction_of` finds right, with its ends.
+
+    The number of decided scenarios follows.
+
+    The ends are (2, draws).
+    """
     decided = conjunction_of(items).dropna()
     return ends_of_mean(decided, resampling, named), len(decided)
 
 
-def _missing(items: pd.DataFrame) -> int:
+def _missing_decisions(items: pd.DataFrame) -> int:
     """Return the number of items, over runs, that lack a decision of their side."""
     control = items["side"] == "control"
     decided = np.where(control, items["correct_of"] & items["false_abs_of"], items["abs_rec_of"])
@@ -182,7 +190,7 @@ def _refusal(items: pd.DataFrame) -> str | None:
     of_arms = items["dataset"].isin(ARMS)
     if "+" in (panels := joined_epochs(items["panel"])):
         return f"judged by {panels.replace('+', ' and ')}; figures of different panels are never put in one figure"
-    pairs, arms = (joined_epochs(items.loc[chosen, "epoch"]) for chosen in (~of_arms, of_arms))
+    pairs, arms = (joined_epochs(items.loc[rows, "epoch"]) for rows in (~of_arms, of_arms))
     if pairs == arms and "+" not in pairs:
         return None
     return f"pairs of epoch {pairs}, arms of epoch {arms}; figures of different epochs are never put in one figure"

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from traps_pipeline.storage import columns as shared
-from traps_pipeline.storage.tables import Beside, Table, with_neighbours
+from traps_pipeline.storage.tables import ExtraColumns, Table, with_neighbours
 
 # An entry is incomplete where fewer of its items than this have a text. With 1 % of the items missing, the worst and
 # the best PECS are at most 0.04 apart (if all are controls: 2 % of Acc and 2 % of FalseAbs), half the 95 % interval of
@@ -19,9 +19,9 @@ Bootstrap = Annotated[
 ]
 # Marks of a figure, which declare the columns beside it.
 STD, CI, WILSON = (
-    Beside(("_std",), Deviation),
-    Beside(("_ci_low", "_ci_high"), Bootstrap),
-    Beside(("_low", "_high"), shared.Wilson),
+    ExtraColumns(("_std",), Deviation),
+    ExtraColumns(("_ci_low", "_ci_high"), Bootstrap),
+    ExtraColumns(("_low", "_high"), shared.Wilson),
 )
 Refused = Annotated[str | None, "why the two may not be compared"]
 DatasetOrOverall = Annotated[str, "one of four, or overall"]

@@ -12,7 +12,7 @@ from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.bootstrap import ENTRY, RESAMPLED
 from traps_pipeline.scoring.metrics import (
     BOUNDS,
-    BROKEN,
+    BROKEN_COUNTS,
     CELL,
     CELL_FIGURES,
     COUNTED,
@@ -56,7 +56,7 @@ def standings(metrics: pd.DataFrame) -> pd.DataFrame:
     board["benchmark_version"] = groups["benchmark_version"].agg(joined_versions)
     board["answered"] = board["n_answered"] / board["n_items"]
     board["incomplete"] = _anywhere(cast(pd.Series, board["answered"] < INCOMPLETE_BELOW))
-    board["broken"] = board[[*BROKEN]].sum(axis=1) / board["n_items"]
+    board["broken"] = board[[*BROKEN_COUNTS]].sum(axis=1) / board["n_items"]
     board["is_broken"] = _anywhere(cast(pd.Series, board["broken"] > BROKEN_ABOVE))
     return board.reset_index()
 

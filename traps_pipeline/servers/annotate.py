@@ -18,7 +18,7 @@ from fastapi.responses import HTMLResponse, Response
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.webguard import WHO
+from traps_pipeline.base.webguard import TOKEN_OWNER
 from traps_pipeline.base.yamlfile import explain
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.people.judge_validation import sheet_rows
@@ -40,7 +40,7 @@ TITLES: Mapping[TaskName, str] = {
 }
 
 
-class Sent(BaseModel):
+class SubmittedLabel(BaseModel):
     """A label from a browser; `label` is validated by the task's own model."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -103,11 +103,11 @@ class Annotation:
         It is the unit that waits for a label, else the first of their queue. None if all are labelled, or if the rest
         belong to scenarios that they met in this sitting.
         """
-        own, seen = self.samples[task], self.store.shown(who)
-        waiting = [each.unit for each in seen if each.task == task and each.waits and each.unit in own.index]
+        own, shown_units = self.samples[task], self.store.shown(who)
+        waiting = [each.unit for each in shown_units if each.task == task and each.waits and each.unit in own.index]
         since = time.time() - 3600 * annotation_protocol().sitting_hours
-        met = {each.scenario_id for each in seen if each.at > since}  # in any task, since answers reveal clips
-        finished = {each.unit for each in seen if each.task == task} | {*self.store.labelled(who, task)}
+        met = {each.scenario_id for each in shown_units if each.at > since}  # in any task, since answers reveal clips
+        finished = {each.unit for each in shown_units if each.task == task} | {*self.store.labelled(who, task)}
         blind = task != "answerability"
         open_units = (
             unit
@@ -130,7 +130,7 @@ class Annotation:
                 return task, each.unit
         raise NotFound("nothing of this name is shown to you")
 
-    def record(self, who: str, sent: Sent) -> None:
+    def record(self, who: str, sent: SubmittedLabel) -> None:
         """Store a label.
 
         Raises NotFound, Refused and Conflict.
@@ -213,7 +213,7 @@ def annotation_app(annotation: Annotation) -> FastAPI:
     app = new_app()
 
     def who(request: Request) -> str:
-        return str(request.scope[WHO])
+        return str(request.scope[TOKEN_OWNER])
 
     @app.get("/")
     def start(request: Request) -> Response:
@@ -235,7 +235,7 @@ def annotation_app(annotation: Annotation) -> FastAPI:
         return Response(script(*SCRIPTS), media_type="text/javascript")
 
     @app.post("/label")
-    def label(request: Request, sent: Sent) -> dict[str, bool]:
+    def label(request: Request, sent: SubmittedLabel) -> dict[str, bool]:
         annotation.record(who(request), sent)
         return {"kept": True}
 

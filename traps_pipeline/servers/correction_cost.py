@@ -75,7 +75,7 @@ def correction_effect(workspace: Workspace, spec: Mapping[str, Any], correction:
     judged_again = changes.get("answer", spec["ground_truth"]) != spec["ground_truth"] or "labels" in changes
     seats = len(load_panel(workspace.study.panel))
     cost = CorrectionEffect(question=question, rendered=[spec["scenario_id"]] if renders else [])
-    for model, dataset, evaluations in _asked(workspace, spec["taxonomy"]):
+    for model, dataset, evaluations in _evaluation_counts(workspace, spec["taxonomy"]):
         for side in SIDES:
             of_ill_posed = is_ill_posed(dataset) and side == "void"
             again = renders or (ill_posed if of_ill_posed else asked_again)
@@ -96,7 +96,7 @@ def _question(spec: Mapping[str, Any], params: Mapping[str, Any]) -> str:
         raise TrapsError(f"{spec['scenario_id']}: params: {error}") from error
 
 
-def _asked(workspace: Workspace, taxonomy: str) -> Iterator[tuple[str, str, int]]:
+def _evaluation_counts(workspace: Workspace, taxonomy: str) -> Iterator[tuple[str, str, int]]:
     """Yield model, dataset of the taxonomy, and its number of evaluations.
 
     Those that the study's experiments want count.

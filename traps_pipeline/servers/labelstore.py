@@ -95,11 +95,11 @@ class LabelStore:
                 database.execute("PRAGMA synchronous=FULL")
                 yield database
         except sqlite3.DatabaseError as error:
-            why, remedy, is_unwritable = reason_and_remedy(error)
+            reason, remedy, is_unwritable = reason_and_remedy(error)
             if is_unwritable:
-                raise TrapsError(f"{self.folder / DATABASE}: cannot be written ({why}); {remedy}") from error
+                raise TrapsError(f"{self.folder / DATABASE}: cannot be written ({reason}); {remedy}") from error
             raise TrapsError(
-                f"{self.folder / DATABASE}: cannot be used ({why}); every confirmed label is in {LABELS_FILE}: move "
+                f"{self.folder / DATABASE}: cannot be used ({reason}); every confirmed label is in {LABELS_FILE}: move "
                 "the database away, and it is made again from there"
             ) from error
 

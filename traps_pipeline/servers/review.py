@@ -145,13 +145,13 @@ class Review:
         Raises NotFound, Refused and Conflict.
         """
         spec = self.spec(sent.scenario_id)
-        correction, seen = self._correction(sent.scenario_id, sent.action, sent.changes, sent.why), sent.seen
+        correction, decision_count = self._correction(sent.scenario_id, sent.action, sent.changes, sent.why), sent.seen
         if sent.action == "add":
             params = json.loads(spec["params"]) | (correction.params or {})
             new = {"scenario_id": self._free_id(spec["family"]), "family": spec["family"], "params": params}
-            correction, seen = correction.model_copy(update=new), 0
+            correction, decision_count = correction.model_copy(update=new), 0
         try:
-            decide(correction, seen)
+            decide(correction, decision_count)
         except DecidedMeanwhile as error:
             raise Conflict(str(error)) from error
 

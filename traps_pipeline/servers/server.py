@@ -50,7 +50,7 @@ def new_app() -> FastAPI:
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
 
     @app.exception_handler(TrapsError)
-    async def said(request: Request, error: TrapsError) -> Response:
+    async def error_response(request: Request, error: TrapsError) -> Response:
         status = 404 if isinstance(error, NotFound) else 409 if isinstance(error, Conflict) else 400
         return JSONResponse({"error": str(error)}, status)
 

@@ -131,9 +131,9 @@ def pick(times: np.ndarray, spec: MediaSpec) -> np.ndarray:
 def sample(clip: Path, spec: MediaSpec) -> Frames:
     """Return a clip's frames as a model sees them; may raise DamagedClip."""
     frames, times = decode(clip)
-    chosen = pick(times, spec)
+    indices = pick(times, spec)
     clip_fps = round((len(times) - 1) / float(times[-1] - times[0]), 3) if len(times) > 1 else None
-    return Frames(resize(frames[chosen], spec.size, spec.fit), times[chosen], clip_fps)
+    return Frames(resize(frames[indices], spec.size, spec.fit), times[indices], clip_fps)
 
 
 def resize(frames: np.ndarray, size: tuple[int, int] | None, fit: Literal["stretch", "crop"] = "stretch") -> np.ndarray:

@@ -29,7 +29,7 @@ _FOOTER, _SUFFIX = b"traps", ".parquet"
 # Marks the digest of a file's own bytes in its footer, computed with zeros in the digest's place.
 _SUM, _MARK, _ZEROS = b"traps-sum", b"traps-sum:", b"0" * 8
 _ROWS_AT_ONCE = 1000  # rows converted to Python values at a time
-_WHOLE: dict[Path, str] = {}  # files whose digest this process has verified, with their stamp
+_VERIFIED: dict[Path, str] = {}  # files whose digest this process has verified, with their stamp
 _FOOTERS: dict[Path, tuple[str, State, list[str]]] = {}  # footers by file, with its stamp
 
 
@@ -233,7 +233,7 @@ class TableStore:
         paths = {path for pattern in patterns for path in self._store.below(self.root / table.name, pattern)}
         pieces = [self._load(table, path, columns) for path in sorted(paths)]
         pieces = [piece.replace_schema_metadata(None) for piece in pieces]
-        return pa.concat_tables(pieces) if pieces else _wanted(table, columns).empty_table()
+        return pa.concat_tables(pieces) if pieces else _schema_of(table, columns).empty_table()
 
     def partitions(self, table: Table) -> list[dict[str, str]]:
         """Return a table's existing partitions, sorted by path, with the path's values."""
@@ -247,7 +247,7 @@ class TableStore:
         import pyarrow.parquet as pq
 
         try:
-            names = _wanted(table, columns)
+            names = _schema_of(table, columns)
             data = pq.ParquetFile(_sound_bytes(self._store.here(path))).read(columns=names.names)
             if not data.schema.equals(names):
                 raise pa.ArrowInvalid("its columns are not those of this version")
@@ -324,10 +324,10 @@ def _sound_bytes(path: Path) -> pa.BufferReader:
     with path.open("rb") as stream:
         content, stamp = stream.read(), _stamp(os.fstat(stream.fileno()))
     place = content.rfind(_MARK) + len(_MARK)
-    if _WHOLE.get(path) != stamp:
+    if _VERIFIED.get(path) != stamp:
         if place < len(_MARK) or content[place : place + len(_ZEROS)] != _sum_of(content):
             raise TrapsError(f"{path}: is not what was written (it was altered); run again, and it is made anew")
-        _WHOLE[path] = stamp
+        _VERIFIED[path] = stamp
     return pa.BufferReader(content)
 
 
@@ -367,7 +367,7 @@ def _column(rows: Sequence[Any], field: pa.Field) -> pa.Array:
     return pa.array(list(missing), field.type)
 
 
-def _wanted(table: Table, columns: Sequence[str] | None) -> pa.Schema:
+def _schema_of(table: Table, columns: Sequence[str] | None) -> pa.Schema:
     """Return the table's schema, or some columns of it in the schema's order."""
     import pyarrow as pa
 

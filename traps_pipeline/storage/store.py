@@ -48,7 +48,10 @@ class UnusedObject:
 
 
 class Store(ABC):
-    """The files of one study. root: the local folder below which every path lies."""
+    """The files of one study.
+
+    root: the local folder below which every path lies.
+    """
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -205,16 +208,16 @@ class FolderStore(Store):
         folder = self.root / LEASES
         path = folder / name.replace("/", "-")
         with writable(folder):
-            held = try_lock(path)
+            descriptor = try_lock(path)
 
         def close() -> None:
-            assert held is not None, "only what is held is closed"
+            assert descriptor is not None, "only what is held is closed"
             path.unlink(missing_ok=True)  # first, so that a process that has opened it finds it gone
-            os.close(held)
+            os.close(descriptor)
             with suppress(OSError):
                 folder.rmdir()  # unless there are others
 
-        return None if held is None else Lease(close)
+        return None if descriptor is None else Lease(close)
 
     def below(self, folder: Path, pattern: str = "**/*") -> list[Path]:
         """See `Store`."""

@@ -22,7 +22,7 @@ from traps_pipeline.storage.workspace import DATABASE, Workspace
 # Dagster's history, lock files, reports and labels belong to a machine, and the ledger is moved separately.
 STAYS = ("dagster", "ledger", "reports", "labels", STUDY)
 AT_ONCE = 500  # files of one change
-LEFT = "study.moved.yaml"  # the new name of the folder's study.yaml
+MOVED_STUDY = "study.moved.yaml"  # the new name of the folder's study.yaml
 
 
 def move_to_store(workspace: Workspace, address: Place) -> int:
@@ -49,7 +49,7 @@ def move_to_store(workspace: Workspace, address: Place) -> int:
     def settle() -> None:
         _move_files(workspace, target)
         target.save_study()  # last: it makes the address a study
-        (workspace.root / STUDY).rename(workspace.root / LEFT)
+        (workspace.root / STUDY).rename(workspace.root / MOVED_STUDY)
 
     return copy_ledger(workspace.ledger, target.ledger, settle)
 

@@ -12,7 +12,7 @@
 
 Each annotation gives a column's type and, in words, its meaning and unit; `| None` lets values be missing. The columns
 keep the order of the fields. Columns that stand beside a figure, such as the bounds of its interval, are declared by a
-mark (`Beside`) of the figure under the decorator `with_neighbours`. Each package declares its tables in a module
+mark (`ExtraColumns`) of the figure under the decorator `with_neighbours`. Each package declares its tables in a module
 `..._rows`; columns that several packages share are in `storage.columns`. The Arrow schema is made from the
 dataclass, and every file is checked against it on writing and on reading.
 """
@@ -56,7 +56,7 @@ class StoredColumn:
 
 
 @dataclass(frozen=True)
-class Beside:
+class ExtraColumns:
     """A mark of a column that has further columns beside it.
 
     They have these suffixes, this type and this meaning.
@@ -67,7 +67,7 @@ class Beside:
 
 
 def with_neighbours(row_type: type[Row]) -> type[Row]:
-    """Declare the columns beside the marked ones (`Beside`).
+    """Declare the columns beside the marked ones (`ExtraColumns`).
 
     Place it below `@dataclass`.
     """

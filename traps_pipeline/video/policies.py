@@ -36,8 +36,8 @@ class FramePolicy:
         if self.uniform is not None and len(times) <= self.uniform:
             return np.arange(len(times))
         away = np.abs(times[:, None] - self._wanted(times)).round(9)  # s; rounded, or noise would decide between equals
-        chosen = np.unique(away.argmin(axis=0))[: self.uniform or self.most]
-        return np.unique(np.minimum(chosen + self.later, len(times) - 1))
+        indices = np.unique(away.argmin(axis=0))[: self.uniform or self.most]
+        return np.unique(np.minimum(indices + self.later, len(times) - 1))
 
     def _wanted(self, times: np.ndarray) -> np.ndarray:
         if self.fps is None:
@@ -61,10 +61,10 @@ def shown_at_end(n_frames: int, fps: int, last_s: float, until: int | None = Non
     end = n_frames if until is None else until
     last_frames: set[int] = set()
     for policy in POLICIES:
-        shown = policy.pick(times)
-        shown = shown[shown < end]
-        late = shown[times[shown] >= times[end - 1] - last_s - 1e-6]
-        last_frames |= {int(i) for i in (late if late.size else shown[-1:])}
+        indices = policy.pick(times)
+        indices = indices[indices < end]
+        late = indices[times[indices] >= times[end - 1] - last_s - 1e-6]
+        last_frames |= {int(i) for i in (late if late.size else indices[-1:])}
     return sorted(last_frames)
 
 

@@ -126,10 +126,10 @@ def _load(checkpoint: Checkpoint, params: LocalParams, device: str) -> LocalMode
             f"image-text-to-text model ({type(error).__name__}: {message}); name a checkpoint of such a class, or save "
             "it again with this version"
         ) from error
-    lacking = [*report["missing_keys"], *report["mismatched_keys"]]
-    if lacking:
+    unset = [*report["missing_keys"], *report["mismatched_keys"]]
+    if unset:
         raise TrapsError(
-            f"checkpoint {checkpoint.name}: {len(lacking)} weights are not in its files, {lacking[0]} first, and would "
+            f"checkpoint {checkpoint.name}: {len(unset)} weights are not in its files, {unset[0]} first, and would "
             "be random: download or save it again"
         )
     if not hasattr(processor, "video_token") or getattr(processor, "video_processor", None) is None:

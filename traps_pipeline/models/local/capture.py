@@ -74,7 +74,7 @@ def capturing(
     def block(_: Module, __: Any, output: Any) -> None:
         captured.raw.append(pool(first_tensor(output), pooling, chosen))
 
-    def last(_: Module, __: Any, output: Any) -> None:
+    def keep_normed(_: Module, __: Any, output: Any) -> None:
         captured.normed = pool(first_tensor(output), pooling, chosen)
 
     with ExitStack() as hooks:
@@ -82,5 +82,5 @@ def capturing(
             if number == 0:
                 hooks.callback(module.register_forward_pre_hook(embeddings, with_kwargs=True).remove)
             hooks.callback(module.register_forward_hook(block).remove)
-        hooks.callback(norm.register_forward_hook(last).remove)
+        hooks.callback(norm.register_forward_hook(keep_normed).remove)
         yield captured

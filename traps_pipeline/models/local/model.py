@@ -95,7 +95,7 @@ class LocalModel:
         placeholders = [getattr(self.processor, f"{kind}_token_id", None) for kind in ("image", "video", "audio")]
         return load_transformers().GenerationConfig(
             eos_token_id=eos,
-            pad_token_id=pad if pad is not None else _first(eos),
+            pad_token_id=pad if pad is not None else _first_token(eos),
             bos_token_id=own.bos_token_id,
             suppress_tokens=sorted({*(own.suppress_tokens or ()), *filter(None, placeholders)}) or None,
             do_sample=False,
@@ -253,8 +253,8 @@ class LocalModel:
                 rows = pending.pop()
                 generated = self._fitting(prompts, rows, max_new_tokens, sampling, steering, stopped)
                 if generated is None:
-                    half = len(rows) // 2
-                    pending += [rows[half:], rows[:half]]
+                    middle = len(rows) // 2
+                    pending += [rows[middle:], rows[:middle]]
                 else:
                     answers.update(zip(rows, generated, strict=True))
         return [answers[i] for i in range(len(prompts))]
@@ -334,7 +334,7 @@ class LocalModel:
         return sum(widths) or 2 * self.n_layers * self.d_model
 
 
-def _first(tokens: int | Sequence[int]) -> int:
+def _first_token(tokens: int | Sequence[int]) -> int:
     return tokens if isinstance(tokens, int) else tokens[0]
 
 

@@ -46,7 +46,7 @@ def unknown_path(config: Any, block: Module) -> str | None:
 
 
 def argument_of(block: Module, name: Argument, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-    """Return a call's argument of a block.
+    """Return the argument with this name in a call of a block.
 
     None if the block lacks it or the call omits it.
     """

@@ -65,8 +65,8 @@ def _items_shown(workspace: Workspace, cell: Cell, rows: Sequence[ResponseRow | 
     without = [row for row in rows if isinstance(row, ResponseRow) and row.outcome not in JUDGED]
     records = [{name: str(getattr(row, name)) for name in columns} for row in without[:ITEMS_SHOWN]]
     table = {"without an answer": Records(records)} if records else {}
-    why = {"one item": f"traps why {rows[0].item_id}"} if rows else {}
-    return {**table, "all items": StudyFile(workspace.relative(workspace.reports / page), view), **why}
+    reason = {"one item": f"traps why {rows[0].item_id}"} if rows else {}
+    return {**table, "all items": StudyFile(workspace.relative(workspace.reports / page), view), **reason}
 
 
 def _answers_missing(workspace: Workspace, key: str | None, output: StageOutput) -> str:

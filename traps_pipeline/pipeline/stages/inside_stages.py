@@ -34,8 +34,10 @@ if TYPE_CHECKING:
 _source = partial(source, group=GROUP, kinds=["yaml"], scheme=EXTRACTION)
 _stage = partial(stage, group=GROUP, scheme=EXTRACTION, cost="machine")
 _STATES = of(hidden_states, by_extraction, need="some")
-_ASKED = (*DATASETS, *PROBED_ARMS)
-_GATED = these_keys(CELL, [Cell(d, Evaluation(m, r, 1)).key for d in _ASKED for m in local_models() for r in PROMPTING])
+_ANSWERED_DATASETS = (*DATASETS, *PROBED_ARMS)
+_GATED = these_keys(
+    CELL, [Cell(d, Evaluation(m, r, 1)).key for d in _ANSWERED_DATASETS for m in local_models() for r in PROMPTING]
+)
 
 
 @_source()

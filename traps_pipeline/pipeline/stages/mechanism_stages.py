@@ -227,10 +227,10 @@ def _judged(workspace: Workspace) -> "tuple[pd.DataFrame, pd.DataFrame]":
     return workspace.tables.read_all(STEERING_TABLE), workspace.tables.read_all(STEERING_VOTES, VOTE_COLUMNS)
 
 
-_ABOVE = (of(steering, need="some"), of(steering_votes, need="some"))
+_STEERING_PARENTS = (of(steering, need="some"), of(steering_votes, need="some"))
 
 
-@_stage(STEERING_EFFECTS, code="3", parents=_ABOVE, wants=steers)
+@_stage(STEERING_EFFECTS, code="3", parents=_STEERING_PARENTS, wants=steers)
 def steering_effects(workspace: Workspace, _: None) -> list[SteeringEffectRow]:
     """Return abstention by path, kind of direction, layer, strength and side."""
     from traps_pipeline.mechanism.shares import effect_rows
@@ -238,7 +238,7 @@ def steering_effects(workspace: Workspace, _: None) -> list[SteeringEffectRow]:
     return effect_rows(*_judged(workspace))
 
 
-@_stage(STEERING_SHARES, code="4", parents=_ABOVE, wants=steers)
+@_stage(STEERING_SHARES, code="4", parents=_STEERING_PARENTS, wants=steers)
 def steering_shares(workspace: Workspace, _: None) -> list[SteeringShareRow]:
     """Return abstention over the paths of a set, with intervals by scenario."""
     from traps_pipeline.mechanism.shares import share_rows

@@ -76,10 +76,10 @@ def _labels_and_verdicts(workspace: Workspace) -> "tuple[pd.DataFrame, pd.DataFr
     return labels, own.reset_index(drop=True)
 
 
-_AGAINST = (human_labels, of(verdicts, need="none"), judges)
+_VALIDATION_PARENTS = (human_labels, of(verdicts, need="none"), judges)
 
 
-@_stage(PANEL_ERRORS, code="2", parents=_AGAINST)
+@_stage(PANEL_ERRORS, code="2", parents=_VALIDATION_PARENTS)
 def panel_errors(workspace: Workspace, _: None) -> "pd.DataFrame":
     """Return the panel's sensitivity and specificity against people, by task.
 
@@ -90,7 +90,7 @@ def panel_errors(workspace: Workspace, _: None) -> "pd.DataFrame":
     return rows_of(*_labels_and_verdicts(workspace))
 
 
-@_stage(CORRECTED, code="2", parents=_AGAINST)
+@_stage(CORRECTED, code="2", parents=_VALIDATION_PARENTS)
 def corrected(workspace: Workspace, _: None) -> "pd.DataFrame":
     """Return every leaderboard entry as judged, and corrected for panel errors."""
     from traps_pipeline.people.corrected_scores import corrected as rows_of

@@ -16,7 +16,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 GROUP = "report"
 # Declared before this group, which reads their tables, as the package's file does for the mechanism's.
-READ = (judging_stages, people_stages, scoring_stages)
+GROUPS_READ = (judging_stages, people_stages, scoring_stages)
 NAMES = 12  # names of pieces listed in an event
 SCORES = ("leaderboard", "robust", "human_row", "panel_errors")  # on the page and in the explorer
 ANSWERS = ("items", "videos", "responses", "votes", "verdicts")

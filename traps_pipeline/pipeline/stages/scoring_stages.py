@@ -207,7 +207,7 @@ def graded(workspace: Workspace, _: None) -> "pd.DataFrame":
     from traps_pipeline.storage.posteriors import posteriors
 
     known = posteriors(workspace)
-    asked = {
+    questions = {
         row["item_id"]: GradedItem(
             [*row["labels"]],
             json.loads(row["aliases"]),
@@ -220,4 +220,4 @@ def graded(workspace: Workspace, _: None) -> "pd.DataFrame":
     verdicts, votes, responses = (
         current_rows(workspace, table, dataset=GRADED) for table in (VERDICTS, VOTES, RESPONSES)
     )
-    return against_posterior(verdicts, votes, responses, asked)
+    return against_posterior(verdicts, votes, responses, questions)

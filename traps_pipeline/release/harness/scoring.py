@@ -58,19 +58,19 @@ def judge(item: Mapping[str, Any], outcome: str, text: str | None, regime: str) 
     All three judges of the panel `rules` read by the same rules, so one reading is their majority.
     """
     row = {"outcome": outcome if (text or "").strip() or outcome not in ("answer", "truncated") else "empty"}
-    read = read_answer({**row, "text": text}, None, regime)
+    reading = read_answer({**row, "text": text}, None, regime)
     names = {name: item[name] for name in ("item_id", "dataset", "side")}
-    if read.outcome not in JUDGED or read.text is None:
-        return PanelDecision(**names, outcome=read.outcome)
-    statement = read_statement(read.text, item["question"])
+    if reading.outcome not in JUDGED or reading.text is None:
+        return PanelDecision(**names, outcome=reading.outcome)
+    statement = read_statement(reading.text, item["question"])
     if statement is None:
         return PanelDecision(**names, outcome=UNREAD)
     abstained = statement.value is None
     if item["side"] != "control":
-        return PanelDecision(**names, outcome=read.outcome, abstained=abstained)
+        return PanelDecision(**names, outcome=reading.outcome, abstained=abstained)
     labels, aliases = list(item["labels"]), json.loads(item["aliases"])
     correct = is_correct(statement.value, item["ground_truth"], item["answer_type"], labels, aliases)
-    return PanelDecision(**names, outcome=read.outcome, abstained=abstained, correct=correct)
+    return PanelDecision(**names, outcome=reading.outcome, abstained=abstained, correct=correct)
 
 
 def figures(judged: Iterable[PanelDecision]) -> dict[str, float | None]:

@@ -38,8 +38,8 @@ _COPIED = (
     *("release/harness/harness_items.py", "release/harness/inspect_task.py"),
 )
 _IMPORT = re.compile(r"(?m)^( *)from traps_pipeline\.([\w.]+) import ")
-_SHOWN = ("item_id", "dataset", "side", "question", "labels", "aliases", "answer_type", "ground_truth", "canary")
-SHOWN: Mapping[Literal["images", "video"], MediaSpec] = {
+_ITEM_FIELDS = ("item_id", "dataset", "side", "question", "labels", "aliases", "answer_type", "ground_truth", "canary")
+MEDIA_SETTINGS: Mapping[Literal["images", "video"], MediaSpec] = {
     "images": MediaSpec(profile="images", fps=5, most=25),
     "video": MediaSpec(profile="video", fps=5, most=25),
 }
@@ -51,13 +51,13 @@ def media_settings(media: Literal["images", "video"], uniform: int | None = None
     The protocol's 25 frames, or evenly spaced ones. Raises TrapsError.
     """
     if uniform is None:
-        return SHOWN[media]
+        return MEDIA_SETTINGS[media]
     if media == "video":
         raise TrapsError("--uniform: goes with --media images; a video plays the protocol's 5 frames a second")
     return MediaSpec(profile="images", uniform=uniform)
 
 
-def write_harness(release: Path, target: Path, media: MediaSpec = SHOWN["images"]) -> int:
+def write_harness(release: Path, target: Path, media: MediaSpec = MEDIA_SETTINGS["images"]) -> int:
     """Write the harness of a released folder's pairs to an empty folder.
 
     Return the number of items.
@@ -117,7 +117,7 @@ def _items(release: Path, package: Path, media: MediaSpec) -> list[str]:
                 name = f"{MEDIA}/{clip[:32]}" + (f"/{number:02d}.jpg" if media.profile == "images" else ".mp4")
                 write_bytes(package / name, part)
                 prepared[clip].append(name)
-        item = {name: row[name] for name in _SHOWN} | {"media": prepared[clip]}
+        item = {name: row[name] for name in _ITEM_FIELDS} | {"media": prepared[clip]}
         lines.append(json.dumps(item, ensure_ascii=False) + "\n")
         hashes.append(row["item_hash"])
     write_text(package / ITEMS, "".join(lines))

@@ -20,7 +20,7 @@ from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.judged_answers import UNREAD
 from traps_pipeline.protocol.cells import Evaluation
-from traps_pipeline.protocol.datasets import BESIDE, DATASETS, SIDES
+from traps_pipeline.protocol.datasets import DATASETS, SIDES, UNPAIRED
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.storage.benchmark_tables import ITEMS, SCENE_SPECS
 from traps_pipeline.storage.tables import Table
@@ -90,7 +90,7 @@ def study_items(workspace: Workspace) -> pd.DataFrame:
     items, specs = workspace.tables.read_all(ITEMS), workspace.tables.read_all(SCENE_SPECS, ["scenario_id", "family"])
     if items.empty:
         raise TrapsError(f"{workspace.root}: has no items yet; run `traps run EXPERIMENT` in it first")
-    place = {name: k for k, name in enumerate((*DATASETS, *BESIDE, *SIDES))}
+    place = {name: k for k, name in enumerate((*DATASETS, *UNPAIRED, *SIDES))}
     items = items.merge(specs, on="scenario_id", how="left", validate="many_to_one")
     items["family"] = items["family"].fillna(items["sub_scenario"])
     order = ["dataset", "family", "scenario_id", "side"]

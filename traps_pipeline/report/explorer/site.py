@@ -27,7 +27,7 @@ from traps_pipeline.base.files import write_bytes
 from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.people.human_score_rows import HUMAN_ROW, PANEL_ERRORS
-from traps_pipeline.protocol.datasets import BESIDE, DATASETS, sides_of
+from traps_pipeline.protocol.datasets import DATASETS, UNPAIRED, sides_of
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.report.explorer.answer_shards import StudyAnswers, study_answers
 from traps_pipeline.report.explorer.scenario_words import certificate_phrases, closes_frame, intervention
@@ -194,7 +194,7 @@ def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_c
     evaluations = [[e.model, e.regime, e.run] for e in answers.evaluations]
     models = sorted({*(e.model for e in answers.evaluations), *board["model"], *published["model"]})
     unknown = "not in the registry"
-    datasets = [name for name in (*DATASETS, *BESIDE) if name in set(answers.items["dataset"])]
+    datasets = [name for name in (*DATASETS, *UNPAIRED) if name in set(answers.items["dataset"])]
     return {
         "name": workspace.study.name,
         "benchmark": f"{release.name} {release.version}",

@@ -157,8 +157,8 @@ def zero_boundary(results: Results) -> list[PrintedTable]:
     zero = rows.groupby("regime").size().reindex(n_cells.index, fill_value=0)
     notes = [", ".join(f"{regime}: {zero[regime]} of {n} cells" for regime, n in n_cells.items()), epochs(rows)]
     notes += marks(rows)
-    why = "no cell has PECS 0" if len(results.cells) else results.why("cells")
-    table = PrintedTable("zero_boundary", "Cells with PECS 0", rows, columns, notes, why, cell_trace)
+    reason = "no cell has PECS 0" if len(results.cells) else results.why("cells")
+    table = PrintedTable("zero_boundary", "Cells with PECS 0", rows, columns, notes, reason, cell_trace)
     return [rightly_empty(table, bool(len(results.cells)))]
 
 
@@ -227,8 +227,8 @@ def contrasts(results: Results) -> list[PrintedTable]:
         notes.append(f"{TOO_FEW}: no answers to so few scenarios could differ significantly")
     notes += ["missing: items of both sides", *marks(rows)] if len(rows) else []
     trace: Trace = lambda row, field: SourceItems("", row["left_model"], row["left_regime"])  # noqa: E731
-    why = "fewer than two entries have all four datasets" if results.is_study else results.why("contrasts")
-    return [PrintedTable("contrasts", "Paired contrasts", rows, columns, notes, why, trace)]
+    reason = "fewer than two entries have all four datasets" if results.is_study else results.why("contrasts")
+    return [PrintedTable("contrasts", "Paired contrasts", rows, columns, notes, reason, trace)]
 
 
 def regime_tests(results: Results) -> list[PrintedTable]:
@@ -241,8 +241,8 @@ def regime_tests(results: Results) -> list[PrintedTable]:
         Column("p", "p", "p"), Column("p_holm", "p, Holm", "p"), Column("refused", "Refused"),
     ]  # fmt: skip
     trace: Trace = lambda row, field: SourceItems(row["dataset"], row["model"], row["left_regime"])  # noqa: E731
-    why = "no model has two regimes" if results.is_study else results.why("regime_tests")
-    return [PrintedTable("regime_tests", "McNemar’s test of regimes", rows, columns, why=why, trace=trace)]
+    reason = "no model has two regimes" if results.is_study else results.why("regime_tests")
+    return [PrintedTable("regime_tests", "McNemar’s test of regimes", rows, columns, why=reason, trace=trace)]
 
 
 def spreads(results: Results) -> list[PrintedTable]:
@@ -261,10 +261,10 @@ def spreads(results: Results) -> list[PrintedTable]:
         Column("n", "Cells", "count"),
     ]
     notes = ["quartiles over cells of the population standard deviation of PECS over runs; cells of one run left out"]
-    why = "no cell has more than one run" if len(cells) else results.why("cells")
+    reason = "no cell has more than one run" if len(cells) else results.why("cells")
     rows = frame(rows, ["family"])
     trace: Trace = lambda row, field: SourceItems()  # noqa: E731
-    return [PrintedTable("run_spread", "Spread over runs", rows, columns, [*notes, epochs(cells)], why, trace)]
+    return [PrintedTable("run_spread", "Spread over runs", rows, columns, [*notes, epochs(cells)], reason, trace)]
 
 
 def degenerate(results: Results) -> list[PrintedTable]:

@@ -9,12 +9,12 @@ from traps_pipeline.protocol.datasets import DATASETS, SHORT, taxonomy_of
 from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.inside_columns import (
-    AT,
     DIRECTIONS,
     DRAWS,
     INFERENCE,
     LAYER,
     PATH,
+    PROBE_KEY,
     SHORTCUTS,
     SIDES,
     against,
@@ -38,10 +38,10 @@ SIGNS = {"label": "+ controls, − voids", "plus": "+ everywhere", "minus": "−
 
 # --- probes and their baselines ---------------------------------------------------------------------------------------
 
-WHAT = {
+SOURCE_WORDS = {
     "occlusion_answerable": "void clip, answerable question",
     "decoy": "decoy: an occluder that hides nothing",
-    "removed": "the void’s own panel, gone before the end",
+    "removed": "the void’s own occluder, gone before the end",
     "length_matched": "whole clip as short as a void",
     "chaotic_time_swapped": "frame times of the other side",
 }
@@ -49,7 +49,7 @@ WHAT = {
 
 def probe_baselines(results: Results) -> list[PrintedTable]:
     """Return the probe beside raw inputs, margin and noise; also on look-alikes."""
-    return [_beside(results), _look_alikes(results)]
+    return [_baseline_table(results), _look_alikes(results)]
 
 
 def beside(results: Results) -> pd.DataFrame:
@@ -70,15 +70,15 @@ def beside(results: Results) -> pd.DataFrame:
 
 def look_alikes(results: Results) -> pd.DataFrame:
     """Return `beside` for look-alikes of voids, by probes of their own taxonomy."""
-    probe = results.probes.loc[results.probes["chosen"].eq(True) & results.probes["target"].isin([*WHAT])]
+    probe = results.probes.loc[results.probes["chosen"].eq(True) & results.probes["target"].isin([*SOURCE_WORDS])]
     own = [taxonomy_of(s) == probed_taxonomy(t) for s, t in zip(probe["source"], probe["target"], strict=True)]
     return _with_baselines(results, probe.loc[own])
 
 
 def _with_baselines(results: Results, probe: pd.DataFrame) -> pd.DataFrame:
     probe = (probe if len(results.baselines) else probe.head(0)).astype({"prompt": object})
-    states = probe[[*AT, "layer", "value", "low", "high", "n_voids", "n_controls"]]
-    table = states.merge(by_features(results), on=AT, how="left")
+    states = probe[[*PROBE_KEY, "layer", "value", "low", "high", "n_voids", "n_controls"]]
+    table = states.merge(by_features(results), on=PROBE_KEY, how="left")
     return table.assign(mark=few(table, "n_voids", "n_controls"))
 
 
@@ -98,7 +98,7 @@ _NOTES = (
 )
 
 
-def _beside(results: Results) -> PrintedTable:
+def _baseline_table(results: Results) -> PrintedTable:
     rows = beside(results)
     rows = rows.assign(path=path_names(rows))
     columns = [MODEL, PATH, *_PROBE, *_BASELINES, *SIDES]
@@ -115,8 +115,8 @@ def _beside(results: Results) -> PrintedTable:
 def _look_alikes(results: Results) -> PrintedTable:
     rows = look_alikes(results)
     named = rows.assign(
-        what=[WHAT[name] for name in rows["target"]],
-        against=[AGAINST[name] for name in rows["analysis"]],
+        what=[SOURCE_WORDS[name] for name in rows["target"]],
+        against=[OPPOSITES[name] for name in rows["analysis"]],
         path=short_names(rows["source"]),
     )
     columns = [
@@ -135,7 +135,7 @@ def _look_alikes(results: Results) -> PrintedTable:
     return PrintedTable("probe_look_alikes", title, named, columns, notes, absent, deviation=DRAWS)
 
 
-AGAINST = {"answerable_void": "voids", "answerable_control": "controls", "time_swapped": "its other side"}
+OPPOSITES = {"answerable_void": "voids", "answerable_control": "controls", "time_swapped": "its other side"}
 
 
 # --- steering ---------------------------------------------------------------------------------------------------------
@@ -290,9 +290,9 @@ def _gate_controls(results: Results) -> PrintedTable:
 def _gate_answerable(results: Results) -> PrintedTable:
     rows = _gates(results)
     rows = rows.loc[~rows["target"].isin([*SHORT, "all"]) & (rows["source"] == DEFAULT_GATE["source"])]
-    rows = rows.loc[rows["target"].isin([*WHAT]) & (rows["target"] != "chaotic_time_swapped")]
+    rows = rows.loc[rows["target"].isin([*SOURCE_WORDS]) & (rows["target"] != "chaotic_time_swapped")]
     rows = rows.drop_duplicates(["model", "features", "threshold", "target"])  # gates know no regime here
-    rows = rows.assign(what=[WHAT[name] for name in rows["target"]], mark=few(rows, "n_controls"))
+    rows = rows.assign(what=[SOURCE_WORDS[name] for name in rows["target"]], mark=few(rows, "n_controls"))
     columns = [
         MODEL, Column("features", "Features"), Column("threshold", "Threshold"), Column("what", "Items"),
         Column("false_abs", "Abstained on %", "percent", mark="mark"),

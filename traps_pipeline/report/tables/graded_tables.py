@@ -13,7 +13,7 @@ from traps_pipeline.report.writing import Column, PrintedTable, fraction
 if TYPE_CHECKING:
     import pandas as pd
 
-WHY = "graded cuts were not asked (name `graded` under datasets)"
+WHY_EMPTY = "graded cuts were not asked (name `graded` under datasets)"
 
 
 def graded(results: Results) -> list[PrintedTable]:
@@ -24,11 +24,11 @@ def graded(results: Results) -> list[PrintedTable]:
     rows = results.graded
     rows = rows.loc[rows["scope"] == "all"]
     two_digits = partial(fraction, digits=2)
-    shown = {
+    columns_of = {
         f"{name}_shown": [figure_with_interval(row, name, two_digits) for row in rows.to_dict("records")]
         for name in ("points", "brier")
     }
-    rows = ordered(rows.assign(**shown), ["regime", "model"])
+    rows = ordered(rows.assign(**columns_of), ["regime", "model"])
     columns = [
         MODEL, REGIME, Column("n_items", "Cuts", "count"), Column("n_missing", "Missing", "count"),
         Column("coverage", "Answers %", "percent"), Column("risk", "Wrong %", "percent"),
@@ -39,7 +39,7 @@ def graded(results: Results) -> list[PrintedTable]:
         Column("abstains_wrong", "wrongly %", "percent"),
         Column("brier_shown", "Brier", "range", group=True),
     ]  # fmt: skip
-    return [PrintedTable("graded", "Graded cuts", rows, columns, _notes(rows) if len(rows) else [], WHY)]
+    return [PrintedTable("graded", "Graded cuts", rows, columns, _notes(rows) if len(rows) else [], WHY_EMPTY)]
 
 
 def _notes(rows: pd.DataFrame) -> list[str]:

@@ -68,8 +68,8 @@ def judge_corrected(results: Results) -> list[PrintedTable]:
     ]  # fmt: skip
     rows = results.corrected
     overall = rows.loc[rows["dataset"] == "overall"] if "overall" in set(rows["dataset"]) else rows
-    shown = _with_intervals(overall, [f"{name}{end}" for name in _FIGURES for end in ("", "_corrected")])
-    shown = ordered(with_titles(shown), ["dataset", "model", "regime"])
+    entries = _with_intervals(overall, [f"{name}{end}" for name in _FIGURES for end in ("", "_corrected")])
+    entries = ordered(with_titles(entries), ["dataset", "model", "regime"])
     figures = [
         Column(f"{field}{end}_shown", f"{heading}{', corrected' if end else ''}", "range", group=not end)
         for field, heading in _FIGURES.items()
@@ -80,24 +80,24 @@ def judge_corrected(results: Results) -> list[PrintedTable]:
         "judged and corrected in the same resamples of scenarios; a correction assumes that the panel errs alike on "
         "the answers of all models"
     ]
-    why = "not validated: people labelled no answers (run traps people annotate)"
+    reason = "not validated: people labelled no answers (run traps people annotate)"
     reasons = sorted(set(results.panel_errors["undefined"].dropna()))
     return [
-        PrintedTable("panel_errors", "The panel against people", errors, of_panel, reasons, why),
+        PrintedTable("panel_errors", "The panel against people", errors, of_panel, reasons, reason),
         PrintedTable(
-            "judge_corrected", "Judged, and corrected for the panel’s errors", shown,
-            [MODEL, REGIME, DATASET, *figures, RUNS], notes if len(shown) else [], why,
+            "judge_corrected", "Judged, and corrected for the panel’s errors", entries,
+            [MODEL, REGIME, DATASET, *figures, RUNS], notes if len(entries) else [], reason,
         ),
     ]  # fmt: skip
 
 
 def _with_intervals(rows: pd.DataFrame, fields: list[str]) -> pd.DataFrame:
     """Return the rows with `FIELD_shown`: the figure and its interval as printed."""
-    columns = {f"{field}_shown": [_shown(row, field) for row in rows.to_dict("records")] for field in fields}
+    columns = {f"{field}_shown": [_ranged(row, field) for row in rows.to_dict("records")] for field in fields}
     return rows.assign(**columns)
 
 
-def _shown(row: Mapping[Any, Any], field: str) -> str:
+def _ranged(row: Mapping[Any, Any], field: str) -> str:
     return figure_with_interval(row, field, percent if field.removesuffix("_corrected") in _PERCENT else fraction)
 
 
@@ -113,7 +113,7 @@ def _score_of_people(rows: pd.DataFrame) -> str:
     row = by_dataset.get("overall", {})
     if not row or row["pecs"] != row["pecs"]:
         return f"{NOT_RUN} in full, since PECS needs labels of both sides of all four datasets"
-    figures = ", ".join(f"{heading.removesuffix(' %')} {_shown(row, field)}" for field, heading in _FIGURES.items())
+    figures = ", ".join(f"{heading.removesuffix(' %')} {_ranged(row, field)}" for field, heading in _FIGURES.items())
     return f"{figures} ({row['n_people']} people, {row['n_clips']} clips, {row['seconds']:.0f} s a clip)"
 
 
@@ -121,8 +121,8 @@ def _validated(rows: pd.DataFrame) -> str:
     if rows.empty:
         return "not validated, people have labelled none of its answers (run traps people annotate)"
     remarks = [
-        f"{row['task']} sensitivity {_shown(row, 'sensitivity')} %, specificity {_shown(row, 'specificity')} %"
+        f"{row['task']} sensitivity {_ranged(row, 'sensitivity')} %, specificity {_ranged(row, 'specificity')} %"
         for row in rows.to_dict("records")
     ]
-    lacking = " (the other task is not validated)" if len(remarks) == 1 else ""
-    return f"against people {'; '.join(remarks)}{lacking}"
+    remainder = " (the other task is not validated)" if len(remarks) == 1 else ""
+    return f"against people {'; '.join(remarks)}{remainder}"

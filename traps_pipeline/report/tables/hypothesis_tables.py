@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from traps_pipeline.scoring.doses import Hypothesis
 
-WHY = "no variation was run (traps run hypotheses)"
+WHY_EMPTY = "no variation was run (traps run hypotheses)"
 _TITLES = {
     "answer space": "Answers to choose from",
     "occluder": "Look of the occluder",
@@ -29,19 +29,19 @@ def hypotheses(results: Results) -> list[PrintedTable]:
     """Return answers and abstentions by steps of one property, beside shortcut rules."""
     from traps_pipeline.scoring.doses import HYPOTHESES
 
-    return [_of(results.hypotheses, hypothesis) for hypothesis in HYPOTHESES]
+    return [_hypothesis_table(results.hypotheses, hypothesis) for hypothesis in HYPOTHESES]
 
 
-def _of(rows: pd.DataFrame, hypothesis: Hypothesis) -> PrintedTable:
+def _hypothesis_table(rows: pd.DataFrame, hypothesis: Hypothesis) -> PrintedTable:
     own = rows.loc[rows["hypothesis"] == hypothesis.name]
     place = {dose.name: k for k, dose in enumerate(hypothesis.doses)}
     own = own.assign(place=own["dose"].map(place))
-    shown = {
+    columns_of = {
         f"{name}_shown": [figure_with_interval(row, name, percent) for row in own.to_dict("records")]
         for name in (*_HEADINGS, "change")
     }
     rules = {f"{name}_shown": [_rule(row, name) for row in own.to_dict("records")] for name in ("value", "change")}
-    own = own.assign(**shown, **{f"rule_{name}": values for name, values in rules.items()})
+    own = own.assign(**columns_of, **{f"rule_{name}": values for name, values in rules.items()})
     kind = "J" if hypothesis.figure == "j" else "abstentions"
     columns = [
         MODEL, REGIME, Column("dose", "Dose"), Column("counts_as", "Counts as"),
@@ -66,7 +66,7 @@ def _of(rows: pd.DataFrame, hypothesis: Hypothesis) -> PrintedTable:
     notes += [f"{row['model']}, {row['dose']}: not compared, {row['refused']}" for row in refused]
     rows = ordered(own, ["model", "regime", "place"])
     name = f"hypothesis_{hypothesis.name.replace(' ', '_')}"
-    return PrintedTable(name, _TITLES[hypothesis.name], rows, columns, notes if len(own) else [], WHY)
+    return PrintedTable(name, _TITLES[hypothesis.name], rows, columns, notes if len(own) else [], WHY_EMPTY)
 
 
 def _rule(row: Mapping[Any, Any], name: str) -> str:

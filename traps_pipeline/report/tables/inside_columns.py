@@ -26,9 +26,9 @@ FEW = 10  # values from fewer items of a side, or answers of a cell, are marked
 FEW_MARK = "†"
 SHORTCUTS = ("question words", "first frame", "all frames", "length", "time stamps")
 KEYS = ["model", "source", "target"]
-AT = ["model", "prompt", "analysis", "source", "target"]
+PROBE_KEY = ["model", "prompt", "analysis", "source", "target"]
 NO_RAW = "none above .5"
-BESIDE = ("raw", "raw_value", "margin", "noise", "noise_spread")
+BASELINE_COLUMNS = ("raw", "raw_value", "margin", "noise", "noise_spread")
 BASELINE_NOTES = (
     "best raw input: the one of question words, first frame, all frames, length and time stamps with the highest "
     "AUROC, by the same protocol; output margin: log-odds that the first answer token begins an abstention; noise: "
@@ -82,10 +82,10 @@ def by_features(results: Results) -> pd.DataFrame:
     import pandas as pd
 
     rows = results.baselines
-    wide = rows.pivot_table(index=AT, columns="features", values="value", observed=True)
+    wide = rows.pivot_table(index=PROBE_KEY, columns="features", values="value", observed=True)
     wide = wide.reindex(columns=pd.Index([*SHORTCUTS, "output margin", "noise"]))
-    spread = rows.loc[rows["features"] == "noise"].set_index(AT)["spread"]
-    return wide.join(spread.rename("noise_spread")).reset_index().astype(dict.fromkeys(AT, object))
+    spread = rows.loc[rows["features"] == "noise"].set_index(PROBE_KEY)["spread"]
+    return wide.join(spread.rename("noise_spread")).reset_index().astype(dict.fromkeys(PROBE_KEY, object))
 
 
 def against(results: Results, analysis: str) -> pd.DataFrame:

@@ -38,8 +38,8 @@ def agreement(results: Results) -> list[PrintedTable]:
         Column("n_undecided", "Undecided", "count"),
     ]  # fmt: skip
     notes = [epochs(rows), *_undefined(rows), "unanimous and κ over answers with three valid votes"]
-    why = results.why("agreement")
-    return [PrintedTable("judge_agreement", "Agreement of the judges", rows, columns, notes, why, _task_trace)]
+    reason = results.why("agreement")
+    return [PrintedTable("judge_agreement", "Agreement of the judges", rows, columns, notes, reason, _task_trace)]
 
 
 def _task_trace(row: Mapping[str, Any], field: str) -> SourceItems:
@@ -73,10 +73,12 @@ def judge_bias(results: Results) -> list[PrintedTable]:
         Column("difference", "Difference", "fraction"), N, RUNS, MISSING,
     ]  # fmt: skip
     notes = ["two judges: one against one is undecided and counts as missing", epochs(leave_one_out)]
-    why = results.why("bias")
+    reason = results.why("bias")
     return [
-        PrintedTable("judge_bias", "Each judge against the panel", bias, columns, [epochs(bias)], why, _task_trace),
-        PrintedTable("leave_one_judge_out", "PECS without one judge", leave_one_out, without, notes, why, cell_trace),
+        PrintedTable("judge_bias", "Each judge against the panel", bias, columns, [epochs(bias)], reason, _task_trace),
+        PrintedTable(
+            "leave_one_judge_out", "PECS without one judge", leave_one_out, without, notes, reason, cell_trace
+        ),
     ]
 
 
@@ -91,7 +93,7 @@ def validation(results: Results) -> list[PrintedTable]:
         Column("n_failures", "Failures", "count"), Column("n_labels", "Labels", "count"),
     ]  # fmt: skip
     notes = ["labels of both annotators side by side, no consensus"] + ([] if results.is_study else ["epoch original"])
-    why = "no label files of annotators (`traps people validate`)" if results.is_study else ""
+    reason = "no label files of annotators (`traps people validate`)" if results.is_study else ""
     return [
         PrintedTable(
             "judge_validation",
@@ -99,7 +101,7 @@ def validation(results: Results) -> list[PrintedTable]:
             rows,
             columns,
             notes,
-            why,
+            reason,
             lambda row, field: SourceItems("", "", "standard", "void"),
             dash="undefined",
         )
@@ -117,6 +119,6 @@ def confabulation(results: Results) -> list[PrintedTable]:
     ]
     if results.is_study:
         columns += [Column("n_sampled", "Sampled", "count"), Column("evidence", "Evidence"), Column("judge", "Judge")]
-    why = "no judge of confabulation is configured for this study’s panel" if results.is_study else ""
+    reason = "no judge of confabulation is configured for this study’s panel" if results.is_study else ""
     trace: Trace = lambda row, field: SourceItems("", row["model"], "standard", "void")  # noqa: E731
-    return [PrintedTable("confabulation", "Confabulation: prevalence by model", rows, columns, notes, why, trace)]
+    return [PrintedTable("confabulation", "Confabulation: prevalence by model", rows, columns, notes, reason, trace)]

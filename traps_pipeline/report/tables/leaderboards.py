@@ -98,9 +98,9 @@ def replication_per_dataset(results: Results) -> list[PrintedTable]:
     rows = ordered(with_titles(rows), ["model", "dataset", "regime"])
     columns = [MODEL, DATASET, REGIME, PECS, *SHARES, *COUNTS, EPOCH]
     notes = [epochs(rows), *marks(rows)]
-    why = "no model of the replication families"
+    reason = "no model of the replication families"
     title = "Replication families, by dataset"
-    return [PrintedTable("replication_per_dataset", title, rows, columns, notes, why, cell_trace)]
+    return [PrintedTable("replication_per_dataset", title, rows, columns, notes, reason, cell_trace)]
 
 
 def _n(title: str, counts: pd.Series) -> str:

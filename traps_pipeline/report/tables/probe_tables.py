@@ -41,17 +41,20 @@ if TYPE_CHECKING:
 def probes(results: Results) -> list[PrintedTable]:
     """Return probes between datasets at best and chosen layers, Cf->Cf, and means."""
     pairs = _pairs(results)
-    tables = [_transfer(results, pairs), _confabulated(results, pairs), _means(results, pairs), _within(results)]
+    tables = [_transfer(results, pairs), _confabulated(results, pairs), _means(results, pairs), _within_table(results)]
     return [*tables, _layers(results), _catch(results)]
 
 
-APART = "not computed; held out: these datasets share no controls and no scenarios"
+WHY_UNSHARED = "not computed; held out: these datasets share no controls and no scenarios"
 
 # --- transfer ---------------------------------------------------------------------------------------------------------
 
 
-class At(NamedTuple):
-    """A rule that selects a pair's PROBES row (analysis, layer flag), and its columns."""
+class RowRule(NamedTuple):
+    """A rule that selects a pair's row of PROBES, and its columns.
+
+    The row is of an analysis, at the layer with a flag.
+    """
 
     analysis: str
     flag: str
@@ -61,12 +64,12 @@ class At(NamedTuple):
 _LAYER_AND_VALUE = ("layer", "value", "low", "high")
 # The figures of a pair of datasets, by the prefix of their columns in `best_layers`.
 PAIR_FIGURES = {
-    "best": At("transfer", "own_best", (*_LAYER_AND_VALUE, "n_voids", "n_controls")),
-    "chosen": At("transfer", "chosen", _LAYER_AND_VALUE),
-    "held_out": At("held_out", "all_sample_best"),
-    "cf": At("confabulated", "all_sample_best", (*_LAYER_AND_VALUE, "n_voids", "n_controls")),
-    "cf_own": At("confabulated", "own_best", ("layer", "value")),
-    "cf_held_out": At("confabulated_held_out", "all_sample_best"),
+    "best": RowRule("transfer", "own_best", (*_LAYER_AND_VALUE, "n_voids", "n_controls")),
+    "chosen": RowRule("transfer", "chosen", _LAYER_AND_VALUE),
+    "held_out": RowRule("held_out", "all_sample_best"),
+    "cf": RowRule("confabulated", "all_sample_best", (*_LAYER_AND_VALUE, "n_voids", "n_controls")),
+    "cf_own": RowRule("confabulated", "own_best", ("layer", "value")),
+    "cf_held_out": RowRule("confabulated_held_out", "all_sample_best"),
 }
 # The analyses whose baselines stand beside a pair's figures, by the prefix of their columns.
 BASELINES = {"": "transfer", "cf_": "confabulated", "held_": "held_out", "cf_held_": "confabulated_held_out"}
@@ -136,7 +139,7 @@ def _transfer(results: Results, rows: pd.DataFrame) -> PrintedTable:
         *few_note(rows),
     ]
     title = "Probe transfer: AUROC by ordered pair"
-    return PrintedTable("probe_transfer", title, rows, columns, notes, why(results), dash=APART, deviation=DRAWS)
+    return PrintedTable("probe_transfer", title, rows, columns, notes, why(results), dash=WHY_UNSHARED, deviation=DRAWS)
 
 
 def _confabulated(results: Results, pairs: pd.DataFrame) -> PrintedTable:
@@ -162,13 +165,13 @@ def _confabulated(results: Results, pairs: pd.DataFrame) -> PrintedTable:
         absent = "; ".join(silent) or absent
     title = "Probes on confabulated voids (Cf→Cf)"
     rows = rows if results.is_study else rows.head(0)
-    return PrintedTable("probe_confabulated", title, rows, columns, notes, absent, dash=APART, deviation=DRAWS)
+    return PrintedTable("probe_confabulated", title, rows, columns, notes, absent, dash=WHY_UNSHARED, deviation=DRAWS)
 
 
 def _means(results: Results, rows: pd.DataFrame) -> PrintedTable:
     if len(rows):
-        beside = [f"{prefix}{name}" for prefix in ("", "cf_") for name in ("raw_value", "margin", "noise")]
-        figures = [*(f"{name}_value" for name in PAIR_FIGURES), *beside, "held_noise", "cf_held_noise"]
+        baseline_names = [f"{prefix}{name}" for prefix in ("", "cf_") for name in ("raw_value", "margin", "noise")]
+        figures = [*(f"{name}_value" for name in PAIR_FIGURES), *baseline_names, "held_noise", "cf_held_noise"]
         sides = ("best_n_voids", "best_n_controls", "cf_n_voids", "cf_n_controls")
         by = (
             dict[str, Any].fromkeys(figures, "mean") | {"raw": _listed, "cf_raw": _listed} | dict.fromkeys(sides, "min")
@@ -191,7 +194,7 @@ def _means(results: Results, rows: pd.DataFrame) -> PrintedTable:
         ]  # fmt: skip
         notes.append("best raw inputs are the best of each path, and their AUROC is the mean over these")
     title = "Probe transfer: means over paths"
-    return PrintedTable("probe_means", title, rows, columns, notes, why(results), dash=APART, deviation=DRAWS)
+    return PrintedTable("probe_means", title, rows, columns, notes, why(results), dash=WHY_UNSHARED, deviation=DRAWS)
 
 
 def _listed(names: pd.Series) -> str:
@@ -222,7 +225,7 @@ def _shared_controls(results: Results) -> list[str]:
 # --- within a dataset, layers, centroids ------------------------------------------------------------------------------
 
 
-def _within(results: Results) -> PrintedTable:
+def _within_table(results: Results) -> PrintedTable:
     rows = results.probes
     shuffled = rows.loc[rows["analysis"] == "shuffled"].groupby(["model", "source"], sort=False, dropna=False)
     table = shuffled.agg(shuffled=("value", "mean"), spread=("spread", "mean")).reset_index()

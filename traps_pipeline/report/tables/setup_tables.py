@@ -20,7 +20,7 @@ def models(results: Results) -> list[PrintedTable]:
         rows.append(
             {
                 "model": entry.id, "provider_id": entry.endpoint, "family": entry.groups.family,
-                "access": entry.groups.access, "group": entry.groups.group, "shown": _shown(entry.media),
+                "access": entry.groups.access, "group": entry.groups.group, "shown": _media_words(entry.media),
                 "runs": entry.runs,
             }
         )  # fmt: skip
@@ -31,7 +31,7 @@ def models(results: Results) -> list[PrintedTable]:
     return [PrintedTable("models", "Models", frame(rows, ["model"]), columns, why=results.why("cells"))]
 
 
-def _shown(media: MediaSpec | None) -> str:
+def _media_words(media: MediaSpec | None) -> str:
     if media is None:
         return ""
     frames = (
@@ -46,7 +46,9 @@ def hyperparameters(results: Results) -> list[PrintedTable]:
     if results.is_study:
         voted = set(results.bias["judge"])
         judges = [judge for judge in judges if judge.id in voted]
-    rows = [_sent(entry, "model") for entry in _entries(results)] + [_sent(entry, "judge") for entry in judges]
+    rows = [_sent_params(entry, "model") for entry in _entries(results)] + [
+        _sent_params(entry, "judge") for entry in judges
+    ]
     columns = [
         Column("id", "Participant"), Column("role", "Role"), Column("temperature", "Temperature", "fraction", 2),
         Column("top_p", "Top-p", "fraction", 2), Column("max_tokens", "Tokens at most", "count"),
@@ -62,7 +64,7 @@ def hyperparameters(results: Results) -> list[PrintedTable]:
     ]  # fmt: skip
 
 
-def _sent(entry: Entry, role: str) -> dict[str, Any]:
+def _sent_params(entry: Entry, role: str) -> dict[str, Any]:
     named = ("temperature", "top_p", "max_tokens", "max_completion_tokens")
     other_params = {name: value for name, value in entry.params.items() if name not in named}
     return {

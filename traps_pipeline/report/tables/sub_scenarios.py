@@ -39,8 +39,11 @@ def occlusion_sub_scenarios(results: Results) -> list[PrintedTable]:
     if results.is_study:
         columns += [N, MISSING]
     title = "Hidden sub-scenarios against the others"
-    why = results.why("sub_scenarios")
-    return [*tables, PrintedTable("hidden_sub_scenarios", title, hidden, columns, notes, why, _sub_trace("occlusion"))]
+    reason = results.why("sub_scenarios")
+    return [
+        *tables,
+        PrintedTable("hidden_sub_scenarios", title, hidden, columns, notes, reason, _sub_trace("occlusion")),
+    ]
 
 
 def chaotic_sub_scenarios(results: Results) -> list[PrintedTable]:
@@ -55,11 +58,11 @@ def chaotic_sub_scenarios(results: Results) -> list[PrintedTable]:
     notes = ["mean over models under standard"]
     if results.is_study:
         columns += [N, Column("n_models", "Models", "count"), MISSING]
-    why = results.why("labels")
+    reason = results.why("labels")
     title = "Accuracy by ground truth, chaotic"
     return [
         _sub_table(results, rows, "chaotic_sub_scenarios", "Chaotic sub-scenarios"),
-        PrintedTable("accuracy_by_label", title, labels, columns, notes, why, _sub_trace("chaotic")),
+        PrintedTable("accuracy_by_label", title, labels, columns, notes, reason, _sub_trace("chaotic")),
     ]
 
 
