@@ -20,6 +20,7 @@ PRIVATE = {
     "dagster._core.storage.sqlite_storage": ("dagster", "pipeline/event_storage.py", "what dagster.yaml names"),
     "dagster._core.workspace.context": ("dagster", "pipeline/webserver.py", "serves"),
     "dagster._core.workspace.load_target": ("dagster", "pipeline/webserver.py", "serves"),
+    "super()._has_asset_key_col_on_connection": ("dagster", "pipeline/event_storage.py", "looked up for each event"),
     "self._db_lock": ("dagster", "pipeline/event_storage.py", "one thread opens a file of events"),
     "self._initdb": ("dagster", "pipeline/event_storage.py", "creates the tables of a file of events"),
     "self._initialized_dbs": ("dagster", "pipeline/event_storage.py", "files of events that have their tables"),

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from traps_pipeline.base.digests import file_digest
 from traps_pipeline.benchmark.shortcuts import shortcuts
 from traps_pipeline.report.figures.grids import shortcut_figure
 from traps_pipeline.video.encode import encode
@@ -21,7 +22,8 @@ def _clip(path: Path, rng: np.random.Generator, frames: int, occluder: bool) -> 
     if occluder:
         video[:, 20:50, 40:90] = (20, 30, 90)
     encode(list(video), path, 10)
-    return {"path": path.name, "duration_s": frames / 10, "size_bytes": path.stat().st_size}
+    found = {"path": path.name, "duration_s": frames / 10, "size_bytes": path.stat().st_size}
+    return {**found, "file_sha256": file_digest(path)}
 
 
 @pytest.fixture(scope="module")

@@ -88,13 +88,28 @@ def test_a_picture_is_made_again_when_the_rows_that_it_shows_change_and_not_with
     report: Report, versions: dict[str, str]
 ) -> None:
     def made_again(rows: list[str]) -> list[str]:
-        picture = Piece("sheet", lambda: repr(rows).encode(), inputs=rows)
+        picture = Piece("sheet", lambda: repr(rows).encode(), ("metrics",), lambda: rows)
         return make_pieces(report.workspace, "site", "1", [picture])[1]
 
     assert made_again(["plinko-0001"]) == ["sheet"]
     versions["metrics/chaotic"] = "2"
     assert made_again(["plinko-0001"]) == []
+    versions["metrics/chaotic"] = "3"
     assert made_again(["plinko-0002"]) == ["sheet"]
+    assert made_again(["plinko-0002"]) == []
+
+
+def test_rows_are_not_looked_at_while_their_table_is_the_same(report: Report, versions: dict[str, str]) -> None:
+    looked = list[str]()
+
+    def look() -> list[str]:
+        looked.append(versions["metrics/chaotic"])
+        return ["plinko-0001"]
+
+    for version in ("1", "1", "2", "2"):
+        versions["metrics/chaotic"] = version
+        make_pieces(report.workspace, "site", "1", [Piece("sheet", lambda: b"drawn", ("metrics",), look)])
+    assert looked == ["1", "2"]
 
 
 def test_what_all_studies_have_in_common_is_made_once_for_a_user(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import re
 from functools import cache, cached_property
@@ -22,6 +23,7 @@ from traps_pipeline.report import publish
 from traps_pipeline.report.catalogue import FIGURE_REPORTS, JUDGED_STAGES, TABLE_REPORTS
 from traps_pipeline.report.figures.abstention import doubt_points
 from traps_pipeline.report.published_results import PublishedResults
+from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.report.writing import (
     NotRun,
@@ -286,6 +288,25 @@ def test_the_report_page_depends_on_all_that_its_tables_and_figures_read():
     graph = the_graph()
     reads = {stage for report in (*TABLE_REPORTS, *FIGURE_REPORTS) for stage in report.reads}
     assert (reads & graph.declared.keys()) | {"published", "verdicts"} <= graph.parents("report_page", None).keys()
+
+
+@pytest.mark.parametrize("report", [report for report in FIGURE_REPORTS if report.frames], ids=lambda r: r.name)
+def test_a_figure_reads_the_frames_that_decide_whether_it_is_drawn_again(report, partial):
+    frames = {name for name, value in vars(Results).items() if isinstance(value, cached_property)}
+    read = set()
+
+    class Watched:
+        def __init__(self, results):
+            self.results = results
+
+        def __getattr__(self, name):
+            read.add(name)
+            return getattr(self.results, name)
+
+    for results in (PAPER, partial):
+        with contextlib.suppress(NotRun):
+            report.figure(Watched(results))
+    assert set() < read & frames <= {*report.frames}
 
 
 def test_whatever_reads_figures_that_the_panel_decided_says_who_judged():

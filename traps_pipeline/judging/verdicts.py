@@ -74,8 +74,9 @@ def decide(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) ->
     rows["unanimous"] = judged & _unanimous(abstention) & (~on_control | _unanimous(correctness))
     rows["undecided"] = judged & undecided
     said_unread = votes["invalid_reason"].eq(UNREAD) & votes["task"].eq("abstention")
-    times = rows[ANSWER].merge(votes.loc[said_unread, ANSWER].value_counts().reset_index(name="n"), how="left")["n"]
-    rows.loc[times.eq(len(cast.judges)).to_numpy(), "outcome"] = UNREAD
+    if said_unread.any():
+        times = rows[ANSWER].merge(votes.loc[said_unread, ANSWER].value_counts().reset_index(name="n"), how="left")["n"]
+        rows.loc[times.eq(len(cast.judges)).to_numpy(), "outcome"] = UNREAD
     panels = votes.loc[:, [*CELL, "panel"]].drop_duplicates(CELL)
     return rows.merge(panels, on=CELL, how="left").loc[:, VERDICTS.names]
 
@@ -86,6 +87,8 @@ def _rejects_premise(rows: pd.DataFrame, votes: pd.DataFrame, n_judges: int) -> 
     Null without a majority, or if no judge was asked.
     """
     marks = votes.loc[votes["task"].eq("abstention") & votes["rejects_premise"].notna(), [*ANSWER, "rejects_premise"]]
+    if marks.empty:
+        return pd.arrays.BooleanArray(np.zeros(len(rows), bool), np.ones(len(rows), bool))
     yes = marks.astype({"rejects_premise": "int64"}).groupby(ANSWER)["rejects_premise"].agg(["sum", "size"])
     counts = rows[ANSWER].merge(yes.reset_index(), on=ANSWER, how="left").fillna(0)
     rejects, accepts = counts["sum"].to_numpy(), (counts["size"] - counts["sum"]).to_numpy()

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 from traps_pipeline.models.thinking import strip_fence
@@ -23,6 +24,7 @@ _THOUSANDS = re.compile(r"(?<=\d),(?=\d{3}(?!\d))")
 _PUNCTUATION = re.compile(r"(?<=\d)[.\-](?=\d)|(?<![\w.])-(?=\.?\d)|(?<![\w.])\.(?=\d)|([^\w\s])")
 
 
+@lru_cache(4096)  # every vote on correctness normalises all labels and aliases of its item again
 def normalise(text: str) -> str:
     """Return the text in lower case, without articles and punctuation.
 

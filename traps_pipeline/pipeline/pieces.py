@@ -1,7 +1,7 @@
 """Cache the parts of an asset, and rebuild each only when its inputs change.
 
 The report is one page of a hundred tables, figures and pictures. Each is a piece: its content lies in an archive beside
-the asset's state, together with a digest of its inputs.
+the asset's state, together with digests of its inputs.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from traps_pipeline.base.paths import user_cache
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.storage.workspace import Workspace
 
-NOTES = "inputs.json"  # archive member with the digest of each piece's inputs
+Digests = tuple[str, str]  # of the versions of what a piece reads, and of what it shows of it
+NOTES = "inputs.json"  # archive member with the digests of each piece
 _DRAWN_BY = ("matplotlib", "pandas", "jinja2")  # libraries whose versions decide what a piece looks like
 _DATE = (1980, 1, 1, 0, 0, 0)  # date of every member, so that equal pieces give equal bytes
 
 
 @dataclass(frozen=True)
 class Piece:
-    """A part of an asset.
+    """One part of an asset. reads: the stages and sources whose versions decide whether it is rebuilt.
 
-    reads: the stages and sources whose versions decide whether it is rebuilt. inputs: if only part of a table matters,
-    that part as JSON, which is compared instead of versions. is_shared: whether all studies have the same; it is then
-    built once per user.
+    inputs: returns what it shows of them, as JSON; if their versions have changed, it is rebuilt only if this has, too.
+    is_shared: whether all studies have the same; it is then built once per user.
     """
 
     name: str
     make: Callable[[], bytes]
     reads: Sequence[str] = ()
-    inputs: Any = None
+    inputs: Callable[[], Any] | None = None
     is_shared: bool = False
 
 
@@ -50,17 +50,21 @@ def make_pieces(
     path = workspace.reports / ".state" / f"{stage}.pieces.zip"
     former = _read(workspace.store.here(path).read_bytes()) if workspace.store.has(path) else {}
     versions, shared = Lineage(workspace).inputs(stage, None), _Shared(stage)
-    inputs, contents, remade = dict[str, str](), dict[str, bytes](), list[str]()
+    inputs, contents, remade = dict[str, Digests](), dict[str, bytes](), list[str]()
     for piece in pieces:
         own = {name: version for name, version in versions.items() if name.partition("/")[0] in piece.reads}
-        inputs[piece.name] = digest([code, own if piece.inputs is None else piece.inputs])
-        known, content = former.get(piece.name, ("", b""))
-        if known != inputs[piece.name]:
-            content = shared.get(piece, inputs[piece.name]) if piece.is_shared else piece.make()
+        known, content = former.get(piece.name, (("", ""), b""))
+        of_versions = shown = digest([code, own])
+        if known[0] == of_versions:
+            shown = known[1]
+        elif piece.inputs is not None:
+            shown = digest([code, piece.inputs()])
+        if known[1] != shown:
+            content = shared.get(piece, shown) if piece.is_shared else piece.make()
             remade.append(piece.name)
-        contents[piece.name] = content
+        inputs[piece.name], contents[piece.name] = (of_versions, shown), content
     shared.keep()
-    if remade or former.keys() != contents.keys():
+    if inputs != {name: known for name, (known, _) in former.items()}:
         workspace.store.write({path: _archive(inputs, contents)})
     return contents, remade
 
@@ -73,7 +77,7 @@ class _Shared:
 
     def __init__(self, asset: str) -> None:
         self._asset, self._libraries = asset, [*map(version, _DRAWN_BY)]
-        self._pieces: dict[str, tuple[str, bytes]] | None = None
+        self._pieces: dict[str, tuple[Digests, bytes]] | None = None
         self._is_new = False
 
     def get(self, piece: Piece, inputs: str) -> bytes:
@@ -82,11 +86,11 @@ class _Shared:
             self._pieces = {}
             with suppress(OSError, RuntimeError):  # RuntimeError: a user without a home folder
                 self._pieces = _read(self._path.read_bytes())
-        inputs_digest = digest([inputs, *self._libraries])
-        known, content = self._pieces.get(piece.name, ("", b""))
-        if known != inputs_digest:
+        inputs_digests = (digest([inputs, *self._libraries]),) * 2
+        known, content = self._pieces.get(piece.name, (("", ""), b""))
+        if known != inputs_digests:
             content = piece.make()
-            self._pieces[piece.name], self._is_new = (inputs_digest, content), True
+            self._pieces[piece.name], self._is_new = (inputs_digests, content), True
         return content
 
     def keep(self) -> None:
@@ -102,7 +106,7 @@ class _Shared:
         return user_cache() / f"{self._asset}.pieces.zip"
 
 
-def _archive(inputs: Mapping[str, str], contents: Mapping[str, bytes]) -> bytes:
+def _archive(inputs: Mapping[str, Digests], contents: Mapping[str, bytes]) -> bytes:
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in {NOTES: json.dumps(inputs).encode(), **contents}.items():
@@ -110,11 +114,13 @@ def _archive(inputs: Mapping[str, str], contents: Mapping[str, bytes]) -> bytes:
     return stream.getvalue()
 
 
-def _read(data: bytes) -> dict[str, tuple[str, bytes]]:
-    """Return input digest and content of each piece, empty if the archive is damaged."""
+def _read(data: bytes) -> dict[str, tuple[Digests, bytes]]:
+    """Return the digests and content of each piece; empty if the archive is damaged, or of an earlier version."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            inputs = json.loads(archive.read(NOTES))
-            return {name: (str(inputs[name]), archive.read(name)) for name in inputs}  # checks each CRC
+            inputs = {
+                name: (str(versions), str(shown)) for name, (versions, shown) in json.loads(archive.read(NOTES)).items()
+            }
+            return {name: (digests, archive.read(name)) for name, digests in inputs.items()}  # checks each CRC
     except (zipfile.BadZipFile, ValueError, KeyError, TypeError):
         return {}

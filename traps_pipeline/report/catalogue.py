@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from traps_pipeline.models.judges import BY_RULES
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.figure import Figure
 
     from traps_pipeline.report.result_frames import Results
@@ -101,10 +102,9 @@ class TableReport:
 
 @dataclass(frozen=True)
 class FigureReport:
-    """A figure.
+    """A figure. reads: the stages whose tables it uses; published: whether the paper prints its numbers.
 
-    function: draws it (module.function of `report.figures`); reads: the stages whose tables it uses; published: whether
-    the paper prints its numbers; has_finding: whether `report.findings` has a function of its name.
+    frames: the frames of `Results` that it draws, if it is to be drawn again only when these change.
     """
 
     name: str
@@ -113,6 +113,7 @@ class FigureReport:
     reads: tuple[str, ...]
     published: bool = True
     has_finding: bool = False
+    frames: tuple[str, ...] = ()
 
     @property
     def make(self) -> Callable[[Results], Figure]:
@@ -131,6 +132,11 @@ class FigureReport:
     def note(self, results: Results) -> str:
         """Return the finding about a study (one sentence per model) and the caption."""
         return f"{self.finding(results)} {self.doc}".strip()
+
+    def inputs(self, results: Results) -> list[str]:
+        """Return the frames that it draws, and the words of those that were refused and of those who judged."""
+        frames: list[pd.DataFrame] = [getattr(results, name) for name in self.frames]
+        return [repr(rows.to_dict("split")) for rows in frames] + [repr(results.refused), results.judged_by]
 
     def files(self, results: Results) -> dict[str, bytes]:
         """Return PDF, SVG and PNG by path; empty if the figure was not run."""
@@ -206,13 +212,18 @@ TABLE_REPORTS: tuple[TableReport, ...] = (
         paper="hyperparameters"),
 )  # fmt: skip
 FIGURE_REPORTS: tuple[FigureReport, ...] = (
-    FigureReport("pecs_landscape", "PECS landscape", "landscape.landscape", ("leaderboard",)),
-    FigureReport("visual_textual", "Visual against textual voids", "abstention.visual_textual", ("leaderboard",)),
-    FigureReport("abs_rec", "AbsRec, standard and guided", "abstention.abs_rec_by_model", ("leaderboard",)),
-    FigureReport("reasoning_arrows", "Reasoning in PECS space", "landscape.reasoning", ("leaderboard",)),
+    FigureReport("pecs_landscape", "PECS landscape", "landscape.landscape", ("leaderboard",),
+        frames=("overall", "cells")),
+    FigureReport("visual_textual", "Visual against textual voids", "abstention.visual_textual", ("leaderboard",),
+        frames=("rates",)),
+    FigureReport("abs_rec", "AbsRec, standard and guided", "abstention.abs_rec_by_model", ("leaderboard",),
+        frames=("overall", "cells")),
+    FigureReport("reasoning_arrows", "Reasoning in PECS space", "landscape.reasoning", ("leaderboard",),
+        frames=("overall",)),
     FigureReport("doubt_conversion", "Doubt and conversion", "abstention.doubt",
-        ("leaderboard", "confabulation_prevalence")),
-    FigureReport("sub_scenarios", "AbsRec by sub-scenario", "grids.sub_scenarios", ("metrics", "items")),
+        ("leaderboard", "confabulation_prevalence"), frames=("rates", "confabulation")),
+    FigureReport("sub_scenarios", "AbsRec by sub-scenario", "grids.sub_scenarios", ("metrics", "items"),
+        frames=("sub_scenarios", "sub_cells")),
     FigureReport("graded", "Graded cuts", "graded_figure.graded", ("graded",), published=False),
     FigureReport("confabulation", "Prevalence of confabulation", "grids.confabulation", ("confabulation_prevalence",)),
     FigureReport("states_and_output", "States against output, item by item", "expression_figures.states_and_output",

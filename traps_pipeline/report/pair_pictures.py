@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.protocol.datasets import DATASETS
@@ -29,23 +31,34 @@ NO_ITEMS = "this study has no items yet"
 class Picture:
     """One or several figures of clips, by file name.
 
-    make: raises NotRun and DamagedClip. inputs: the rows that they show, as JSON; null if all rows of the stages
-    `reads` matter. kind: "webp" if they show frames, else "svg".
+    make: raises NotRun and DamagedClip. inputs: returns what they show of the stages `reads`, as JSON; raises
+    DamagedClip. kind: "webp" if they show frames, else "svg".
     """
 
     name: str
     title: str
     make: Callable[[], Mapping[str, Figure]]
     reads: tuple[str, ...]
-    inputs: Any = None
+    inputs: Callable[[], Any]
     kind: str = "webp"
 
     def figures(self) -> Mapping[str, Figure]:
         """Return figures by file name. Raises NotRun, or TrapsError for a damaged clip."""
-        try:
-            return self.make()
-        except DamagedClip as error:
-            raise TrapsError(str(error)) from error
+        return _of_whole_clips(self.make)
+
+    def shown(self) -> Any:
+        """Return `inputs`. Raises TrapsError for a damaged clip."""
+        return _of_whole_clips(self.inputs)
+
+
+Found = TypeVar("Found")
+
+
+def _of_whole_clips(find: Callable[[], Found]) -> Found:
+    try:
+        return find()
+    except DamagedClip as error:
+        raise TrapsError(str(error)) from error
 
 
 class PairPictures:
@@ -73,13 +86,14 @@ class PairPictures:
         return [
             Picture("worked_example", "Worked example: a pair, the answers, the panel’s reading, the verdicts",
                     lambda: {"worked_example": self._example(example)},
-                    ("items", "responses", "votes", "verdicts"), inputs),
+                    ("items", "responses", "votes", "verdicts"), lambda: inputs),
             Picture("six_pairs", "Six pairs: control above, void below", lambda: {"six_pairs": self._six(six)},
-                    ("items",), _as_json(six)),
+                    ("items",), lambda: _as_json(six)),
             Picture("arms", "One scenario with its arms", self._arms, ("items", "arms"),
-                    [_as_json(self.arms), _as_json(visual) if len(self.arms) else ""]),
+                    lambda: [_as_json(self.arms), _as_json(visual) if len(self.arms) else ""]),
             Picture("shortcuts", "How well one cue alone separates control from void (0.5 is chance)",
-                    lambda: {"shortcuts": self._shortcuts()}, ("items", "videos"), kind="svg"),
+                    lambda: {"shortcuts": self._shortcuts()}, ("items", "videos"),
+                    lambda: repr(self.shortcuts.to_dict("split")), kind="svg"),
         ]  # fmt: skip
 
     def _example(self, example: Example | None) -> Figure:
@@ -99,16 +113,28 @@ class PairPictures:
             raise NotRun("no arm was filmed in this study")
         return sheets
 
+    @cached_property
+    def shortcuts(self) -> pd.DataFrame:
+        """The table of `benchmark.shortcuts`, of which only what a correction changes is computed again."""
+        from traps_pipeline.benchmark.shortcuts import shortcuts
+
+        kept, store = self.workspace.reports / ".state" / "shortcuts.json", self.workspace.store
+        known: dict[str, list[float]] = {}
+        with suppress(ValueError):  # a damaged file counts as none
+            known = json.loads(store.here(kept).read_text(encoding="utf-8")) if store.has(kept) else {}
+        clips = self.workspace.bring(self.items["clip"]) if len(self.items) else self.workspace.root
+        table = shortcuts(self.items, self.workspace.tables.read_all(VIDEOS), clips, known)
+        store.write({kept: json.dumps(known).encode()})
+        return table
+
     def _shortcuts(self) -> Figure:
-        from traps_pipeline.benchmark.shortcuts import FOLDS, shortcuts
+        from traps_pipeline.benchmark.shortcuts import FOLDS
 
         if not len(self.items):
             raise NotRun(NO_ITEMS)
-        videos = self.workspace.tables.read_all(VIDEOS)
-        table = shortcuts(self.items, videos, self.workspace.bring(self.items["clip"]))
-        if not len(table):
+        if not len(self.shortcuts):
             raise NotRun(f"no dataset has {FOLDS} scenarios")
-        return shortcut_figure(table)
+        return shortcut_figure(self.shortcuts)
 
 
 def _as_json(rows: pd.DataFrame) -> str:

@@ -39,16 +39,13 @@ PAPER = "paper"  # the chapter of the paper's cards, which use only `assets/publ
 
 @dataclass(frozen=True)
 class Part:
-    """A card before it is built.
-
-    reads: its stages. inputs: instead, the rows that matter, as JSON; null for all.
-    """
+    """A card before it is built. reads: its stages; inputs: returns what it shows of them, as JSON; null for all."""
 
     chapter: str
     name: str
     make: Callable[[], Card]
     reads: tuple[str, ...]
-    inputs: Any = None
+    inputs: Callable[[], Any] | None = None
 
 
 def report_parts(sources: Sources, address: Address | None = explorer_address) -> list[Part]:
@@ -56,15 +53,27 @@ def report_parts(sources: Sources, address: Address | None = explorer_address) -
     # A study with mechanistic analyses leads with the figures that could refute its claims.
     first = INSIDE if sources.workspace.study.mechanism else ()
     figures = [
-        Part("figures", report.name, lambda report=report: figure_card(report, sources), report.reads)
+        Part(
+            "figures",
+            report.name,
+            lambda report=report: figure_card(report, sources),
+            report.reads,
+            (lambda report=report: report.inputs(sources.study)) if report.frames else None,
+        )
         for report in sorted(FIGURE_REPORTS, key=lambda report: report.name not in first)
     ]
     pictures = [
-        Part("pictures", each.name, lambda each=each: picture_card(each), each.reads, each.inputs)
+        Part("pictures", each.name, lambda each=each: picture_card(each), each.reads, lambda each=each: each.shown())
         for each in PairPictures(sources.workspace).all()
     ]
     tables = [
-        Part("tables", report.name, lambda report=report: table_card(report, sources, address), report.reads)
+        Part(
+            "tables",
+            report.name,
+            lambda report=report: table_card(report, sources, address),
+            report.reads,
+            lambda report=report: [table.content for table in report.tables(sources.study)],
+        )
         for report in TABLE_REPORTS
     ]
     paper = [

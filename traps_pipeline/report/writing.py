@@ -12,7 +12,7 @@ import io
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -167,6 +167,12 @@ class PrintedTable:
     def records(self) -> list[dict[str, Any]]:
         """The rows as mappings."""
         return self.rows.to_dict("records")  # pyright: ignore[reportReturnType]
+
+    @property
+    def content(self) -> str:
+        """All that it prints, links and exports: two tables with equal content give the same files."""
+        words = [getattr(self, field.name) for field in fields(self) if field.name not in ("rows", "trace")]
+        return repr([*words, [*self.rows.columns], self.records])
 
     @cached_property
     def marked(self) -> set[Column]:

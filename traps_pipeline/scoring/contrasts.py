@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 from math import comb, erfc, inf, sqrt
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
@@ -38,7 +38,9 @@ CONTRASTED_FIGURES = ("pecs", "j")
 SEPARABLE_BELOW = 0.05
 VERSION_SIDES = ("n_missing", "epoch", "benchmark_version")  # columns that `version_contrasts` has for each side
 _FAMILY = ["kind", "dataset", "figure", "_regime"]
-_SIDES = ["left_model", "left_regime", "right_model", "right_regime"]
+_SIDE_COLUMNS = (("left_model", "left_regime"), ("right_model", "right_regime"))
+_SIDES = [column for columns in _SIDE_COLUMNS for column in columns]
+_AT_ONCE = 64  # paired differences whose resamples are in memory at once
 _Side = tuple[str, str]  # model, regime
 
 
@@ -49,21 +51,25 @@ def contrasts(resampled: ResampledFigures, metrics: pd.DataFrame, verdicts: pd.D
     regime and every pair of regimes of each model, in PECS and in J, on each dataset, and overall if both sides have a
     run of all four.
     """
-    places = {entry: row for row, entry in enumerate(resampled.entries)}
     items_of, sizes = answered_items(verdicts), _scenarios(verdicts)
-    means = means_over_runs(metrics).loc[:, [*CONTRASTED_FIGURES]].to_dict("index")
-    rows = []
+    rows: list[dict[str, Any]] = []
     for kind, dataset, left, right in _pairs([entry for entry in resampled.entries if entry in items_of]):
-        items = items_of[(*left, dataset)]
-        refused = refusal(items, items_of[(*right, dataset)])
-        for figure in CONTRASTED_FIGURES:
-            row = {"kind": kind, "dataset": dataset, "figure": figure, "_regime": left[1] if kind == "models" else ""}
-            row |= dict(zip(_SIDES, (*left, *right), strict=True)) | {"refused": refused}
-            if refused is None:
-                draws = [resampled.figure(figure)[places[(*side, dataset)]] for side in (left, right)]
-                observed = [means.get((*side, dataset), {}).get(figure, np.nan) for side in (left, right)]
-                row |= _difference(figure, draws, observed, sizes[(*left, dataset)])
-            rows.append(row)
+        refused = refusal(items_of[(*left, dataset)], items_of[(*right, dataset)])
+        row = {"kind": kind, "dataset": dataset, "_regime": left[1] if kind == "models" else "", "refused": refused}
+        row |= dict(zip(_SIDES, (*left, *right), strict=True))
+        rows += [{**row, "figure": figure} for figure in CONTRASTED_FIGURES]
+    places = {entry: row for row, entry in enumerate(resampled.entries)}
+    means = means_over_runs(metrics).loc[:, [*CONTRASTED_FIGURES]].to_dict("index")
+    for figure in CONTRASTED_FIGURES:
+        compared = [row for row in rows if row["figure"] == figure and row["refused"] is None]
+        for first in range(0, len(compared), _AT_ONCE):
+            part = compared[first : first + _AT_ONCE]
+            sides = [[(row[model], row[regime], row["dataset"]) for row in part] for model, regime in _SIDE_COLUMNS]
+            draws = [resampled.figure(figure)[[places[entry] for entry in side]] for side in sides]
+            observed = [[means.get(entry, {}).get(figure, np.nan) for entry in side] for side in sides]
+            of_rows = _differences(figure, draws, observed, [sizes[entry] for entry in sides[0]])
+            for row, columns in zip(part, of_rows, strict=True):
+                row |= columns
     table = pd.DataFrame(rows, columns=pd.Index([*CONTRASTS.names, "_regime"]))
     table["p_holm"] = _holm_by(table, _FAMILY)
     table["separable"] = _separable(table, _FAMILY)
@@ -96,8 +102,8 @@ def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RE
             row = dict(zip(ENTRY, entry, strict=True)) | {"figure": figure, "n_pairs": about["n_pairs"], **values}
             row["n_scenarios"] = sizes[entry]
             if refused is None:
-                ends = [resampled[entry][:, RESAMPLED.index(figure)] for resampled in draws[::-1]]
-                row |= _difference(figure, ends, [row["now"], row["then"]], sizes[entry])
+                ends = [resampled[entry][None, :, RESAMPLED.index(figure)] for resampled in draws[::-1]]
+                row |= _differences(figure, ends, [[row["now"]], [row["then"]]], [sizes[entry]])[0]
             rows.append(row | {"refused": refused})
     columns = [
         *ENTRY,
@@ -228,23 +234,25 @@ def _scenarios(verdicts: pd.DataFrame) -> dict[tuple[str, str, str], int]:
     return cast(dict[tuple[str, str, str], int], counts.to_dict())
 
 
-def _difference(
-    figure: str, sides: Sequence[np.ndarray], observed: Sequence[float], scenarios: int
-) -> dict[str, float]:
-    """Return a paired difference over scenarios with its interval and two-sided p.
+def _differences(
+    figure: str, sides: Sequence[np.ndarray], observed: Sequence[Sequence[float]], scenarios: Sequence[int]
+) -> list[dict[str, float]]:
+    """Return the columns of n paired differences, each over its number of scenarios: interval and two-sided p.
 
-    sides: the resampled ends of the left and the right, (2, resamples) each. If every resample is NaN, there is no p.
+    sides: the resampled ends of the left and the right, (n, 2, resamples) each. If every resample is NaN, there is no
+    p.
     """
-    low, high = difference(*sides)
-    apart = observed[0] - observed[1]
+    ends, apart = difference(*sides), np.subtract(*observed)
     least, most = limits_of(figure)
-    ends = interval(np.stack([low, high]), apart, (least - most, most - least))
-    columns = {"n_scenarios": scenarios, "difference": apart, "ci_low": ends[0], "ci_high": ends[1]}
-    low, high = low[~np.isnan(low)], high[~np.isnan(high)]
-    if not len(low) or not len(high):
-        return columns
-    p = 2 * min(_beyond(low), _beyond(-high))
-    return columns | {"p": min(1.0, max(p, least_p(scenarios)))}
+    bounds = interval(ends, apart, (least - most, most - least))
+    rows = []
+    for size, value, bound, (lower, upper) in zip(scenarios, apart, bounds, ends, strict=True):
+        row = {"n_scenarios": size, "difference": value, "ci_low": bound[0], "ci_high": bound[1]}
+        low, high = lower[~np.isnan(lower)], upper[~np.isnan(upper)]
+        if len(low) and len(high):
+            row["p"] = min(1.0, max(2 * min(_beyond(low), _beyond(-high)), least_p(size)))
+        rows.append(row)
+    return rows
 
 
 def _beyond(ends: np.ndarray) -> float:

@@ -145,19 +145,20 @@ def hypotheses(
     resampling = draw_scenarios(items, resamples, seed)
     rows: list[dict[str, Any]] = []
     for (model, regime), group in cast(Any, items.groupby(["model", "regime"], sort=True)):
-        for hypothesis in HYPOTHESES:
+        asked = {*group["dataset"]}
+        for hypothesis in [one for one in HYPOTHESES if any(asked & {*dose.datasets} for dose in _variations(one))]:
             by_dose = [(dose, _items_of(group, dose)) for dose in hypothesis.doses]
             with_items = [(dose, its) for dose, its in by_dose if len(its)]
-            if {dose for dose, _ in with_items} - {hypothesis.doses[0], *_in_pairs(hypothesis)}:
+            if {dose for dose, _ in with_items} & _variations(hypothesis):
                 reference = by_dose[0][1]
                 dose_rows = [_row(hypothesis, dose, its, reference, resampling) for dose, its in with_items]
                 rows += [{"model": model, "regime": regime, "hypothesis": hypothesis.name, **row} for row in dose_rows]
     return _beside_rules(pd.DataFrame(rows, columns=pd.Index(TABLE.names)))
 
 
-def _in_pairs(hypothesis: Hypothesis) -> set[Dose]:
-    """Return the doses that are sides of the pairs, which every study has."""
-    return {dose for dose in hypothesis.doses if set(dose.datasets) <= set(VISUAL)}
+def _variations(hypothesis: Hypothesis) -> set[Dose]:
+    """Return the doses other than the reference and the sides of the pairs, which every study has."""
+    return {dose for dose in hypothesis.doses[1:] if not {*dose.datasets} <= {*VISUAL}}
 
 
 def _items_of(group: pd.DataFrame, dose: Dose) -> pd.DataFrame:

@@ -27,13 +27,15 @@ def leave_one_out(
     """
     panel = board.rename(columns={"pecs": "pecs_panel", "n_missing": "n_missing_panel"})
     panel = panel.loc[:, [*ENTRY, "pecs_panel", "n_missing_panel"]]
-    frames = [
-        _scored(two).merge(panel, on=ENTRY, how="inner", validate="one_to_one").assign(without=judge)
-        for judge, two in two_judge_verdicts(verdicts, votes, judges)
-    ]
-    if not frames:
+    judged = [*two_judge_verdicts(verdicts, votes, judges)]
+    if not judged:
         return pd.DataFrame(columns=_COLUMNS)
-    rows = pd.concat(frames, ignore_index=True)
+    # All judges in one pass: a model without one of them is scored like a model of its own.
+    seats = [two.assign(model=f"{seat}|" + two["model"]) for seat, (_, two) in enumerate(judged)]
+    rows = _scored(pd.concat(seats, ignore_index=True))
+    names = [name.split("|", 1) for name in rows["model"]]
+    rows = rows.assign(model=[model for _, model in names], without=[judged[int(seat)][0] for seat, _ in names])
+    rows = rows.merge(panel, on=ENTRY, how="inner", validate="many_to_one")
     rows["difference"] = rows["pecs"] - rows["pecs_panel"]
     return rows.loc[:, _COLUMNS]
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import cast
+from collections.abc import Callable, Sequence
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
@@ -19,7 +20,6 @@ from traps_pipeline.scoring.metrics import (
     REJECTS,
     joined_epochs,
     joined_versions,
-    mean,
     pecs_of,
 )
 from traps_pipeline.scoring.score_rows import BROKEN_ABOVE, INCOMPLETE_BELOW, LEADERBOARD
@@ -44,11 +44,11 @@ def standings(metrics: pd.DataFrame) -> pd.DataFrame:
     without a text count in no figure; if there are too many of them, the entry is `incomplete`.
     """
     groups = _runs(metrics).groupby(ENTRY, sort=True)
-    means, deviations = (groups[CELL_FIGURES].agg(f) for f in (mean, _deviation))
-    means["pecs_by_family"] = groups["pecs_by_family"].agg(mean)
-    bounds, sums = groups[BOUNDS].agg(mean), cast(pd.DataFrame, groups[_SUMMED].sum())
+    means = _by_group(groups, [*CELL_FIGURES, "pecs_by_family", *BOUNDS])
+    deviations = _by_group(groups, CELL_FIGURES, np.std)
+    sums = cast(pd.DataFrame, groups[_SUMMED].sum())
     sums[REJECTS] = groups[REJECTS].sum(min_count=1)
-    board = means.join([deviations.add_suffix("_std"), bounds, sums])
+    board = means.join([deviations.add_suffix("_std"), sums])
     board["n_runs"] = groups["run"].nunique()
     board["n_pairs"] = groups["n_pairs"].max()
     board["epoch"] = groups["epoch"].agg(joined_epochs)
@@ -63,7 +63,7 @@ def standings(metrics: pd.DataFrame) -> pd.DataFrame:
 
 def means_over_runs(metrics: pd.DataFrame) -> pd.DataFrame:
     """Return CELL_FIGURES by ENTRY from METRICS rows, as on the leaderboard."""
-    return pd.DataFrame(_runs(metrics).groupby(ENTRY, sort=True)[CELL_FIGURES].agg(mean))
+    return _by_group(_runs(metrics).groupby(ENTRY, sort=True), CELL_FIGURES)
 
 
 def _runs(metrics: pd.DataFrame) -> pd.DataFrame:
@@ -79,7 +79,7 @@ def _by_family(metrics: pd.DataFrame) -> pd.DataFrame:
     The paper calls a family a sub-scenario.
     """
     families = metrics.loc[metrics["scope"].str.startswith("sub_scenario:")].groupby(CELL)
-    shares = families[["acc", "abs_rec", "false_abs"]].agg(mean)
+    shares = _by_group(families, ["acc", "abs_rec", "false_abs"])
     pecs = pecs_of(shares["acc"].to_numpy(float), (shares["abs_rec"] - shares["false_abs"]).to_numpy(float))
     return shares.assign(pecs_by_family=pecs)[["pecs_by_family"]].reset_index()
 
@@ -90,7 +90,7 @@ def _overall_runs(cells: pd.DataFrame) -> pd.DataFrame:
     complete_runs = cells.loc[groups["dataset"].transform("nunique") == len(DATASETS)].groupby(_RUN, sort=True)
     counts = cast(pd.DataFrame, complete_runs[["n_pairs", *_SUMMED]].sum())
     counts[REJECTS] = complete_runs[REJECTS].sum(min_count=1)
-    overall = complete_runs[[*CELL_FIGURES, "pecs_by_family", *BOUNDS]].agg(mean).join(counts)
+    overall = _by_group(complete_runs, [*CELL_FIGURES, "pecs_by_family", *BOUNDS]).join(counts)
     overall["epoch"] = complete_runs["epoch"].agg(joined_epochs)
     overall["panel"] = complete_runs["panel"].agg(joined_epochs)
     overall["benchmark_version"] = complete_runs["benchmark_version"].agg(joined_versions)
@@ -103,8 +103,18 @@ def _anywhere(wrong: pd.Series) -> pd.Series:
     return wrong | (anywhere & (wrong.index.get_level_values("dataset") == "overall"))
 
 
-def _deviation(values: pd.Series) -> float:
-    return float(np.std(values.to_numpy(float)))
+def _by_group(groups: Any, columns: Sequence[str], figure: Callable[..., np.ndarray] = np.mean) -> pd.DataFrame:
+    """Return a figure of each group's values in some columns, indexed by group.
+
+    It is null if any value is null, so that no mean silently uses fewer values. Groups of one size are one array.
+    """
+    index, rows_of = groups.size().index, groups.indices
+    places, values = [rows_of[key] for key in index], groups.obj[[*columns]].to_numpy(float)
+    sizes, table = np.array([len(rows) for rows in places]), np.full((len(index), len(columns)), np.nan)
+    for size in np.unique(sizes):
+        rows = np.stack([rows for rows in places if len(rows) == size])
+        table[sizes == size] = figure(np.ascontiguousarray(values[rows].swapaxes(1, 2)), axis=-1)
+    return pd.DataFrame(table, index, pd.Index(columns))
 
 
 def _ranks(board: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:

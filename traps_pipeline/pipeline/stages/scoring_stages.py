@@ -32,6 +32,8 @@ from traps_pipeline.storage.workspace import Workspace
 if TYPE_CHECKING:
     import pandas as pd
 
+    from traps_pipeline.scoring.bootstrap import ResampledFigures
+
 _stage = partial(stage, group="scoring")
 
 
@@ -81,6 +83,20 @@ def _scored(workspace: Workspace, name: str) -> "tuple[pd.DataFrame, pd.DataFram
     return cells, current_rows(workspace, VERDICTS)
 
 
+def _resampled(judged: "pd.DataFrame") -> "ResampledFigures":
+    """Return the bootstrap of verdicts, which one run needs twice: for the contrasts, then for the leaderboard."""
+    from traps_pipeline.scoring.bootstrap import resample
+
+    kept = [figures for rows, figures in _RESAMPLED if rows.equals(judged)]
+    _RESAMPLED.clear()  # after the second time the memory is free again
+    if kept:
+        return kept[0]
+    _RESAMPLED.append((judged, resample(judged)))
+    return _RESAMPLED[0][1]
+
+
+_RESAMPLED: list[tuple["pd.DataFrame", "ResampledFigures"]] = []  # the verdicts and the bootstrap of the last call
+
 # The panel is an input of everything computed from its verdicts, so that a change of panel makes them stale at once,
 # not only after the new votes.
 _SCORED = (of(metrics, need="some"), of(verdicts, need="some"), judges)
@@ -89,11 +105,10 @@ _SCORED = (of(metrics, need="some"), of(verdicts, need="some"), judges)
 @_stage(CONTRASTS, parents=_SCORED, wants=has_pairs)
 def contrasts(workspace: Workspace, _: None) -> StageOutput:
     """Return paired differences of models and regimes, with intervals and Holm's p."""
-    from traps_pipeline.scoring.bootstrap import resample
     from traps_pipeline.scoring.contrasts import contrasts as paired
 
     cells, judged = _scored(workspace, "contrasts")
-    table = paired(resample(judged), cells, judged)
+    table = paired(_resampled(judged), cells, judged)
     separable, refused = table["separable"].to_numpy(bool, na_value=False), len(table.loc[table["refused"].notna()])
     separable_overall = table.loc[separable & (table["dataset"] == "overall")]
     figures = {"contrasts": rows_shown(separable_overall), "separable": int(separable.sum()), "refused": refused}
@@ -123,11 +138,11 @@ def regime_tests(workspace: Workspace, _: None) -> "pd.DataFrame":
 def leaderboard(workspace: Workspace, _: None) -> StageOutput:
     """Return means, spreads, 95 % intervals and ranks by model, regime and dataset."""
     from traps_pipeline.report.leaderboard_page import leaderboard_markdown
-    from traps_pipeline.scoring.bootstrap import intervals, resample
+    from traps_pipeline.scoring.bootstrap import intervals
     from traps_pipeline.scoring.standings import leaderboard as rank
 
     cells, judged = _scored(workspace, "leaderboard")
-    board = rank(cells, intervals(resample(judged)), workspace.tables.read(CONTRASTS, {}))
+    board = rank(cells, intervals(_resampled(judged)), workspace.tables.read(CONTRASTS, {}))
     overall = board.loc[board["dataset"] == "overall", "pecs"].to_numpy(float)
     best = {"best overall PECS": float(overall.max())} if len(overall) else {}
     return StageOutput(board, shown={"leaderboard": Markdown(leaderboard_markdown(board))} | best)
