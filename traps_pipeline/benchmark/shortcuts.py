@@ -1,6 +1,4 @@
-"""Measure how well superficial cues tell control from void.
-
-Cues are a question's wording, a clip's length, its first frame and its file size.
+"""Measure how well superficial cues (wording, length, file size) tell the side.
 
 A model that abstained on such a cue alone would score without having seen anything, so a reader must know their size.
 They are reported beside the observer and are no gate: a cut clip *is* shorter.
@@ -26,9 +24,7 @@ COLUMNS = ("dataset", "cue", "n_pairs", "accuracy", "half_width")
 
 
 def shortcuts(items: pd.DataFrame, videos: pd.DataFrame, root: Path) -> pd.DataFrame:
-    """Return how accurately each cue predicts the side, one row per dataset and cue.
-
-    Accuracy is on held-out scenarios; 0.5 is chance.
+    """Return how accurately each cue predicts the side, per dataset; 0.5 is chance.
 
     items are ITEMS rows, videos VIDEOS rows, clips lie under root. Columns: dataset, cue, n_pairs, accuracy, half_width
     (of a 95 % normal interval over pairs). Every scenario is predicted by a classifier fitted on the others (five
