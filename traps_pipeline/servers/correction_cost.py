@@ -1,7 +1,4 @@
-"""Preview the cost of a correction before it is decided.
-
-It is the items, calls and dollars to ask again.
-"""
+"""Preview a correction's cost: items, calls and dollars to ask again."""
 
 from __future__ import annotations
 
@@ -60,10 +57,7 @@ class CorrectionEffect:
 
 
 def correction_effect(workspace: Workspace, spec: Mapping[str, Any], correction: Correction) -> CorrectionEffect:
-    """Return the effect of a correction on a SCENE_SPECS row.
-
-    Raises TrapsError for refused parameters.
-    """
+    """Return a correction's effect on a row. Raises TrapsError for refused parameters."""
     changes = correction.changes()
     question, renders = changes.get("question", spec["question"]), False
     if "params" in changes:
@@ -97,10 +91,7 @@ def _question(spec: Mapping[str, Any], params: Mapping[str, Any]) -> str:
 
 
 def _asked(workspace: Workspace, taxonomy: str) -> Iterator[tuple[str, str, int]]:
-    """Yield model, dataset of the taxonomy, and its number of evaluations.
-
-    Those that the study's experiments want count.
-    """
+    """Yield model, dataset of a taxonomy, and how many evaluations the study wants."""
     cells = [Cell.parse(key) for key in StudyPartitions(workspace).cells]
     counts = Counter((c.evaluation.model, c.dataset) for c in cells if c.dataset in DATASETS)
     yield from ((model, d, count) for (model, d), count in sorted(counts.items()) if taxonomy_of(d) == taxonomy)
