@@ -86,7 +86,7 @@ class Money:
         return self._database.submit(change).result()
 
     def is_any_alive(self, sessions: Iterable[str]) -> bool:
-        """Return whether a session lives, so that its calls may turn out to cost less."""
+        """Return whether any session is alive, so that its calls may yet cost less."""
         return any(not self._database.is_dead(session) for session in sessions)
 
     def releasable(self) -> dict[str, Releasable]:

@@ -56,7 +56,7 @@ _SAID: dict[str, Callable[[Any], bool]] = {
 
 
 def heal(row: dict[str, Any]) -> list[str]:
-    """Replace impossible values and characters in place; return the fields' names."""
+    """Replace impossible values by unknown ones, in place; return the fields' names."""
     healed = []
     for name, fits in _SAID.items():
         value = row.get(name)

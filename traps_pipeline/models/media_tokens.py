@@ -54,7 +54,7 @@ def gemini_frame(model: str, size: Size, profile: Profile) -> float:
 
 
 def anthropic_frame(size: Size) -> float:
-    """Return an image's tokens, area / 750, scaled to at most 1,568 pixels a side.
+    """Return the tokens of an image of at most 1,568 pixels a side: area / 750.
 
     https://docs.anthropic.com/en/docs/build-with-claude/vision
     """

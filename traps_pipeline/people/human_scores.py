@@ -30,7 +30,7 @@ from traps_pipeline.scoring.metrics import COUNTS, decision_counts, joined_versi
 
 
 def stratum_weights(labels: pd.DataFrame) -> np.ndarray:
-    """Return each label's weight, (labels,): its stratum's size over its labels."""
+    """Return each label's weight, (labels,): stratum size / labels in the stratum."""
     return (labels["stratum_size"] / labels.groupby("stratum")["stratum"].transform("size")).to_numpy(float)
 
 

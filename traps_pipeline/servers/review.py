@@ -243,7 +243,7 @@ class Review:
         )
 
     def _commands(self, experiment: str) -> list[str]:
-        """Return commands that plan and run the changes of our experiment or a file's."""
+        """Return the commands that plan and run an experiment after the changes."""
         name = experiment if (EXPERIMENTS / f"{experiment}.yaml").is_file() else f"{experiment}.yaml"
         target = f"{shlex.quote(name)} --workspace {shlex.quote(str(self.workspace.root))}"
         return [f"traps status {target}", f"traps run {target}"]

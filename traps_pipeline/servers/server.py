@@ -66,7 +66,7 @@ def page(template: str, **values: Any) -> str:
 
 @cache
 def script(*names: str) -> str:
-    """Return sources of this room and the explorer as a classic script of own scope."""
+    """Return sources of this room and the explorer as one scoped classic script."""
     paths = [WEB / name if (WEB / name).is_file() else SHARED / name for name in names]
     sources = "\n".join(path.read_text(encoding="utf-8") for path in paths)
     return f'(() => {{\n"use strict";\n{sources}\n}})();\n'
