@@ -1,6 +1,4 @@
-"""Give researchers a study's states, directions and protocol.
-
-States are arrays, directions are context managers, and the protocol takes any probe.
+"""Give researchers a study's states (arrays), directions, and probe protocol.
 
     from traps_pipeline import inside
 
@@ -85,14 +83,10 @@ def load(
     prompt: str = "standard",
     datasets: Sequence[str] | None = None,
 ) -> LoadedStates:
-    """Return the states of a study's items at one layer.
-
-    They are joined with the verdicts of run 1.
+    """Return a study's states at one layer, joined with the verdicts of run 1.
 
     layer: 0 for embeddings; `normed`: the last one after the final norm. datasets: some of those with states; all by
-    default.
-
-    Raises TrapsError if the study has no such states, model, layer or dataset.
+    default. Raises TrapsError if the study has no such states, model, layer or dataset.
     """
     opened = _workspace(workspace)
     states = StoredStates.of(opened, Extraction(get_model(model).id, prompt))
@@ -139,14 +133,13 @@ def protocol(
     change: Callable[[np.ndarray], np.ndarray] = lambda states: states,
     features: LoadedStates | None = None,
 ) -> pd.DataFrame:
-    """Run the study's own protocol with another probe.
+    """Run the study's own protocol with another probe; return its rows.
 
-    Return rows like those of `probe_baselines`.
-
-    They have the same items, folds, splits by scenario and intervals as the study's. fit: maps states (n, d) and void
-    (n,) to an object with `scores` (`from_sklearn`, `mean_difference`, your own). change: transforms the states of a
-    dataset, (n, d) to (n, k). features: used instead of the study's states; datasets without features are left out.
-    Columns: analysis, source, target, value (AUROC), low, high, n_voids, n_controls.
+    Rows are like those of `probe_baselines`, with the same items, folds, splits by scenario and intervals as the
+    study's. fit: maps states (n, d) and void (n,) to an object with `scores` (`from_sklearn`, `mean_difference`, your
+    own). change: transforms the states of a dataset, (n, d) to (n, k). features: used instead of the study's states;
+    datasets without features are left out. Columns: analysis, source, target, value (AUROC), low, high, n_voids,
+    n_controls.
     """
     opened = _workspace(workspace)
     states = StoredStates.of(opened, Extraction(get_model(model).id, prompt))
@@ -184,14 +177,13 @@ def gate(
     prompt: str = "standard",
     without: Collection[str] = (),
 ) -> Gate:
-    """Return a gate for live use.
+    """Return a gate for live use: `abstains(model, prompt)`, `answer(model, prompt)`.
 
-    It has `abstains(model, prompt)` and `answer(model, prompt)`, for a local model and its prompt.
-
-    source: `one:DATASET`, `other datasets` (than the target) or `other families`. threshold: mid, J or conformal.
-    layer: default: that of the gate stage. without: scenarios, or families as the gate stage names them
-    (`occlusion:tunnel`), to hold out: without those of a fold, its decisions about that fold equal the stage's. Raises
-    TrapsError for a source without enough pairs, and for states that are means over a part of the prompt.
+    model, prompt: a local model and its prompt. source: `one:DATASET`, `other datasets` (than the target) or `other
+    families`. threshold: mid, J or conformal. layer: default: that of the gate stage. without: scenarios, or families
+    as the gate stage names them (`occlusion:tunnel`), to hold out: without those of a fold, its decisions about that
+    fold equal the stage's. Raises TrapsError for a source without enough pairs, and for states that are means over a
+    part of the prompt.
     """
     extraction = Extraction(get_model(model).id, prompt)
     return fitted_gate(
@@ -237,9 +229,7 @@ class Direction:
         change: Change = add,
         site: Site = "residual",
     ) -> Iterator[None]:
-        """Change a model's passes inside the context.
-
-        The hook is always removed afterwards.
+        """Change a model's passes inside the context; always remove the hook after it.
 
         model: a transformers model, or one of ours. amount: in the model's own unit, or gaps: in class gaps. change:
         maps the states at a site (rows, T, d), the unit direction and the amount to new states; with a cache, T is 1
@@ -293,10 +283,9 @@ def direction(
     kind: str = "void",
     draw: int = 0,
 ) -> Direction:
-    """Return a saved direction of a study, with the class gap.
+    """Return a saved direction: a dataset's void direction, or a draw of a null.
 
-    It is the void direction of a dataset, or a draw of one of its nulls. Raises TrapsError if the study has no such
-    direction.
+    It has the class gap. Raises TrapsError if the study has no such direction.
     """
     directions: Mapping[str, Any] = saved_directions(_workspace(workspace), Extraction(get_model(model).id, prompt))
     if dataset not in directions or kind not in directions[dataset].vectors:

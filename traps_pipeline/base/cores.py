@@ -1,7 +1,4 @@
-"""Count the cores that work may use.
-
-They are those of this process, or those that a cluster reserved for its run.
-"""
+"""Count the cores of this process, or those that a cluster reserved for its run."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Translate a database's error into a reason and a remedy.
-
-Neither quotes SQLAlchemy's text or a statement.
-"""
+"""Translate database errors into a reason and a remedy that quote no statement."""
 
 from __future__ import annotations
 
@@ -21,10 +18,7 @@ _SERVER = r"connection to server|could not translate host name|server closed the
 
 
 def reason_and_remedy(error: BaseException) -> tuple[str, str, bool]:
-    """Return why a database is unusable, a remedy, and whether it is unwritable.
-
-    error: raised by its driver or by SQLAlchemy.
-    """
+    """Return why a database is unusable, a remedy, and whether it is unwritable."""
     words = plain(" ".join(str(getattr(error, "orig", None) or error).split()))[:MOST_WORDS]
     for pattern, reason, remedy in _UNWRITABLE:
         if re.search(pattern, words, re.IGNORECASE):

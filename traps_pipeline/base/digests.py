@@ -10,10 +10,7 @@ from typing import Any
 
 
 def canonical_json(value: Any) -> str:
-    """Return JSON with sorted keys, no spaces and no NaN.
-
-    Equal values give equal text.
-    """
+    """Return JSON with sorted keys, no spaces, no NaN; equal values give equal text."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 
 
@@ -23,10 +20,7 @@ def digest(value: Any) -> str:
 
 
 def digest_of_list(values: Iterable[Any]) -> str:
-    """Return `digest(list(values))` while holding one value at a time.
-
-    So a large table fits in memory.
-    """
+    """Return `digest(list(values))`, but hold only one value in memory at a time."""
     hasher, separator = hashlib.sha256(b"["), b""
     for value in values:
         hasher.update(separator + canonical_json(value).encode())

@@ -1,7 +1,4 @@
-"""Define the exception that the command line shows as a sentence.
-
-Any other is shown as a traceback.
-"""
+"""Define the exception that the command line prints without a traceback."""
 
 from __future__ import annotations
 
@@ -9,10 +6,7 @@ from traps_pipeline.base.redaction import redact
 
 
 class TrapsError(Exception):
-    """Bad input or a broken file.
-
-    The message names file and record, says what to do, and holds no key.
-    """
+    """Bad input or a broken file; names file, record and remedy, and holds no key."""
 
     def __init__(self, message: object) -> None:
         super().__init__(redact(str(message)))

@@ -1,4 +1,4 @@
-"""Name the optional dependencies (`extras` of `pyproject.toml`) that are missing."""
+"""Declare the optional dependencies (`extras`), and name one that is missing."""
 
 from __future__ import annotations
 
@@ -38,27 +38,18 @@ def install_line(name: ExtraName) -> str:
 
 
 def missing(name: ExtraName, *modules: str) -> list[str]:
-    """Return the modules of an extra that are not installed, without importing any.
-
-    Only the given ones are looked up, if there are any.
-    """
+    """Return which modules of an extra (or only of these) are missing; import none."""
     return [module for module in modules or EXTRAS[name].modules if find_spec(module) is None]
 
 
 def require(name: ExtraName, *modules: str) -> None:
-    """Raise TrapsError with the command to type unless an extra is installed.
-
-    Call it before its first import.
-    """
+    """Raise TrapsError with the command to type unless an extra is installed."""
     if absent := missing(name, *modules):
         raise TrapsError(_sentence(name, absent))
 
 
 def sentence_of(error: ModuleNotFoundError) -> str | None:
-    """Return the sentence of `require` for an ImportError.
-
-    None if the module belongs to no extra.
-    """
+    """Return the sentence of `require` for an ImportError; None outside all extras."""
     module = (error.name or "").partition(".")[0]
     known: tuple[ExtraName, ...] = get_args(ExtraName)
     return next((_sentence(name, [module]) for name in known if module in EXTRAS[name].modules), None)

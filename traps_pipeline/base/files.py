@@ -74,10 +74,7 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
 
 
 def sync_folder(folder: Path) -> None:
-    """Sync a folder's entries to disk.
-
-    Without it, a synced file can still lose its name in a power cut.
-    """
+    """Sync a folder's entries, so that a power cut does not lose new file names."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
@@ -86,10 +83,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def is_in_place(descriptor: int, path: Path) -> bool:
-    """Return whether an open file still has its name.
-
-    A lock on a removed file excludes nobody.
-    """
+    """Return whether an open file still has its name; else its lock excludes nobody."""
     try:
         current, own = path.stat(), os.fstat(descriptor)
     except FileNotFoundError:
@@ -123,10 +117,7 @@ def try_lock(path: Path) -> int | None:
 
 
 def require_in_place(descriptor: int, path: Path) -> None:
-    """Raise TrapsError if the file of a lock that this process holds was removed.
-
-    Another run may then hold the same lock.
-    """
+    """Raise TrapsError if a held lock's file was removed: others could lock anew."""
     if not is_in_place(descriptor, path):
         raise TrapsError(
             f"{path}: was removed while this run held it, so that another run may ask the same calls; nothing more is "
@@ -154,10 +145,7 @@ def is_same_file(one: Path, other: Path) -> bool:
 
 
 def link(existing: Path, path: Path) -> None:
-    """Hard-link an existing file to `path`, replacing any file there.
-
-    This is safe because files are only ever replaced as a whole.
-    """
+    """Hard-link a file to `path`, replacing any there (safe: files are never edited)."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     try:
@@ -168,10 +156,7 @@ def link(existing: Path, path: Path) -> None:
 
 
 def check_disk(folder: Path, least_gb: float) -> str:
-    """Return the free space at a folder in words.
-
-    The folder need not exist yet. Raises TrapsError if the space is too small.
-    """
+    """Return a folder's free space in words; raise TrapsError if it is too small."""
     existing = next(path for path in (folder, *folder.parents) if path.exists())
     free = shutil.disk_usage(existing).free / 1e9
     if free < least_gb:

@@ -27,10 +27,7 @@ _NAMES = {"\n": "a line break", "\r": "a carriage return", "\t": "a tab", " ": "
 
 
 def read_key(variable: str) -> str:
-    """Return the key in an environment variable.
-
-    Raises TrapsError, which names the variable and never the value, if it is not set or `check_key` refuses it.
-    """
+    """Return the key in a variable. Raises TrapsError if it is not set or refused."""
     value = optional_key(variable)
     if value is None:
         raise TrapsError(f"{variable} is not set; export the key, or leave the models that need it out")
@@ -38,10 +35,7 @@ def read_key(variable: str) -> str:
 
 
 def optional_key(variable: str) -> str | None:
-    """Return the key in an environment variable; None if it is not set.
-
-    Raises TrapsError as `read_key` does.
-    """
+    """Return the key in a variable, None if not set. Raises TrapsError if refused."""
     value = os.environ.get(variable)
     if not value:
         return None
@@ -51,12 +45,10 @@ def optional_key(variable: str) -> str | None:
 
 
 def check_key(variable: str, value: str) -> None:
-    """Check that a key consists of printable ASCII characters without white space.
+    """Raise TrapsError unless a key (or address with a password) is printable ASCII.
 
-    An address with a password is checked alike.
-
-    White space is refused, not stripped, so that every program reads the same key from the variable. Raises TrapsError,
-    which names the variable and never the value.
+    White space is refused, not stripped, so that every program reads the same key from the variable. The error names
+    the variable and never the value.
     """
     problem = _problem(value)
     if problem:
@@ -64,10 +56,7 @@ def check_key(variable: str, value: str) -> None:
 
 
 def check_parameters(params: Mapping[str, Any]) -> None:
-    """Raise ValueError if a call's parameters hold a key or an address at any depth.
-
-    The error names no value.
-    """
+    """Raise ValueError, without the value, if parameters hold a key or an address."""
     for name, value in params.items():
         if _NO_PARAMETER.search(str(name)):  # a token's number in `logit_bias`
             raise ValueError(
@@ -80,10 +69,7 @@ def check_parameters(params: Mapping[str, Any]) -> None:
 
 
 def check_address(address: str) -> str:
-    """Return the address unchanged if it holds no key.
-
-    Raises ValueError, which does not repeat it, if it may hold one.
-    """
+    """Return the address if it holds no key; else raise ValueError without quoting it."""
     parts = urlsplit(address)
     if parts.username is not None or parts.query or parts.fragment:
         raise ValueError("holds more than scheme, host, port and path: export the key and name its variable as `key`")
@@ -91,10 +77,7 @@ def check_address(address: str) -> str:
 
 
 def check_variable(name: str) -> str:
-    """Return the variable's name unchanged if it is no key.
-
-    Raises ValueError, which does not repeat it, if it may be the key.
-    """
+    """Return the variable's name if it is no key; else raise ValueError without it."""
     if not re.fullmatch(r"[A-Z][A-Z0-9_]*", name):
         raise ValueError("is the name of the environment variable that holds a key, such as MY_KEY, not the key itself")
     return name

@@ -1,7 +1,4 @@
-"""Validate names that users choose.
-
-They name models, judges, panels, accounts, experiments, benchmarks and submissions.
-"""
+"""Validate names that users choose, of models, judges, benchmarks and the like."""
 
 from __future__ import annotations
 

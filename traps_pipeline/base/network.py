@@ -1,7 +1,4 @@
-"""Check the proxy and certificate variables of the environment.
-
-Client libraries read these variables on their own, and their errors do not name them.
-"""
+"""Check the proxy and certificate variables that client libraries read unasked."""
 
 from __future__ import annotations
 
@@ -26,10 +23,7 @@ CERTIFICATES = (*TLS_VARIABLES, "REQUESTS_CA_BUNDLE", "CURL_CA_BUNDLE")  # read 
 
 @dataclass(frozen=True)
 class Proxy:
-    """A proxy that the environment configures.
-
-    variable: the variable's name, or "the system's settings".
-    """
+    """A proxy, and the variable (or "the system's settings") that configures it."""
 
     variable: str
     url: str
@@ -76,20 +70,14 @@ def is_loopback(host: str) -> bool:
 
 
 def proxy_of(url: str) -> Proxy | None:
-    """Return the proxy that the environment configures for a URL, if any.
-
-    Loopback addresses never have one.
-    """
+    """Return the proxy configured for a URL; None for loopback addresses."""
     parts = urlsplit(url)
     return _proxy_of(parts.scheme, parts.hostname or "", tuple(os.environ.get(name) for name in _VARIABLES))
 
 
 @lru_cache(maxsize=256)
 def _proxy_of(scheme: str, host: str, _: tuple[str | None, ...]) -> Proxy | None:
-    """Return the proxy for a host, cached while the variables keep their values.
-
-    Each call asks for it.
-    """
+    """Return the proxy for a host, cached while the variables keep their values."""
     proxies = urllib.request.getproxies()
     address = proxies.get(scheme) or proxies.get("all")
     if not address or is_loopback(host) or urllib.request.proxy_bypass(host):

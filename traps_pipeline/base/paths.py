@@ -1,6 +1,4 @@
-"""Locate the files that come with the code.
-
-They are `assets/`, `scene_specs/` and `dagster.yaml`.
+"""Locate `assets/`, `scene_specs/` and `dagster.yaml`, which come with the code.
 
 They are top-level folders of the repository, and a wheel carries them inside the package (`SHIPPED`). Every reader asks
 this module, so that the same code runs from a checkout and from a wheel.
@@ -35,10 +33,7 @@ def user_cache() -> Path:
 
 
 def require_root() -> Path:
-    """Return the folder of `assets/` and `scene_specs/`.
-
-    Raises TrapsError with the remedy if one is missing.
-    """
+    """Return the folder of `assets/` and `scene_specs/`. Raises TrapsError if missing."""
     for folder in (ASSETS, SCENE_SPECS):
         if not folder.is_dir():
             raise TrapsError(
@@ -59,10 +54,7 @@ def require_own(path: Path, instead: str) -> Path:
 
 
 def require_own_corrections(folder: Path = CORRECTIONS) -> Path:
-    """Return the folder of corrections if decisions may be written into it.
-
-    Raises TrapsError otherwise.
-    """
+    """Return the corrections folder; raise TrapsError unless decisions may go there."""
     return require_own(
         folder, f"copy {OWN_SPECS} to a folder of your own, set {SPECS_VARIABLE} to it, and decide there"
     )

@@ -55,10 +55,7 @@ def split(wait_s: float) -> int | None:
 
 
 def wait_for(children: Collection[int]) -> tuple[int, int]:
-    """Return id and exit code of the first child process to end; reap orphans.
-
-    A negative exit code is a signal's.
-    """
+    """Return id and exit code (-N: signal N) of the first child to end; reap orphans."""
     while True:
         pid, status = os.wait()
         if pid in children:
@@ -66,10 +63,7 @@ def wait_for(children: Collection[int]) -> tuple[int, int]:
 
 
 def stop_descendants(wait_s: float) -> None:
-    """Stop every process below this one: SIGTERM, then SIGKILL.
-
-    SIGKILL follows after `wait_s` seconds or KeyboardInterrupt.
-    """
+    """Stop every process below: SIGTERM, then SIGKILL after `wait_s` s or Ctrl-C."""
     try:
         pids = descendants()
         for pid in pids:

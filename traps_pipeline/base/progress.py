@@ -39,10 +39,7 @@ class Tally:
 
 @dataclass
 class Traffic:
-    """A stage's calls to one model or judge.
-
-    Latencies are those of the last 500 calls, in seconds.
-    """
+    """A stage's calls to one model or judge, with the last 500 latencies in seconds."""
 
     wanted: int = 0
     cached: int = 0
@@ -59,10 +56,7 @@ class Traffic:
         return self.done / max(time.monotonic() - self.began, 1e-9)
 
     def latency_s(self, share: float) -> float:
-        """Return the latency quantile of the last calls, in seconds.
-
-        share: the quantile, from 0 to 1.
-        """
+        """Return a quantile (0 to 1) of the last calls' latencies, in seconds."""
         ordered = sorted(self.latencies)
         return ordered[min(int(share * len(ordered)), len(ordered) - 1)] if ordered else 0.0
 
@@ -169,10 +163,7 @@ class Progress:
         self.changed()
 
     def asking(self, stage: str, calls: Mapping[str, tuple[int, int]]) -> None:
-        """Count a cell's calls before they are sent.
-
-        By model or judge, new calls and those in the ledger.
-        """
+        """Count a cell's new and recorded calls, by model or judge, before sending any."""
         if self.current_stage is None:
             self.current_stage = StageProgress(stage, 0)
         self.current_stage.cells += 1
@@ -228,10 +219,7 @@ class Progress:
 
     @contextmanager
     def heard_by(self, listener: Callable[[str], None]) -> Iterator[None]:
-        """Send a listener progress lines about the running stage within the block.
-
-        One line every 30 s, and one at the stage's end.
-        """
+        """Send a listener a progress line every 30 s and at a stage's end."""
         self._listeners.append(listener)
         try:
             yield

@@ -59,10 +59,7 @@ def remember(value: str) -> None:
 
 
 def redact(text: str) -> str:
-    """Return the text with each secret replaced by `***`.
-
-    A secret is known, or recognizable by its header.
-    """
+    """Replace secrets, known or recognizable by their header, by `***`."""
     if len(text) < SHORTEST:  # most cells of a table
         return text
     environment = frozenset(os.environb.items())  # `os.environ` decodes each name and value anew
@@ -82,10 +79,7 @@ def redact(text: str) -> str:
 
 
 def redact_tracebacks() -> None:
-    """Redact this process's log records, tracebacks and warnings.
-
-    Each may quote a request's headers.
-    """
+    """Redact this process's log records, tracebacks and warnings."""
     make = logging.getLogRecordFactory()
     if getattr(make, "__module__", "") == __name__:
         return
@@ -113,10 +107,7 @@ def redact_tracebacks() -> None:
 
 
 def redacted(error: Exception) -> Exception:
-    """Return an exception whose traceback shows no key.
-
-    It is the given one, unless that would show a key.
-    """
+    """Return the exception, or a replacement if its traceback would show a key."""
     text = "".join(traceback.format_exception(error))
     without = redact(text)
     return error if without == text else RuntimeError(without).with_traceback(error.__traceback__)
@@ -139,10 +130,7 @@ def _secrets(
 
 @lru_cache(maxsize=64)
 def _pieces(secrets: frozenset[str]) -> dict[str, list[tuple[str, int]]]:
-    """Return pieces that all forms of the secrets contain.
-
-    Each piece maps to the forms that hold it, and where it begins in them.
-    """
+    """Index the pieces of all secrets' forms: piece -> forms, each with its offset."""
     forms = set[str]()
     for secret in secrets:
         for part in {secret, *re.split(r"[^!-~]+", secret)}:
@@ -157,10 +145,7 @@ def _pieces(secrets: frozenset[str]) -> dict[str, list[tuple[str, int]]]:
 
 
 def _encoded(secret: str) -> Iterator[str]:
-    """Yield how a secret looks in hexadecimal and inside longer base64 content.
-
-    In base64, at each of three offsets.
-    """
+    """Yield a secret in hexadecimal, and inside base64 at each of three offsets."""
     content = secret.encode("utf-8", "surrogateescape")
     yield content.hex()
     for before, skipped in ((0, 0), (1, 2), (2, 3)):
@@ -169,10 +154,7 @@ def _encoded(secret: str) -> Iterator[str]:
 
 
 def _searched(text: str, is_decoded: bool) -> str:
-    """Reduce a text to the lower-case printable ASCII characters to search.
-
-    White space, quotes and backslashes are left out.
-    """
+    """Reduce a text to the lower-case printable ASCII characters to search."""
     if is_decoded:
         text = _ENCODED.sub(lambda match: _decoded(match[0]), text)
     return text.encode("ascii", "ignore").translate(None, _IGNORED).lower().decode()

@@ -9,16 +9,10 @@ if TYPE_CHECKING:
 
 
 def no_formula(value: object) -> object:
-    """Return a text with a leading `'` if a spreadsheet would execute it.
-
-    Any other value is returned unchanged.
-    """
+    """Prefix a text with `'` if a spreadsheet would execute it as a formula."""
     return f"'{value}" if isinstance(value, str) and value[:1] in ("=", "+", "-", "@", "\t", "\r") else value
 
 
 def csv_bytes(table: pd.DataFrame, float_format: str | None = None) -> bytes:
-    """Return a table as CSV with a header.
-
-    Texts may come from models, so formulas are escaped.
-    """
+    """Return a table as CSV with a header, with spreadsheet formulas escaped."""
     return table.map(no_formula).to_csv(index=False, float_format=float_format).encode()

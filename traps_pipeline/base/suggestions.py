@@ -17,9 +17,6 @@ def nearest(word: str, known: Iterable[str]) -> str | None:
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """Return the end of a sentence that suggests the nearest known word.
-
-    It is empty if no word is near.
-    """
+    """Return a sentence's end that suggests the nearest known word, or nothing."""
     near = nearest(word, known)
     return f"; did you mean {near}?" if near else ""

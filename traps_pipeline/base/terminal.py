@@ -25,9 +25,7 @@ _JOINER, _EMOJI_STYLE = "\u200d", "\ufe0f"
 
 
 def visible(text: str) -> str:
-    """Return the text with invisible or direction-changing characters escaped.
-
-    Each is written as `[U+202E]`.
+    """Escape invisible and direction-changing characters in a text as `[U+202E]`.
 
     Line ends and tabs stay, and so do an emoji's variation selector and joiner. Every page and every value for Dagster
     passes through here; the type (`Markup`) is preserved.
@@ -46,10 +44,7 @@ def _number(match: re.Match[str]) -> str:
 
 
 def finalized(value: object) -> object:
-    """Return an expression's value as a template prints it.
-
-    It is `finalize` of every Jinja2 environment.
-    """
+    """Format an expression's value for a Jinja2 template (its `finalize`)."""
     return visible(value) if isinstance(value, str) else value
 
 
@@ -63,9 +58,7 @@ def _printable(text: str) -> str:
 
 
 def wrapped(text: str, stream: TextIO | None = None, *, hang: int | None = None) -> str:
-    """Return lines for a stream, wrapped between words on a terminal.
-
-    stream: standard output by default.
+    """Return lines for a stream (default: stdout), wrapped at words on a terminal.
 
     hang: extra indentation of continuation lines, in columns (default: 4 if the line is indented, else 0).
     """

@@ -67,12 +67,7 @@ def token_for(host: str, token: str | None, *, danger: str, variable: str) -> st
 
 
 def public_name(address: str) -> str:
-    """Return name (and port) of the HTTPS proxy before this server.
-
-    Raises TrapsError unless the address is `https:
-
-    NAME[:PORT]`.
-    """
+    """Return the HTTPS proxy's NAME[:PORT]; raise TrapsError for another address."""
     parts = urlsplit(address)
     if parts.scheme != "https" or not parts.hostname or address.rstrip("/") != f"https://{parts.netloc}":
         raise TrapsError(
@@ -82,10 +77,7 @@ def public_name(address: str) -> str:
 
 
 def personal_tokens(token: str, people: Sequence[str]) -> dict[str, str]:
-    """Return a token per person, derived from one secret.
-
-    Tokens are stable over restarts, and none reveals another.
-    """
+    """Derive a token per person from a secret: stable, and none reveals another."""
 
     def token_of(who: str) -> str:
         return urlsafe_b64encode(hmac.digest(token.encode(), who.encode(), "sha256")[:18]).decode()
@@ -170,10 +162,7 @@ class Guard:
         return self._owner(_given_token(scope)) is not None
 
     def _owner(self, token_given: str | None) -> str | None:
-        """Return the token's owner; None if nobody owns it.
-
-        It is compared with every token, so that timing reveals nothing.
-        """
+        """Return the token's owner, if any, in constant time."""
         owner = None
         for token, person in self._tokens.items():
             if token_given is not None and hmac.compare_digest(token_given.encode(), token.encode()):
@@ -195,10 +184,7 @@ class Guard:
         return self._owner(cookies[self._cookie].value) if self._cookie in cookies else None
 
     async def _enter(self, scope: Scope, send: Send) -> None:
-        """Set the token as a cookie and redirect to the page without it.
-
-        Browsers show and record addresses.
-        """
+        """Set the token as a cookie and redirect, so that no address shows the token."""
         parameters = [pair for pair in parse_qsl(scope["query_string"].decode("latin-1")) if pair[0] != "token"]
         place = "/" + quote(scope["path"].lstrip("/\\")) + (f"?{urlencode(parameters)}" if parameters else "")
         cookie = f"{self._cookie}={_given_token(scope)}; HttpOnly; SameSite=Strict; Path=/{self._secure}"

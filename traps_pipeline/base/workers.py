@@ -1,7 +1,4 @@
-"""Render in worker processes, one per core, with results in job order.
-
-Workers are recycled, and none is left running.
-"""
+"""Render in recycled worker processes, one per core; yield results in job order."""
 
 from __future__ import annotations
 
@@ -44,10 +41,7 @@ _idle: list[_Pool] | None = None  # idle pools of `kept_workers`
 
 @contextmanager
 def kept_workers() -> Iterator[None]:
-    """Keep idle workers for the next `run_in_order` in the block.
-
-    Starting one takes as long as twenty frames.
-    """
+    """Keep idle workers for the block's next `run_in_order`, as starting one is slow."""
     global _idle
     if _idle is not None:
         yield

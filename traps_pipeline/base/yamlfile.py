@@ -1,6 +1,4 @@
-"""Read YAML and JSON Lines strictly.
-
-Each reader returns plain values, or raises one sentence with file, line and complaint.
+"""Read YAML and JSON Lines strictly, or raise a sentence with file and line.
 
 Anything that two readers could read differently (a duplicate key, `yes`, `1:30`, `010`, `.inf`) is refused.
 """
@@ -37,10 +35,7 @@ _SAFE: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # five times as fast
 
 
 class _Strict(_SAFE):
-    """A loader of YAML 1.2's plain values alone.
-
-    It refuses dates, sexagesimals, octals, other booleans, and a key given twice.
-    """
+    """A YAML 1.2 loader: no dates, sexagesimals, octals, `yes`/`no` or repeated keys."""
 
     yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012 - the loader's own way to say it
 
@@ -76,10 +71,7 @@ _Strict.add_constructor(f"{_TAG}float", _float)
 
 
 def _check_events(content: str) -> None:
-    """Raise MarkedYAMLError for a tag, and for too much depth, nodes or aliases.
-
-    By these, few lines could stand for millions.
-    """
+    """Raise MarkedYAMLError for a tag, and for too much depth, nodes or aliases."""
     nodes = aliases = 0
     anchors = list[bool]()  # for each collection around an event: whether it has an anchor
     for event in yaml.parse(content, Loader=_SAFE):
@@ -102,10 +94,7 @@ def _check_events(content: str) -> None:
 
 
 def read_yaml(path: Path) -> Any:
-    """Return parsed YAML.
-
-    Raises TrapsError naming file, line and the parser's complaint.
-    """
+    """Return parsed YAML. Raises TrapsError with file, line and complaint."""
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -123,10 +112,7 @@ def read_yaml(path: Path) -> Any:
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
-    """Return parsed YAML that is a mapping.
-
-    Raises TrapsError.
-    """
+    """Return parsed YAML that must be a mapping. Raises TrapsError."""
     data = read_yaml(path)
     if not isinstance(data, dict):
         raise TrapsError(f"{path}: must be a mapping of names, not {data!r:.60}; correct the file")
@@ -153,10 +139,7 @@ def _complaint(error: Exception) -> str:
 
 
 def read_lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield the non-empty lines of a JSON Lines file, numbered from 1.
-
-    Raises TrapsError, also for ambiguous JSON.
-    """
+    """Yield a JSON Lines file's numbered non-empty lines. Raises TrapsError."""
     try:
         text = path.read_text(encoding="utf-8-sig")  # some editors and shells put a byte-order mark first
     except (OSError, UnicodeDecodeError) as error:
@@ -168,10 +151,7 @@ def read_lines(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def _check_line(line: str, where: str) -> None:
-    """Raise TrapsError for ambiguous or unbounded JSON.
-
-    Invalid JSON is left to the reader.
-    """
+    """Raise TrapsError for ambiguous or unbounded JSON; ignore invalid JSON."""
     try:
         if len(line) > MOST_LINE_BYTES or _depth(line) > MOST_DEPTH:
             raise _Odd("too large, or nested too deeply")
@@ -207,10 +187,7 @@ def _finite(text: str) -> float:
 
 
 def _depth(line: str) -> int:
-    """Return the nesting depth of brackets outside strings.
-
-    It is fast, since every command reads some megabytes.
-    """
+    """Return the nesting depth of brackets outside strings (must be fast)."""
     outside = _STRINGS.sub("", line) if "\\" in line else "".join(line.split('"')[::2])
     brackets = outside.encode().translate(None, _NO_BRACKETS)
     return max(accumulate(map(_STEPS.__getitem__, brackets)), default=0)
@@ -219,10 +196,7 @@ def _depth(line: str) -> int:
 def parse_yaml_model(
     model: type[Model], data: Any, path: Path, where: str = "", context: Mapping[str, Any] | None = None
 ) -> Model:
-    """Validate parsed YAML; validators see `context`.
-
-    Raises TrapsError naming file, entry and field.
-    """
+    """Validate parsed YAML. Raises TrapsError naming file, entry and field."""
     try:
         parsed = model.model_validate(data, context=context)
     except ValidationError as error:
@@ -233,10 +207,7 @@ def parse_yaml_model(
 
 
 def _other_kinds(data: Any, validated: Any, name: str = "") -> Iterator[str]:
-    """Yield values that a model converted to another type, and non-finite numbers.
-
-    For example true to 1, or a text to a number.
-    """
+    """Yield values that a model converted to another type, and non-finite numbers."""
     if isinstance(validated, float) and not math.isfinite(validated):
         yield f"{name}: {validated} is no finite number"
     number = isinstance(validated, int | float) and not isinstance(validated, bool)
@@ -255,10 +226,7 @@ def _other_kinds(data: Any, validated: Any, name: str = "") -> Iterator[str]:
 
 
 def explain(error: ValidationError, model: type[BaseModel] | None = None) -> str:
-    """Return a validation error on one line, as `field: complaint`.
-
-    Of an unknown field it names the nearest known one.
-    """
+    """Return a validation error as `field: complaint`, with the nearest known field."""
     parts = list[str]()
     for each in error.errors():
         field, message = ".".join(map(str, each["loc"])), each["msg"].removeprefix("Value error, ")
@@ -270,10 +238,7 @@ def explain(error: ValidationError, model: type[BaseModel] | None = None) -> str
 
 
 def _fields_at(model: type[BaseModel], place: Sequence[int | str]) -> list[str]:
-    """Return the field names of a model, or of its nested model at `place`.
-
-    [] if there is none.
-    """
+    """Return the field names of a model, or of its nested model at `place`, if any."""
     for step in place:
         field = model.model_fields.get(str(step))
         if field is None:  # a number in a list, a name in a mapping or of a union's member

@@ -43,9 +43,7 @@ def certify_all(
     fresh: bool = False,
     report: Callable[[str], None] = lambda _: None,
 ) -> tuple[list[Verdict], list[str]]:
-    """Return verdicts on a benchmark folder's records, and all problems in words.
-
-    Problems of scenarios come first.
+    """Return verdicts on a folder's records, and all problems, scenarios' ones first.
 
     Verdicts are cached under `kept` by record and code, so that an interrupted call resumes.
     """
@@ -79,10 +77,7 @@ def _case(released: Path, folder: Path, spec: SceneSpec) -> Case:
 
 @cache
 def code_digest(family: str) -> str:
-    """Return the digest of the code that certifies a family.
-
-    Cached verdicts of other code are ignored.
-    """
+    """Return the digest of the code that certifies a family; it keys cached verdicts."""
     folder = PACKAGE / "scenes"
     files = [path for path in sorted(folder.rglob("*.py")) if path.parent.name != "families" or path.stem == family]
     return digest([[path.name, file_digest(path)] for path in files])
@@ -104,10 +99,7 @@ def judge(case: Case) -> Verdict:
 
 
 def _alike(verdicts: Iterable[Verdict]) -> list[str]:
-    """Return clips of different scenarios that end in the same frame.
-
-    No clip may serve two scenarios.
-    """
+    """Return problems: clips of different scenarios that end in the same frame."""
     problems = []
     for side in ("control_end", "void_end"):
         owners: defaultdict[str, list[str]] = defaultdict(list)
@@ -119,10 +111,7 @@ def _alike(verdicts: Iterable[Verdict]) -> list[str]:
 
 
 def foreseeable(specs: Iterable[SceneSpec], verdicts: Iterable[Verdict]) -> list[str]:
-    """Return families of cut clips whose state at the cut predicts the outcome.
-
-    Only families with at least a hundred records are judged.
-    """
+    """Return families of 100+ cut clips whose state at the cut predicts the outcome."""
     states = {verdict.scenario_id: verdict.at_cut for verdict in verdicts if len(verdict.at_cut)}
     families: defaultdict[str, list[SceneSpec]] = defaultdict(list)
     for spec in specs:

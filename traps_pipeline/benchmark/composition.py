@@ -1,7 +1,4 @@
-"""Sample a whole benchmark, and check it across scenarios.
-
-It has a number of scenarios for each family.
-"""
+"""Sample a benchmark with so many scenarios per family, and check it as a whole."""
 
 from __future__ import annotations
 
@@ -30,10 +27,7 @@ class Composition(RootModel[dict[str, int]]):
 
 
 def load_composition(path: Path = SCENE_SPECS / "composition.yaml") -> dict[str, int]:
-    """Return the number of scenarios of each family.
-
-    Raises TrapsError naming the file.
-    """
+    """Return each family's number of scenarios. Raises TrapsError naming the file."""
     try:
         return Composition.model_validate(read_yaml(path)).root
     except ValidationError as error:
@@ -50,12 +44,10 @@ def sample_benchmark(
     workers: int | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> None:
-    """Sample a benchmark into the folder `out`.
+    """Sample a benchmark into `out`: records, trajectories, and `benchmark.yaml`.
 
-    It gets released records, trajectories, and `benchmark.yaml` with its own canary.
-
-    Existing records of the same seed and numbers stay: an interrupted sampling resumes. Raises TrapsError if a family
-    cannot be filled.
+    It has a canary of its own. Existing records of the same seed and numbers stay: an interrupted sampling resumes.
+    Raises TrapsError if a family cannot be filled.
     """
     with kept_workers():
         for family, count in counts.items():
@@ -71,12 +63,7 @@ def sample_benchmark(
 
 
 def problems(specs: Sequence[SceneSpec], counts: Mapping[str, int] | None = None) -> list[str]:
-    """Return problems of a set of records as a whole.
-
-    One sentence each, naming the family.
-
-    counts: the required number of scenarios of each family; not checked if None.
-    """
+    """Return problems of records as a whole (against `counts`), one sentence each."""
     families: defaultdict[str, list[SceneSpec]] = defaultdict(list)
     for spec in specs:
         families[spec.family].append(spec)
@@ -116,10 +103,7 @@ def _repeated_questions(family: str, members: Sequence[SceneSpec]) -> list[str]:
 
 
 def _constant_margin(family: str, members: Sequence[SceneSpec]) -> list[str]:
-    """Return a problem if a margin is the same in every scene.
-
-    Then nothing was measured.
-    """
+    """Return a problem if a margin is equal in all scenes, so nothing was measured."""
     margins = {spec.evidence.get("margin_m") for spec in members}
     return [f"{family}: every scenario has the margin {margins.pop()} m"] if len(margins) == 1 < len(members) else []
 
@@ -140,10 +124,7 @@ def _predictable(specs: Sequence[SceneSpec]) -> list[str]:
 
 
 def prior_accuracy(specs: Sequence[SceneSpec]) -> float:
-    """Return the accuracy of always giving a sub-scenario's commonest answer.
-
-    Taxonomies are weighted equally.
-    """
+    """Return the accuracy of each sub-scenario's commonest answer, mean of taxonomies."""
     commonest = commonest_answers([spec.model_dump(mode="json") for spec in specs])
     shares = []
     for taxonomy in ("occlusion", "chaotic"):

@@ -1,6 +1,4 @@
-"""Fold review decisions over the released records.
-
-Released records and corrections together are a benchmark version.
+"""Fold corrections over released records; together they are a benchmark version.
 
 `scene_specs/corrections/*.jsonl` is append-only, one decision a line, read in the order of file names and lines:
 
@@ -65,9 +63,7 @@ class Correction(BaseModel):
 
 @dataclass(frozen=True)
 class Scenario:
-    """A scenario after its corrections: its released record and its changes.
-
-    The record of an added scenario is None.
+    """A scenario after corrections: its changes, and its record (None if added).
 
     `params` is not None if the scene itself must be resolved again; the scene_specs stage does that.
     """
@@ -87,10 +83,7 @@ class Scenario:
         return digest([base, dict(self.words), dict(self.params) if self.params is not None else None])[:16]
 
     def changed_words(self) -> SceneSpec:
-        """Return the released record with the corrected words.
-
-        Raises TrapsError naming the correction.
-        """
+        """Return the record with corrected words. Raises TrapsError for a bad correction."""
         if self.released is None:
             raise ValueError(f"{self.scenario_id} was added; it has no released record")
         return apply_words(self.released, self.words, self.where)
@@ -105,10 +98,7 @@ _OfFamily = TypeVar("_OfFamily", bound=_HasFamily)
 
 
 def apply_words(spec: SceneSpec, words: Mapping[str, Any], where: str) -> SceneSpec:
-    """Return a record with other words, after checking labels against the answer.
-
-    Raises TrapsError.
-    """
+    """Return a record with other words and checked labels. Raises TrapsError."""
     if not words:
         return spec
     record = spec.model_dump(mode="json") | {name: value for name, value in words.items() if name != "answer"}
@@ -122,10 +112,7 @@ def apply_words(spec: SceneSpec, words: Mapping[str, Any], where: str) -> SceneS
 
 
 def read_corrections(folder: Path = CORRECTIONS) -> list[tuple[str, Correction]]:
-    """Return all decisions with `file:line`.
-
-    Raises TrapsError naming the line.
-    """
+    """Return all decisions with `file:line`. Raises TrapsError naming the line."""
     corrections = []
     for path in sorted(folder.glob("*.jsonl")):
         for number, line in read_lines(path):
@@ -142,10 +129,7 @@ def read_corrections(folder: Path = CORRECTIONS) -> list[tuple[str, Correction]]
 
 
 def fold(released: Mapping[str, SceneSpec], corrections: Sequence[tuple[str, Correction]]) -> dict[str, Scenario]:
-    """Return the benchmark after all decisions, by scenario id, sorted.
-
-    Raises TrapsError naming the line.
-    """
+    """Return scenarios by id after all decisions. Raises TrapsError with `file:line`."""
     scenarios = {
         id_: Scenario(id_, spec.family, spec.category, spec, where="released") for id_, spec in released.items()
     }
@@ -220,10 +204,7 @@ def _added(where: str, correction: Correction) -> Scenario:
 
 
 def load_scenarios(study: Study) -> dict[str, Scenario]:
-    """Return the scenarios of a study: with corrections, then limited to its subset.
-
-    Raises TrapsError for an unknown named scenario.
-    """
+    """Return a study's corrected subset. Raises TrapsError for unknown scenarios."""
     check_benchmark(study)
     return subset(corrected_scenarios(), study)
 
@@ -251,7 +232,7 @@ def corrected_scenarios() -> dict[str, Scenario]:
 
 
 def subset(scenarios: Mapping[str, _OfFamily], study: Study) -> dict[str, _OfFamily]:
-    """Return the study's named scenarios (or records of them), or the first n of each family, or all.
+    """Return the study's named scenarios, or the first n per family, or all.
 
     Discarded scenarios are left out without replacement.
     """

@@ -1,6 +1,4 @@
-"""Append review decisions to the corrections.
-
-Several reviewers may do so at once.
+"""Append review decisions to the corrections, also of several reviewers at once.
 
 The append-only file is the only store. A decision is checked by folding it over all earlier ones, written at once and
 synced to disk before it is confirmed; so a kill loses no confirmed decision, and concurrent reviewers append one after
@@ -33,28 +31,20 @@ class DecidedMeanwhile(TrapsError):
 
 
 def decisions_on(scenario_id: str, folder: Path = CORRECTIONS) -> list[Correction]:
-    """Return all decisions about a scenario, in order.
-
-    Raises TrapsError for an unreadable file.
-    """
+    """Return a scenario's decisions, in order. Raises TrapsError if unreadable."""
     return [each for _, each in read_corrections(folder) if each.scenario_id == scenario_id]
 
 
 def is_reviewed(decisions: Sequence[Correction]) -> bool:
-    """Return whether the last decision about a scenario is valid.
-
-    `restore` takes back those before it.
-    """
+    """Return whether a scenario has decisions, the last of them not `restore`."""
     return bool(decisions) and decisions[-1].action != "restore"
 
 
 def decide(correction: Correction, seen: int, folder: Path = CORRECTIONS) -> None:
     """Append a decision.
 
-    seen: the number of decisions about the scenario that the reviewer knew of.
-
-    Raises DecidedMeanwhile if there are more by now, and TrapsError if the decision does not fit the record; nothing is
-    written then.
+    seen: the number of decisions about the scenario that the reviewer knew of. Raises DecidedMeanwhile if there are
+    more by now, and TrapsError if the decision does not fit the record; nothing is written then.
     """
     with _appending(folder) as append:
         _require_known(correction.scenario_id, seen, folder)
@@ -62,9 +52,7 @@ def decide(correction: Correction, seen: int, folder: Path = CORRECTIONS) -> Non
 
 
 def undo(scenario_id: str, seen: int, *, who: str, why: str, folder: Path = CORRECTIONS) -> None:
-    """Take back the last decision about a scenario.
-
-    Decisions that restore the former state are appended.
+    """Append decisions that take back the last one about a scenario.
 
     Raises DecidedMeanwhile as `decide` does, and TrapsError if there is no decision to take back.
     """
@@ -84,10 +72,7 @@ def undo(scenario_id: str, seen: int, *, who: str, why: str, folder: Path = CORR
 
 
 def _bring_back(is_released: bool, before: Scenario | None, *, was_reviewed: bool, signed: Signed) -> list[Correction]:
-    """Return the decisions that restore a scenario's former state.
-
-    The scenario becomes reviewed only if it was.
-    """
+    """Return decisions that restore a scenario's state, reviewed only if it was."""
     if not is_released:
         if before is None:
             return [signed("discard")]  # undo an addition

@@ -1,7 +1,4 @@
-"""Render and certify, once, each scenario's arms that the study asks for.
-
-This is the arms stage (docs/arms.md).
-"""
+"""Render and certify, once, the arms that a study asks for (docs/arms.md)."""
 
 from __future__ import annotations
 
@@ -43,10 +40,7 @@ _RESULT_SUFFIX = ".arm.json"  # suffix of the files with an arm's result
 
 @dataclass(frozen=True)
 class ArmResult:
-    """The stored result of an arm of a scenario, beside its clip.
-
-    of: the digest of the record and the code.
-    """
+    """An arm's stored result beside its clip; `of` is the digest of record and code."""
 
     of: str
     refused: str | None
@@ -64,10 +58,7 @@ class ArmResult:
 
 @dataclass(frozen=True)
 class Job:
-    """The arms of one scenario still to be rendered: arm -> its clip.
-
-    Trajectories are (F, nq).
-    """
+    """A scenario's arms to render, by arm with its clip; trajectories are (F, nq)."""
 
     spec: SceneSpec
     qpos: np.ndarray
@@ -82,10 +73,7 @@ def asked_arms(workspace: Workspace, category: str) -> list[str]:
 
 
 def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tuple[int, bool]:
-    """Render and certify a category's missing arms, sharing with other processes.
-
-    Return the result of `share`. Raises TrapsError.
-    """
+    """Render missing arms of a category; return `share`'s result. Raises TrapsError."""
     specs, arms = _specs(workspace, category), asked_arms(workspace, category)
 
     def files(row: Row) -> list[Path]:
@@ -112,10 +100,7 @@ def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tupl
 
 
 def seconds_left(workspace: Workspace, category: str) -> float:
-    """Estimate one core's time (s) to render a category's missing arms.
-
-    Released records alone are counted.
-    """
+    """Estimate one core's seconds to render missing arms of released records."""
     clips = [
         _finding_of(workspace.clip(id_, arm, spec.scene_hash))
         for id_, spec in released_in_study(workspace, category).items()
@@ -125,10 +110,7 @@ def seconds_left(workspace: Workspace, category: str) -> float:
 
 
 def build_arms(workspace: Workspace, category: str) -> list[ArmRow]:
-    """Return rows of the category's arms.
-
-    Raises TrapsError for an arm that was not rendered, and for a damaged clip.
-    """
+    """Return a category's arms. Raises TrapsError for a missing or damaged one."""
     specs, arms = _specs(workspace, category), asked_arms(workspace, category)
     of_pairs = {
         (row["scenario_id"], row["side"]): row
@@ -174,37 +156,25 @@ def _finding_of(clip: Path) -> Path:
 
 
 def _files(clip: Path) -> tuple[Path, ...]:
-    """Return the files of an arm: its clip with the note, and the result.
-
-    A refused arm has no clip.
-    """
+    """Return an arm's files: its clip with the note (none if refused), and the result."""
     return clip, note_of(clip), _finding_of(clip)
 
 
 @cache
 def _code(arm: str) -> str:
-    """Return the code version of an arm or a variation.
-
-    A change of it causes a new rendering.
-    """
+    """Return the code version of an arm or variation; a change renders it again."""
     name = GRADED if arm == GRADED else "arms" if arm in ARM_NAMES else "variations"
     return file_digest(PACKAGE / "scenes" / "variants" / f"{name}.py")
 
 
 def arm_of(spec: SceneSpec, arm: str) -> Arm:
-    """Return the arm or variation of a scenario.
-
-    For crossed questions it has its partner in the benchmark.
-    """
+    """Return a scenario's arm or variation; for crossed questions, with its partner."""
     return crossed(_partners(spec.family).get(spec.scenario_id)) if arm == CROSSED else ARMS_BY_NAME[arm]
 
 
 @cache
 def _partners(family: str) -> dict[str, SceneSpec]:
-    """Return the partners of a family's scenarios.
-
-    A scenario with a corrected or added scene has none.
-    """
+    """Return a family's scenarios' partners; corrected and added scenes have none."""
     members = [scenario for scenario in corrected_scenarios().values() if scenario.family == family]
     specs = {
         scenario.scenario_id: scenario.changed_words()
@@ -220,10 +190,7 @@ def _record_digest(spec: SceneSpec, arm: str) -> str:
 
 
 def _is_made(spec: SceneSpec, arm: str, clip: Path) -> bool:
-    """Return whether an arm is complete here, with its clip if it has one.
-
-    Raises DamagedClip.
-    """
+    """Return whether an arm and its clip, if any, are complete. Raises DamagedClip."""
     finding = ArmResult.read(_finding_of(clip), _record_digest(spec, arm))
     return finding is not None and (not finding.frames or read_clip(clip) is not None)
 
@@ -313,10 +280,7 @@ def _shown_in_pair(row: Row) -> dict[str, Any]:
 
 
 def unmade(workspace: Workspace, category: str) -> list[str]:
-    """Return why a category's table is incomplete.
-
-    An arm was requested later, or a clip was lost.
-    """
+    """Return why a category's table is incomplete: a new arm or a lost clip."""
     table = workspace.tables.read(ARMS, {"category": category}, ["arm", "clip"])
     present = set(table["arm"])
     reasons = [f"arm {arm} is asked for now" for arm in asked_arms(workspace, category) if arm not in present]

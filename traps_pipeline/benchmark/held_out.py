@@ -14,10 +14,7 @@ KEY_BYTES = 32
 
 
 def opaque(key: bytes, item_id: str) -> str:
-    """Return the name of a held-out item.
-
-    Without the key nobody can tell which item it is.
-    """
+    """Return a held-out item's name, which only the key can map to the item."""
     return hmac.new(key, item_id.encode(), "sha256").hexdigest()[:24]
 
 

@@ -1,7 +1,4 @@
-"""Turn scenarios and clips into questions to models, two per pair.
-
-This is the items stage (docs/spec.md 1 and 2).
-"""
+"""Turn scenarios and clips into questions, two per pair (docs/spec.md 1 and 2)."""
 
 from __future__ import annotations
 
@@ -40,10 +37,7 @@ def categories_of_dataset(dataset: str) -> list[str]:
 
 
 def build_items(workspace: Workspace, dataset: str) -> list[ItemRow]:
-    """Return rows of a dataset's items, after comparing clips with their digests.
-
-    Raises TrapsError.
-    """
+    """Return a dataset's items, with clips verified by digest. Raises TrapsError."""
     specs: list[Record] = []
     clips: dict[tuple[str, str], Record] = {}
     for category in categories_of_dataset(dataset):
@@ -92,10 +86,7 @@ def expected_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
 def _of_arm(
     workspace: Workspace, arm: str, specs: Mapping[str, Record], commonest: Mapping[str, str], version: str
 ) -> list[ItemRow]:
-    """Return an arm's items for each scenario that admits the arm.
-
-    Their questions are those of the arms table.
-    """
+    """Return items with the arms table's questions, per scenario that admits the arm."""
     rows = []
     for category in categories_of_dataset(arm):
         if workspace.tables.state(ARMS_TABLE, {"category": category}) is not None:
@@ -135,10 +126,7 @@ def answer_type_of(labels: Sequence[str]) -> str:
 
 
 def commonest_answers(specs: Sequence[Record]) -> dict[str, str]:
-    """Return the commonest control answer of each sub-scenario.
-
-    Of equally common ones, the alphabetically first.
-    """
+    """Return each sub-scenario's commonest control answer; ties alphabetically."""
     counts: dict[str, Counter[str]] = {}
     for spec in specs:
         counts.setdefault(spec["sub_scenario"], Counter())[spec["ground_truth"]] += 1

@@ -1,6 +1,4 @@
-"""Measure how well the state at a void's cut predicts the outcome.
-
-The predictor knows all poses.
+"""Measure how well all poses at a void's cut predict the outcome.
 
 The certificate `open` proves for each record that its futures disagree. A family's records may still have something in
 common: if a ball on the left ends on the left more often than not, a rule that has seen enough records predicts the
@@ -38,10 +36,7 @@ class OutcomeLeakage:
 
 
 def outcome_leakage(states: Sequence[Sequence[float] | np.ndarray], outcomes: Sequence[str]) -> OutcomeLeakage | None:
-    """Return how well states (one per record, of any lengths) predict outcomes.
-
-    None if some outcome is rarer than the number of folds.
-    """
+    """Return how well records' states predict outcomes; None if one is too rare."""
     from sklearn.ensemble import ExtraTreesClassifier
     from sklearn.linear_model import LogisticRegression
     from sklearn.model_selection import StratifiedKFold, cross_val_score

@@ -1,7 +1,4 @@
-"""Read released records, and the benchmark's name.
-
-`scene_specs/released/*.jsonl` holds one fully resolved scenario per line.
-"""
+"""Read the benchmark's name and its records, one resolved scenario per JSON line."""
 
 from __future__ import annotations
 
@@ -21,10 +18,7 @@ from traps_pipeline.scenes.worlds.spec import SceneSpec
 
 
 class Release(BaseModel):
-    """The contents of `scene_specs/benchmark.yaml`: name and canary.
-
-    The canary serves contamination checks.
-    """
+    """`scene_specs/benchmark.yaml`: the name, and a canary for contamination checks."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     name: Name
@@ -40,10 +34,7 @@ def load_release(path: Path = SCENE_SPECS / "benchmark.yaml") -> Release:
 
 @cache
 def load_released(folder: Path = RELEASED) -> dict[str, SceneSpec]:
-    """Return all released records by scenario id.
-
-    Raises TrapsError naming file, line and remedy.
-    """
+    """Return released records by id. Raises TrapsError naming file, line and remedy."""
     records: dict[str, SceneSpec] = {}
     for path in sorted(folder.glob("*.jsonl")):
         for number, line in read_lines(path):
@@ -61,10 +52,7 @@ def load_released(folder: Path = RELEASED) -> dict[str, SceneSpec]:
 
 
 def parse_record(line: str, where: str) -> SceneSpec:
-    """Return the record of one line of a released file.
-
-    Raises TrapsError.
-    """
+    """Parse a released file's line. Raises TrapsError."""
     try:
         spec = SceneSpec.model_validate(from_json(line))  # twice as fast as `json`, with the same numbers
     except ValidationError as error:

@@ -1,6 +1,4 @@
-"""Share the rendering of a category's clips between processes.
-
-They run on one host or many, and take one scenario at a time.
+"""Share the rendering of a category's clips between processes on any hosts.
 
 All processes go through the same rows. Each leases a free row, makes its missing clips, publishes them to the study and
 goes on to the next. Leases of dead processes expire. `share` returns when every clip exists.
@@ -111,10 +109,7 @@ class _Sharing(Generic[Job]):
 
 
 def known_clips(store: Store, clips: Iterable[Path]) -> dict[Path, Clip]:
-    """Return the notes of existing clips, without fetching a clip.
-
-    Raises DamagedClip if one differs from its note.
-    """
+    """Return existing clips' notes, unfetched. Raises DamagedClip if one differs."""
     paths = [*clips]
     store.bring(map(note_of, paths))
     digests = store.digests(paths)

@@ -1,6 +1,4 @@
-"""Measure how well superficial cues tell control from void.
-
-Cues are a question's wording, a clip's length, its first frame and its file size.
+"""Measure how well superficial cues (wording, length, file size) tell the side.
 
 A model that abstained on such a cue alone would score without having seen anything, so a reader must know their size.
 They are reported beside the observer and are no gate: a cut clip *is* shorter.
@@ -38,12 +36,11 @@ class _Cue(NamedTuple):
 def shortcuts(
     items: pd.DataFrame, videos: pd.DataFrame, root: Path, known: MutableMapping[str, list[float]] | None = None
 ) -> pd.DataFrame:
-    """Return one row per dataset and cue: the accuracy of predicting the side on held-out scenarios; 0.5 is chance.
+    """Return how accurately each cue predicts the side, per dataset; 0.5 is chance.
 
     items are ITEMS rows, videos VIDEOS rows, clips lie under root. Columns: dataset, cue, n_pairs, accuracy, half_width
     (of a 95 % normal interval over pairs). Every scenario is predicted by a classifier fitted on the others (five
-    folds), with both its sides in one fold. Datasets of fewer than five scenarios are left out. known: figures of
-    earlier calls, by what they were computed from; afterwards those of this call. Raises DamagedClip.
+    folds), with both its sides in one fold. Datasets of fewer than five scenarios are left out. Raises DamagedClip.
     """
     clips = videos.drop_duplicates("path").set_index("path")
     cues, code = _cues(clips, root), [file_digest(Path(__file__)), version("scikit-learn")]

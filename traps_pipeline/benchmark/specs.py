@@ -1,7 +1,4 @@
-"""Resolve corrected scenarios to complete records with trajectories.
-
-This is the scene_specs stage.
-"""
+"""Resolve corrected scenarios to complete records with trajectories."""
 
 from __future__ import annotations
 
@@ -39,10 +36,7 @@ class ResolvedScenario:
 
 
 def resolve_scenario(workspace: Workspace, scenario: Scenario) -> ResolvedScenario:
-    """Return the record after corrections.
-
-    Only a changed or added scene is simulated, once.
-    """
+    """Return the corrected record; simulate a changed or added scene once."""
     if scenario.params is None:
         spec = scenario.changed_words()
         return ResolvedScenario(spec, RELEASED / "trajectories" / f"{spec.scenario_id}.npz")
@@ -61,10 +55,7 @@ def resolve_scenario(workspace: Workspace, scenario: Scenario) -> ResolvedScenar
 
 
 def _resolved_anew(workspace: Workspace, scenario: Scenario) -> tuple[SceneSpec, Path]:
-    """Return the scene of a correction's parameters, with the family's words for it.
-
-    It is simulated once and stored.
-    """
+    """Return the scene of corrected parameters, with its family's words; stored once."""
     name = _resolved_name(scenario)
     own = [workspace.trajectories / f"{name}{ending}" for ending in (".npz", ".json")]
     workspace.store.bring(own)
@@ -105,7 +96,7 @@ def _wording(scenario: Scenario, params: Mapping[str, Any]) -> Wording:
 
 
 def wording_of(family_name: str, seed: int, scenario_id: str, params: Mapping[str, Any]) -> Wording:
-    """Return the family's words for some parameters; the same for the same scenario.
+    """Return the family's words for parameters, fixed for a scenario.
 
     Raises ValueError or TypeError if the family has no such parameters.
     """
@@ -115,19 +106,13 @@ def wording_of(family_name: str, seed: int, scenario_id: str, params: Mapping[st
 
 
 def _has_valid_words(scenario: Scenario) -> bool:
-    """Return whether the released words fit the corrected parameters.
-
-    They do if the family gives both the same words.
-    """
+    """Return whether released and corrected parameters have the same family words."""
     released = scenario.released
     return released is not None and _wording(scenario, released.params) == _wording(scenario, scenario.params or {})
 
 
 def _simulate(scenario: Scenario) -> tuple[SceneSpec, np.ndarray, np.ndarray]:
-    """Resolve a scene from a correction's parameters.
-
-    Raises TrapsError naming the correction.
-    """
+    """Simulate a corrected scene. Raises TrapsError naming the correction."""
     from traps_pipeline.scenes.draw.resolve import resolve
     from traps_pipeline.scenes.parts.wording import draw_ill_posed
     from traps_pipeline.scenes.worlds.outcome import Rejected
@@ -164,10 +149,7 @@ def seconds_left(workspace: Workspace, category: str) -> float:
 
 
 def build_specs(workspace: Workspace, category: str) -> tuple[list[SceneSpecRow], list[ResolvedScenario]]:
-    """Return a category's rows of scene_specs, and the resolved records behind them.
-
-    Trajectories are compared with their digests.
-    """
+    """Return a category's rows and resolved records, with trajectories verified."""
     scenarios = [s for s in load_scenarios(workspace.study).values() if s.category == category]
     resolved = [resolve_scenario(workspace, scenario) for scenario in scenarios]
     released = released_in_study(workspace, category).values()
@@ -197,7 +179,7 @@ def expected_specs(workspace: Workspace, category: str) -> list[SceneSpecRow]:
 
 
 def released_in_study(workspace: Workspace, category: str) -> dict[str, SceneSpec]:
-    """Return the released records of a category that the study would have without any correction."""
+    """Return a category's released records in the study, as without corrections."""
     records = subset(load_released(), workspace.study)
     return {id_: spec for id_, spec in sorted(records.items()) if spec.category == category}
 
@@ -214,10 +196,7 @@ def corrections_version(workspace: Workspace, category: str) -> str:
 
 
 def void_from_s(spec: SceneSpec) -> float:
-    """Return the time (s) from which the void shows nothing decisive.
-
-    It is the moment of hiding (occluder) or of the cut (truncation).
-    """
+    """Return the time (s) of hiding (occluder) or of the cut (truncation) in the void."""
     frame = spec.void["hidden_from_frame"] if spec.void_kind == "occluder" else spec.void["cut_frame"]
     return frame / spec.physics["fps"]
 
@@ -244,10 +223,7 @@ def _row(workspace: Workspace, item: ResolvedScenario, version: str) -> SceneSpe
 
 
 def _relative(path: Path, *roots: Path) -> str:
-    """Return the path relative to the first root that contains it.
-
-    It is unchanged if none does (a private benchmark).
-    """
+    """Return the path relative to the first root above it, else unchanged."""
     root = next((root for root in roots if path.is_relative_to(root)), None)
     return (path.relative_to(root) if root else path).as_posix()
 
@@ -262,10 +238,7 @@ def spec_of(row: Mapping[str, Any]) -> SceneSpec:
 
 
 def trajectory_of(workspace: Workspace, row: Mapping[str, Any], world: Literal["qpos", "twin"] = "qpos") -> np.ndarray:
-    """Return the frozen qpos (F, nq) of a row of scene_specs, or its twin's.
-
-    Raises TrapsError.
-    """
+    """Return the frozen qpos (F, nq) of a row's scene or twin. Raises TrapsError."""
     candidates: Sequence[Path] = (ROOT / row["trajectory"], workspace.resolve(row["trajectory"]))
     path = next((p for p in candidates if p.is_file()), candidates[0])
     try:
@@ -276,10 +249,7 @@ def trajectory_of(workspace: Workspace, row: Mapping[str, Any], world: Literal["
 
 
 def unsettled_outcomes(resolved: Sequence[ResolvedScenario]) -> list[str]:
-    """Return problems of outcomes.
-
-    The certificate `outcome` is recomputed from each frozen trajectory.
-    """
+    """Return problems of outcomes, recomputed from the frozen trajectories."""
     from traps_pipeline.scenes.certification.certificates import OUTCOME, pair_of
 
     problems = []

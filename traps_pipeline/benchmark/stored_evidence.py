@@ -1,6 +1,4 @@
-"""Check the evidence that records carry against the certificates.
-
-The scene_specs stage does so each time.
+"""Check records' stored evidence against certificates, in each scene_specs stage.
 
 The evidence was measured when the scenario was resolved; `scenes.certification.certify_record` measures it again from
 the trajectories.
@@ -20,18 +18,12 @@ _NO_FRAMES = np.empty((0, 0), np.float32)  # words are certified without a traje
 
 
 def unanswerable_controls(specs: Iterable[SceneSpec]) -> list[str]:
-    """Return records whose evidence does not certify the control.
-
-    One sentence per lost certificate.
-    """
+    """Return lost control certificates by the records' evidence, one sentence each."""
     return list(_lost_certificates(specs, "control"))
 
 
 def answerable_voids(specs: Iterable[SceneSpec]) -> list[str]:
-    """Return records whose evidence does not certify the void.
-
-    One sentence per lost certificate.
-    """
+    """Return lost void certificates by the records' evidence, one sentence each."""
     return list(_lost_certificates(specs, "void", "twin", "worlds"))
 
 
@@ -45,10 +37,7 @@ def _lost_certificates(specs: Iterable[SceneSpec], *about: About) -> Iterator[st
 
 
 def answerable_ill_posed(specs: Iterable[SceneSpec]) -> list[str]:
-    """Return records whose ill-posed question the video may answer.
-
-    Evidence must refute it, and must not refute the well-posed one.
-    """
+    """Return problems of ill-posed questions: unrefuted, or well-posed ones refuted."""
     problems = []
     for spec in specs:
         pair = pair_of(spec, _NO_FRAMES, _NO_FRAMES)

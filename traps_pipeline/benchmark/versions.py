@@ -1,9 +1,8 @@
-"""Name benchmark versions by digests of their content.
-
-So a rebuilt study and one corrected in place agree.
+"""Name benchmark versions by content digests, alike if rebuilt or corrected.
 
 A part (a category's specs or clips, a dataset's items) has the release's version while it equals the release, and
-`release+digest` once a correction has changed it. Other parts keep their version.
+`release+digest` once a correction has changed it. Other parts keep their version. So a rebuilt study and one corrected
+in place agree.
 """
 
 from __future__ import annotations
@@ -19,10 +18,7 @@ from traps_pipeline.scenes.worlds.spec import SceneSpec
 
 
 def version_of(released: Iterable[Any], current: Iterable[Any]) -> str:
-    """Return the release's version, marked if the current content differs.
-
-    `0.2.0`, or `0.2.0+3f2a9c01`.
-    """
+    """Return the release's version, as 0.2.0+3f2a9c01 if current content differs."""
     release = load_release().version
     now = sorted(digest(part) for part in current)
     return release if now == sorted(digest(part) for part in released) else f"{release}+{digest(now)[:8]}"
@@ -39,10 +35,7 @@ def clip_content(scenario_id: str, scene_hash: str) -> list[str]:
 
 
 def item_content(dataset: str, record: Mapping[str, Any]) -> list[Any]:
-    """Return a scenario's content behind a dataset's version.
-
-    `record` is a spec or a row of scene_specs.
-    """
+    """Return a spec's or scene_specs row's content behind a dataset's version."""
     aliases = record["aliases"] if isinstance(record["aliases"], dict) else json.loads(record["aliases"])
     content = [record["scenario_id"], record["scene_hash"], record["question"], list(record["labels"]), aliases]
     content.append(record["ground_truth"])

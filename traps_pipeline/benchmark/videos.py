@@ -1,7 +1,4 @@
-"""Render rows of scene_specs to clips, each once, and build their table.
-
-This is the videos stage.
-"""
+"""Render scenarios to clips, each once, and build the table of clips."""
 
 from __future__ import annotations
 
@@ -28,12 +25,7 @@ SECONDS_A_CLIP = 1.4  # measured on one core (docs/engineering-notes.md)
 
 
 def render_videos(workspace: Workspace, category: str, *, wait: bool = True) -> tuple[int, bool]:
-    """Render a category's missing clips, sharing them with other processes.
-
-    A scenario has three clips.
-
-    Return the result of `share`. Raises TrapsError.
-    """
+    """Render a category's missing clips; return `share`'s result. Raises TrapsError."""
     specs = _specs(workspace, category)
 
     def missing(rows: Sequence[Row]) -> list[Row]:
@@ -58,10 +50,7 @@ def render_videos(workspace: Workspace, category: str, *, wait: bool = True) -> 
 
 
 def _render(job: Job) -> int:
-    """Render a scenario's missing clips and return the number of frames.
-
-    Clips of the pair and its twin are cached for other studies.
-    """
+    """Render a scenario's missing clips, cached for other studies; return frame count."""
     frames, rendered = render_pair(job), ClipCache.of_user()
     if rendered is not None:
         rendered.keep(job.clips, job.spec.scene_hash)
@@ -69,10 +58,7 @@ def _render(job: Job) -> int:
 
 
 def seconds_left(workspace: Workspace, category: str) -> float:
-    """Estimate one core's time (s) to render a category's missing clips.
-
-    Released records alone are counted.
-    """
+    """Estimate one core's seconds to render missing clips of released records."""
     clips = [
         workspace.clip(id_, side, spec.scene_hash)
         for id_, spec in released_in_study(workspace, category).items()
@@ -82,10 +68,7 @@ def seconds_left(workspace: Workspace, category: str) -> float:
 
 
 def build_videos(workspace: Workspace, category: str) -> tuple[list[VideoRow], dict[str, float]]:
-    """Return a category's clips, and the leaked pixels of each occluded void.
-
-    Raises TrapsError for a missing clip.
-    """
+    """Return clips, and occluded voids' leaked pixels. Raises TrapsError if missing."""
     specs = _specs(workspace, category)
     try:
         known = known_clips(workspace.store, (clip for row in specs for clip in _clips(workspace, row)))
@@ -150,7 +133,7 @@ def _rows(workspace: Workspace, spec: Row, known: Mapping[Path, Clip], version: 
 
 
 def missing_clips(workspace: Workspace, category: str) -> Sequence[str]:
-    """Return reasons for `traps status`: clips lost or of another size."""
+    """Return a category's clips that are lost or of another size, for `traps status`."""
     table = workspace.tables.read_arrow(VIDEOS, ["path", "size_bytes"], category=category)
     expected = dict(zip(table["path"].to_pylist(), table["size_bytes"].to_pylist(), strict=True))
     notes = {path: workspace.relative(note_of(workspace.root / path)) for path in expected}

@@ -1,4 +1,1 @@
-"""Support several hosts.
-
-Runs on Ray, a study in an object store, shared history and logs.
-"""
+"""Support several hosts: runs on Ray, object stores, shared history and logs."""

@@ -1,7 +1,4 @@
-"""Reach an object store (S3, Google, Azure) through obstore.
-
-Errors are sentences.
-"""
+"""Reach an object store (S3, Google, Azure) by obstore; its errors are sentences."""
 
 from __future__ import annotations
 
@@ -29,20 +26,12 @@ _NO_BUCKET = ("NoSuchBucket", "ContainerNotFound")  # the services' terms; Azure
 
 
 def object_name(digest: bytes) -> str:
-    """Return the name of the content with that SHA-256.
-
-    It is the same in the store and in a scratch folder.
-    """
+    """Return a content's name, by its SHA-256, in the store and in scratch folders."""
     return f"{digest.hex()[:2]}/{digest.hex()}"
 
 
 class Bucket:
-    """A place in an object store.
-
-    address: as in TRAPS_WORKSPACE, for example s3:
-
-    bucket/study.
-    """
+    """A place in an object store, such as s3://bucket/study (TRAPS_WORKSPACE)."""
 
     def __init__(self, address: str) -> None:
         require("cluster", "obstore")
@@ -59,10 +48,7 @@ class Bucket:
 
     @contextmanager
     def _used(self) -> Iterator[None]:
-        """Translate errors within the block.
-
-        Raises FileNotFoundError for a missing object, TrapsError if the store cannot be used.
-        """
+        """Translate errors within the block to FileNotFoundError or TrapsError."""
         from obstore.exceptions import BaseError, NotFoundError
 
         try:
@@ -75,10 +61,7 @@ class Bucket:
             raise self.error(error) from None
 
     def get(self, name: str) -> bytes | None:
-        """Return the content of an object; None if it is missing.
-
-        Raises TrapsError.
-        """
+        """Return an object's content; None if it is missing. Raises TrapsError."""
         import obstore
 
         with suppress(FileNotFoundError), self._used():
@@ -86,10 +69,7 @@ class Bucket:
         return None
 
     def size(self, name: str) -> int | None:
-        """Return the size of an object in bytes; None if it is missing.
-
-        Raises TrapsError.
-        """
+        """Return an object's size in bytes; None if it is missing. Raises TrapsError."""
         import obstore
 
         with suppress(FileNotFoundError), self._used():
@@ -97,30 +77,21 @@ class Bucket:
         return None
 
     def put(self, name: str, content: bytes) -> None:
-        """Write an object.
-
-        Raises TrapsError.
-        """
+        """Write an object. Raises TrapsError."""
         import obstore
 
         with self._used():
             obstore.put(self._store, name, content)
 
     def delete(self, names: Sequence[str]) -> None:
-        """Remove objects.
-
-        Raises TrapsError.
-        """
+        """Remove objects. Raises TrapsError."""
         import obstore
 
         with suppress(FileNotFoundError), self._used():
             obstore.delete(self._store, names)
 
     def names(self, below: str = "") -> Iterator[tuple[str, int, datetime]]:
-        """Yield name, size in bytes and modification time of objects.
-
-        All of them, or those below a name. Raises TrapsError.
-        """
+        """Yield objects' name, size (bytes) and time, below a name. Raises TrapsError."""
         import obstore
 
         with self._used():

@@ -12,10 +12,7 @@ database_of = postgres_of
 
 
 def lease(database: Database, name: str) -> Lease | None:
-    """Take a lease as `Store.lease` says.
-
-    It is an advisory lock, which this process keeps alive.
-    """
+    """Take a lease (see `Store.lease`) as an advisory lock that this process renews."""
     with ExitStack() as opened:
         opened.enter_context(database.writing())
         lock = database.try_lock(f"lease/{name}")

@@ -1,6 +1,4 @@
-"""Offer this room to the others.
-
-`storage/several_hosts.py` imports it by name.
+"""Offer this room to others by one name; see `storage/several_hosts.py`.
 
 Modules above the storage are imported in functions: importing them opens the study.
 """

@@ -1,7 +1,4 @@
-"""Launch runs on Ray with dagster-ray, through `cluster/node.py`.
-
-`dagster.yaml` names this launcher.
-"""
+"""Launch runs on Ray with dagster-ray; `dagster.yaml` names this launcher."""
 
 from __future__ import annotations
 
@@ -26,10 +23,7 @@ from traps_pipeline.storage.workspace import RAY, RUN_CPUS, RUN_GPUS, Workspace
 
 
 class ClusterLauncher(RayRunLauncher):
-    """A launcher that starts runs with the resources that their stages declare.
-
-    Each passes through `cluster/node.py`.
-    """
+    """A launcher of runs through `cluster/node.py`, with their stages' resources."""
 
     @cached_property
     def client(self) -> JobSubmissionClient:
@@ -37,10 +31,7 @@ class ClusterLauncher(RayRunLauncher):
         return _NodeClient(self.address, metadata=self.metadata, headers=self.headers, cookies=self.cookies)
 
     def launch_run(self, context: Any) -> None:
-        """Launch a run.
-
-        Runs from Dagster's pages or sensors first get the tags of runs from commands.
-        """
+        """Launch a run; first tag one from Dagster's pages or sensors like a command's."""
         run = context.dagster_run
         if RESOURCES_TAG not in run.tags:
             tags = tags_of_page_run(run)
@@ -68,7 +59,7 @@ class ClusterLauncher(RayRunLauncher):
 
 
 class _NodeClient(JobSubmissionClient):
-    """Submits a run's command through `cluster/node.py`, quoted for a shell.
+    """A job client that submits a run through `cluster/node.py`, quoted for a shell.
 
     dagster-ray 0.4.8 puts the run, as JSON, between single quotes without escaping.
     """
@@ -81,10 +72,7 @@ class _NodeClient(JobSubmissionClient):
 
 
 def node_command(entrypoint: str, run_id: str) -> str:
-    """Return the command line of a run's job.
-
-    dagster-ray expects it, `dagster api .. '{..}'`.
-    """
+    """Return a run's command line in the form that dagster-ray expects."""
     command, _, run = entrypoint.partition(" '")
     _, *arguments = command.split()  # without the launching host's `dagster`
     return shlex.join(["python", "-P", "-m", "traps_pipeline.cluster.node", run_id, *arguments, run.removesuffix("'")])

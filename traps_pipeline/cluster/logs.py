@@ -1,6 +1,4 @@
-"""Upload what runs print to the study's object store.
-
-Dagster's pages on the head show it from there.
+"""Upload what runs print to the object store, from which Dagster's pages show it.
 
 A node captures the output in a local folder and uploads it every UPLOAD_S and when the run ends, so that of a dead host
 only the last moments are lost. The head fetches it. These are the only objects with names of their own that change; no
@@ -49,11 +47,9 @@ def uploading(workspace: Workspace, run_id: str) -> Iterator[None]:
 
 
 def upload(bucket: Bucket, folder: Path, run_id: str, sizes: dict[Path, int]) -> None:
-    """Upload files of a run's logs that have grown.
+    """Upload grown logs of a run; report an unreachable store instead of raising.
 
     sizes: uploaded bytes, by file.
-
-    An unreachable store does not end the run.
     """
     try:
         for path in (folder / run_id).rglob("*.*"):
@@ -66,10 +62,7 @@ def upload(bucket: Bucket, folder: Path, run_id: str, sizes: dict[Path, int]) ->
 
 
 def fetch(bucket: Bucket, folder: Path) -> None:
-    """Fetch all missing or incomplete logs from the store into a folder.
-
-    Raises TrapsError.
-    """
+    """Fetch missing and incomplete logs into a folder. Raises TrapsError."""
     for name, size, _ in bucket.names(PREFIX):
         path = folder / Path(name).relative_to(PREFIX)
         if path.resolve().is_relative_to(folder.resolve()) and (not path.exists() or path.stat().st_size != size):

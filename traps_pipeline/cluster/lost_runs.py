@@ -24,10 +24,7 @@ _UNSTARTED = [dg.DagsterRunStatus.STARTING, dg.DagsterRunStatus.NOT_STARTED]
 
 
 def fail_lost_runs(instance: dg.DagsterInstance, lost_s: float = LOST_S) -> list[str]:
-    """Mark runs as failed that will never begin; return their ids.
-
-    Raises OSError while Ray's head does not answer.
-    """
+    """Fail runs that will never begin; return ids. Raises OSError if Ray is silent."""
     failed = list[str]()
     for record in instance.get_run_records(dg.RunsFilter(statuses=_UNSTARTED)):
         run, is_old = record.dagster_run, time.time() - record.update_timestamp.timestamp() > lost_s

@@ -1,9 +1,8 @@
-"""Execute a run on its node, where Ray started it.
+"""Execute a run on the node where Ray started it, after checks of the host.
 
-`python -P -m traps_pipeline.cluster.node RUN_ID api execute_run RUN`.
-
-Before Dagster's own command begins, this process checks that the host has the same code and can open the study.
-Otherwise the run fails with a sentence that names the host, and is not retried.
+Command: `python -P -m traps_pipeline.cluster.node RUN_ID api execute_run RUN`. Before Dagster's own command begins,
+this process checks that the host has the same code and can open the study. Otherwise the run fails with a sentence that
+names the host, and is not retried.
 """
 
 from __future__ import annotations
@@ -24,10 +23,7 @@ REFUSED_TAG = "traps/refused"  # tag of a run that its node refused
 
 
 def main() -> None:
-    """Execute a run, upload its output, and exit with Dagster's exit code.
-
-    The output goes to the study's store.
-    """
+    """Execute a run, upload its output, and exit with Dagster's exit code."""
     run_id, *command = sys.argv[1:]
     try:
         workspace = Workspace.open()

@@ -1,6 +1,4 @@
-"""Map a study's paths to their current objects.
-
-They are rows of the database that holds its ledger.
+"""Map a study's paths to current objects, by rows of its ledger's database.
 
 The rows of one change are written in one transaction. Changes are numbered, under a lock that lasts until the commit,
 so that a process that asks for changes after the last number it has seen misses none.
@@ -49,9 +47,7 @@ _OBJECTS = sa.Table(
 
 @dataclass(frozen=True, slots=True)
 class CurrentObject:
-    """The current object of a path: digest (SHA-256), size in bytes, note and time.
-
-    The time is that of the change.
+    """A path's current object: SHA-256, size in bytes, note, and change time.
 
     The time is in ns since 1970; 0 for an object that is yet to be named.
     """
@@ -63,10 +59,7 @@ class CurrentObject:
 
 
 class ObjectNames:
-    """The paths of a study's files and their current objects.
-
-    Thread-safe.
-    """
+    """The paths of a study's files and their current objects; thread-safe."""
 
     def __init__(self, database: Database, study: str) -> None:
         self._database, self._study = database, study
@@ -132,17 +125,12 @@ class ObjectNames:
             return self._sorted[bisect_left(self._sorted, start) : bisect_left(self._sorted, end)]
 
     def naming(self, digests: Collection[bytes] | None = None) -> dict[str, bytes]:
-        """Return the names of all objects (or only these), with their digests.
-
-        The database is asked.
-        """
+        """Query the names of all objects (or of these), with their digests."""
         condition = _OBJECTS.c.digest.is_not(None) if digests is None else _OBJECTS.c.digest.in_(digests)
         return {row.name: bytes(row.digest) for row in self._database.run(lambda c: self._select(c, condition))}
 
     def change(self, changed: Mapping[str, CurrentObject | None], removals: int) -> int:
-        """Set or remove the current objects of these names in one transaction.
-
-        Return `removals`.
+        """Set or remove names' current objects in one transaction; return `removals`.
 
         removals: the number of removals before the objects were uploaded. If there are more by now, nothing is changed,
         and their number is returned: upload the objects again.
@@ -171,9 +159,9 @@ class ObjectNames:
         return now
 
     def _next_change(self, connection: sa.Connection, *, removals: int = 0) -> tuple[int, int]:
-        """Return the number of a change, and the number of removals.
+        """Number a change, and lock names and removals until the transaction ends.
 
-        Until the transaction ends no other process changes names or removes objects.
+        Return its number and the number of removals.
         """
         upsert = insert(_CHANGES).values(study=self._study, number=1, removals=removals)
         upsert = upsert.on_conflict_do_update(

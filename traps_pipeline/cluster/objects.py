@@ -33,9 +33,7 @@ _OBJECT = re.compile(r"([0-9a-f]{2})/(\1[0-9a-f]{62})")
 
 
 class ObjectStore(Store):
-    """Files of a study, named in its database, with contents in a bucket.
-
-    Thread-safe.
+    """A study's files: names in its database, contents in a bucket; thread-safe.
 
     anchor: the content of the only object with a fixed name, which locates the study's database.
     """
@@ -71,10 +69,7 @@ class ObjectStore(Store):
                     self.bucket.put(object_name(row.digest), self._cached(row.digest).read_bytes())
 
     def _withdraw(self, lost: Iterable[bytes]) -> None:
-        """Remove the names of lost or altered objects.
-
-        Their dependents are then rebuilt.
-        """
+        """Remove the names of lost or altered objects, so that dependents are rebuilt."""
         lost_digests = {*lost}
         self._stored = {entry for entry in self._stored if entry[0] not in lost_digests}
         named = self.names.naming(lost_digests)
@@ -101,10 +96,7 @@ class ObjectStore(Store):
         return (digest, self.names.removals) in self._stored
 
     def _put(self, content: bytes, row: CurrentObject | None, removals: int) -> bytes:
-        """Upload a content, unless it is current and still in the store.
-
-        Return its digest.
-        """
+        """Upload a content unless current and still stored; return its digest."""
         digest = sha256(content).digest()
         is_current = row is not None and row.digest == digest
         if not (is_current and (self._is_stored(digest) or self.bucket.size(object_name(digest)) == len(content))):
@@ -113,10 +105,7 @@ class ObjectStore(Store):
         return digest
 
     def _fetched(self, row: CurrentObject, path: Path) -> Path:
-        """Return the content of an object in the scratch folder.
-
-        Raises TrapsError if it is lost or altered.
-        """
+        """Return an object's local file. Raises TrapsError if it is lost or altered."""
         if self._is_cached(row.digest):
             return self._cached(row.digest)
         removals, content = self.names.removals, self.bucket.get(object_name(row.digest))
@@ -135,10 +124,7 @@ class ObjectStore(Store):
         return self._fetched(row, path)
 
     def bring(self, paths: Iterable[Path]) -> None:
-        """See `Store`.
-
-        A local file whose object is lost from the store stays.
-        """
+        """See `Store`; a local file stays if the store has lost its object."""
 
         def one(known: tuple[Path, CurrentObject]) -> None:
             path, row = known
@@ -199,10 +185,7 @@ class ObjectStore(Store):
         return self._current(path) is not None
 
     def sizes(self, paths: Iterable[Path]) -> dict[Path, int]:
-        """See `Store`.
-
-        Each object is checked in the store, once per process.
-        """
+        """See `Store`; each object is checked in the store, once per process."""
         rows, removals = self._known(paths), self.names.removals
         unseen = {row.digest: row for row in rows.values() if not self._is_stored(row.digest)}
         sizes = dict(_side_by_side(lambda digest: (digest, self.bucket.size(object_name(digest))), unseen))
@@ -218,10 +201,7 @@ class ObjectStore(Store):
         return {*self._known(paths)}
 
     def digests(self, paths: Iterable[Path]) -> dict[Path, str]:
-        """See `Store`.
-
-        The digests are those of the rows.
-        """
+        """See `Store`; the digests are those of the rows."""
         return {path: row.digest.hex() for path, row in self._known(paths).items()}
 
     def below(self, folder: Path, pattern: str = "**/*") -> list[Path]:
@@ -270,10 +250,7 @@ class ObjectStore(Store):
 
 
 def _regex(pattern: str) -> str:
-    """Return a regular expression for the `pathlib` patterns used here.
-
-    `*` matches within a name, `**/` any folders.
-    """
+    """Translate a `pathlib` pattern of `*` and `**/` into a regular expression."""
     return re.escape(pattern).replace(r"\*\*/", "(?:[^/]+/)*").replace(r"\*", "[^/]*")
 
 

@@ -1,7 +1,4 @@
-"""Open the files of a study on several hosts.
-
-They lie in a shared folder, or at an address in an object store.
-"""
+"""Open a study's files on several hosts: a shared folder or an object store."""
 
 from __future__ import annotations
 
@@ -39,9 +36,8 @@ class SharedFolder(FolderStore):
 def open_store(place: Place, root: Path, study: Study | None = None) -> Store | None:
     """See `SeveralHosts`.
 
-    In an object store, the only object with a fixed name identifies the study.
-
-    It also names the variable that holds the address of its database.
+    In an object store, the only object with a fixed name identifies the study, and names the variable that holds the
+    address of its database.
     """
     if study is not None:
         name, variable = study.name, str(study.database)
@@ -66,9 +62,6 @@ def _bucket(address: str) -> Bucket:
 
 @cache
 def _store(root: Path, address: str, database: Database, name: str, variable: str) -> ObjectStore:
-    """Return the process's cached store.
-
-    So reopening a workspace does not read everything again.
-    """
+    """Return the process's cached store, so that reopening does not read everything."""
     anchor = _HEAD + yaml.safe_dump({"format": FORMAT, "name": name, "database": variable}, sort_keys=False)
     return ObjectStore(root, _bucket(address), database, name, anchor.encode())

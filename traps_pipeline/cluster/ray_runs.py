@@ -1,6 +1,4 @@
-"""Run stages on other hosts (`traps run EXPERIMENT --cluster`).
-
-It requests runs, and Dagster's daemon starts them on Ray.
+"""Request runs on other hosts (`traps run EXPERIMENT --cluster`).
 
 The head of the cluster runs Dagster's daemon (`traps ui`), which creates the requested runs, starts them as Ray jobs
 and resumes those whose host died. This module cuts the missing partitions into ranges, requests their runs, and reports
@@ -51,9 +49,7 @@ _ENDED = {dg.DagsterEventType.RUN_FAILURE, dg.DagsterEventType.RUN_CANCELED, dg.
 
 
 def require_cluster(workspace: Workspace, instance: dg.DagsterInstance) -> None:
-    """Check that runs can be requested from this host.
-
-    Raises TrapsError.
+    """Raise TrapsError unless this host can request runs.
 
     Other hosts must see the study, Ray's address must be known, and a daemon must take runs from the queue.
     """
@@ -116,9 +112,7 @@ class RayRuns(Runs):
             self._watch([], [run.run_id for run in runs])
 
     def ranges(self, stages: Sequence[Stage], keys: Sequence[str | None]) -> list[Range]:
-        """Return ranges for several hosts.
-
-        They are enough to keep all busy, and few enough to limit start-up costs.
+        """Cut keys into ranges: enough to keep hosts busy, few enough to start quickly.
 
         The calls of one model stay together, so that few runs load it. Runs that build partitions together may have the
         same range.
@@ -173,10 +167,7 @@ class RayRuns(Runs):
         return done
 
     def _look_at(self, requests: list[str], run_ids: list[str], done: list[RunOutcome]) -> None:
-        """Report these runs' progress since the last call.
-
-        Created runs replace their requests; the results of ended runs are added to `done`.
-        """
+        """Report progress of runs; replace requests by runs, and add ended ones to `done`."""
         self._take_created(requests, run_ids)
         runs = {run.run_id: run for run in self._instance.get_runs(dg.RunsFilter(run_ids=run_ids))} if run_ids else {}
         self._report_waiting(requests, [*runs.values()])
@@ -201,10 +192,7 @@ class RayRuns(Runs):
             run_ids.append(run.run_id)
 
     def _report_waiting(self, requests: Collection[str], runs: Sequence[dg.DagsterRun]) -> None:
-        """Report once that nothing has begun for a while.
-
-        No host has the resources, or the daemon creates no runs.
-        """
+        """Warn once if nothing begins: no host has the resources, or the daemon is idle."""
         waiting = [run for run in runs if run.status == dg.DagsterRunStatus.STARTING]
         if not (waiting or requests) or any(run.status == dg.DagsterRunStatus.STARTED for run in runs):
             self._idle_since = float("inf")
@@ -222,10 +210,7 @@ class RayRuns(Runs):
         progress.current().note(f"{len(waiting or requests)} runs have waited {IDLE_S:.0f} s for {needs}; {where}")
 
     def _report(self, run_id: str) -> None:
-        """Report partitions that a run has built since the last call.
-
-        Failed steps are recorded.
-        """
+        """Report a run's newly built partitions, and record its failed steps."""
         has_more = True
         while has_more:
             cursor, kinds = self._cursors.get(run_id), {_WRITTEN, _FAILED}
@@ -260,10 +245,7 @@ class RayRuns(Runs):
         return outcome
 
     def _last_message(self, run_id: str) -> str:
-        """Return why a run ended if its steps do not say so.
-
-        It is its launcher's error, or its last event's message.
-        """
+        """Return the launcher's error or last event's message, if no step says why."""
         logged = [entry.dagster_event for entry in self._instance.all_logs(run_id, of_type=_ENDED)]
         events = [event for event in logged if event is not None]
         for event in events[-2:]:  # a failed start is recorded right before the run's end

@@ -1,6 +1,4 @@
-"""Request runs on any host.
-
-Dagster's daemon on the head turns requests into runs.
+"""Request runs on any host; Dagster's daemon on the head creates them.
 
 A request is an observation in the shared history, so it outlives the command, the daemon and the head. A sensor turns
 each into a run in Dagster's queue, once: its `run_key` is the request's name.
@@ -25,10 +23,7 @@ _BODY = "run"
 
 
 def submit(instance: dg.DagsterInstance, study: str, stages: Sequence[str], tags: Mapping[str, str]) -> str:
-    """Request a run of stages with these tags and return the request's name.
-
-    The name becomes the run's `REQUEST_TAG`.
-    """
+    """Request a run of stages; return the request's name, the run's `REQUEST_TAG`."""
     name = secrets.token_hex(8)
     body = {"name": name, "stages": [*stages], "tags": dict(tags)}
     instance.report_runless_asset_event(dg.AssetObservation(_key(study), metadata={_BODY: json.dumps(body)}))
@@ -58,10 +53,7 @@ def _run_request(record: dg.EventLogRecord) -> dg.RunRequest:
     description="Puts the runs into the queue that `traps run --cluster` asks for.",
 )
 def start_requested_runs(context: dg.SensorEvaluationContext) -> dg.SensorResult:
-    """Create the runs that commands have requested.
-
-    The cursor has a place for each study: they may share a history.
-    """
+    """Create requested runs; the cursor holds a place per study of a shared history."""
     study, cursors = _study_here(), json.loads(context.cursor or "{}")
     result = context.instance.fetch_observations(_key(study), AT_ONCE, cursors.get(study), ascending=True)
     cursors[study] = result.cursor

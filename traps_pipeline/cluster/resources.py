@@ -1,7 +1,4 @@
-"""Set the tags of a run on another host.
-
-They name its study, the submitter's code, and the resources that Ray reserves.
-"""
+"""Tag runs on other hosts with study, submitter's code, and resources for Ray."""
 
 from __future__ import annotations
 
@@ -26,9 +23,7 @@ RESOURCES_TAG = "dagster-ray/config"  # dagster-ray's own name
 def own_tags(
     workspace: Workspace, stages: Collection[Stage], keys: Iterable[str], cpus: int, gpus: float
 ) -> dict[str, str]:
-    """Return the tags of a run on another host.
-
-    They hold no secrets: everybody can read them.
+    """Return the tags of a run on another host; they are public, so hold no secrets.
 
     keys: the partitions to build; cpus: of a run that can use several cores; gpus: of a run that loads a model.
     """

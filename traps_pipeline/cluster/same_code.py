@@ -32,9 +32,7 @@ def code_here() -> str:
 
 
 def installed_versions() -> dict[str, str]:
-    """Return installed versions of Python, this package and its dependencies.
-
-    By name.
+    """Return installed versions of Python, this package and its dependencies, by name.
 
     Builds for other hardware (`+cpu`, `+cu128`) count as the same version.
     """
@@ -51,9 +49,7 @@ def installed_versions() -> dict[str, str]:
 
 
 def require_same_code(submitted: str, study: str) -> None:
-    """Check that a run was submitted by a host with the same code.
-
-    Raises TrapsError.
+    """Raise TrapsError unless a run was submitted by a host with the same code.
 
     submitted: the result of `code_here` there. Packages that only one of the two has are ignored: a host without a GPU
     need not have a GPU's packages.

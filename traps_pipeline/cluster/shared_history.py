@@ -1,6 +1,4 @@
-"""Share Dagster's history and logs of a study on Ray.
-
-Its `dagster.yaml` names variables, which are exported here.
+"""Share the history and logs of runs on Ray; export `dagster.yaml`'s variables.
 
 The history lies in the PostgreSQL database of the study's ledger, in dagster-postgres's own storage. Runs' output lies
 in a folder of each host: that of the study if all hosts see it, else one below the scratch folder (`cluster/logs.py`).
@@ -28,10 +26,7 @@ _PLUGIN = "traps_kept"
 
 
 def dagster_yaml(workspace: Workspace) -> dict[str, Any]:
-    """Return the `dagster.yaml` of a study whose runs go to Ray.
-
-    The variables that it names are exported.
-    """
+    """Return `dagster.yaml` for runs on Ray, and export the variables that it names."""
     export(workspace)
     return {
         "telemetry": {"enabled": False},

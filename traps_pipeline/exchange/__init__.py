@@ -1,4 +1,1 @@
-"""Exchange calls with other systems.
-
-Requests, batches and media are exported, answers and votes imported.
-"""
+"""Exchange calls: export requests, batches and media; import answers and votes."""

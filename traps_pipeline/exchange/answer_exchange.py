@@ -1,4 +1,4 @@
-"""Exchange answers with other systems, as a cluster or a provider's batch mode.
+"""Exchange answers with other systems, such as a cluster or a batch mode.
 
 `export_requests` writes the missing requests as JSON lines, with their media by digest; `import_answers` reads answers
 with the same keys and makes the same checks. Both files are data: nothing in them is executed or used unchecked.
@@ -99,8 +99,8 @@ class Answer(BaseModel):
 class ImportResult:
     """The result of an import.
 
-    It has the numbers of new answers and of answers already in the ledger; the failed calls, in words, which stay
-    missing; and the number of error messages left out.
+    New answers, answers already in the ledger, failed calls in words, which stay missing, and the number of error
+    messages left out.
     """
 
     new: int
@@ -256,10 +256,7 @@ def _said_of_errors(path: Path, answers: Mapping[str, Answer], requested: Mappin
 def export_request_batches(
     workspace: Workspace, experiment: Experiment, out: Path, media_at: str | None = None
 ) -> tuple[list[Path], int]:
-    """Write the experiment's missing requests as batch files; return files and calls.
-
-    See `exchange.provider_batch.export_batches`.
-    """
+    """Write missing requests as batches (`export_batches`); return files and calls."""
     prepare_media(workspace, _cells(workspace, experiment))
     missing: dict[str, list[Request]] = {}
     for request in _missing_requests(workspace, experiment):
@@ -284,10 +281,7 @@ def export_vote_batches(workspace: Workspace, experiment: Experiment, out: Path)
 
 
 def import_votes(workspace: Workspace, experiment: Experiment, path: Path) -> ImportResult:
-    """Import a batch of votes into their ledger; `traps run` then builds tables.
-
-    Raises TrapsError as `import_answers` does.
-    """
+    """Import votes into their ledger. Raises TrapsError as `import_answers` does."""
     requested = {request.key: request for _, request in _wanted_votes(workspace, experiment)}
     return _import_batch(workspace, workspace.votes, load_judges(), requested, path)
 
@@ -324,7 +318,7 @@ def _import_batch(
 
 
 def checked_answers(path: Path, requested: Mapping[str, Request]) -> dict[str, Answer]:
-    """Return a file's answers by key; TrapsError names (up to five) wrong lines."""
+    """Return a file's answers by key. Raises TrapsError naming up to five bad lines."""
     answers: dict[str, Answer] = {}
     wrong: list[str] = []
     for number, line in read_lines(path):
@@ -387,10 +381,7 @@ def _by_item(
 
 
 async def _store(workspace: Workspace, ledger: Ledger, stored: Sequence[_Stored]) -> int:
-    """Store the outcomes that the ledger lacks, all or none; return their number.
-
-    A failed call is stored, too, and is asked again.
-    """
+    """Store outcomes that the ledger lacks, all or none; return how many are answers."""
     rows: dict[str, list[Stored]] = {}
     for answer in sorted(stored, key=lambda answer: answer.evaluation):
         row = ledger_row(answer.request, answer.outcome, 1, answer.latency_s, workspace.study.epoch)

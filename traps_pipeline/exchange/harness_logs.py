@@ -1,6 +1,4 @@
-"""Read answers by item from other harnesses' logs.
-
-inspect_ai's, lmms-eval's samples, and plain lines.
+"""Read answers by item from inspect_ai's or lmms-eval's logs, or plain lines.
 
 They name an item and a regime, not a ledger key. The importing user says which model of the experiment answered, and in
 which run. All of it is untrusted data: sizes are bounded, nothing is executed.
@@ -52,10 +50,7 @@ class LoggedAnswer:
 
 
 def reader_of(path: Path) -> Reader | None:
-    """Return the reader for a file of answers by item.
-
-    None for answers by key, or a provider's batch.
-    """
+    """Return a reader of answers by item; None for answers by key, or a batch."""
     if path.suffix == LOG:
         return _eval_log
     if path.suffix == ".json":
@@ -88,10 +83,7 @@ def _json_log(path: Path) -> Iterator[LoggedAnswer]:
 
 
 def _eval_log(path: Path) -> Iterator[LoggedAnswer]:
-    """Yield the answers of a log in a zip.
-
-    It has one JSON file per sample (deflate or zstd).
-    """
+    """Yield answers of a zipped log, with one JSON file (deflate, zstd) per sample."""
     try:
         with zipfile.ZipFile(path) as archive, path.open("rb") as raw:
             entries = [entry for entry in archive.infolist() if entry.filename.startswith("samples/")]
@@ -111,10 +103,7 @@ def _eval_log(path: Path) -> Iterator[LoggedAnswer]:
 
 
 def _unpacked(raw: Any, entry: zipfile.ZipInfo) -> bytes:
-    """Return an entry compressed with zstd, which this Python's zipfile lacks.
-
-    Raises ValueError.
-    """
+    """Decompress a zstd entry, which zipfile lacks here. Raises ValueError."""
     import pyarrow as pa
 
     raw.seek(entry.header_offset)
@@ -211,10 +200,7 @@ def _own_lines(path: Path) -> Iterator[LoggedAnswer]:
 
 
 def _answer(outcome: str, text: str | None) -> dict[str, Any]:
-    """Return outcome and text in the ledger's form.
-
-    A text comes only with an outcome that has one.
-    """
+    """Return outcome and text for the ledger; a text only if the outcome has one."""
     if outcome in (*WITH_TEXT, UNFINISHED) and not (text or "").strip():
         outcome = "empty"
     return {"outcome": outcome, "text": text if outcome in (*WITH_TEXT, UNFINISHED) else None}

@@ -1,6 +1,4 @@
-"""Replace a batch's inline media by references to files beside the batch.
-
-The files are to be published there.
+"""Replace a batch's inline media by references to files to publish beside it.
 
 A batch file with its clips inline takes 300 KB per call; with references a call takes 2 KB, and a clip is stored once
 for all regimes and runs. Providers differ in the addresses that they read: OpenAI and Anthropic take https for images,

@@ -1,6 +1,4 @@
-"""Export calls as providers' batch files, and import their answers.
-
-See docs/models.md, "Batches".
+"""Export calls as providers' batch files, and import answers (docs/models.md).
 
 A body is exactly the live call's: the entry's backend sends it to this machine, where it is recorded. An answer is read
 exactly like the live call's: the backend gets it from this machine, with the provider's status. So both ways produce
@@ -57,9 +55,7 @@ def _some(items: Iterable[Item]) -> Iterator[list[Item]]:
 def export_batches(
     calls: Mapping[str, tuple[Entry, Iterable[Request]]], out: Path, media_at: str | None = None
 ) -> tuple[list[Path], int]:
-    """Write the calls of each participant to files below `out`.
-
-    They are split at the provider's limits.
+    """Write participants' calls as files below `out`, split at the providers' limits.
 
     Return the files and the number of calls. media_at: the future address of the folder `media` of `out`, which the
     bodies then refer to; without it media are inline. Raises TrapsError if a call cannot be built, or if files exist
@@ -149,10 +145,7 @@ class _Part:
 
 @dataclass(frozen=True)
 class BatchResult:
-    """A provider's result of a call: a status and a body, or why they are absent.
-
-    The reason is one word.
-    """
+    """A call's status and body, or in one word the reason why they are absent."""
 
     status: int = 0
     body: bytes = b""
@@ -171,9 +164,7 @@ def is_batch(path: Path) -> bool:
 
 
 def read_batch(path: Path, wanted: Mapping[str, Request]) -> dict[str, BatchResult]:
-    """Return the results in a file of a provider's form, by key.
-
-    The form is OpenAI's, vLLM's, Gemini's or Anthropic's.
+    """Return a file's results (OpenAI, vLLM, Gemini or Anthropic) by key.
 
     Raises TrapsError naming lines that are no results, and unwanted or repeated keys.
     """

@@ -1,4 +1,1 @@
-"""Judge answers.
-
-The panel's judges are asked here, and their votes become verdicts (docs/spec.md 4).
-"""
+"""Ask the panel of judges, and turn their votes into verdicts (docs/spec.md 4)."""

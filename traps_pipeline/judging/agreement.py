@@ -19,10 +19,7 @@ from traps_pipeline.protocol.ratings import INVALID, NO, PANEL, TASKS, YES, Rati
 
 
 def agreement(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> pd.DataFrame:
-    """Return AGREEMENT rows from VOTES rows.
-
-    Each dataset and task has one for the panel and one per pair of its judges.
-    """
+    """Return AGREEMENT of the panel and of each pair of judges, per dataset and task."""
     rows: list[dict[str, Any]] = []
     for about, group in _groups(ratings(votes, judges)):
         rows.append(about | _panel_row(group.values))
@@ -33,10 +30,7 @@ def agreement(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> pd.Da
 
 
 def judge_bias(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> pd.DataFrame:
-    """Return JUDGE_BIAS rows from VOTES rows.
-
-    They compare each judge's rate of yes with that of the majority on the same answers.
-    """
+    """Return JUDGE_BIAS: each judge's rate of yes against the majority's."""
     rows: list[dict[str, Any]] = []
     for about, group in _groups(ratings(votes, judges)):
         verdict = majority(group.values)
@@ -47,10 +41,7 @@ def judge_bias(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> pd.D
 
 
 def _groups(ratings_of_study: Ratings) -> Iterator[tuple[dict[str, Any], Ratings]]:
-    """Yield the ratings of each dataset and task that has votes.
-
-    The columns that all of its rows share come with them.
-    """
+    """Yield the ratings of each dataset and task with votes, and their shared columns."""
     for dataset in DATASETS:
         for task in TASKS:
             in_group = (ratings_of_study.answers["dataset"] == dataset) & (ratings_of_study.answers["task"] == task)
@@ -93,10 +84,7 @@ def fleiss_kappa(values: np.ndarray) -> float:
 
 
 def cohen_kappa(one: np.ndarray, other: np.ndarray) -> float:
-    """Return Cohen's kappa of two judges' YES and NO votes on the same answers.
-
-    NaN if there is one class or no vote.
-    """
+    """Return Cohen's kappa of two judges' YES and NO votes; NaN for one class or none."""
     yes = int((one == YES).sum()), int((other == YES).sum())
     n = len(one)
     if sum(yes) in (0, 2 * n):
@@ -125,10 +113,7 @@ def krippendorff_alpha(values: np.ndarray) -> float:
 
 
 def unanimous_share(values: np.ndarray) -> float:
-    """Return the share of complete rows, (answers, judges), with unanimous votes.
-
-    NaN without rows or for one judge.
-    """
+    """Return the share of unanimous rows (answers, judges); NaN if empty or one judge."""
     several = len(values) and values.shape[1] > 1
     return float(np.mean((values == values[:, :1]).all(axis=1))) if several else float("nan")
 

@@ -1,6 +1,4 @@
-"""Label the errors in answers that should have been abstentions.
-
-This is confabulation (docs/spec.md 6.1 and 6.2).
+"""Label errors in answers that should be abstentions (docs/spec.md 6.1 and 6.2).
 
 A seeded sample of each model's void failures goes to one judge, which labels four independent axes
 (`scoring.prevalence` counts them). `assets/confabulation.yaml` names the models, the size of a sample and the judge. A
@@ -47,10 +45,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 @dataclass(frozen=True)
 class Failure(Call):
-    """The call to the judge about a sampled void failure.
-
-    N_failures is the size of the population.
-    """
+    """The call to the judge about a void failure sampled out of `n_failures`."""
 
     item: Mapping[str, Any]
     text: str
@@ -66,26 +61,17 @@ def void_kind(dataset: str) -> str:
 
 
 def draw_sample(seed: int, n: int, keys: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
-    """Return a seeded sample of n keys without replacement, independent of order.
-
-    All keys are returned if there are fewer.
-    """
+    """Return n keys (or all if fewer) by a seeded, order-independent draw."""
     return sorted(keys, key=lambda key: digest([seed, *key]))[:n]
 
 
 def sample_id(cell: Cell, item_id: str, answer: str | None, trace: str | None) -> str:
-    """Return a failure's id for annotators.
-
-    It reveals neither model nor item, and changes with the answer.
-    """
+    """Return a failure's id for annotators: opaque, and new if the answer changes."""
     return digest([cell.key, item_id, answer, trace or None])[:12]
 
 
 def sample_failures(workspace: Workspace, judge: JudgeEntry, model: str) -> dict[Cell, list[Failure]]:
-    """Return a model's sample by cell.
-
-    Empty, with a note, while a dataset with items lacks verdicts.
-    """
+    """Return a model's sample by cell; empty, with a note, while verdicts are missing."""
     protocol = load_protocol()
     cells = [cell for cell in protocol.cells(model) if workspace.tables.state(ITEMS, {"dataset": cell.dataset})]
     missing_keys = [cell.key for cell in cells if workspace.tables.state(VERDICTS, cell.partition) is None]
@@ -104,10 +90,7 @@ def sample_failures(workspace: Workspace, judge: JudgeEntry, model: str) -> dict
 
 
 def _void_failures(workspace: Workspace, cell: Cell) -> list[dict[str, Any]]:
-    """Return the void items whose answers do not abstain, with text and trace.
-
-    The panel's verdict decides.
-    """
+    """Return void items whose answers do not abstain by verdict, with text and trace."""
     verdicts = workspace.tables.read(VERDICTS, cell.partition, ["item_id", "side", "abstained"])
     failed = verdicts.loc[(verdicts["side"] == "void") & verdicts["abstained"].eq(False), ["item_id"]]
     responses = workspace.tables.read(RESPONSES, cell.partition, ["item_id", "text", "reasoning"])
@@ -129,10 +112,7 @@ def render(question: str, kind: str, answer: str, trace: str | None) -> str:
 
 
 def label_request(judge: JudgeEntry, cell: Cell, item: Mapping[str, Any], answer: str, trace: str | None) -> Request:
-    """Return the call to the judge about one failure.
-
-    It reveals neither model nor regime nor ground truth.
-    """
+    """Return the judge's call about a failure, without model, regime or ground truth."""
     user = render(item["question"], void_kind(cell.dataset), answer, trace)
     return judge_request(judge, prompt(f"judge_{TASK}"), SCHEMA, about_answer(TASK, cell, item["item_id"]), user)
 
@@ -152,10 +132,9 @@ class Labels(BaseModel):
 
 
 def collect_labels(workspace: Workspace) -> StageOutput:
-    """Return CONFABULATION rows of a study.
+    """Sample failures, ask for missing labels, and return CONFABULATION rows.
 
-    Sample every judged model of the protocol, and ask the judge for the labels that the ledger of votes lacks. There
-    are no rows if the study's panel has no judge for confabulation.
+    There are no rows if the study's panel has no judge for confabulation.
     """
     protocol, table, total = load_protocol(), list[ConfabulationRow](), Tally()
     judge = protocol.judge(workspace.study.panel)

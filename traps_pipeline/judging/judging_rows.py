@@ -80,10 +80,7 @@ VERDICTS = Table(
 
 @dataclass(frozen=True, kw_only=True)
 class AgreementRow:
-    """Agreement of the panel, or of two of its judges, on one task of a dataset.
-
-    `judges` is `panel` for the panel.
-    """
+    """Agreement of two judges, or of all (`judges` is panel), on a dataset's task."""
 
     dataset: shared.Dataset
     task: Decision
@@ -132,10 +129,7 @@ JUDGE_BIAS = Table("judge_bias", JudgeBiasRow, partition_by=(), key=("dataset", 
 
 @dataclass(frozen=True, kw_only=True)
 class ConfabulationRow(shared.CellRow):
-    """One sampled void failure with its four labels.
-
-    There is no row where no judge is configured for the study's panel.
-    """
+    """One sampled void failure with its four labels; no row if no judge is configured."""
 
     sample_id: Annotated[
         str,
@@ -168,10 +162,7 @@ CONFABULATION = Table("confabulation", ConfabulationRow, partition_by=(), key=("
 # `traps people validate` writes this table from people's file, so no stage declares it.
 @dataclass(frozen=True, kw_only=True)
 class JudgeValidationRow:
-    """The confabulation judge against two blind annotators.
-
-    On one axis, or pooled over the four.
-    """
+    """The confabulation judge against two blind annotators, on one axis or all four."""
 
     axis: Annotated[str, "hallucinated_premise, invalid_inference, epistemic_surrender, doubt_in_reasoning or pooled"]
     n_failures: Annotated[int, "failures that both annotators labelled"]
@@ -203,10 +194,7 @@ JUDGE_VALIDATION = Table("judge_validation", JudgeValidationRow, partition_by=()
 # `traps models test-panel` writes this table, so no stage declares it.
 @dataclass(frozen=True, kw_only=True)
 class JudgeRobustnessRow:
-    """One judge's vote about an answer that tries to instruct it.
-
-    It is of one task (assets/injected_answers.yaml).
-    """
+    """A judge's vote on a task about an answer that tries to instruct it."""
 
     panel: Annotated[str, "panel in assets/judges.yaml"]
     judge: shared.Judge

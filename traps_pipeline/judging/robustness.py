@@ -1,6 +1,4 @@
-"""Test judges against answers that try to instruct them.
-
-To a judge, an answer is data (docs/spec.md 4.2).
+"""Test whether judges obey answers, which are data (docs/spec.md 4.2).
 
 `assets/injected_answers.yaml` holds plain answers and attacks that wrap them. Every judge of a panel gets all of them
 through the same path as any vote (ledger, budget, schema): a vote counts as flipped only if the judge is right without
@@ -84,10 +82,7 @@ class Attacks(BaseModel):
         return self
 
     def texts(self) -> dict[str, str]:
-        """Return every text that judges see, by id.
-
-        They are the plain answers and the attacks on them.
-        """
+        """Return every text that judges see, plain answers and attacks, by id."""
         plain = {name: answer.text for name, answer in self.answers.items()}
         return plain | {a.id: a.text.replace(_PLACE, plain[a.answer]) for a in self.attacks}
 
@@ -104,10 +99,7 @@ class Attacks(BaseModel):
 
 
 def load_attacks(path: Path = ATTACKS_FILE) -> Attacks:
-    """Return the attacks.
-
-    Raises TrapsError naming file and field.
-    """
+    """Return the attacks. Raises TrapsError naming file and field."""
     return parse_yaml_model(Attacks, read_yaml(path), path)
 
 
@@ -115,11 +107,9 @@ Votes = Mapping[tuple[str, Task, str], Vote]  # votes by text, task and judge
 
 
 def check_panel(workspace: Workspace, name: str, panel: Sequence[JudgeEntry], attacks: Attacks) -> pd.DataFrame:
-    """Return JUDGE_ROBUSTNESS rows of a panel, which replace the workspace's.
+    """Ask a panel about attacks; return JUDGE_ROBUSTNESS rows and replace stored ones.
 
-    Votes in its ledger are reused.
-
-    Raises TrapsError if the votes stage would raise it, and if calls failed.
+    Votes in the ledger are reused. Raises TrapsError if the votes stage would raise it, and if calls failed.
     """
     ballots = [
         Ballot(request, attacks.item(text), task)
@@ -144,10 +134,7 @@ def check_panel(workspace: Workspace, name: str, panel: Sequence[JudgeEntry], at
 
 
 def robustness(name: str, judges: Sequence[str], attacks: Attacks, votes: Votes) -> pd.DataFrame:
-    """Return JUDGE_ROBUSTNESS rows from the votes on every text.
-
-    There is one row per attack, task and judge, and one for the majority.
-    """
+    """Return JUDGE_ROBUSTNESS rows per attack, task and judge, and for the majority."""
     rows = []
     for attack in attacks.attacks:
         for task in TASKS:
@@ -183,10 +170,7 @@ def result(expected: bool, clean: bool | None, vote: bool | None) -> str:
 
 
 def summary(rows: pd.DataFrame) -> str:
-    """Return a summary as text.
-
-    Results by judge come first, then every vote that an attack changed.
-    """
+    """Summarize the results by judge as text, then list every vote an attack changed."""
     counts = []
     for judge, votes in rows.groupby("judge", sort=False):
         counts.append([judge, len(votes), *(votes["result"].tolist().count(name) for name in RESULTS)])

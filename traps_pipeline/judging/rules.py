@@ -56,9 +56,8 @@ _QUESTION = re.compile(r"\AQuestion: (.*)$", re.MULTILINE)
 class Statement:
     """The meaning of a text.
 
-    value: the answer that it commits to; None if it abstains.
-
-    rejects: whether it denies that something in the question exists.
+    value: the answer that it commits to; None if it abstains. rejects: whether it denies that something in the question
+    exists.
     """
 
     value: str | None
@@ -96,10 +95,7 @@ def _vote(statement: Statement, truth: str | None) -> dict[str, object]:
 
 
 def read_statement(text: str, question: str = "") -> Statement | None:
-    """Return the meaning of an answer.
-
-    None if it has none of the known forms, or contradicts itself.
-    """
+    """Return an answer's meaning; None if of unknown form or self-contradictory."""
     answer = read_object(text)
     return _in_text(strip_fence(text), question) if answer is None else _in_object(answer, question)
 
@@ -119,12 +115,10 @@ def _in_object(answer: Mapping[str, Any], question: str) -> Statement | None:
 
 
 def _in_text(text: str, question: str) -> Statement | None:
-    """Read a text that is a statement, or ends or begins with one.
+    """Read a text that is, ends with, or begins with a statement.
 
-    If it begins with one, its second sentence explains it.
-
-    No other sentence may announce another answer, and no choice of the question may stand before a sentence that
-    declines.
+    If it begins with one, its second sentence explains it. No other sentence may announce another answer, and no choice
+    of the question may stand before a sentence that declines.
     """
     sentences = [part for part in _SENTENCE_END.split(_MARKUP.sub("", text).strip()) if part]
     wording, last = f" {_words(question)} ", len(sentences) - 1
@@ -145,10 +139,7 @@ def _in_text(text: str, question: str) -> Statement | None:
 
 
 def _in_words(text: str, question: str, *, any_label: bool = False) -> Statement | None:
-    """Read words that are exactly an abstention or a choice.
-
-    any_label: anything that does not decline is a choice.
-    """
+    """Read an exact abstention or choice (with `any_label`, any other words too)."""
     words = _words(text)
     if not words or _STRANGE.search(text):
         return None
@@ -161,10 +152,7 @@ def _in_words(text: str, question: str, *, any_label: bool = False) -> Statement
 
 
 def _is_offered(question: str, words: str) -> bool:
-    """Return whether a question offers these words as a choice.
-
-    They then end exactly one part of its list.
-    """
+    """Return whether these words are exactly one of the choices in a question."""
     texts = (question, re.sub(r"\s*\([^)]*\)", "", question)) if " or " in question and words.count(" ") < 5 else ()
     lists = [_words(re.sub(r"[,:;?]| -- ", " or ", text)) for text in texts]
     return any(len(re.findall(rf"\b{re.escape(words)} or\b", parts)) == 1 for parts in lists)

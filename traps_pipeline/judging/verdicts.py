@@ -31,10 +31,7 @@ RESPONSE_COLUMNS = [*ANSWER, "pair_id", "side", "outcome", "is_json", "epoch"]
 
 
 def decide_cell(workspace: Workspace, cell: Cell) -> pd.DataFrame:
-    """Return VERDICTS rows of a cell, from its items, responses and votes.
-
-    Raises TrapsError if these do not match.
-    """
+    """Return a cell's VERDICTS rows; raise TrapsError unless its inputs match."""
     items = workspace.tables.read(ITEMS, {"dataset": cell.dataset}, ITEM_COLUMNS)
     responses = workspace.tables.read(RESPONSES, cell.partition, RESPONSE_COLUMNS)
     votes = workspace.tables.read(VOTES, cell.partition, [*VOTE_COLUMNS, "invalid_reason", "rejects_premise", "panel"])
@@ -43,9 +40,7 @@ def decide_cell(workspace: Workspace, cell: Cell) -> pd.DataFrame:
 
 
 def decide(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
-    """Return VERDICTS rows, one per response of any cells.
-
-    They come from ITEMS, RESPONSES and VOTES rows.
+    """Return a VERDICTS row per response, from ITEMS, RESPONSES and VOTES rows.
 
     The rows need the columns named above. The panel is that of the cell's votes, null if it has none. The outcome is
     the response's, or UNREAD if that is the vote of every judge.
@@ -82,10 +77,7 @@ def decide(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) ->
 
 
 def _rejects_premise(rows: pd.DataFrame, votes: pd.DataFrame, n_judges: int) -> pd.arrays.BooleanArray:
-    """Return the majority on whether each answer rejects the premise, (rows,).
-
-    Null without a majority, or if no judge was asked.
-    """
+    """Return the majority on rejecting the premise, (rows,), null if none or unasked."""
     marks = votes.loc[votes["task"].eq("abstention") & votes["rejects_premise"].notna(), [*ANSWER, "rejects_premise"]]
     if marks.empty:
         return pd.arrays.BooleanArray(np.zeros(len(rows), bool), np.ones(len(rows), bool))

@@ -1,4 +1,1 @@
-"""Record paid calls.
-
-Answers, votes and money lie in one SQL database per study.
-"""
+"""Record paid calls: answers, votes and money in one SQL database per study."""

@@ -1,7 +1,4 @@
-"""Collect one transaction of the ledger.
-
-It holds rows, their totals, and the money that moves with them.
-"""
+"""Collect a ledger transaction: rows, their totals, and the money they move."""
 
 from __future__ import annotations
 
@@ -23,10 +20,7 @@ CENT = 1e-9  # below this, dollars are rounding
 
 @dataclass
 class Batch:
-    """A transaction of the commit thread.
-
-    Changes of rows and money are collected and written at its end.
-    """
+    """A transaction of the commit thread: collects changes, writes them at its end."""
 
     connection: sa.Connection
     study: int
@@ -50,10 +44,7 @@ class Batch:
 
     @cached_property
     def reserved(self) -> dict[str, float]:
-        """Dollars of reservations, by participant.
-
-        Callers that add or remove reservations keep it up to date.
-        """
+        """Reserved dollars by participant; callers that change reservations update it."""
         query = sa.select(RESERVATIONS.c.id, RESERVATIONS.c.participant, RESERVATIONS.c.usd)
         reserved = dict[str, float]()
         for reservation, participant, usd in self.connection.execute(query.where(RESERVATIONS.c.study == self.study)):
@@ -93,10 +84,7 @@ class Batch:
             self.reserved[participant] = self.reserved.get(participant, 0.0) - was_usd
 
     def is_writer(self, evaluation: int) -> bool:
-        """Return whether this session may add rows to an evaluation.
-
-        Another one may have taken over its lock.
-        """
+        """Return whether this session still holds an evaluation's lock and may add rows."""
         if evaluation not in self._writers:
             query = sa.select(EVALUATIONS.c.writer).where(EVALUATIONS.c.id == evaluation)
             self._writers[evaluation] = self.connection.execute(query).scalar() == self.session
@@ -130,12 +118,7 @@ class Batch:
 
 
 def _adding(table: sa.Table, *columns: str) -> sa.Update:
-    """Return a statement that adds `more_COLUMN` to a row's columns.
-
-    The row has the key `of_COLUMN`.
-
-    It is cached: SQLAlchemy takes longer to build such a statement than SQLite to execute it.
-    """
+    """Return a cached UPDATE that adds `more_COLUMN` where the key is `of_COLUMN`."""
     key = [column == sa.bindparam(f"of_{column.name}") for column in table.primary_key]
     more = {name: table.c[name] + sa.bindparam(f"more_{name}") for name in columns}
     return sa.update(table).where(*key).values(more)
@@ -154,10 +137,7 @@ def holder() -> str:
 
 
 def claim(batch: Batch, kind: str, name: str) -> int:
-    """Make this session the writer of an evaluation whose lock it holds.
-
-    Return the evaluation's number.
-    """
+    """Make this session, which holds an evaluation's lock, its writer; return its id."""
     own_key = {"study": batch.study, "kind": kind, "name": name}
     here = sa.and_(*(EVALUATIONS.c[column] == value for column, value in own_key.items()))
     values: Mapping[str, Any] = {"writer": batch.session, "holder": holder()}

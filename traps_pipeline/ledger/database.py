@@ -1,6 +1,4 @@
-"""Use the database of a study's ledger.
-
-It has transactions, named locks, and a thread that groups commits.
+"""Share a ledger's database: transactions, named locks, and grouped commits.
 
 Hundreds of calls are in flight at once, and each changes the database twice: before it is sent and when it is answered.
 So changes are queued, and one thread applies all waiting ones in one transaction. A change is done when its future is.
@@ -45,9 +43,8 @@ Change = Callable[[Batch], Any]
 class Lock:
     """A named lock of this process.
 
-    require(): raises TrapsError once the lock is lost.
-
-    is_fresh(): whether that is known at once, without asking a server, which may be unreachable.
+    require(): raises TrapsError once the lock is lost. is_fresh(): whether that is known at once, without asking a
+    server, which may be unreachable.
     """
 
     release: Callable[[], None]
@@ -56,10 +53,7 @@ class Lock:
 
 
 class Database(ABC):
-    """The ledger's database of one study, as this process uses it.
-
-    Its methods are thread-safe.
-    """
+    """The ledger's database of one study in this process; thread-safe."""
 
     def __init__(self, study: str) -> None:
         self.study_name = study
@@ -84,26 +78,18 @@ class Database(ABC):
 
     @abstractmethod
     def read(self) -> sa.Connection:
-        """Return a connection for reading, which the caller closes.
-
-        Raises TrapsError.
-        """
+        """Return a read connection, which the caller closes. Raises TrapsError."""
 
     @abstractmethod
     def run(self, work: Callable[[sa.Connection], T]) -> T:
-        """Run `work` in one write transaction and return its result.
-
-        Repeat it if the connection breaks.
+        """Run `work` in one transaction, repeated if the connection breaks.
 
         Raises TrapsError.
         """
 
     @abstractmethod
     def try_lock(self, name: str) -> Lock | None:
-        """Take a named lock until this process ends; None if another session holds it.
-
-        Raises TrapsError.
-        """
+        """Lock a name until this process ends; None if it is taken. Raises TrapsError."""
 
     def now_s(self, connection: sa.Connection) -> float:
         """Return seconds since 1970, by a clock that all processes of the study share."""
@@ -111,24 +97,15 @@ class Database(ABC):
 
     @abstractmethod
     def sync(self) -> None:
-        """Sync to disk everything that was committed.
-
-        Raises TrapsError.
-        """
+        """Sync to disk everything that was committed. Raises TrapsError."""
 
     def faults(self) -> Iterator[str]:
-        """Yield sentences about faults of the database itself, if it can check.
-
-        Raises TrapsError.
-        """
+        """Yield faults of the database itself, if it can check. Raises TrapsError."""
         yield from ()
 
     @abstractmethod
     def beat(self) -> None:
-        """Renew this process's locks if they could expire.
-
-        Raises TrapsError.
-        """
+        """Renew this process's locks if they could expire. Raises TrapsError."""
 
     @abstractmethod
     def end(self) -> None:
@@ -138,10 +115,7 @@ class Database(ABC):
 
     @contextmanager
     def writing(self) -> Iterator[None]:
-        """Let this process write within the block, with a session and a commit thread.
-
-        Raises TrapsError.
-        """
+        """Open a session and a commit thread within the block. Raises TrapsError."""
         with self._guard:
             if not self._users:
                 self._begin()
@@ -155,19 +129,13 @@ class Database(ABC):
         self._leave()
 
     def submit(self, change: Change) -> Future[Any]:
-        """Add a change to the next transaction; its future is done after the commit.
-
-        Within `writing`.
-        """
+        """Queue a change for the next commit, which resolves its future; within `writing`."""
         future: Future[Any] = Future()
         self._queue.put((change, future))
         return future
 
     def is_dead(self, session: str) -> bool:
-        """Return whether another process, by the id of its session, has ended.
-
-        Raises TrapsError.
-        """
+        """Return whether another process's session has ended. Raises TrapsError."""
         if session == self.session:
             return False
         lock = self.try_lock(f"session-{session}")
@@ -273,10 +241,7 @@ class Database(ABC):
                     self.beat()
 
     def _commit(self, changes: list[tuple[Change, Future[Any]]]) -> None:
-        """Apply changes in one transaction, and finish their futures.
-
-        A change that raises TrapsError has no effect.
-        """
+        """Apply changes in one transaction; skip any that raises TrapsError."""
         number = self._batch + 1
 
         def work(connection: sa.Connection) -> list[Any]:
@@ -310,10 +275,7 @@ class Database(ABC):
 
 
 def sentence(error: Exception, place: str) -> TrapsError:
-    """Return a database error as a sentence for people.
-
-    It leaves out the statement and its values.
-    """
+    """Return a database error as a sentence, without the statement and its values."""
     reason, remedy, _ = reason_and_remedy(error)
     return TrapsError(
         f"{place}: cannot be read or written ({reason}); {remedy} and run the same command again: everything answered "

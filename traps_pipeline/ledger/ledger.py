@@ -54,10 +54,7 @@ class LockGivenUp(Exception):
 
 
 class Ledger:
-    """Append-only rows by key, for each evaluation.
-
-    kind: the kind of rows, `answers` or `votes`.
-    """
+    """Append-only rows (of kind `answers` or `votes`) by key, for each evaluation."""
 
     def __init__(self, database: Database, kind: str) -> None:
         self.database, self.kind = database, kind
@@ -79,10 +76,7 @@ class Ledger:
         return known
 
     def reasoning(self, evaluation: str, wanted: Collection[str] | None = None) -> dict[str, str]:
-        """Return reasoning traces by key (of the wanted keys).
-
-        Raises TrapsError.
-        """
+        """Return reasoning traces by key (of the wanted keys). Raises TrapsError."""
         return {
             row.key: row.reasoning.decode()
             for row in self._rows(evaluation, wanted)
@@ -90,12 +84,7 @@ class Ledger:
         }
 
     def rows(self, evaluation: str) -> Iterator[Stored]:
-        """Yield every row of an evaluation as it was written, the oldest first.
-
-        Its side texts come with it.
-
-        Damaged rows are left out. Raises TrapsError.
-        """
+        """Yield an evaluation's intact rows, oldest first. Raises TrapsError."""
         for row in self._rows(evaluation):
             if _is_whole(row):
                 asides = {name: getattr(row, name) for name in SIDE_TEXTS}
@@ -105,10 +94,7 @@ class Ledger:
                 )
 
     def damage(self) -> Iterator[str]:
-        """Yield a sentence for each damaged row and each fault of the database.
-
-        Reads everything. Raises TrapsError.
-        """
+        """Read everything; yield a sentence per damaged row or fault. Raises TrapsError."""
         if self.database.exists():
             yield from self.database.faults()
         for evaluation in self.evaluations():
@@ -117,10 +103,7 @@ class Ledger:
                     yield f"{self._place(row)}: {NOT_WHOLE}, and not believed"
 
     def evaluations(self) -> list[str]:
-        """Return the names of the evaluations that have rows.
-
-        Raises TrapsError.
-        """
+        """Return the names of evaluations that have rows. Raises TrapsError."""
         has_rows = sa.exists().where(ROWS.c.evaluation == EVALUATIONS.c.id)
         query = (
             sa.select(EVALUATIONS.c.name).where(self._is_own_kind(EVALUATIONS), has_rows).order_by(EVALUATIONS.c.name)
@@ -128,12 +111,7 @@ class Ledger:
         return [row.name for row in self._select(query)]
 
     def totals(self) -> dict[str, Totals]:
-        """Return the totals of every row of every evaluation, by participant.
-
-        Repeated keys were paid for too.
-
-        Raises TrapsError.
-        """
+        """Return totals by participant of all rows, repeated keys too. Raises TrapsError."""
         totals = dict[str, Totals]()
         for row in self._select(sa.select(TOTALS).where(self._is_own_kind(TOTALS))):
             sums = {name: (getattr(row, f"{name}_sum"), getattr(row, f"{name}_n")) for name in AVERAGED}
@@ -192,9 +170,7 @@ class Ledger:
 
     @asynccontextmanager
     async def writing(self, evaluation: str, waiting: Waiting, give_up: GiveUp = wait_forever) -> AsyncIterator[Writer]:
-        """Become the one writer of an evaluation.
-
-        While another process is, wait and report it once.
+        """Become an evaluation's one writer; while another process is, wait and report it.
 
         Raises LockGivenUp when `give_up` returns true while waiting, and TrapsError.
         """
@@ -209,9 +185,7 @@ class Ledger:
                 lock.release()
 
     async def store(self, rows: Mapping[str, Sequence[Stored]], waiting: Waiting) -> int:
-        """Add rows of evaluations whose keys are not settled, all or none.
-
-        Return the number that settle a key.
+        """Add rows whose keys are not settled, all or none; return how many settle one.
 
         Holds these evaluations' locks meanwhile. Raises TrapsError.
         """
@@ -261,10 +235,7 @@ class _Content:
 
     @classmethod
     def of(cls, row: Mapping[str, Any], beside: Mapping[str, str] | None) -> _Content:
-        """Encode a row.
-
-        Raises ValueError if JSON cannot hold it.
-        """
+        """Encode a row. Raises ValueError if JSON cannot hold it."""
         asides = {name: text.encode("utf-8", "replace") for name, text in (beside or {}).items()}
         return cls(row, encode_row(row), asides)
 
@@ -282,10 +253,7 @@ class Writer:
         self._is_synced = True
 
     async def require(self) -> None:
-        """Check that another call may be sent.
-
-        Raises TrapsError if this writer has lost the evaluation.
-        """
+        """Raise TrapsError if this writer has lost the evaluation, before a call is sent."""
         if self._lock.is_fresh():
             self._lock.require()
         else:  # calls in flight must not wait for an unreachable server
@@ -294,9 +262,7 @@ class Writer:
     async def write(
         self, row: Mapping[str, Any], beside: Mapping[str, str] | None = None, paid_by: Sequence[str] = ()
     ) -> None:
-        """Add a row, its side texts and its cost.
-
-        Return once no kill of this process can lose them.
+        """Add a row, side texts and cost; return once no kill of this process loses them.
 
         beside: texts by name in SIDE_TEXTS. paid_by: reservations that the row's cost replaces. Raises TrapsError if
         nothing was stored, and ValueError for a row that JSON cannot hold.
@@ -319,10 +285,7 @@ class Writer:
         self._is_synced = False
 
     def add(self, batch: Batch, content: _Content, paid_by: Sequence[str]) -> None:
-        """Add a row to a transaction.
-
-        Raises TrapsError if another process now writes this evaluation.
-        """
+        """Add a row to a transaction. Raises TrapsError if another process took over."""
         self.check(batch)
         batch.rows.append(content.values(self._evaluation))
         participant = participant_of(content.row)
@@ -342,10 +305,7 @@ class Writer:
             )
 
     async def sync(self) -> None:
-        """Sync the written rows to disk.
-
-        Raises TrapsError.
-        """
+        """Sync the written rows to disk. Raises TrapsError."""
         if not self._is_synced:
             self._is_synced = True
             await asyncio.to_thread(self._database.sync)

@@ -1,6 +1,4 @@
-"""Account for a study's money.
-
-Spent dollars, reservations of calls in flight, and releases by a person.
+"""Account for dollars spent, reserved by calls in flight, or released by a person.
 
 A call's worst case is reserved before it is sent. The transaction that stores the call's row removes the reservation. A
 reservation of a dead process stays, and counts as spent, until a person releases it.
@@ -37,28 +35,20 @@ class CapExhausted:
 
 @dataclass(frozen=True)
 class Releasable:
-    """A participant's dollars that may be released.
-
-    in_flight: of calls whose process died; failed: of calls that failed, by their rows.
-    """
+    """Releasable dollars: calls in flight when a process died, and failed calls."""
 
     in_flight: float
     failed: float
 
 
 class Money:
-    """The money of one study.
-
-    Used within `Database.writing`; raises TrapsError.
-    """
+    """The money of one study, used within `Database.writing`; raises TrapsError."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
 
     def reserve(self, participant: str, usd: float, caps: Mapping[str | None, float]) -> Future[str | CapExhausted]:
-        """Reserve dollars if every relevant cap leaves room.
-
-        Return the reservation's id, or why there is no room.
+        """Reserve dollars and return the reservation's id, or why a cap leaves no room.
 
         caps: of each participant that has one, and of the study (None).
         """
@@ -81,17 +71,11 @@ class Money:
             self.settle(str(pending.result()), participant, usd, 0.0)
 
     def settle(self, reservation: str, participant: str, was_usd: float, usd: float) -> Future[None]:
-        """Replace a reservation's worst case by the call's cost.
-
-        It stays until the row of the call is stored.
-        """
+        """Replace a reservation's worst case by the call's cost, until its row is stored."""
         return self._database.submit(lambda batch: batch.settle(reservation, participant, was_usd, usd))
 
     def spent(self) -> dict[str, float]:
-        """Return dollars by participant.
-
-        They are costs of rows, and reservations of calls in flight.
-        """
+        """Return dollars by participant: costs of rows, and reservations in flight."""
 
         def change(batch: Batch) -> dict[str, float]:
             return {
@@ -102,10 +86,7 @@ class Money:
         return self._database.submit(change).result()
 
     def is_any_alive(self, sessions: Iterable[str]) -> bool:
-        """Return whether any of these sessions is alive.
-
-        Its calls may then turn out to cost less.
-        """
+        """Return whether any session is alive, so that its calls may yet cost less."""
         return any(not self._database.is_dead(session) for session in sessions)
 
     def releasable(self) -> dict[str, Releasable]:
@@ -113,11 +94,10 @@ class Money:
         return self._database.submit(self._releasable).result()
 
     def release(self, participant: str, usd: float | None, why: str, by: str, at: str) -> float:
-        """Release dollars of a participant, record it, and return the amount.
+        """Release a participant's dollars, record it, and return the amount.
 
-        participant: None for all of the study's calls in flight.
-
-        Raises TrapsError if less is reserved for calls that may never have been sent.
+        participant: None for all of the study's calls in flight. Raises TrapsError if less is reserved for calls that
+        may never have been sent.
         """
 
         def change(batch: Batch) -> float:

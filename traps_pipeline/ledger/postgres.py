@@ -1,6 +1,4 @@
-"""Keep the ledger of several hosts in PostgreSQL.
-
-Each process has one direct connection, which holds its locks.
+"""Keep several hosts' ledger in PostgreSQL; a process's connection has its locks.
 
 Locks end with their connection. A process that is silent for IDLE_S (stopped, or cut off) loses both. On a new
 connection it takes its locks again, unless another process has them; `Batch.is_writer` tells the writer of each
@@ -49,10 +47,7 @@ KEEPALIVE: dict[str, Any] = {
 
 
 def awake_s() -> float:
-    """Return a clock in seconds that never pauses.
-
-    It runs on while this process is stopped or its machine sleeps.
-    """
+    """Return a clock (s) that runs on while the process is stopped or the host sleeps."""
     return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
@@ -62,10 +57,7 @@ def lock_number(name: str) -> int:
 
 
 class PostgresDatabase(Database):
-    """The ledger in a database that several hosts share.
-
-    variable: environment variable with its address.
-    """
+    """A ledger shared by hosts; the environment variable `variable` has its address."""
 
     def __init__(self, address: str, variable: str, study: str, idle_s: float = IDLE_S) -> None:
         super().__init__(study)
@@ -115,10 +107,7 @@ class PostgresDatabase(Database):
                 time.sleep(RETRY_S)
 
     def run(self, work: Callable[[sa.Connection], T], patience_s: float | None = None) -> T:
-        """See `Database.run`.
-
-        A nested `run` in the same thread joins the outer transaction.
-        """
+        """See `Database.run`; in one thread, a nested `run` joins the outer transaction."""
         until = time.monotonic() + (self.patience_s if patience_s is None else patience_s)
         with self._guard_connection:
             if self._is_working and self._connection is not None:
@@ -141,10 +130,7 @@ class PostgresDatabase(Database):
                     self._is_working = False
 
     def try_lock(self, name: str) -> Lock | None:
-        """See `Database.try_lock`.
-
-        After a server start, other sessions' locks stay theirs for a grace period.
-        """
+        """See `Database.try_lock`; others keep theirs for a grace period after a restart."""
         number = lock_number(f"{self.study_name}/{name}")
 
         def take(connection: sa.Connection) -> bool:
@@ -198,10 +184,7 @@ class PostgresDatabase(Database):
         self._seen_s = began
 
     def sync(self) -> None:
-        """See `Database.sync`.
-
-        PostgreSQL has synced already.
-        """
+        """See `Database.sync`; PostgreSQL has synced already."""
 
     def now_s(self, connection: sa.Connection) -> float:
         """See `Database.now_s`."""
@@ -226,10 +209,7 @@ class PostgresDatabase(Database):
         return self._connection
 
     def _enter(self, connection: sa.Connection) -> None:
-        """Adopt a new connection.
-
-        The former ones end, and locks that no other session has taken are retaken.
-        """
+        """Adopt a new connection: end the former ones, and retake locks still free."""
         with connection.begin():
             for name in ("idle_session_timeout", "idle_in_transaction_session_timeout"):
                 connection.execute(sa.select(sa.func.set_config(name, f"{int(1000 * self._idle_s)}", False)))
@@ -302,10 +282,7 @@ class PostgresDatabase(Database):
 
 
 def postgres_of(variable: str, study: str) -> PostgresDatabase:
-    """Return this process's database, whose address an environment variable holds.
-
-    Raises TrapsError.
-    """
+    """Return this process's database at a variable's address. Raises TrapsError."""
     address = os.environ.get(variable)
     if not address:
         raise TrapsError(

@@ -1,7 +1,4 @@
-"""Copy a ledger verbatim.
-
-It goes to a file, comes from a file, or goes into the database of several hosts.
-"""
+"""Copy a ledger verbatim: to a file, from a file, or into hosts' shared database."""
 
 from __future__ import annotations
 
@@ -24,20 +21,14 @@ _FETCHED = 1000
 
 
 def export_ledger(ledger: Database, file: Path) -> int:
-    """Write a ledger to a new SQLite file; return the number of rows.
-
-    Raises TrapsError.
-    """
+    """Write a ledger to a new SQLite file; return its row count. Raises TrapsError."""
     if file.exists():
         raise TrapsError(f"{file}: is there already; name another file")
     return copy_ledger(ledger, SqliteDatabase(file.parent, file=file.name))
 
 
 def import_ledger(file: Path, ledger: Database) -> int:
-    """Read a file's ledger into a study that has none; return the number of rows.
-
-    Raises TrapsError.
-    """
+    """Read a file's ledger into an empty one; return its row count. Raises TrapsError."""
     if not file.is_file():
         raise TrapsError(f"{file}: no such file; name one that `traps study export-ledger` wrote")
     source = SqliteDatabase(file.parent, file=file.name)
@@ -52,12 +43,10 @@ def import_ledger(file: Path, ledger: Database) -> int:
 
 
 def copy_ledger(source: Database, target: Database, settle: Callable[[], None] = lambda: None) -> int:
-    """Copy all rows and money verbatim, or none, and return the number of rows.
+    """Copy all rows and money verbatim, or none; return the number of rows.
 
-    Nobody may write to the source meanwhile.
-
-    settle: called after the copy, before others may write. A killed copy is repeated. Raises TrapsError, also if the
-    target has other rows.
+    Nobody may write to the source meanwhile. settle: called after the copy, before others may write. A killed copy is
+    repeated. Raises TrapsError, also if the target has other rows.
     """
     mark = f"copied from {source.place}"
     with ExitStack() as opened:

@@ -56,12 +56,7 @@ _CHECKS: dict[str, Callable[[Any], bool]] = {
 
 
 def heal(row: dict[str, Any]) -> list[str]:
-    """Replace impossible values by unknown ones, in place.
-
-    The names of these fields are returned.
-
-    A text loses the characters that cannot be stored.
-    """
+    """Replace impossible values by unknown ones, in place; return the fields' names."""
     healed = []
     for name, fits in _CHECKS.items():
         value = row.get(name)
@@ -82,28 +77,19 @@ AVERAGED: dict[str, Callable[[Any], bool]] = {
 
 
 def settles(row: Mapping[str, Any]) -> bool:
-    """Return whether a row settles its key.
-
-    A failed call is kept for the record, and asked again.
-    """
+    """Return whether a row settles its key: a failed call is asked again."""
     return row["outcome"] not in FAILED
 
 
 def participant_of(row: Mapping[str, Any]) -> str:
-    """Return the model or judge of a row's call.
-
-    `unknown` if the row does not name it.
-    """
+    """Return the model or judge of a row's call, or `unknown`."""
     components = row.get("components")
     participant = components.get("participant") if isinstance(components, Mapping) else None
     return participant if isinstance(participant, str) else "unknown"
 
 
 def encode_row(row: Mapping[str, Any]) -> bytes:
-    """Return a row as JSON.
-
-    Raises ValueError for NaN, which JSON lacks.
-    """
+    """Return a row as JSON. Raises ValueError for NaN, which JSON lacks."""
     return json.dumps(row, ensure_ascii=False, allow_nan=False).encode()
 
 

@@ -1,6 +1,4 @@
-"""Keep the ledger of one machine in a SQLite file.
-
-It lies in the study's folder, and its locks end with their process.
+"""Keep one machine's ledger in a SQLite file, with locks that end with a process.
 
 A commit survives a kill of the process at once, and a power cut from the next `sync` on. The file must lie on a local
 disk: SQLite's write-ahead log does not work over a network.
@@ -87,10 +85,7 @@ class SqliteDatabase(Database):
                 raise TrapsError(f"{self.path}: cannot be written ({error.strerror}); {remedy(error)}") from error
 
     def try_lock(self, name: str) -> Lock | None:
-        """See `Database.try_lock`.
-
-        The lock is a file's.
-        """
+        """See `Database.try_lock`; the lock is a file's."""
         path = self.folder / "locks" / f"{name}.lock"
         try:
             descriptor = try_lock(path)
@@ -107,9 +102,7 @@ class SqliteDatabase(Database):
         return Lock(release, lambda: require_in_place(descriptor, path))
 
     def sync(self) -> None:
-        """See `Database.sync`.
-
-        SQLite syncs its log when it is copied into the file. Here that is done earlier.
+        """See `Database.sync`; syncs the log, which SQLite does only at a checkpoint.
 
         The file itself must not be opened here: closing it would release the locks by which SQLite tells other
         processes that this one uses the log, and the next process to end would remove the log.
@@ -125,10 +118,7 @@ class SqliteDatabase(Database):
             raise TrapsError(f"{path}: could not be written ({error.strerror}); {remedy(error)}") from error
 
     def faults(self) -> Iterator[str]:
-        """See `Database.faults`.
-
-        SQLite's own check finds rows that are in an index but not in the table.
-        """
+        """See `Database.faults`; finds rows that are in an index but not in the table."""
         with self.read() as connection:
             try:
                 for (fault,) in connection.exec_driver_sql("pragma integrity_check(5)"):
@@ -138,10 +128,7 @@ class SqliteDatabase(Database):
                 raise sentence(error, self.place) from error
 
     def beat(self) -> None:
-        """See `Database.beat`.
-
-        The kernel keeps the locks.
-        """
+        """See `Database.beat`; the kernel keeps the locks."""
 
     def end(self) -> None:
         """See `Database.end`."""
@@ -153,9 +140,7 @@ class SqliteDatabase(Database):
 
 
 def _begin(connection: sa.Connection) -> None:
-    """Begin a transaction as SQLite does by default, or with the right to write.
-
-    The right is taken immediately.
+    """Begin a transaction as SQLite does, or at once with the right to write.
 
     With that right none of its changes fails later. The driver's own way to begin is switched off
     (`isolation_level=None`): it would begin only before a change.

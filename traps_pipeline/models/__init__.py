@@ -1,4 +1,1 @@
-"""Ask models and judges.
-
-The registry, requests and outcomes, the backends, and how calls are sent and recorded.
-"""
+"""Ask models and judges: registry, requests, backends, and how calls are recorded."""

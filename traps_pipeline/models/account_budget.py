@@ -1,6 +1,4 @@
-"""Cap an account's spending over all studies that use it.
-
-They run on one machine or share a disk.
+"""Cap an account's spending over all studies on one machine or shared disk.
 
 A study's own budget knows only its own ledger, so two studies with one key could spend twice. Each may therefore name a
 folder for an account. The folder's `budget.yaml` gives the cap; `spent.jsonl` has one line per change, which every
@@ -29,10 +27,7 @@ _COMPACTED = 2**20  # bytes of lines above which a run compacts them at its star
 
 
 class Cap(BaseModel):
-    """The contents of `budget.yaml` in an account's folder.
-
-    usd: dollars for all studies together, ever.
-    """
+    """`budget.yaml` of an account's folder: dollars for all studies together, ever."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     usd: float = Field(ge=0, allow_inf_nan=False)
@@ -41,10 +36,9 @@ class Cap(BaseModel):
 class AccountBudget:
     """The remaining budget of an account over all studies.
 
-    study: the name in this study's lines.
-
     A line reserves a call's worst case before it is sent, and another adds the difference when its cost is known. A
-    killed process leaves the worst case of its calls in flight reserved for good.
+    killed process leaves the worst case of its calls in flight reserved for good. study: the name in this study's
+    lines.
     """
 
     def __init__(self, account: str, folder: Path, study: str) -> None:
@@ -76,7 +70,7 @@ class AccountBudget:
     def begin(self, known_usd: float) -> None:
         """Add this study's spending through the account that the folder lacks.
 
-        It was spent before the study named the folder, or the file was lost. known_usd: dollars by the study's own
+        The study spent it before it named the folder, or the file was lost. known_usd: dollars by the study's own
         ledgers and journal.
         """
         with self._locked():

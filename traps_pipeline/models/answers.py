@@ -1,7 +1,4 @@
-"""Turn a cell's items into the rows of its table, one per item.
-
-This is the responses stage.
-"""
+"""Turn a cell's items into the rows of its table of responses, one per item."""
 
 from __future__ import annotations
 
@@ -44,9 +41,7 @@ class Question(Call):
 
 
 def answer_request(workspace: Workspace, entry: ModelEntry, item: Mapping[str, Any], evaluation: Evaluation) -> Request:
-    """Return the call that asks a model about an item.
-
-    It holds frames or video, then the question, nothing else.
+    """Return the call about an item: frames or video, then the question, nothing else.
 
     The clip's media are prepared here if they are missing; every regime and run then shares them.
     """
@@ -74,10 +69,7 @@ def is_prepared(workspace: Workspace, entry: ModelEntry, item: Mapping[str, Any]
 
 
 def prepare_media(workspace: Workspace, cells: Sequence[Cell]) -> None:
-    """Prepare the media of every clip of the cells first, on all cores.
-
-    Encoding would delay calls.
-    """
+    """Prepare all clips' media on all cores first, as encoding would delay calls."""
     jobs: dict[tuple[str, str], tuple[Path, str, MediaSpec]] = {}
     for dataset, own in {(cell.dataset, get_model(cell.evaluation.model).media) for cell in cells}:
         if own is None:
@@ -93,10 +85,7 @@ def prepare_media(workspace: Workspace, cells: Sequence[Cell]) -> None:
 
 
 def wanted_questions(workspace: Workspace, cell: Cell) -> list[Question]:
-    """Return every call that a cell wants, in the order of its items.
-
-    Raises TrapsError if there are no items.
-    """
+    """Return a cell's calls in item order. Raises TrapsError if there are no items."""
     entry = get_model(cell.evaluation.model)
     items = asked_items(workspace, cell.dataset)
     if not items:
@@ -105,9 +94,7 @@ def wanted_questions(workspace: Workspace, cell: Cell) -> list[Question]:
 
 
 def asked_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
-    """Return the columns of a dataset's items that later stages use, in order.
-
-    They serve requests, responses and votes.
+    """Return the columns of items that requests, responses and votes use, in order.
 
     Equal texts share one copy: a cell of 100,000 items may have a hundred questions.
     """
@@ -124,10 +111,7 @@ def asked_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
 
 
 def with_posteriors(workspace: Workspace, dataset: str, items: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return items of a dataset.
-
-    Those of graded cuts with `posterior`, which the strategy `bayes` reads.
-    """
+    """Add `posterior`, which strategy `bayes` reads, to items of graded cuts."""
     if dataset != GRADED:
         return items
     known = posteriors(workspace)
@@ -135,9 +119,7 @@ def with_posteriors(workspace: Workspace, dataset: str, items: list[dict[str, An
 
 
 def _secret(entry: ModelEntry, item: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the hidden facts that reference strategies may read.
-
-    Side and labels, and on a control its ground truth.
+    """Return the hidden facts for reference strategies: side, labels, control's truth.
 
     Only `prior` and the rules read the sub-scenario's commonest answer, so that a corrected answer which changes it
     re-asks no other model, and only `bayes` reads the probabilities of answers. A rule reads nothing else, and every

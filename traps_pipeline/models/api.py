@@ -1,6 +1,4 @@
-"""Call network models through litellm.
-
-One attempt per call, exactly the declared parameters, typed outcomes.
+"""Call network models through litellm: one attempt, declared parameters, outcomes.
 
 Retries, pace and money are handled elsewhere (`ask`). litellm is imported on the first call: it takes seconds and would
 fetch a price list from the network.
@@ -66,10 +64,7 @@ TRANSIENT_STATUSES = {408: "timeout", 409: "conflict", 429: RATE_LIMITED}
 
 @cache
 def load_litellm() -> Any:
-    """Return litellm, configured to send and fetch nothing of its own.
-
-    Raises TrapsError if it is not installed.
-    """
+    """Return litellm, set to send and fetch nothing itself. Raises TrapsError."""
     require("api")
     from traps_pipeline.models.wire import use_in
 
@@ -136,10 +131,7 @@ def media_parts(media: Media, route: str) -> list[dict[str, Any]]:
 
 
 def messages(entry: Entry, request: Request) -> list[dict[str, Any]]:
-    """Return system prompt, then the clip and the question, nothing else.
-
-    See docs/spec.md 3.3.
-    """
+    """Return system prompt, then clip and question, nothing else (docs/spec.md 3.3)."""
     user: str | list[dict[str, Any]] = request.user
     if request.sent is not None:
         route = str(entry.provider_id).split("/")[0]
@@ -236,10 +228,7 @@ class ApiBackend:
         return cost if usage.believed else max(cost, worst)
 
     def _failure(self, error: Exception, exchange: Exchange) -> Outcome:
-        """Return a failure as an outcome, or raise it as TransientError.
-
-        Its text is for people and never stored.
-        """
+        """Return a failure as an outcome, without its text, or raise it as TransientError."""
         from traps_pipeline.models.wire import cause_of
 
         if exchange.is_unsent:
@@ -284,10 +273,7 @@ class ApiBackend:
         return f"HTTP {exchange.status}, {kind}, {len(exchange.content or b'')} bytes{begins}"
 
     def _tell(self, kind: str, message: str, *, passes: bool = False) -> None:
-        """Report the provider's message once per kind, without the key.
-
-        passes: whether a retry may help.
-        """
+        """Report a message once per kind, without the key; `passes` if a retry may help."""
         if kind not in self._told:
             self._told.add(kind)
             message = redact(" ".join(message.split())).removeprefix(f"{kind}: ")  # before it is cut
@@ -297,10 +283,7 @@ class ApiBackend:
 
 
 def failure_kind(status: int, reported: ProviderError) -> str:
-    """Return the kind of a failure.
-
-    http_<status> is final, anything else is worth a retry.
-    """
+    """Return a failure's kind: http_<status> if final, anything else if worth a retry."""
     if status in TRANSIENT_STATUSES:
         return TRANSIENT_STATUSES[status]
     if status >= 500:

@@ -72,10 +72,7 @@ class SettledCell(Generic[AnyCell, AnyCall]):
 
 @dataclass(frozen=True)
 class Work(Generic[AnyCell, AnyCall, Finished]):
-    """A stage's calls.
-
-    calls(cell): returns all wanted calls, once per cell. finish(settled cell): returns its table.
-    """
+    """A stage's calls by cell (requested once), and `finish`, which makes its table."""
 
     stage: str
     ledger: Ledger

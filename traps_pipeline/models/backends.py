@@ -1,7 +1,4 @@
-"""Create a registry entry's backend, in this one place.
-
-A new backend is one more branch here.
-"""
+"""Create the backend of a registry entry, in this one place."""
 
 from __future__ import annotations
 
@@ -12,10 +9,7 @@ from traps_pipeline.models.request import Backend
 
 
 def require_libraries(entry: Entry) -> None:
-    """Raise TrapsError unless an entry's libraries are installed.
-
-    The error holds the command to type.
-    """
+    """Raise TrapsError, with the command, unless an entry's libraries are installed."""
     if entry.backend == NETWORK:
         require("api")
     if entry.backend == LOCAL:
@@ -25,9 +19,7 @@ def require_libraries(entry: Entry) -> None:
 
 
 def make_backend(entry: Entry) -> Backend:
-    """Return the entry's backend.
-
-    Imports are lazy: a study without paid models never loads a provider's library.
+    """Return the entry's backend, and import its library only now.
 
     Raises TrapsError if its library is not installed, its key is not set, or its weights are missing.
     """

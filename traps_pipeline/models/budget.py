@@ -47,10 +47,7 @@ def most_tokens(entry: Entry, request: Request) -> Tokens:
 
 
 def worst_case_usd(entry: Entry, request: Request) -> float:
-    """Return a call's maximum cost in dollars.
-
-    0 if the price is unknown (a study must allow that).
-    """
+    """Return a call's maximum cost in dollars; 0 if its price is unknown."""
     if entry.prices is None:
         return 0.0
     tokens = most_tokens(entry, request)
@@ -58,10 +55,7 @@ def worst_case_usd(entry: Entry, request: Request) -> float:
 
 
 def check_money(study: Study, entry: Entry) -> None:
-    """Raise TrapsError unless the study allows the cost of asking a participant.
-
-    The possible cost counts.
-    """
+    """Raise TrapsError unless the study allows a participant's possible cost."""
     if entry.backend != NETWORK:
         return
     if entry.prices is None:
@@ -111,9 +105,7 @@ class Budget:
         return sum(self._money.spent().values()) if self._money else 0.0
 
     async def reserve(self, participant: str, worst_usd: float) -> Reservation | None:
-        """Reserve a call's worst case; return None for a free call.
-
-        Wait while calls in flight hold the room.
+        """Reserve a call's worst case (None if free), or wait for calls in flight.
 
         Raises BudgetReached if there is no room and no call in flight that could free some, and TrapsError.
         """
@@ -143,10 +135,7 @@ class Budget:
                     await asyncio.wait_for(self._changed.wait(), LOOK_S)
 
     async def settle(self, reservation: Reservation | None, cost_usd: float | None) -> None:
-        """Replace a call's worst case by its cost.
-
-        An unknown cost counts as the worst case.
-        """
+        """Replace a call's worst case by its cost, unless that is unknown."""
         if reservation is None:
             return
         cost = reservation.usd if cost_usd is None else cost_usd
@@ -166,28 +155,19 @@ class Budget:
         await asyncio.wrap_future(settled)
 
     async def _has_room_later(self, full: CapExhausted) -> bool:
-        """Return whether calls in flight may cost less than their worst case.
-
-        Those of any process count.
-        """
+        """Return whether calls in flight, of any process, may yet cost less than reserved."""
         if any(full.slot in (None, its.participant) for its in self._in_flight.values()):
             return True
         assert self._money is not None, "what is full was asked for"
         return await asyncio.to_thread(self._money.is_any_alive, full.others)
 
     def _has_calls_through(self, account: AccountBudget) -> bool:
-        """Return whether this process's calls in flight may free an account's budget.
-
-        Settling them may.
-        """
+        """Return whether settling this process's calls may free an account's budget."""
         return any(self._accounts.get(its.participant) is account for its in self._in_flight.values())
 
 
 def reached(participant: str | None, spent_usd: float, cap_usd: float, worst_usd: float) -> str:
-    """Return why a budget leaves no room for a call.
-
-    participant: None for the study's budget.
-    """
+    """Return why a budget (None: the study's) leaves no room for a call."""
     return (
         f"the budget of {participant or 'the study'} is reached: ${spent_usd:.2f} of ${cap_usd:.2f} spent, the next "
         f"call may cost ${worst_usd:.4f}. Raise it (--budget-usd, or study.yaml) and run the same command to go on"

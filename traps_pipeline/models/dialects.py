@@ -70,10 +70,7 @@ def dialect_of(provider_id: str) -> Dialect:
 
 
 def parse_body(content: bytes) -> Json:
-    """Return the JSON object in a body.
-
-    Raises OddShapeError for anything else.
-    """
+    """Return the JSON object in a body. Raises OddShapeError for anything else."""
     text = content.decode("utf-8-sig", "replace")
     try:
         body = json.loads(text)
@@ -97,10 +94,7 @@ def shape_of(text: str) -> str:
 
 
 def read_reply(body: Json, provider_id: str) -> Reply:
-    """Return the answer in the body of a response with status 200.
-
-    Raises OddShapeError.
-    """
+    """Return the answer in a body of status 200. Raises OddShapeError."""
     # litellm asks some OpenAI models over the Responses API whatever their route says.
     dialect = "responses" if body.get("object") == "response" else dialect_of(provider_id)
     try:
@@ -122,10 +116,7 @@ class _Texts:
     refusal: list[str] = field(default_factory=list)
 
     def add(self, parts: Any, into: str | None = None) -> None:
-        """Add a content: a text, or a list of parts.
-
-        into: the field that receives all of it.
-        """
+        """Add a content, a text or a list of parts; `into` names one field for all of it."""
         if isinstance(parts, str):
             getattr(self, into or "text").append(parts)
             return
@@ -139,10 +130,7 @@ class _Texts:
                 self.add(part[name], into or kind)
 
     def reply(self, finish: Any, served_model: Any, usage: Any) -> Reply:
-        """Return the answer.
-
-        Raises OddShapeError if it lacks a finish reason.
-        """
+        """Return the answer. Raises OddShapeError if it lacks a finish reason."""
         if not finish or not isinstance(finish, str):
             raise OddShapeError("it gives no finish reason, which each complete answer has")
         return Reply(
@@ -229,8 +217,5 @@ def _text_of(holder: Json, name: str) -> str:
 
 
 def storable(text: str) -> str:
-    """Return a text without unpaired surrogates.
-
-    A cut inside an emoji leaves one, and no file can store it.
-    """
+    """Return a text without unpaired surrogates, which no file can store."""
     return text.encode("utf-8", "replace").decode("utf-8")

@@ -1,9 +1,4 @@
-"""Read log-probabilities of an answer's first token from a provider's bytes.
-
-They are those of its alternatives.
-
-See docs/arms.md, "Graded cuts".
-"""
+"""Read the log-probabilities of an answer's first token (docs/arms.md)."""
 
 from __future__ import annotations
 
@@ -30,10 +25,7 @@ def of_chat(logprobs: Any) -> dict[str, float]:
 
 
 def stored_alternatives(alternatives: Mapping[str, float], regime: object) -> str | None:
-    """Return alternatives in stored form, the likeliest first.
-
-    None without any, or if the regime uses none.
-    """
+    """Return alternatives as stored, likeliest first; None if the regime uses none."""
     if not alternatives or regime not in BY_NAME or not BY_NAME[str(regime)].first_token:
         return None
     likeliest = sorted(alternatives.items(), key=lambda one: -one[1])[: MOST + 1]  # the sampled token may be unlikely

@@ -22,10 +22,7 @@ LOW_SHARE = 0.4  # share of the expected completion that a terse model takes
 
 @dataclass(frozen=True)
 class Experience:
-    """Means over answered calls: tokens of prompt and completion, seconds.
-
-    None if nothing is known.
-    """
+    """Means over answered calls, None if unknown: prompt, completion tokens, seconds."""
 
     prompt_tokens: float | None = None
     completion_tokens: float | None = None
@@ -60,10 +57,7 @@ def experience(totals: Iterable[Totals]) -> Experience:
 
 
 def forecast(entry: Entry, calls: int, seen: Experience) -> Forecast:
-    """Return the forecast of a number of new calls to an entry.
-
-    The high end is each call's worst case, which a budget reserves.
-    """
+    """Forecast a number of new calls; the high end is what a budget reserves."""
     frames, most_frames = _clip_tokens(entry)
     prompt = seen.prompt_tokens or frames + TYPICAL_TEXT_BYTES / TYPICAL_BYTES_A_TOKEN
     completion = seen.completion_tokens or entry.expected_completion_tokens
@@ -93,10 +87,7 @@ def forecast(entry: Entry, calls: int, seen: Experience) -> Forecast:
 
 
 def minutes_of(forecasts: Iterable[Forecast]) -> float:
-    """Return minutes of parallel calls.
-
-    They are those of the slowest participant, or of a shared account's pace.
-    """
+    """Return parallel calls' minutes: the slowest participant's, or an account's pace."""
     rows, shared = list(forecasts), dict[str, float]()
     for row in rows:
         shared[row.account] = shared.get(row.account, 0.0) + row.paced_minutes

@@ -1,7 +1,4 @@
-"""Choose the frames shown of a clip in a dataset that varies them.
-
-See docs/hypotheses.md.
-"""
+"""Choose the frames shown in a dataset that varies them (docs/hypotheses.md)."""
 
 from __future__ import annotations
 
@@ -14,10 +11,7 @@ CLIP_S = 5  # duration of a whole clip (docs/spec.md 2)
 
 
 def media_for_dataset(spec: MediaSpec, dataset: str) -> MediaSpec:
-    """Return the media settings for a dataset's clips.
-
-    As in the entry, or with other frames.
-    """
+    """Return a dataset's media settings: the entry's, or with other frames."""
     if dataset in _RATES:
         rate = _RATES[dataset]
         return spec.model_copy(update={"fps": float(rate), "uniform": None, "most": rate * CLIP_S})
@@ -25,9 +19,6 @@ def media_for_dataset(spec: MediaSpec, dataset: str) -> MediaSpec:
 
 
 def observer_frames(dataset: str) -> FramePolicy:
-    """Return the frames that the observer answers from.
-
-    5 a second, or as the dataset varies them.
-    """
+    """Return the frames that the observer sees: 5 a second, or the dataset's."""
     spec = media_for_dataset(MediaSpec(profile="frames", fps=5), dataset)
     return FramePolicy(spec.fps, spec.uniform, spec.most, spec.later)

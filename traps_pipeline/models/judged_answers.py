@@ -1,7 +1,4 @@
-"""Decide correctness by code (docs/spec.md 4.3).
-
-An extracted value is compared with the ground truth.
-"""
+"""Decide correctness: compare a value with the ground truth (docs/spec.md 4.3)."""
 
 from __future__ import annotations
 
@@ -26,12 +23,7 @@ _PUNCTUATION = re.compile(r"(?<=\d)[.\-](?=\d)|(?<![\w.])-(?=\.?\d)|(?<![\w.])\.
 
 @lru_cache(4096)  # every vote on correctness normalises all labels and aliases of its item again
 def normalise(text: str) -> str:
-    """Return the text in lower case, without articles and punctuation.
-
-    Spaces are single.
-
-    Punctuation of numbers and ranges stays.
-    """
+    """Return the text in lower case, without articles and non-numeric punctuation."""
     text = _THOUSANDS.sub("", re.sub("[–—−]", "-", text.lower()))
     text = re.sub(r"(?<=\d)\s*(?:-|to)\s*(?=\d)", "-", text)
     text = _PUNCTUATION.sub(lambda match: " " if match[1] else match[0], text)
@@ -39,10 +31,7 @@ def normalise(text: str) -> str:
 
 
 def read_object(text: str) -> dict[str, Any] | None:
-    """Return the JSON object of a text, in a fence or not.
-
-    None if it is none, or repeats a key.
-    """
+    """Return a text's JSON object, fenced or not; None if it is none or repeats a key."""
     try:
         parsed = json.loads(strip_fence(text), object_pairs_hook=_unique)
     except (ValueError, RecursionError):
@@ -51,9 +40,7 @@ def read_object(text: str) -> dict[str, Any] | None:
 
 
 def leading_object(text: str) -> str:
-    """Return the JSON object at the beginning of a text, in a fence or not.
-
-    The prose after it is left out.
+    """Return the JSON object, fenced or not, at a text's start, without later prose.
 
     The text is returned unchanged if it begins with no complete object, or if another brace follows: of two verdicts
     neither is the judge's.
@@ -76,28 +63,19 @@ def _unique(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def read_flag(value: object) -> object:
-    """Return a truth value that JSON states as a word (`"true"`) as a bool.
-
-    Anything else unchanged.
-    """
+    """Return a word for a truth value (`"true"`) as a bool; anything else unchanged."""
     return {"true": True, "false": False}.get(value.strip().lower(), value) if isinstance(value, str) else value
 
 
 def to_number(text: str) -> float | None:
-    """Return the only number in a value, in digits or as a word.
-
-    None if it contains none or several.
-    """
+    """Return the only number in a text, in digits or words; None if none or several."""
     words = [NUMBER_WORDS.get(word, word) for word in normalise(text).split()]
     numbers = _NUMBER.findall(" ".join(words))
     return float(numbers[0]) if len(numbers) == 1 else None
 
 
 def to_label(text: str, labels: Sequence[str], aliases: Mapping[str, str]) -> str | None:
-    """Return the label that a value names, exactly or through an alias.
-
-    None if it names none.
-    """
+    """Return the label that a value names, exactly or by an alias; else None."""
     table = {normalise(label): label for label in labels}
     table |= {normalise(alias): label for alias, label in aliases.items()}
     return table.get(normalise(text))
@@ -106,12 +84,7 @@ def to_label(text: str, labels: Sequence[str], aliases: Mapping[str, str]) -> st
 def is_correct(
     extracted: str | None, ground_truth: str, answer_type: str, labels: Sequence[str], aliases: Mapping[str, str]
 ) -> bool:
-    """Return whether a value is correct.
-
-    It is a number within 0.5 of the ground truth, or a name of the true label.
-
-    Aliases count as names. A value that matches no label is wrong.
-    """
+    """Return whether a value is within 0.5 of the truth, or names its label or alias."""
     if extracted is None:
         return False
     if answer_type == "numeric":

@@ -1,9 +1,4 @@
-"""Register judges and panels (`assets/judges.yaml`).
-
-They have prompts and schemas.
-
-`judging/` collects and counts a panel's votes.
-"""
+"""Register judges and panels (`assets/judges.yaml`), with prompts and schemas."""
 
 from __future__ import annotations
 
@@ -99,10 +94,7 @@ class Judge(typing.Protocol):
 
 
 def vote_prompt(seat: Judge, task: Task) -> str:
-    """Return the system prompt of a task.
-
-    It is the paper's, with our part about the premise if the judge is asked for it.
-    """
+    """Return a task's system prompt: the paper's, and ours about the premise if asked."""
     text = prompt(f"judge_{task}")
     return f"{text}\n\n{prompt('judge_premise_suffix')}" if seat.premise and task == "abstention" else text
 
@@ -133,10 +125,7 @@ class JudgeEntry(Entry):
 @user_registry.cached_registry
 @cache
 def load_judges(path: Path = JUDGES_FILE) -> dict[str, JudgeEntry]:
-    """Return judges by id.
-
-    Raises TrapsError naming judge and field.
-    """
+    """Return judges by id. Raises TrapsError naming judge and field."""
     judges = read_entries(path, "judges", JudgeEntry)
     return with_own(judges, "judges", JudgeEntry) if path == JUDGES_FILE else judges
 
@@ -150,10 +139,7 @@ def thinking_of(judge: str) -> Marks | None:
 @user_registry.cached_registry
 @cache
 def load_panel(name: str, path: Path = JUDGES_FILE) -> tuple[JudgeEntry, ...]:
-    """Return the judges of a panel: three, or one.
-
-    Raises TrapsError naming the file and the problem.
-    """
+    """Return a panel's judges (three, or one). Raises TrapsError naming the file."""
     panels, judges = load_panels(path), load_judges(path)
     if not name:
         raise TrapsError(f"no panel is named: {how_to_name_a_panel(path)}")
@@ -170,10 +156,7 @@ def load_panel(name: str, path: Path = JUDGES_FILE) -> tuple[JudgeEntry, ...]:
 
 
 def load_panels(path: Path = JUDGES_FILE) -> dict[str, Any]:
-    """Return the judges of every panel by name, unchecked.
-
-    Raises TrapsError if the file has no mapping `panels:`.
-    """
+    """Return every panel's judges, unchecked. Raises TrapsError without `panels:`."""
     panels = read_mapping(path).get("panels")
     if not isinstance(panels, dict):
         raise TrapsError(f"{path}: must hold a mapping `panels:`")
@@ -189,9 +172,7 @@ def how_to_name_a_panel(path: Path = JUDGES_FILE) -> str:
 
 
 def require_panel(panel: str, models: Iterable[str], *, judged_by_rules: bool) -> None:
-    """Raise TrapsError if no panel is named, or an unfit one.
-
-    It is unfit if it is unknown, or if rules would judge unasked.
+    """Raise TrapsError unless the panel is named, known, and allowed for these models.
 
     Rules judge models other than reference models only if the user says so.
     """
@@ -207,10 +188,7 @@ def require_panel(panel: str, models: Iterable[str], *, judged_by_rules: bool) -
 
 
 def panel_version(panel: str) -> str:
-    """Return the version of everything but answers that decides a panel's votes.
-
-    Judges, prompts, schemas.
-    """
+    """Return the version of a panel's judges, prompts and schemas, which decide votes."""
     return version_of_judges(load_panel(panel)) if panel else "no panel is named"
 
 
@@ -224,10 +202,7 @@ def version_of_judges(seats: Iterable[Judge]) -> str:
 
 
 def panel_id(panel: str) -> str:
-    """Return a panel's id in rows.
-
-    It is its name and the version of its judges, with a mark for a single judge.
-    """
+    """Return a panel's id in rows: name, judges' version, and a mark for one judge."""
     return id_of_judges(panel, load_panel(panel)) if panel else f"@{panel_version(panel)[:8]}"
 
 
@@ -242,8 +217,5 @@ def panel_names(panels: str) -> list[str]:
 
 
 def is_judged_by_rules(panels: str, model: str) -> bool:
-    """Return whether rules judged a model that is no reference model.
-
-    panels: the column `panel` of its rows.
-    """
+    """Return whether rules judged a non-reference model, by its rows' `panel` column."""
     return RULES_PANEL in panel_names(panels) and not is_reference(model)

@@ -1,6 +1,4 @@
-"""Estimate the prompt tokens of a clip's frames, by provider.
-
-They are documented or measured.
+"""Estimate a clip's prompt tokens by provider, as documented or measured.
 
 `traps plan` uses them; a budget reserves an entry's `tokens_per_frame`, an upper bound.
 """
@@ -23,12 +21,10 @@ STAMP = 8  # Qwen3-VL: the time before two frames, and the marks around them
 
 
 def openai_frame(model: str, size: Size) -> float | None:
-    """Return the tokens of an image at detail auto or high.
+    """Return an image's tokens at detail auto or high; None for other vendors' models.
 
-    None for a model that is not OpenAI's.
-
-    They count tiles of 512 pixels, or patches of 32, by the model. Frames are small enough not to be scaled down, and
-    are not enlarged.
+    OpenAI's models count tiles of 512 pixels, or patches of 32. Frames are small enough not to be scaled down, and are
+    not enlarged.
 
     https://platform.openai.com/docs/guides/images-vision (calculating costs). It says 1.62 tokens a patch of
     gpt-5-mini; 1.20 were measured at the API with six sizes (OpenAI Developer Community, "GPT-5-mini image input token
@@ -45,9 +41,7 @@ def openai_frame(model: str, size: Size) -> float | None:
 
 
 def gemini_frame(model: str, size: Size, profile: Profile) -> float:
-    """Return the tokens of an image or video frame for Gemini.
-
-    At the default media resolution.
+    """Return the tokens of an image or a video frame at Gemini's default resolution.
 
     Up to Gemini 2.5: 258 tokens a frame (that is 258 a second at one frame a second), and 258 an image of at most 384
     pixels, or each tile of 768 (https://ai.google.dev/gemini-api/docs/tokens). Gemini 3: 70 a frame and 1,120 an image
@@ -60,9 +54,7 @@ def gemini_frame(model: str, size: Size, profile: Profile) -> float:
 
 
 def anthropic_frame(size: Size) -> float:
-    """Return the tokens of an image: its area divided by 750.
-
-    Its long edge has at most 1,568 pixels.
+    """Return the tokens of an image of at most 1,568 pixels a side: area / 750.
 
     https://docs.anthropic.com/en/docs/build-with-claude/vision
     """
@@ -79,10 +71,7 @@ def qwen3_vl_frame(size: Size, profile: Profile) -> float:
 
 
 def expected_clip_tokens(entry: ModelEntry) -> float:
-    """Return the prompt tokens of a whole clip.
-
-    For an unknown model the entry's `tokens_per_frame`.
-    """
+    """Return a clip's prompt tokens; for unknown models by `tokens_per_frame`."""
     media = entry.media
     if media is None:
         return 0.0

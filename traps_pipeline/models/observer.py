@@ -1,7 +1,4 @@
-"""Answer as a model from a clip's frames and the question alone.
-
-This is the ceiling row of a leaderboard.
-"""
+"""Answer from a clip's frames and the question alone: a leaderboard's ceiling row."""
 
 from __future__ import annotations
 
@@ -17,20 +14,14 @@ from traps_pipeline.video.policies import FramePolicy
 
 @lru_cache(maxsize=100_000)
 def observer_answer(media_digest: str, clip: Path, question: str, frames: FramePolicy) -> str | None:
-    """Return the observer's answer from these frames of a clip.
-
-    It is cached for all regimes and runs.
-    """
+    """Return the observer's answer from these frames, cached for regimes and runs."""
     from traps_pipeline.scenes.observe import observe
 
     return observe(clip, question, frames)
 
 
 class ObserverBackend:
-    """A reference model that answers by classical vision on the clip.
-
-    It sees neither the record nor the simulator.
-    """
+    """A backend that answers by classical vision on the clip, without its record."""
 
     async def ask(self, request: Request) -> Outcome:
         """Return the outcome of one attempt; see `Backend`."""

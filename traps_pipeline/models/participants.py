@@ -1,6 +1,4 @@
-"""Send one call to a participant.
-
-Its connections, its account's pace, retries, reservation and ledger row.
+"""Send one call to a participant: pace, retries, reservation and ledger row.
 
 This is the one place that sends calls; `models/ask.py` decides which.
 """
@@ -46,10 +44,7 @@ OVERRUN = 16  # highest plausible cost, in worst cases
 
 @dataclass(frozen=True)
 class Participant:
-    """A model or judge.
-
-    It has a backend, an entry, connections, its account's pace, and failures.
-    """
+    """A model or judge with its backend, entry, connections, pace and failures."""
 
     backend: Backend
     entry: Entry
@@ -59,10 +54,7 @@ class Participant:
 
 
 def allow_connections(count: int) -> None:
-    """Raise this process's limit of open files to allow so many connections.
-
-    Raises TrapsError if the shell forbids it: a paid answer could not be stored.
-    """
+    """Raise the open-file limit for so many connections. Raises TrapsError if denied."""
     needed = count + FILES
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft == resource.RLIM_INFINITY or soft >= needed:
@@ -76,9 +68,7 @@ def allow_connections(count: int) -> None:
 
 
 class Participants:
-    """Participants by id, created on first use.
-
-    An unused one then needs neither key nor budget.
+    """Participants by id, created on first use: an unused one needs no key or budget.
 
     All evaluations of a run share connections, and all participants of an account its pace. sharers: how many processes
     use an account, if hosts share it.
@@ -141,10 +131,8 @@ async def attempt(
 ) -> tuple[Outcome, int, float] | None:
     """Return an outcome, the number of attempts, and the last one's seconds.
 
-    None if halted before anything was spent.
-
     This is the one retry layer: exponential backoff with full jitter, and never sooner than the provider asks. The
-    outcome's cost includes what earlier attempts may have cost.
+    outcome's cost includes what earlier attempts may have cost. None if halted before anything was spent.
     """
     limits, tokens = participant.entry.limits, most_tokens(participant.entry, request)
     lost_usd, seconds, malformed = 0.0, 0.0, 0
@@ -190,10 +178,7 @@ async def attempt(
 def _given_up(
     kind: str, attempts: int, seconds: float, lost_usd: float, raw: str | None = None
 ) -> tuple[Outcome, int, float] | None:
-    """Return a failure for the ledger.
-
-    None for a call that was never sent, or that was free and will be retried.
-    """
+    """Return a ledger failure; None for a call never sent, or free and to be retried."""
     if kind in ("interrupted", "budget") and not lost_usd:
         return None
     if kind == MALFORMED:
@@ -241,9 +226,7 @@ async def _send(participant: Participant, request: Request, allowed: CallContext
 
 
 def _believed(cost_usd: float | None, worst_usd: float) -> float:
-    """Return an answer's cost as read by a backend.
-
-    The worst case if it is unknown or impossible.
+    """Return an answer's cost, or the worst case if it is unknown or impossible.
 
     A provider may exceed a call's limits and charge for it, up to a bound: an impossible number of tokens would
     otherwise end the study.
@@ -262,10 +245,7 @@ async def _is_stopped_within(stop: asyncio.Event, seconds: float) -> bool:
 def ledger_row(
     request: Request, outcome: Outcome, attempts: int, latency_s: float, epoch: str
 ) -> tuple[Row, dict[str, str]]:
-    """Return the row of an answer, and its side texts.
-
-    They are the reasoning trace and a malformed answer.
-    """
+    """Return an answer's row and side texts: reasoning trace, malformed answer."""
     fields = asdict(outcome)
     side_texts = {name: text for name in SIDE_TEXTS if (text := fields.pop(name)) is not None}
     if fields["first_token"] is None:
@@ -282,8 +262,5 @@ def ledger_row(
 
 
 def when_asked(row: Row) -> Row:
-    """Return the columns that say when a row's call was asked.
-
-    Every table made from a ledger has them.
-    """
+    """Return when a row's call was asked, as columns of every table from a ledger."""
     return {"epoch": row["epoch"], "created_at": datetime.fromisoformat(row["created_at"])}

@@ -1,7 +1,4 @@
-"""Read system prompts of regimes and judges, verbatim from `assets/prompts`.
-
-See docs/spec.md 3.3.
-"""
+"""Read regimes' and judges' system prompts, verbatim (docs/spec.md 3.3)."""
 
 from __future__ import annotations
 
@@ -36,37 +33,23 @@ def prompt(name: str) -> str:
 
 @cache
 def system_prompt(regime: str, dataset: str = "") -> str:
-    """Return the regime's system prompt.
-
-    A dataset may vary it. Its parts are joined by one blank line.
-    """
+    """Return a regime's system prompt, which a dataset may vary."""
     varied = (_SCHEMA_PARTS[dataset],) if dataset in _SCHEMA_PARTS else ()
     return "\n\n".join(prompt(part) for part in (*BY_NAME[regime].texts, *varied))
 
 
 @cache
 def vqa_prompt(name: str) -> str:
-    """Return the system prompt under which hidden states are extracted.
-
-    name: one of VQA_PROMPTS (docs/spec.md 7.1).
-    """
+    """Return a prompt of VQA_PROMPTS, used for hidden states (docs/spec.md 7.1)."""
     return "\n\n".join(prompt(part) for part in BY_NAME[name].states)
 
 
 def prompt_version(regime: str, datasets: Iterable[str] = ()) -> str:
-    """Return the version of a regime's system prompt.
-
-    Its variations in those datasets that have one count, too.
-    """
+    """Return the version of a regime's prompt and of its variations in datasets."""
     varied = [system_prompt(regime, dataset) for dataset in sorted({*datasets} & {*_SCHEMA_PARTS})]
     return digest([system_prompt(regime), *varied] if varied else system_prompt(regime))[:16]
 
 
 def states_prompt(system: str, name: str) -> str:
-    """Return the system prompt for hidden states.
-
-    It is the VQA prompt of that name, or the benchmark's own.
-
-    system: `benchmark` for the latter.
-    """
+    """Return the system prompt for hidden states: the benchmark's, or a VQA prompt."""
     return system_prompt(name) if system == "benchmark" else vqa_prompt(name)

@@ -1,6 +1,4 @@
-"""Read a provider's error object, and its requested waiting time.
-
-It may come with any HTTP status.
+"""Read a provider's error object, whatever its status, and its waiting time.
 
 One reader serves OpenAI, Anthropic, Gemini and the proxies and servers that copy them.
 """
@@ -66,10 +64,7 @@ class ProviderError:
 
     @property
     def is_about_key(self) -> bool:
-        """Whether a 401 or 403 with it is about the key.
-
-        This is also assumed without words.
-        """
+        """Whether a 401 or 403 with it is about the key; assumed if it has no words."""
         text = " ".join((self.message, *self.words)).replace("_", " ")
         return not text.strip() or bool(_ABOUT_KEY.search(text))
 
@@ -102,10 +97,7 @@ def read_error(content: bytes | None) -> ProviderError | None:
 
 
 def _is_flat(body: Mapping[str, Any]) -> bool:
-    """Return whether a body itself is an error object.
-
-    It then has a message with a code, and no field of an answer.
-    """
+    """Return whether a body itself is an error: a message with a code, no answer."""
     return (
         isinstance(body.get("message"), str)
         and "code" in body
@@ -181,10 +173,7 @@ def _reset_s(named: Mapping[str, str], now: float) -> float | None:
 
 
 def _seconds(value: Any, now: float) -> float | None:
-    """Return the seconds from a number, an amount with units or a date.
-
-    "1m30s" has units. None for anything else.
-    """
+    """Parse a number, an amount ("1m30s") or a date into seconds; else None."""
     text = str(value).strip() if isinstance(value, str | int | float) else ""
     try:
         number = float(text)

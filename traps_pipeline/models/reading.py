@@ -1,6 +1,4 @@
-"""Interpret a ledger row: an answer, or a text that is none.
-
-See docs/models.md, "Broken is not modest".
+"""Interpret a ledger row: an answer, or a text that is none (docs/models.md).
 
 The ledger keeps what a provider sent; the responses table comes from this interpretation, so that improving it asks
 nothing again. A text that is no answer has an outcome of its own and reaches no judge, who would take it for modesty.
@@ -97,10 +95,9 @@ def read_answer(
 
 
 def _has_final_answer(text: str) -> bool:
-    """Return whether a truncated text contains a final answer.
+    """Return whether a truncated text has a final answer, in or before its object.
 
-    That is the complete field of its object, or an answer announced before the object. The object's reason announces
-    nothing.
+    The field of the object must be complete. The object's reason announces nothing.
     """
     brace = _OBJECT.search(text)
     start = brace.start() if brace else len(text)
@@ -125,10 +122,7 @@ def _whole_fields(text: str) -> dict[str, Any]:
 
 
 def _skip(text: str, place: int, sign: str = "") -> int:
-    """Return the place after white space, or after a sign and white space.
-
-    Raises ValueError.
-    """
+    """Return the place after white space (and a sign). Raises ValueError."""
     place = len(text) - len(text[place:].lstrip())
     if not text.startswith(sign, place):
         raise ValueError(f"{sign!r} is not there")
@@ -136,9 +130,7 @@ def _skip(text: str, place: int, sign: str = "") -> int:
 
 
 def degenerate(text: str) -> str | None:
-    """Return why a text says nothing; None if it says something.
-
-    It has no letter and no digit, or repeats itself.
+    """Return why a text says nothing (no letter or digit, or repetition), else None.
 
     A text repeats itself if a unit of at most 40 words occurs at least six times in a row at its end and makes up at
     least half of its words, or if 30 characters or more are of at most two kinds.

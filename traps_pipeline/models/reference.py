@@ -1,6 +1,4 @@
-"""Answer by keyless strategies that take the path of a paid model.
-
-See docs/spec.md 5.3.
+"""Answer by keyless strategies that take a paid model's path (docs/spec.md 5.3).
 
 Only they see a request's `secret` (side, ground truth, labels). Their random choices are digests of the request, so a
 crash and a second run give the same answers.
@@ -114,10 +112,7 @@ def _belief(answer: str | None, request: Request) -> dict[str, float]:
 
 
 class ReferenceBackend:
-    """A player of one strategy.
-
-    With a `faults` parameter it also misbehaves like a bad provider (model `flaky`).
-    """
+    """A player of one strategy; with `faults` it fails like a bad provider."""
 
     def __init__(self) -> None:
         self._attempts: Counter[str] = Counter()
@@ -142,10 +137,7 @@ class ReferenceBackend:
         )
 
     def _misfortune(self, request: Request) -> Outcome | None:
-        """Return a simulated failure of this request by the `faults` shares.
-
-        None for an answer.
-        """
+        """Return a simulated failure by the `faults` shares, or None for an answer."""
         faults: Mapping[str, Any] = request.params.get("faults", {})
         if not faults:
             return None

@@ -1,7 +1,4 @@
-"""Register models and accounts (`assets/models.yaml`); to add one, add an entry.
-
-Judges (`assets/judges.yaml`) are entries of the same form.
-"""
+"""Register models and accounts (`assets/models.yaml`); judges have the same form."""
 
 from __future__ import annotations
 
@@ -80,7 +77,7 @@ class Account(BaseModel):
         return self
 
     def secret(self) -> str | None:
-        """Return the key from the environment; None if unneeded; may raise TrapsError."""
+        """Return the key from the environment, None if unneeded. Raises TrapsError."""
         return read_key(self.key) if self.key is not None else None
 
 
@@ -267,7 +264,7 @@ _Entry = TypeVar("_Entry", bound=Entry)
 
 
 def read_entries(path: Path, key: str, kind: type[_Entry]) -> dict[str, _Entry]:
-    """Return a file's entries by id, in file order; TrapsError names entry and field."""
+    """Return a file's entries by id, in order. Raises TrapsError naming entry, field."""
     data = read_yaml(path)
     entries = data.get(key) if isinstance(data, dict) else None
     if not isinstance(entries, list):
@@ -306,7 +303,7 @@ def with_own(entries: dict[str, _Entry], key: user_registry.Kind, kind: type[_En
 @user_registry.cached_registry
 @cache
 def load_models(path: Path = MODELS_FILE) -> dict[str, ModelEntry]:
-    """Return models by id, in file order; TrapsError names entry and field."""
+    """Return models by id, in file order. Raises TrapsError naming entry and field."""
     models = read_entries(path, "models", ModelEntry)
     return with_own(models, "models", ModelEntry) if path == MODELS_FILE else models
 
@@ -314,7 +311,7 @@ def load_models(path: Path = MODELS_FILE) -> dict[str, ModelEntry]:
 @user_registry.cached_registry
 @cache
 def load_accounts(path: Path = MODELS_FILE) -> dict[str, Account]:
-    """Return accounts by name; TrapsError names account and field."""
+    """Return accounts by name. Raises TrapsError naming account and field."""
     data = read_yaml(path)
     accounts = data.get("accounts", {}) if isinstance(data, dict) else None
     if not isinstance(accounts, dict):
@@ -375,10 +372,7 @@ def get_model(model_id: str) -> ModelEntry:
 
 
 def is_reference(model_id: str) -> bool:
-    """Return whether a model is a reference model, which rule judges can judge.
-
-    On a board of several submissions it may be named model@submission.
-    """
+    """Return whether a model, or model@submission, is one that rules can judge."""
     known, name = load_models(), model_id.partition("@")[0]
     return name in known and known[name].backend in ("reference", "observer", "rule")
 

@@ -1,6 +1,4 @@
-"""Release money reserved for calls that were never sent, with the reason.
-
-`traps study release-money` does so.
+"""Release money reserved for unsent calls (`traps study release-money`).
 
 A call in flight when its process died, and a failed one that may be billed, count as their worst case until released. A
 person who has checked the provider's bill releases them; the ledger records who, when and why.
@@ -19,18 +17,13 @@ from traps_pipeline.storage.workspace import Workspace
 
 
 def releasable(workspace: Workspace) -> dict[str, Releasable]:
-    """Return the releasable dollars by participant.
-
-    Raises TrapsError.
-    """
+    """Return the releasable dollars by participant. Raises TrapsError."""
     with workspace.ledger.writing():
         return Money(workspace.ledger).releasable()
 
 
 def release(workspace: Workspace, participant: str, usd: float | None, why: str) -> float:
-    """Release dollars of a participant and return the amount.
-
-    None: all of its calls in flight.
+    """Release a participant's dollars (None: all in flight); return the amount.
 
     Raises TrapsError if less is reserved for calls that may never have been sent.
     """

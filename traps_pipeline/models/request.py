@@ -47,10 +47,7 @@ class Request:
 
     @property
     def components(self) -> dict[str, Any]:
-        """The parts of the ledger key, by name.
-
-        Code version, concurrency, time-out and API key are not among them.
-        """
+        """The parts of the ledger key: no code version, concurrency, time-out or API key."""
         parts: dict[str, Any] = {
             "participant": self.participant,
             "endpoint": self.endpoint,
@@ -70,9 +67,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The result of a request.
-
-    A failure is a kind, never a text: no error string ever reaches a judge.
+    """The result of a request; a failure is a kind, so no error text reaches a judge.
 
     finish_reason: as the provider sent it. client: library and version that built and sent the call. raw: the beginning
     of a malformed answer, for people. cost_usd: None if it is unknown. first_token: see `first_token.stored`.
@@ -101,9 +96,7 @@ class Outcome:
 
 
 class TransientError(Exception):
-    """A failure worth a retry.
-
-    Time-out, 408, 409, 429, 5xx, a cut connection, a malformed answer.
+    """A failure worth a retry: time-out, 408, 409, 429, 5xx, or a broken answer.
 
     billed: whether the provider may charge for it; cost_usd: the stated charge, if any, else the worst case counts;
     raw: see `Outcome`; why: what went wrong, or why a call was not sent, for people.
@@ -130,11 +123,8 @@ class TransientError(Exception):
 
 
 class Backend(Protocol):
-    """Answers requests of one participant."""
+    """A backend, which answers requests of one participant."""
 
     async def ask(self, request: Request) -> Outcome:
-        """Return the outcome of one attempt.
-
-        Raises TransientError if a retry may help; any other failure is an Outcome.
-        """
+        """Make one attempt. Raises TransientError to retry; other failures are Outcomes."""
         ...

@@ -7,12 +7,7 @@ from typing import Any
 
 
 def structured_output(name: str, **properties: Any) -> dict[str, Any]:
-    """Return the `response_format` of an object with exactly these properties.
-
-    All of them are required.
-
-    properties: the JSON schema of each.
-    """
+    """Return a `response_format` that requires exactly these properties (schemas)."""
     return {"type": "json_schema", "json_schema": {"name": name, "strict": True, "schema": _object(**properties)}}
 
 

@@ -1,6 +1,4 @@
-"""Abstain by one cue, without understanding the void.
-
-Such a rule is the baseline that a model must beat.
+"""Abstain by one cue, without understanding: the baseline that a model must beat.
 
 A cue uses the clip or the question alone, never the record. Without its cue a rule gives the observer's answer, and if
 that has none the commonest answer of the sub-scenario: it abstains by its cue alone.
@@ -54,7 +52,7 @@ RULES: Mapping[str, tuple[str, ...]] = {**{name: (name,) for name in CUES}, "any
 
 
 class RuleBackend:
-    """Plays the rule that `params.rule` names."""
+    """A reference model that plays the rule that `params.rule` names."""
 
     async def ask(self, request: Request) -> Outcome:
         """Return the outcome of one attempt; see `Backend`."""

@@ -1,4 +1,4 @@
-"""Share what a study and its accounts leave to spend, while the run goes on."""
+"""Yield the budget of a run: what its study and accounts leave to spend."""
 
 from __future__ import annotations
 
@@ -17,10 +17,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 @contextmanager
 def spending(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Budget]:
-    """Yield the study's remaining budget, which all its processes share.
-
-    Raises TrapsError.
-    """
+    """Yield the study's remaining budget, shared by its processes. Raises TrapsError."""
     _check_names(workspace)
     caps = workspace.study.budget_usd, workspace.study.model_budgets_usd
     if not any(entry.prices for entry in participants):
@@ -37,10 +34,7 @@ def spending(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Bu
 
 @contextmanager
 def sharing(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Callable[[str], int]]:
-    """Use these participants within the block.
-
-    Yield a function that counts an account's current processes.
-    """
+    """Use these participants in the block; yield a counter of an account's processes."""
     accounts = {entry.account for entry in participants if entry.account}
     if not accounts:
         yield lambda account: 1
@@ -50,10 +44,7 @@ def sharing(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Cal
 
 
 def account_budgets(workspace: Workspace, spent: Mapping[str, float]) -> dict[str, AccountBudget]:
-    """Return the shared account budgets that `study.yaml` configures.
-
-    By participant.
-    """
+    """Return `study.yaml`'s account budgets by participant. Raises TrapsError."""
     study, shared = workspace.study, dict[str, AccountBudget]()
     entries: list[Entry] = [*load_models().values(), *load_judges().values()]
     for account, folder in study.account_budgets.items():

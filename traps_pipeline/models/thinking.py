@@ -1,7 +1,4 @@
-"""Strip an answer's surroundings.
-
-Thinking between declared marks, a code fence, and leftover special tokens.
-"""
+"""Strip an answer's marked thinking, code fence, and leftover special tokens."""
 
 from __future__ import annotations
 
@@ -32,10 +29,7 @@ _TURN = re.compile(r"<\|start\|>assistant|<\|(?:start|end|return)\|>")  # gpt-os
 
 @dataclass(frozen=True)
 class ThinkingSplit:
-    """A text split into thinking and answer.
-
-    is_open: whether the text ends inside its thinking.
-    """
+    """A text split into thinking and answer; `is_open` if it ends in its thinking."""
 
     thinking: str
     answer: str
@@ -43,10 +37,7 @@ class ThinkingSplit:
 
 
 def marks_of(declared: str | Sequence[str]) -> Marks:
-    """Return the marks that an entry declares.
-
-    Both, or only the opening one if it is common. Raises ValueError.
-    """
+    """Parse declared marks: both, or a common opening one. Raises ValueError."""
     usual = dict(USUAL)
     if isinstance(declared, str) and declared in usual:
         return declared, usual[declared]
@@ -82,10 +73,7 @@ def split_thinking(text: str, marks: Marks | None) -> ThinkingSplit:
 
 
 def strip_tokens(text: str) -> str:
-    """Return a text without trailing end-of-sequence tokens.
-
-    Surrounding invisible characters go, too.
-    """
+    """Remove trailing end-of-sequence tokens, and invisible characters around a text."""
     text = text.strip(_INVISIBLE)
     end, has_token = len(text), False
     while True:
@@ -98,10 +86,7 @@ def strip_tokens(text: str) -> str:
 
 
 def strip_fence(text: str) -> str:
-    """Return the content of a code fence around a whole text, else the text.
-
-    Some models and judges add one.
-    """
+    """Return the content of a code fence around the whole text, else the text."""
     text = text.strip().strip(_INVISIBLE).strip()
     if text[:3] not in ("```", "~~~") or not text[3:].endswith(text[:3]):
         return text
@@ -110,10 +95,7 @@ def strip_fence(text: str) -> str:
 
 
 def undeclared_mark(text: str) -> str | None:
-    """Return the opening mark of the first common pair in a text.
-
-    None if there is none.
-    """
+    """Return the opening mark of the first common pair in a text, if any."""
     lower = text.lower()
     return next((opens for opens, closes in USUAL if opens.lower() in lower or closes.lower() in lower), None)
 

@@ -1,9 +1,4 @@
-"""Pace calls to participants.
-
-Connections that shrink on a 429, an account's rate limits, and a circuit breaker.
-
-None of it affects an answer.
-"""
+"""Pace calls by connections, rate limits and a breaker; no answer is affected."""
 
 from __future__ import annotations
 
@@ -26,10 +21,7 @@ BURST_S = 2.0  # burst size, in seconds of the rate
 
 
 class Gate:
-    """The connection limit of one participant.
-
-    It is halved on a 429 (once a second at most), raised after each round of answers.
-    """
+    """A participant's connection limit, halved on a 429, raised by rounds of answers."""
 
     def __init__(self, most: int) -> None:
         self.most, self.limit, self.open = most, most, 0
@@ -77,9 +69,7 @@ class Gate:
 
 
 class Meter:
-    """The rate limiter of one account: two token buckets.
-
-    They limit calls and tokens per minute.
+    """An account's rate limiter: token buckets for calls and for tokens per minute.
 
     sharers: the number of processes that use the account at this moment; each gets an equal part of the rate.
     """
@@ -104,9 +94,7 @@ class Meter:
         return float("inf") if rate is None else max(rate * BURST_S, least)
 
     async def admit(self, tokens: int, halted: Callable[[], bool] = lambda: False) -> None:
-        """Wait until one call with this many tokens may be sent.
-
-        Or until calls are halted.
+        """Wait until a call with this many tokens may be sent, or calls are halted.
 
         The bucket may go below zero: later calls wait longer.
         """
@@ -135,10 +123,7 @@ _stopped: list[dict[str, str]] = []  # one per active `remembering_stops`: parti
 
 @contextmanager
 def remembering_stops() -> Iterator[None]:
-    """Keep a stopped participant stopped within the block.
-
-    All later callers get the same reason.
-    """
+    """Keep stopped participants stopped for all callers in the block, with the reason."""
     _stopped.append({})
     try:
         yield
@@ -157,18 +142,13 @@ class Breaker:
         self._window: deque[bool] = deque(maxlen=ERROR_WINDOW)
 
     def check(self) -> None:
-        """Raise ParticipantStopped for a participant that was stopped before.
-
-        See `remembering_stops`.
-        """
+        """Raise ParticipantStopped if the participant was stopped (`remembering_stops`)."""
         for stopped in _stopped:
             if self._participant in stopped:
                 raise ParticipantStopped(stopped[self._participant])
 
     def no_connection(self, why: str = "") -> None:
-        """Raise ParticipantStopped after five consecutive unsent calls.
-
-        The first of them must be some time ago.
+        """Raise ParticipantStopped after five unsent calls in a row, over some time.
 
         A restarted server has that long. why: why the last one was not sent.
         """
@@ -215,10 +195,7 @@ class Breaker:
 
 
 def _refusal(outcome: Outcome) -> str:
-    """Return the kind of a provider's refusal; empty if it is none.
-
-    Of the content, or of the call itself.
-    """
+    """Return the kind of a provider's refusal of content or call; empty if it is none."""
     if outcome.kind == "refused":
         return outcome.error or outcome.finish_reason or "refused"
     return (outcome.error or "") if outcome.kind == "error" and (outcome.error or "").startswith("http_") else ""

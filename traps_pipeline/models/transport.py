@@ -59,10 +59,7 @@ WATCHED: ContextVar[Exchange | None] = ContextVar("watched", default=None)
 
 @contextmanager
 def watching() -> Iterator[Exchange]:
-    """Record the wire's traffic within the block.
-
-    In the exchange that a caller already watches, or in a new one.
-    """
+    """Record the wire's traffic in the block, in the caller's exchange or a new one."""
     if (outer := WATCHED.get()) is not None:
         yield outer
         return

@@ -1,6 +1,4 @@
-"""Read a call's token usage from a provider's answer.
-
-It is believed only if it is complete and possible.
+"""Read a call's token usage, believed only if it is complete and possible.
 
 It is read from the raw answer, since litellm replaces missing counts by zeros. An unbelievable usage is unknown, and a
 call with unknown tokens counts as its worst case (docs/models.md, "Money").
@@ -53,20 +51,14 @@ class Usage:
 
 @dataclass(frozen=True)
 class Sizes:
-    """Our own measure of a call.
-
-    Bytes of its prompt's text, frames, bytes of the returned text.
-    """
+    """Our measure of a call: bytes of prompt text, frames, bytes of returned text."""
 
     prompt_bytes: int
     frames: int
     text_bytes: int
 
     def contradict(self, usage: Usage) -> bool:
-        """Return whether a usage is below the minimum for these sizes.
-
-        An answer cannot take 0 tokens.
-        """
+        """Return whether a usage is below the minimum for these sizes."""
         least = self.prompt_bytes // BYTES_A_TOKEN + self.frames * TOKENS_A_FRAME
         return usage.prompt < least or usage.completion < max(1, -(-self.text_bytes // BYTES_A_TOKEN))
 

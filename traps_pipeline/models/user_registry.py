@@ -33,10 +33,7 @@ Cached = TypeVar("Cached")
 
 
 class UserRegistry(BaseModel):
-    """Additions of an experiment or a workspace to the registries.
-
-    Entries are in the form of `assets/models.yaml` and `assets/judges.yaml`, or short.
-    """
+    """An experiment's or workspace's additions to the registries, which may be short."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     accounts: dict[Name, dict[str, Any]] = {}
@@ -77,10 +74,7 @@ _clearers: list[Callable[[], None]] = []  # clear the caches of the registries
 
 
 def cached_registry(cached: Cached) -> Cached:
-    """Register a cached reader of a registry; decorates it.
-
-    Its cache is cleared when entries are added.
-    """
+    """Decorate a cached registry reader; adding entries clears its cache."""
     _clearers.append(cached.cache_clear)  # pyright: ignore[reportAttributeAccessIssue] - of functools.cache
     return cached
 
@@ -92,10 +86,7 @@ def clear_caches() -> None:
 
 
 def add_entries(own: UserRegistry, path: Path) -> None:
-    """Add the entries of an experiment's file, for this process.
-
-    path: the file, for errors.
-    """
+    """Add an experiment's entries for this process; `path` serves errors."""
     _overlay[:] = [(path, own)]
     clear_caches()
 
@@ -111,10 +102,7 @@ def save_entries(workspace: Workspace) -> None:
 
 
 def sources() -> list[tuple[Path, UserRegistry]]:
-    """Return all additions, each with its file.
-
-    The workspace's, then the experiment's.
-    """
+    """Return all additions, each with its file: the workspace's, the experiment's."""
     path = Workspace.file_of(Workspace.default_place(), FILE) if os.environ.get(VARIABLE) else None
     return [*([(path, _read(path))] if path else []), *_overlay]
 
@@ -178,10 +166,7 @@ def _entry_fields(raw: Mapping[str, Any], kind: Kind) -> dict[str, Any]:
 
 
 def _params(protocol: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the parameters to send.
-
-    They are the protocol's and the entry's own, without nulls.
-    """
+    """Return the parameters to send: the protocol's and the entry's, without nulls."""
     replaced = {"max_tokens"} if "max_completion_tokens" in own else set[str]()  # the same limit
     params = {name: value for name, value in protocol.items() if name not in replaced}
     return {name: value for name, value in (params | {**own}).items() if value is not None}

@@ -1,6 +1,4 @@
-"""Send calls out of this machine, in this one place.
-
-An httpx transport on aiohttp records what was sent.
+"""Send all calls out of this machine by an httpx transport that records them.
 
 `use_in` makes litellm's clients use it on every route. Each attempt's `Exchange` records whether its request was sent,
 the status of the answer, and the answer's bytes. Loopback addresses bypass proxies, redirects are not followed, an
@@ -44,10 +42,7 @@ class _Body(aiohttp.BytesPayload):
         self._exchange = exchange
 
     async def write_with_length(self, writer: AbstractStreamWriter, content_length: int | None) -> None:
-        """Write headers and body, and record that bytes are sent.
-
-        Nothing is recorded if the connection is closed.
-        """
+        """Write headers and body, and record them as sent if the connection is open."""
         transport = getattr(writer, "transport", None)
         if transport is None or transport.is_closing():
             raise aiohttp.ClientConnectionResetError("the connection was closed before the request was written")
@@ -56,7 +51,7 @@ class _Body(aiohttp.BytesPayload):
 
 
 class Wire(httpx.AsyncBaseTransport):
-    """Sends requests with aiohttp, with one session per event loop.
+    """A transport that sends requests with aiohttp, one session per event loop.
 
     tls: a context, or False to trust every certificate; None: the certificates that SSL_CERT_FILE or certifi names.
     """
@@ -142,10 +137,7 @@ class Wire(httpx.AsyncBaseTransport):
 
 
 def _dispose(session: aiohttp.ClientSession) -> None:
-    """Close a session whose loop is closed, without waiting.
-
-    Otherwise aiohttp would report an open session.
-    """
+    """Close the session of a closed loop without waiting, lest aiohttp report it."""
     with suppress(StopIteration):
         session.close().send(None)
 
@@ -162,10 +154,7 @@ async def _read(response: aiohttp.ClientResponse) -> bytes:
 
 
 def _decoded(content: bytes, encoding: str) -> bytes:
-    """Return a decompressed body.
-
-    Raises ValueError if it is truncated, too large, or in another encoding.
-    """
+    """Decompress a body; raise ValueError if truncated, too large or unknown."""
     if encoding.lower() == "identity":
         return content
     if encoding.lower() not in ("gzip", "x-gzip", "deflate"):
@@ -228,10 +217,7 @@ def use_in(handler: Any) -> None:
 
 
 def get(url: str, headers: Mapping[str, str], timeout_s: float) -> httpx.Response:
-    """Return the answer to a GET without a body, for callers outside of an event loop.
-
-    Raises TrapsError that says why there is none.
-    """
+    """Return the answer to a GET, outside of event loops. Raises TrapsError if none."""
 
     async def answer() -> httpx.Response:
         async with httpx.AsyncClient(transport=Wire(), timeout=timeout_s, follow_redirects=False) as client:

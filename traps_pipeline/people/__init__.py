@@ -1,4 +1,1 @@
-"""Work with people's labels.
-
-Samples to label, people's scores, scores corrected by labels, and validation of judges.
-"""
+"""Sample units to label, score people, correct scores by labels, validate judges."""

@@ -1,6 +1,4 @@
-"""Correct scores for the panel's errors (docs/people.md).
-
-People's labels of judged answers reveal them.
+"""Correct scores for the panel's errors, by people's labels (docs/people.md).
 
 A panel with sensitivity Se and specificity Sp against people says yes to p = Se t + (1 - Sp) (1 - t) of answers of
 which a share t is yes. Solved for t (Rogan and Gladen 1978), this turns a judged share into a corrected one. Se, Sp and
@@ -45,10 +43,7 @@ Errors = Mapping[TaskName, np.ndarray]  # by task: the ends of sensitivity and s
 def panel_errors(
     labels: pd.DataFrame, verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED
 ) -> pd.DataFrame:
-    """Return PANEL_ERRORS rows from HUMAN_LABELS and the panel's VERDICTS rows.
-
-    None without labels.
-    """
+    """Return PANEL_ERRORS from HUMAN_LABELS and VERDICTS rows; none without labels."""
     rows = []
     if _is_labelled(labels):
         resampling = _resampling(verdicts, resamples, seed)
@@ -116,10 +111,7 @@ def _resampling(verdicts: pd.DataFrame, resamples: int, seed: int) -> Resampling
 
 
 def _errors(labels: pd.DataFrame, resampling: Resampling) -> Errors:
-    """Return the panel's sensitivity and specificity by labelled task and draw.
-
-    NaN if people never say yes, or no.
-    """
+    """Return sensitivity and specificity by task and draw; NaN without yes, or no."""
     errors: dict[TaskName, np.ndarray] = {}
     for task in ABOUT_ANSWERS:
         answers = truths(labels, task).dropna(subset=["truth"])
@@ -177,10 +169,7 @@ def _entry(group: pd.DataFrame, named: str, resampling: Resampling, errors: Erro
 
 
 def _runs(group: pd.DataFrame, dataset: str) -> int:
-    """Return the number of runs behind the row of a dataset.
-
-    For `overall` those with all four datasets count.
-    """
+    """Return how many runs are behind a dataset's row (`overall`: with all four)."""
     if dataset != "overall":
         return len(set(group["run"][group["dataset"] == dataset]))
     return sum(len(set(rows["dataset"])) == len(DATASETS) for _, rows in group.groupby("run"))

@@ -1,7 +1,4 @@
-"""Define the tables of people's labels and of their agreement.
-
-The version of the underlying files is computed here, too.
-"""
+"""Define the tables of people's labels and agreement, and the files' version."""
 
 from dataclasses import dataclass
 from datetime import datetime
@@ -22,10 +19,7 @@ Axis = Annotated[bool | None, "an axis of confabulation; null in other tasks"]
 
 @dataclass(frozen=True, kw_only=True)
 class HumanLabelRow:
-    """One person's label of one clip or answer that is still in the study.
-
-    A later label of the same replaces it.
-    """
+    """One person's last label of one clip or answer that is still in the study."""
 
     task: PeopleTask
     unit: Annotated[str, "digest of what was shown; it changes with clip, question and answer"]
@@ -57,10 +51,7 @@ HUMAN_LABELS = Table("human_labels", HumanLabelRow, partition_by=(), key=("task"
 
 @dataclass(frozen=True, kw_only=True)
 class HumanAgreementRow:
-    """How far people agree on one decision of one task.
-
-    A missing row means that nobody labelled.
-    """
+    """How far people agree on one decision of a task; no row if nobody labelled."""
 
     task: PeopleTask
     decision: Annotated[str, "abstained (of clips: cannot be known), correct, or an axis of confabulation"]

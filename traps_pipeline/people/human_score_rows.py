@@ -1,7 +1,4 @@
-"""Define the tables of scores from people's labels.
-
-They are the human row, the panel's errors, and judge-corrected scores.
-"""
+"""Define score tables from labels: human row, panel errors, corrected scores."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -18,10 +15,7 @@ Judged = Annotated[float | None, "as the panel decided, mean over runs"]
 @dataclass(frozen=True, kw_only=True)
 @with_neighbours
 class HumanRow:
-    """People on one dataset, or overall (equal-weight mean over the four).
-
-    A missing row means that nobody labelled.
-    """
+    """People on a dataset, or overall (mean over the four); no row if nobody labelled."""
 
     dataset: DatasetOrOverall
     n_people: Annotated[int, "who labelled clips"]
@@ -67,10 +61,7 @@ PANEL_ERRORS = Table("panel_errors", PanelErrorsRow, partition_by=(), key=("task
 @dataclass(frozen=True, kw_only=True)
 @with_neighbours
 class CorrectedRow:
-    """A model under a regime, as judged and corrected for the panel's errors.
-
-    On one dataset, or overall.
-    """
+    """A model under a regime, as judged and corrected; on one dataset, or overall."""
 
     model: shared.Model
     regime: shared.Regime

@@ -1,7 +1,5 @@
 """Score people on the clips that models are asked about (docs/people.md).
 
-This is the human row.
-
 Labels of all people are pooled. A label is weighted by the size of its stratum over the number of its labels, so that
 clips chosen because the judges are split about them count no more than they do in the study.
 """
@@ -32,17 +30,12 @@ from traps_pipeline.scoring.metrics import COUNTS, decision_counts, joined_versi
 
 
 def stratum_weights(labels: pd.DataFrame) -> np.ndarray:
-    """Return the weight of each label, (labels,).
-
-    It is its stratum's size over the number of its labels.
-    """
+    """Return each label's weight, (labels,): stratum size / labels in the stratum."""
     return (labels["stratum_size"] / labels.groupby("stratum")["stratum"].transform("size")).to_numpy(float)
 
 
 def human_row(labels: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED) -> pd.DataFrame:
-    """Return HUMAN_ROW rows from HUMAN_LABELS rows.
-
-    They are scores of all labels of clips, with intervals over scenarios.
+    """Return people's scores on clips (HUMAN_ROW), with intervals over scenarios.
 
     Without a label of a clip there is no row; overall is null until all four datasets have figures.
     """
@@ -78,7 +71,7 @@ def _row(dataset: str, figures: np.ndarray, clips: pd.DataFrame) -> dict[str, An
 
 
 def with_intervals(names: Sequence[str], draws: np.ndarray, suffix: str = "") -> Mapping[str, float]:
-    """Return each score with its interval, as columns.
+    """Return scores with intervals as columns.
 
     draws: (2, names, 1 + resamples), observed ones first.
     """

@@ -1,6 +1,4 @@
-"""Validate the confabulation judge against two blind annotators.
-
-See docs/spec.md 6.3.
+"""Validate the confabulation judge against two annotators (docs/spec.md 6.3).
 
 `annotation_sheet` writes the annotators' material: question, void kind, answer, and the trace if the judge saw it; a
 sample id replaces model and item. Their labels come back as one CSV file with a line per annotator and failure.
@@ -56,9 +54,7 @@ class HumanLabels:
 
 
 def sheet_rows(workspace: Workspace) -> list[dict[str, str]]:
-    """Return an annotator's material for each failure.
-
-    Its order reveals nothing.
+    """Return an annotator's material for each failure, ordered to reveal nothing.
 
     Columns sample_id, question, why_unanswerable, reasoning_trace (empty without one) and response. Raises TrapsError
     if no failure of the models to validate was labelled, or if a failure's answer has been replaced.
@@ -73,10 +69,7 @@ def sheet_rows(workspace: Workspace) -> list[dict[str, str]]:
 
 
 def annotation_sheet(workspace: Workspace) -> list[dict[str, str]]:
-    """Return the rows that an annotator fills in, safe for a spreadsheet.
-
-    They are SHEET_COLUMNS of `sheet_rows`.
-    """
+    """Return an annotator's rows (SHEET_COLUMNS), safe for a spreadsheet."""
     empty = dict.fromkeys(LABEL_COLUMNS, "")
     return [
         empty | {name: str(no_formula(text)) for name, text in row.items()} | {"sample_id": row["sample_id"]}
@@ -111,10 +104,7 @@ def _row_of(frame: pd.DataFrame, item_id: str) -> dict[Any, Any]:
 
 
 def write_sheet(rows: Sequence[Mapping[str, str]], path: Path, columns: Sequence[str] = SHEET_COLUMNS) -> None:
-    """Write a sheet, or only LABEL_COLUMNS, as CSV.
-
-    Raises TrapsError if the file exists, since it may hold labels.
-    """
+    """Write a sheet, or only LABEL_COLUMNS, as CSV. Raises TrapsError if it exists."""
     if path.exists():
         raise TrapsError(f"{path} exists already and may hold labels; give another name, or delete it")
     with path.open("w", encoding="utf-8", newline="") as stream:
@@ -124,11 +114,10 @@ def write_sheet(rows: Sequence[Mapping[str, str]], path: Path, columns: Sequence
 
 
 def read_labels(path: Path, known: Sequence[str]) -> HumanLabels:
-    """Return two annotators' labels from a CSV file.
+    """Return two annotators' labels from a CSV file of LABEL_COLUMNS.
 
-    It has LABEL_COLUMNS; values are true/false, yes/no or 1/0.
-
-    known: sample ids that the judge has labelled. Raises TrapsError naming the lines and columns that are wrong.
+    Values are true/false, yes/no or 1/0. known: sample ids that the judge has labelled. Raises TrapsError naming the
+    lines and columns that are wrong.
     """
     labels: dict[tuple[str, str], tuple[int, list[bool]]] = {}
     wrong: list[str] = []
@@ -151,10 +140,7 @@ def read_labels(path: Path, known: Sequence[str]) -> HumanLabels:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
-    """Yield the rows of a CSV file with their line numbers.
-
-    Every LABEL_COLUMNS value is a stripped text.
-    """
+    """Yield a CSV file's numbered rows, with LABEL_COLUMNS as stripped texts."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:
             reader = csv.DictReader(stream)
@@ -194,10 +180,7 @@ def _refuse(wrong: Sequence[str]) -> None:
 
 
 def validate(workspace: Workspace, path: Path) -> pd.DataFrame:
-    """Return JUDGE_VALIDATION rows from a label file, and write them.
-
-    Raises TrapsError, also without failures.
-    """
+    """Write and return JUDGE_VALIDATION rows from a label file. Raises TrapsError."""
     judged = _judged(workspace).set_index("sample_id")
     if judged.empty:
         raise TrapsError(f"{workspace.root}: the study has no labelled failure to compare with; run it first")
@@ -218,9 +201,8 @@ def _judged(workspace: Workspace) -> pd.DataFrame:
 def compare(judge: np.ndarray, human: HumanLabels) -> pd.DataFrame:
     """Return JUDGE_VALIDATION rows that compare the judge with both annotators.
 
-    judge: its labels, (failures, axes) of bool.
-
-    Pooled labels are both annotators' labels side by side, without a consensus: 2 x failures per axis.
+    judge: its labels, (failures, axes) of bool. Pooled labels are both annotators' labels side by side, without a
+    consensus: 2 x failures per axis.
     """
     rows = [_axis_row(axis, judge[:, k], human.labels[:, :, k], human) for k, axis in enumerate(AXES)]
     agreed = [float(np.mean(human.labels[k] == judge)) for k in (0, 1)]
@@ -265,20 +247,15 @@ def _axis_row(axis: str, judge: np.ndarray, labels: np.ndarray, human: HumanLabe
 
 
 def is_degenerate(one: np.ndarray, other: np.ndarray) -> bool:
-    """Return whether kappa is meaningless.
-
-    One class then has at most 2 % of either annotator's labels.
-    """
+    """Return whether one class is at most 2 % of labels, so that kappa means nothing."""
     return any(min(np.mean(labels), 1 - np.mean(labels)) <= DEGENERATE_SHARE + 1e-12 for labels in (one, other))
 
 
 def _kappa(one: np.ndarray, other: np.ndarray) -> tuple[float, float, float]:
     """Return Cohen's kappa and its 95 % interval; NaN if it is degenerate.
 
-    The interval is a Bayesian bootstrap over failures.
-
-    One failure is unseen: at the lower end the annotators differ on it, at the upper end they agree. So the interval
-    keeps a width even if they always agree.
+    The interval is a Bayesian bootstrap over failures, one of them unseen: at the lower end the annotators differ on
+    it, at the upper end they agree. So the interval keeps a width even if they always agree.
     """
     if is_degenerate(one, other):
         return np.nan, np.nan, np.nan

@@ -1,6 +1,4 @@
-"""List the clips and answers that people label (docs/people.md).
-
-Each task has units and a seeded sample of them.
+"""List the clips and answers that people label, and sample them (docs/people.md).
 
 Everything that a task could label is a unit. Its id is a digest of the shown content, so that people's labels of one
 clip or answer are never taken for labels of another. A task's units are in groups, and each group in two strata: those
@@ -64,17 +62,12 @@ class AnnotationProtocol(BaseModel):
 
 @cache
 def annotation_protocol(path: Path = PROTOCOL_FILE) -> AnnotationProtocol:
-    """Return the protocol.
-
-    Raises TrapsError naming the wrong field.
-    """
+    """Return the protocol. Raises TrapsError naming the wrong field."""
     return parse_yaml_model(AnnotationProtocol, read_yaml(path), path)
 
 
 def units(workspace: Workspace, task: TaskName) -> pd.DataFrame:
-    """Return UNIT_COLUMNS of all units of a task in the study.
-
-    No rows if there are none.
+    """Return UNIT_COLUMNS of all units of a task in the study; may be empty.
 
     panel is the panel's decision (null except in ABOUT_ANSWERS); model, regime and run are null for clips.
     """
@@ -128,10 +121,7 @@ def _answers(workspace: Workspace, task: TaskName) -> pd.DataFrame:
 
 
 def _failures(workspace: Workspace) -> pd.DataFrame:
-    """Return the failures that the confabulation judge labelled.
-
-    `validation` samples them.
-    """
+    """Return the failures that the confabulation judge labelled, to be sampled."""
     rows = workspace.tables.read_all(CONFABULATION)
     judged = rows.loc[rows["valid"].astype(bool) & rows["model"].isin(load_protocol().validation.models)]
     scenarios = judged["item_id"].str.split(":").str[1]
@@ -143,10 +133,7 @@ def _unit(*shown: str) -> str:
 
 
 def sample(workspace: Workspace, task: TaskName) -> pd.DataFrame:
-    """Return the sampled units for people, in the columns of `units`.
-
-    The sample is `draw_sample`, or the sheet's failures.
-    """
+    """Return the units sampled for people (`draw_sample`, or the sheet's failures)."""
     population = units(workspace, task)
     if population.empty:
         return population
@@ -160,9 +147,7 @@ def sample(workspace: Workspace, task: TaskName) -> pd.DataFrame:
 
 
 def drawn_units(group: pd.DataFrame, size: int, protocol: AnnotationProtocol) -> pd.DataFrame:
-    """Return a seeded sample of a group without replacement.
-
-    All units are returned if there are at most `size`.
+    """Return a seeded sample of up to `size` units of a group, without replacement.
 
     A share comes from all units, then the rest from those that split the judges and, if these are too few, from all
     again.
@@ -190,10 +175,7 @@ def queue_of(who: str, sampled: pd.DataFrame) -> list[str]:
 
 
 def require_task(name: str) -> TaskName:
-    """Return the task of that name.
-
-    Raises TrapsError with the known names.
-    """
+    """Return the task of that name. Raises TrapsError with the known names."""
     for task in TASKS:
         if task == name:
             return task

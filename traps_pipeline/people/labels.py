@@ -1,6 +1,4 @@
-"""Read people's stored labels, and build tables from them.
-
-They are labels of the study's units, and agreement.
+"""Read people's labels of the study's units, and their agreement, into tables.
 
 `traps people annotate` appends each label to `labels.jsonl`, one line with a checksum per label; a later line of the
 same person about the same unit replaces the earlier one. Stages read only that file.
@@ -72,9 +70,7 @@ class Line(BaseModel):
 
 
 def label_lines(folder: Path) -> list[Line]:
-    """Return the labels in a study's folder of labels, in order.
-
-    None if nobody has labelled.
+    """Return a study's labels in order; none if nobody has labelled.
 
     Raises TrapsError for a damaged line; a last line that a crash cut off was never confirmed and is left out.
     """
@@ -99,10 +95,7 @@ def label_lines(folder: Path) -> list[Line]:
 
 
 def human_labels(workspace: Workspace) -> pd.DataFrame:
-    """Return HUMAN_LABELS rows.
-
-    They are each person's last label of each unit that the study still has.
-    """
+    """Return HUMAN_LABELS: each person's last label of each unit still in the study."""
     last: dict[tuple[TaskName, str, str], dict[str, Any]] = {}
     for line in label_lines(workspace.labels):
         key = line.task, line.unit, line.who
@@ -123,10 +116,7 @@ def human_labels(workspace: Workspace) -> pd.DataFrame:
 
 
 def _with_answers(workspace: Workspace, rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows with answers about clips read like models' answers.
-
-    They abstained, or are correct on a control.
-    """
+    """Add whether people's answers about clips abstain, or are correct on a control."""
     columns = ["item_id", "ground_truth", "answer_type", "labels", "aliases"]
     items = workspace.tables.read_all(ITEMS, columns, dataset=DATASETS).set_index("item_id").to_dict("index")
 
@@ -188,10 +178,7 @@ def agreement_of(values: np.ndarray) -> tuple[int, float, float]:
 
 
 def matrix(labels: pd.DataFrame, decision: str) -> np.ndarray:
-    """Return labels as YES, NO and INVALID (not labelled).
-
-    (units, people) int8, both in alphabetical order.
-    """
+    """Return labels as YES, NO, INVALID (unlabelled): (units, people) int8, sorted."""
     names, people = (sorted(labels[column].unique()) for column in ("unit", "annotator"))
     values = np.full((len(names), len(people)), INVALID, np.int8)
     places = (
@@ -217,11 +204,10 @@ def truths(labels: pd.DataFrame, task: TaskName) -> pd.DataFrame:
 
 
 def confabulation_rows(labels: pd.DataFrame) -> list[dict[str, str]]:
-    """Return the confabulation labels as `traps people validate` reads them.
+    """Return confabulation labels as `traps people validate` reads them.
 
-    labels: HUMAN_LABELS rows.
-
-    They cover failures that every annotator has labelled. Raises TrapsError if there are none.
+    labels: HUMAN_LABELS rows. The result covers failures that every annotator has labelled. Raises TrapsError if there
+    are none.
     """
     own = labels.loc[labels["task"] == "confabulation"]
     everybody = own.groupby("unit")["annotator"].transform("nunique") == own["annotator"].nunique()

@@ -1,4 +1,1 @@
-"""Define the benchmark's vocabulary and keys.
-
-Datasets, arms, regimes, metrics and the cells that they span.
-"""
+"""Define the vocabulary and keys: datasets, arms, regimes, metrics and cells."""

@@ -18,10 +18,7 @@ _EVALUATION = re.compile(r"(?P<model>.+?)__(?P<regime>[a-z]+)__run(?P<run>[1-9][
 
 @dataclass(frozen=True, order=True)
 class Evaluation:
-    """One model under one regime in one run.
-
-    It is the second partition dimension of the paid stages.
-    """
+    """One model under one regime in one run; a partition dimension of paid stages."""
 
     model: str
     regime: str
@@ -34,10 +31,7 @@ class Evaluation:
 
     @staticmethod
     def parse(key: str) -> Evaluation:
-        """Return the evaluation of a key.
-
-        Raises ValueError that says what is wrong.
-        """
+        """Parse an evaluation's key. Raises ValueError that says what is wrong."""
         match = _EVALUATION.fullmatch(key)
         if match is None or match["regime"] not in REGIMES:
             raise ValueError(f"evaluation key {key!r} is not model__regime__runN with a regime of {REGIMES}")
@@ -53,10 +47,7 @@ class Cell:
 
     @property
     def key(self) -> str:
-        """The partition key as Dagster writes it.
-
-        Dimensions are sorted by name (`dataset` before `evaluation`).
-        """
+        """The partition key, with dimensions sorted by name as Dagster writes it."""
         return f"{self.dataset}|{self.evaluation.key}"
 
     @property
@@ -67,10 +58,7 @@ class Cell:
 
     @staticmethod
     def parse(key: str) -> Cell:
-        """Return the cell of a key.
-
-        Raises ValueError that says what is wrong.
-        """
+        """Parse a cell's key. Raises ValueError that says what is wrong."""
         dataset, _, evaluation = key.partition("|")
         if dataset not in (*DATASETS, *UNPAIRED):
             raise ValueError(f"cell key {key!r}: dataset {dataset!r} is not one of {(*DATASETS, *UNPAIRED)}")
@@ -99,10 +87,7 @@ class Extraction:
 
     @staticmethod
     def parse(key: str) -> Extraction:
-        """Return the extraction of a key.
-
-        Raises ValueError that says what is wrong.
-        """
+        """Parse an extraction's key. Raises ValueError that says what is wrong."""
         model, _, prompt = key.partition("__")
         if prompt not in VQA_PROMPTS:
             raise ValueError(f"extraction key {key!r} is not model__prompt with a prompt of {VQA_PROMPTS}")
@@ -128,10 +113,7 @@ class StatesCell:
 
     @staticmethod
     def parse(key: str) -> StatesCell:
-        """Return the cell of a key.
-
-        Raises ValueError that says what is wrong.
-        """
+        """Parse a cell's key. Raises ValueError that says what is wrong."""
         dataset, _, extraction = key.partition("|")
         if dataset not in PROBED_DATASETS:
             raise ValueError(f"states key {key!r}: dataset {dataset!r} is not one of {PROBED_DATASETS}")
@@ -152,10 +134,7 @@ class SteeredEvaluation(Evaluation):
 
 @dataclass(frozen=True, order=True)
 class SteeringCell(Cell):
-    """One target dataset under directions of one VQA prompt and answers of one regime.
-
-    It is a partition of steering.
-    """
+    """A partition of steering: dataset, model, directions' prompt, answers' regime."""
 
     directions: str
 
@@ -177,18 +156,12 @@ class SteeringCell(Cell):
 
     @staticmethod
     def make(dataset: str, model: str, directions: str, regime: str) -> SteeringCell:
-        """Return the steering cell of a dataset, a model, a VQA prompt and a regime.
-
-        directions: the prompt of the directions. regime: that of the answers.
-        """
+        """Make a steering cell from the directions' prompt and the answers' regime."""
         return SteeringCell(dataset, SteeredEvaluation(model, regime, 1), directions)
 
     @staticmethod
     def parse(key: str) -> SteeringCell:
-        """Return the cell of a key.
-
-        Raises ValueError that says what is wrong.
-        """
+        """Parse a cell's key. Raises ValueError that says what is wrong."""
         dataset, _, run = key.partition("|")
         parts = run.split("__")
         # The graph has a key for each dataset of its study, arms too; only those of pairs are ever wanted.

@@ -57,18 +57,12 @@ def taxonomy_of(dataset: str) -> str:
 
 
 def is_ill_posed(dataset: str) -> bool:
-    """Return whether a pair's void is the control's clip with another question.
-
-    That question is unanswerable.
-    """
+    """Return whether a void is the control's clip with an unanswerable question."""
     return dataset.endswith("_ill_posed")
 
 
 def transfer_type(source: str, target: str) -> str:
-    """Return what a transfer between datasets crosses (docs/spec.md 7.2).
-
-    The void's modality, the domain, both or neither.
-    """
+    """Return what a transfer crosses (docs/spec.md 7.2): modality, domain, both, none."""
     domain = taxonomy_of(source) != taxonomy_of(target)
     modality = is_ill_posed(source) != is_ill_posed(target)
     return {(True, True): "Cross-both", (True, False): "Cross-domain", (False, True): "Cross-modality"}.get(
@@ -98,10 +92,7 @@ def beside_of(taxonomy: str) -> tuple[str, ...]:
 
 
 def all_datasets_of(category: str) -> tuple[str, ...]:
-    """Return all datasets that a category's scenarios may be asked in.
-
-    Arms and variations are among them.
-    """
+    """Return all datasets, with arms and variations, of a category's scenarios."""
     return (*datasets_of_category(category), *beside_of(taxonomy_of_category(category)))
 
 

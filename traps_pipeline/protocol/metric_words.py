@@ -1,6 +1,4 @@
-"""Describe metrics in words.
-
-Name, heading, range, direction, and the items that each counts.
+"""Describe metrics: name, heading, range, direction, and the items counted.
 
 `scoring.metrics` computes them, `scoring.bootstrap` resamples them.
 """
@@ -13,10 +11,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Metric:
-    """A figure of a model.
-
-    side: the side whose items a share counts; empty if it counts both.
-    """
+    """A model's figure; `side` is the side whose items it counts ("" for both)."""
 
     name: str
     heading: str

@@ -1,6 +1,4 @@
-"""Arrange votes of judges as a matrix, and count their majority.
-
-One row per answer and task, one column per judge.
+"""Arrange votes as a matrix, answers and tasks by judges; count majorities.
 
 Verdicts, agreement, bias and scores without one judge are all computed from this matrix.
 """
@@ -82,10 +80,7 @@ def ratings(votes: pd.DataFrame, judges: Sequence[str] | None = None, answer: Se
 
 
 def _grouped(votes: pd.DataFrame, by: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Return each vote's group by these columns, and each group's first vote.
-
-    Shapes (votes,) and (groups,).
-    """
+    """Return each vote's group (votes,), and each group's first vote (groups,)."""
     import pandas as pd
 
     code = np.zeros(len(votes), np.int64)
@@ -104,10 +99,7 @@ def _decisions(votes: pd.DataFrame) -> np.ndarray:
 
 
 def majority(values: np.ndarray) -> np.ndarray:
-    """Return the vote of more than half of the judges, (rows,) int8.
-
-    INVALID without such a majority.
-    """
+    """Return the vote of more than half of the judges, else INVALID; (rows,) int8."""
     half_of_judges = values.shape[1] / 2
     is_yes, is_no = ((values == vote).sum(axis=1) > half_of_judges for vote in (YES, NO))
     return np.where(is_yes, YES, np.where(is_no, NO, INVALID)).astype(np.int8)

@@ -1,7 +1,4 @@
-"""Define the regimes, the system prompts under which models answer.
-
-Each has its texts and an answer format.
-"""
+"""Define the regimes: system prompts for models, their texts and answer formats."""
 
 from __future__ import annotations
 
@@ -12,9 +9,7 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class Regime:
-    """A system prompt and its answer format.
-
-    Its texts are files of `assets/prompts`, joined by one blank line.
+    """A system prompt, of files of `assets/prompts`, and its answer format.
 
     fields: of the JSON object that an answer must be; none: free text. states: the texts under which hidden states are
     read (docs/spec.md 7.1); none: no states are read under this regime. marker: of a model's point in the landscape.
@@ -64,10 +59,7 @@ PROBE_PROMPT = STANDARD  # probes are of this VQA prompt, the other one serves d
 
 
 def fields_of(regime: str, dataset: str = "") -> tuple[str, ...] | None:
-    """Return the fields of the JSON answer under a regime; None for free text.
-
-    A dataset may vary them.
-    """
+    """Return a regime's JSON fields (a dataset may vary them); None for free text."""
     return FIELDS.get(dataset, FIELDS.get(regime))
 
 

@@ -1,4 +1,1 @@
-"""Publish a study.
-
-The released folder, commitments, harnesses, results files and submissions.
-"""
+"""Publish a study: release folder, commitments, harnesses, results, submissions."""

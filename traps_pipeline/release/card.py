@@ -1,7 +1,4 @@
-"""Write the dataset card (with the hub's header) and the data dictionary.
-
-Both come from the tables' definitions.
-"""
+"""Write the dataset card (with the hub's header) and data dictionary from tables."""
 
 from __future__ import annotations
 
@@ -23,10 +20,7 @@ _WITH_CLIPS = (PAIRS.name, RELEASED_ITEMS.name, HELD_OUT_ITEMS.name)
 
 @cache
 def environment() -> Environment:
-    """Return the template environment of a release.
-
-    Templates are plain text, in which an undefined name is an error.
-    """
+    """Return a release's template environment: plain text, undefined names are errors."""
     folder = Path(__file__).parent / "templates"
     return Environment(loader=FileSystemLoader(folder), undefined=StrictUndefined, keep_trailing_newline=True)
 
@@ -62,10 +56,7 @@ def _size(rows: int) -> str:
 
 
 def dictionary(tables: Sequence[Table[Any]], places: Mapping[str, str], canary: str) -> str:
-    """Return the data dictionary in Markdown.
-
-    It has each table with its key and its columns, their types and meanings.
-    """
+    """Return the data dictionary in Markdown: tables, keys, column types and meanings."""
     parts = [f"<!-- {canary} -->\n\n# Data dictionary\n"]
     for table in tables:
         parts.append(f"\n## {table.name}\n\nOne row is {table.row}. File: `{places[table.name]}`, JSON lines. ")

@@ -1,7 +1,4 @@
-"""Write and verify the SHA-256 of every file of a folder.
-
-The format is that of `sha256sum --check`.
-"""
+"""Write and verify the SHA-256 of a folder's files, as `sha256sum --check` does."""
 
 from __future__ import annotations
 
@@ -19,20 +16,14 @@ _LINE = re.compile(r"([0-9a-f]{64})  (\S.*)")
 
 
 def released_files(folder: Path) -> list[str]:
-    """Return every file of a folder that has a checksum, by relative path, sorted.
-
-    Hidden files have none.
-    """
+    """Return the files of a folder that have a checksum, by relative path, sorted."""
     paths = [path.relative_to(folder) for path in folder.rglob("*") if path.is_file() or path.is_symlink()]
     names = [path.as_posix() for path in paths if not any(part.startswith(".") for part in path.parts)]
     return sorted(name for name in names if name not in _OUTSIDE)
 
 
 def write_checksums(folder: Path, canary: str) -> int:
-    """Write the checksums of a folder, below a comment with the canary.
-
-    Return the number of files.
-    """
+    """Write a folder's checksums below a canary comment; return the number of files."""
     names = released_files(folder)
     lines = [f"{file_digest(folder / name)}  {name}\n" for name in names]
     write_text(folder / CHECKSUMS, f"# {canary}\n{''.join(lines)}")
@@ -40,10 +31,7 @@ def write_checksums(folder: Path, canary: str) -> int:
 
 
 def read_checksums(folder: Path) -> dict[str, str]:
-    """Return the checksum of each file by its path.
-
-    Raises TrapsError naming an invalid line.
-    """
+    """Return checksums by path. Raises TrapsError naming an invalid line."""
     path = folder / CHECKSUMS
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -63,10 +51,7 @@ def read_checksums(folder: Path) -> dict[str, str]:
 
 
 def altered_files(folder: Path) -> list[str]:
-    """Return the differences between a folder and its checksums.
-
-    One sentence per file. Raises TrapsError.
-    """
+    """Compare a folder with its checksums, one sentence a file. Raises TrapsError."""
     expected, existing = read_checksums(folder), {*released_files(folder)}
     problems = []
     for name in sorted({*expected, *existing}):

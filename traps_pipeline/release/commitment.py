@@ -1,6 +1,4 @@
-"""Commit to a benchmark before anybody sees it, and reveal it later.
-
-The reveal proves that it is the same one.
+"""Commit to a benchmark before anybody sees it, and prove its identity later.
 
 The commitment holds digests of the seed and of each record, all mixed with a secret number, so that nobody can search
 for the seed. The reveal holds the seed and that number. Anyone with both can draw the benchmark again.
@@ -58,10 +56,7 @@ class Commitment(_Strict):
 
 
 class Reveal(_Strict):
-    """The secret file, kept until the benchmark is revealed.
-
-    nonce: the secret number, in hexadecimal digits.
-    """
+    """The secret file, kept until the benchmark is revealed; `nonce` is hexadecimal."""
 
     format: Literal[1] = 1
     seed: int = Field(ge=0)
@@ -77,12 +72,10 @@ def _sealed_spec(reveal: Reveal, spec: SceneSpec) -> str:
 
 
 def commit(benchmark: Path, commitment: Path, reveal: Path) -> Commitment:
-    """Commit to a benchmark: write the public file and the secret one.
+    """Commit to a benchmark: write the public file, and the secret one for its owner.
 
-    benchmark: of `traps benchmark sample`.
-
-    Only the owner can read the latter. Raises TrapsError if the folder is no such benchmark, or of several seeds, and
-    if either file exists.
+    benchmark: of `traps benchmark sample`. Raises TrapsError if the folder is no such benchmark, or of several seeds,
+    and if either file exists.
     """
     for path in (commitment, reveal):
         if path.exists():
@@ -114,18 +107,12 @@ def _made_with() -> dict[str, str]:
 
 
 def read_commitment(path: Path) -> Commitment:
-    """Return a commitment from its file.
-
-    Raises TrapsError.
-    """
+    """Read a commitment. Raises TrapsError."""
     return _read(Commitment, path)
 
 
 def read_reveal(path: Path) -> Reveal:
-    """Return a reveal from its file.
-
-    Raises TrapsError.
-    """
+    """Read a reveal. Raises TrapsError."""
     return _read(Reveal, path)
 
 
@@ -144,10 +131,7 @@ def _read(kind: type[Any], path: Path) -> Any:
 
 
 def revealed_specs(folder: Path) -> dict[str, SceneSpec]:
-    """Return the records of a sampled or released folder.
-
-    Raises TrapsError, also for an altered trajectory.
-    """
+    """Return a folder's records. Raises TrapsError, also for an altered trajectory."""
     from traps_pipeline.benchmark.specs import spec_of
 
     if (folder / "scenarios.jsonl").is_file():
@@ -171,10 +155,7 @@ def revealed_specs(folder: Path) -> dict[str, SceneSpec]:
 
 
 def broken_seals(commitment: Commitment, reveal: Reveal, specs: Mapping[str, SceneSpec]) -> list[str]:
-    """Return the differences between records and commitment.
-
-    One sentence each, the seed's first.
-    """
+    """Return how records differ from the commitment, one sentence each, seed first."""
     problems = []
     if _sealed_seed(reveal, commitment.draws) != commitment.seed:
         problems.append("the revealed seed, number or composition is not the one that was committed")
@@ -195,10 +176,7 @@ def drawn_again(
     workers: int | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> dict[str, SceneSpec]:
-    """Return the records that the revealed seed gives on this machine.
-
-    Raises TrapsError if a family cannot be filled.
-    """
+    """Redraw the revealed seed's records. Raises TrapsError for an unfillable family."""
     with TemporaryDirectory(prefix="traps-") as folder:
         with kept_workers():
             for family, count in commitment.draws.items():
@@ -221,18 +199,12 @@ def drawn_again(
 
 
 def is_same_scene(spec: SceneSpec, other: SceneSpec) -> bool:
-    """Return whether two records are the same up to a machine's arithmetic.
-
-    They may differ in the fields that depend on it.
-    """
+    """Return whether records differ only in fields that depend on machine arithmetic."""
     return spec.model_dump(exclude={*_OF_ARITHMETIC}) == other.model_dump(exclude={*_OF_ARITHMETIC})
 
 
 def other_arithmetic(commitment: Commitment) -> str:
-    """Return how machine and libraries differ from the commitment's, in words.
-
-    Empty if they do not.
-    """
+    """Return how machine and libraries differ from the commitment's, if they do."""
     here = _made_with()
     names = [name for name in here if commitment.made_with.get(name) != here[name]]
     return ", ".join(f"{name} {commitment.made_with.get(name, 'unknown')} there, {here[name]} here" for name in names)

@@ -1,7 +1,4 @@
-"""Build the rows of a released folder from a study's tables.
-
-The study must have rendered clips.
-"""
+"""Build the rows of a release from the tables of a study with rendered clips."""
 
 from __future__ import annotations
 
@@ -48,10 +45,7 @@ Rows = Sequence[Mapping[str, Any]]
 
 @dataclass(frozen=True)
 class Content:
-    """The released content.
-
-    ITEMS rows of pairs and arms; SCENE_SPECS rows; clips by released path; the benchmark.
-    """
+    """A release's content: ITEMS and SCENE_SPECS rows, clips by path, benchmark."""
 
     items: Rows
     specs: Rows
@@ -65,10 +59,7 @@ class Content:
 
 
 def content_of(workspace: Workspace, arms: Sequence[str] = ()) -> Content:
-    """Return a study's pairs, and items of these arms.
-
-    Raises TrapsError for missing tables, or a wrong clip.
-    """
+    """Return a study's pairs and these arms' items. Raises TrapsError if unsound."""
     items = _records(workspace, ITEMS, (*DATASETS, *arms))
     if not items:
         raise TrapsError(f"{workspace.root}: no pairs to release; make items first (traps run ... --until items)")
@@ -105,10 +96,7 @@ def lite_of(items: Iterable[Mapping[str, Any]]) -> set[str]:
 
 
 def pair_rows(content: Content) -> list[PairRow]:
-    """Return one row per pair, sorted by id.
-
-    Raises TrapsError for a pair with a missing side.
-    """
+    """Return one row per pair, sorted by id. Raises TrapsError for a missing side."""
     lite, rows, pairs = lite_of(content.items), list[PairRow](), dict[str, dict[str, Mapping[str, Any]]]()
     for row in content.items:
         if row["dataset"] in DATASETS:
@@ -150,10 +138,7 @@ def item_rows(content: Content) -> list[ReleasedItemRow]:
 
 
 def held_out_rows(content: Content, key: bytes) -> list[HeldOutItemRow]:
-    """Return one row per item, sorted by opaque name.
-
-    No field reveals its answer.
-    """
+    """Return one row per item, sorted by opaque name; no field reveals the answer."""
     rows = [
         HeldOutItemRow(
             item=opaque(key, row["item_id"]),
@@ -168,10 +153,7 @@ def held_out_rows(content: Content, key: bytes) -> list[HeldOutItemRow]:
 
 
 def held_out_clip(media_digest: str) -> str:
-    """Return a clip's path in a folder without answers.
-
-    Its name is the digest of its content.
-    """
+    """Return a clip's path without answers: its name is its content's digest."""
     return f"{_CLIPS}{media_digest[:2]}/{media_digest[:32]}.mp4"
 
 
@@ -181,10 +163,7 @@ def scenario_rows(content: Content) -> list[ScenarioRow]:
 
 
 def certificate_rows(content: Content) -> list[CertificateRow]:
-    """Return one row per certificate and scenario.
-
-    It is evaluated on the numbers that its record stores.
-    """
+    """Return one row per certificate and scenario, evaluated on the record's numbers."""
     return [row for spec in content.specs for row in _certificates(spec_of(dict(spec)), content.release.canary)]
 
 

@@ -1,7 +1,4 @@
-"""Describe a released folder in Croissant 1.1.
-
-It has the fields of responsible AI.
-"""
+"""Describe a release in Croissant 1.1, with the fields of responsible AI."""
 
 from __future__ import annotations
 
@@ -72,10 +69,7 @@ _RAI: Mapping[str, Any] = {
 
 
 def croissant(root: Path, manifest: Mapping[str, Any], tables: Sequence[Table[Any]], places: Mapping[str, str]) -> str:
-    """Return the description as JSON-LD.
-
-    root: the folder, which already holds the tables.
-    """
+    """Return the JSON-LD description of a folder that already holds the tables."""
     described: dict[str, Any] = {
         "@context": _CONTEXT,
         "@type": "sc:Dataset",

@@ -1,7 +1,4 @@
-"""Write the released folder (`traps publish release`).
-
-The same study gives the same bytes.
-"""
+"""Write the folder of `traps publish release`, byte-identical for the same study."""
 
 from __future__ import annotations
 
@@ -69,10 +66,7 @@ class Options:
 
 @dataclass(frozen=True)
 class ReleaseSummary:
-    """A summary of the written folder.
-
-    Numbers of files, clips and rows by table, and the path of held-out answers.
-    """
+    """A written folder's counts of files, clips and rows, and the held-out answers."""
 
     files: int
     clips: int
@@ -98,10 +92,7 @@ class _Folder:
 
 
 def write_release(content: Content, target: Path, options: Options) -> ReleaseSummary:
-    """Write the folder; it may replace only a former release.
-
-    Raises TrapsError.
-    """
+    """Write the folder; it may replace only a former release. Raises TrapsError."""
     if target.exists() and any(target.iterdir()) and not (target / CHECKSUMS).is_file():
         raise TrapsError(
             f"{target}: holds other files, or what a stopped release left; give an empty or a new folder, or delete it"
@@ -201,10 +192,7 @@ ANONYMOUS_CITATION = {
 
 
 def identifying() -> dict[str, str]:
-    """Return the texts that identify the authors, each with its replacement.
-
-    Double-blind review needs it.
-    """
+    """Return texts that identify the authors, with replacements for blind review."""
     data = yaml.safe_load((ROOT / CITATION).read_text(encoding="utf-8"))
     paper = data["preferred-citation"]
     names = [f"{author['given-names']} {author['family-names']}" for author in paper["authors"]]

@@ -1,7 +1,4 @@
-"""Define the tables of a released folder.
-
-The data dictionary, the card and the Croissant description are made from them.
-"""
+"""Define a release's tables, the source of dictionary, card and Croissant file."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -45,10 +42,7 @@ PAIRS = Table("pairs", PairRow, partition_by=(), key=("pair_id",))
 
 @dataclass(frozen=True, kw_only=True)
 class ReleasedItemRow(ItemRow):
-    """An item: what a model is asked about one clip.
-
-    Items of arms have an arm as their dataset.
-    """
+    """What a model is asked about one clip; items of arms have an arm as dataset."""
 
     file_name: Annotated[str, "mp4, relative to this table's folder"]
     lite: Lite
@@ -60,10 +54,7 @@ RELEASED_ITEMS = Table("items", ReleasedItemRow, partition_by=(), key=("item_id"
 
 @dataclass(frozen=True, kw_only=True)
 class HeldOutItemRow:
-    """An item whose answer is withheld.
-
-    Neither its name nor its place in the table tells its side or its pair.
-    """
+    """An item without its answer; neither name nor place tells its side or pair."""
 
     item: Annotated[str, "an opaque name, by which answers are sent in"]
     question: shared.Question
@@ -87,10 +78,7 @@ SCENARIOS = Table("scenarios", ScenarioRow, partition_by=(), key=("scenario_id",
 
 @dataclass(frozen=True, kw_only=True)
 class CertificateRow:
-    """A certificate of a scenario: a promise about its pair.
-
-    It is held against the numbers that its record stores.
-    """
+    """A certificate of a scenario's pair, checked against its record's numbers."""
 
     scenario_id: shared.ScenarioId
     certificate: Annotated[str, "name of the certificate"]

@@ -1,7 +1,4 @@
-"""Export a study's leaderboard.
-
-The hub's `.eval_results`, Every Eval Ever, and plain Parquet.
-"""
+"""Export a leaderboard as the hub's `.eval_results`, Every Eval Ever, and Parquet."""
 
 from __future__ import annotations
 
@@ -40,10 +37,7 @@ Row = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Attribution:
-    """The evaluating organization, and the developer of all models.
-
-    Reference models have their own developer.
-    """
+    """The evaluating organization, and the developer of all but reference models."""
 
     organization: str = "unknown"
     developer: str = "unknown"
@@ -54,9 +48,7 @@ class Attribution:
 
 
 def write_results(workspace: Workspace, target: Path, dataset: str, who: Attribution) -> list[str]:
-    """Write all rows as Parquet, and overall scores of every model that has them.
-
-    Return the files.
+    """Write all rows as Parquet, and models' overall scores; return the files.
 
     dataset: the repository of the release, as the hub names it.
 

@@ -22,10 +22,7 @@ def _library() -> Any:
 
 
 def sign(folder: Path, private_key: Path) -> Path:
-    """Sign a folder's files with a private elliptic key (PEM); return the signature.
-
-    Raises TrapsError.
-    """
+    """Sign a folder with a PEM key; return the signature's path. Raises TrapsError."""
     library, path = _library(), folder / SIGNATURE
     try:
         config = library.signing.Config().use_elliptic_key_signer(private_key=private_key)
@@ -39,10 +36,7 @@ def sign(folder: Path, private_key: Path) -> Path:
 
 
 def check_signature(folder: Path, public_key: Path) -> str:
-    """Return what is wrong with a folder's signature, or nothing.
-
-    Raises TrapsError for a missing library or file.
-    """
+    """Return what is wrong with a signature, if anything. Raises TrapsError."""
     library, path = _library(), folder / SIGNATURE
     if not path.is_file():
         raise TrapsError(f"{path}: is missing, so that there is nothing to verify; leave --key out")

@@ -1,6 +1,4 @@
-"""Pack a study's items, answers, votes and numbers into one file.
-
-Anybody can verify such a submission.
+"""Pack a study's items, answers, votes and numbers into one verifiable file.
 
 The file is a zip of Parquet tables and one JSON; nothing in it is executed. It is untrusted: names, sizes and schemas
 are checked before anything is read, and nothing is written to disk.
@@ -54,10 +52,7 @@ class _Strict(BaseModel):
 
 
 class SubmittedJudge(_Strict):
-    """A judge in a submission.
-
-    It holds everything that decides its votes, without address and key.
-    """
+    """A submission's judge: all that decides its votes, without address and key."""
 
     id: str = Field(max_length=200)
     backend: str = Field(max_length=50)
@@ -147,10 +142,7 @@ def pack(workspace: Workspace, target: Path, name: str) -> About:
 
 
 def table_bytes(table: Table[Any], frame: pd.DataFrame) -> bytes:
-    """Return the rows of a table as Parquet, sorted by its key.
-
-    Equal rows give equal bytes.
-    """
+    """Return rows as Parquet, sorted by the table's key; equal rows give equal bytes."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -175,10 +167,7 @@ def _zipped(content: Mapping[str, bytes]) -> bytes:
 
 
 def read_submission(path: Path) -> Submission:
-    """Return a submission.
-
-    Raises TrapsError for unexpected names, columns, sizes, compression or formats.
-    """
+    """Return a submission. Raises TrapsError for anything unexpected in the file."""
     try:
         size = path.stat().st_size
         if size > MOST_FILE_BYTES:
@@ -217,10 +206,7 @@ def _members(path: Path, archive: zipfile.ZipFile) -> dict[str, bytes]:
 
 
 def _frame(path: Path, file: str, content: bytes) -> pd.DataFrame:
-    """Return a table whose size and columns are checked.
-
-    The size is checked before it is unpacked, and the columns are those of this version.
-    """
+    """Unpack a submitted table; check its size before, and its columns after."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

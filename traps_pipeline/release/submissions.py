@@ -1,7 +1,4 @@
-"""Rank submissions.
-
-Each is verified, and those with the same items and panel are ranked together.
-"""
+"""Verify submissions, and rank those with the same items and panel together."""
 
 from __future__ import annotations
 
@@ -43,10 +40,7 @@ class AcceptedSubmission:
 
     @property
     def group(self) -> tuple[str, str]:
-        """The digest of its items, and its panel.
-
-        Submissions with the same group are ranked together.
-        """
+        """The items' digest and the panel, which submissions ranked together share."""
         items = self.submission.table(ITEMS)
         about = self.submission.about
         return digest(sorted(items["item_hash"]))[:16], id_of_judges(about.panel, about.judges)
@@ -62,10 +56,7 @@ class RefusedSubmission:
 
 @dataclass(frozen=True)
 class RankedGroup:
-    """Entries that are ranked together.
-
-    LEADERBOARD rows, of models named model@submission if names repeat.
-    """
+    """LEADERBOARD rows ranked together, named model@submission if names repeat."""
 
     items: str
     panel: str
@@ -90,10 +81,7 @@ class Board:
 
 
 def gather(paths: Iterable[Path], release: Path | None = None, say: Callable[[str], None] = lambda line: None) -> Board:
-    """Verify submissions and rank the valid ones.
-
-    Raises TrapsError if two have one name, and if none is valid.
-    """
+    """Verify and rank submissions. Raises TrapsError for equal names, or none valid."""
     board = Board()
     for path in paths:
         try:
@@ -123,10 +111,7 @@ def gather(paths: Iterable[Path], release: Path | None = None, say: Callable[[st
 
 
 def _group(key: tuple[str, str], members: Sequence[AcceptedSubmission]) -> RankedGroup:
-    """Return the members' verdicts scored together.
-
-    Their differences are then paired over the same scenarios.
-    """
+    """Score members' verdicts together, to pair differences over the same scenarios."""
     owners = Counter(model for member in members for model in _verdicts(member)["model"].unique())
     parts, submissions = list[pd.DataFrame](), dict[str, str]()
     for member in members:

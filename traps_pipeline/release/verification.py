@@ -1,8 +1,7 @@
-"""Verify a submission.
+"""Verify a submission: recast votes, recompute numbers, compare with a release.
 
-Its votes are recast if that needs no key, every number is recomputed, and it is compared with a release.
-
-Items, prompts and media are compared with the release's. The result names what cannot be checked.
+Votes are recast if that needs no key. Items, prompts and media are compared with the release's. The result names what
+cannot be checked.
 """
 
 from __future__ import annotations
@@ -123,10 +122,7 @@ def _wrong_prompts(submission: Submission) -> Iterator[str]:
 
 
 def released_items(release: Path) -> dict[str, tuple[str, str]]:
-    """Return digests of item and clip by released item.
-
-    Raises TrapsError, also for an altered folder.
-    """
+    """Return digests of item and clip by item. Raises TrapsError, also if altered."""
     from traps_pipeline.release.checksums import altered_files
     from traps_pipeline.release.content import CLIPS
 
@@ -241,10 +237,7 @@ def _cast_again(task: str, user: str) -> Outcome:
 
 
 def _other_vote(row: Row, item: Row, again: Outcome | None) -> str:
-    """Return how a vote differs from the correct one.
-
-    An item with a wrong kind decides nothing.
-    """
+    """Return how a vote differs from the correct one; wrong kinds decide nothing."""
     try:
         return _difference(row, item, again)
     except (ValueError, TypeError, AttributeError) as error:
@@ -275,10 +268,7 @@ def _difference(row: Row, item: Row, again: Outcome | None) -> str:
 
 
 def _numbers(verified: Verification, submission: Submission) -> None:
-    """Compute verdicts, metrics and leaderboard from the votes.
-
-    Record how the submission's numbers differ.
-    """
+    """Recompute verdicts, metrics and leaderboard; record differing numbers."""
     own = id_of_judges(submission.about.panel, submission.about.judges)
     try:
         tables = (submission.table(table) for table in (ITEMS, RESPONSES, VOTES))

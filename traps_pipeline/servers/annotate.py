@@ -56,10 +56,7 @@ class Reopen(BaseModel):
 
 
 class Annotation:
-    """A study whose clips and answers people label.
-
-    It is as it was when this object was created.
-    """
+    """A study whose clips and answers people label, as it was at creation."""
 
     def __init__(self, workspace: Workspace) -> None:
         self.workspace = workspace
@@ -120,10 +117,7 @@ class Annotation:
         return unit
 
     def find(self, who: str, handle: str) -> tuple[TaskName, str]:
-        """Return the task and unit of a handle that was given to this person.
-
-        Raises NotFound.
-        """
+        """Return a person's task and unit behind a handle. Raises NotFound."""
         for each in self.store.shown(who):
             task = require_task(each.task)
             if self.store.handle(who, each.task, each.unit) == handle and each.unit in self.samples[task].index:
@@ -131,10 +125,7 @@ class Annotation:
         raise NotFound("nothing of this name is shown to you")
 
     def record(self, who: str, sent: SubmittedLabel) -> None:
-        """Store a label.
-
-        Raises NotFound, Refused and Conflict.
-        """
+        """Store a label. Raises NotFound, Refused and Conflict."""
         task, unit = self.find(who, sent.handle)
         try:
             label = LABELS[task].model_validate(sent.label)
@@ -146,10 +137,7 @@ class Annotation:
             raise Conflict(str(error)) from error
 
     def reopen(self, who: str, name: str) -> None:
-        """Show the last labelled unit of a task again.
-
-        Raises NotFound without one.
-        """
+        """Show a task's last labelled unit again. Raises NotFound without one."""
         task = require_task(name)
         known = [unit for unit in self.store.labelled(who, task) if unit in self.samples[task].index]
         if not known:
@@ -157,10 +145,7 @@ class Annotation:
         self.store.show(who, task, known[-1], str(self.samples[task].loc[known[-1], "scenario_id"]))
 
     def clip(self, who: str, handle: str) -> Path:
-        """Return the clip behind a handle.
-
-        Raises NotFound.
-        """
+        """Return the clip behind a handle. Raises NotFound."""
         task, unit = self.find(who, handle)
         if task != "answerability":
             raise NotFound("nothing of this name is shown to you")
@@ -206,10 +191,7 @@ class Annotation:
 
 
 def annotation_app(annotation: Annotation) -> FastAPI:
-    """Return the app of the labelling pages.
-
-    The guard before it identifies the person.
-    """
+    """Return the app of the labelling pages, behind a guard that identifies people."""
     app = new_app()
 
     def who(request: Request) -> str:

@@ -1,7 +1,4 @@
-"""Preview the cost of a correction before it is decided.
-
-It is the items, calls and dollars to ask again.
-"""
+"""Preview a correction's cost: items, calls and dollars to ask again."""
 
 from __future__ import annotations
 
@@ -60,10 +57,7 @@ class CorrectionEffect:
 
 
 def correction_effect(workspace: Workspace, spec: Mapping[str, Any], correction: Correction) -> CorrectionEffect:
-    """Return the effect of a correction on a SCENE_SPECS row.
-
-    Raises TrapsError for refused parameters.
-    """
+    """Return a correction's effect on a row. Raises TrapsError for refused parameters."""
     changes = correction.changes()
     question, renders = changes.get("question", spec["question"]), False
     if "params" in changes:

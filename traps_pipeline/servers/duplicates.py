@@ -25,9 +25,9 @@ class Neighbour:
 
 
 def fingerprint(clip: Path) -> np.ndarray:
-    """Return the difference hash of first, middle and last frame.
+    """Return first, middle and last frames' difference hash. Raises DamagedClip.
 
-    (3 * SIDE * SIDE,) bool. Raises DamagedClip.
+    Shape (3 * SIDE * SIDE,), bool.
     """
     import cv2
 
@@ -59,9 +59,7 @@ def neighbours(prints: Mapping[str, np.ndarray], families: Mapping[str, str]) ->
 class Comparison:
     """The neighbours of all scenarios, computed in the background on first use.
 
-    Decoding 700 clips takes a minute.
-
-    clips: control clips by scenario; unreadable ones are left out.
+    Decoding 700 clips takes a minute. clips: control clips by scenario; unreadable ones are left out.
     """
 
     def __init__(self, clips: Mapping[str, Path], families: Mapping[str, str]) -> None:

@@ -1,6 +1,4 @@
-"""Store labels of `traps people annotate`.
-
-They go into SQLite, and the append-only file that stages read.
+"""Store labels of `traps people annotate` in SQLite and an append-only file.
 
 A label is committed, appended to `labels.jsonl` and synced to disk before it is confirmed, so that a kill loses no
 confirmed label. A label that a kill leaves between the two steps is appended when the store is next opened; if the
@@ -48,18 +46,12 @@ CREATE INDEX IF NOT EXISTS labels_of_a_person ON labels (who, task);
 
 
 class NotWaiting(TrapsError):
-    """An error: the labelled unit waits for no label.
-
-    For instance, it was labelled in another window.
-    """
+    """The error that a unit waits for no label, e.g. as another window labelled it."""
 
 
 @dataclass(frozen=True)
 class ShownUnit:
-    """A unit that was shown to a person.
-
-    at: seconds since 1970, when it was last shown. waits: it has no label yet.
-    """
+    """A unit shown to a person: last at `at` (s since 1970); `waits` while unlabelled."""
 
     task: str
     unit: str
@@ -69,10 +61,7 @@ class ShownUnit:
 
 
 class LabelStore:
-    """The labels of a study in one folder, which several processes may have open.
-
-    Raises TrapsError for a damaged file.
-    """
+    """A study's labels in a shared folder. Raises TrapsError for a damaged file."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -86,10 +75,7 @@ class LabelStore:
 
     @contextmanager
     def _database(self) -> Iterator[sqlite3.Connection]:
-        """Open a connection whose changes are committed when the block ends.
-
-        They are synced, too. After an error nothing is committed.
-        """
+        """Open a connection; commit and sync at the block's end, unless it raises."""
         try:
             with closing(sqlite3.connect(self.folder / DATABASE, timeout=30, isolation_level=None)) as database:
                 database.execute("PRAGMA synchronous=FULL")
@@ -104,10 +90,7 @@ class LabelStore:
             ) from error
 
     def handle(self, who: str, task: str, unit: str) -> str:
-        """Return an opaque name of a unit for one person's browser.
-
-        It is different for each person.
-        """
+        """Return an opaque name of a unit, different for each person's browser."""
         content = "\0".join((who, task, unit)).encode()
         return hmac.new(self._secret.encode(), content, "sha256").hexdigest()[:HANDLE_DIGITS]
 
@@ -138,10 +121,7 @@ class LabelStore:
         return [unit for (unit,) in rows]
 
     def record(self, who: str, task: str, unit: str, label: Mapping[str, Any]) -> None:
-        """Store a label.
-
-        Raises NotWaiting if the unit is not shown to this person, or has been labelled meanwhile.
-        """
+        """Store a label; raise NotWaiting if the unit is not shown, or labelled meanwhile."""
         with self._database() as database:
             database.execute("BEGIN IMMEDIATE")
             row = database.execute(
@@ -160,10 +140,7 @@ class LabelStore:
         self._export()
 
     def _export(self, *, restore: bool = False) -> None:
-        """Append the labels that the file lacks.
-
-        restore: first import those that the database lacks.
-        """
+        """Append labels that the file lacks (`restore`: first import the database's gaps)."""
         path = self.folder / LABELS_FILE
         is_new = not path.exists()
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
@@ -204,10 +181,7 @@ class LabelStore:
 
 
 def _last_seq(descriptor: int) -> int:
-    """Return the number of the last label in the file, 0 in an empty one.
-
-    Half a line left by a crash is truncated.
-    """
+    """Return the last label's number in the file, or 0; drop half a line of a crash."""
     size = os.lseek(descriptor, 0, os.SEEK_END)
     from_ = max(0, size - _TAIL)
     tail = os.pread(descriptor, _TAIL, from_)

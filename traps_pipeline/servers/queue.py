@@ -23,9 +23,7 @@ MEANINGS: Mapping[QueueName, str] = {
 
 
 def flags(workspace: Workspace) -> pd.DataFrame:
-    """Return by scenario the disagreement of judges and of models.
-
-    Empty without verdicts.
+    """Return judges' and models' disagreement by scenario; empty without verdicts.
 
     `judges`: the number of judged answers without a unanimous panel. `models`: p (1 - p), from 0 to 0.25, of the share
     p of models that answer the controls correctly.
@@ -45,9 +43,7 @@ def queue(
     flagged: pd.DataFrame,
     alike: Mapping[str, float],
 ) -> list[str]:
-    """Return the scenarios of a queue, in order.
-
-    A reviewed scenario leaves every queue except `all`.
+    """Return a queue's scenarios in order; reviewed ones stay only in `all`.
 
     flagged: `flags`; alike: by scenario, the distance of its most similar one.
     """

@@ -1,7 +1,4 @@
-"""Serve `traps people review`: one scenario per screen, its clips in step.
-
-Decisions are appended to the corrections.
-"""
+"""Serve `traps people review`, and append decisions to the corrections."""
 
 from __future__ import annotations
 
@@ -42,9 +39,8 @@ Record = Mapping[str, Any]
 class Decision(BaseModel):
     """A reviewer's decision.
 
-    seen: the number of decisions about the scenario on the page.
-
-    `add` creates a new scenario of the same family, with this one's parameters and the changes.
+    seen: the number of decisions about the scenario on the page. `add` creates a new scenario of the same family, with
+    this one's parameters and the changes.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -80,10 +76,7 @@ class Review:
 
     @cached_property
     def specs(self) -> dict[str, Record]:
-        """SCENE_SPECS rows by scenario.
-
-        Raises TrapsError without any.
-        """
+        """SCENE_SPECS rows by scenario. Raises TrapsError without any."""
         rows = self.workspace.tables.read_all(SCENE_SPECS).sort_values("scenario_id").to_dict("records")
         if not rows:
             raise TrapsError(f"{self.workspace.root}: has no scenes yet; run `traps run EXPERIMENT` in it first")
@@ -102,10 +95,7 @@ class Review:
 
     @cached_property
     def comparison(self) -> Comparison:
-        """The comparison of control clips.
-
-        It starts when the queue of near duplicates is opened.
-        """
+        """The comparison of control clips, started by the queue of near duplicates."""
         differences = {
             id_: self.workspace.resolve(row["path"]) for (id_, side), row in self.clips.items() if side == "control"
         }
@@ -121,10 +111,7 @@ class Review:
         return {str(item): str(text) for item, text in zip(first["item_id"], first["text"], strict=True)}
 
     def spec(self, scenario_id: str) -> Record:
-        """Return the row of a scenario.
-
-        Raises NotFound.
-        """
+        """Return the row of a scenario. Raises NotFound."""
         if scenario_id not in self.specs:
             raise NotFound(f"{scenario_id}: not a scenario of this study")
         return self.specs[scenario_id]
@@ -140,10 +127,7 @@ class Review:
         return queue(name, list(self.specs), self.reviewed(), self.flags, alike)
 
     def decide(self, sent: Decision) -> None:
-        """Append a decision.
-
-        Raises NotFound, Refused and Conflict.
-        """
+        """Append a decision. Raises NotFound, Refused and Conflict."""
         spec = self.spec(sent.scenario_id)
         correction, decision_count = self._correction(sent.scenario_id, sent.action, sent.changes, sent.why), sent.seen
         if sent.action == "add":
@@ -161,10 +145,7 @@ class Review:
         return next(name for k in count(9001) if (name := f"{family}-{k}") not in used)
 
     def undo(self, sent: Undo) -> None:
-        """Take back the last decision.
-
-        Raises NotFound, Refused and Conflict.
-        """
+        """Take back the last decision. Raises NotFound, Refused and Conflict."""
         self.spec(sent.scenario_id)
         try:
             undo(sent.scenario_id, sent.seen, who=self.who, why=sent.why)
@@ -172,10 +153,7 @@ class Review:
             raise Conflict(str(error)) from error
 
     def preview(self, sent: Preview) -> dict[str, Any]:
-        """Return the words after the changes, and the cost of asking again.
-
-        Raises NotFound and Refused.
-        """
+        """Return changed words, and the cost to ask again. Raises NotFound and Refused."""
         spec = self.spec(sent.scenario_id)
         correction = self._correction(sent.scenario_id, "correct", sent.changes, "preview")
         cost = correction_effect(self.workspace, spec, correction)
@@ -251,10 +229,7 @@ class Review:
         )
 
     def done_page(self, name: QueueName) -> str:
-        """Return the page at the end of a queue.
-
-        It shows the decisions' effect, and the commands that follow.
-        """
+        """Return a queue's last page: the decisions' effect, and the next commands."""
         return page(
             "review_done.html.j2",
             effect=self.summary(),
@@ -268,19 +243,13 @@ class Review:
         )
 
     def _commands(self, experiment: str) -> list[str]:
-        """Return the commands that plan and run the changes.
-
-        They are for our experiment or one from a file.
-        """
+        """Return the commands that plan and run an experiment after the changes."""
         name = experiment if (EXPERIMENTS / f"{experiment}.yaml").is_file() else f"{experiment}.yaml"
         target = f"{shlex.quote(name)} --workspace {shlex.quote(str(self.workspace.root))}"
         return [f"traps status {target}", f"traps run {target}"]
 
     def strip(self, scenario_id: str) -> bytes:
-        """Return frames of the control above the void's at the same times, as JPEG.
-
-        Raises NotFound.
-        """
+        """Return a JPEG of control frames above the void's. Raises NotFound."""
         import cv2
 
         from traps_pipeline.video.encode import decode
@@ -299,10 +268,7 @@ class Review:
         return jpeg.tobytes()
 
     def clip(self, scenario_id: str, side: str) -> Path:
-        """Return the file of a clip.
-
-        Raises NotFound if the study has none.
-        """
+        """Return the file of a clip. Raises NotFound if the study has none."""
         row = self.clips.get((scenario_id, side))
         if row is None:
             raise NotFound(f"{scenario_id}: the study has no {side} clip of it")

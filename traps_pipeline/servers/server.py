@@ -1,6 +1,4 @@
-"""Share what local pages need.
-
-A FastAPI app behind the guard, templates, errors as sentences, and clips.
+"""Serve local pages: a guarded FastAPI app, templates, errors and clips.
 
 Only files that a study's tables name are served. The guard (`webguard`) admits only holders of the token, and refuses
 foreign hosts, foreign origins and every change that is not a POST of JSON.
@@ -43,10 +41,7 @@ class Conflict(TrapsError):
 
 
 def new_app() -> FastAPI:
-    """Return an app that answers a TrapsError with a sentence and a status.
-
-    It has no documentation pages.
-    """
+    """Return an app without docs pages; a TrapsError becomes sentence and status."""
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
 
     @app.exception_handler(TrapsError)
@@ -63,10 +58,7 @@ def new_app() -> FastAPI:
 
 
 def page(template: str, **values: Any) -> str:
-    """Return a page with the explorer's look.
-
-    Its policy allows only its own scripts, clips and pictures.
-    """
+    """Return a page with the explorer's look and a policy of its own content only."""
     style = (SHARED / "style.css").read_text(encoding="utf-8")
     digest = b64encode(hashlib.sha256(style.encode()).digest()).decode("ascii")
     return environment(WEB).get_template(template).render(style=style, style_digest=digest, **values)
@@ -74,20 +66,14 @@ def page(template: str, **values: Any) -> str:
 
 @cache
 def script(*names: str) -> str:
-    """Return sources of this room and of the explorer as one classic script.
-
-    It has its own scope.
-    """
+    """Return sources of this room and the explorer as one scoped classic script."""
     paths = [WEB / name if (WEB / name).is_file() else SHARED / name for name in names]
     sources = "\n".join(path.read_text(encoding="utf-8") for path in paths)
     return f'(() => {{\n"use strict";\n{sources}\n}})();\n'
 
 
 def study_file(workspace: Workspace, relative: str) -> Path:
-    """Return a clip that a table of the study names.
-
-    Raises NotFound for any other path.
-    """
+    """Return a clip that the study's tables name. Raises NotFound for any other path."""
     path = workspace.resolve(relative)
     inside = path.resolve().is_relative_to((workspace.root / "clips").resolve())
     if not inside or not path.is_file():
@@ -118,10 +104,7 @@ class Listening:
 
 
 def serve(app: FastAPI, listening: Listening) -> None:
-    """Serve an app behind the guard until Ctrl-C.
-
-    Each address is printed with its token.
-    """
+    """Serve an app behind the guard until Ctrl-C, and print addresses with tokens."""
     import uvicorn
 
     for person, address in listening.addresses().items():

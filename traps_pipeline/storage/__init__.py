@@ -1,4 +1,1 @@
-"""Store a study on disk.
-
-Its workspace and `study.yaml`, tables, ledger of paid calls, and prepared media.
-"""
+"""Store a study: workspace, `study.yaml`, tables, ledger and prepared media."""

@@ -1,7 +1,4 @@
-"""Define the benchmark's tables: scenarios, clips and items.
-
-It also tells which rows are still in the benchmark.
-"""
+"""Define the tables scenarios, clips and items, and select their current rows."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -87,10 +84,7 @@ VIDEOS = Table("videos", VideoRow, partition_by=("category",), key=("scenario_id
 
 @dataclass(frozen=True, kw_only=True)
 class ArmRow:
-    """An arm's or variation's clip and question, or why a scenario has none.
-
-    They lie beside the pair.
-    """
+    """An arm's or variation's clip and question, or why a scenario has none."""
 
     scenario_id: shared.ScenarioId
     category: shared.Category
@@ -149,11 +143,10 @@ def current_rows(
     columns: Sequence[str] | None = None,
     dataset: str | Sequence[str] = DATASETS,
 ) -> "pd.DataFrame":
-    """Return the rows of a table whose items are still in the benchmark.
+    """Return a table's rows whose items are still in the benchmark.
 
-    Rows of arms only if `dataset` names them.
-
-    Every count uses these: a cell that was evaluated before a correction may hold others.
+    Every count uses these: a cell that was evaluated before a correction may hold others. Rows of arms come only if
+    `dataset` names them.
     """
     rows = workspace.tables.read_all(table, columns, dataset=dataset)
     current_ids = workspace.tables.read_all(ITEMS, ["item_id"])["item_id"]

@@ -1,9 +1,4 @@
-"""Lease pieces of work that several processes share.
-
-The study's files may lie anywhere.
-
-A lease expires with its process, and another process makes the piece.
-"""
+"""Lease pieces of work that processes share; a lease expires with its process."""
 
 from __future__ import annotations
 
@@ -18,12 +13,7 @@ POLL_S = 0.2
 
 @contextmanager
 def alone(store: Store, name: str) -> Iterator[None]:
-    """Hold an exclusive lease on a piece of work within the block.
-
-    A second process waits.
-
-    Raises TrapsError if no lease can be had.
-    """
+    """Hold a lease within the block; other processes wait. Raises TrapsError."""
     while (lease := store.lease(name)) is None:
         time.sleep(POLL_S)
     with closing(lease):
@@ -31,9 +21,7 @@ def alone(store: Store, name: str) -> Iterator[None]:
 
 
 def leased_ranges(store: Store, work: str, items: int, size: int) -> Generator[range]:
-    """Yield ranges of at most `size` items, each under a lease.
-
-    The lease ends when the next range is requested.
+    """Yield ranges of up to `size` items, each leased until the next is requested.
 
     Ranges that no other process holds come first, then the others as they are released, finished or not. Raises
     TrapsError if no lease can be had.

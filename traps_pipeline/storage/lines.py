@@ -1,7 +1,4 @@
-"""Append JSON Lines with a checksum per line.
-
-Damaged lines are detected.
-"""
+"""Append JSON Lines with a checksum per line, to detect damaged lines."""
 
 from __future__ import annotations
 
@@ -20,10 +17,7 @@ NOT_WHOLE = "not what was written"
 
 
 def line_with_checksum(row: Mapping[str, Any]) -> bytes:
-    """Return a non-empty row as a JSON line whose last field is its checksum.
-
-    Raises ValueError for NaN.
-    """
+    """Return a JSON line that ends with its checksum. Raises ValueError for NaN."""
     body = json.dumps(row, ensure_ascii=False, allow_nan=False).encode()[:-1]
     return body + _SUM + _sum_of(body) + b'"}\n'
 
@@ -40,10 +34,7 @@ def is_whole(line: bytes) -> bool:
 
 @dataclass(frozen=True)
 class Line:
-    """A line of a file, numbered from 1.
-
-    whole: its checksum is right. torn: a last line that a crash cut off.
-    """
+    """A line of a file, numbered from 1: `whole` if intact, `torn` if cut by a crash."""
 
     number: int
     content: bytes
@@ -63,10 +54,7 @@ def read_checked(path: Path) -> Iterator[Line]:
 
 
 def append_whole(descriptor: int, content: bytes) -> None:
-    """Append all of the content, or nothing.
-
-    Half a line would corrupt the next one. Raises OSError.
-    """
+    """Append all of the content, or nothing. Raises OSError."""
     size, remaining = os.lseek(descriptor, 0, os.SEEK_END), content
     try:
         while remaining:

@@ -104,11 +104,9 @@ class Frames:
 class Media:
     """A clip as it is sent.
 
-    path: the mp4, or the zip of JPEGs. None for profile frames, which `sample` returns.
-
-    sha256: of the sent content (the mp4; the JPEGs one after another; pixels and times), wherever the clip lies.
-    times_s: seconds into the clip. fps: playing speed of a video; None for other profiles. size_bytes: of the file, or
-    of the pixels.
+    path: the mp4, or the zip of JPEGs; None for profile frames, which `sample` returns. sha256: of the sent content
+    (the mp4; the JPEGs one after another; pixels and times), wherever the clip lies. times_s: seconds into the clip.
+    fps: playing speed of a video; None for other profiles. size_bytes: of the file, or of the pixels.
     """
 
     profile: Profile
@@ -124,7 +122,7 @@ class Media:
 
 
 def pick(times: np.ndarray, spec: MediaSpec) -> np.ndarray:
-    """Return indices of the frames shown to a model; times: (F,) s of the clip's."""
+    """Return indices of the frames shown to a model; times: (F,) of the clip, in s."""
     return FramePolicy(spec.fps, spec.uniform, spec.most, spec.later).pick(times)
 
 
@@ -228,7 +226,7 @@ def profile_digest(spec: MediaSpec) -> str:
 
 
 def payload(media: Media) -> list[bytes]:
-    """Return the bytes to send: of the mp4, or of each JPEG in order.
+    """Return the bytes of the mp4, or of each JPEG in order.
 
     Raises DamagedClip if the file has changed, TrapsError for profile frames.
     """
@@ -285,7 +283,7 @@ def _make(clip: Path, clip_digest: str, spec: MediaSpec, note: Path) -> Media:
 
 
 def _require(clip: Path, clip_digest: str) -> None:
-    """Raise DamagedClip unless the clip has the digest of its future media."""
+    """Raise DamagedClip unless the clip has the digest that its media will carry."""
     try:
         digest = file_digest(clip)
     except OSError as error:
@@ -342,10 +340,7 @@ def _unzipped(data: bytes) -> list[bytes]:
 
 @contextmanager
 def _alone(folder: Path) -> Iterator[None]:
-    """Hold a folder's lock: one process prepares, the others reuse the result.
-
-    The system frees it when its holder dies. Raises TrapsError.
-    """
+    """Hold a folder's lock, freed when its holder dies. Raises TrapsError."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
@@ -362,10 +357,7 @@ def _alone(folder: Path) -> Iterator[None]:
 
 
 class UriCache:
-    """An LRU cache of data URIs, by digest, bounded by their total length in bytes.
-
-    Threads that want the same clip at once share one encoding.
-    """
+    """A thread-safe LRU cache of data URIs by digest, bounded by their total length."""
 
     def __init__(self, most_bytes: int) -> None:
         self.most_bytes, self.held_bytes = most_bytes, 0

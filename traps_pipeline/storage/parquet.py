@@ -46,10 +46,7 @@ class State:
 
 @dataclass(frozen=True)
 class StageOutput:
-    """A stage's output for a partition before it is written: rows, or files by path.
-
-    Also its tally of work, the extra content to show of it, and data for its checks.
-    """
+    """A partition's unwritten rows or files, its tally, previews and check data."""
 
     content: Sequence[Any] | pd.DataFrame | Mapping[str, bytes]
     tally: Tally = field(default_factory=Tally)
@@ -67,10 +64,7 @@ class StageOutput:
 
 
 def joined(parts: Sequence[StageOutput]) -> StageOutput:
-    """Return the outputs of a partition's parts as one.
-
-    Rows are joined, tallies and shown numbers added up.
-    """
+    """Join the outputs of a partition's parts: concatenate rows, add up the numbers."""
     first, *later = parts
     for later_part in later:
         first.tally.add(later_part.tally)
@@ -86,9 +80,7 @@ class TableStore:
         self.root, self._store = root, store or FolderStore(root)
 
     def path(self, table: Table, partition: Mapping[str, Any]) -> Path:
-        """Return a partition's file: `<table>/<value>/.../<value>.parquet`.
-
-        `<table>/<table>.parquet` without partitions.
+        """Return a partition's file: `<table>/<value>/.../<value or table>.parquet`.
 
         No name is `column=value`: a file holds its partition columns, and readers would add them once more.
         """
@@ -203,21 +195,18 @@ class TableStore:
         return ""
 
     def read(self, table: Table, partition: Mapping[str, Any], columns: Sequence[str] | None = None) -> pd.DataFrame:
-        """Return one partition; raises TrapsError naming a missing file and its stage."""
+        """Return one partition. Raises TrapsError naming a missing file and its stage."""
         return self._load(table, self.path(table, partition), columns).to_pandas()
 
     def records(
         self, table: Table, partition: Mapping[str, Any], columns: Sequence[str] | None = None
     ) -> Iterator[dict[str, Any]]:
-        """Yield a partition's rows as mappings, few at once; raises as `read` does."""
+        """Yield a partition's rows as mappings, few at once. Raises TrapsError."""
         for batch in self._load(table, self.path(table, partition), columns).to_batches(_ROWS_AT_ONCE):
             yield from batch.to_pylist()
 
     def read_all(self, table: Table, columns: Sequence[str] | None = None, **equal: Any) -> pd.DataFrame:
-        """Return all partitions with these values (a list: any) of partition columns.
-
-        The frame is empty if there are none.
-        """
+        """Read partitions with these column values (a list: any of them); may be empty."""
         return self.read_arrow(table, columns, **equal).to_pandas()
 
     def read_arrow(self, table: Table, columns: Sequence[str] | None = None, **equal: Any) -> pa.Table:
@@ -312,12 +301,10 @@ def _sum_of(content: bytes) -> bytes:
 
 
 def _sound_bytes(path: Path) -> pa.BufferReader:
-    """Return a file's bytes after verifying them, or raise TrapsError.
-
-    Verified bytes are not verified again in this process while size and time are unchanged.
+    """Return a file's bytes, verified once per process until they change.
 
     Arrow's threads read a buffer without Python: with a file object of Python's they may meet an interpreter that is
-    ending, and abort or hang (https://github.com/apache/arrow/issues/50482).
+    ending, and abort or hang (https://github.com/apache/arrow/issues/50482). Raises TrapsError.
     """
     import pyarrow as pa
 
@@ -380,10 +367,7 @@ def _unreadable(path: Path, table: Table, error: Exception) -> TrapsError:
 
 
 def content_version(data: pa.Table) -> str:
-    """Return the digest of a table's content without volatile columns.
-
-    Unchanged content makes nothing downstream stale.
-    """
+    """Return the digest of a table's content without volatile columns."""
     lasting = data.drop_columns([c for c in VOLATILE if c in data.column_names])
     rows = (row for batch in lasting.to_batches(max_chunksize=_ROWS_AT_ONCE) for row in batch.to_pylist())
     return digest_of_list(rows)[:16]

@@ -19,10 +19,7 @@ Place = Path | str  # a folder, or an address s3://bucket/study
 
 
 def place_of(text: str) -> Place:
-    """Return the place that a text names: an object store's address, or a folder.
-
-    Raises TrapsError for another address.
-    """
+    """Parse an object store's address or a folder. Raises TrapsError."""
     if "://" not in text:
         folder = Path(text).absolute()
         require_history_path(folder)
@@ -37,10 +34,7 @@ def place_of(text: str) -> Place:
 
 
 def name_of(place: Place) -> str:
-    """Return a unique name of a study.
-
-    It is the folder's, with a digest of where it was created.
-    """
+    """Return a unique name of a study: its folder's, and a digest of where it began."""
     plain = re.sub(r"[^a-z0-9]+", "-", str(place).rpartition("/")[2].lower()).strip("-")[:LONGEST]
     return f"{plain}-{digest(str(place))[:8]}".lstrip("-")
 

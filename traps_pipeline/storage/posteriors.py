@@ -1,7 +1,4 @@
-"""Read the measured probability of each answer to a graded cut.
-
-See docs/arms.md, "Graded cuts".
-"""
+"""Read measured answer probabilities of graded cuts (docs/arms.md, "Graded cuts")."""
 
 from __future__ import annotations
 

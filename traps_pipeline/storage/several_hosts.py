@@ -1,8 +1,6 @@
-"""Reach the room `traps_pipeline.cluster` by its one entry point.
+"""Reach the room `traps_pipeline.cluster`, which only several hosts need.
 
-Only several hosts need that room, and no other room imports it.
-
-It is imported by name, and only if a study has a database that hosts share.
+It is imported by name, and only if a study has a database that hosts share. No other room imports it.
 """
 
 from __future__ import annotations
@@ -23,43 +21,30 @@ _ROOM = "traps_pipeline.cluster.entry"
 
 
 class SeveralHosts(Protocol):
-    """The interface that other rooms use.
-
-    workspace: a `Workspace`, which itself asks here.
-    """
+    """The interface of `traps_pipeline.cluster`; `workspace` is always a `Workspace`."""
 
     def open_store(self, place: Place, root: Path, study: Study | None = None) -> Store | None:
-        """Return the files of a study with a database.
+        """Open a study with a database, in a shared folder or an object store.
 
-        They lie in a shared folder or an object store.
-
-        They lie below `root` while they are used. study: the contents of `study.yaml`, if known; else they are read
+        Files lie below `root` while they are used. study: the contents of `study.yaml`, if known; else they are read
         from the address, and None is returned if there is no study. Raises TrapsError if the store or its database
         cannot be used.
         """
         ...
 
     def dagster_yaml(self, workspace: Any) -> dict[str, Any]:
-        """Return the `dagster.yaml` of a study whose runs go to Ray.
-
-        The variables that it names are exported.
-        """
+        """Return `dagster.yaml` for runs on Ray, and export the variables that it names."""
         ...
 
     def runs(self, workspace: Any, instance: dg.DagsterInstance, options: Any) -> Any:
-        """Return the `Runs` of a cluster (`pipeline/runs.py`).
-
-        Those of earlier commands have ended by then.
+        """Return a cluster's `Runs`, after those of earlier commands have ended.
 
         options: of `traps run`. Raises TrapsError if no run can be submitted from this host.
         """
         ...
 
     def sensors(self) -> Sequence[dg.SensorDefinition]:
-        """Return the sensors that start such runs and end those that cannot begin.
-
-        Dagster's daemon evaluates them.
-        """
+        """Return the daemon's sensors that start cluster runs and end unstartable ones."""
         ...
 
 

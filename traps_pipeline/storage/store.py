@@ -1,6 +1,4 @@
-"""Store a study's files behind one interface.
-
-They lie in a folder of one machine or in an object store.
+"""Define the interface to a study's files, in a folder or an object store.
 
 Code names a file by its path below the workspace's folder on this machine, writes it there, and publishes it with
 `keep`; before it reads files that another host may have written, it fetches them with `bring`. In a folder
@@ -27,20 +25,14 @@ LEASES = ".leases"  # in a study's folder: lease files
 
 @dataclass(frozen=True)
 class Lease:
-    """An exclusive right to a piece of work.
-
-    It is held until `close` or the end of this process.
-    """
+    """An exclusive right to a piece of work, until `close` or this process's end."""
 
     close: Callable[[], None]
 
 
 @dataclass(frozen=True)
 class UnusedObject:
-    """An unreferenced object in a study's store.
-
-    size: in bytes. at: when it was written, by the store's clock.
-    """
+    """An unreferenced object: size in bytes, and write time by the store's clock."""
 
     name: str
     size: int
@@ -58,26 +50,18 @@ class Store(ABC):
 
     @abstractmethod
     def here(self, path: Path) -> Path:
-        """Return a local file with the current content of a path.
-
-        Nobody changes it while it is read.
+        """Return a local file with a path's content, unchanged while it is read.
 
         Raises FileNotFoundError if there is none, TrapsError if it is damaged or cannot be fetched.
         """
 
     @abstractmethod
     def bring(self, paths: Iterable[Path]) -> None:
-        """Fetch these files, if they exist, to their local paths.
-
-        Raises TrapsError.
-        """
+        """Fetch these files, if they exist, to their local paths. Raises TrapsError."""
 
     @abstractmethod
     def keep(self, paths: Iterable[Path]) -> None:
-        """Publish these local files to every host, all or none.
-
-        Raises TrapsError and OSError.
-        """
+        """Publish local files to every host, all or none. Raises TrapsError, OSError."""
 
     @abstractmethod
     def write(self, files: Mapping[Path, bytes], *, note: str | None = None, durable: bool = False) -> None:
@@ -104,16 +88,11 @@ class Store(ABC):
 
     @abstractmethod
     def digests(self, paths: Iterable[Path]) -> dict[Path, str]:
-        """Return the SHA-256, in hex, of those files that exist.
-
-        No content is fetched.
-        """
+        """Return the hex SHA-256 of those files that exist, without fetching content."""
 
     @abstractmethod
     def lease(self, name: str) -> Lease | None:
-        """Take a lease on a piece of work.
-
-        None if any process, this one included, holds it.
+        """Take a lease on a piece of work; None if any process, also this one, holds it.
 
         It ends when it is closed, and soon after its process or host has died. A host that is cut off may lose it
         unknowingly, so work under a lease must be idempotent. Raises TrapsError.
@@ -121,17 +100,11 @@ class Store(ABC):
 
     @abstractmethod
     def below(self, folder: Path, pattern: str = "**/*") -> list[Path]:
-        """Return a folder's files whose relative paths match a pattern, sorted.
-
-        Hidden files are left out.
-        """
+        """Return a folder's files that match a relative pattern, sorted; none hidden."""
 
     @abstractmethod
     def note(self, path: Path) -> str | None:
-        """Return the note that was written with a file.
-
-        None without one, if only the file itself can tell.
-        """
+        """Return the note written with a file; None if only the file itself can tell."""
 
     @abstractmethod
     def changed_ns(self, path: Path) -> int:
@@ -139,18 +112,13 @@ class Store(ABC):
 
     @abstractmethod
     def look(self) -> None:
-        """Refresh the view of other hosts' files.
-
-        It may otherwise be half a second old.
-        """
+        """Refresh the view of other hosts' files, which may be half a second old."""
 
     def unused(self, *, is_removed: bool = False, grace_days: float | None = None) -> list[UnusedObject]:
         """Return unreferenced objects, the oldest first, and remove them if asked to.
 
-        A folder has none.
-
-        grace_days: their minimum age, GRACE_DAYS if None. Raises TrapsError if the store cannot be used, or is another
-        study's.
+        A folder has none. grace_days: their minimum age, GRACE_DAYS if None. Raises TrapsError if the store cannot be
+        used, or is another study's.
         """
         return []
 
@@ -201,10 +169,7 @@ class FolderStore(Store):
         return {path: file_digest(path) for path in self.there(paths)}
 
     def lease(self, name: str) -> Lease | None:
-        """See `Store`.
-
-        The lease is a lock on a file, which exists while it is held.
-        """
+        """See `Store`; the lease is a lock on a file, removed at its end."""
         folder = self.root / LEASES
         path = folder / name.replace("/", "-")
         with writable(folder):
@@ -246,8 +211,5 @@ def writable(folder: Path) -> Iterator[None]:
 
 
 def is_hidden(relative: Path) -> bool:
-    """Return whether a name on a file's path begins with a dot.
-
-    Such names are those of locks and unfinished files.
-    """
+    """Return whether a name on the path begins with a dot (locks, unfinished files)."""
     return any(part.startswith(".") for part in relative.parts)

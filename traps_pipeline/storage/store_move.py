@@ -1,6 +1,4 @@
-"""Move a study of one machine into an object store.
-
-Rows and spending go into the database, files under their digests.
+"""Move a study's rows and spending to a database, its files to an object store.
 
 Nothing is asked, rendered or extracted again. Until everything is there, the address is empty and the folder is the
 study; a killed move is repeated. Afterwards the folder is no longer a study, so that nobody pays twice; its files stay.
@@ -26,7 +24,7 @@ MOVED_STUDY = "study.moved.yaml"  # the new name of the folder's study.yaml
 
 
 def move_to_store(workspace: Workspace, address: Place) -> int:
-    """Move a study to an address (s3://BUCKET/STUDY); return its ledger's row count.
+    """Move a study to s3://BUCKET/STUDY; return its ledger's row count.
 
     Raises TrapsError, also while another process writes to the ledger.
     """

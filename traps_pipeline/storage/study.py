@@ -1,7 +1,4 @@
-"""Define `study.yaml`.
-
-It holds a workspace's benchmark, experiments, budget and mechanistic analyses.
-"""
+"""Define `study.yaml`: benchmark, experiments, budget and mechanistic analyses."""
 
 from __future__ import annotations
 
@@ -22,10 +19,7 @@ Regime = Annotated[str, Field(pattern=f"^({'|'.join(VQA_PROMPTS)})$")]
 
 
 class Layers(BaseModel):
-    """Layers of one model, counted as in hidden_states.
-
-    0 = embeddings, l = output of the l-th block.
-    """
+    """A model's layers as in hidden_states: 0 = embeddings, l = output of block l."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     steering: int = Field(ge=1, description="block whose output is steered")
@@ -49,9 +43,7 @@ class ProbeSettings(BaseModel):
 
 
 class NullSettings(BaseModel):
-    """The null directions against which an effect is ranked.
-
-    Each kind has a number of draws.
+    """The number of null directions of each kind against which an effect is ranked.
 
     They are steered at the largest dose on the datasets that they come from.
     """
@@ -127,10 +119,7 @@ class PatchingSettings(BaseModel):
 
 
 class MechanismSettings(BaseModel):
-    """The section `mechanism:` of an experiment and of `study.yaml`.
-
-    models: the local models, and their layers.
-    """
+    """The section `mechanism:` of experiments and `study.yaml`: models and layers."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     models: dict[str, Layers] = Field(min_length=1)
@@ -175,10 +164,7 @@ class MechanismSettings(BaseModel):
 
 
 class Asked(BaseModel):
-    """One experiment's requests about a study's scenarios.
-
-    mechanism: whether it includes mechanistic analyses.
-    """
+    """One experiment's scenarios, and whether they get mechanistic analyses."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     datasets: tuple[str, ...]
@@ -189,9 +175,7 @@ class Asked(BaseModel):
 
 
 class Study(BaseModel):
-    """`study.yaml` of a workspace.
-
-    It holds the benchmark, its subset, the panel, the budget and the experiments.
+    """`study.yaml`: benchmark and subset, panel, budget and experiments.
 
     benchmark, scenarios and per_family are fixed when the workspace is created; panel, epoch and budget may be edited.
     No command and no button asks a model that `experiments` does not name.

@@ -39,10 +39,7 @@ TYPES: tuple[Any, ...] = (str, int, float, bool, datetime, list[str])
 
 @dataclass(frozen=True)
 class StoredColumn:
-    """One column of a table.
-
-    Its name, its type (one of TYPES), whether values may be missing, its meaning and unit in words.
-    """
+    """A column: name, type (of TYPES), whether values may be missing, meaning, unit."""
 
     name: str
     type: Any
@@ -67,10 +64,7 @@ class ExtraColumns:
 
 
 def with_neighbours(row_type: type[Row]) -> type[Row]:
-    """Declare the columns beside the marked ones (`ExtraColumns`).
-
-    Place it below `@dataclass`.
-    """
+    """Declare the columns beside those marked `Beside`; place it below `@dataclass`."""
     annotations = dict[str, Any]()
     for name, annotation in row_type.__annotations__.items():
         annotations[name] = annotation
@@ -82,9 +76,7 @@ def with_neighbours(row_type: type[Row]) -> type[Row]:
 
 @dataclass(frozen=True)
 class Table(Generic[Row]):
-    """A table's contract.
-
-    Its name, the dataclass of its rows, the columns that partition it, its key.
+    """A table's contract: name, row type, partition columns and key.
 
     Layout: `tables/<table>/<value>/.../<value>.parquet`, one value for each partition column; the file holds these
     columns too. Raises ValueError for a key or partition column that the dataclass lacks.
@@ -110,10 +102,7 @@ class Table(Generic[Row]):
 
     @cached_property
     def columns(self) -> tuple[StoredColumn, ...]:
-        """The columns in the order of the fields.
-
-        Raises TypeError for an annotation that declares no column.
-        """
+        """The columns by field. Raises TypeError for an annotation without a column type."""
         return tuple(_columns(self.row_type))
 
     @property

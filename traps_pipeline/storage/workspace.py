@@ -1,6 +1,4 @@
-"""Define the paths of a workspace.
-
-A workspace is one folder, or one place in an object store, that holds one study.
+"""Define a workspace, the folder or place in an object store of one study.
 
 Code works with paths below `root`, a folder of this machine: the workspace itself, or a scratch folder for the files of
 an object store (`storage/store.py`).
@@ -38,10 +36,7 @@ DATABASE = "TRAPS_DATABASE"  # default variable for the database's address of a 
 
 
 class Workspace:
-    """Paths and stores of one study.
-
-    Use `Workspace.open` or `Workspace.create`.
-    """
+    """Paths and stores of one study; use `Workspace.open` or `Workspace.create`."""
 
     def __init__(self, root: Path, study: Study, address: str = "") -> None:
         self.root, self.study, self._address = root, study, address
@@ -58,27 +53,19 @@ class Workspace:
 
     @staticmethod
     def default_place() -> Place:
-        """Return `$TRAPS_WORKSPACE`, else `.workspaces/default`.
-
-        The latter lies in the checkout or the current folder.
-        """
+        """Return `$TRAPS_WORKSPACE`, else `.workspaces/default` of the checkout or cwd."""
         return place_of(os.environ.get(VARIABLE) or str(WORKSPACES / "default"))
 
     @staticmethod
     def is_there(place: Place) -> bool:
-        """Return whether a place holds a study.
-
-        Raises TrapsError if an object store cannot be used.
-        """
+        """Return whether a place holds a study. Raises TrapsError if a store fails."""
         if isinstance(place, str):
             return several_hosts().open_store(place, scratch_of(place)) is not None
         return (place / STUDY).is_file()
 
     @staticmethod
     def file_of(place: Place, name: str) -> Path | None:
-        """Return a file at the top of a study, even if the study cannot be opened.
-
-        None if there is none.
+        """Return a study's top-level file, if any, without opening the study.
 
         Raises TrapsError if an object store cannot be used.
         """
@@ -93,10 +80,7 @@ class Workspace:
 
     @classmethod
     def create(cls, place: Place, study: Study) -> Workspace:
-        """Create a workspace, or open an existing one of the same benchmark.
-
-        Raises TrapsError if it differs.
-        """
+        """Create a workspace, or open one of the same benchmark (else raise TrapsError)."""
         require_root()
         if cls.is_there(place):
             workspace = cls.open(place)
@@ -133,10 +117,7 @@ class Workspace:
 
     @property
     def mechanism(self) -> MechanismSettings:
-        """The study's mechanistic settings.
-
-        Raises TrapsError if it has none.
-        """
+        """The study's mechanistic settings. Raises TrapsError if it has none."""
         if self.study.mechanism is None:
             raise TrapsError(
                 f"{self.root}/study.yaml: asks nothing inside models; run an experiment with a `mechanism:` section "
@@ -145,20 +126,14 @@ class Workspace:
         return self.study.mechanism
 
     def allow(self, **changes: Any) -> Workspace:
-        """Return the workspace with changed fields of the study.
-
-        They may be budgets, prices, mechanism and experiments.
-        """
+        """Return the workspace with changed fields of its study, such as budgets."""
         changed = Workspace(self.root, self.study.model_copy(update=changes), self._address)
         changed.save_study()
         return changed
 
     @classmethod
     def open(cls, place: Place | None = None) -> Workspace:
-        """Return the workspace at a place (default: `default_place()`).
-
-        Raises TrapsError naming the file and the remedy.
-        """
+        """Open the workspace at a place (default: `default_place()`). Raises TrapsError."""
         place = place or cls.default_place()
         path = cls.file_of(place, STUDY)
         if path is None:
@@ -176,22 +151,14 @@ class Workspace:
         return cls(scratch_of(place), study, place) if isinstance(place, str) else cls(place.absolute(), study)
 
     def copy_dagster_yaml(self, home: Path | None = None) -> None:
-        """Copy the checkout's `dagster.yaml` to Dagster's folder if it has none.
-
-        home: the workspace's by default.
-
-        A study's own `dagster.yaml` may name another storage.
-        """
+        """Copy the checkout's `dagster.yaml` to Dagster's folder, unless it has its own."""
         own = (home or self.dagster_home) / "dagster.yaml"
         if own.is_symlink() or not own.exists():
             write_text(own, (ROOT / "dagster.yaml").read_text(encoding="utf-8"))
 
     @property
     def is_on_cluster(self) -> bool:
-        """Whether runs of this study may go to other hosts.
-
-        Then its history lies in its database.
-        """
+        """Whether runs may go to other hosts, so that the history is in the database."""
         return bool(self.study.database and os.environ.get(RAY))
 
     @property
@@ -212,18 +179,12 @@ class Workspace:
 
     @property
     def labels(self) -> Path:
-        """The folder of people's labels.
-
-        It holds the database of the pages, and the append-only file that stages read.
-        """
+        """The folder of people's labels: the pages' database and the file for stages."""
         return self.root / "labels"
 
     @property
     def trajectories(self) -> Path:
-        """The folder of trajectories simulated here.
-
-        They are simulated because a correction changed parameters.
-        """
+        """The folder of trajectories simulated again for corrected parameters."""
         return self.root / "trajectories"
 
     @property
@@ -273,12 +234,7 @@ class Workspace:
 
     @cached_property
     def ledger(self) -> Database:
-        """The database of answers, votes and money.
-
-        It lies in the study's folder, or in PostgreSQL.
-
-        Raises TrapsError naming the variable and the remedy.
-        """
+        """The database of answers, votes and money. Raises TrapsError with a remedy."""
         from traps_pipeline.ledger.postgres import postgres_of
         from traps_pipeline.ledger.sqlite import SqliteDatabase
 
@@ -287,10 +243,7 @@ class Workspace:
         return SqliteDatabase(self.ledger_folder)
 
     def failed_check(self, stage: str, check: str, key: str | None) -> Path:
-        """Return the file that exists while a check of a partition fails.
-
-        It holds the details.
-        """
+        """Return the file that exists, with the details, while a partition's check fails."""
         return self.root / "checks" / stage / check / f"{key or stage}.json"
 
     def failed_checks(self, stage: str, key: str | None) -> list[str]:
@@ -303,10 +256,7 @@ class Workspace:
         return self.store.here(self.failed_check(stage, check, key)).read_text(encoding="utf-8")
 
     def clip(self, scenario_id: str, side: str, scene_hash: str) -> Path:
-        """Return a clip's path.
-
-        Its name contains the scene hash, so a corrected scene overwrites no judged one.
-        """
+        """Return a clip's path; its scene hash keeps corrections from overwriting it."""
         return self.root / "clips" / scenario_id / f"{side}-{scene_hash[:16]}.mp4"
 
     def relative(self, path: Path) -> str:
@@ -319,18 +269,12 @@ class Workspace:
         return self.root / relative
 
     def bring(self, relatives: Iterable[str]) -> Path:
-        """Fetch these files, if they exist, and return the local folder that holds them.
-
-        Raises TrapsError.
-        """
+        """Fetch existing files; return their local root folder. Raises TrapsError."""
         self.store.bring(self.root / relative for relative in relatives)
         return self.root
 
     def bring_folder(self, folder: Path) -> Path:
-        """Fetch a folder's files to this machine and return the folder.
-
-        Raises TrapsError.
-        """
+        """Fetch a folder's files and return the folder. Raises TrapsError."""
         self.store.bring(self.store.below(folder))
         return folder
 

@@ -1,7 +1,4 @@
-"""Encode frames as H.264 clips and decode them, through PyAV.
-
-The same frames give the same bytes (one encoder thread).
-"""
+"""Encode frames as H.264 clips (always the same bytes) and decode them, with PyAV."""
 
 from __future__ import annotations
 
@@ -39,9 +36,7 @@ def frames_digest(frames: Sequence[np.ndarray]) -> str:
 
 
 def encode(frames: Sequence[np.ndarray], path: Path, fps: int) -> None:
-    """Write RGB frames (F, H, W, 3) as an mp4 (H.264, yuv420p, faststart).
-
-    The file appears whole or not at all.
+    """Write RGB frames (F, H, W, 3) as a whole mp4 (H.264, yuv420p, faststart).
 
     Raises TrapsError when it cannot be written (a full disk); a former file then still stands. Raises TrapsError, too,
     for a width or height that is odd, before anything is written.
@@ -70,10 +65,7 @@ def encode(frames: Sequence[np.ndarray], path: Path, fps: int) -> None:
 
 
 def decode(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return all frames (F, H, W, 3) uint8 RGB and their times (F,) in seconds.
-
-    Raises DamagedClip.
-    """
+    """Return frames (F, H, W, 3) uint8 RGB and times (F,) s. Raises DamagedClip."""
     import av
     from av.error import FFmpegError
 
@@ -93,10 +85,7 @@ def decode(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def count_frames(path: Path) -> int:
-    """Return how many frames a clip says that it has; nothing is decoded.
-
-    Raises DamagedClip.
-    """
+    """Return a clip's declared frame count without decoding. Raises DamagedClip."""
     import av
     from av.error import FFmpegError
 
@@ -110,10 +99,7 @@ def count_frames(path: Path) -> int:
 
 
 def decode_first(path: Path) -> np.ndarray:
-    """Return the first frame (H, W, 3) uint8 RGB alone.
-
-    Raises DamagedClip.
-    """
+    """Return the first frame (H, W, 3) uint8 RGB. Raises DamagedClip."""
     import av
     from av.error import FFmpegError
 

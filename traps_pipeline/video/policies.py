@@ -1,7 +1,4 @@
-"""Choose which frames of a clip a model is shown.
-
-Policies are a grid of so many a second, and so many evenly spaced ones.
-"""
+"""Choose which frames of a clip a model is shown: a time grid, or evenly spaced."""
 
 from __future__ import annotations
 
@@ -29,9 +26,8 @@ class FramePolicy:
     def pick(self, times: np.ndarray) -> np.ndarray:
         """Return indices of the frames nearest to the wanted times, none twice.
 
-        Of two equally near frames the earlier one is taken.
-
-        times: (F,) seconds, ascending. A grid starts at 0; uniform includes the first frame and the last one.
+        times: (F,) seconds, ascending. A grid starts at 0; uniform includes the first frame and the last one. Of two
+        equally near frames the earlier one is taken.
         """
         if self.uniform is not None and len(times) <= self.uniform:
             return np.arange(len(times))
@@ -69,18 +65,12 @@ def shown_at_end(n_frames: int, fps: int, last_s: float, until: int | None = Non
 
 
 def last_of_all(n_frames: int, fps: int) -> int:
-    """Return the last frame of the policy that stops looking first.
-
-    Every policy shows this frame or a later one last.
-    """
+    """Return the last frame that every policy reaches: each ends on it or later."""
     times = np.arange(n_frames) / fps
     return min(int(policy.pick(times)[-1]) for policy in POLICIES)
 
 
 def fewest_within(n_frames: int, fps: int, span: tuple[int, int]) -> int:
-    """Return the fewest frames that any policy shows within a span.
-
-    span: from its first frame up to its end.
-    """
+    """Return the fewest frames that any policy shows within a span (start, end)."""
     times = np.arange(n_frames) / fps
     return min(sum(span[0] <= int(i) < span[1] for i in policy.pick(times)) for policy in POLICIES)

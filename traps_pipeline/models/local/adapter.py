@@ -1,6 +1,4 @@
-"""Adapt every image-text-to-text model of transformers.
-
-Prompts in, hidden states and answers out.
+"""Adapt any image-text-to-text model: prompts in, hidden states and answers out.
 
     model = load_local_model(get_model("pocket"))
     prompt = model.prompt(system, question, frames, times_s)      # frames (N, H, W, 3) uint8, seconds into the clip
@@ -71,7 +69,7 @@ def load_local_model(entry: ModelEntry, *, inside: bool = False) -> LocalModel:
 
 
 def _make_room(checkpoint: Checkpoint, params: LocalParams, device: str) -> None:
-    """Unload the device's least recently used models until the weights fit.
+    """Unload a device's least recently used models until the weights fit.
 
     The memory of a model that a caller still holds is freed only when the caller drops it.
     """
@@ -145,10 +143,7 @@ def _load(checkpoint: Checkpoint, params: LocalParams, device: str) -> LocalMode
 
 
 def _require_packable(network: Any, name: str) -> None:
-    """Raise TrapsError naming modules that cannot be packed on a CPU.
-
-    Their rows are no multiple of the 64 weights that bitsandbytes packs.
-    """
+    """Raise TrapsError for modules that bitsandbytes cannot pack on a CPU (rows % 64)."""
     odd = [
         part
         for part, module in network.named_modules()
@@ -163,10 +158,7 @@ def _require_packable(network: Any, name: str) -> None:
 
 
 def _precision(params: LocalParams, device: str) -> dict[str, Any]:
-    """Return the arguments of `from_pretrained` about precision.
-
-    Raises TrapsError if NF4 lacks its library.
-    """
+    """Return precision arguments of `from_pretrained`. Raises TrapsError without NF4."""
     import torch
 
     options: dict[str, Any] = {"dtype": getattr(torch, params.dtype)}

@@ -1,6 +1,4 @@
-"""Answer waiting requests in batches on local models.
-
-One worker thread per device does so.
+"""Answer requests in batches on local models, with one worker thread per device.
 
 For callers it is like an API: one request, one outcome, one row of the ledger. So a crash loses only the running batch.
 """
@@ -52,10 +50,7 @@ class _Batch:
 
 
 class LocalBackend:
-    """A backend that answers one entry's requests with its checkpoint.
-
-    It is loaded at the first request.
-    """
+    """A backend that answers with an entry's checkpoint, loaded at the first request."""
 
     def __init__(self, entry: Entry) -> None:
         if not isinstance(entry, ModelEntry) or entry.media is None:
@@ -67,10 +62,7 @@ class LocalBackend:
         self._running: asyncio.Task[None] | None = None
 
     async def ask(self, request: Request) -> Outcome:
-        """Return the outcome of one attempt; see `Backend`.
-
-        Raises TrapsError if a retry would not help.
-        """
+        """Make one attempt (see `Backend`). Raises TrapsError if a retry cannot help."""
         answer: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
         self._waiting.requests.append(request)
         self._waiting.answers.append(answer)
@@ -136,18 +128,12 @@ def _frames(request: Request, spec: MediaSpec) -> Frames:
 
 
 def seeds(requests: Sequence[Request]) -> list[int]:
-    """Return a seed per request, from its key.
-
-    Runs differ, and the same call gives the same answer.
-    """
+    """Return a seed per request from its key, so that runs differ and repeats agree."""
     return [int(request.key[:16], 16) for request in requests]
 
 
 def outcome(text: str, finish: str, prompt_tokens: int, completion_tokens: int, served_model: str) -> Outcome:
-    """Return the outcome of an answer.
-
-    It is truncated if the limit cut it off, empty if no text is left.
-    """
+    """Return an answer's outcome: truncated at the limit, empty without text."""
     text = text.strip()
     kind = ("truncated" if finish == "length" else "answer") if text else "empty"
     return Outcome(

@@ -1,6 +1,4 @@
-"""Capture hidden states by hooks that keep one vector per layer.
-
-The library would keep tensors of every token.
+"""Capture hidden states with hooks that keep one vector per layer, not per token.
 
 Layers count as in the library's hidden_states: 0 = embeddings, l = output of the l-th block as it leaves the block. The
 library's own last state is the normed one; here both are kept.
@@ -28,28 +26,22 @@ ONE_TOKEN: tuple[Pooling, ...] = ("last", "answer")
 
 @dataclass
 class CapturedStates:
-    """States of one forward pass, on the model's device.
-
-    raw: embeddings and block outputs in order, each (d,).
-    """
+    """One pass's states on its device: embeddings and block outputs `raw`, each (d,)."""
 
     raw: list[Tensor] = field(default_factory=list)
     normed: Tensor | None = None
 
 
 def first_tensor(output: Any) -> Tensor:
-    """Return the hidden states in a module's output.
-
-    Blocks of some models return a tuple.
-    """
+    """Return the hidden states in a block's output, which some models wrap in a tuple."""
     return output[0] if isinstance(output, tuple) else output
 
 
 def pool(states: Tensor, pooling: Pooling, chosen: Tensor | None = None) -> Tensor:
-    """Return (1, T, d) pooled to (d,).
+    """Pool (1, T, d) to (d,): the last token's state, or a mean.
 
-    The state of the last token, in the model's precision, or the mean over all tokens, or over those that a mask (T,)
-    selects, in float32. The result is a copy: a view would keep the whole tensor alive.
+    The state of the last token is in the model's precision; the mean over all tokens, or over those that a mask (T,)
+    selects, is in float32. The result is a copy: a view would keep the whole tensor alive.
     """
     if len(states) != 1:
         raise ValueError(f"{len(states)} prompts in one pass: states are taken one prompt at a time")
@@ -62,10 +54,7 @@ def pool(states: Tensor, pooling: Pooling, chosen: Tensor | None = None) -> Tens
 def capturing(
     blocks: Iterator[Module], norm: Module, pooling: Pooling, chosen: Tensor | None = None
 ) -> Iterator[CapturedStates]:
-    """Keep the pooled states of forward passes in the block.
-
-    The hooks are always removed afterwards.
-    """
+    """Keep the pooled states of passes within the block; remove all hooks afterwards."""
     captured = CapturedStates()
 
     def embeddings(_: Module, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:

@@ -1,7 +1,4 @@
-"""Find and identify a checkpoint, and check that it fits into memory.
-
-Nothing is downloaded silently.
-"""
+"""Find and identify a local checkpoint (no download); check that it fits memory."""
 
 from __future__ import annotations
 
@@ -30,10 +27,7 @@ _NF4_BYTES = 0.6  # bytes of a weight in 4 bits with its share of scales and of 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A local checkpoint.
-
-    digest: the hub's commit, or the digest of the folder's content.
-    """
+    """A local checkpoint; `digest` is the hub's commit, or that of the content."""
 
     name: str
     folder: Path
@@ -41,19 +35,13 @@ class Checkpoint:
 
 
 def as_folder(name: str) -> Path | None:
-    """Return the folder that a `checkpoint:` names, relative to the checkout.
-
-    None if it is a hub id.
-    """
+    """Return a `checkpoint:` folder, relative to the checkout; None for a hub id."""
     folder = ROOT / name
     return folder if folder.is_dir() or not _HUB_ID.fullmatch(name) else None
 
 
 def find_checkpoint(params: LocalParams) -> Checkpoint:
-    """Return the checkpoint that an entry names.
-
-    Raises TrapsError, with the download command, if it is missing.
-    """
+    """Return an entry's checkpoint. Raises TrapsError with the download command."""
     require("local")
     folder = as_folder(params.checkpoint)
     if folder is not None:
@@ -71,9 +59,7 @@ def find_checkpoint(params: LocalParams) -> Checkpoint:
 
 
 def declared_digest(params: LocalParams) -> str | None:
-    """Return the digest of the weights in the ledger key.
-
-    It stands beside the entry.
+    """Return the weights' digest, which stands beside the entry in the ledger key.
 
     For a folder it is the digest of its content, for a hub id the commit in the hub's cache. None for a hub id whose
     `revision` is a commit, and for one that is not downloaded: it can be planned, and must be downloaded before it is
@@ -96,10 +82,7 @@ def download_command(params: LocalParams) -> str:
 
 
 def _cached_snapshot(params: LocalParams) -> Path | None:
-    """Return the folder of a hub id in the hub's cache, named by its commit.
-
-    None if it is missing.
-    """
+    """Return a hub id's cached folder, named by its commit; None if missing."""
     if find_spec("huggingface_hub") is None:
         return None  # without the extra `local` the model can be planned; `find_checkpoint` then says what is missing
     from huggingface_hub import try_to_load_from_cache
@@ -125,10 +108,7 @@ def _require_whole(folder: Path, name: str, remedy: str) -> None:
 
 
 def require_no_code(checkpoint: Checkpoint) -> None:
-    """Raise TrapsError for a checkpoint with its own code.
-
-    Such code could do whatever its user can.
-    """
+    """Raise TrapsError for a checkpoint that brings its own code."""
     code = [path.relative_to(checkpoint.folder).as_posix() for path in sorted(checkpoint.folder.rglob("*.py"))]
     for path in sorted(checkpoint.folder.glob("*.json")):
         if path.stat().st_size <= _CONFIG_BYTES and _has_own_code(path):
@@ -142,10 +122,7 @@ def require_no_code(checkpoint: Checkpoint) -> None:
 
 
 def _has_own_code(path: Path) -> bool:
-    """Return whether settings name classes of a checkpoint's own files.
-
-    JSON may spell the name in any way.
-    """
+    """Return whether settings name classes of own files, in any JSON spelling."""
     try:
         return '"auto_map"' in json.dumps(json.loads(path.read_bytes()))
     except (ValueError, RecursionError):
@@ -153,10 +130,7 @@ def _has_own_code(path: Path) -> bool:
 
 
 def folder_digest(folder: Path) -> str:
-    """Return the digest of a checkpoint folder's content, wherever it lies.
-
-    Cached until a file changes.
-    """
+    """Return the digest of a folder's content, cached until a file changes."""
     files = sorted(path for path in folder.iterdir() if path.suffix in _FILES)
     stamps = tuple((path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in files)
     return _content_digest(folder, stamps)
@@ -171,10 +145,7 @@ def _content_digest(folder: Path, stamps: tuple[tuple[str, int, int], ...]) -> s
 
 
 def weight_bytes(folder: Path, dtype: Dtype, quantisation: Quantisation) -> float:
-    """Return the memory in bytes that the weights take at this precision.
-
-    It is read from the headers of their files.
-    """
+    """Return the weights' bytes of memory at a precision, from their files' headers."""
     weights = sum(math.prod(shape) for file in sorted(folder.glob("*.safetensors")) for shape in _shapes(file))
     return weights * (_NF4_BYTES if quantisation == "nf4" else _ITEM_BYTES[dtype])
 
@@ -190,10 +161,7 @@ def _shapes(file: Path) -> list[Sequence[int]]:
 
 
 def free_bytes(device: str) -> float:
-    """Return the free memory of a device, in bytes.
-
-    Infinite if the system does not report it.
-    """
+    """Return a device's free bytes of memory; infinite if they are unknown."""
     if device == SPREAD:
         import torch
 

@@ -1,7 +1,4 @@
-"""Decode one batch with the library's own `generate`.
-
-It is steered, sampled per row, and stopped on demand.
-"""
+"""Decode a batch with the library's `generate`: steered, sampled and stoppable."""
 
 from __future__ import annotations
 
@@ -53,11 +50,9 @@ def decode(
     steering: Steers | None,
     stopped: Callable[[], bool],
 ) -> tuple[list[list[int]], list[dict[int, float]]]:
-    """Return the tokens after each prompt, and first-token log-probabilities.
+    """Return answers' tokens (greedy without `sampling`), and first-token log-probs.
 
     Tokens after an answer's end are included.
-
-    Decoding is greedy unless sampling is given.
     """
     import torch
 
@@ -76,10 +71,7 @@ def decode(
 
 
 class _FirstToken:
-    """A transformers logits processor that records the likeliest first tokens.
-
-    It changes nothing.
-    """
+    """A logits processor that only records the likeliest first tokens."""
 
     def __init__(self) -> None:
         self.likeliest: list[dict[int, float]] = []  # one per prompt: token to log-probability

@@ -1,7 +1,4 @@
-"""Load torch and transformers, quietly and in the right order.
-
-No other module does.
-"""
+"""Load torch and transformers, quietly and in the right order, only here."""
 
 from __future__ import annotations
 
@@ -20,10 +17,7 @@ from traps_pipeline.base.extras import require
 
 @cache
 def load_transformers() -> Any:
-    """Return transformers, set to send nothing and log only errors.
-
-    Raises TrapsError if it is not installed.
-    """
+    """Return transformers, set to send nothing. Raises TrapsError if not installed."""
     require("local")
     os.environ.setdefault("HF_HUB_DISABLE_TELEMETRY", "1")
     os.environ.setdefault("HF_HUB_DISABLE_PROGRESS_BARS", "1")
@@ -63,10 +57,7 @@ _KEPT: list[Any] = []
 
 
 def _torchvision_library() -> Path | None:
-    """Return the path of torchvision's compiled library without importing the package.
-
-    None if it is missing.
-    """
+    """Return the path of torchvision's library, if any, without importing it."""
     spec = find_spec("torchvision")
     folders = list(spec.submodule_search_locations or ()) if spec else []
     return next((path for folder in folders for path in Path(folder).glob("_C*.so")), None)

@@ -1,7 +1,4 @@
-"""Hold a checkpoint in memory: prompts, hidden states and answers.
-
-`adapter` loads and identifies it.
-"""
+"""Run a checkpoint in memory: prompts, hidden states and answers."""
 
 from __future__ import annotations
 
@@ -35,10 +32,7 @@ MEMORY_SHARE = 0.7  # share of free memory for a batch, by estimate
 
 @dataclass(frozen=True)
 class GeneratedAnswer:
-    """An answer. finish_reason: stop, or length if `max_new_tokens` cut it off.
-
-    first_token: log-probabilities of its likeliest first tokens.
-    """
+    """An answer, its end (stop, or length), and its likeliest first tokens' log-probs."""
 
     text: str
     prompt_tokens: int
@@ -61,10 +55,7 @@ class States:
 
 
 class LocalModel:
-    """A checkpoint in memory.
-
-    device, dtype, quantisation: as in the entry, never changed.
-    """
+    """A checkpoint in memory, with the entry's device, dtype and quantisation."""
 
     def __init__(self, network: Any, processor: Any, checkpoint: Checkpoint, params: LocalParams, device: str) -> None:
         self.network, self.processor, self.checkpoint, self.params, self.device = (
@@ -103,10 +94,7 @@ class LocalModel:
 
     @cached_property
     def identity(self) -> dict[str, Any]:
-        """The properties that decide hidden states besides the prompt.
-
-        They serve keys, and hold neither paths nor device.
-        """
+        """What decides hidden states besides the prompt (no paths, no device), for keys."""
         return {
             "checkpoint_digest": self.checkpoint.digest,
             "class": type(self.network).__name__,
@@ -134,10 +122,7 @@ class LocalModel:
         return f"{self.device} ({torch.cuda.get_device_name(self.device)})"
 
     def block(self, layer: int) -> Module:
-        """Return the block whose output is hidden_states[layer].
-
-        Raises TrapsError for a layer out of range.
-        """
+        """Return the block with output hidden_states[layer]. Raises TrapsError."""
         if not 1 <= layer <= self.n_layers:
             raise TrapsError(
                 f"{self.checkpoint.name}: no block {layer}; it has blocks 1 to {self.n_layers} (layer 0 are the "
@@ -192,10 +177,7 @@ class LocalModel:
     # --- hidden states ------------------------------------------------------------------------------------------------
 
     def forward(self, prompt: Prompt) -> Any:
-        """Run one bare pass over a prompt, without logits or gradients.
-
-        Return the library's output.
-        """
+        """Return the library's output of a bare pass, without logits or gradients."""
         import torch
 
         with torch.inference_mode():
@@ -302,10 +284,7 @@ class LocalModel:
         return GeneratedAnswer(text, prompt.n_tokens, len(own_tokens), finish, tuple(own_tokens), named)
 
     def placed(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return inputs of a prompt or batch on the model's device.
-
-        Pictures get its precision.
-        """
+        """Return inputs on the model's device, with pictures in its precision."""
         dtype, device = self.network.dtype, self.inputs_device
         return {
             name: value.to(device, dtype) if value.is_floating_point() else value.to(device)
@@ -313,10 +292,7 @@ class LocalModel:
         }
 
     def _row_bytes(self, prompt: Prompt, max_new_tokens: int) -> float:
-        """Return an upper estimate of a row's memory.
-
-        Keys and values, the widest activations, pictures, logits.
-        """
+        """Return an upper estimate of a row's memory, in bytes."""
         item, vocabulary = self.network.dtype.itemsize, self.network.config.get_text_config().vocab_size
         cache = self._cached_width * item * (prompt.n_tokens + max_new_tokens)
         passing = 28 * prompt.n_tokens * self.d_model * item  # a block's peak: residual, gate, up and down
@@ -325,10 +301,7 @@ class LocalModel:
 
     @cached_property
     def _cached_width(self) -> int:
-        """Cached numbers per token, over all blocks.
-
-        Blocks that share another's cache add none.
-        """
+        """Cached numbers per token over all blocks that do not share another's cache."""
         names = ("k_proj", "v_proj")
         widths = [module.out_features for name, module in self.blocks.named_modules() if name.endswith(names)]
         return sum(widths) or 2 * self.n_layers * self.d_model
@@ -339,10 +312,7 @@ def _first_token(tokens: int | Sequence[int]) -> int:
 
 
 def _decoder_parts(network: Any, name: str) -> tuple[Any, Any]:
-    """Return blocks and final norm of the language model.
-
-    Raises TrapsError for another architecture.
-    """
+    """Return the language model's blocks and final norm, or raise TrapsError."""
     decoder = network.get_decoder() if hasattr(network, "get_decoder") else None
     blocks, norm = getattr(decoder, "layers", None), getattr(decoder, "norm", None)
     expected = getattr(network.config.get_text_config(), "num_hidden_layers", None)

@@ -1,7 +1,4 @@
-"""Process prompts and batch them.
-
-Neither needs a model.
-"""
+"""Hold processed prompts, and batch them by form, length and memory."""
 
 from __future__ import annotations
 
@@ -16,11 +13,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Prompt:
-    """A processed prompt.
+    """A prompt's text, rendered by the chat template, and the processor's inputs.
 
-    text: rendered by the chat template, before the clip is expanded.
-
-    inputs: the processor's output, on the CPU, each with a first axis of one prompt (or of its patches or frames).
+    text: before the clip is expanded. inputs: on the CPU, each with a first axis of one prompt (or of its patches or
+    frames).
     """
 
     text: str
@@ -49,10 +45,7 @@ class Prompt:
 
     @property
     def form(self) -> tuple[tuple[str, tuple[int, ...]], ...]:
-        """The shapes that prompts of one batch must share.
-
-        Those of the clip's tensors except the first axis.
-        """
+        """The shapes that a batch shares: those of clips' tensors without the first axis."""
         clip = sorted(self.inputs.keys() - set(self.sequences))
         return tuple((name, tuple(self.inputs[name].shape[1:])) for name in clip)
 
@@ -73,10 +66,7 @@ def collate(prompts: Sequence[Prompt], pad_token: int) -> dict[str, Tensor]:
 
 
 def batches(prompts: Sequence[Prompt], row_bytes: Sequence[float], room: float) -> Iterator[list[int]]:
-    """Yield indices of prompts to batch.
-
-    A batch has one form, similar length, and as many as fit into the room (bytes).
-    """
+    """Yield batches of prompt indices: same form, like length, within `room` (bytes)."""
     by_form: defaultdict[Any, list[int]] = defaultdict(list)
     for i in sorted(range(len(prompts)), key=lambda i: prompts[i].n_tokens):
         by_form[prompts[i].form].append(i)

@@ -1,7 +1,4 @@
-"""Sample with a random stream per row.
-
-So an answer depends on its own seed and not on its batch.
-"""
+"""Sample with a random stream per row, so that its batch changes no answer."""
 
 from __future__ import annotations
 
@@ -29,9 +26,7 @@ class Sampling:
 
 
 class SeededNucleus:
-    """A logits processor of transformers that leaves one token per row possible.
-
-    It is drawn from the row's own stream.
+    """A logits processor that leaves one token, drawn from each row's own stream.
 
     Greedy decoding then picks that token. The nucleus is the smallest set of tokens whose probability reaches top_p.
     """
@@ -41,10 +36,7 @@ class SeededNucleus:
         self._streams = [np.random.default_rng(seed) for seed in sampling.seeds]
 
     def __call__(self, input_ids: Any, scores: Tensor) -> Tensor:
-        """Mask all logits except the sampled token's.
-
-        scores: (rows, vocabulary). The same shape is returned.
-        """
+        """Mask all logits (rows, vocabulary) except those of the sampled tokens."""
         import torch
 
         probabilities, order = (scores.float() / self._sampling.temperature).softmax(dim=-1).sort(descending=True)

@@ -25,10 +25,7 @@ _NF4_SKIP = ("model.visual", "lm_head")
 
 
 def tiny_model(family: Family, folder: Path, quantisation: Quantisation = "none") -> LocalModel:
-    """Return a family's tiny checkpoint from a folder, loaded by the real classes.
-
-    Build it if it is missing.
-    """
+    """Load a family's tiny checkpoint, built if missing, with the real classes."""
     build_tiny(family, folder)
     params = {"checkpoint": str(folder), "dtype": "float32", "quantisation": quantisation}
     params |= {"do_sample": False, "max_new_tokens": 8, "nf4_skip": _NF4_SKIP if quantisation == "nf4" else ()}
@@ -43,9 +40,7 @@ def _prompt(model: LocalModel, folder: Path) -> Prompt:
 
 
 def check_family(family: Family, folder: Path) -> str:
-    """Build, save and reload a checkpoint, and answer a clip.
-
-    Return the observation in words.
+    """Build, save, reload and ask a checkpoint; return what happened in words.
 
     Raises TrapsError, or any error of the library, if a step fails.
     """
@@ -55,10 +50,7 @@ def check_family(family: Family, folder: Path) -> str:
 
 
 def check_nf4(folder: Path) -> str:
-    """Load a tiny checkpoint in 4 bits, if the libraries for it are installed.
-
-    Return the observation in words.
-    """
+    """Load a tiny checkpoint in 4 bits, if possible; return what happened in words."""
     if absent := missing("nf4"):
         return f"{' and '.join(absent)} not installed (`{install_line('nf4')}`): entries in NF4 do not load"
     model = tiny_model("qwen3-vl", folder / "nf4", "nf4")

@@ -49,10 +49,7 @@ class LocalParams(BaseModel):
 
 
 class NetworkSize(BaseModel):
-    """The size of a network, for `traps plan`.
-
-    parameters_b: in billions. layers, width: of the language model.
-    """
+    """A network's billions of parameters, and its language model's layers and width."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     parameters_b: float = Field(gt=0)
@@ -61,10 +58,7 @@ class NetworkSize(BaseModel):
 
 
 class MechanismSpec(BaseModel):
-    """Overrides for loading a model for mechanistic analyses (docs/spec.md 7.1).
-
-    quantisation, with its nf4_skip: None means that of `params`.
-    """
+    """Overrides for mechanistic analyses (docs/spec.md 7.1); None: as in `params`."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     quantisation: Quantisation | None = None

@@ -1,7 +1,5 @@
 """Name what a block reads besides the residual stream and its own cache.
 
-Its inputs come from earlier blocks; its own cache holds its keys and values.
-
 Gemma 4 has two such paths, both of them arguments of its blocks. Its upper blocks compute no keys and values: each
 reads those of the last lower block with its kind of attention (`shared_kv_states`, a mapping by kind). And every block
 adds its own vector computed from the token and its embedding (`per_layer_input`). So a state at block l does not
@@ -33,12 +31,7 @@ _FIELDS: dict[str, tuple[Argument | None, str]] = {
 
 
 def unknown_path(config: Any, block: Module) -> str | None:
-    """Return a path of the model's configuration that no known argument covers.
-
-    Arguments are those of its blocks.
-
-    The path is described in words and by the name of its field; None if there is none.
-    """
+    """Describe a configured path that no known argument of the blocks covers, if any."""
     for field, (argument, path) in _FIELDS.items():
         if getattr(config, field, 0) and argument not in _arguments(type(block)):
             return f"{path} ({field})"
@@ -46,10 +39,7 @@ def unknown_path(config: Any, block: Module) -> str | None:
 
 
 def argument_of(block: Module, name: Argument, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-    """Return the argument with this name in a call of a block.
-
-    None if the block lacks it or the call omits it.
-    """
+    """Return a call's argument of a block; None if it is missing from either."""
     names = _arguments(type(block))
     place = names.index(name) if name in names else len(args)
     return args[place] if place < len(args) else kwargs.get(name)

@@ -1,6 +1,4 @@
-"""Locate the parts of a prompt.
-
-System prompt, time stamps, visual tokens, question, the last token.
+"""Locate a prompt's parts: system, times, visual tokens, question, last token.
 
 Nothing here depends on a family. Visual tokens are those of the processor's own placeholders. The rest is found by its
 text: tokens are decoded one by one, blanks are ignored on both sides (tokenizers write them differently), and a token
@@ -70,9 +68,7 @@ def visual_tokens(model: LocalModel, prompt: Prompt) -> np.ndarray:
 
 
 def changed_tokens(one: Prompt, other: Prompt, visual: np.ndarray) -> np.ndarray | None:
-    """Return where a prompt's visual tokens differ from another prompt's.
-
-    (T,) bool, by the pixels behind each token.
+    """Return where two prompts' visual tokens differ, by their pixels: (T,) bool.
 
     None if the clips have different numbers of pixels, or the processor's pixels do not come token by token. Qwen's do:
     the patches that are merged into one token follow each other.

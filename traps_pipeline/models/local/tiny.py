@@ -115,10 +115,7 @@ def build_tiny(
 
 
 def make_tokenizer(family: Family, tokenizer: Tokenizer | None = None) -> Any:
-    """Return a transformers tokenizer with the family's special tokens added.
-
-    default: one token per byte.
-    """
+    """Return a tokenizer (default: bytes) with the family's special tokens added."""
     transformers = load_transformers()
     special = _SPECIAL[family]
     base = _byte_level() if tokenizer is None else tokenizer
@@ -153,10 +150,7 @@ def _byte_level() -> Tokenizer:
 
 
 def make_config(family: Family, tokenizer: Any, text: Overrides | None = None, vision: Overrides | None = None) -> Any:
-    """Return the family's configuration for a tokenizer of `make_tokenizer`.
-
-    It is tiny, except for overridden fields.
-    """
+    """Return the family's tiny configuration for a tokenizer, with overrides."""
     transformers = load_transformers()
     ids = {name: tokenizer.convert_tokens_to_ids(token) for name, token in _SPECIAL[family].items()}
     shared = {"vocab_size": len(tokenizer), "pad_token_id": ids["pad"], "eos_token_id": ids["eos"]}
@@ -202,8 +196,8 @@ def _qwen3_vl(transformers: Any, ids: Mapping[str, int], base: Overrides, text: 
 def _gemma_4(transformers: Any, ids: Mapping[str, int], base: Overrides, text: Overrides, vision: Overrides) -> Any:
     """Build a model like E4B.
 
-    Sliding and full attention, per-layer embeddings, and upper blocks that read the keys and values of lower ones,
-    below which there are blocks whose keys and values no other block reads.
+    It has sliding and full attention, per-layer embeddings, and upper blocks that read the keys and values of lower
+    ones, below which there are blocks whose keys and values no other block reads.
     """
     words = {
         **base,
@@ -265,10 +259,7 @@ def _llava_next_video(
 
 
 def make_processor(family: Family, tokenizer: Any, video: Overrides | None = None) -> Any:
-    """Return the family's processor for a tokenizer of `make_tokenizer`.
-
-    `video` overrides fields of its video part.
-    """
+    """Return the family's processor for a tokenizer; `video` overrides its video part."""
     transformers = load_transformers()
     video_settings = dict(video or {})
     match family:

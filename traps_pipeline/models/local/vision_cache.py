@@ -1,6 +1,4 @@
-"""Cache the vision tower's output per clip.
-
-Mechanistic analyses show a model the same clip under several prompts, and steering again for every direction and dose.
+"""Cache the vision tower's output per clip, which many prompts and doses share.
 
 The three families say in their own ways which pixels belong to which clip (`_clips_of`); other classes run uncached. A
 clip is identified by the bytes of its pixels and its grid, so that a re-rendered clip is another one. Code that changes
@@ -26,10 +24,7 @@ MOST_BYTES = 2 * 2**30  # maximum bytes of cached features, on the model's devic
 
 @dataclass(frozen=True, eq=False)
 class _Features:
-    """A clip's features: decoder tokens, and additions after its first blocks.
-
-    By place.
-    """
+    """A clip's features: decoder tokens, and additions after first blocks, by place."""
 
     tokens: Tensor
     deepstack: tuple[Tensor, ...]
@@ -41,10 +36,7 @@ class _Features:
 
 @dataclass(eq=False)
 class ClipMemory:
-    """Features by clip, the latest ones.
-
-    passes: clips that went through the vision tower.
-    """
+    """Features of the latest clips; `passes` counts those that the tower encoded."""
 
     most_bytes: int = MOST_BYTES
     passes: int = 0
@@ -54,12 +46,7 @@ class ClipMemory:
 
     @contextmanager
     def remembering(self, network: Any) -> Iterator[None]:
-        """Cache the output of a network's vision tower within the block.
-
-        Each clip passes the tower once.
-
-        Nested contexts change nothing.
-        """
+        """Encode each clip once within the block; a nested block changes nothing."""
         owner = network.base_model
         original = getattr(owner, "get_video_features", None)
         if original is None or "get_video_features" in vars(owner):
@@ -119,10 +106,7 @@ class ClipMemory:
 
 
 def _clips_of(arguments: dict[str, Any]) -> list[dict[str, Tensor]] | None:
-    """Return the arguments of each clip alone.
-
-    None if the class does not separate clips.
-    """
+    """Return each clip's own arguments; None if the class does not separate clips."""
     pixels, grids = arguments["pixel_values_videos"], arguments.get("video_grid_thw")
     if grids is not None:  # Qwen3-VL: patches of all clips one after the other, and how many each has
         parts = pixels.split(grids.prod(-1).tolist())

@@ -13,10 +13,7 @@ ITEMS, ABOUT, MEDIA = "items.jsonl", "about.json", "media"
 
 @cache
 def about() -> dict[str, Any]:
-    """Return about the benchmark: name, version, canary, prompts and parameters.
-
-    Prompts are by regime, parameters are the protocol's.
-    """
+    """Return the benchmark's name, version, canary, prompts by regime, and parameters."""
     return json.loads((FOLDER / ABOUT).read_text(encoding="utf-8"))
 
 
@@ -33,10 +30,7 @@ def media_of(item: dict[str, Any]) -> list[Path]:
 
 
 def prompt(regime: str) -> str:
-    """Return the system prompt.
-
-    Raises ValueError with the known regimes.
-    """
+    """Return a regime's system prompt. Raises ValueError with the known regimes."""
     prompts: dict[str, str] = about()["prompts"]
     if regime not in prompts:
         raise ValueError(f"regime {regime!r} is unknown; known: {', '.join(prompts)}")

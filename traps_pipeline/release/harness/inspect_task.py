@@ -1,8 +1,5 @@
 # pyright: reportMissingImports=false
-"""Run the benchmark as an inspect_ai task.
-
-`inspect eval traps_task.py -T regime=standard --model ...`.
-"""
+"""Run the benchmark with inspect_ai (`inspect eval traps_task.py -T regime=...`)."""
 
 from __future__ import annotations
 
@@ -27,10 +24,7 @@ def traps(regime: str = "standard") -> Any:
 
 
 def evaluation(regime: str) -> Any:
-    """Return a task with all items under one regime, once.
-
-    Each run is a separate evaluation, as PECS is per run.
-    """
+    """Return a task with all items under a regime, once; each run is an evaluation."""
     system = prompt(regime)
     samples = [
         Sample(
@@ -76,10 +70,7 @@ def traps_figures() -> Any:
 
 @scorer(metrics=[traps_figures()])
 def panel(regime: str) -> Any:
-    """Return the scorer, the rule panel.
-
-    It gives 1 for a correct answer to a control and for abstention on a void.
-    """
+    """Return the rule panel as scorer: 1 for a correct control or an abstained void."""
     known = {item["item_id"]: item for item in items()}
 
     async def score(state: Any, target: Any) -> Any:

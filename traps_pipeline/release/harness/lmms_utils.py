@@ -1,8 +1,5 @@
 # pyright: reportMissingImports=false
-"""Run the benchmark as lmms-eval tasks, one per regime.
-
-The YAML files beside this one name these functions.
-"""
+"""Define the functions that the YAML files of lmms-eval tasks name."""
 
 from __future__ import annotations
 
@@ -34,18 +31,12 @@ def doc_to_target(doc: dict[str, Any]) -> str:
 
 
 def _text(doc: dict[str, Any], lmms_eval_specific_kwargs: Any = None, *, regime: str) -> str:
-    """Return system prompt and question as one text.
-
-    It is for models without a system prompt.
-    """
+    """Return system prompt and question as one text, for models without the former."""
     return f"{prompt(regime)}\n\n{doc['question']}"
 
 
 def _messages(doc: dict[str, Any], lmms_eval_specific_kwargs: Any = None, *, regime: str) -> list[dict[str, Any]]:
-    """Return the messages for a chat model.
-
-    System prompt, then the clip and the question, nothing else.
-    """
+    """Return chat messages: system prompt, then the clip and the question."""
     visuals = doc_to_visual(doc)
     kind = "video" if isinstance(visuals[0], str) else "image"
     content = [{"type": kind, "url": visual} for visual in visuals]
@@ -71,10 +62,7 @@ pecs, acc, abs_rec, false_abs, j, missing, unread = (partial(_figure, name=name)
 
 
 def __getattr__(name: str) -> Callable[..., Any]:
-    """Return a regime's function by its name in a task's YAML.
-
-    For example `guided_results`.
-    """
+    """Return a regime's function by its name in a task's YAML (`guided_results`)."""
     regime, _, kind = name.rpartition("_")
     if not regime or kind not in _BY_REGIME:
         raise AttributeError(name)

@@ -1,7 +1,4 @@
-"""Score answers with only the standard library.
-
-Texts are read, the rule panel applies, and PECS is computed.
-"""
+"""Score answers with the standard library: read texts, apply rules, compute PECS."""
 
 from __future__ import annotations
 
@@ -53,9 +50,8 @@ class PanelDecision:
 def judge(item: Mapping[str, Any], outcome: str, text: str | None, regime: str) -> PanelDecision:
     """Return the panel's decision about an answer.
 
-    outcome: answer, truncated, empty, refused or error.
-
-    All three judges of the panel `rules` read by the same rules, so one reading is their majority.
+    outcome: answer, truncated, empty, refused or error. All three judges of the panel `rules` read by the same rules,
+    so one reading is their majority.
     """
     row = {"outcome": outcome if (text or "").strip() or outcome not in ("answer", "truncated") else "empty"}
     reading = read_answer({**row, "text": text}, None, regime)

@@ -1,7 +1,4 @@
-"""Write the folder for inspect_ai and lmms-eval (`traps publish harness`).
-
-They evaluate models on a release with it.
-"""
+"""Write the folder with which inspect_ai and lmms-eval evaluate on a release."""
 
 from __future__ import annotations
 
@@ -46,10 +43,7 @@ MEDIA_SETTINGS: Mapping[Literal["images", "video"], MediaSpec] = {
 
 
 def media_settings(media: Literal["images", "video"], uniform: int | None = None) -> MediaSpec:
-    """Return the media settings of a clip.
-
-    The protocol's 25 frames, or evenly spaced ones. Raises TrapsError.
-    """
+    """Return media settings of the protocol, or of even frames. Raises TrapsError."""
     if uniform is None:
         return MEDIA_SETTINGS[media]
     if media == "video":
@@ -58,9 +52,7 @@ def media_settings(media: Literal["images", "video"], uniform: int | None = None
 
 
 def write_harness(release: Path, target: Path, media: MediaSpec = MEDIA_SETTINGS["images"]) -> int:
-    """Write the harness of a released folder's pairs to an empty folder.
-
-    Return the number of items.
+    """Write the harness of a release's pairs to an empty folder; return item count.
 
     media: of `media_settings`: the JPEGs or the mp4 that the pipeline sends, byte for byte. Raises TrapsError for an
     altered release or one without answers, and for a folder that holds other files.
@@ -95,10 +87,7 @@ def write_harness(release: Path, target: Path, media: MediaSpec = MEDIA_SETTINGS
 
 
 def rewritten_source(source: str) -> str:
-    """Return the source of one of this package's modules, for the harness.
-
-    Its imports are rewritten.
-    """
+    """Return a module's source with imports rewritten for the harness."""
     return _IMPORT.sub(lambda m: f"{m[1]}from {PACKAGE}.{m[2].rpartition('.')[2]} import ", source)
 
 
