@@ -298,15 +298,6 @@ def forget_answers(study: Checkout) -> Checkout:
     return study
 
 
-def forget_rows(study: Checkout, kind: str, evaluation: str) -> None:
-    """Remove the rows of an evaluation from the ledger."""
-    which = "select id from traps_evaluations where kind = ? and name = ?"
-    with closing(sqlite3.connect(study.workspace / "ledger" / "ledger.sqlite", timeout=600)) as opened:
-        removed = opened.execute(f"delete from traps_rows where evaluation in ({which})", [kind, evaluation])
-        assert removed.rowcount > 0
-        opened.commit()
-
-
 @pytest.fixture(scope="session")
 def one_regime(small: Checkout, tmp_path_factory: pytest.TempPathFactory) -> Checkout:
     """The small study's items put to four reference models, scored without a disturbance. Read only."""

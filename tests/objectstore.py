@@ -4,7 +4,6 @@ and is no fake of ours: what is tested goes through HTTP, signatures and status 
 from __future__ import annotations
 
 import os
-import socket
 import subprocess
 import sys
 import time
@@ -13,6 +12,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
+
+from tests.providers.servers import closed_port
 
 LACKING = "moto's S3 server or obstore is not installed; `pip install -e '.[dev]'` brings both"
 START_S = 600
@@ -33,9 +34,7 @@ class S3:
     @contextmanager
     def running(cls) -> Iterator[S3]:
         """A server until the block ends."""
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            server = cls(free.getsockname()[1])
+        server = cls(closed_port())
         command = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(server.port)]
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         try:

@@ -6,7 +6,6 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import tempfile
 import time
@@ -15,6 +14,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
+
+from tests.providers.servers import closed_port
 
 USER, PASSWORD = "traps", "a-password-0123"
 START_S = 600
@@ -44,11 +45,8 @@ class Postgres:
     def running(cls, *, durable: bool = False) -> Iterator[Postgres]:
         """A server until the block ends. durable: it syncs to the disk as a real one does, which tests of processes
         that are killed need not wait for."""
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            port = free.getsockname()[1]
         folder = Path(tempfile.mkdtemp(prefix="pg-"))  # short: the name of a Unix socket holds 107 characters
-        server = cls(folder, port, durable)
+        server = cls(folder, closed_port(), durable)
         try:
             if server._user is not None:
                 shutil.chown(folder, server._user)

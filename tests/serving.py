@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 import os
-import socket
 import subprocess
 import sys
 import time
@@ -18,6 +17,8 @@ from pathlib import Path
 from typing import Any
 from urllib.request import urlopen
 
+from tests.providers.servers import closed_port
+
 START_S = 600
 
 
@@ -25,9 +26,7 @@ START_S = 600
 def transformers_serve(checkpoint: Path, hub: Path) -> Iterator[str]:
     """The address at which a checkpoint's folder is served, under its path as the name. hub: an empty folder in the
     place of the user's cache of models."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = str(free.getsockname()[1])
+    port = str(closed_port())
     command = [sys.executable, "-m", "tests.serving", "serve", str(checkpoint), "--port", port, "--device", "cpu"]
     environment = os.environ | {"HF_HOME": str(hub), "HF_HUB_OFFLINE": "1"}
     with (hub / "serve.log").open("w") as log:

@@ -57,12 +57,6 @@ def test_checks_run_on_every_python_that_the_package_admits_and_every_shard_at_n
     assert shards == [f"{k}/{len(shards)}" for k in range(1, len(shards) + 1)]
 
 
-def test_make_help_names_the_targets_of_users_first_and_those_of_maintainers_after_them() -> None:
-    printed = subprocess.run(["make", "help"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    users, _, maintainers = printed.partition("for maintainers")
-    assert "\ntest " in users and "\nlock " in maintainers and "\nlock " not in users
-
-
 def test_a_tag_that_is_another_version_and_a_placeholder_that_is_left_stop_a_release() -> None:
     def check(tag: str) -> str:
         command = ["make", "-o", "setup-core", f"BIN={Path(sys.executable).parent}", "release-check", f"TAG={tag}"]
@@ -92,34 +86,26 @@ def commit(message: str, folder: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, input=message, capture_output=True, text=True, check=False)
 
 
-@pytest.mark.parametrize(
-    "message",
-    [
+def test_a_message_in_the_form_of_the_page_is_committed(tmp_path: Path) -> None:
+    for message in (
         "Add a column for retries",
         "Bring the clips of a study\n\nThey were left behind where a bucket was slow.\n",
         "Pass the seed on\n\n" + "x" * 200,
         "Merge branch 'main' into a-branch-with-a-name-that-is-longer-than-the-seventy-two-characters",
         'Revert "added a column."',
         "Use `inside` in the notebook\n# Added by git.\n",
-    ],
-)
-def test_a_message_in_the_form_of_the_page_is_committed(message: str, tmp_path: Path) -> None:
-    finished = commit(message, tmp_path)
-    assert (finished.returncode, finished.stderr) == (0, "")
+    ):
+        finished = commit(message, tmp_path)
+        assert (finished.returncode, finished.stderr) == (0, ""), message
 
 
-@pytest.mark.parametrize(
-    ("message", "rule"),
-    [
-        ("Added a column", "imperative"),
-        ("Adds a column", "imperative"),
-        ("Adding a column", "imperative"),
-        ("fix: a column", "capital"),
-        ("Add a column.", "full stop"),
-        ("Add " + "a" * 69, "73 characters"),
-        ("Add a column\nfor retries", "blank line"),
-    ],
-)
-def test_another_message_is_refused_by_the_rule_that_it_breaks(message: str, rule: str, tmp_path: Path) -> None:
-    finished = commit(message, tmp_path)
-    assert finished.returncode != 0 and rule in finished.stderr
+def test_another_message_is_refused_by_the_rule_that_it_breaks(tmp_path: Path) -> None:
+    for message, rule in {
+        **dict.fromkeys(("Added a column", "Adds a column", "Adding a column"), "imperative"),
+        "fix: a column": "capital",
+        "Add a column.": "full stop",
+        "Add " + "a" * 69: "73 characters",
+        "Add a column\nfor retries": "blank line",
+    }.items():
+        finished = commit(message, tmp_path)
+        assert finished.returncode != 0 and rule in finished.stderr, message

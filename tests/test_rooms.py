@@ -16,42 +16,15 @@ PACKAGE = Path(traps_pipeline.__file__).parent
 # From bottom to top. A room imports rooms that stand before it here, and none that stands behind it: neither at the top
 # of a file nor inside a function nor for types alone.
 ROOMS = (
-    "base",
-    "protocol",
-    "video",
-    "scenes",
-    "ledger",
-    "storage",
-    "benchmark",
-    "models",
-    "judging",
-    "scoring",
-    "mechanism",
-    "people",
-    "inside",
-    "checks",
-    "report",
-    "pipeline",
-    "exchange",
-    "release",
-    "servers",
-    "definitions",
-    "cli",
-    "cluster",
-)
+    "base", "protocol", "video", "scenes", "ledger", "storage", "benchmark", "models", "judging", "scoring",
+    "mechanism", "people", "inside", "checks", "report", "pipeline", "exchange", "release", "servers", "definitions",
+    "cli", "cluster",
+)  # fmt: skip
 # The same for what lies in the room of scenes, whose largest rooms are folders.
 SCENES = (
-    "physics",
-    "picture",
-    "parts",
-    "families",
-    "family_registry",
-    "observe",
-    "worlds",
-    "certification",
-    "draw",
+    "physics", "picture", "parts", "families", "family_registry", "observe", "worlds", "certification", "draw",
     "variants",
-)
+)  # fmt: skip
 
 
 def files() -> dict[str, Path]:
@@ -145,20 +118,6 @@ def test_the_room_for_several_hosts_is_asked_for_in_one_place_and_has_what_is_as
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__"
     )
     assert sorted(functions) == sorted(has) and len(functions) <= 5
-
-
-def test_an_import_counts_in_a_function_and_for_types_too() -> None:
-    source = """
-from typing import TYPE_CHECKING
-import traps_pipeline.storage.tables
-if TYPE_CHECKING:
-    from traps_pipeline import cli
-def late():
-    from traps_pipeline.scenes.physics import kit, nothing
-    import json
-"""
-    found = [(3, "storage.tables"), (5, "cli"), (7, "scenes.physics.kit"), (7, "scenes.physics")]
-    assert sorted(imported(source, files())) == sorted((line, f"traps_pipeline.{name}") for line, name in found)
 
 
 def test_files_are_short_but_for_those_that_the_rules_defend() -> None:

@@ -16,7 +16,7 @@ from traps_pipeline.checks.loopback import render
 from traps_pipeline.checks.wire_body import ClipPart, WireBody, read_body
 from traps_pipeline.checks.wire_check import check_named, examine, requests_of
 from traps_pipeline.cli import main
-from traps_pipeline.models import api, judges
+from traps_pipeline.models import api
 from traps_pipeline.models.registry import ModelEntry, get_model, load_models
 from traps_pipeline.models.schemas import answer_object
 from traps_pipeline.protocol.regimes import FIELDS, fields_of
@@ -24,24 +24,11 @@ from traps_pipeline.storage.media import Media, MediaSpec, data_uris, payload
 
 pytestmark = pytest.mark.slow  # litellm's import
 
-PAPER = [
-    "gemini-2.5-pro",
-    "gemini-2.5-flash",
-    "gemini-2.5-flash-nt",
-    "gemini-3.1-pro",
-    "gemini-3.1-pro-r-low",
-    "gemini-3.1-flash-lite",
-    "qwen3-vl-think",
-    "qwen3-vl-instruct",
-    "qwen3-vl-8b",
-    "gpt-5-pro",
-    "gpt-5-high",
-    "gpt-5-medium",
-    "gpt-5-nr",
-    "gpt-5-mini",
-    "gemma-4-e4b",
-    "llava-next-video-7b",
-]  # docs/spec.md 3.2
+PAPER = [  # docs/spec.md 3.2
+    "gemini-2.5-pro", "gemini-2.5-flash", "gemini-2.5-flash-nt", "gemini-3.1-pro", "gemini-3.1-pro-r-low",
+    "gemini-3.1-flash-lite", "qwen3-vl-think", "qwen3-vl-instruct", "qwen3-vl-8b", "gpt-5-pro", "gpt-5-high",
+    "gpt-5-medium", "gpt-5-nr", "gpt-5-mini", "gemma-4-e4b", "llava-next-video-7b",
+]  # fmt: skip
 CHECKED = [name for name, entry in wire_check.participants().items() if entry.backend in ("api", "local")]
 
 
@@ -232,12 +219,8 @@ def test_the_command_needs_neither_keys_nor_a_network() -> None:
     )
     lines = done.stdout.splitlines()
     assert done.returncode == 0, done.stdout + done.stderr
-    assert [line.split()[0] for line in lines[:-1]] == [
-        "gemini-2.5-pro",
-        "qwen3-vl-think",
-        "gpt-5-nr",
-        "judge-claude-opus-4.6",
-    ]
+    checked = ["gemini-2.5-pro", "qwen3-vl-think", "gpt-5-nr", "judge-claude-opus-4.6"]
+    assert [line.split()[0] for line in lines[:-1]] == checked
     assert lines[-1] == "every entry sends what it declares"
     assert done.stderr == ""
 
@@ -255,14 +238,6 @@ def test_the_command_fails_where_an_entry_does(
     assert main(["models", "check", "gpt-6"]) == 1
 
 
-def test_a_panel_is_checked_by_its_name_and_a_broken_one_fails_every_check(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_panel_is_checked_by_its_name(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["models", "check", "rules"]) == 0
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()[:-1]] == ["rule-1", "rule-2", "rule-3"]
-    registry = tmp_path / "judges.yaml"
-    registry.write_text(judges.JUDGES_FILE.read_text() + "  two: [judge-gemini-3-flash, judge-claude-opus-4.6]\n")
-    monkeypatch.setattr(judges.load_panels, "__defaults__", (registry,))
-    monkeypatch.setattr(judges.load_panel.__wrapped__, "__defaults__", (registry,))
-    assert main(["models", "check", "rule-1"]) == 1
-    assert "panel 'two' must seat 1 or 3 different known judges" in capsys.readouterr().err

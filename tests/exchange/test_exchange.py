@@ -11,8 +11,9 @@ from pydantic import ValidationError
 from tests.build.errors import raises
 from tests.judging.conftest import item_row
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.exchange.answer_exchange import _ERROR_TEXT, Answer, ImportResult, import_answers
+from traps_pipeline.exchange.answer_exchange import _ERROR_TEXT, Answer, ImportResult, checked_answers, import_answers
 from traps_pipeline.models.answers import wanted_questions
+from traps_pipeline.models.request import Request
 from traps_pipeline.pipeline.experiment import Experiment
 from traps_pipeline.storage.benchmark_tables import ITEMS, ItemRow
 from traps_pipeline.storage.study import Study
@@ -84,3 +85,18 @@ def test_a_file_without_answers_is_named_and_nothing_is_imported(
     with raises(TrapsError, "", name):
         import_answers(study, ASKED, tmp_path / name)
     assert not study.answers.read(CELL.evaluation.key).settled
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        '{"key": "k", "text": "x", "mood": 1}',
+        '{"key": "k", "outcome": "error"}',
+        '{"key": "k", "outcome": "answer", "text": " "}',
+        '{"key": "k", "outcome": "refused", "text": "no"}',
+    ],
+)
+def test_a_line_that_is_no_answer_is_named(tmp_path: Path, line: str) -> None:
+    (tmp_path / "answers.jsonl").write_text(line + "\n")
+    with raises(TrapsError, "exchange.answer_exchange", "answers.jsonl:1"):
+        checked_answers(tmp_path / "answers.jsonl", {"k": Request("m", "api", {}, "s", "u", {})})

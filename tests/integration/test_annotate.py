@@ -6,7 +6,7 @@ import json
 import re
 import sqlite3
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ import pytest
 from playwright.sync_api import Page
 
 from tests.conftest import EXPERIMENT, Checkout
-from tests.integration.listening import Server, listening
+from tests.integration.listening import TOKEN, Server, listening
 from tests.pages import a_browser, ready, until, watched
 from traps_pipeline.people.human_label_rows import HUMAN_AGREEMENT, HUMAN_LABELS
 from traps_pipeline.people.human_score_rows import CORRECTED, HUMAN_ROW, PANEL_ERRORS
@@ -254,15 +254,11 @@ def test_strangers_and_others_get_nothing(study: Checkout) -> None:
         assert server.ask("GET", clip, who="jd")[0] == 200
         assert server.ask("GET", clip, who="ab")[0] == 404  # a handle is one person's own
         assert server.ask("POST", "/label", label, who="ab")[0] == 404
-        refused: Sequence[tuple[int, dict[str, str]]] = [
-            (403, {"Origin": "http://evil.example"}),
-            (403, {"Sec_Fetch_Site": "cross-site"}),
-            (421, {"Host": f"rebound.test:{server.port}"}),
-            (403, {"Authorization": "Bearer token-of-a-reviewer-0123"}),  # what the tokens are made from is none
-            (415, {"Content_Type": "text/plain"}),
-        ]
-        for status, headers in refused:
-            assert server.ask("POST", "/label", label, who="jd", **headers)[0] == status, headers
+        for wrong in (
+            {"Origin": "http://evil.example"},
+            {"Authorization": f"Bearer {TOKEN}"},
+        ):  # tokens are made from it
+            assert server.ask("POST", "/label", label, who="jd", **wrong)[0] == 403, wrong
         for path in ("/task/secrets", "/clip/0123", "/clip/plinko-0001", "/docs", "/../study.yaml", "/labels.sqlite"):
             assert server.ask("GET", path, who="jd")[0] == 404, path
         for wrong in ({"answer": ""}, {"answer": None, "side": "void"}, {"abstained": True}, {"answer": "x" * 201}):
@@ -270,10 +266,7 @@ def test_strangers_and_others_get_nothing(study: Checkout) -> None:
         assert not (study.workspace / "labels" / "labels.jsonl").read_text()
         give(server, "jd", shown, {"answer": None})
         status, said = server.ask("POST", "/label", label, who="jd")
-        assert (status, said["error"]) == (
-            409,
-            "this was labelled before, in another window perhaps; load the page again",
-        )
+        assert status == 409 and "labelled before" in said["error"]
         assert server.ask("POST", "/reopen", {"task": "correctness"}, who="jd")[0] == 404
     assert study.traps("people", "annotate", "--who", "jd", "jd").code == 1
     beyond = study.traps("people", "annotate", "--who", "jd", "--host", "0.0.0.0")

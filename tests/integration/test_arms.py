@@ -4,6 +4,7 @@ and no part of the pairs' figures."""
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.report.leaderboard_page import leaderboard_text
 from traps_pipeline.scoring.score_rows import GRADED_CUTS, HYPOTHESES, LEADERBOARD, ROBUST
 from traps_pipeline.storage.benchmark_tables import ARMS, ITEMS
+from traps_pipeline.storage.parquet import TableStore
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
@@ -30,29 +32,41 @@ datasets:
 """
 
 
-def test_arms_are_asked_with_the_pairs_and_take_the_shortcuts_gain_away(study: Checkout, tmp_path: Path) -> None:
-    path = tmp_path / "with-arms.yaml"
-    path.write_text(EXPERIMENT)
-    other = Checkout(study.root, tmp_path / "armed")
-    (tmp_path / "armed").mkdir()
-    (study.workspace / "clips").rename(other.workspace / "clips")
-    until = ("--until", "leaderboard,robust,hypotheses,graded")
-    run = other.traps("run", path, *until).ok()
+UNTIL = ("--until", "leaderboard,robust,hypotheses,graded")
+
+
+@pytest.fixture(scope="module")
+def armed(small: Checkout, tmp_path_factory: pytest.TempPathFactory) -> tuple[Checkout, Path, dict[str, int]]:
+    """A study of the experiment, which takes over the small study's clips; its file; and what its run counted."""
+    folder = tmp_path_factory.mktemp("arms")
+    (folder / "with-arms.yaml").write_text(EXPERIMENT)
+    study = Checkout(small.root, folder / "armed")
+    shutil.copytree(small.workspace / "clips", study.workspace / "clips")
+    ran = study.traps("run", folder / "with-arms.yaml", *UNTIL).ok()
+    return study, folder / "with-arms.yaml", ran.counts()
+
+
+@pytest.fixture
+def tables(armed: tuple[Checkout, Path, dict[str, int]]) -> TableStore:
+    return Workspace.open(armed[0].workspace).tables
+
+
+def test_arms_and_variations_are_asked_and_rendered_once(
+    armed: tuple[Checkout, Path, dict[str, int]], tables: TableStore
+) -> None:
+    study, path, counts = armed
     # Pairs: 2 scenarios x 2 datasets x 2 sides. Arms: decoy 1, twin_control 2, crossed 2 x 2.
     # Variations: 2 x 2 of the race, whose answers are colours, panel 1, schema and frames 2 x 2 each. A graded cut.
-    assert run.counts()["answers"] == 3 * (8 + (1 + 2 + 4) + (4 + 1 + 4 + 4) + 1)
-    tables = Workspace.open(other.workspace).tables
+    assert counts["answers"] == 3 * (8 + (1 + 2 + 4) + (4 + 1 + 4 + 4) + 1)
     arms = tables.read_all(ARMS)
-    cut = arms.set_index("arm").loc["graded"]
     # Decoy and grey, and the graded cut; the others show the pair's own clips.
-    assert run.counts()["frames"] == 50 + 50 + cut["n_frames"]
-    posterior, truth = json.loads(cut["evidence"])["posterior"], load_released()["plinko-0001"].ground_truth
-    graded = tables.read_all(GRADED_CUTS).query("scope == 'all'").set_index("model")
-    assert graded.loc["oracle", "points"] == pytest.approx(4 * posterior[truth] - 3)  # it knows what came of it
-    assert graded.loc["oracle", "points_best"] == pytest.approx(4 * max(posterior.values()) - 3)
-    assert (graded.loc["any-rule", ["coverage", "points"]] == 0).all()  # it takes a short clip for a void
+    assert counts["frames"] == 50 + 50 + arms.set_index("arm").loc["graded", "n_frames"]
     (refused,) = arms.dropna(subset=["refused"])["scenario_id"].unique()
     assert refused == "plinko-0001"  # the numbers of its buckets are no colours
+    assert study.traps("run", path, *UNTIL).counts() == {"answers": 0, "votes": 0, "frames": 0}
+
+
+def test_a_crossed_pair_shows_each_clip_with_another_question(tables: TableStore) -> None:
     items = tables.read_all(ITEMS, dataset="crossed").set_index("item_id")
     pair = tables.read_all(ITEMS, dataset="chaotic").set_index("item_id")
     aside, foreign = (items.loc[f"crossed:plinko-0001:{side}"] for side in ("control", "void"))
@@ -60,14 +74,19 @@ def test_arms_are_asked_with_the_pairs_and_take_the_shortcuts_gain_away(study: C
     assert (aside["clip"], aside["ground_truth"]) == (pair.loc["chaotic:plinko-0001:void", "clip"], answer)
     assert foreign["clip"] == pair.loc["chaotic:plinko-0001:control", "clip"]
     assert items["ground_truth"].isna().groupby(items["side"]).all().to_dict() == {"control": False, "void": True}
+
+
+def test_arms_take_the_shortcuts_gain_away(tables: TableStore) -> None:
     robust = tables.read_all(ROBUST).set_index("model")
     board = tables.read_all(LEADERBOARD).query("dataset == 'overall'").set_index("model")
-    figures = ["conjunction", "robust"]
-    assert robust.loc["oracle", figures].tolist() == [1.0, 1.0] and board.loc["oracle", "pecs"] == 1.0
+    assert robust.loc["oracle", ["conjunction", "robust"]].tolist() == [1.0, 1.0] and board.loc["oracle", "pecs"] == 1.0
     assert board.loc["any-rule", "pecs"] == 1.0  # it understands nothing of a void
     assert robust.loc["any-rule", "conjunction"] == 0 and robust.loc["any-rule", "robust"] < 0.8
-    board_text = leaderboard_text(tables.read(LEADERBOARD, {}), tables.read_all(ROBUST))
-    assert "all over 3 of 7 arms" in board_text and "nan" not in board_text and "no conjunction" not in board_text
+    text = leaderboard_text(tables.read(LEADERBOARD, {}), tables.read_all(ROBUST))
+    assert "all over 3 of 7 arms" in text and "nan" not in text and "no conjunction" not in text
+
+
+def test_variations_are_doses_of_their_hypotheses(tables: TableStore) -> None:
     doses = tables.read_all(HYPOTHESES).set_index(["model", "hypothesis", "dose"])
     grey = doses.loc[("occluder-rule", "occluder", "grey")]
     assert (grey["at_reference"], grey["value"], grey["rule_change"]) == (1.0, 0.0, -1.0)
@@ -76,5 +95,12 @@ def test_arms_are_asked_with_the_pairs_and_take_the_shortcuts_gain_away(study: C
     assert set(tables.read_all(ITEMS, dataset="labels_two")["labels"].map(len)) == {2}
     said = tables.read_all(RESPONSES, dataset="schema_abstain").query("model == 'oracle'")
     assert said["is_json"].all() and {json.loads(text)["abstain"] for text in said["text"]} == {True, False}
-    again = other.traps("run", path, *until)
-    assert again.counts() == {"answers": 0, "votes": 0, "frames": 0}
+
+
+def test_a_graded_cut_is_scored_by_its_posterior(tables: TableStore) -> None:
+    posterior = json.loads(tables.read_all(ARMS).set_index("arm").loc["graded", "evidence"])["posterior"]
+    truth = load_released()["plinko-0001"].ground_truth
+    graded = tables.read_all(GRADED_CUTS).query("scope == 'all'").set_index("model")
+    assert graded.loc["oracle", "points"] == pytest.approx(4 * posterior[truth] - 3)  # it knows what came of it
+    assert graded.loc["oracle", "points_best"] == pytest.approx(4 * max(posterior.values()) - 3)
+    assert (graded.loc["any-rule", ["coverage", "points"]] == 0).all()  # it takes a short clip for a void

@@ -3,25 +3,17 @@
 from __future__ import annotations
 
 import sqlite3
-import subprocess
 from contextlib import closing
 from pathlib import Path
 
 import pytest
 
-from tests.conftest import EXPERIMENT, ROOT, Checkout, Finished, make_checkout
+from tests.conftest import EXPERIMENT, Checkout
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.scoring.score_rows import METRICS
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
-
-
-def assert_refused(finished: Finished, *words: str) -> None:
-    assert finished.code == 1, finished.out
-    assert "Traceback" not in finished.err, finished.err
-    for word in words:
-        assert word in finished.err, finished.err
 
 
 def test_a_damaged_row_of_the_ledger_is_named_and_its_answer_alone_asked_again(study: Checkout) -> None:
@@ -56,10 +48,3 @@ def test_failed_calls_are_told_counted_as_missing_and_asked_again(study: Checkou
     again = study.score(tmp_path / "flaky.yaml")
     assert again.code == 1
     assert again.counts()["answers"] == outcomes["error"]  # those that failed, and no other
-
-
-def test_a_fresh_checkout_without_assets_says_what_it_is(tmp_path: Path) -> None:
-    root = make_checkout(tmp_path / "half")
-    subprocess.run(["rm", "-r", root / "scene_specs"], check=True)
-    finished = Checkout(root, tmp_path / "none").traps("run", ROOT / EXPERIMENT)
-    assert_refused(finished, "scene_specs/released: holds no released records", "restore it from git")

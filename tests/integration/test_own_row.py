@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import socket
 from pathlib import Path
 
 import pytest
 
 from tests.conftest import KEY, ROOT, SMALL, Checkout
 from tests.providers.server import Provider
+from tests.providers.servers import closed_port
 from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.workspace import Workspace
 
@@ -65,9 +65,7 @@ def test_a_model_that_says_dots_is_broken_and_not_modest_and_a_changed_panel_mak
 def test_whatever_is_wrong_with_a_model_is_named_before_anything_is_rendered_or_judged(
     provider: Provider, tmp_path: Path
 ) -> None:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        dead = f"http://127.0.0.1:{free.getsockname()[1]}/v1"
+    dead = f"http://127.0.0.1:{closed_port()}/v1"
     said = '{"reason": "seen", "final_answer": "red and blue"}'
     provider.configure(
         fault_by_model={"wrong-name": "not_found", "wrong-key": "unauthorized"},

@@ -17,6 +17,7 @@ import pytest
 
 from tests.build.processes import MARK, marked, wait_until_gone
 from tests.conftest import ROOT, Checkout
+from tests.providers.servers import closed_port
 from traps_pipeline.pipeline.webserver import AGAIN
 
 pytestmark = pytest.mark.slow
@@ -34,9 +35,7 @@ class Background:
             "TRAPS_WORKSPACE": str(folder / "study"),
             "DAGSTER_HOME": str(folder / "study" / "dagster"),
         }
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.port = probe.getsockname()[1]
+        self.port = closed_port()
 
     def traps(self, *arguments: str, before: str = "") -> int:
         """Start a command; returns its process id."""

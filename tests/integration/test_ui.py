@@ -6,7 +6,6 @@ import os
 import re
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -20,6 +19,7 @@ from playwright.sync_api import Page, expect
 
 from tests.conftest import EXPERIMENT, Checkout, copied
 from tests.pages import a_browser, patient
+from tests.providers.servers import closed_port
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.pipeline.automation import INTERVAL_S
 from traps_pipeline.storage.benchmark_tables import ITEMS
@@ -44,9 +44,7 @@ def wait_until(condition: Callable[[], bool], seconds: float, what: str, *, paus
 @contextmanager
 def serving(study: Checkout) -> Iterator[str]:
     """`make ui`'s command on a free port: web server and daemon of a study."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = closed_port()
     command = (sys.executable, "-m", "traps_pipeline.cli", "ui", "--port", str(port), "--token", TOKEN)
     url, log = f"http://127.0.0.1:{port}", (study.workspace / "dagster-dev.log").open("w")
     # Its runs write to the same stream: a pipe that nobody reads would stop them.
@@ -66,19 +64,6 @@ def serving(study: Checkout) -> Iterator[str]:
         log.close()
 
 
-@pytest.fixture(scope="module")
-def study(small: Checkout, tmp_path_factory: pytest.TempPathFactory) -> Checkout:
-    """A copy of the small study under one server, which takes as long to start as a test: each test of it leaves it
-    current, but for what a correction leaves to be asked in the last one."""
-    return copied(small, tmp_path_factory.mktemp("served"))
-
-
-@pytest.fixture(scope="module")
-def server(study: Checkout) -> Iterator[str]:
-    with serving(study) as url:
-        yield url
-
-
 def _answers(url: str) -> bool:
     try:
         asked = urllib.request.Request(url, headers={"Authorization": f"Bearer {TOKEN}"})
@@ -94,12 +79,6 @@ def browsing(server: str) -> Iterator[Page]:
         page.goto(f"{server}/?token={TOKEN}")
         page.goto(NOWHERE)
         expect.set_options(timeout=60_000)
-        yield page
-
-
-@pytest.fixture
-def page(server: str) -> Iterator[Page]:
-    with browsing(server) as page:
         yield page
 
 
@@ -176,45 +155,30 @@ def stale(study: Checkout) -> list[str]:
     return [name for name, *counts in rows if counts != ["0", "0"]]
 
 
-def test_a_selection_of_stages_over_all_their_partitions_is_one_click(study: Checkout, server: str, page: Page) -> None:
-    before = {name: written(study, name) for name in ("responses", "votes", "verdicts")}
-    launch_all(page, f"{server}/locations/traps_pipeline.definitions/asset-groups/evaluation/lineage")
-    for name, then in before.items():
-        wait_until(
-            lambda name=name, then=then: all(written(study, name)[file] > time for file, time in then.items()),
-            RUN_SECONDS,
-            f"all of {name} is made anew",
-        )
-    assert not stale(study)  # from the same inputs the same content: nothing below is outdated
-
-
-def test_a_correction_is_followed_alone_where_it_is_free_and_by_one_click_where_it_is_paid(
-    study: Checkout, server: str, page: Page
-) -> None:
-    rows, before = (len(study.ledger_rows("answers")), {n: written(study, n) for n in ("metrics", "report_page")})
-    time.sleep(INTERVAL_S / 3)  # the daemon has seen everything current
-    study.correct("plinko-0003", ill_posed_question="Why is the little triangle beside the board singing?")
+def test_a_correction_is_followed_alone_where_it_is_free_and_by_one_click_where_it_is_paid(own_study: Checkout) -> None:
+    study, question = own_study, "Why is the little triangle beside the board singing?"
     tables = Workspace.open(study.workspace).tables
+    rows, before = (
+        len(study.ledger_rows("answers")),
+        {name: written(study, name) for name in ("metrics", "report_page")},
+    )
 
     def followed() -> bool:
-        asked = tables.read_all(ITEMS, ["question"], dataset="chaotic_ill_posed")["question"]
-        return bool((asked == "Why is the little triangle beside the board singing?").sum() == 1)
+        return question in [*tables.read_all(ITEMS, ["question"], dataset="chaotic_ill_posed")["question"]]
 
-    wait_until(followed, 20 * INTERVAL_S, "free stages follow a correction")
-    time.sleep(2 * INTERVAL_S)
-    assert len(study.ledger_rows("answers")) == rows  # nothing is asked before the click
-    launch_job(page, server, "evaluation")
-    wait_until(
-        lambda: (
-            written(study, "report_page") != before["report_page"] and written(study, "metrics") != before["metrics"]
-        ),
-        RUN_SECONDS,
-        "what hangs on the answers follows alone",
-    )
-    assert len(study.ledger_rows("answers")) == rows + 3 * 2  # one item, of each model under each regime
-    # Labels of confabulations are asked by the job `scoring`; all else is current again.
-    current = "everything that was asked for is current"
-    wait_until(lambda: {*stale(study)} <= {"confabulation"}, RUN_SECONDS, current, pause_s=PAUSE_S)
+    with serving(study) as server, browsing(server) as page:
+        time.sleep(INTERVAL_S / 3)  # the daemon has seen everything current
+        study.correct("plinko-0003", ill_posed_question=question)
+        wait_until(followed, 20 * INTERVAL_S, "free stages follow a correction")
+        time.sleep(2 * INTERVAL_S)
+        assert len(study.ledger_rows("answers")) == rows  # nothing is asked before the click
+        launch_job(page, server, "evaluation")
+        below = "what hangs on the answers follows alone"
+        wait_until(lambda: all(written(study, name) != then for name, then in before.items()), RUN_SECONDS, below)
+        assert len(study.ledger_rows("answers")) == rows + 3 * 2  # one item, of each model under each regime
+        # Labels of confabulations are asked by the job `scoring`; all else is current again.
+        current = "everything that was asked for is current"
+        wait_until(lambda: {*stale(study)} <= {"confabulation"}, RUN_SECONDS, current, pause_s=PAUSE_S)
 
 
 # What failed results of an asset's check `current` say, newest first.

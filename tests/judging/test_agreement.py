@@ -16,7 +16,6 @@ from tests.judging.conftest import vote_rows
 from traps_pipeline.judging.agreement import (
     agreement,
     cohen_kappa,
-    complete,
     fleiss_kappa,
     judge_bias,
     krippendorff_alpha,
@@ -62,12 +61,6 @@ def test_krippendorffs_alpha_takes_missing_votes_and_leaves_lone_ones_out() -> N
     # Pairable: yy-, ynn, nnn; --y stands alone. 8 votes, 3 yes, 5 no. Disagreement: 2 x 1 x 2 / (3 - 1) = 2 of 8;
     # expected 2 x 3 x 5 / (8 x 7) = 30/56. 1 - (2/8) / (30/56) = 8/15.
     assert krippendorff_alpha(matrix("yy-", "ynn", "nnn", "--y")) == pytest.approx(8 / 15)
-
-
-def test_the_unanimous_share_is_of_complete_answers() -> None:
-    values = matrix("yyy", "nnn", "yyn", "yy-", "---")
-    assert len(complete(values)) == 3
-    assert unanimous_share(complete(values)) == pytest.approx(2 / 3)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -7,13 +7,8 @@ import pytest
 from traps_pipeline.models.judged_answers import is_correct, normalise
 
 SIDES = ["left", "right", "elsewhere"]
-ALIASES = {
-    "left bin": "left",
-    "red bin": "left",
-    "right bin": "right",
-    "blue bin": "right",
-    "somewhere else": "elsewhere",
-}
+BINS = {"left bin": "left", "red bin": "left", "right bin": "right", "blue bin": "right"}
+ALIASES = BINS | {"somewhere else": "elsewhere"}
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from tests.build.cells import row
 from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.pipeline.automation import report_unseen
 from traps_pipeline.pipeline.graph import the_graph
+from traps_pipeline.pipeline.history import History
 from traps_pipeline.pipeline.lineage import Lineage, Status
 from traps_pipeline.pipeline.partition_checks import CURRENT
 from traps_pipeline.pipeline.study_status import StageStatus
@@ -95,17 +96,21 @@ def test_a_damaged_table_waits_for_nothing_but_what_is_above_it(study: Workspace
     assert Lineage(study).waits("metrics", "chaotic")
 
 
-def test_damage_is_reported_again_after_a_restart_of_the_daemon(study: Workspace, tmp_path: Path) -> None:
-    path = study.tables.path(VERDICTS, CELL)
-    path.write_bytes(path.read_bytes()[:-20])
+def test_damage_and_a_loss_are_reported_again_after_a_restart_of_the_daemon(study: Workspace, tmp_path: Path) -> None:
+    path, cell, graph = study.tables.path(VERDICTS, CELL), NAME.partition("/")[2], the_graph()
     with dg.DagsterInstance.local_temp(str(tmp_path)) as instance:
-        for _ in range(2):  # a new process has reported nothing yet
+        instance.report_runless_asset_event(History(instance, graph).event(graph["verdicts"], cell, "1", {}, {}))
+        path.write_bytes(path.read_bytes()[:-20])
+        for last in (False, False, True):  # a new process has reported nothing yet
+            if last:
+                path.unlink()
             report_unseen(instance, study, Lineage(study), set())
         key = dg.AssetCheckKey(dg.AssetKey("verdicts"), CURRENT)
         stored = instance.event_log_storage.get_asset_check_execution_history(key, limit=9)
-    evaluations = [each.event.dagster_event.asset_check_evaluation_data for each in stored]  # pyright: ignore
-    assert [each.partition for each in evaluations] == [None, "chaotic|prior__json__run1"]
-    assert [each.metadata["partition"].value for each in evaluations] == ["chaotic|prior__json__run1"] * 2
+    newest, *_ = found = [each.event.dagster_event.asset_check_evaluation_data for each in stored]  # pyright: ignore
+    assert [each.partition for each in found] == [None, None, cell]
+    assert {each.metadata["partition"].value for each in found} == {cell}
+    assert "its file is gone" in newest.metadata["not current"].value
 
 
 def test_another_formula_makes_metrics_stale(study: Workspace) -> None:

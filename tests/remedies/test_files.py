@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -11,6 +12,9 @@ import pytest
 
 from tests.remedies.remedied import remedied
 from traps_pipeline.base.files import write_text
+from traps_pipeline.base.paths import RELEASED
+from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.scenes.worlds.spec import load_trajectory
 
 
 def written(path: Path, text: str = "x") -> Callable[[], str]:
@@ -70,3 +74,17 @@ def test_what_lies_in_the_way_is_moved_away(tmp_path: Path, in_the_way: str) -> 
     else:
         path.mkdir(parents=True)
     remedied(written(tmp_path / "f" / "a.txt"), "base.files.replacing", lambda: path.rename(tmp_path / "away"))
+
+
+def test_a_trajectory_of_another_scene_is_read_once_it_is_restored(tmp_path: Path) -> None:
+    of_one, of_another = (RELEASED / "trajectories" / f"plinko-000{n}.npz" for n in (1, 2))
+    path, sha256 = (
+        Path(shutil.copy(of_another, tmp_path / "plinko-0001.npz")),
+        load_released()["plinko-0001"].trajectory_sha256,
+    )
+    remedied(
+        lambda: load_trajectory(path, sha256),
+        "scenes.worlds.spec.load_trajectory",
+        lambda: shutil.copy(of_one, path),
+        error=ValueError,
+    )

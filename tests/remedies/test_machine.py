@@ -2,67 +2,22 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import shutil
 import subprocess
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from tests.build.entries import nobodys_own
 from tests.build.ledger import answer, local, write
 from tests.ledger.conftest import VARIABLE
 from tests.postgres import Postgres
 from tests.remedies.remedied import refused, remedied
-from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.ledger.postgres import PostgresDatabase
 from traps_pipeline.pipeline.run import dagster_history
 from traps_pipeline.report.explorer import site
-from traps_pipeline.scenes.parts.course import Course
-from traps_pipeline.scenes.physics.kit import Box, Physics, View
-from traps_pipeline.scenes.picture.trial import check_rendering
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
-
-__all__ = ["nobodys_own"]  # a fixture
-
-
-@pytest.mark.slow
-def test_a_variable_that_chooses_an_opengl_that_does_not_draw_is_named_and_unset(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    variable = "GALLIUM_DRIVER"
-    monkeypatch.setenv(variable, "nonsense")
-    with pytest.raises(TrapsError, match=f"cannot render clips with .*{variable}=nonsense"):
-        check_rendering()
-
-    def unset() -> None:
-        monkeypatch.delenv(variable)
-        monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
-
-    remedied(check_rendering, "scenes.picture.trial.check_rendering", unset)
-
-
-@pytest.mark.slow  # opens a renderer
-def test_the_next_renderer_is_opened_once_the_first_is_closed() -> None:
-    from traps_pipeline.scenes.picture.camera import fit_camera
-    from traps_pipeline.scenes.picture.render import Renderer
-
-    course = Course(Physics())
-    course.block("wall", (0.2, 0.6), (0, 1), (0, 1), "red")
-    model = course.spec.compile()
-    camera = fit_camera(View(70.0, -25.0, 40.0), Box((-0.5, -0.5, 0.0), (0.5, 0.5, 0.8)).corners())
-    first = contextlib.ExitStack()
-    first.enter_context(Renderer(model, camera))
-
-    def draw() -> np.ndarray:
-        with Renderer(model, camera) as renderer:
-            return next(renderer.frames(np.zeros((1, 0))))
-
-    shown = remedied(draw, "scenes.picture.render", first.close, error=RuntimeError)
-    assert shown.shape == (360, 480, 3)
 
 
 def test_a_history_is_opened_once_what_lies_in_its_way_is_moved(

@@ -33,37 +33,22 @@ def release(workspace: Workspace, tmp_path_factory: pytest.TempPathFactory) -> P
     return folder
 
 
-def test_a_release_is_written_to_an_empty_a_new_or_a_deleted_folder(workspace: Workspace, tmp_path: Path) -> None:
+def test_a_release_is_written_to_another_folder_or_once_what_is_not_of_it_is_moved(
+    workspace: Workspace, tmp_path: Path
+) -> None:
     content, folder = content_of(workspace), tmp_path / "taken"
+    letter = folder / "letter.txt"
 
-    def taken() -> None:
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir()
-        (folder / "letter.txt").write_text("mine")
+    def write(to: Path = folder) -> object:
+        return write_release(content, to, Options())
 
-    taken()
-    (tmp_path / "empty").mkdir()
-    for other in (tmp_path / "empty", tmp_path / "new"):
-        remedied(
-            lambda: write_release(content, folder, Options()),
-            "release.folder.write_release",
-            again=lambda other=other: write_release(content, other, Options()),
-        )
-    remedied(
-        lambda: write_release(content, folder, Options()), "release.folder.write_release", lambda: shutil.rmtree(folder)
-    )
+    folder.mkdir()
+    letter.write_text("mine")
+    remedied(write, "release.folder.write_release", again=lambda: write(tmp_path / "new"))
+    remedied(write, "release.folder.write_release", lambda: shutil.rmtree(folder))
     assert (folder / CHECKSUMS).is_file()
-    (folder / "letter.txt").write_text("mine")
-    remedied(
-        lambda: write_release(content, folder, Options()),
-        "release.folder",
-        lambda: (folder / "letter.txt").rename(tmp_path / "letter.txt"),
-    )
-    remedied(
-        lambda: write_release(content, folder, Options(held_out=folder / "key")),
-        "release.folder.write_release",  # and the former release is still there
-        again=lambda: write_release(content, folder, Options(held_out=tmp_path / "key")),
-    )
+    letter.write_text("mine")
+    remedied(write, "release.folder", lambda: letter.rename(tmp_path / "letter.txt"))
 
 
 def test_results_are_of_a_repository_and_of_models_that_were_run(

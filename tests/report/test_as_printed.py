@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import re
-from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
 
+from tests.build.boards import Rows
 from traps_pipeline.report.catalogue import TABLE_REPORTS
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.writing import table_html
@@ -26,35 +26,11 @@ NAMES = {
 TOTAL = ["Total", "1,404", ""]  # the one row of the paper that spans columns
 
 
-class Body(HTMLParser):
-    """The texts of the cells of every row below the headings."""
-
-    def __init__(self, page: str) -> None:
-        super().__init__()
-        self.rows: list[list[str]] = []
-        self.inside = False
-        self.feed(page.partition("<tbody>")[2])
-
-    def handle_starttag(self, tag: str, attrs: object) -> None:
-        if tag == "tr":
-            self.rows.append([])
-        elif tag in ("td", "th"):
-            self.rows[-1].append("")
-            self.inside = True
-
-    def handle_endtag(self, tag: str) -> None:
-        self.inside = self.inside and tag not in ("td", "th")
-
-    def handle_data(self, data: str) -> None:
-        if self.inside:
-            self.rows[-1][-1] += data
-
-
 @pytest.mark.parametrize("label", PAPER)
 def test_a_table_of_the_page_has_the_papers_values_digit_by_digit(label: str) -> None:
     named = NAMES.get(label, 1)
     expected = [row[named:] if row != TOTAL else ["", "1,404", ""] for row in PAPER[label]["rows"]]
-    shown = Body(table_html(PRINTED[PLACES[label]["name"]])).rows
+    shown = Rows(table_html(PRINTED[PLACES[label]["name"]]).partition("<tbody>")[2]).rows
     assert [row[-len(values) :] for row, values in zip(shown, expected, strict=True)] == expected
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from functools import cached_property
 from itertools import product
@@ -24,7 +25,6 @@ from traps_pipeline.mechanism.control_rows import (
 )
 from traps_pipeline.mechanism.effects import own_effects
 from traps_pipeline.mechanism.mechanism_rows import PROBES, STEERING_EFFECTS
-from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report import publish, study_results
 from traps_pipeline.report.cards import Sources
 from traps_pipeline.report.catalogue import FIGURE_REPORTS, INSIDE
@@ -93,17 +93,8 @@ def patching() -> pd.DataFrame:
 def item_scores() -> pd.DataFrame:
     """Two voids, both answered: states rank them above both controls, the output between them."""
     scored = (("void", 2.0, -3.0), ("void", 1.0, -1.0), ("control", -1.0, -2.0), ("control", -4.0, -4.0))
-    rows = [
-        {
-            "item_id": str(n),
-            "dataset": "chaotic",
-            "side": side,
-            "own": own,
-            "margin": margin,
-            "abstained_standard": False,
-        }
-        for n, (side, own, margin) in enumerate(scored)
-    ]
+    about = {"dataset": "chaotic", "abstained_standard": False}
+    rows = [about | {"item_id": str(n), "side": s, "own": own, "margin": m} for n, (s, own, m) in enumerate(scored)]
     return frame(ITEM_SCORES, *rows)
 
 
@@ -225,12 +216,6 @@ def test_every_site_that_was_patched_is_in_the_table_and_has_a_panel() -> None:
     assert axes[0].get_ylabel().replace("\n", " ") == "m: chaotic, into the control, 6 pairs"
 
 
-def test_doses_are_in_units_of_the_class_gap() -> None:
-    own = Made().own_effects
-    assert sorted(set(own["gaps"])) == pytest.approx([0.0, 0.05, 1.0])  # alpha 10 of a gap of 200
-    assert set(own["target"]) == {"chaotic"} <= set(DATASETS)
-
-
 @pytest.mark.parametrize("name", INSIDE)
 def test_a_figure_is_drawn_from_them(name: str) -> None:
     report = next(report for report in FIGURE_REPORTS if report.name == name)
@@ -238,27 +223,21 @@ def test_a_figure_is_drawn_from_them(name: str) -> None:
     assert axes and all(ax.has_data() for ax in axes)  # no panel for a dataset that was not asked
 
 
+# The numbers of each sentence, in their order.
 FINDINGS = {
-    "states_and_output": "m answered 2 voids under standard: its states put 2 of them among voids (and 0 of 2 "
-    "controls), its output 0; as orders of the sides (AUROC, mean of datasets): states 1.00, first token 0.75, "
-    "whole abstentions 0.38.",
-    "lens": "In m the guided prompt moves the log-odds of abstaining by +7.0 on voids and +1.0 on controls at the last "
-    "layer, and by +0.0 and +0.0 one layer before (means over datasets).",
-    "probe_baselines": "m: states are above every raw input, the output margin and noise on 0 of 1 pairs of datasets, "
-    "and on 0 of 1 datasets themselves.",
-    "gate_arrows": "m under guided: a gate on states takes PECS from 0.45 to 0.64, the best other gate (question "
-    "words) to 0.64.",
-    "patching": "In m, under standard, the difference of the output is carried by stamps tokens at the embeddings "
-    "(0.99 of it) and by stamps at the last layer (0.99).",
-    "doses_among_nulls": "m: void directions do more than 19 of 20 draws of every null in 1 of 1 cells, most of all ch "
-    "at 1 gap, where 80% more of 5 controls are abstained on.",
+    "states_and_output": "2 2 0 2 0 1.00 0.75 0.38",  # answered; states of voids, of controls; output; as orders
+    "lens": "+7.0 +1.0 +0.0 +0.0",
+    "probe_baselines": "0 1 0 1",
+    "gate_arrows": "0.45 0.64 0.64",
+    "patching": "0.99 0.99",
+    "doses_among_nulls": "19 20 1 1 1 80% 5",
 }
 
 
 @pytest.mark.parametrize("name", INSIDE)
 def test_a_lead_figure_says_what_it_shows_of_the_study_and_nothing_of_an_empty_one(name: str) -> None:
     report = next(report for report in FIGURE_REPORTS if report.name == name)
-    assert report.finding(Made()) == FINDINGS[name]
+    assert re.findall(r"[+-]?\d+(?:\.\d+)?%?", report.finding(Made())) == FINDINGS[name].split()
     assert report.note(Results()) == report.doc
 
 

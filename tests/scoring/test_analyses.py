@@ -9,7 +9,6 @@ from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.analyses import (
     accuracy_by_label,
     hidden_against_others,
-    models_of,
     naive_gap,
     overall,
     pair_differences,
@@ -23,7 +22,7 @@ from traps_pipeline.scoring.analyses import (
     zero_boundary,
 )
 from traps_pipeline.scoring.epochs import EpochMismatch
-from traps_pipeline.scoring.published import published, published_cells
+from traps_pipeline.scoring.published import published
 
 
 def cell(model="m", dataset="occlusion", regime="standard", acc=0.5, abs_rec=0.4, false_abs=0.1, pecs=0.15, epoch="e1"):
@@ -56,11 +55,8 @@ def test_uplift_is_the_ratio_of_means_not_the_mean_of_ratios():
         cell(regime="guided", abs_rec=0.5), cell(dataset="chaotic", regime="guided", abs_rec=0.3),
     )  # fmt: skip
     assert uplift(frame)["ratio"].tolist() == pytest.approx([0.4 / 0.2])
-
-
-def test_uplift_from_nothing_is_infinite():
-    frame = cells(cell(abs_rec=0.0), cell(regime="guided", abs_rec=0.5))
-    assert uplift(frame)["ratio"].tolist() == [np.inf]
+    from_nothing = cells(cell(abs_rec=0.0), cell(regime="guided", abs_rec=0.5))
+    assert uplift(from_nothing)["ratio"].tolist() == [np.inf]
 
 
 def test_a_mean_of_which_a_dataset_has_no_figure_is_null_and_so_is_what_is_made_of_it():
@@ -88,16 +84,6 @@ def test_a_mean_may_mix_epochs_where_both_sides_mix_them_alike():
     assert uplift(frame)["ratio"].tolist() == [1.0]
 
 
-def test_the_papers_own_chaotic_gap_is_refused_and_its_occlusion_gap_is_not():
-    frame = published_cells()
-    with raises(EpochMismatch, "scoring.epochs.require_one_epoch", "chaotic"):
-        visual_textual_gap(frame)
-    gaps = visual_textual_gap(frame, ["occlusion"]).set_index(["model", "regime"])
-    rows = published("behavioral_per_dataset").set_index(["model", "regime", "dataset"])["abs_rec_pct"]
-    expected = rows["gpt-5-pro", "standard", "occlusion_ill_posed"] / rows["gpt-5-pro", "standard", "occlusion"]
-    assert gaps.loc[("gpt-5-pro", "standard"), "gap"] == pytest.approx(expected)
-
-
 def test_the_pooled_gap_is_a_ratio_of_means_and_a_gap_over_zero_is_infinite():
     rates = dict(zip(DATASETS, (0.1, 0.2, 0.0, 0.5), strict=True))
     gaps = visual_textual_gap(cells(*(cell(dataset=d, abs_rec=r) for d, r in rates.items()))).set_index("taxonomy")
@@ -119,17 +105,6 @@ def test_the_naive_gap_counts_cells_strictly_above_the_threshold():
 
 def test_zero_boundary_lists_the_cells_with_pecs_0():
     assert list(zero_boundary(cells(cell("none", pecs=0.0), cell("some")))["model"]) == ["none"]
-
-
-def test_published_analyses_give_the_papers_figures():
-    frame = published_cells()
-    ratios = uplift(frame).set_index("model")["ratio"]
-    main = ratios[models_of("main")]
-    assert (main.median().round(1), main.max().round(), ratios["gemma-4-e4b"].round(1)) == (2.6, 11, 1.8)
-    guided = frame[frame["regime"] == "guided"]
-    assert sorted(pareto_frontier(guided)["model"]) == ["gemini-3.1-pro", "gemini-3.1-pro-r-low"]
-    assert len(naive_gap(guided[guided["model"].isin(models_of("main"))], 0.03)) == 16
-    assert spread(frame)["n"].iloc[0] == 183  # 16 x 4 x 3 cells, nine of a single run
 
 
 def test_reasoning_pairs_subtract_the_other_from_the_thinking_member():

@@ -16,12 +16,6 @@ def findings():
 
 
 def test_the_counts_are_the_documented_ones(findings):
-    assert findings["verdict"].value_counts().to_dict() == {
-        "agrees": 468,
-        "within rounding": 69,
-        "differs": 37,
-        "declared": 2,
-    }
     documented = " ".join((Path(__file__).parents[2] / "docs" / "scoring.md").read_text().split())
     assert counts_text(findings) in documented
 

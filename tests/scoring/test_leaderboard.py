@@ -102,8 +102,10 @@ def test_what_became_of_the_items_is_summed_over_runs_and_datasets(rows):
     assert tuple(entry(board, "overall")[columns]) == (4, 8, 4, 8, 8 / 32, True, 12 / 32)
 
 
-@pytest.mark.parametrize("outcome", ["degenerate", "unfinished", "unread"])
-@pytest.mark.parametrize(("dots", "is_broken"), [(0, False), (1, False), (2, True)])
+@pytest.mark.parametrize(
+    ("outcome", "dots", "is_broken"),
+    [("degenerate", 1, False), ("degenerate", 2, True), ("unfinished", 2, True), ("unread", 2, True)],
+)
 def test_an_entry_is_broken_where_more_than_1_percent_of_its_texts_say_nothing(outcome, dots, is_broken, rows):
     verdicts = rows([(True, False, True)] * 50, outcomes=[outcome] * dots + ["answer"] * (100 - dots))
     row = entry(board_of(verdicts))

@@ -153,13 +153,6 @@ def test_what_must_be_inferred_enters_neither_figure(rows: Rows) -> None:
     assert np.isnan([alone.robust, alone.robust_ci_low, alone.conjunction]).all() and alone.inference_acc == 1.0
 
 
-def test_figures_are_computed_per_run_and_then_averaged(rows: Rows) -> None:
-    # Run 1: decoys right, 1. Run 2: decoys abstained on, 1/4. Their mean is 5/8; no pooled run has it.
-    runs = [study(rows, [RIGHT] * 30, {"decoy": [said] * 30}, run=run) for run, said in ((1, RIGHT), (2, SHY))]
-    row = only(robust(pd.concat(runs, ignore_index=True), 20))
-    assert (row.n_runs, row.robust) == (2, pytest.approx(0.625))
-
-
 def test_an_entry_rests_on_the_runs_that_have_most_arms(rows: Rows) -> None:
     # Run 1 alone has the twins, run 3 no arm, run 4 lacks a dataset.
     one = study(rows, [RIGHT], {"decoy": [RIGHT], "twin_control": [RIGHT]}, run=1)

@@ -58,12 +58,8 @@ def test_data_files_hold_each_answer_with_its_decisions_and_votes(workspace: Wor
     items = read_data(data / "items.js")["items"]
     assert items["side"] == ["control", "void"]
     decisions = read_data(data / "decisions.js")["decisions"]
-    assert [[*pair] for pair in zip(decisions["item"], decisions["evaluation"], strict=True)] == [
-        [0, 0],
-        [0, 1],
-        [1, 0],
-        [1, 1],
-    ]
+    pairs = [*zip(decisions["item"], decisions["evaluation"], strict=True)]
+    assert pairs == [(0, 0), (0, 1), (1, 0), (1, 1)]
     assert [study["outcomes"][k] for k in decisions["outcome"]] == ["answer", "answer", "refused", "refused"]
     assert decisions["abstained"] == [NO, NO, NONE, NONE]
     assert decisions["correct"] == [NONE] * 4
