@@ -431,4 +431,6 @@ def test_a_certificate_that_is_added_reaches_draws_records_asset_checks_and_the_
 
 
 def test_the_table_on_the_page_is_that_of_the_definitions() -> None:
-    assert certificate_table.written() == certificates.table() + "\n", "python -m tests.scenes.certificate_table"
+    assert certificate_table.ON_PAGE.written() == certificates.table() + "\n", (
+        "python -m tests.scenes.certificate_table"
+    )
