@@ -11,20 +11,9 @@ import numpy as np
 import pytest
 
 from tests.scenes.released import Released, first_of_each, load
-from traps_pipeline.scenes.certification.certificates import (
-    TWIN_OF_CUT,
-    earliest_cut,
-    futures_of,
-    pair_of,
-)
+from traps_pipeline.scenes.certification.certificates import TWIN_OF_CUT, earliest_cut, futures_of, pair_of
 from traps_pipeline.scenes.certification.certify_record import certify
-from traps_pipeline.scenes.certification.ensemble import (
-    Cut,
-    Rollout,
-    along_contacts,
-    entropy_bits,
-    unseen_steps,
-)
+from traps_pipeline.scenes.certification.ensemble import Cut, Rollout, along_contacts, entropy_bits, unseen_steps
 from traps_pipeline.scenes.certification.evidence import Claim, Evidence
 from traps_pipeline.scenes.draw.resolve import choose_cut, open_cuts
 from traps_pipeline.scenes.draw.sample import Draw, try_draw
