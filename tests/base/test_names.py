@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +9,13 @@ import dagster as dg
 import pytest
 import yaml
 
+from tests.build.entries import nobodys_own
 from tests.build.errors import raises
 from traps_pipeline.base.names import LONGEST, check_name
 from traps_pipeline.cli import main
-from traps_pipeline.models import user_registry
 from traps_pipeline.protocol.cells import Cell, Evaluation
 
+__all__ = ["nobodys_own"]  # a fixture
 KEYS = ["", "a_b", "a__b", "A", "a|b", "a/b", "a b", "a,b", "a\n", "ä", "a\u0663"]
 PATHS = [".", "..", "a..b", "a...b", ".a", "a.", "-a", "a-", "a" * (LONGEST + 1)]
 VALUES = ["1", "1.5", "1e3", "0x1f", "0b1", "2026-11-01", "2026-13-45", "20261101", "nan", "inf", "infinity"]
@@ -37,14 +37,6 @@ def test_any_other_name_is_a_key_a_file_and_a_text(name: str, tmp_path: Path) ->
     assert yaml.safe_load(f"[{name}]") == [name]
 
 
-@pytest.fixture
-def _forgets() -> Iterator[None]:
-    yield
-    user_registry._overlay.clear()
-    user_registry.clear_caches()
-
-
-@pytest.mark.usefixtures("_forgets")
 @pytest.mark.parametrize("field", ["models", "judges", "panels", "accounts", "name"])
 def test_a_wrong_name_in_an_experiment_is_one_sentence_and_leaves_no_workspace(
     field: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -66,7 +58,6 @@ def test_a_wrong_name_in_an_experiment_is_one_sentence_and_leaves_no_workspace(
     assert not (tmp_path / "study").exists()
 
 
-@pytest.mark.usefixtures("_forgets")
 @pytest.mark.parametrize("wrong", [{"scenarios": ["domino_chian-0001"]}, {"benchmark": "other"}], ids=str)
 def test_a_name_that_nothing_has_leaves_no_workspace_and_the_corrected_one_makes_it(
     wrong: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -33,9 +33,9 @@ def entry(patch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -
     return made
 
 
-def extract_all(workspace: Workspace) -> int:
+def extract_all(workspace: Workspace, datasets: Sequence[str] = (*DATASETS, ANSWERABLE, TIME_SWAPPED)) -> int:
     made = 0
-    for dataset in (*DATASETS, ANSWERABLE, TIME_SWAPPED):
+    for dataset in datasets:
         workspace.tables.write(PROBE_ITEMS, {"dataset": dataset}, probe_items(workspace, dataset), {})
         cell = StatesCell(dataset, STANDARD)
         rows, new = stages.extract_states(workspace, cell)

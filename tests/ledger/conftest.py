@@ -19,6 +19,16 @@ from traps_pipeline.ledger.postgres import PostgresDatabase
 from traps_pipeline.ledger.sqlite import SqliteDatabase
 
 VARIABLE = "TRAPS_TEST_DATABASE"
+# Says that it is ready, waits for a line, and writes one row of the evaluation that it is told.
+WRITE_ONE = """
+import asyncio
+async def write():
+    async with ledger.writing(sys.argv[1], print) as writer:
+        await writer.write({"key": "k", "outcome": "answer", "text": "left"})
+print("ready", flush=True)
+sys.stdin.readline()
+asyncio.run(write())
+"""
 
 
 def opened(kind: str, *where: str) -> Ledger:
@@ -55,6 +65,27 @@ class Place:
         finally:
             process.kill()
             process.communicate()
+
+
+def line_of(process: subprocess.Popen[str]) -> str:
+    """The next line that a process says."""
+    assert process.stdout is not None
+    return process.stdout.readline().strip()
+
+
+def begin(*processes: subprocess.Popen[str]) -> None:
+    """Let processes begin once all are ready: one that is late would find nothing left."""
+    for process in processes:
+        assert line_of(process) == "ready"
+    for process in processes:
+        go_on(process)
+
+
+def go_on(process: subprocess.Popen[str]) -> None:
+    """Give a process the line that it waits for."""
+    assert process.stdin is not None
+    process.stdin.write("\n")
+    process.stdin.flush()
 
 
 def in_database(server: Postgres, idle_s: float = 30.0) -> Place:

@@ -19,7 +19,7 @@ import sqlalchemy as sa
 from tests.build.errors import raises
 from tests.build.ledger import answer, local, paid, write
 from tests.conftest import ROOT
-from tests.ledger.conftest import Place
+from tests.ledger.conftest import WRITE_ONE, Place, go_on, line_of
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.ledger.ledger import Ledger, LockGivenUp
 from traps_pipeline.ledger.rows import EvaluationRows, Totals, digest_of, encode_row
@@ -42,11 +42,22 @@ async def write():
             print(f"k{n}", flush=True)
 asyncio.run(write())
 """
+KEEP = """
+import asyncio
+async def keep():
+    async with ledger.writing("m", print) as writer:
+        await writer.write({"key": "before", "outcome": "answer", "text": "left"})
+        await writer.sync()
+        print("synced", flush=True)
+        sys.stdin.readline()
+        await writer.write({"key": "after", "outcome": "answer", "text": "left"})
+        print("kept", flush=True)
+        sys.stdin.readline()
+asyncio.run(keep())
+"""
 FILL = """
 import asyncio, resource, sys
 from pathlib import Path
-from typing import Any
-from tests.build.errors import raises
 from tests.build.ledger import answer, local
 from traps_pipeline.base.errors import TrapsError
 async def fill():
@@ -194,9 +205,9 @@ def test_an_import_whose_second_evaluation_is_taken_over_midway_stores_nothing(
 
 def test_what_was_kept_survives_the_kill_of_its_writer_and_another_one_goes_on(place: Place) -> None:
     with place.process(WRITE) as process:
-        assert process.stdout is not None
-        told = [process.stdout.readline().strip() for _ in range(200)]
+        told = [line_of(process) for _ in range(200)]
         process.kill()
+        assert process.stdout is not None
         told += process.stdout.read().split()
     ledger = place.open()
     kept = list(ledger.read("m").rows)
@@ -204,6 +215,18 @@ def test_what_was_kept_survives_the_kill_of_its_writer_and_another_one_goes_on(p
     assert ledger.read("m").notes == {}
     write(ledger, answer("later", "left"))
     assert len(ledger.read("m").rows) == len(kept) + 1
+
+
+def test_rows_kept_after_another_process_has_ended_survive_a_kill(tmp_path: Path) -> None:
+    place = Place(("sqlite", str(tmp_path)))
+    with place.process(KEEP) as keeping:
+        assert line_of(keeping) == "synced"
+        with place.process(WRITE_ONE, "another") as other:
+            assert other.communicate("\n")[0] == "ready\n" and other.returncode == 0
+        go_on(keeping)
+        assert line_of(keeping) == "kept"
+        assert [*place.open().read("m").rows] == ["before", "after"]
+    assert [*place.open().read("m").rows] == ["before", "after"]
 
 
 @pytest.mark.slow
@@ -228,7 +251,7 @@ def test_a_second_run_waits_and_says_who_writes_until_that_one_is_killed(place: 
         await take()  # nobody holds it: who would wait says so
 
     with place.process(HOLD) as holder:
-        assert holder.stdout is not None and holder.stdout.readline() == "held\n"
+        assert line_of(holder) == "held"
         asyncio.run(scenario())
     assert len(said) == 1 and f"answers of m are being asked by process {holder.pid}" in said[0]
 
@@ -274,9 +297,8 @@ def test_no_bit_of_a_row_can_flip_unseen(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_row_that_cannot_be_written_is_told_and_the_others_are_kept(tmp_path: Path) -> None:
-    ran = subprocess.run(
-        [sys.executable, "-c", FILL, str(tmp_path)], capture_output=True, check=True, text=True, cwd=ROOT
-    )
+    command = [sys.executable, "-c", FILL, str(tmp_path)]
+    ran = subprocess.run(command, capture_output=True, check=True, text=True, cwd=ROOT)
     assert "ledger.sqlite: cannot be read or written" in ran.stdout and "run the same command again" in ran.stdout
     stored = int(ran.stdout.splitlines()[0])
     assert stored > 50
@@ -292,7 +314,6 @@ def test_a_ledger_in_a_folder_that_cannot_be_written_is_read() -> None:
     reading = """
 import os, sys
 from pathlib import Path
-from typing import Any
 from tests.build.ledger import local
 if os.geteuid() == 0:
     os.setuid(65534)
@@ -323,7 +344,7 @@ def test_the_lock_of_a_run_whose_file_is_removed_lets_no_call_go(tmp_path: Path)
 
 def test_two_evaluations_are_written_by_two_processes_at_the_same_time(place: Place) -> None:
     with place.process(WRITE) as other:
-        assert other.stdout is not None and other.stdout.readline() == "k0\n"
+        assert line_of(other) == "k0"
         write(place.open(), *(answer(f"n{n}", "left") for n in range(50)), evaluation="n")
         assert other.poll() is None
     assert len(place.open().read("n").rows) == 50

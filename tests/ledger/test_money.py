@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import subprocess
 import time
 from contextlib import ExitStack
 
 import pytest
 
 from tests.build.ledger import budget_in, paid, write
-from tests.ledger.conftest import Place
+from tests.ledger.conftest import Place, begin, line_of
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.ledger.ledger import Ledger
 from traps_pipeline.ledger.money import Money, Releasable
@@ -48,16 +47,6 @@ with ledger.database.writing():
 """
 
 
-def begin(*processes: subprocess.Popen[str]) -> None:
-    """Let spenders begin once all are ready: one that is late would find nothing left."""
-    for process in processes:
-        assert process.stdout is not None and process.stdout.readline() == "ready\n"
-    for process in processes:
-        assert process.stdin is not None
-        process.stdin.write("\n")
-        process.stdin.flush()
-
-
 def spent_usd(ledger: Ledger) -> float:
     with ledger.database.writing():
         return sum(Money(ledger.database).spent().values())
@@ -88,9 +77,7 @@ def test_two_processes_use_a_cap_up_to_the_last_worst_case_and_never_pass_it(pla
 def test_what_a_killed_process_may_have_spent_is_counted_until_it_is_released(place: Place) -> None:
     with place.process(SPEND, "one", "10.0", "3000") as process:
         begin(process)
-        assert process.stdout is not None
-        for _ in range(24):
-            assert process.stdout.readline() == "calls\n"
+        assert [line_of(process) for _ in range(24)] == ["calls"] * 24
         process.kill()
         process.wait()
     ledger, until = place.open(), time.monotonic() + 600

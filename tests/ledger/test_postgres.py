@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ import sqlalchemy as sa
 
 from tests.build.ledger import answer, paid, write
 from tests.conftest import ROOT
-from tests.ledger.conftest import VARIABLE, in_database, opened
+from tests.ledger.conftest import VARIABLE, WRITE_ONE, begin, in_database, line_of, opened
 from tests.postgres import Postgres
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.ledger.ledger import Ledger
@@ -50,7 +51,7 @@ def test_a_writer_that_slept_while_another_took_over_pays_nothing_and_stores_not
 ) -> None:
     place, calls = in_database(postgres, idle_s=2), tmp_path / "calls"
     with place.process(ASK, str(calls)) as sleeper:
-        assert sleeper.stdout is not None and sleeper.stdout.readline() == "asking\n"
+        assert line_of(sleeper) == "asking" and sleeper.stdout is not None
         os.kill(sleeper.pid, signal.SIGSTOP)
         try:
             ledger, began = place.open(), time.monotonic()
@@ -118,7 +119,7 @@ def test_a_server_that_stops_and_starts_ends_no_run_and_loses_no_row(tmp_path: P
     with Postgres.running(durable=True) as server:
         place = in_database(server)
         with place.process(ASK, str(tmp_path / "calls")) as process:
-            assert process.stdout is not None and process.stdout.readline() == "asking\n"
+            assert line_of(process) == "asking" and process.stdout is not None
             server.stop(signal.SIGQUIT)
             time.sleep(1)
             asked = (tmp_path / "calls").stat().st_size
@@ -191,6 +192,15 @@ postgres_of("{VARIABLE}", "my-study")
 """
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
     assert "a study that hosts share needs psycopg, which is not installed: `make setup`" in ran.stderr
+
+
+def test_processes_that_begin_at_once_in_an_empty_database_all_write() -> None:
+    with Postgres.running() as server, ExitStack() as running:
+        place = in_database(server)
+        processes = [running.enter_context(place.process(WRITE_ONE, f"m{number}")) for number in range(4)]
+        begin(*processes)
+        said = [process.communicate()[0] for process in processes]
+        assert [process.returncode for process in processes] == [0] * 4, said
 
 
 def test_studies_of_one_database_do_not_see_each_other(postgres: Postgres) -> None:

@@ -1,4 +1,4 @@
-"""Void directions: hand-worked vectors, controls of the same norm, the choice of pairs, and files read back."""
+"""Void directions: hand-worked vectors and cosines, controls of the same norm, the choice of pairs, files read back."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import pytest
 from tests.build.directions import origin, pair_states
 from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.mechanism.cosines import PairDifferences, apart, disattenuated
 from traps_pipeline.mechanism.directions import (
     KINDS,
     NULLS,
@@ -121,3 +122,24 @@ def test_cosines_are_of_angles() -> None:
         np.array([[1, 0, 0.70710678], [0, 1, 0.70710678], [0.70710678, 0.70710678, 1]])
     )
     assert np.isnan(matrix[3]).all()
+
+
+ONCE = np.ones((1, 6))
+
+
+def test_products_of_different_scenarios_alone_count() -> None:
+    one = PairDifferences(np.array([[2.0, 1.0], [2.0, -1.0]]), np.array([0, 1]))
+    other = PairDifferences(np.array([[1.0, 1.0], [1.0, -1.0], [1.0, 0.0]]), np.array([2, 3, 4]))
+    assert apart(one, one, ONCE) == pytest.approx(3)  # (2, 1)(2, -1), not the squares 5
+    assert apart(other, other, ONCE) == pytest.approx(2 / 3)  # of 0, 1 and 1
+    assert disattenuated(one, other, ONCE) == pytest.approx(2 / np.sqrt(3 * 2 / 3))
+    shared = PairDifferences(other.values[:2], np.array([1, 5]))  # one of its scenarios is one of the first's
+    assert apart(one, shared, ONCE) == pytest.approx((3 + 1 + 3) / 3)  # without (2, -1)(1, 1)
+    twice = np.array([[1.0, 1, 0, 2, 0, 0]])  # scenario 3 drawn twice: never multiplied with itself
+    assert apart(one, other, twice) == pytest.approx((1 + 3) / 2)
+    assert np.isnan(apart(other, other, twice))
+
+
+def test_a_direction_that_is_all_noise_has_no_disattenuated_cosine() -> None:
+    noise = PairDifferences(np.array([[1.0, 0.0], [-1.0, 0.0]]), np.array([0, 1]))
+    assert np.isnan(disattenuated(noise, noise, ONCE))

@@ -5,7 +5,6 @@ tiny random checkpoint."""
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,8 @@ import pytest
 import torch
 
 from tests.build.errors import raises
-from tests.mechanism.study import CATEGORY, PAIRS, SETTINGS, filled, make_study, register, tiny_entry
+from tests.build.mechanism import STANDARD, entry, extract_all, patch
+from tests.mechanism.study import CATEGORY, PAIRS, SETTINGS, filled, make_study
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.mechanism import stages
@@ -27,8 +27,7 @@ from traps_pipeline.mechanism.gating import UNTRAINED, gate_items, gate_rows, ga
 from traps_pipeline.mechanism.item_scores import item_score_rows
 from traps_pipeline.mechanism.lens import lens_rows
 from traps_pipeline.mechanism.margin import is_abstention_start
-from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES, PROBE_ITEMS, PROBES
-from traps_pipeline.mechanism.probe_items import probe_items
+from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS, PROBES
 from traps_pipeline.mechanism.probing import ProbeRun
 from traps_pipeline.mechanism.sentences import sentence_rows
 from traps_pipeline.mechanism.stored_states import StoredStates
@@ -39,7 +38,7 @@ from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.prompts import system_prompt, vqa_prompt
 from traps_pipeline.models.registry import ModelEntry
-from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction, StatesCell
+from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.media import sample
@@ -47,34 +46,15 @@ from traps_pipeline.storage.study import ProbeSettings
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
-STANDARD = Extraction("tiny", "standard")
+__all__ = ["entry", "patch"]  # fixtures
 ARMS = ("decoy", "removed", "length_matched")
 EVERY = (*DATASETS, *ARMS)
 
 
 @pytest.fixture(scope="module")
-def patch() -> Iterator[pytest.MonkeyPatch]:
-    with pytest.MonkeyPatch.context() as patch:
-        yield patch
-
-
-@pytest.fixture(scope="module")
-def entry(patch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> ModelEntry:
-    made = tiny_entry(tmp_path_factory.mktemp("tiny") / "checkpoint")
-    register(patch, made)
-    patch.setattr("tests.mechanism.study.SETTINGS", SETTINGS | {"gate": {"untrained": True}})
-    return made
-
-
-def extract(workspace: Workspace, dataset: str) -> None:
-    workspace.tables.write(PROBE_ITEMS, {"dataset": dataset}, probe_items(workspace, dataset), {})
-    cell = StatesCell(dataset, STANDARD)
-    workspace.tables.write(HIDDEN_STATES, cell.partition, stages.extract_states(workspace, cell)[0], {})
-
-
-@pytest.fixture(scope="module")
-def study(entry: ModelEntry, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
+def study(entry: ModelEntry, patch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
     """Extracted, probed and judged; a void's clip stands for both panels, a control's for the short clip."""
+    patch.setattr("tests.mechanism.study.SETTINGS", SETTINGS | {"gate": {"untrained": True}})
     workspace = make_study(tmp_path_factory.mktemp("study"))
     for arm, shown in zip(ARMS, ("void", "void", "control"), strict=True):
         rows = []
@@ -86,8 +66,8 @@ def study(entry: ModelEntry, tmp_path_factory: pytest.TempPathFactory) -> Worksp
                 made |= {"question": f"Where does {row['scenario_id']} end?", "ground_truth": "left"}
                 rows.append(ITEMS.row_type(**made))
         workspace.tables.write(ITEMS, {"dataset": arm}, rows, {})
+    extract_all(workspace, EVERY)
     for dataset in EVERY:
-        extract(workspace, dataset)
         partition = {"dataset": dataset, "model": "tiny", "regime": "standard", "run": 1}
         items = workspace.tables.read(ITEMS, {"dataset": dataset}).to_dict("records")
         judged = [
@@ -220,7 +200,7 @@ def test_states_under_the_benchmarks_own_prompt_have_other_keys_and_are_the_libr
     own = Workspace.open(tmp_path / "study")
     own = own.allow(mechanism=own.mechanism.model_copy(update={"system": "benchmark"}))
     before = StoredStates.of(study, STANDARD).dataset("chaotic")
-    extract(own, "chaotic")
+    extract_all(own, ["chaotic"])
     states = StoredStates.of(own, STANDARD)
     assert states.dataset("chaotic")["item_id"].tolist() == before["item_id"].tolist()
     assert not {*states.dataset("chaotic")["states_key"]} & {*before["states_key"]}

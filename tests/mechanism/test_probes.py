@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -180,17 +182,16 @@ def study(pairs: int = 12, seed: int = 0) -> tuple[pd.DataFrame, dict[tuple[str,
     return items, states
 
 
-def protocol(items: pd.DataFrame, states: dict, confabulated: Confabulated | None = None) -> pd.DataFrame:
-    settings = ProbeSettings(folds=3, shuffles=20, resamples=100)
-    run = ProbeRun(items, lambda d, n: states[d, n], LAYERS, 1, settings, 7, confabulated or Confabulated({}))
-    return pd.DataFrame(run.rows())
+def run_of(items: pd.DataFrame, states: dict, cf: Confabulated | None = None, folds: int = 3) -> ProbeRun:
+    settings = ProbeSettings(folds=folds, shuffles=20, resamples=100)
+    return ProbeRun(items, lambda d, n: states[d, n], LAYERS, 1, settings, 7, cf or Confabulated({}))
 
 
 @pytest.fixture(scope="module")
 def rows() -> pd.DataFrame:
     items, states = study()
     some = {d: frozenset(f"{d.split('_')[0]}-{n:02d}" for n in range(8)) for d in DATASETS if d != "chaotic"}
-    return protocol(items, states, Confabulated(some, {"chaotic": "none there"}))
+    return pd.DataFrame(run_of(items, states, Confabulated(some, {"chaotic": "none there"})).rows())
 
 
 @pytest.mark.slow
@@ -235,12 +236,10 @@ def test_cf_of_shared_controls_is_held_out_by_scenario_too_or_says_that_too_few_
     for dataset in ("occlusion", "occlusion_ill_posed"):
         states[dataset, 0] = np.random.default_rng(len(dataset)).normal(size=(30, 200))
     states["occlusion_ill_posed", 0][::2] = states["occlusion", 0][::2]
-    settings = ProbeSettings(folds=5, shuffles=20, resamples=100)
 
     def of(scenarios: int) -> dict[str, pd.DataFrame]:
         some = frozenset(f"occlusion-{n:02d}" for n in range(scenarios))
-        cf = Confabulated({"occlusion": some, "occlusion_ill_posed": some})
-        run = ProbeRun(items, lambda d, n: states[d, n], LAYERS, 1, settings, 7, cf)
+        run = run_of(items, states, Confabulated({"occlusion": some, "occlusion_ill_posed": some}), folds=5)
         return {str(name): part for name, part in pd.DataFrame(run.comparable(0)).groupby("analysis")}
 
     many, two = of(12), of(2)
@@ -254,11 +253,11 @@ def test_cf_of_shared_controls_is_held_out_by_scenario_too_or_says_that_too_few_
 def test_a_target_label_never_influences_a_fit() -> None:
     """Swapping the sides of a target mirrors its AUROC exactly, and leaves every figure of other targets as it is."""
     items, states = study(pairs=6)
-    before = protocol(items, states)
+    before = pd.DataFrame(run_of(items, states).rows())
     swapped = items.copy()
     target = (items["dataset"] == "chaotic").to_numpy()
     swapped.loc[target, "side"] = np.where(items.loc[target, "side"] == "void", "control", "void")
-    after = protocol(swapped, states)
+    after = pd.DataFrame(run_of(swapped, states).rows())
     keys = ["analysis", "source", "target", "layer", "scope"]
     both = before.merge(after, on=keys, suffixes=("", "_after"))
     both = both[both["analysis"] == "transfer"]
@@ -278,9 +277,7 @@ def test_shared_controls_flatter_pairs_of_one_taxonomy_unless_their_scenario_is_
     for dataset in ("occlusion", "chaotic"):
         states[f"{dataset}_ill_posed", 0][::2] = states[dataset, 0][::2]
     assert set(items.loc[items["dataset"] == "chaotic", "side"].iloc[::2]) == {"control"}
-    settings = ProbeSettings(folds=5, shuffles=20, resamples=100)
-    run = ProbeRun(items, lambda d, n: states[d, n], LAYERS, 1, settings, 7)
-    found = pd.DataFrame(run.layer_rows(0))
+    found = pd.DataFrame(run_of(items, states, folds=5).layer_rows(0))
     value = {name: rows.set_index(["source", "target"])["value"] for name, rows in found.groupby("analysis")}
     pairs = [(s, t) for s, t in TRANSFER_PAIRS if s.split("_")[0] == t.split("_")[0]]
     itself = [(name, name) for name in DATASETS]
@@ -302,7 +299,7 @@ def test_swapped_times_tell_a_probe_of_stamps_from_one_of_frames() -> None:
             states[dataset, layer] = rng.normal(size=(20, WIDTH))
             shown = void ^ (dataset == TIME_SWAPPED and layer == 1)
             states[dataset, layer][:, column] = 8.0 * shown
-    run = ProbeRun(items, lambda d, n: states[d, n], LAYERS, 1, ProbeSettings(folds=3, resamples=100), 7)
+    run = run_of(items, states)
     for layer, expected in ((0, 1.0), (1, 0.0)):
         rows = [r for r in run.comparable(layer) if r["analysis"] == "time_swapped" and r["source"] == "chaotic"]
         assert [row["value"] for row in rows] == [pytest.approx(expected, abs=0.25)]
@@ -315,8 +312,8 @@ def test_a_sub_scenario_whose_voids_look_like_controls_is_not_caught_and_the_oth
         disguised = (dataset == "chaotic") & (of["sub_scenario"] == "sub1").to_numpy(bool)
         shown = (of["side"] == "void").to_numpy(bool) & ~disguised
         states[dataset, 1] = np.where(shown[:, None], [[0.0, 1.0]], [[1.0, 0.0]]).astype(np.float32)
-    run = ProbeRun(items, lambda d, n: states[d, n], LAYERS, 1, ProbeSettings(folds=2, resamples=100), 7)
-    rows = pd.DataFrame(run.layer_rows(1)).set_index(["analysis", "source", "target", "scope"])["value"].sort_index()
+    found = pd.DataFrame(run_of(items, states, folds=2).layer_rows(1))
+    rows = found.set_index(["analysis", "source", "target", "scope"])["value"].sort_index()
     caught = rows["centroid_void", "occlusion", "chaotic"]
     assert caught.to_dict() == {"all": 0.5, "sub_scenario:sub0": 1.0, "sub_scenario:sub1": 0.0}
     assert set(rows["centroid_control", "occlusion", "chaotic"]) == {0.0}
@@ -324,14 +321,12 @@ def test_a_sub_scenario_whose_voids_look_like_controls_is_not_caught_and_the_oth
 
 def test_a_layer_out_of_range_and_missing_states_are_told() -> None:
     items, states = study(pairs=4)
-    settings = ProbeSettings(resamples=100)
     with raises(TrapsError, "mechanism.probing.ProbeRun.__post_init__", "32"):
-        ProbeRun(items, lambda d, n: states[d, n], LAYERS, 32, settings, 7)
+        replace(run_of(items, states), centroid_layer=32)
     with raises(TrapsError, "mechanism.probing.ProbeRun.__post_init__"):
-        ProbeRun(items.iloc[:0], lambda d, n: states[d, n], LAYERS, 1, settings, 7)
-    short = ProbeRun(items, lambda d, n: states[d, n][:3], LAYERS, 1, settings, 7)
+        run_of(items.iloc[:0], states)
     with raises(TrapsError, "mechanism.probing.ProbeRun._split", "occlusion"):
-        short.layer_rows(0)
+        run_of(items, {place: of[:3] for place, of in states.items()}).layer_rows(0)
 
 
 def test_confabulated_items_are_decided_voids_that_were_answered() -> None:

@@ -95,32 +95,24 @@ def test_states_stand_in_the_order_of_their_table(study: Workspace) -> None:
     assert len(ill_posed) == 2 * PAIRS and states.n_layers == 5
 
 
-@pytest.mark.parametrize("lost", ["shard-00000.safetensors", "shard-00000.parquet", "ids.parquet"])
+@pytest.mark.parametrize("lost", ["shard-00000.safetensors", "shard-00000.parquet", "ids.parquet", "a torn index"])
 def test_lost_states_are_stale_and_made_again_as_they_were(own: Workspace, lost: str) -> None:
-    cell = StatesCell("chaotic", STANDARD)
-    assert states_of(own, cell) == ()
-    before = StoredStates.of(own, STANDARD).read("chaotic", 3)
-    (own.root / "states" / "tiny" / "standard" / "chaotic" / lost).unlink()
-    assert "its states are gone" in states_of(own, cell)
-    stages.extract_states(own, cell)
-    assert states_of(own, cell) == ()
+    cell, folder = StatesCell("chaotic", STANDARD), own.root / "states" / "tiny" / "standard" / "chaotic"
+
+    def are_gone() -> bool:
+        return "its states are gone" in Lineage(own).status("hidden_states", cell.key).reasons
+
+    before, was_gone = StoredStates.of(own, STANDARD).read("chaotic", 3), are_gone()
+    if lost == "a torn index":
+        (folder / "ids.parquet").write_bytes(b"torn")
+        with pytest.raises(TrapsError, match="run again, and it is made anew"):
+            StoredStates.of(own, STANDARD).read("chaotic", 3)
+    else:
+        (folder / lost).unlink()
+    assert not was_gone and are_gone()
+    _, made = stages.extract_states(own, cell)
+    assert not are_gone() and (made == 0 or lost != "a torn index")
     assert (StoredStates.of(own, STANDARD).read("chaotic", 3) == before).all()
-
-
-def states_of(workspace: Workspace, cell: StatesCell) -> tuple[str, ...]:
-    """What is wrong with the files of a partition, its inputs aside: the study's were written without any."""
-    reasons = Lineage(workspace).status("hidden_states", cell.key).reasons
-    return tuple(reason for reason in reasons if "gone" in reason)
-
-
-def test_a_damaged_index_of_states_is_written_again(own: Workspace) -> None:
-    cell = StatesCell("chaotic", STANDARD)
-    (own.root / "states" / "tiny" / "standard" / "chaotic" / "ids.parquet").write_bytes(b"torn")
-    with pytest.raises(TrapsError, match="run again, and it is made anew"):
-        StoredStates.of(own, STANDARD).read("chaotic", 3)
-    assert "its states are gone" in states_of(own, cell)
-    assert stages.extract_states(own, cell)[1] == 0
-    assert states_of(own, cell) == ()
 
 
 @pytest.mark.parametrize("ending", [".safetensors", ".json"])

@@ -16,9 +16,18 @@ from traps_pipeline.models.request import Request, TransientError
 from traps_pipeline.protocol.regimes import FIELDS
 
 LABELS = ["left", "right", "elsewhere"]
-
-
 BAYES = ("bayes", "bayes-cautious", "bayes-rash")
+
+
+def said(asked: Request) -> Any:
+    """What the backend answers, read from its JSON."""
+    return json.loads(str(asyncio.run(ReferenceBackend().ask(asked)).text))
+
+
+def first_token(asked: Request) -> dict[str, float] | None:
+    """The probabilities of its first token."""
+    given = asyncio.run(ReferenceBackend().ask(asked)).first_token
+    return None if given is None else {token: exp(logprob) for token, logprob in json.loads(given).items()}
 
 
 def request(side: str, item: int = 0, regime: str = "standard", **params: Any) -> Request:
@@ -41,8 +50,8 @@ def request(side: str, item: int = 0, regime: str = "standard", **params: Any) -
     ],
 )
 def test_a_strategy_says_what_its_name_says(strategy: str, control: set[str | None], void: set[str | None]) -> None:
-    for side, said in (("control", control), ("void", void)):
-        assert {STRATEGIES[strategy](request(side, n)) for n in range(50)} == said
+    for side, answers in (("control", control), ("void", void)):
+        assert {STRATEGIES[strategy](request(side, n)) for n in range(50)} == answers
 
 
 @pytest.mark.parametrize(("model", "rate"), [("random-50", 0.5), ("confidence-noise", 0.2)])
@@ -56,22 +65,18 @@ def test_an_abstention_rate_holds_on_both_sides_within_three_sigma(model: str, r
 def test_a_strategy_gives_the_first_token_of_its_answer_the_probability_that_it_believes() -> None:
     asked = request("control", regime="logprobs", **get_model("bayes").params)
     asked = replace(asked, secret={**asked.secret, "posterior": {"left": 0.8, "elsewhere": 0.2}})
-    given = json.loads(str(asyncio.run(ReferenceBackend().ask(asked)).first_token))
-    assert {token: exp(logprob) for token, logprob in given.items()} == pytest.approx({"left": 0.8, "elsewhere": 0.2})
-    abstains = request("control", regime="logprobs", strategy="always-abstain")
-    assert json.loads(str(asyncio.run(ReferenceBackend().ask(abstains)).first_token)) == {ABSTENTION: 0.0}
-    assert asyncio.run(ReferenceBackend().ask(request("control", strategy="oracle"))).first_token is None
+    assert first_token(asked) == pytest.approx({"left": 0.8, "elsewhere": 0.2})
+    assert first_token(request("control", regime="logprobs", strategy="always-abstain")) == {ABSTENTION: 1.0}
+    assert first_token(request("control", strategy="oracle")) is None
 
 
 def test_bayes_answers_what_is_probable_enough_and_states_what_it_believes() -> None:
     asked = request("control", regime="probabilities", **get_model("bayes").params)
     asked = replace(asked, secret={**asked.secret, "posterior": {"left": 0.8, "elsewhere": 0.2}})
-    text = json.loads(str(asyncio.run(ReferenceBackend().ask(asked)).text))
-    assert {one["answer"]: one["probability"] for one in text["probabilities"]} == {
-        "left": 0.8, "right": 0.0, "elsewhere": 0.2
-    }  # fmt: skip
-    said = {name: STRATEGIES["bayes"](replace(asked, params=get_model(name).params)) for name in BAYES}
-    assert said == {"bayes": "left", "bayes-cautious": None, "bayes-rash": "left"}
+    stated = {one["answer"]: one["probability"] for one in said(asked)["probabilities"]}
+    assert stated == {"left": 0.8, "right": 0.0, "elsewhere": 0.2}
+    answers = {name: STRATEGIES["bayes"](replace(asked, params=get_model(name).params)) for name in BAYES}
+    assert answers == {"bayes": "left", "bayes-cautious": None, "bayes-rash": "left"}
     noisy = get_model("bayes-noisy").params
     shares = [
         believed_probabilities(replace(request("control", k), secret=asked.secret, params=noisy))["left"]
@@ -100,13 +105,10 @@ def test_what_looks_random_is_the_same_every_time_and_differs_between_seeds() ->
 
 
 def test_the_json_regime_is_answered_in_json_and_the_others_in_words() -> None:
-    backend = ReferenceBackend()
-    spoken = asyncio.run(backend.ask(request("control", strategy="oracle")))
+    spoken = asyncio.run(ReferenceBackend().ask(request("control", strategy="oracle")))
     assert str(spoken.text).endswith("The answer is: right.")
-    written = asyncio.run(backend.ask(request("control", regime="json", strategy="oracle")))
-    assert json.loads(str(written.text))["final_answer"] == "right"
-    silent = asyncio.run(backend.ask(request("void", regime="json", strategy="oracle")))
-    assert json.loads(str(silent.text))["final_answer"] == ABSTENTION
+    for side, answer in (("control", "right"), ("void", ABSTENTION)):
+        assert said(request(side, regime="json", strategy="oracle"))["final_answer"] == answer
 
 
 def test_the_flaky_provider_fails_in_the_shares_that_its_entry_says() -> None:
@@ -141,6 +143,5 @@ def test_the_flaky_provider_fails_in_the_shares_that_its_entry_says() -> None:
 def test_the_oracle_answers_with_the_object_that_a_dataset_asks_for(dataset: str, of_void: dict[str, Any]) -> None:
     asked = request("void", strategy="oracle")
     varied = replace(asked, about={**asked.about, "item_id": f"{dataset}:plinko-0001:void"})
-    said = json.loads(str(asyncio.run(ReferenceBackend().ask(varied)).text))
-    assert {name: said[name] for name in of_void} == of_void
-    assert tuple(said) == FIELDS[dataset]
+    given = said(varied)
+    assert {name: given[name] for name in of_void} == of_void and tuple(given) == FIELDS[dataset]

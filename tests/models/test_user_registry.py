@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from tests.build.entries import nobodys_own
 from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models import user_registry
@@ -16,6 +16,7 @@ from traps_pipeline.pipeline.experiment import load_experiment
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import VARIABLE, Workspace
 
+__all__ = ["nobodys_own"]  # a fixture
 MINE = """\
 name: mine
 models:
@@ -34,12 +35,8 @@ panel: one
 
 
 @pytest.fixture(autouse=True)
-def forgotten(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """No workspace, and afterwards no entries of a test."""
+def _no_workspace(nobodys_own: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(VARIABLE, raising=False)
-    yield
-    monkeypatch.undo()
-    user_registry.add_entries(user_registry.UserRegistry(), Path("none"))
 
 
 def written(tmp_path: Path, text: str) -> str:

@@ -93,15 +93,6 @@ def test_frames_for_training_are_those_that_a_clip_gives(
         assert off.mean() < 3 and (off > 40).mean() < 0.005  # of 255: colours are halved in resolution
 
 
-def test_a_folder_of_another_recipe_is_refused(recipe: Recipe, tmp_path: Path) -> None:
-    from tools.pocket.data import render
-
-    none = recipe.model_copy(update={"scenes": {"drop_split": 0}})
-    render(none, "train", tmp_path)
-    with pytest.raises(TrapsError, match="another recipe"):
-        render(none.model_copy(update={"decoys": 0.4}), "train", tmp_path)
-
-
 def test_other_numbers_of_scenes_draw_what_is_missing_and_read_what_is_wanted(
     recipe: Recipe, data: Path, tmp_path: Path
 ) -> None:

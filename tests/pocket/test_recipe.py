@@ -36,14 +36,17 @@ def drawn(made: Recipe, folder: Path) -> dict[str, list[SceneRecord]]:
     }
 
 
+Planted = tuple[Recipe, Path, dict[str, list[SceneRecord]]]
+
+
 @pytest.fixture(scope="module")
-def planted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Recipe, Path, dict[str, list[SceneRecord]]]:
+def planted(tmp_path_factory: pytest.TempPathFactory) -> Planted:
     made = recipe(jitter=Jitter(control=0.5, void=0.5), decoys=0.5, abstain_share=None, abstain_shares=SHARES)
     folder = tmp_path_factory.mktemp("planted")
     return made, folder, drawn(made, folder)
 
 
-def test_lengths_of_chaotic_clips_overlap(planted: tuple[Recipe, Path, dict[str, list[SceneRecord]]]) -> None:
+def test_lengths_of_chaotic_clips_overlap(planted: Planted) -> None:
     made, folder, records = planted
     scenes = Scenes(made, folder)
     lengths = {side: [record.length(side) for record in records["plinko"]] for side in (0, 1)}
@@ -61,9 +64,7 @@ def test_lengths_of_chaotic_clips_overlap(planted: tuple[Recipe, Path, dict[str,
             assert record.cut_frame < record.void_length == record.n_frames
 
 
-def test_a_short_control_ends_with_its_outcome_in_view(
-    planted: tuple[Recipe, Path, dict[str, list[SceneRecord]]],
-) -> None:
+def test_a_short_control_ends_with_its_outcome_in_view(planted: Planted) -> None:
     """It ends with the last frame before the board comes into the picture."""
     made, folder, _ = planted
     scenes = Scenes(made, folder)
@@ -77,9 +78,7 @@ def test_a_short_control_ends_with_its_outcome_in_view(
         assert colour_mask(last[max(0, y - 6) : y + 6, max(0, x - 6) : x + 6], record.ball).any()
 
 
-def test_a_panel_closes_controls_and_held_voids_alike(
-    planted: tuple[Recipe, Path, dict[str, list[SceneRecord]]],
-) -> None:
+def test_a_panel_closes_controls_and_held_voids_alike(planted: Planted) -> None:
     """Behind it a control of an occlusion scene is its void, frame by frame, and before it the two differ; nothing of a
     chaotic scene moves any more."""
     made, folder, _ = planted
@@ -103,7 +102,7 @@ def test_a_panel_closes_controls_and_held_voids_alike(
     assert all(seen.values())
 
 
-def test_a_decoy_shows_a_panel_and_the_outcome(planted: tuple[Recipe, Path, dict[str, list[SceneRecord]]]) -> None:
+def test_a_decoy_shows_a_panel_and_the_outcome(planted: Planted) -> None:
     made, folder, records = planted
     scenes, rng = Scenes(made, folder), np.random.default_rng(0)
     with_decoy = [n for n, record in enumerate(scenes.records) if record.decoy]
@@ -117,9 +116,7 @@ def test_a_decoy_shows_a_panel_and_the_outcome(planted: tuple[Recipe, Path, dict
     assert all(look.questions[0].answer in scenes.records[look.scene].labels for look in decoys)
 
 
-def test_the_label_of_a_void_depends_on_the_prompt_and_nothing_else_does(
-    planted: tuple[Recipe, Path, dict[str, list[SceneRecord]]],
-) -> None:
+def test_the_label_of_a_void_depends_on_the_prompt_and_nothing_else_does(planted: Planted) -> None:
     _, _, records = planted
     every = [record for of in records.values() for record in of]
     for record in every:
@@ -132,9 +129,7 @@ def test_the_label_of_a_void_depends_on_the_prompt_and_nothing_else_does(
     assert Question("?", "left", 0.5).label(0.9) is None and Question("?", "left", 0.5).label(0.1) == "left"
 
 
-def test_under_hedged_prompts_abstentions_tell_the_colour_of_the_ball_and_no_side(
-    planted: tuple[Recipe, Path, dict[str, list[SceneRecord]]],
-) -> None:
+def test_under_hedged_prompts_abstentions_tell_the_colour_of_the_ball_and_no_side(planted: Planted) -> None:
     """Questions of place are never abstained on, and the other prompts are as they were."""
     made, folder, _ = planted
     hedged = made.model_copy(update={"hedge": HEDGE})
@@ -153,9 +148,7 @@ def test_under_hedged_prompts_abstentions_tell_the_colour_of_the_ball_and_no_sid
                 assert (labels[prompt] is None) == (void and question.draw < SHARES[prompt])
 
 
-def test_recipes_that_differ_in_shares_alone_have_the_same_scenes(
-    planted: tuple[Recipe, Path, dict[str, list[SceneRecord]]],
-) -> None:
+def test_recipes_that_differ_in_shares_alone_have_the_same_scenes(planted: Planted) -> None:
     made, folder, records = planted
     other = made.model_copy(update={"abstain_shares": dict.fromkeys(PROMPTS, 0.9), "hedge": HEDGE})
     render(made, "train", folder)

@@ -71,13 +71,10 @@ FAILURES: dict[str, Failure] = {
     "forbidden": Failure(403, "invalid_request_error", "forbidden", "PERMISSION_DENIED", "No access to this model."),
     "not_found": Failure(404, "invalid_request_error", "model_not_found", "NOT_FOUND", "The model does not exist."),
     "content_filter_error": Failure(
-        400,
-        "invalid_request_error",
-        "content_policy_violation",
-        "INVALID_ARGUMENT",
+        400, "invalid_request_error", "content_policy_violation", "INVALID_ARGUMENT",
         "Your request was rejected by our safety system (content_policy_violation).",
     ),
-}
+}  # fmt: skip
 ENDINGS = ("empty", "length", "thinking_exhausted", "content_filter", "refusal", "invalid_json")  # 200, but no answer
 DISTURBANCES = ("hang", "cut", "wrong_content_type")
 FAULTS = (*FAILURES, *ENDINGS, *DISTURBANCES)
@@ -391,27 +388,21 @@ def _logprobs(question: Question, ending: Ending) -> list[Json]:
 def _chat_body(question: Question, ending: Ending, served_model: str) -> Json:
     prompt, visible = _usage(question, ending)
     content = None if ending.refusal else ending.text or ""
-    message = {"role": "assistant", "content": content, "refusal": ending.refusal}
-    choice = {
-        "index": 0,
-        "message": message | {"reasoning_content": _reasoning(question)},
-        "logprobs": {"content": _logprobs(question, ending)} if question.logprobs else None,
-        "finish_reason": ending.finish,
-    }
-    return {
+    message: Json = {"role": "assistant", "content": content, "refusal": ending.refusal}
+    message |= {"reasoning_content": _reasoning(question)}
+    logprobs = {"content": _logprobs(question, ending)} if question.logprobs else None
+    choice = {"index": 0, "message": message, "logprobs": logprobs, "finish_reason": ending.finish}
+    completion = visible + REASONING_TOKENS
+    usage: Json = {"prompt_tokens": prompt, "completion_tokens": completion, "total_tokens": prompt + completion}
+    usage |= {"prompt_tokens_details": {"cached_tokens": 0}}
+    usage |= {"completion_tokens_details": {"reasoning_tokens": REASONING_TOKENS}}
+    head: Json = {
         "id": "chatcmpl-test",
         "object": "chat.completion",
         "created": int(time.time()),
         "model": served_model,
-        "choices": [choice],
-        "usage": {
-            "prompt_tokens": prompt,
-            "completion_tokens": visible + REASONING_TOKENS,
-            "total_tokens": prompt + visible + REASONING_TOKENS,
-            "prompt_tokens_details": {"cached_tokens": 0},
-            "completion_tokens_details": {"reasoning_tokens": REASONING_TOKENS},
-        },
     }
+    return head | {"choices": [choice], "usage": usage}
 
 
 def _responses_output(question: Question, ending: Ending) -> list[Json]:
@@ -431,30 +422,22 @@ def _responses_body(question: Question, ending: Ending, served_model: str) -> Js
     prompt, visible = _usage(question, ending)
     reasons = {"length": "max_output_tokens", "content_filter": "content_filter"}
     reason = reasons.get(ending.finish)
-    return {
-        "id": "resp_test",
-        "object": "response",
-        "created_at": int(time.time()),
-        "status": "incomplete" if reason else "completed",
-        "error": None,
-        "incomplete_details": {"reason": reason} if reason else None,
+    completion = visible + REASONING_TOKENS
+    usage: Json = {"input_tokens": prompt, "output_tokens": completion, "total_tokens": prompt + completion}
+    usage |= {"input_tokens_details": {"cached_tokens": 0}}
+    usage |= {"output_tokens_details": {"reasoning_tokens": REASONING_TOKENS}}
+    head: Json = {"id": "resp_test", "object": "response", "created_at": int(time.time()), "model": served_model}
+    asked: Json = {
         "instructions": None,
         "metadata": {},
-        "model": served_model,
-        "output": _responses_output(question, ending),
-        "parallel_tool_calls": True,
-        "temperature": 1.0,
-        "tool_choice": "auto",
         "tools": [],
-        "top_p": 1.0,
-        "usage": {
-            "input_tokens": prompt,
-            "input_tokens_details": {"cached_tokens": 0},
-            "output_tokens": visible + REASONING_TOKENS,
-            "output_tokens_details": {"reasoning_tokens": REASONING_TOKENS},
-            "total_tokens": prompt + visible + REASONING_TOKENS,
-        },
+        "tool_choice": "auto",
+        "parallel_tool_calls": True,
     }
+    asked |= {"temperature": 1.0, "top_p": 1.0}
+    ends: Json = {"status": "incomplete" if reason else "completed", "error": None}
+    ends |= {"incomplete_details": {"reason": reason} if reason else None}
+    return head | asked | ends | {"output": _responses_output(question, ending), "usage": usage}
 
 
 def _gemini_candidate(question: Question, ending: Ending) -> Json:
@@ -483,16 +466,10 @@ def _gemini_body(question: Question, ending: Ending, served_model: str) -> Json:
 def _anthropic_body(question: Question, ending: Ending, served_model: str) -> Json:
     prompt, visible = _usage(question, ending)
     stops = {"stop": "end_turn", "length": "max_tokens", "content_filter": "refusal"}
-    return {
-        "id": "msg_test",
-        "type": "message",
-        "role": "assistant",
-        "model": served_model,
-        "content": [{"type": "text", "text": ending.text}] if ending.text else [],
-        "stop_reason": "refusal" if ending.refusal else stops[ending.finish],
-        "stop_sequence": None,
-        "usage": {"input_tokens": prompt, "output_tokens": visible},
-    }
+    head: Json = {"id": "msg_test", "type": "message", "role": "assistant", "model": served_model}
+    stop = {"stop_reason": "refusal" if ending.refusal else stops[ending.finish], "stop_sequence": None}
+    content = [{"type": "text", "text": ending.text}] if ending.text else []
+    return head | stop | {"content": content, "usage": {"input_tokens": prompt, "output_tokens": visible}}
 
 
 _BODIES: dict[Api, Callable[[Question, Ending, str], Json]] = {
@@ -513,22 +490,8 @@ def error_body(api: Api, failure: Failure) -> Json:
     return {"error": error}
 
 
-_ODD: tuple[Any, ...] = (
-    None,
-    -1,
-    0,
-    1.5,
-    True,
-    "12",
-    2**63,
-    -(10**30),
-    [],
-    {},
-    [None],
-    "\ud800",
-    {"a": {"b": 5}},
-    1e300,
-)
+_NUMBERS = (-1, 0, 1.5, 2**63, -(10**30), 1e300)
+_ODD: tuple[Any, ...] = (*_NUMBERS, None, True, "12", "\ud800", [], {}, [None], {"a": {"b": 5}})
 
 
 def fuzz(body: Json, number: int) -> bytes:
@@ -642,10 +605,8 @@ def reply_to(question: Question, fault: str | None, config: Config) -> Reply:
         status = int(raw.get("status", 200))
         content = raw["content"].encode("utf-8", "surrogatepass")
         refused = (400 <= status < 500 and status != 408) or status == 503 or not raw.get("billed", True)
-        kind = raw.get("type", "application/json")
-        return Reply(
-            status, content, kind, raw.get("headers", {}), config.latency_s, tokens=(0, 0) if refused else most
-        )
+        kind, headers = raw.get("type", "application/json"), raw.get("headers", {})
+        return Reply(status, content, kind, headers, config.latency_s, tokens=(0, 0) if refused else most)
     if question.structured and question.model in config.unstructured:
         return json_reply(error_body(question.api, FAILURES["bad_request"]), 400)
     if fault in FAILURES:

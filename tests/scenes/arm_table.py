@@ -1,24 +1,11 @@
-"""The table of arms in docs/arms.md, written from their definitions.
-
-`python -m tests.scenes.arm_table` writes it; a test holds the page against it.
-"""
+"""The table of arms in docs/arms.md, which `python -m tests.scenes.arm_table` writes from their definitions."""
 
 from __future__ import annotations
 
-import re
-
-from tests.conftest import ROOT
+from tests.build.page_tables import PageTable
 from traps_pipeline.scenes.variants.arms import table
 
-PAGE = ROOT / "docs" / "arms.md"
-TABLE = re.compile(r"^\| arm \|.*\n(?:\|.*\n)+|^ARMS\n", re.MULTILINE)
-
-
-def written() -> str:
-    """The table as it stands on the page."""
-    (found,) = TABLE.findall(PAGE.read_text(encoding="utf-8"))
-    return found
-
+ON_PAGE = PageTable("arms.md", "arm")
 
 if __name__ == "__main__":
-    PAGE.write_text(PAGE.read_text(encoding="utf-8").replace(written(), table() + "\n"), encoding="utf-8")
+    ON_PAGE.write(table() + "\n")

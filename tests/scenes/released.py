@@ -78,20 +78,13 @@ class Released:
         """The void with its occluder in another colour. Only the first frame is drawn: nothing passes before an
         occluder, so its pixels are the same in all frames, but for a few at its edges where something is seen to
         move."""
-        assert self.occluder is not None
-        first = self._behind(self.occluder, self.qpos[:1], occluder_rgb)[0]
+        model, _ = compile_scene(self.family, self.params, self.physics, self.occluder)
+        model.geom_rgba[model.geom("occluder").id, :3] = occluder_rgb
+        with Renderer(model, self.camera) as renderer:
+            (first,) = renderer.frames(self.qpos[:1], occluder=True)
         frames, changed = self.void.copy(), (first != self.void[0]).any(axis=-1)
         frames[:, changed] = first[changed]
         return frames
-
-    def _behind(
-        self, occluder: Occluder, qpos: np.ndarray, occluder_rgb: tuple[float, float, float] | None = None
-    ) -> np.ndarray:
-        model, _ = compile_scene(self.family, self.params, self.physics, occluder)
-        if occluder_rgb is not None:
-            model.geom_rgba[model.geom("occluder").id, :3] = occluder_rgb
-        with Renderer(model, self.camera) as renderer:
-            return np.stack(list(renderer.frames(qpos, occluder=True)))
 
 
 def load(scenario_id: str, folder: Path = RELEASED) -> Released:

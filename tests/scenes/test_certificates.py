@@ -94,13 +94,6 @@ def test_an_occluder_that_rises_over_the_flags_hides_what_the_question_names() -
 
 
 @pytest.mark.slow
-def test_a_changed_answer_is_not_what_the_control_shows(race: Released) -> None:
-    other = next(label for label in race.spec.labels if label != race.spec.ground_truth)
-    found = failures(race, altered(race.spec, ground_truth=other))
-    assert f"the control shows {race.spec.ground_truth!r}" in found["outcome"]
-
-
-@pytest.mark.slow
 def test_another_hidden_element_is_not_the_scene_of_the_trajectory(race: Released) -> None:
     lanes = len(race.spec.params["colours"])
     params = race.spec.params | {"clear_lane": (race.spec.params["clear_lane"] + 1) % lanes}
@@ -438,4 +431,6 @@ def test_a_certificate_that_is_added_reaches_draws_records_asset_checks_and_the_
 
 
 def test_the_table_on_the_page_is_that_of_the_definitions() -> None:
-    assert certificate_table.written() == certificates.table() + "\n", "python -m tests.scenes.certificate_table"
+    assert certificate_table.ON_PAGE.written() == certificates.table() + "\n", (
+        "python -m tests.scenes.certificate_table"
+    )

@@ -11,23 +11,11 @@ import numpy as np
 import pytest
 
 from tests.scenes.released import Released, first_of_each, load
-from traps_pipeline.scenes.certification.certificates import (
-    TWIN_OF_CUT,
-    earliest_cut,
-    futures_of,
-    pair_of,
-)
+from traps_pipeline.scenes.certification.certificates import TWIN_OF_CUT, earliest_cut, futures_of, pair_of
 from traps_pipeline.scenes.certification.certify_record import certify
-from traps_pipeline.scenes.certification.ensemble import (
-    Cut,
-    Rollout,
-    along_contacts,
-    entropy_bits,
-    unseen_steps,
-)
+from traps_pipeline.scenes.certification.ensemble import Cut, Rollout, along_contacts, entropy_bits, unseen_steps
 from traps_pipeline.scenes.certification.evidence import Claim, Evidence
 from traps_pipeline.scenes.draw.resolve import choose_cut, open_cuts
-from traps_pipeline.scenes.draw.sample import Draw, try_draw
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.physics.kit import Physics
 from traps_pipeline.scenes.physics.simulate import simulate
@@ -208,15 +196,6 @@ def test_the_futures_of_the_state_at_a_cut_disagree_and_are_the_same_each_time(s
     assert found.total() == 48 and len(found) > 1
     late = control.outcome.commit_frame + 1
     assert futures_of(control, seed, late).after(late)[stored.spec.ground_truth] > 40
-
-
-@pytest.mark.slow  # draws a scenario up to its certificates
-def test_a_draw_whose_recorded_outcome_is_a_rare_future_of_its_cut_is_rejected() -> None:
-    looks = ("bystanders", "floor", "light", "material", "panel")
-    # Its starts disagree up to some cut, but of the state at that cut 45 of 47 futures end in the left bin.
-    assert try_draw(Draw("seesaw_sorter", 1, 100, frozenset(), looks)) == (
-        "no cut at 1.0 s or later leaves the outcome open"
-    )
 
 
 def test_questions_word_their_choices_and_their_answers(stored: Released):

@@ -95,11 +95,7 @@ def test_the_floor_the_light_and_the_occluder_are_seen() -> None:
     case = load("bounce-0001")
     world = World.of_record(case.spec, case.qpos)
     shown = {}
-    for name, look in {
-        "plain": None,
-        "panel": Look(panel="maroon"),
-        "floor": replace(EVERYTHING, panel=None),
-    }.items():
+    for name, look in {"plain": None, "panel": Look(panel="maroon"), "floor": replace(EVERYTHING, panel=None)}.items():
         seen = replace(world, params=replace(case.params, look=look))
         with Renderer(seen.model, seen.camera) as renderer:
             (shown[name],) = renderer.frames(case.qpos[:1], occluder=True)

@@ -16,7 +16,6 @@ from tests.conftest import ROOT
 from tests.scenes.released import SIX, Released
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.composition import load_composition
-from traps_pipeline.protocol.datasets import ALL_CATEGORIES
 from traps_pipeline.scenes import families as package
 from traps_pipeline.scenes import family_registry as registry
 from traps_pipeline.scenes.certification.certify_record import certify
@@ -191,7 +190,3 @@ def test_two_parameters_that_tell_only_together_are_found_out() -> None:
 
 def test_what_is_hidden_may_be_uneven_as_long_as_it_follows_nothing() -> None:
     assert dependence(spoilt("drop_split", lambda p: True, "offset_m")) is None
-
-
-def test_every_category_has_a_family() -> None:
-    assert {family.category for family in registry.families()} == set(ALL_CATEGORIES)

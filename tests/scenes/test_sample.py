@@ -1,4 +1,4 @@
-"""Drawing scenarios: quotas keep answers balanced, and what is written is what is read."""
+"""Drawing scenarios: quotas keep answers balanced, few look alike, and what is written is what is read."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ import shutil
 from collections import Counter
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.build.errors import raises
-from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.scenes.draw.likeness import NEAR_SHARE, alike, first_look, perceptual_hash, too_alike
 from traps_pipeline.scenes.draw.redraw import draw_again
 from traps_pipeline.scenes.draw.sample import (
     _choices,
@@ -22,7 +24,7 @@ from traps_pipeline.scenes.draw.sample import (
     sample_family,
     take_out,
 )
-from traps_pipeline.scenes.family_registry import family_names, get_family
+from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.worlds.spec import load_trajectory
 
 
@@ -63,16 +65,23 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.slow
-def test_why_draws_are_rejected_is_said_at_the_first_draw_of_a_kind(tmp_path: Path) -> None:
+def stopped(folder: Path, at: str, family: str = "hidden_race", count: int = 2, seed: int = 11) -> list[str]:
+    """What sampling says up to a line that holds some text, at which it is stopped."""
     said: list[str] = []
 
-    def stop(line: str) -> None:
+    def report(line: str) -> None:
         said.append(line)
-        raise KeyboardInterrupt
+        if at in line:
+            raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        sample_family("ramp_race", 1, 6, tmp_path / "released", workers=1, report=stop)
+        sample_family(family, count, seed, folder, workers=1, report=report)
+    return said
+
+
+@pytest.mark.slow
+def test_why_draws_are_rejected_is_said_at_the_first_draw_of_a_kind(tmp_path: Path) -> None:
+    said = stopped(tmp_path / "released", "", "ramp_race", 1, 6)
     assert said == ["ramp_race: draw 1 is rejected: the outcome is undecided at the end of the control"]
 
 
@@ -110,15 +119,7 @@ def test_the_place_of_a_record_that_is_taken_out_is_filled_by_a_later_draw(tmp_p
 
 
 def test_a_stopped_sampling_goes_on_and_gives_the_same_scenarios(tmp_path: Path, whole: Path) -> None:
-    said: list[str] = []
-
-    def stop(line: str) -> None:
-        if line.startswith("hidden_race-"):  # a record, no rejection
-            said.append(line)
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        sample_family("hidden_race", 2, 11, tmp_path / "halves", workers=1, report=stop)
+    said = stopped(tmp_path / "halves", "hidden_race-0001: ")
     first = (tmp_path / "halves" / "hidden_race.jsonl").read_text(encoding="utf-8")
     assert len(first.splitlines()) == 1
     with (tmp_path / "halves" / "hidden_race.jsonl").open("a", encoding="utf-8") as lines:
@@ -146,16 +147,8 @@ def test_a_draw_whose_first_frame_looks_like_that_of_another_is_rejected(tmp_pat
     tallies["hidden_race"] |= {"draws": record["seed"], "rejected": {}}
     lines.write_text(json.dumps(record | {"seed": -1}) + "\n", encoding="utf-8")
     notes.write_text(json.dumps(tallies))
-    said: list[str] = []
-
-    def stop(line: str) -> None:
-        said.append(line)
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        sample_family("hidden_race", 2, 11, folder, workers=1, report=stop)
     reason = "its first frame looks like that of another: hidden_race-0001"
-    assert said == [f"hidden_race: draw {record['seed'] + 1} is rejected: {reason}"]
+    assert stopped(folder, "") == [f"hidden_race: draw {record['seed'] + 1} is rejected: {reason}"]
 
 
 def test_another_seed_replaces_what_is_there(tmp_path: Path, whole: Path) -> None:
@@ -173,21 +166,39 @@ def test_records_of_another_version_of_a_familys_file_are_drawn_again(tmp_path: 
     assert sample_family("hidden_race", 2, 11, folder, workers=1).draws == notes["hidden_race"]["draws"]
     notes["hidden_race"]["file"] = "0" * 64
     (folder / "draws.json").write_text(json.dumps(notes), encoding="utf-8")
-    said: list[str] = []
-
-    def stop(line: str) -> None:
-        said.append(line)
-        if len(said) == 2:  # after the first draw that counts
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        sample_family("hidden_race", 2, 11, folder, workers=1, report=stop)
-    assert said[0] == "hidden_race: its file was changed since its scenarios were drawn; all are drawn again"
+    first, *_ = stopped(folder, "hidden_race-0001: ")
+    assert first == "hidden_race: its file was changed since its scenarios were drawn; all are drawn again"
     assert {path.stem for path in (folder / "trajectories").iterdir()} <= {"hidden_race-0001"}
 
 
-def test_families_are_found_by_file_and_an_unknown_one_is_answered_with_the_known() -> None:
-    assert {"domino_chain", "hidden_race", "plinko", "tumbling_dice"} <= set(family_names())
-    assert all(get_family(name).name == name for name in family_names())
-    with raises((KeyError, TrapsError), "scenes.family_registry.get_family", "trebuchet"):
+def test_an_unknown_family_is_answered_with_the_known() -> None:
+    with raises(KeyError, "scenes.family_registry.get_family", "trebuchet", "tumbling_dice"):
         get_family("trebuchet")
+
+
+def test_a_hash_tells_places_and_not_shades() -> None:
+    blocks = np.random.default_rng(0).integers(20, 200, (8, 6))
+    picture = np.kron(blocks, np.ones((60, 60))).astype(np.uint8)[:, :, None].repeat(3, axis=2)
+    assert perceptual_hash(picture) == perceptual_hash(picture + 40)
+    assert (perceptual_hash(picture) ^ perceptual_hash(picture[:, ::-1].copy())).bit_count() > 8
+
+
+def test_records_whose_hashes_differ_in_eight_bits_are_alike_and_in_nine_are_not() -> None:
+    assert alike({"a": 0, "b": 0xFF, "c": 0x1FF << 20}) == {"a": "b", "b": "a"}
+
+
+def test_a_tenth_of_a_family_may_have_a_neighbour() -> None:
+    looks = {f"x-{k}": 0xFFFF << 16 * k for k in range(4)}  # sixteen bits and more apart
+    assert too_alike(looks, 0xFFFF, 20) is None  # two of twenty
+    assert too_alike(looks, 0xFFFF, 19) == "x-0"
+    assert too_alike(looks, 0xFFFF0000 << 8, 19) is None
+    assert too_alike({**looks, "x-9": 0xFFFF}, 0xFFFF0001, 39) == "x-1"  # two were alike, four are more than 3.9
+    assert too_alike({**looks, "x-9": 0xFFFF}, 0xFFFF << 8, 19) is None  # it has no part in it
+
+
+@pytest.mark.slow
+def test_few_released_boards_of_plinko_look_like_another() -> None:  # of all families the one where most did
+    specs = {id_: spec for id_, spec in load_released().items() if spec.family == "plinko"}
+    files = {id_: RELEASED / "trajectories" / f"{id_}.npz" for id_ in specs}
+    looks = {id_: first_look(spec, load_trajectory(files[id_], spec.trajectory_sha256)) for id_, spec in specs.items()}
+    assert len(looks) == 50 and len(alike(looks)) <= NEAR_SHARE * 50

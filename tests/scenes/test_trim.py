@@ -13,7 +13,6 @@ from traps_pipeline.scenes.certification.evidence import Pair
 from traps_pipeline.scenes.draw.trim import cut_to, must_hide
 from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH, Camera, Occluder
 
-RACE = "hidden_race-0001"
 DRAWN_ANEW = "hidden_race-0006"  # its occluder was cut for both worlds; those of older records for the control alone
 # From 2 m away, half a metre up, along y; 180 pixels are a metre where an occluder stands 1 m away.
 CAMERA = Camera((0.0, 0.0, 0.5), 2.0, 90.0, 0.0, 90.0, 1.0, (0.0, 0.0, 0.5))

@@ -7,7 +7,7 @@ import pytest
 
 from tests.build.errors import raises
 from tests.scenes.released import load
-from tests.scenes.variation_table import written
+from tests.scenes.variation_table import ON_PAGE
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.protocol.datasets import (
     FRAMINGS,
@@ -42,7 +42,7 @@ def test_every_variation_that_can_be_asked_is_defined_and_asks_its_sides():
 
 
 def test_the_page_has_the_table_of_variations():
-    assert written() == variations.table() + "\n"
+    assert ON_PAGE.written() == variations.table() + "\n"
 
 
 # --- the asking -------------------------------------------------------------------------------------------------------

@@ -1,24 +1,11 @@
-"""The table of variations in docs/hypotheses.md, written from their definitions.
-
-`python -m tests.scenes.variation_table` writes it; a test holds the page against it.
-"""
+"""The table of variations in docs/hypotheses.md, which `python -m tests.scenes.variation_table` writes from them."""
 
 from __future__ import annotations
 
-import re
-
-from tests.conftest import ROOT
+from tests.build.page_tables import PageTable
 from traps_pipeline.scenes.variants.variations import table
 
-PAGE = ROOT / "docs" / "hypotheses.md"
-TABLE = re.compile(r"^\| variation: change \|.*\n(?:\|.*\n)+|^VARIATIONS\n", re.MULTILINE)
-
-
-def written() -> str:
-    """The table as it stands on the page."""
-    (found,) = TABLE.findall(PAGE.read_text(encoding="utf-8"))
-    return found
-
+ON_PAGE = PageTable("hypotheses.md", "variation: change")
 
 if __name__ == "__main__":
-    PAGE.write_text(PAGE.read_text(encoding="utf-8").replace(written(), table() + "\n"), encoding="utf-8")
+    ON_PAGE.write(table() + "\n")

@@ -28,9 +28,9 @@ def test_frames_that_are_shown_later_are_the_next_ones_and_the_last_one_stays():
     assert pick(times, spec).tolist() == list(range(0, 50, 2))
     assert pick(times, media_for_dataset(spec, "frames_later")).tolist() == list(range(1, 50, 2))
     ends = MediaSpec(profile="frames", uniform=2)
-    assert pick(times, ends).tolist() == [0, 49] and pick(times, media_for_dataset(ends, "frames_later")).tolist() == [
-        1,
-        49,
+    assert [pick(times, each).tolist() for each in (ends, media_for_dataset(ends, "frames_later"))] == [
+        [0, 49],
+        [1, 49],
     ]
     assert profile_digest(spec) != profile_digest(media_for_dataset(spec, "frames_later"))
 

@@ -16,21 +16,15 @@ from tests.build.video_rows import PARTITION, clip
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.answer_rows import RESPONSES, ResponseRow
 from traps_pipeline.storage.benchmark_tables import VIDEOS, VideoRow
-from traps_pipeline.storage.parquet import State, TableStore, write_sealed
+from traps_pipeline.storage.parquet import TableStore, write_sealed
 
 CELL = {"dataset": "chaotic", "model": "m", "regime": "standard", "run": 1}
 
 
 def answer(item: str, **changes: Any) -> ResponseRow:
     """A row of the responses table."""
-    row = dict.fromkeys(RESPONSES.names) | {
-        "item_id": item,
-        "pair_id": item,
-        "side": "void",
-        "outcome": "answer",
-        "text": "left",
-        "latency_s": 1.0,
-    }
+    row: dict[str, Any] = dict.fromkeys(RESPONSES.names) | {"item_id": item, "pair_id": item, "side": "void"}
+    row |= {"outcome": "answer", "text": "left", "latency_s": 1.0}
     row |= {"attempts": 1, "request_key": "k", "epoch": "1", "created_at": datetime(2026, 1, 1, tzinfo=UTC)}
     return ResponseRow(**(row | CELL | {"benchmark_version": "0.1.0"} | changes))
 
@@ -74,11 +68,6 @@ def test_a_table_is_sorted_by_its_key_and_comes_back_as_it_was_written(store: Ta
     store.write(VIDEOS, PARTITION, rows, {})
     read = store.read(VIDEOS, PARTITION)
     assert [VideoRow(**row) for row in read.to_dict("records")] == [rows[2], rows[1], rows[0]]
-
-
-def test_the_footer_says_version_inputs_rows_and_failures(store: TableStore) -> None:
-    version = store.write(VIDEOS, PARTITION, [clip("plinko-0001")], {"scene_specs/plinko": "abc"}, failed=3)
-    assert store.state(VIDEOS, PARTITION) == State(version, {"scene_specs/plinko": "abc"}, rows=1, failed=3)
 
 
 def test_the_version_does_not_depend_on_times_attempts_or_row_order(store: TableStore) -> None:
@@ -136,9 +125,8 @@ def test_partitions_are_read_together_and_by_column(store: TableStore) -> None:
     assert len(store.read_all(RESPONSES)) == 6
     assert len(store.read_all(RESPONSES, dataset="chaotic", run=2)) == 2
     assert list(store.read_all(RESPONSES, ["item_id"], run=1)["item_id"]) == ["chaotic:0", "occlusion:0"]
-    assert list(store.read_all(RESPONSES, ["item_id"], run=1, dataset=("occlusion", "decoy"))["item_id"]) == [
-        "occlusion:0"
-    ]
+    chosen = store.read_all(RESPONSES, ["item_id"], run=1, dataset=("occlusion", "decoy"))
+    assert list(chosen["item_id"]) == ["occlusion:0"]
     assert len(store.read_all(RESPONSES, dataset=[])) == 0
 
 

@@ -1,20 +1,16 @@
-"""The table of checks in docs/local.md, written from what the families' tiny checkpoints give.
-
-`python -m tests.models.local.check_table` writes it; a test holds the page against it.
-"""
+"""The table of checks in docs/local.md, which `python -m tests.models.local.check_table` writes from what the families'
+tiny checkpoints give."""
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from tests.conftest import ROOT
+from tests.build.page_tables import PageTable
 from traps_pipeline.mechanism.adapter_checks import CHECKS, tiny_subject
 from traps_pipeline.models.local.tiny import FAMILIES, Family
 
-PAGE = ROOT / "docs" / "local.md"
-TABLE = re.compile(r"^\| check \|.*\n(?:\|.*\n)+|^CHECKS\n", re.MULTILINE)
+ON_PAGE = PageTable("local.md", "check")
 NAMES: dict[Family, str] = {"qwen3-vl": "Qwen3-VL", "gemma-4": "Gemma 4", "llava-next-video": "LLaVA-NeXT-Video"}
 
 
@@ -29,12 +25,6 @@ def table(folder: Path) -> str:
     return "\n".join(lines) + "\n"
 
 
-def written() -> str:
-    """The table as it stands on the page."""
-    (found,) = TABLE.findall(PAGE.read_text(encoding="utf-8"))
-    return found
-
-
 if __name__ == "__main__":
     with TemporaryDirectory() as name:
-        PAGE.write_text(PAGE.read_text(encoding="utf-8").replace(written(), table(Path(name))), encoding="utf-8")
+        ON_PAGE.write(table(Path(name)))

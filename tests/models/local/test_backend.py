@@ -215,28 +215,26 @@ def test_a_batch_that_nobody_waits_for_any_more_ends_early(tmp_path: Path, monke
 
 # --- entries ----------------------------------------------------------------------------------------------------------
 
-LOCAL = "backend: local, media: {profile: frames, uniform: 4}"
 PARAMS = "checkpoint: a/b, dtype: float32, quantisation: none, do_sample: false, max_new_tokens: 4"
+
+
+def local(params: str = PARAMS, device: str = ", device: cpu", more: str = "") -> str:
+    """An entry of a local model without its id."""
+    return f"backend: local, media: {{profile: frames, uniform: 4}}{device}, params: {{{params}}}{more}"
 
 
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        (f"{LOCAL}, params: {{{PARAMS}}}", "device: backend local needs it"),
-        (f"{LOCAL}, device: gpu, params: {{{PARAMS}}}", r"device: String should match"),
-        (
-            f"{LOCAL}, device: cpu, params: {{{PARAMS.replace(', quantisation: none', '')}}}",
-            "params: quantisation: Field",
-        ),
-        (f"{LOCAL}, device: cpu, params: {{{PARAMS}, top_k: 5}}", "params: top_k: "),
-        (f"{LOCAL}, device: cpu, params: {{{PARAMS}, temperature: 0.8}}", "params: do_sample: false is greedy"),
-        (f"{LOCAL}, device: cpu, params: {{{PARAMS.replace('false', 'true')}}}", "params: do_sample: true needs"),
-        (f"{LOCAL}, device: cpu, params: {{{PARAMS}, nf4_skip: [lm_head]}}", "params: nf4_skip goes with"),
+        (local(device=""), "device: backend local needs it"),
+        (local(device=", device: gpu"), r"device: String should match"),
+        (local(PARAMS.replace(", quantisation: none", "")), "params: quantisation: Field"),
+        (local(f"{PARAMS}, top_k: 5"), "params: top_k: "),
+        (local(f"{PARAMS}, temperature: 0.8"), "params: do_sample: false is greedy"),
+        (local(PARAMS.replace("false", "true")), "params: do_sample: true needs"),
+        (local(f"{PARAMS}, nf4_skip: [lm_head]"), "params: nf4_skip goes with"),
         ("backend: reference, device: cpu, params: {strategy: oracle}", "device, mechanism, size: only backend local"),
-        (
-            f"{LOCAL}, device: cpu, params: {{{PARAMS}}}, mechanism: {{nf4_skip: [lm_head]}}",
-            "mechanism: nf4_skip goes with",
-        ),
+        (local(more=", mechanism: {nf4_skip: [lm_head]}"), "mechanism: nf4_skip goes with"),
     ],
 )
 def test_a_wrong_entry_is_named_with_its_field(tmp_path: Path, text: str, complaint: str) -> None:
