@@ -116,7 +116,7 @@ def states_of(workspace: Workspace, cell: StatesCell) -> tuple[str, ...]:
 def test_a_damaged_index_of_states_is_written_again(own: Workspace) -> None:
     cell = StatesCell("chaotic", STANDARD)
     (own.root / "states" / "tiny" / "standard" / "chaotic" / "ids.parquet").write_bytes(b"torn")
-    with pytest.raises(TrapsError, match="run again, and it is made anew"):
+    with pytest.raises(TrapsError, match="materialize it again"):
         StoredStates.of(own, STANDARD).read("chaotic", 3)
     assert "its states are gone" in states_of(own, cell)
     assert stages.extract_states(own, cell)[1] == 0

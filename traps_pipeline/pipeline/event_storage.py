@@ -13,9 +13,7 @@ from collections.abc import Iterator
 from typing import Any, cast
 
 import sqlalchemy as db
-from dagster._core.storage.event_log import SqliteEventLogStorage
-from dagster._core.storage.runs import SqliteRunStorage
-from dagster._core.storage.sqlite_storage import DagsterSqliteStorage
+from dagster._core.storage.sqlite_storage import DagsterSqliteStorage, SqliteEventLogStorage, SqliteRunStorage
 from sqlalchemy.event import listen
 from sqlalchemy.exc import DBAPIError, OperationalError
 
