@@ -33,6 +33,6 @@ def test_rows_are_shown_with_their_short_texts_and_without_long_ones() -> None:
 
 def test_work_is_numbers_that_dagster_plots_and_that_are_read_back() -> None:
     event = dg.AssetMaterialization("responses", metadata=tally_metadata(the_graph()["responses"], Tally(cached=4)))
-    assert event.metadata == {n: dg.MetadataValue.int(v) for n, v in (("asked", 0), ("cached", 4), ("errors", 0))}
+    assert event.metadata == {n: dg.MetadataValue.int(v) for n, v in (("asked", 0), ("known", 4), ("failed", 0))}
     assert tally_of(event.metadata) == Tally(cached=4)
     assert tally_metadata(the_graph()["videos"], Tally(frames=9)) == {"frames": 9}

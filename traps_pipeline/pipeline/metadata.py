@@ -17,6 +17,7 @@ from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
 PREVIEWED, SHORT = 5, 24  # rows, and characters of a text that is shown in them
+WORDS = {"asked": "asked", "cached": "known", "errors": "failed", "frames": "frames"}  # of a tally's counts
 RANKED = ("pecs", "conjunction")  # columns by which the rows of a table are better or worse
 
 
@@ -48,12 +49,12 @@ def tally_metadata(stage: Stage, tally: Tally) -> dict[str, int]:
     Zeros are left out where a stage never does such work.
     """
     asks = {"asked", "cached", "errors"} if stage.cost else set()
-    return {name: count for name, count in vars(tally).items() if count or name in asks}
+    return {WORDS[name]: count for name, count in vars(tally).items() if count or name in asks}
 
 
 def tally_of(metadata: Mapping[str, dg.MetadataValue]) -> Tally:
     """Return the work that `tally_metadata` has written."""
-    return Tally(**{name: cast(int, metadata[name].value) for name in vars(Tally()) if name in metadata})
+    return Tally(**{name: cast(int, metadata[word].value) for name, word in WORDS.items() if word in metadata})
 
 
 def partition_metadata(workspace: Workspace, stage: Stage, output: StageOutput) -> dict[str, Any]:
