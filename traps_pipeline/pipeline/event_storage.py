@@ -13,7 +13,11 @@ from collections.abc import Iterator
 from typing import Any, cast
 
 import sqlalchemy as db
-from dagster._core.storage.sqlite_storage import DagsterSqliteStorage, SqliteEventLogStorage, SqliteRunStorage
+from dagster._core.storage.sqlite_storage import (
+    DagsterSqliteStorage,
+    SqliteEventLogStorage,  # pyright: ignore[reportPrivateImportUsage] - a part of the storage, of another module
+    SqliteRunStorage,  # pyright: ignore[reportPrivateImportUsage] - the same
+)
 from sqlalchemy.event import listen
 from sqlalchemy.exc import DBAPIError, OperationalError
 

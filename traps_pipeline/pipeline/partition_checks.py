@@ -78,6 +78,15 @@ class StageChecks:
         """Evaluate a partition that could not be built."""
         yield from self.of_made(key, {CURRENT: {"not made": str(error), REACHED: isinstance(error, BudgetReached)}})
 
+    def of_fresh(self, key: str | None) -> Iterator[dg.AssetCheckEvaluation]:
+        """Evaluate the checks that a partition passes which is fresh, so that this run does not build it.
+
+        Dagster awaits an evaluation from the run, and would say that the check was skipped, or failed to execute.
+        """
+        failed = {*self._workspace.failed_checks(self._stage.name, key)}
+        names = {CURRENT, *(check.name for check in self._stage.checks)} - failed
+        yield from evaluations(self._history, self._stage.name, key, {name: {} for name in sorted(names)})
+
     def still_failing(self, lineage: Lineage, seen: Collection[str | None]) -> Iterator[dg.AssetCheckEvaluation]:
         """Re-evaluate failing checks, including unchanged ones: Dagster shows only a check's newest result."""
         name = self._stage.name

@@ -64,6 +64,7 @@ def run_step(stage: Stage, context: dg.AssetExecutionContext, workspace: Workspa
             yield step.history.event(stage, key, version, step.provenance, metadata)
             yield from step.checks.of_made(key, found)
     yield from step.tell_taken()
+    yield from step.tell_fresh()
     yield from step.tell_unmade()
     yield from step.hand_on(made_result)
     if not step.stages_below():
@@ -144,6 +145,13 @@ class _Step:
             progress.current().partition(self.stage.name, key or "", tally)
             about = {TAKEN: "made by another run meanwhile", **tally_metadata(self.stage, tally)}
             yield self.history.event(self.stage, key, version, self.provenance, about)
+
+    def tell_fresh(self) -> Iterator[dg.AssetCheckEvaluation]:
+        """Report partitions of this run that need not be built."""
+        for key in self._wanted:
+            is_left = key not in self._inputs and key not in self._maker.unmade
+            if is_left and self.lineage.status(self.stage.name, key).kind == "fresh":
+                yield from self.checks.of_fresh(key)
 
     def tell_unmade(self) -> Iterator[dg.AssetCheckEvaluation]:
         """Report partitions that could not be built, and those that fail a check, in this run or before."""
