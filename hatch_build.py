@@ -9,7 +9,7 @@ from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
-SHIPPED = ("assets", "scene_specs", "dagster.yaml", "LICENSE-DATA", "CITATION.cff")
+SHIPPED = ("assets", "scene_specs", "LICENSE-DATA", "CITATION.cff")
 
 
 class Shipped(BuildHookInterface):

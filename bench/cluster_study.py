@@ -182,7 +182,7 @@ def watch(run: subprocess.Popen[str], kill: object, at: str = "scene_specs") -> 
     assert run.stdout is not None
     for line in run.stdout:
         print(f"  {time.monotonic() - began:6.1f} s  {line.rstrip()}", flush=True)
-        failed += sum(int(found) for found in re.findall(r"(\d+) calls failed and can be asked again", line))
+        failed += sum(int(found) for found in re.findall(r"(\d+) calls? failed; a new run", line))
         if not killed and at in line and "[" in line:
             killed = True
             time.sleep(3)

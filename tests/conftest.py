@@ -153,7 +153,7 @@ def make_checkout(root: Path) -> Path:
     """Copy what the package needs to run, with what Python has compiled: the commands of tests need not do it again."""
     for name in ("traps_pipeline", "assets", "scene_specs"):
         shutil.copytree(ROOT / name, root / name)
-    for name in ("dagster.yaml", "LICENSE-DATA", "CITATION.cff"):
+    for name in ("LICENSE-DATA", "CITATION.cff"):
         shutil.copy(ROOT / name, root / name)
     return root
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from traps_pipeline.cluster.cluster_database import Database
 from traps_pipeline.cluster.objects import Bucket, ObjectStore
+from traps_pipeline.ledger.postgres import PostgresDatabase
 from traps_pipeline.storage.store import FolderStore, Store
 
 
@@ -32,6 +32,6 @@ def opened(folder: str, *of_database: str) -> Store:
     return ObjectStore(Path(folder) / host, Bucket(f"s3://lab/{study}"), database(address, study), study, b"anchor")
 
 
-def database(address: str, study: str) -> Database:
+def database(address: str, study: str) -> PostgresDatabase:
     """The database of a study, as a process of its own has it."""
-    return Database(address, "TRAPS_TEST_DATABASE", study)
+    return PostgresDatabase(address, "TRAPS_TEST_DATABASE", study)

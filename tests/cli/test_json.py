@@ -54,6 +54,11 @@ def test_a_study_is_read_without_its_tables(small: Checkout) -> None:
     status = read(small, "status", EXPERIMENT)
     assert status["checks"] == [] and status["command"] == f"traps run {EXPERIMENT}"
     assert not any(row["stale"] or row["missing"] for row in status["stages"])
+    elsewhere = read(small, "status", EXPERIMENT, "--workspace", str(small.workspace))
+    assert elsewhere["command"] == f"traps run {EXPERIMENT} --workspace {small.workspace}"
+    # The study does not say where the file of its experiment lies.
+    job = "dagster job execute -m traps_pipeline.definitions -j everything"
+    assert read(small, "status")["command"] == job
 
 
 def test_findings_and_differences_are_rows(small: Checkout) -> None:

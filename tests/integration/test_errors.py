@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -36,7 +37,7 @@ def test_failed_calls_are_told_counted_as_missing_and_asked_again(study: Checkou
     (tmp_path / "flaky.yaml").write_text(text)
     run = study.score(tmp_path / "flaky.yaml")
     assert run.code == 1
-    assert "calls failed" in run.err
+    assert re.search(r"calls? failed; a new run of this partition asks", run.err)
     rows = Workspace.open(study.workspace).tables.read_all(RESPONSES, model="flaky")
     outcomes = rows["outcome"].value_counts().to_dict()
     assert set(outcomes) == {"answer", "empty", "refused", "error"}

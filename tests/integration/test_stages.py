@@ -28,6 +28,18 @@ pytestmark = pytest.mark.slow
 CELL = "occlusion|oracle__standard__run1"
 RANGE = "occlusion|oracle__standard__run1...occlusion_ill_posed|oracle__json__run1"
 
+# Partitions of a check by their state, as Dagster's page of the check counts them.
+CHECKED = """
+import json
+import dagster as dg
+from traps_pipeline.pipeline.schemes import CELL
+from traps_pipeline.pipeline.translation import partitions_of
+key = dg.AssetCheckKey(dg.AssetKey("votes"), "current")
+with dg.DagsterInstance.get() as history:
+    state = history.event_log_storage.get_asset_check_state([(key, partitions_of(CELL))])[key]
+print(json.dumps({name.value: subset.size for name, subset in state.subsets.items() if subset.size}))
+"""
+
 
 def versions(study: Checkout) -> dict[str, str | None]:
     """Versions of all that is there, by partition, as the footers say."""
@@ -51,6 +63,7 @@ def test_a_range_of_cells_is_one_run_through_three_stages_and_makes_exactly_its_
     for stage in ("responses", "votes", "verdicts"):
         assert len([*(study.workspace / "tables" / stage).rglob("*.parquet")]) == 2 * 2  # datasets x regimes
     assert len(study.ledger_rows("answers")) == 2 * 2 * 12
+    assert json.loads(study.python("-c", CHECKED).ok().out.splitlines()[-1]) == {"SUCCEEDED": 4 * 3 * 2}
     materialize(study, "metrics", "--partition-range", "occlusion...occlusion_ill_posed").ok()
 
 

@@ -9,7 +9,7 @@ from dagster._core.storage.sqlite_storage import DagsterSqliteStorage
 from sqlalchemy import Engine
 from sqlalchemy.event import listen, remove
 
-from traps_pipeline.base.paths import ROOT
+from traps_pipeline.base.paths import ASSETS, ROOT
 
 
 @dg.asset
@@ -19,7 +19,7 @@ def answer() -> int:
 
 @pytest.fixture
 def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    (tmp_path / "dagster.yaml").write_text((ROOT / "dagster.yaml").read_text())
+    (tmp_path / "dagster.yaml").write_text((ASSETS / "dagster.yaml").read_text())
     monkeypatch.setenv("DAGSTER_HOME", str(tmp_path))
     return tmp_path
 
@@ -82,3 +82,13 @@ def test_threads_that_write_at_once_lose_nothing(home: Path) -> None:
             thread.join()
         for key in keys:
             assert len(instance.fetch_materializations(key, limit=100).records) == 20
+
+
+def test_the_settings_of_a_checkout_need_no_study_and_send_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`dagster dev` reads them where DAGSTER_HOME is not set."""
+    monkeypatch.delenv("DAGSTER_HOME", raising=False)
+    (tmp_path / "dagster.yaml").write_text((ROOT / "dagster.yaml").read_text())
+    with dg.DagsterInstance.from_config(str(tmp_path)) as instance:
+        assert instance.get_runs() == [] and not instance.telemetry_enabled

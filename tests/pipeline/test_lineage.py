@@ -7,15 +7,18 @@ from typing import Any
 
 import dagster as dg
 import pytest
+from dagster._core.storage.asset_check_execution_record import AssetCheckExecutionResolvedStatus
 
 from tests.build.cells import row
 from traps_pipeline.judging.judging_rows import VERDICTS
-from traps_pipeline.pipeline.automation import report_unseen
+from traps_pipeline.pipeline.automation import report_unseen, sensors
 from traps_pipeline.pipeline.graph import the_graph
 from traps_pipeline.pipeline.history import History
 from traps_pipeline.pipeline.lineage import Lineage, Status
-from traps_pipeline.pipeline.partition_checks import CURRENT
+from traps_pipeline.pipeline.partition_checks import CURRENT, evaluations
+from traps_pipeline.pipeline.schemes import CELL as CELLS
 from traps_pipeline.pipeline.study_status import StageStatus
+from traps_pipeline.pipeline.translation import partitions_of
 from traps_pipeline.scoring.score_rows import METRICS
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.study import Asked, Study
@@ -111,6 +114,33 @@ def test_damage_and_a_loss_are_reported_again_after_a_restart_of_the_daemon(stud
     assert [each.partition for each in found] == [None, None, cell]
     assert {each.metadata["partition"].value for each in found} == {cell}
     assert "its file is gone" in newest.metadata["not current"].value
+
+
+def test_a_check_is_of_the_newest_event_of_its_partition(study: Workspace, tmp_path: Path) -> None:
+    """Dagster's page of a check calls a partition missing whose evaluation names no event, or an older one."""
+    key, cell = dg.AssetCheckKey(dg.AssetKey("verdicts"), CURRENT), "chaotic|prior__json__run1"
+    with dg.DagsterInstance.local_temp(str(tmp_path)) as instance:
+        history = History(instance, the_graph())
+
+        def failed() -> list[str]:
+            state = instance.event_log_storage.get_asset_check_state([(key, partitions_of(CELLS))])[key]
+            subset = state.subsets.get(AssetCheckExecutionResolvedStatus.FAILED)
+            return [] if subset is None else list(subset.subset_value.get_partition_keys())
+
+        for _ in range(2):
+            instance.report_runless_asset_event(history.event(the_graph()["verdicts"], cell, "1", {}, {}))
+            assert failed() == []
+        [evaluation] = evaluations(history, "verdicts", cell, {CURRENT: {"damaged": "it was altered"}})
+        instance.report_runless_asset_event(evaluation)
+        assert failed() == [cell]
+
+
+def test_no_study_is_no_error_of_the_sensors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TRAPS_WORKSPACE", str(tmp_path / "none"))
+    with dg.DagsterInstance.local_temp(str(tmp_path)) as instance:
+        for sensor in sensors():
+            skipped = sensor(dg.build_sensor_context(instance))
+            assert isinstance(skipped, dg.SkipReason) and "make one with `traps init`" in str(skipped.skip_message)
 
 
 def test_another_formula_makes_metrics_stale(study: Workspace) -> None:

@@ -230,7 +230,7 @@ def test_an_object_that_was_altered_is_named_and_nothing_is_read_from_it(bucket_
         one.bucket.put(object_name(row.digest), altered)
         other.look()
         there = other.root / "tables/t/part.parquet"
-        with pytest.raises(TrapsError, match=r"tables/t/part\.parquet: is not what was written.*run again"):
+        with pytest.raises(TrapsError, match=r"tables/t/part\.parquet: is not what was written.*materialize"):
             other.here(there)
         assert not other.has(there)
         one.look()

@@ -1,4 +1,4 @@
-"""Locate `assets/`, `scene_specs/` and `dagster.yaml`, which come with the code.
+"""Locate the files that belong to the code: `assets/` and `scene_specs/`.
 
 They are top-level folders of the repository, and a wheel carries them inside the package (`SHIPPED`). Every reader asks
 this module, so that the same code runs from a checkout and from a wheel.

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import os
+import shlex
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
@@ -36,6 +39,7 @@ def add(commands: Commands) -> None:
 
 def status(arguments: argparse.Namespace) -> int:
     """See `traps status --help`."""
+    exported = dict(os.environ)
     workspace = open_workspace(arguments)
     experiment = arguments.experiment
     if experiment is not None and experiment not in workspace.study.experiments:  # a file, or a misspelt name
@@ -51,7 +55,7 @@ def status(arguments: argparse.Namespace) -> int:
     load_definitions()
     rows = list(stage_statuses(workspace, Lineage(workspace), experiment))
     checks = [*failing_checks(workspace)]
-    command = _command(workspace, arguments.experiment)
+    command = _command(workspace, arguments, exported)
     if arguments.json:
         names = ("check", "stage", "partition", "reason")
         failing = [dict(zip(names, check, strict=True)) for check in checks]
@@ -78,13 +82,23 @@ def status(arguments: argparse.Namespace) -> int:
     return OK
 
 
-def _command(workspace: Workspace, experiment: str | None) -> str:
-    """Return `traps run` of the given experiment, else of the study's only one."""
-    from traps_pipeline.pipeline.experiment import EXPERIMENTS
+def _command(workspace: Workspace, arguments: argparse.Namespace, exported: Mapping[str, str]) -> str:
+    """Return a command that refreshes stale partitions, in the shell with these variables.
 
-    names = [experiment] if experiment else [*workspace.study.experiments]
-    files = [name for name in names if name.endswith((".yaml", ".yml")) or (EXPERIMENTS / f"{name}.yaml").exists()]
-    return f"traps run {files[0] if len(files) == len(names) == 1 else 'EXPERIMENT'}"
+    It runs the given experiment or the study's only one; for several, or one whose file is not known, it is the job of
+    the whole study, which needs no file.
+    """
+    from traps_pipeline.pipeline.experiment import EXPERIMENTS
+    from traps_pipeline.storage.workspace import VARIABLE
+
+    given = [arguments.experiment] if arguments.experiment else [*workspace.study.experiments]
+    files = [name for name in given if name.endswith((".yaml", ".yml")) or (EXPERIMENTS / f"{name}.yaml").exists()]
+    if len(files) == len(given) == 1:
+        where = [] if arguments.workspace is None else ["--workspace", str(workspace.place)]
+        return shlex.join(["traps", "run", files[0], *where])
+    needed = {VARIABLE: str(workspace.place), "DAGSTER_HOME": os.environ["DAGSTER_HOME"]}
+    lacking = [f"{name}={shlex.quote(value)}" for name, value in needed.items() if exported.get(name) != value]
+    return " ".join([*lacking, "dagster job execute -m traps_pipeline.definitions -j everything"])
 
 
 def why(arguments: argparse.Namespace) -> int:

@@ -16,7 +16,7 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.dialects.postgresql import insert
 
-from traps_pipeline.cluster.cluster_database import Database
+from traps_pipeline.ledger.postgres import PostgresDatabase
 
 LARGE_FOLDERS = ("clips/", "media/")  # folders whose names are only looked up one by one: there may be millions
 FRESH_S = 0.5  # minimum age of the last look before the rows are read again
@@ -61,7 +61,7 @@ class CurrentObject:
 class ObjectNames:
     """The paths of a study's files and their current objects; thread-safe."""
 
-    def __init__(self, database: Database, study: str) -> None:
+    def __init__(self, database: PostgresDatabase, study: str) -> None:
         self._database, self._study = database, study
         self._rows: dict[str, CurrentObject] = {}
         self._sorted: list[str] = []  # names of these rows

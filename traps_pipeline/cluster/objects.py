@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from datetime import UTC, datetime, timedelta
 from hashlib import sha256
 from pathlib import Path
@@ -18,8 +19,8 @@ from typing import TypeVar
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import is_same_file, link, write_bytes
 from traps_pipeline.cluster.bucket import Bucket, object_name
-from traps_pipeline.cluster.cluster_database import Database, lease
 from traps_pipeline.cluster.object_names import CurrentObject, ObjectNames
+from traps_pipeline.ledger.postgres import PostgresDatabase
 from traps_pipeline.storage.place import STUDY
 from traps_pipeline.storage.store import GRACE_DAYS, Lease, Store, UnusedObject, is_hidden
 
@@ -32,13 +33,24 @@ BATCH = 1000  # objects removed per request
 _OBJECT = re.compile(r"([0-9a-f]{2})/(\1[0-9a-f]{62})")
 
 
+def lease(database: PostgresDatabase, name: str) -> Lease | None:
+    """Take a lease as `Store.lease` says: an advisory lock, which this process keeps alive."""
+    with ExitStack() as opened:
+        opened.enter_context(database.writing())
+        lock = database.try_lock(f"lease/{name}")
+        if lock is None:
+            return None
+        opened.callback(lock.release)
+        return Lease(opened.pop_all().close)
+
+
 class ObjectStore(Store):
     """A study's files: names in its database, contents in a bucket; thread-safe.
 
     anchor: the content of the only object with a fixed name, which locates the study's database.
     """
 
-    def __init__(self, root: Path, bucket: Bucket, database: Database, study: str, anchor: bytes) -> None:
+    def __init__(self, root: Path, bucket: Bucket, database: PostgresDatabase, study: str, anchor: bytes) -> None:
         super().__init__(root)
         self.bucket, self._database, self._study, self._anchor = bucket, database, study, anchor
         self.names = ObjectNames(database, study)
@@ -114,7 +126,7 @@ class ObjectStore(Store):
             return self._cache(row.digest, content)
         self._withdraw([row.digest])
         wrong = "is gone from the store" if content is None else "is not what was written (it was altered)"
-        raise TrapsError(f"{self.bucket.address}/{self._name(path)}: {wrong}; run again, and it is made anew")
+        raise TrapsError(f"{self.bucket.address}/{self._name(path)}: {wrong}; materialize it again")
 
     def here(self, path: Path) -> Path:
         """See `Store`."""

@@ -9,8 +9,8 @@ import yaml
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cluster.bucket import Bucket
-from traps_pipeline.cluster.cluster_database import Database, database_of, lease
-from traps_pipeline.cluster.objects import ObjectStore
+from traps_pipeline.cluster.objects import ObjectStore, lease
+from traps_pipeline.ledger.postgres import PostgresDatabase, postgres_of
 from traps_pipeline.storage.place import STUDY, Place
 from traps_pipeline.storage.store import FolderStore, Lease, Store
 from traps_pipeline.storage.study import FORMAT, Study
@@ -24,7 +24,7 @@ class SharedFolder(FolderStore):
     Leases are in the database: on some file systems, file locks are local to one machine.
     """
 
-    def __init__(self, root: Path, database: Database) -> None:
+    def __init__(self, root: Path, database: PostgresDatabase) -> None:
         super().__init__(root)
         self._database = database
 
@@ -42,7 +42,7 @@ def open_store(place: Place, root: Path, study: Study | None = None) -> Store | 
     if study is not None:
         name, variable = study.name, str(study.database)
         if isinstance(place, Path):
-            return SharedFolder(root, database_of(variable, name))
+            return SharedFolder(root, postgres_of(variable, name))
     else:
         content = _bucket(str(place)).get(STUDY)
         if content is None:
@@ -52,7 +52,7 @@ def open_store(place: Place, root: Path, study: Study | None = None) -> Store | 
             name, variable = str(parsed["name"]), str(parsed["database"])
         except (yaml.YAMLError, KeyError, TypeError) as error:
             raise TrapsError(f"{place}/{STUDY}: is not what `traps init` wrote ({error})") from None
-    return _store(root, str(place), database_of(variable, name), name, variable)
+    return _store(root, str(place), postgres_of(variable, name), name, variable)
 
 
 @cache
@@ -61,7 +61,7 @@ def _bucket(address: str) -> Bucket:
 
 
 @cache
-def _store(root: Path, address: str, database: Database, name: str, variable: str) -> ObjectStore:
+def _store(root: Path, address: str, database: PostgresDatabase, name: str, variable: str) -> ObjectStore:
     """Return the process's cached store, so that reopening does not read everything."""
     anchor = _HEAD + yaml.safe_dump({"format": FORMAT, "name": name, "database": variable}, sort_keys=False)
     return ObjectStore(root, _bucket(address), database, name, anchor.encode())

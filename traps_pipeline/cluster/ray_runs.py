@@ -25,9 +25,10 @@ from traps_pipeline.cluster.requests import REQUEST_TAG, submit
 from traps_pipeline.cluster.resources import RESOURCES_TAG, STUDY_TAG, keys_in, own_tags
 from traps_pipeline.ledger.postgres import PATIENCE_S
 from traps_pipeline.pipeline.graph import Stage, the_graph
+from traps_pipeline.pipeline.metadata import tally_of
 from traps_pipeline.pipeline.ranges import Range, cut, shared_out
 from traps_pipeline.pipeline.runs import RunOutcome, Runs, is_broken_off, problems_of, range_of, range_tags, reason
-from traps_pipeline.pipeline.step import TAKEN, TALLY
+from traps_pipeline.pipeline.step import TAKEN, UNWANTED
 from traps_pipeline.storage.workspace import RAY, VARIABLE, Workspace
 
 POLL_S = 1.0
@@ -222,8 +223,8 @@ class RayRuns(Runs):
                     self._failures.setdefault(run_id, []).append(event)
                     continue
                 materialization = event.step_materialization_data.materialization
-                if TALLY in materialization.metadata:
-                    tally = progress.Tally(**json.loads(str(materialization.metadata[TALLY].value)))
+                if UNWANTED not in materialization.metadata:
+                    tally = tally_of(materialization.metadata)
                     if TAKEN in materialization.metadata:
                         progress.current().helped(materialization.asset_key.path[-1], tally)
                     else:

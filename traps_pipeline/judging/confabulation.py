@@ -150,7 +150,7 @@ def collect_labels(workspace: Workspace) -> StageOutput:
     for _, output in ask_judges(workspace, TASK, [judge], list(samples), samples.__getitem__, finish):
         table.extend(output.rows(CONFABULATION))
         total.add(output.tally)
-    return StageOutput(table, total, {"asked": total.asked, "known": total.cached, "failed": total.errors})
+    return StageOutput(table, total)
 
 
 def _label_row(cell: Cell, failure: Failure, row: Row) -> ConfabulationRow:

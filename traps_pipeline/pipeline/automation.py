@@ -31,6 +31,7 @@ from traps_pipeline.pipeline.partition_checks import CURRENT
 from traps_pipeline.pipeline.ranges import batches
 from traps_pipeline.pipeline.run import materialize_stale, pending_in
 from traps_pipeline.pipeline.runs import RunsHere, range_tags
+from traps_pipeline.pipeline.schemes import study_here
 from traps_pipeline.pipeline.selection import failed_checks
 from traps_pipeline.pipeline.step import MAKE_TAG, OUTDATED, STALE
 from traps_pipeline.pipeline.translation import asset_key
@@ -128,6 +129,7 @@ def _report(instance: dg.DagsterInstance, stage: str, key: str | None, wrong: st
         check_name=CURRENT,
         passed=False,
         metadata={"not current": wrong, "partition": key or "all"},
+        target_materialization_data=History(instance, the_graph()).check_target(stage, key),
     )
     try:
         instance.report_runless_asset_event(failed(partition=key))
@@ -170,11 +172,11 @@ def _sensor(name: str, doc: str, *, costs: bool) -> dg.SensorDefinition:
         default_status=dg.DefaultSensorStatus.STOPPED if costs else dg.DefaultSensorStatus.RUNNING,
         description=doc,
     )
-    def follow(
-        context: dg.SensorEvaluationContext, workspace: WorkspaceResource
-    ) -> dg.SkipReason | list[dg.RunRequest]:
+    def follow(context: dg.SensorEvaluationContext) -> dg.SkipReason | list[dg.RunRequest]:
         reread_sources()
-        opened = workspace.open()
+        opened = study_here()
+        if opened is None:
+            return dg.SkipReason("there is no study; make one with `traps init`, then press Reload definitions")
         lineage = Lineage(opened)
         History(context.instance, the_graph()).observe(lineage)
         report_unseen(context.instance, opened, lineage, reported)

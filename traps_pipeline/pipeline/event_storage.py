@@ -14,8 +14,10 @@ from typing import Any, cast
 
 import sqlalchemy as db
 from dagster._core.storage.event_log import AssetKeyTable, SqliteEventLogStorage
-from dagster._core.storage.runs import SqliteRunStorage
-from dagster._core.storage.sqlite_storage import DagsterSqliteStorage
+from dagster._core.storage.sqlite_storage import (
+    DagsterSqliteStorage,
+    SqliteRunStorage,  # pyright: ignore[reportPrivateImportUsage] - a part of the storage, of another module
+)
 from sqlalchemy.event import listen
 from sqlalchemy.exc import DBAPIError, OperationalError
 

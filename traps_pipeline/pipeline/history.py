@@ -7,6 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import dagster as dg
+from dagster._core.definitions.asset_checks.asset_check_evaluation import (
+    AssetCheckEvaluationTargetMaterializationData as CheckTarget,
+)
 
 from traps_pipeline.pipeline.graph import Graph, Node, Stage
 from traps_pipeline.pipeline.lineage import Lineage
@@ -56,6 +59,18 @@ class History:
         kind = dg.DagsterEventType.ASSET_OBSERVATION if self._graph.source(name) else _MATERIALIZATION
         tags = self._instance.event_log_storage.get_latest_tags_by_partition(asset_key(name), kind, [_VERSION])
         return {key: key_tags[_VERSION] for key, key_tags in tags.items()}
+
+    def check_target(self, name: str, key: str | None) -> CheckTarget | None:
+        """Return the newest event of a partition, which a check's evaluation must name.
+
+        Dagster's page of a check calls a partition missing whose last evaluation names no event, or an older one. The
+        event of an asset without partitions follows its evaluations, in the same run.
+        """
+        if key is None:
+            return None
+        wanted = dg.AssetRecordsFilter(asset_key=asset_key(name), asset_partitions=[key])
+        made = self._instance.fetch_materializations(wanted, limit=1).records
+        return next((CheckTarget(storage_id=r.storage_id, run_id=r.run_id, timestamp=r.timestamp) for r in made), None)
 
     def observe(self, lineage: Lineage, sources: Iterable[str] | None = None) -> list[Node]:
         """Report versions of sources (default: all) that Dagster lacks; return these."""

@@ -24,6 +24,12 @@ from traps_pipeline.storage.workspace import Workspace
 DAMAGED = "damaged"  # the version of damaged data
 
 
+def failed_calls(count: int) -> str:
+    """Return the number of a partition's failed calls, with the remedy, in words."""
+    calls, them = ("1 call", "it") if count == 1 else (f"{count:,} calls", "them")
+    return f"{calls} failed; a new run of this partition asks {them} again"
+
+
 @dataclass(frozen=True)
 class Status:
     """A partition's status, its changed inputs, and its number of failed calls."""
@@ -35,7 +41,7 @@ class Status:
     @property
     def reasons(self) -> tuple[str, ...]:
         """Why it is stale, in words."""
-        return (*self.outdated, f"{self.failed} calls failed and can be asked again") if self.failed else self.outdated
+        return (*self.outdated, failed_calls(self.failed)) if self.failed else self.outdated
 
 
 class Lineage:

@@ -8,6 +8,7 @@ from typing import Any, cast
 
 import dagster as dg
 
+from traps_pipeline.base.progress import Tally
 from traps_pipeline.base.terminal import visible
 from traps_pipeline.pipeline.graph import Stage
 from traps_pipeline.pipeline.previews import Markdown, Records, StudyFile
@@ -16,6 +17,7 @@ from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
 PREVIEWED, SHORT = 5, 24  # rows, and characters of a text that is shown in them
+WORDS = {"asked": "asked", "cached": "known", "errors": "failed", "frames": "frames"}  # of a tally's counts
 RANKED = ("pecs", "conjunction")  # columns by which the rows of a table are better or worse
 
 
@@ -41,15 +43,29 @@ def visible_metadata(value: Any) -> Any:
     return [visible_metadata(each) for each in value] if isinstance(value, list | tuple) else value
 
 
+def tally_metadata(stage: Stage, tally: Tally) -> dict[str, int]:
+    """Return a run's work on a partition, one number an entry, since Dagster plots numbers.
+
+    Zeros are left out where a stage never does such work.
+    """
+    asks = {"asked", "cached", "errors"} if stage.cost else set()
+    return {WORDS[name]: count for name, count in vars(tally).items() if count or name in asks}
+
+
+def tally_of(metadata: Mapping[str, dg.MetadataValue]) -> Tally:
+    """Return the work that `tally_metadata` has written."""
+    return Tally(**{name: cast(int, metadata[word].value) for name, word in WORDS.items() if word in metadata})
+
+
 def partition_metadata(workspace: Workspace, stage: Stage, output: StageOutput) -> dict[str, Any]:
     """Return the metadata that Dagster shows of a partition or of files for people."""
-    counts: dict[str, Any] = {name: count for name, count in vars(output.tally).items() if count}
+    counts = tally_metadata(stage, output.tally)
     if stage.table is None:
         files = cast(Mapping[str, bytes], output.content)
         pages = {path: StudyFile(workspace.relative(workspace.reports / path)) for path in files if "/" not in path}
-        return {"files": len(files), **counts, **pages, **output.shown}
+        return {"files": len(files), **pages, **output.shown, **counts}
     count = "dagster/row_count" if stage.scheme is None else "dagster/partition_row_count"
-    return {count: len(output.content), **counts, **preview(stage.table, output), **output.shown}
+    return {count: len(output.content), **preview(stage.table, output), **output.shown, **counts}
 
 
 def preview(table: Table, output: StageOutput) -> dict[str, dg.TableMetadataValue]:

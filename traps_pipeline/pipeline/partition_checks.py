@@ -11,14 +11,15 @@ import dagster as dg
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.budget import BudgetReached
 from traps_pipeline.pipeline.graph import Graph, Node, Stage, name_of
-from traps_pipeline.pipeline.lineage import Lineage
+from traps_pipeline.pipeline.history import History
+from traps_pipeline.pipeline.lineage import Lineage, failed_calls
 from traps_pipeline.pipeline.metadata import visible_metadata
 from traps_pipeline.pipeline.translation import asset_key
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
 CURRENT = "current"  # the check that every stage has
-CURRENT_DOC = "Made from what is there now, whole, with no failed call: read again after writing."
+CURRENT_DOC = "The partition is complete, made from the current inputs, and no call of it failed."
 REACHED = "a budget is reached"  # in a check's metadata
 STILL = "still failing"  # in a check's metadata: set for a partition that the run did not touch
 MOST_NAMED = 12  # unmade partitions named in an error
@@ -34,8 +35,8 @@ class StageChecks:
     everything downstream, including stages that do not need this partition. `Lineage.blocked` blocks the ones that do.
     """
 
-    def __init__(self, workspace: Workspace, graph: Graph, stage: Stage) -> None:
-        self._workspace, self._graph, self._stage = workspace, graph, stage
+    def __init__(self, workspace: Workspace, history: History, graph: Graph, stage: Stage) -> None:
+        self._workspace, self._history, self._graph, self._stage = workspace, history, graph, stage
         self._failing: dict[tuple[str, str | None], Mapping[str, Any]] = {}
 
     def of_parents(self, lineage: Lineage, key: str | None) -> Iterator[dg.AssetCheckEvaluation]:
@@ -44,17 +45,20 @@ class StageChecks:
             if self._graph.source(parent) is None:
                 for above in keys:
                     if damage := lineage.damage(parent, above):
-                        yield _evaluation(parent, CURRENT, above, {"damaged": damage})
+                        yield from evaluations(self._history, parent, above, {CURRENT: {"damaged": damage}})
 
-    def of_made(self, key: str | None, output: StageOutput) -> Iterator[dg.AssetCheckEvaluation]:
-        """Evaluate every check of a partition just written."""
+    def test(self, key: str | None, output: StageOutput) -> Mapping[str, Mapping[str, Any]]:
+        """Test a partition just written by every check, and return what each finds wrong.
+
+        Failures are stored before Dagster hears of the partition: a run that dies between the two makes it again.
+        """
         stage, wrong = self._stage, dict[str, Any]()
         if stage.table is not None:
             damage = self._workspace.tables.damage(stage.table, stage.columns(key), thorough=True)
             wrong |= {"damaged": damage} if damage else {}
         if output.tally.errors:
-            wrong["failed"] = _failed_calls(output.tally.errors)
-        yield self._evaluate(CURRENT, key, wrong)
+            wrong["failed"] = failed_calls(output.tally.errors)
+        found: dict[str, Mapping[str, Any]] = {CURRENT: wrong}
         for check in stage.checks:
             problems = check.wrong(self._workspace, key, output)
             file = self._workspace.failed_check(stage.name, check.name, key)
@@ -62,12 +66,26 @@ class StageChecks:
                 self._workspace.store.write({file: json.dumps(problems, default=str).encode()})
             else:
                 self._workspace.store.remove([file])
-            plain = json.loads(json.dumps(problems, default=str))
-            yield self._evaluate(check.name, key, {"failing": plain} if problems else {})
+            found[check.name] = {"failing": json.loads(json.dumps(problems, default=str))} if problems else {}
+        return found
 
-    def of_unmade(self, key: str | None, error: TrapsError) -> dg.AssetCheckEvaluation:
+    def of_made(self, key: str | None, found: Mapping[str, Mapping[str, Any]]) -> Iterator[dg.AssetCheckEvaluation]:
+        """Evaluate every check of a partition, after its event, from what `test` found."""
+        self._failing |= {(check, key): wrong for check, wrong in found.items() if wrong}
+        yield from evaluations(self._history, self._stage.name, key, found)
+
+    def of_unmade(self, key: str | None, error: TrapsError) -> Iterator[dg.AssetCheckEvaluation]:
         """Evaluate a partition that could not be built."""
-        return self._evaluate(CURRENT, key, {"not made": str(error), REACHED: isinstance(error, BudgetReached)})
+        yield from self.of_made(key, {CURRENT: {"not made": str(error), REACHED: isinstance(error, BudgetReached)}})
+
+    def of_fresh(self, key: str | None) -> Iterator[dg.AssetCheckEvaluation]:
+        """Evaluate the checks that a partition passes which is fresh, so that this run does not build it.
+
+        Dagster awaits an evaluation from the run, and would say that the check was skipped, or failed to execute.
+        """
+        failed = {*self._workspace.failed_checks(self._stage.name, key)}
+        names = {CURRENT, *(check.name for check in self._stage.checks)} - failed
+        yield from evaluations(self._history, self._stage.name, key, {name: {} for name in sorted(names)})
 
     def still_failing(self, lineage: Lineage, seen: Collection[str | None]) -> Iterator[dg.AssetCheckEvaluation]:
         """Re-evaluate failing checks of all keys; Dagster shows only the newest result."""
@@ -78,14 +96,9 @@ class StageChecks:
                     self._failing[check, key] = {STILL: json.loads(self._workspace.failure(name, check, key))}
                 state = lineage.state(name, key)
                 if state is not None and state.failed:
-                    self._failing[CURRENT, key] = {STILL: _failed_calls(state.failed)}
-        for (check, key), wrong in [*self._failing.items()]:
-            yield self._evaluate(check, key, wrong)
-
-    def _evaluate(self, check: str, key: str | None, wrong: Mapping[str, Any]) -> dg.AssetCheckEvaluation:
-        if wrong:
-            self._failing[check, key] = wrong
-        return _evaluation(self._stage.name, check, key, wrong)
+                    self._failing[CURRENT, key] = {STILL: failed_calls(state.failed)}
+        for (check, key), wrong in self._failing.items():
+            yield from evaluations(self._history, name, key, {check: wrong})
 
 
 def raise_for_run(context: dg.AssetExecutionContext, graph: Graph, last: str) -> None:
@@ -111,14 +124,20 @@ def raise_for_run(context: dg.AssetExecutionContext, graph: Graph, last: str) ->
         raise (BudgetReached if reached else TrapsError)("\n".join([*lines[:MOST_NAMED], *rest]))
 
 
-def _evaluation(stage: str, check: str, key: str | None, wrong: Mapping[str, Any]) -> dg.AssetCheckEvaluation:
-    return dg.AssetCheckEvaluation(
-        asset_key=asset_key(stage), check_name=check, passed=not wrong, partition=key, metadata=visible_metadata(wrong)
-    )
-
-
-def _failed_calls(count: int) -> str:
-    return f"{count} calls failed and can be asked again"
+def evaluations(
+    history: History, stage: str, key: str | None, found: Mapping[str, Mapping[str, Any]]
+) -> Iterator[dg.AssetCheckEvaluation]:
+    """Yield the evaluation of each check of a partition by what it found wrong."""
+    target = history.check_target(stage, key)
+    for check, wrong in found.items():
+        yield dg.AssetCheckEvaluation(
+            asset_key=asset_key(stage),
+            check_name=check,
+            passed=not wrong,
+            partition=key,
+            metadata=visible_metadata(wrong),
+            target_materialization_data=target,
+        )
 
 
 def _lines(check: str, node: Node, event: dg.AssetCheckEvaluation) -> Iterator[str]:

@@ -10,7 +10,6 @@ gets a `MaterializeResult`.
 """
 
 import hashlib
-import json
 import os
 from collections.abc import Generator, Iterator, Mapping
 from typing import Any, cast
@@ -26,7 +25,7 @@ from traps_pipeline.pipeline.history import History
 from traps_pipeline.pipeline.lineage import Lineage, write_report_state
 from traps_pipeline.pipeline.machine import parts_of_run, require_machine, why_nothing
 from traps_pipeline.pipeline.making import PartitionMaker
-from traps_pipeline.pipeline.metadata import partition_metadata, visible_metadata
+from traps_pipeline.pipeline.metadata import partition_metadata, tally_metadata, visible_metadata
 from traps_pipeline.pipeline.partition_checks import StageChecks, raise_for_run
 from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.storage.parquet import StageOutput, State
@@ -35,7 +34,8 @@ from traps_pipeline.storage.workspace import Workspace
 MAKE_TAG, EXPERIMENT_TAG = "traps/make", "traps/experiment"  # tags of runs: what to build, for which experiment
 BACKFILL_TAG = "dagster/backfill"  # tag of a backfill's run: a run with nothing to do must not end the backfill
 STALE, OUTDATED = "stale", "outdated"  # MAKE_TAG: what is not fresh; what is there and not fresh
-TALLY, TAKEN = "tally", "taken over"  # in an event's metadata: this run's work; whether another run built it
+# In an event's metadata: nobody asks for the partition; another run has built it.
+UNWANTED, TAKEN = "not wanted", "taken over"
 RESUMED_ELSEWHERE = 5  # the exit code of a process whose run another process has resumed
 Event = dg.AssetMaterialization | dg.AssetCheckEvaluation | dg.MaterializeResult | dg.Output
 Events = Generator[Event, None, None]
@@ -55,15 +55,18 @@ def run_step(stage: Stage, context: dg.AssetExecutionContext, workspace: Workspa
     made_result: dg.MaterializeResult | None = None
     for key, output in step.make():
         version = step.write(key, output)
-        yield from step.checks.of_made(key, output)
+        found = step.checks.test(key, output)
         progress.current().partition(stage.name, key or "", output.tally, is_empty=not len(output.content))
-        metadata = partition_metadata(workspace, stage, output) | {TALLY: json.dumps(vars(output.tally))}
+        metadata = partition_metadata(workspace, stage, output)
         if stage.scheme is None:
+            yield from step.checks.of_made(key, found)
             metadata = visible_metadata(metadata)
             made_result = dg.MaterializeResult(metadata=metadata, data_version=dg.DataVersion(version))
         else:
             yield step.history.event(stage, key, version, step.provenance, metadata)
+            yield from step.checks.of_made(key, found)
     yield from step.tell_taken()
+    yield from step.tell_fresh()
     yield from step.tell_unmade()
     yield from step.hand_on(made_result)
     if not step.stages_below():
@@ -83,7 +86,7 @@ class _Step:
         self.history, self.lineage = History(context.instance, self.graph), Lineage(workspace, thorough=True)
         self.history.observe(self.lineage, [p for p in stage.parents if self.graph.source(p)])
         self.provenance = self.history.provenance(stage) if stage.scheme else {}
-        self.checks = StageChecks(workspace, self.graph, stage)
+        self.checks = StageChecks(workspace, self.history, self.graph, stage)
         self._maker = PartitionMaker(workspace, stage, self.history)
         self._inputs: dict[str | None, Mapping[str, str]] = {}  # recorded before anything is read
         keys: list[str | None] = [None] if stage.scheme is None else [str(key) for key in context.partition_keys]
@@ -97,9 +100,9 @@ class _Step:
         if self.stage.scheme and not self._wanted and BACKFILL_TAG not in self.tags:
             reason = why_nothing(self._unwanted, self.tags, self.workspace)
             raise TrapsError(f"{self.stage.name}: nothing is made: {reason}")
-        about = {"made": f"nothing: no experiment in {self.workspace.root / 'study.yaml'} asks for it"}
+        about = {UNWANTED: f"nothing is made: no experiment in {self.workspace.root / 'study.yaml'} asks for it"}
         for key in self._unwanted:
-            yield self.history.event(self.stage, key, "not wanted", self.provenance, about)
+            yield self.history.event(self.stage, key, UNWANTED, self.provenance, about)
 
     def to_make(self) -> list[str | None]:
         """Return the wanted keys, or those among them that the run's tag selects."""
@@ -142,8 +145,15 @@ class _Step:
         """Report partitions that other runs have built."""
         for key, (version, tally) in self._maker.taken.items():
             progress.current().partition(self.stage.name, key or "", tally)
-            about = {TAKEN: "made by another run meanwhile", TALLY: json.dumps(vars(tally))}
+            about = {TAKEN: "made by another run meanwhile", **tally_metadata(self.stage, tally)}
             yield self.history.event(self.stage, key, version, self.provenance, about)
+
+    def tell_fresh(self) -> Iterator[dg.AssetCheckEvaluation]:
+        """Report partitions of this run that need not be built."""
+        for key in self._wanted:
+            is_left = key not in self._inputs and key not in self._maker.unmade
+            if is_left and self.lineage.status(self.stage.name, key).kind == "fresh":
+                yield from self.checks.of_fresh(key)
 
     def tell_unmade(self) -> Iterator[dg.AssetCheckEvaluation]:
         """Report partitions that could not be built or fail a check, now or before."""
@@ -151,7 +161,7 @@ class _Step:
         if unmade:
             end_if_resumed(self.context.instance, self.context.run.run_id, _ATTEMPTS[self.context.run.run_id])
         for key, error in unmade.items():
-            yield self.checks.of_unmade(key, error)
+            yield from self.checks.of_unmade(key, error)
         yield from self.checks.still_failing(self.lineage, {*self._inputs, *unmade} - self._maker.taken.keys())
 
     def hand_on(self, result: dg.MaterializeResult | None) -> Iterator[dg.Output | dg.MaterializeResult]:

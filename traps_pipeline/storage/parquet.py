@@ -313,7 +313,7 @@ def _sound_bytes(path: Path) -> pa.BufferReader:
     place = content.rfind(_MARK) + len(_MARK)
     if _VERIFIED.get(path) != stamp:
         if place < len(_MARK) or content[place : place + len(_ZEROS)] != _sum_of(content):
-            raise TrapsError(f"{path}: is not what was written (it was altered); run again, and it is made anew")
+            raise TrapsError(f"{path}: is not what was written (it was altered); materialize it again")
         _VERIFIED[path] = stamp
     return pa.BufferReader(content)
 

@@ -16,7 +16,7 @@ import yaml
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
-from traps_pipeline.base.paths import ROOT, WORKSPACES, require_history_path, require_root
+from traps_pipeline.base.paths import ASSETS, WORKSPACES, require_history_path, require_root
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml
 from traps_pipeline.storage.parquet import TableStore
 from traps_pipeline.storage.place import STUDY, Place, name_of, place_of, scratch_of
@@ -151,10 +151,13 @@ class Workspace:
         return cls(scratch_of(place), study, place) if isinstance(place, str) else cls(place.absolute(), study)
 
     def copy_dagster_yaml(self, home: Path | None = None) -> None:
-        """Copy the checkout's `dagster.yaml` to Dagster's folder, unless it has its own."""
+        """Copy `assets/dagster.yaml` to Dagster's folder (default: the workspace's) if it has none.
+
+        A study's own `dagster.yaml` may name another storage.
+        """
         own = (home or self.dagster_home) / "dagster.yaml"
         if own.is_symlink() or not own.exists():
-            write_text(own, (ROOT / "dagster.yaml").read_text(encoding="utf-8"))
+            write_text(own, (ASSETS / "dagster.yaml").read_text(encoding="utf-8"))
 
     @property
     def is_on_cluster(self) -> bool:
