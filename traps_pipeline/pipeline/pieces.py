@@ -86,7 +86,8 @@ class _Shared:
             self._pieces = {}
             with suppress(OSError, RuntimeError):  # RuntimeError: a user without a home folder
                 self._pieces = _read(self._path.read_bytes())
-        wanted = (digest([inputs, *self._libraries]),) * 2
+        key = digest([inputs, *self._libraries])
+        wanted = (key, key)
         known, content = self._pieces.get(piece.name, (("", ""), b""))
         if known != wanted:
             content = piece.make()
