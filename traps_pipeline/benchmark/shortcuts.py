@@ -66,7 +66,7 @@ def _accuracy(hits: np.ndarray) -> list[float]:
 
 def _cues(clips: pd.DataFrame, root: Path) -> dict[str, _Cue]:
     def of_clip(column: str) -> Callable[[pd.DataFrame], pd.Series]:
-        return lambda items: clips.loc[items["clip"], column]
+        return lambda items: pd.Series(clips.loc[items["clip"], column])
 
     def by_clip(column: str) -> _Cue:
         seen = of_clip(column)
@@ -77,7 +77,9 @@ def _cues(clips: pd.DataFrame, root: Path) -> dict[str, _Cue]:
         return np.stack([thumbnails[path] for path in items["clip"]])
 
     return {
-        "question": _Cue(lambda items: items["question"], lambda items: items["question"].to_numpy(), _reader),
+        "question": _Cue(
+            lambda items: pd.Series(items["question"]), lambda items: items["question"].to_numpy(), _reader
+        ),
         "clip length": by_clip("duration_s"),
         "first frame": _Cue(of_clip("file_sha256"), first_frames, _viewer),
         "file size": by_clip("size_bytes"),

@@ -69,7 +69,7 @@ def decide(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) ->
     rows["unanimous"] = judged & _unanimous(abstention) & (~on_control | _unanimous(correctness))
     rows["undecided"] = judged & undecided
     said_unread = votes["invalid_reason"].eq(UNREAD) & votes["task"].eq("abstention")
-    if said_unread.any():
+    if said_unread.to_numpy(bool).any():
         times = rows[ANSWER].merge(votes.loc[said_unread, ANSWER].value_counts().reset_index(name="n"), how="left")["n"]
         rows.loc[times.eq(len(cast.judges)).to_numpy(), "outcome"] = UNREAD
     panels = votes.loc[:, [*CELL, "panel"]].drop_duplicates(CELL)

@@ -86,7 +86,8 @@ class _Shared:
             self._pieces = {}
             with suppress(OSError, RuntimeError):  # RuntimeError: a user without a home folder
                 self._pieces = _read(self._path.read_bytes())
-        inputs_digests = (digest([inputs, *self._libraries]),) * 2
+        inputs_digest = digest([inputs, *self._libraries])
+        inputs_digests = (inputs_digest, inputs_digest)
         known, content = self._pieces.get(piece.name, (("", ""), b""))
         if known != inputs_digests:
             content = piece.make()

@@ -242,7 +242,7 @@ def _differences(
     sides: the resampled ends of the left and the right, (n, 2, resamples) each. If every resample is NaN, there is no
     p.
     """
-    ends, apart = difference(*sides), np.subtract(*observed)
+    ends, apart = difference(*sides), np.asarray(observed[0]) - np.asarray(observed[1])
     least, most = limits_of(figure)
     bounds = interval(ends, apart, (least - most, most - least))
     rows = []
