@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
+import sys
 from concurrent.futures.process import BrokenProcessPool
 from itertools import count
 
@@ -42,3 +45,26 @@ def test_ctrl_c_says_what_it_waits_for(capsys: pytest.CaptureFixture[str]) -> No
     with pytest.raises(KeyboardInterrupt):
         results.throw(KeyboardInterrupt())  # type: ignore[attr-defined]
     assert "stopping: waiting for what the workers have begun" in capsys.readouterr().err
+
+
+def test_ctrl_c_while_a_worker_is_started_leaves_no_process_waiting() -> None:
+    """The executor never learns of such a worker, and Python waits at its end for every child."""
+    script = """
+import os, signal, time
+from multiprocessing.context import SpawnProcess
+from traps_pipeline.base.workers import run_in_order
+
+start = SpawnProcess.start
+
+def interrupted(self):
+    start(self)
+    SpawnProcess.start = start
+    time.sleep(3)  # the worker waits for a job by then
+    os.kill(os.getpid(), signal.SIGINT)
+
+SpawnProcess.start = interrupted
+if __name__ == "__main__":
+    list(run_in_order(abs, range(3), 1))
+"""
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert "KeyboardInterrupt" in result.stderr and result.returncode == -signal.SIGINT

@@ -48,7 +48,7 @@ def test_entries_keep_their_order_and_defaults(tmp_path: Path) -> None:
             [f"id: a, backend: reference, params: {{strategy: psychic}}, {GROUPS}"],
             r"model 1 \(a\): .*'psychic'.*oracle",
         ),
-        ([f"id: a, backend: rule, params: {{rule: thumb}}, {GROUPS}"], r"model 1 \(a\): .*'thumb'.*panel, length"),
+        ([f"id: a, backend: rule, params: {{rule: thumb}}, {GROUPS}"], r"model 1 \(a\): .*'thumb'.*occluder, length"),
         ([f"id: a, backend: reference, {GROUPS}"], r"model 1 \(a\): .*strategy"),
         ([f"backend: reference, {GROUPS}"], r"model 1 \(\?\): id: Field required"),
         ([entry("a"), entry("b"), entry("a")], r"model 3: id 'a' occurs twice"),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor, wait
@@ -13,6 +12,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from itertools import chain, islice
 from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from typing import TypeVar
 
 from traps_pipeline.base import progress
@@ -28,12 +28,17 @@ class _Pool:
 
     def __init__(self, workers: int) -> None:
         self.workers, self.left = workers, workers * JOBS_A_WORKER
+        context = get_context("spawn")
+        lifeline, self._lifeline = context.Pipe(duplex=False)
         self.executor = ProcessPoolExecutor(
-            workers, mp_context=get_context("spawn"), initializer=_begin_worker, initargs=(os.getpid(),)
+            workers, mp_context=context, initializer=_begin_worker, initargs=(os.getpid(), lifeline)
         )
 
     def end(self) -> None:
-        self.executor.shutdown(wait=True, cancel_futures=True)
+        try:
+            self.executor.shutdown(wait=True, cancel_futures=True)
+        finally:  # ends a worker that the executor does not know: Ctrl-C came while it was started
+            self._lifeline.close()
 
 
 _idle: list[_Pool] | None = None  # idle pools of `kept_workers`
@@ -123,13 +128,13 @@ def _in_order(
         wait([future for _, future in pending if not future.cancel()])
 
 
-def _begin_worker(parent: int) -> None:
-    """Leave Ctrl-C to the parent, and do not outlive it when it is killed."""
+def _begin_worker(parent: int, lifeline: Connection) -> None:
+    """Leave Ctrl-C to the parent, and outlive neither it nor its pool."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(1.0)
+        while os.getppid() == parent and not lifeline.poll(1.0):  # nothing is sent: there is only its end
+            pass
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
