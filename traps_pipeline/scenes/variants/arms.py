@@ -9,6 +9,7 @@ away.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -219,7 +220,10 @@ def _late_occluder(scenario: Scenario) -> Take:
 def _length_matched(scenario: Scenario) -> Take:
     """Return the control's last open frames, as many as the void has; the observer answers from them."""
     spec, family, end = scenario.spec, scenario.control.family, scenario.control.open_frames
-    frames = scenario.control_frames[end - spec.void["cut_frame"] : end]
+    begin, order = end - spec.void["cut_frame"], scenario.control.outcome.in_order
+    if order is not None and order[0] < begin:
+        raise Rejected("the first of the two events that are asked about happens before these frames")
+    frames = scenario.control_frames[begin:end]
     assert family.observe is not None, f"{family.name}: has no observer"
     seen = family.observe(np.stack(frames[scenario.sampled]), spec.question)
     if seen != spec.ground_truth:
@@ -297,19 +301,28 @@ def crossed(partner: SceneSpec | None) -> Arm:
         ]
 
     def film(scenario: Scenario) -> Take:
-        foreign = ask(scenario.spec)[1].text
-        if why := false_premise(foreign, scenario.control.inventory):
+        ask(scenario.spec)
+        assert partner is not None, "asked for above"
+        if why := false_premise(_presumed(partner), scenario.control.inventory):
             return Take([], {"refuted_by": why})
-        raise Rejected(f"the scene does not refute {foreign!r}")
+        raise Rejected(f"the scene does not refute {partner.question!r}")
 
     return Arm(
         CROSSED,
         "this clip, or this question, means: abstain",
-        "the void with a question that it answers; the control with the question of its partner, which presumes a "
-        "colour that nothing in the scene has, as does its own question in the partner's scene",
+        "the void with a question that it answers; the control with the question of its partner, which presumes, "
+        "beside its choices, a colour that nothing in the scene has, as does its own question in the partner's scene",
         ask,
         film,
     )
+
+
+def _presumed(spec: SceneSpec) -> str:
+    """Return the question without its choices, which it offers and does not presume: one of them may be right."""
+    text = re.sub(r"\([^)]*\)", "", spec.question.lower())
+    matches = [re.search(rf"\b{re.escape(label.lower())}\b", text) for label in spec.labels]
+    spans = [match.span() for match in matches if match]
+    return text[: min(spans)[0]] + text[max(end for _, end in spans) :] if spans else text
 
 
 def partners(specs: Iterable[SceneSpec]) -> dict[str, str]:
@@ -320,7 +333,8 @@ def partners(specs: Iterable[SceneSpec]) -> dict[str, str]:
     """
     by_id = {spec.scenario_id: spec for spec in sorted(specs, key=lambda spec: spec.scenario_id)}
     seen = {id_: World.of_record(spec, np.empty((0, 0))).inventory for id_, spec in by_id.items()}
-    refuted = {(a, b) for a in by_id for b in by_id if false_premise(by_id[b].question, seen[a]) is not None}
+    presumed = {id_: _presumed(spec) for id_, spec in by_id.items()}
+    refuted = {(a, b) for a in by_id for b in by_id if false_premise(presumed[b], seen[a]) is not None}
     free = {a: {b for b in by_id if (a, b) in refuted and (b, a) in refuted} for a in by_id}
     chosen: dict[str, str] = {}
     while candidates := [a for a in free if free[a]]:
