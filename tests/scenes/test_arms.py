@@ -13,7 +13,7 @@ from tests.scenes.released import load
 from traps_pipeline.benchmark.filmed_arms import arm_of
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.protocol.datasets import ARMS, GRADED, arms_of, beside_of, sides_of
-from traps_pipeline.scenes.variants import arms, graded
+from traps_pipeline.scenes.variants import arms, graded_cuts
 from traps_pipeline.scenes.worlds.outcome import Rejected
 
 
@@ -34,7 +34,7 @@ def test_every_arm_that_can_be_asked_can_be_filmed_and_asks_its_sides():
 
 
 def test_the_page_has_the_table_of_arms():
-    assert arm_table.ON_PAGE.written() == arms.table() + "\n"
+    assert arm_table.ON_PAGE.written() == arm_table.table() + "\n"
 
 
 # --- words ------------------------------------------------------------------------------------------------------------
@@ -118,15 +118,15 @@ def test_what_is_wanted_is_spread_evenly_whatever_the_family() -> None:
     for family in ("plinko", "pachinko_waterfall", "seesaw_sorter", "tumbling_dice"):
         members = [spec for spec in load_released().values() if spec.family == family]
         for first in (10, len(members)):
-            shares = np.sort([graded.wanted(spec) for spec in members[:first]])
-            gaps = np.diff([graded.LEAST, *shares, 1.0])
+            shares = np.sort([graded_cuts.wanted(spec) for spec in members[:first]])
+            gaps = np.diff([graded_cuts.LEAST, *shares, 1.0])
             assert gaps.min() >= 0 and gaps.max() < 0.6 * 3 / first, family
 
 
 def test_probabilities_are_of_the_futures_that_end_in_an_answer() -> None:
-    shares = graded.probabilities(Counter({"left": 30, None: 20, "right": 10}))
+    shares = graded_cuts.probabilities(Counter({"left": 30, None: 20, "right": 10}))
     assert shares == {"left": 0.75, "right": 0.25}
-    assert graded.probabilities(Counter({None: 3})) == {}
+    assert graded_cuts.probabilities(Counter({None: 3})) == {}
 
 
 @pytest.mark.slow
@@ -149,9 +149,9 @@ def test_a_graded_cut_shows_the_control_up_to_a_sampled_frame_and_knows_how_prob
 
 def test_a_control_that_is_settled_before_the_earliest_cut_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
     plinko = scenario("plinko-0001")
-    monkeypatch.setattr(graded, "earliest_cut", lambda physics: physics.n_frames)
+    monkeypatch.setattr(graded_cuts, "earliest_cut", lambda physics: physics.n_frames)
     with pytest.raises(Rejected, match="before the earliest cut"):
-        graded.graded_cut(plinko.spec, plinko.control)
+        graded_cuts.graded_cut(plinko.spec, plinko.control)
 
 
 def test_graded_cuts_are_of_chaotic_scenarios_and_no_arm() -> None:

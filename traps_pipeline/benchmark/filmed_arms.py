@@ -24,7 +24,7 @@ from traps_pipeline.protocol.datasets import ARMS as ARM_NAMES
 from traps_pipeline.protocol.datasets import CROSSED, GRADED, beside_of, sides_of, taxonomy_of_category
 from traps_pipeline.scenes.variants.arms import ARMS as OF_SHORTCUTS
 from traps_pipeline.scenes.variants.arms import Arm, Question, Scenario, crossed, partners
-from traps_pipeline.scenes.variants.graded import GRADED_CUT
+from traps_pipeline.scenes.variants.graded_cuts import GRADED_CUT
 from traps_pipeline.scenes.variants.variations import VARIATIONS
 from traps_pipeline.scenes.worlds.clips import Clip, note_of, read_clip, save_clip
 from traps_pipeline.scenes.worlds.outcome import Rejected

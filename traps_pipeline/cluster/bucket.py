@@ -35,10 +35,11 @@ class Bucket:
 
     def __init__(self, address: str) -> None:
         require("cluster", "obstore")
+        import obstore
         from obstore.exceptions import BaseError
         from obstore.store import from_url
 
-        self.address = address
+        self.address, self._client = address, obstore
         for variable in _SECRETS[address.partition(":")[0]]:
             optional_key(variable)  # obstore reads it again
         try:
@@ -62,40 +63,30 @@ class Bucket:
 
     def get(self, name: str) -> bytes | None:
         """Return an object's content; None if it is missing. Raises TrapsError."""
-        import obstore
-
         with suppress(FileNotFoundError), self._used():
-            return bytes(obstore.get(self._store, name).bytes())
+            return bytes(self._client.get(self._store, name).bytes())
         return None
 
     def size(self, name: str) -> int | None:
         """Return an object's size in bytes; None if it is missing. Raises TrapsError."""
-        import obstore
-
         with suppress(FileNotFoundError), self._used():
-            return int(obstore.head(self._store, name)["size"])
+            return int(self._client.head(self._store, name)["size"])
         return None
 
     def put(self, name: str, content: bytes) -> None:
         """Write an object. Raises TrapsError."""
-        import obstore
-
         with self._used():
-            obstore.put(self._store, name, content)
+            self._client.put(self._store, name, content)
 
     def delete(self, names: Sequence[str]) -> None:
         """Remove objects. Raises TrapsError."""
-        import obstore
-
         with suppress(FileNotFoundError), self._used():
-            obstore.delete(self._store, names)
+            self._client.delete(self._store, names)
 
     def names(self, below: str = "") -> Iterator[tuple[str, int, datetime]]:
         """Yield objects' name, size (bytes) and time, below a name. Raises TrapsError."""
-        import obstore
-
         with self._used():
-            for page in obstore.list(self._store, below or None):
+            for page in self._client.list(self._store, below or None):
                 yield from ((entry["path"], entry["size"], entry["last_modified"]) for entry in page)
 
     def error(self, error: Exception) -> TrapsError:

@@ -47,10 +47,7 @@ def uploading(workspace: Workspace, run_id: str) -> Iterator[None]:
 
 
 def upload(bucket: Bucket, folder: Path, run_id: str, sizes: dict[Path, int]) -> None:
-    """Upload grown logs of a run; report an unreachable store instead of raising.
-
-    sizes: uploaded bytes, by file.
-    """
+    """Upload a run's grown logs (sizes: bytes by file); report an unreachable store."""
     try:
         for path in (folder / run_id).rglob("*.*"):
             content = path.read_bytes()

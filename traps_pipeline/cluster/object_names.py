@@ -47,10 +47,7 @@ _OBJECTS = sa.Table(
 
 @dataclass(frozen=True, slots=True)
 class CurrentObject:
-    """A path's current object: SHA-256, size in bytes, note, and change time.
-
-    The time is in ns since 1970; 0 for an object that is yet to be named.
-    """
+    """A path's current object; size in bytes, time in ns (0 before it is named)."""
 
     digest: bytes
     size: int
@@ -159,10 +156,7 @@ class ObjectNames:
         return now
 
     def _next_change(self, connection: sa.Connection, *, removals: int = 0) -> tuple[int, int]:
-        """Number a change, and lock names and removals until the transaction ends.
-
-        Return its number and the number of removals.
-        """
+        """Number a change, locking names until the commit; return it and the removals."""
         upsert = insert(_CHANGES).values(study=self._study, number=1, removals=removals)
         upsert = upsert.on_conflict_do_update(
             index_elements=["study"],

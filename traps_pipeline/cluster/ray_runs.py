@@ -38,13 +38,7 @@ CREATED_S = 30.0  # when ending its runs, a command waits so long for the daemon
 DAEMONS = ("QUEUED_RUN_COORDINATOR", "SENSOR")
 ENDS = 300  # characters of the beginning and of the end of a lost run's last message
 OnInterrupt = Literal["leave", "cancel"]
-_UNFINISHED = (
-    dg.DagsterRunStatus.QUEUED,
-    dg.DagsterRunStatus.NOT_STARTED,
-    dg.DagsterRunStatus.STARTING,
-    dg.DagsterRunStatus.STARTED,
-    dg.DagsterRunStatus.CANCELING,
-)
+_UNFINISHED = [status for status in dg.DagsterRunStatus if status.name not in ("SUCCESS", "FAILURE", "CANCELED")]
 _WRITTEN, _FAILED = dg.DagsterEventType.ASSET_MATERIALIZATION, dg.DagsterEventType.STEP_FAILURE
 _ENDED = {dg.DagsterEventType.RUN_FAILURE, dg.DagsterEventType.RUN_CANCELED, dg.DagsterEventType.ENGINE_EVENT}
 
@@ -106,7 +100,7 @@ class RayRuns(Runs):
 
     def wait_for_earlier(self) -> None:
         """Wait for runs of earlier commands."""
-        filters = dg.RunsFilter(statuses=[*_UNFINISHED], tags={STUDY_TAG: self._workspace.study.name})
+        filters = dg.RunsFilter(statuses=_UNFINISHED, tags={STUDY_TAG: self._workspace.study.name})
         if runs := [*self._instance.get_runs(filters)]:
             progress.current().note(f"{len(runs)} runs of this study go on that were left; waiting for them first")
             progress.current().stage("runs that were left", sum(map(_partitions, runs)))
@@ -222,15 +216,12 @@ class RayRuns(Runs):
                 if event.is_step_failure:
                     self._failures.setdefault(run_id, []).append(event)
                     continue
-                materialization = event.step_materialization_data.materialization
-                if UNWANTED not in materialization.metadata:
-                    tally = tally_of(materialization.metadata)
-                    if TAKEN in materialization.metadata:
-                        progress.current().helped(materialization.asset_key.path[-1], tally)
-                    else:
-                        progress.current().partition(
-                            materialization.asset_key.path[-1], materialization.partition or "", tally
-                        )
+                result = event.step_materialization_data.materialization
+                name, tally = result.asset_key.path[-1], tally_of(result.metadata)
+                if TAKEN in result.metadata:
+                    progress.current().helped(name, tally)
+                elif UNWANTED not in result.metadata:
+                    progress.current().partition(name, result.partition or "", tally)
 
     def _ended(self, run_id: str, run: dg.DagsterRun | None, failures: Sequence[dg.DagsterEvent]) -> RunOutcome:
         name = f"run {run_id[:8]} of the study {self._workspace.study.name}"

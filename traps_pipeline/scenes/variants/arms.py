@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from traps_pipeline.protocol.datasets import CROSSED, arms_of, sides_of
+from traps_pipeline.protocol.datasets import CROSSED
 from traps_pipeline.scenes.certification.certificates import (
     EARLIEST_CUT_S,
     legible_groups,
@@ -199,7 +199,7 @@ def _removed(scenario: Scenario) -> Take:
 
 
 def _late_occluder(scenario: Scenario) -> Take:
-    """Return the occluder comes in the last frame before the outcome is settled."""
+    """Return a control whose occluder comes just before the outcome is settled."""
     at = scenario.control.outcome.commit_frame - 1
     if at < EARLIEST_COVER_S * scenario.fps:
         raise Rejected(f"the outcome is settled at {(at + 1) / scenario.fps:.1f} s: nothing can be seen before it")
@@ -232,8 +232,7 @@ def _length_matched(scenario: Scenario) -> Take:
 
 
 def _predictable_cut(scenario: Scenario) -> Take:
-    """Return a cut shortly before the outcome is settled at which nearly all futures of the last frame shown agree with
-    it."""
+    """Return a cut before the outcome is settled at which nearly all futures agree."""
     control, commit = scenario.control, scenario.control.outcome.commit_frame
     if not control.same_physics:
         raise Rejected("simulating here does not give the frozen trajectory, so that its futures are not known")
@@ -246,8 +245,7 @@ def _predictable_cut(scenario: Scenario) -> Take:
 
 
 def _agreeing(scenario: Scenario, frame: int) -> int | None:
-    """Return how many of FUTURES futures of the state in a frame, perturbed by the family's scale, end in the answer;
-    None as soon as they are too few."""
+    """Return how many perturbed futures of a frame end in the answer; None if too few."""
     import mujoco
 
     control, spec = scenario.control, scenario.spec
@@ -400,14 +398,3 @@ ARMS: Mapping[str, Arm] = {
         crossed(None),
     )
 }
-
-
-def table() -> str:
-    """Return the arms as the Markdown table of `docs/arms.md`."""
-    lines = ["| arm | of | asks | takes away | certificate |", "| --- | --- | --- | --- | --- |"]
-    for arm in ARMS.values():
-        of = [taxonomy for taxonomy in ("occlusion", "chaotic") if arm.name in arms_of(taxonomy)]
-        asks = {"control": "must be answered", "void": "must be abstained on"}
-        asked = ", ".join(asks[side] for side in sides_of(arm.name))
-        lines.append(f"| `{arm.name}` | {', '.join(of)} | {asked} | {arm.takes_away} | {arm.promises} |")
-    return "\n".join(lines)
