@@ -172,6 +172,6 @@ def _precision(params: LocalParams, device: str) -> dict[str, Any]:
         )
         options["device_map"] = {"": device}
     if device == SPREAD:
-        require("nf4")  # which brings accelerate
+        require("nf4", "accelerate")
         options["device_map"] = "auto"
     return options
