@@ -185,7 +185,7 @@ def _lost_arms(workspace: Workspace, category: str) -> list[str]:
     group="arms",
     parents=[scene_specs, videos],
     scheme=CATEGORY,
-    code="3",
+    code="4",
     kinds=["parquet", "mp4"],
     takes=RENDERS,
     shared=ConcurrentBuild(_film, _seconds_of_filming),
