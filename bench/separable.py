@@ -142,7 +142,7 @@ def asked_of(spec: SceneSpec) -> Iterator[tuple[str, str, str, Clip]]:
 def one_line(items: pd.DataFrame) -> Decisions:
     """Return whether each cue alone, and any of them, makes a rule abstain on each item."""
     cues = {
-        "panel": items["f1"].to_numpy(float) > 0,  # one stands in the first frame
+        "occluder": items["f1"].to_numpy(float) > 0,  # one stands in the first frame
         "length": items["f0"].to_numpy(float) < CUT_FRAMES,
         "wording": items["question"].map(has_no_choices).to_numpy(bool),
     }

@@ -1,7 +1,7 @@
 """Estimate passes, tokens, GPU-hours and memory of local models for `traps plan`.
 
-The estimate is arithmetic, not measurement: a pass takes 2 operations per parameter and token, and decoding steps are
-bound by the launch of each block's kernels or by reading the weights. docs/mechanism.md states the assumptions.
+The estimate is arithmetic with constants that were measured on one card: a pass takes 2 operations per parameter and
+token, and decoding steps are bound by each block's kernels or by reading the weights. docs/mechanism.md states both.
 """
 
 from __future__ import annotations
@@ -16,13 +16,14 @@ from traps_pipeline.storage.study import MechanismSettings
 
 TEXT_TOKENS = 220  # system prompt, question and chat template
 CLIP_S = 5.0
-REACHED = 0.4  # share of a card's operations that passes over prompts reach
-STEP_S = 0.7e-3  # per block and decoding step, for any number of rows
+REACHED = 0.25  # share of a card's operations that passes over prompts reach
+STEP_S = 0.9e-3  # per block and decoding step
+ATTENTION_S = 14e-9  # beside it, per block, step, row and token of its prompt
 NF4_TIMES = 2.0  # factor on time, since weights are unpacked at every use
 NF4_BYTES, BFLOAT16_BYTES = 0.6, 2.0  # per parameter
 ROWS = 64  # rows of a batch of answers
-WIDEST = 28  # numbers per token and unit of width at a block's peak
-GRAPH = 18  # numbers per token, block and unit of width that a backward pass keeps
+WIDEST = 75  # numbers per token and unit of width at a block's peak
+GRAPH = 24  # numbers per token, block and unit of width that a backward pass keeps
 SOURCES = 4  # sources of patches: the other side, and three nulls
 
 
@@ -97,7 +98,8 @@ def cost_of(entry: ModelEntry, media: MediaSpec, work: Work, card: Card, *, quan
     parameters, layers, width = entry.size.parameters_b * 1e9, entry.size.layers, entry.size.width
     weights = parameters * (NF4_BYTES if quantised else BFLOAT16_BYTES)
     seconds = 2 * parameters * tokens_in / (REACHED * card.operations)
-    seconds += tokens_out / ROWS * max(layers * STEP_S, weights / card.bandwidth)
+    step_s = max(layers * STEP_S, weights / card.bandwidth) + layers * ROWS * prompt * ATTENTION_S
+    seconds += tokens_out / ROWS * step_s
     state = prompt * width * BFLOAT16_BYTES  # bytes of one layer
     extra = (4 * layers + 2 + GRAPH * layers) * state if work.kind == "patching" else WIDEST * state
     return Cost(
