@@ -1,4 +1,4 @@
-"""A ball is thrown in a high arc; the question is whether it lands in the basket.
+"""A ball is thrown in a high arc: does it land in the basket?
 
 Control: the walled pen that it comes down in is in view, and the basket in it. Void: the occluder stands before the
 pen. Hidden element: the basket, which stands where the ball comes down or a step before or beyond. The throw is the
@@ -31,20 +31,20 @@ SEEN = ("ball", "pedestal", "basket")
 
 
 def _basket_half(rng: np.random.Generator, so_far: Drawn) -> float:
-    """Twice the ball's radius and a little more; `step_m` needs it unrounded."""
+    """Return the ball's diameter and a little more; `step_m` needs it unrounded."""
     so_far["half"] = uniform(rng, 2.0, 2.2) * so_far["radius_m"]
     return round(so_far["half"], 4)
 
 
 def _step(rng: np.random.Generator, so_far: Drawn) -> float:
-    """So far to either side that the ball misses the basket."""
+    """Draw a sideways step, so long that the ball misses the basket."""
     side = int(rng.choice([-1, 1]))
     return round(side * (so_far["half"] + so_far["radius_m"] + uniform(rng, 0.07, 0.10)), 4)
 
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 throws to the right. Places are along the throw, from the pedestal's middle."""
+    """Parameters; lengths run from the pedestal's middle, direction +1: to the right."""
 
     direction: int = one_of(-1, 1)
     radius_m: float = between(0.068, 0.080)
@@ -76,7 +76,7 @@ class Params:
 
     @property
     def pen_m(self) -> Span:
-        """Where the pen begins and ends: it has room for both places of the basket and for a ball beside it."""
+        """Ends of the pen, which holds both places of the basket and a ball beside it."""
         aside = self.basket_half_m + 0.03
         room = 2.9 * self.radius_m
         low = self.landing_m + min(0.0, self.step_m) - (aside if self.step_m < 0 else max(room, aside))
@@ -85,7 +85,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return pedestal, pen with a back wall and a low front, basket."""
+    """Build the pedestal, the pen with a high back and a low front, and the basket."""
     course = Course(physics, p.direction, Surface(0.004, solref=SOFT))
     r, rim, deep, colour = p.radius_m, p.rim_m, (-DEPTH_M, DEPTH_M), p.pen_colour
     course.block("pedestal", (-0.09, 0.09), (-0.09, 0.09), (0, p.pedestal_m), p.pedestal_colour)
@@ -129,8 +129,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return 'yes' while the ball is all but down on a floor between the basket's sides, 'no' when it is beside the
-    basket; None while it is higher. The margin is how far its centre ends from the nearest side of the basket."""
+    """Read 'yes' while the low ball is between the basket's sides, 'no' beside them."""
     ball = motion.pos("ball")
     along = p.direction * ball[:, 0]
     inside = p.basket_half_m - np.abs(along - p.basket_m)
@@ -139,7 +138,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return whether the resting ball is between the sides of the basket in the picture."""
+    """Return whether the resting ball is between the basket's sides in the picture."""
     path = [rounded(frame, named["ball"]) for frame in frames[-3:]]
     sides, ball = _sides(frames[-1], named["basket"]), end_of(path)
     if ball is None or sides is None:
@@ -148,8 +147,7 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return whether the flying ball is between the sides of the basket when it has fallen to the middle of their
-    height."""
+    """Predict whether the ball is in the basket when it has fallen to half its height."""
     path = [rounded(frame, named["ball"]) for frame in frames[-3:]]
     sides, flight = _sides(frames[-1], named["basket"]), [ball for ball in path if ball is not None]
     if sides is None or len(flight) < 3:
@@ -163,7 +161,7 @@ def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def _sides(frame: np.ndarray, colour: str) -> tuple[float, float, float, float] | None:
-    """Return the left and the right end, the top and the bottom (px) of all that has the basket's colour."""
+    """Return left, right, top and bottom (px) of all that has the basket's colour."""
     boxes = [part.box for part in blobs(colour_mask(frame, colour), 40)]
     if not boxes:
         return None

@@ -1,5 +1,4 @@
-"""A row of dominoes comes towards the camera and splits in two branches; the question is at the end of which branch the
-domino falls, the left one or the right one.
+"""A row of dominoes splits in two branches: at whose end does the domino fall?
 
 Control: both branches are in view. Void: the occluder stands before them; the row is seen to fall behind it.
 Hidden element: one domino of either branch, of which one stands in its branch and the other lies beside it.
@@ -33,7 +32,7 @@ PLAY = apart("red", "green", "blue", "yellow", "cyan", "purple")
 
 @dataclass(frozen=True)
 class Params:
-    """Lengths without a unit in the name are in domino heights; angles are between a branch and the row."""
+    """Parameters; lengths without a unit in domino heights, angles from the row."""
 
     row_colour: str = PLAY()
     ball_colour: str = PLAY()
@@ -59,9 +58,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return the row runs along -y from the first domino at the origin; the branches start where the kicked ball
-    stops.
-    """
+    """Build the row along -y, and two branches from where the kicked ball stops."""
     course, h = Course(physics), p.height_m
     face = (p.visible - 1) * p.spacing + p.thickness / 2
     junction = face + STOP_AT
@@ -101,7 +98,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _add_branch(course: Course, p: Params, side: str, yaw: float, junction: float) -> None:
-    """Add the dominoes of a branch, one of which may lie beside it, on the inner side."""
+    """Add the dominoes of a branch, of which one may lie beside it, on the inner side."""
     ahead, inwards = np.array([np.sin(yaw), np.cos(yaw)]), np.sign(yaw) * np.array([-np.cos(yaw), np.sin(yaw)])
     start = np.array([0.0, junction]) + (BALL - PUSH + p.thickness / 2) * ahead
     colours = [p.row_colour] * (p.branch - 1) + [p.left_colour if side == "left" else p.right_colour]
@@ -115,9 +112,7 @@ def _add_branch(course: Course, p: Params, side: str, yaw: float, junction: floa
 def _add_domino(
     course: Course, p: Params, name: str, at: np.ndarray, yaw: float, colour: str, *, lying: bool = False
 ) -> None:
-    """Add a free domino (body and geom `name`) at (across, along), its thickness along a direction `yaw` from the
-    row.
-    """
+    """Add a free domino at (across, along), its thickness along `yaw` from the row."""
     h = p.height_m
     deep, high = (1.0, p.thickness) if lying else (p.thickness, 1.0)
     place = (float(at[0]) * h, -float(at[1]) * h, (PLANK + high / 2) * h)
@@ -127,8 +122,7 @@ def _add_domino(
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return the side on which alone the end domino's top is below half a domino's height, from when no domino of the
-    branches moves any more. The margin is how far either top ends from that height, at least."""
+    """Read the side on which alone the end domino falls, once the branches are still."""
     tops = np.stack([top_m(motion, f"end_{side}", p.height_m) for side in SIDES], axis=1) - PLANK * p.height_m
     still = still_from(*(motion.pos(body) for side in SIDES for body in p.bodies(side)), within_m=STILL_M)
     sides = [("left" if left else "right") if left != right else None for left, right in tops < p.height_m / 2]
@@ -137,7 +131,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 
 def _aside(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
-    """After the order of the choices, which is drawn first, either what starts the fall or what falls first."""
+    """Draw a question: what starts the fall, or what falls first."""
     choices = tuple(str(c) for c in rng.permutation([p.row_colour, p.ball_colour, p.left_colour, p.right_colour]))
     if rng.integers(2):
         question = f"What colour is the ball that sets off the row of dominoes: {listed(choices)}?"
@@ -155,11 +149,13 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return the side whose end domino alone has left its place or is about to; a flag of its colour does neither."""
+    """Predict the side whose end domino alone has left its place or is about to."""
     falls = []
     for colour in (named["left"], named["right"]):
         seen = blobs(colour_mask(frames[0], colour), 60)
-        falls.append(any(not upper_half_stays(frames, colour, one) or struck(frames, one, 0.0) for one in seen))
+        falls.append(
+            any(not upper_half_stays(frames, colour, domino) or struck(frames, domino, 0.0) for domino in seen)
+        )
     return None if falls[0] == falls[1] else "left" if falls[0] else "right"
 
 
@@ -173,8 +169,7 @@ def look(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def _stands(frames: np.ndarray, colour: str) -> bool | None:
-    """Return whether the upper half of the thing of that colour is where it was; None if it is not to be seen at the
-    end."""
+    """Return whether a colour's upper half is where it was; None if out of view."""
     first, last = largest(frames[0], colour, 60), largest(frames[-1], colour, 60)
     if first is None or last is None or is_occluder(first) or is_occluder(last):
         return None

@@ -1,4 +1,4 @@
-"""A ball rolls along a high track into a chute and drops on a plate; the question is to which side it drops off.
+"""A ball drops through a chute on a plate: to which side does it drop off?
 
 Control: the plate below the chute and the two bins are in view. Void: the occluder stands before them.
 Hidden element: the plate is tilted to the left or to the right. The ball drops straight on its middle, whatever the
@@ -31,7 +31,7 @@ PLAY, PLAIN = apart(*NAMED), shuffled("wood", "grey", "white")
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 rolls to the right. tilt: +1 if the plate sheds the ball to the right."""
+    """Parameters; direction +1: to the right, tilt +1: the plate sheds to the right."""
 
     left_colour: str = PLAY()
     right_colour: str = PLAY()
@@ -54,9 +54,9 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return track on a post, chute, tilting plate on a partition, one bin on each side of it, board at the back.
+    """Build track, chute, tilting plate on a partition, two bins, and back board.
 
-    Only track, post, chute and ball are mirrored by `direction`; bins and board are left and right in the picture.
+    `direction` mirrors only track, post, chute and ball; bins and board stay as in the picture.
     """
     course = Course(physics)
     r, d, half_y, half_x = p.radius_m, p.direction, 1.5 * p.radius_m, p.bin_m + WALL_M
@@ -112,17 +112,14 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return the side of the bin in which the ball is, while it is below the bins' outer walls. The margin is how far
-    it ends from the partition."""
+    """Read the bin that the ball is in, while it is below the outer walls."""
     ball = motion.pos("ball")
     x = ball[:, 0]
     return Reading(side_while(ball[:, 2] < p.rim_m + p.radius_m, x, "right", "left"), float(abs(x[-1]) - p.radius_m))
 
 
 def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return the side that the plate above the middle of the bins falls to, by the slopes of its edges in the
-    picture.
-    """
+    """Predict the side to which the plate falls, by the slopes of its edges."""
     left, right = (largest(frames[0], named[side], 60) for side in ("left", "right"))
     if left is None or right is None or left.x > right.x:
         return None

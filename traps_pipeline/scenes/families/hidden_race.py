@@ -1,4 +1,4 @@
-"""Balls race through a tunnel in lanes of their own; the question is which colour comes out first.
+"""Balls race through a tunnel in lanes of their own: which colour is first out?
 
 Control: the far end of the tunnel and the tray behind it are in view. Void: the occluder stands before them.
 Hidden element: inside the tunnel every lane but one crosses a rough board that slows its ball to a creep. The visible
@@ -41,14 +41,14 @@ PLAIN = shuffled("wood", "grey", "white")
 
 
 def _direction(rng: np.random.Generator, so_far: Drawn) -> int:
-    """Before it, the number of lanes, which no field stores: there are as many as colours."""
+    """Draw the direction, and before it the number of lanes, which no field stores."""
     so_far["lanes"] = int(rng.choice([2, 3, 3]))
     return int(rng.choice([-1, 1]))
 
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 rolls to the right. colours, speeds, starts: one per lane, front lane first."""
+    """Parameters by lane, front lane first; direction +1: to the right."""
 
     direction: int = drawn_by(_direction)
     tunnel_colour: str = PLAIN()
@@ -69,7 +69,7 @@ class Params:
 
     @property
     def balls(self) -> list[str]:
-        """One a lane, front lane first."""
+        """Bodies of the balls, front lane first."""
         return [f"ball_{i}" for i in range(len(self.colours))]
 
     @property
@@ -79,7 +79,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return deck with rails, opaque tunnel, sunken tray. Lengths run along the lanes."""
+    """Build deck with rails, opaque tunnel, sunken tray."""
     course = Course(physics, p.direction)
     lanes, r, pitch, wall = len(p.colours), p.radius_m, 2.8 * p.radius_m, 0.012
     side, roof, rim, end = lanes * pitch / 2, DECK_M + 2.6 * r, TRAY_M + 0.9 * r, p.exit_m + p.tray_m
@@ -121,18 +121,18 @@ def build(p: Params, physics: Physics) -> Scene:
 
 def _roughness(p: Params, lane: int, physics: Physics) -> float:
     """Return rolling friction (m) that brings this lane's ball down to `creep_m_s`."""
-    lost = (ARRIVING * p.speeds_m_s[lane]) ** 2 - p.creep_m_s**2
-    return brake(p.radius_m, lost, ROUGH_BOARD_M, physics)
+    loss = (ARRIVING * p.speeds_m_s[lane]) ** 2 - p.creep_m_s**2
+    return brake(p.radius_m, loss, ROUGH_BOARD_M, physics)
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return the colour that came out first, from when its ball is wholly out."""
+    """Read the colour that came out first, from when its ball is wholly out."""
     along = [p.direction * motion.pos(ball)[:, 0] for ball in p.balls]
     return first_past(motion, np.stack(along, axis=1) - p.radius_m - p.exit_m, p.colours, MIN_LEAD_S)
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return the ball that is seen again first after it was out of sight, once all of them are."""
+    """Return the ball seen first after it was out of sight, once all are seen again."""
     colours = colours_of_balls(frames, named, BALL_COLOURS)
     out = [_seen_again(frames, colour) for colour in colours]
     seen = [frame for frame in out if frame is not None]
@@ -142,7 +142,7 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def _seen_again(frames: np.ndarray, colour: str) -> int | None:
-    """Return first frame that shows at least half of the ball after the tunnel, None if it stays out of sight."""
+    """Return the first frame with half of the ball after the tunnel, None if none."""
     areas = np.array([_ball_pixels(frame, colour) for frame in frames])
     gone = np.flatnonzero(areas == 0)
     if not gone.size or areas[-3:].min() == 0:
@@ -157,7 +157,7 @@ def _ball_pixels(frame: np.ndarray, colour: str) -> int:
 
 
 def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return the ball that is the first to be seen again, be it a part of it."""
+    """Predict the ball of which any part is seen first after the tunnel."""
     back: dict[str, int] = {}
     for colour in colours_of_balls(frames, named, BALL_COLOURS):
         gone = [at for at, frame in enumerate(frames) if _ball_pixels(frame, colour) == 0]

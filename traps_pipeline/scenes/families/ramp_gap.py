@@ -1,4 +1,4 @@
-"""A ball rolls down a ramp and along a deck with a box at its end; the question is whether it reaches the box.
+"""A ball rolls along a deck with a box at its end: does it reach the box?
 
 Control: the whole deck and the box are in view. Void: the occluder stands before all but the beginning of the deck.
 Hidden element: a board that bridges a gap in the deck, or lies on the ground below it, so that the ball falls in.
@@ -25,7 +25,7 @@ PLAY, PLAIN = apart(*NAMED), shuffled("wood", "grey", "black")
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 rolls to the right. Lengths run along the deck from the foot of the ramp."""
+    """Parameters; lengths run from the ramp's foot, direction +1: to the right."""
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()
@@ -60,7 +60,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return ramp with rails and support, deck in two parts with the gap between them, box."""
+    """Build ramp with rails and support, deck in two parts with a gap, and box."""
     course = Course(physics, p.direction)
     r, side, gap, end = p.radius_m, 1.7 * p.radius_m, p.gap_span, p.deck_end_m + p.box_m
     deep, deck, box = (-side, side), (0, p.deck_m), (p.deck_end_m, end)
@@ -100,12 +100,11 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return 'yes' from when the ball is past the end of the deck, 'no' from when it is half its radius down in the
-    gap. The margin is how far it ends past the deck, or below it."""
+    """Read 'yes' once the ball is past the deck, 'no' once it is down in the gap."""
     ball = motion.pos("ball")
-    past, sunk = p.direction * ball[:, 0] - p.deck_end_m, p.deck_m + p.radius_m - ball[:, 2]
-    labels = ["yes" if x > 0 else "no" if z > 0.5 * p.radius_m else None for x, z in zip(past, sunk, strict=True)]
-    return Reading(labels, float(past[-1] if past[-1] > 0 else sunk[-1]))
+    past, depth = p.direction * ball[:, 0] - p.deck_end_m, p.deck_m + p.radius_m - ball[:, 2]
+    labels = ["yes" if x > 0 else "no" if z > 0.5 * p.radius_m else None for x, z in zip(past, depth, strict=True)]
+    return Reading(labels, float(past[-1] if past[-1] > 0 else depth[-1]))
 
 
 FAMILY = scene_family(

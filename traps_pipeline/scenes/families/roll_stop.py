@@ -1,4 +1,4 @@
-"""A ball rolls along a track with a line across it; the question is whether it passes the line.
+"""A ball rolls along a track with a line across it: does it pass the line?
 
 Control: the whole track is in view. Void: the occluder stands before all but its first part.
 Hidden element: a patch of the track before the line, rough enough to stop the ball, or as smooth as the track.
@@ -33,7 +33,7 @@ SEEN = ("ball", "start", "line")
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 rolls to the right. Lengths run along the track from its beginning."""
+    """Parameters; lengths run from the track's beginning, direction +1: to the right."""
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()
@@ -63,7 +63,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return track with kerbs, patch, two lines and end wall."""
+    """Build track with kerbs, patch, two lines and end wall."""
     course = Course(physics, p.direction)
     r, side, end = p.radius_m, p.half_width_m, p.line_m + p.felt_m
     deep, outer, track = (-side, side), (-side - WALL_M, side + WALL_M), (0, TRACK_M)
@@ -96,14 +96,13 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return 'yes' while the middle of the ball is past the far edge of the line; 'no' while it is not, from when it
-    moves no more. The margin is how far it ends from the line."""
+    """Read whether the ball's middle is past the line; 'no' only once it rests."""
     past = p.direction * motion.pos("ball")[:, 0] - p.line_m - LINE_M / 2
     return Reading(yes_while(past > 0, still_from(past, within_m=STILL_M)), clear_m(past, LINE_M))
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str], ahead: float | None = None) -> str | None:
-    """On which side of the line the ball rests; it came from the side where it was seen first."""
+    """Return whether the ball rests on the other side of the line than it came from."""
     path = [compact(frame, named["ball"], shape=(0.5, 2.0)) for frame in frames]
     first, last = next((ball for ball in path if ball is not None), None), end_of(path, ahead)
     if first is None or last is None:

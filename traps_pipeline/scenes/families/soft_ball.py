@@ -1,4 +1,4 @@
-"""A soft ball is tossed up and falls between two pairs of bars; the question is on which of them it gets stuck.
+"""A soft ball falls between two pairs of bars: on which does it get stuck?
 
 Control: both pairs and the tray below are in view. Void: the occluder stands before them.
 Hidden element: how far apart the bars are. No gap is as wide as the ball: through the wider ones it squeezes, on the
@@ -35,7 +35,7 @@ PLAY, PLAIN = apart(*NAMED), shuffled("wood", "grey", "white")
 
 @dataclass(frozen=True)
 class Params:
-    """passes: through how many pairs of bars the ball squeezes. wide, narrow: gaps as shares of the ball's diameter."""
+    """Parameters; passes: pairs of bars passed, wide, narrow: gaps in ball diameters."""
 
     ball_colour: str = PLAY()
     upper_colour: str = PLAY()
@@ -65,7 +65,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return two pairs of bars that reach out of a board, one above the other, the tray below, a cube to one side."""
+    """Build two pairs of bars on a board, the tray below, and a cube to one side."""
     course = Course(physics, surface=Surface(solref=SOFT))
     end, high = p.half_m, p.upper_m + 0.10
     outer, deep = end + WALL_M, (-DEPTH_M, DEPTH_M)
@@ -113,8 +113,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return what is nearest below the ball where it ends, from when it stays there: the upper bars, the lower ones or
-    the tray. The margin is how far its middle ends from the height halfway to where it would lie otherwise."""
+    """Read what is nearest below the resting ball: a pair of bars, or the tray."""
     height = motion.pos("ball")[:, 2]
     lies = [p.upper_m + 0.9 * p.radius_m, p.lower_m + 0.9 * p.radius_m, FLOOR_M + p.radius_m]
     halfway = [(lies[0] + lies[1]) / 2, (lies[1] + lies[2]) / 2]
@@ -126,14 +125,13 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 
 def _height(frame: np.ndarray, colour: str) -> float | None:
-    """Return the mean row (px) of all that has a colour; None if there is little of it."""
+    """Return the mean row (px) of all that has a colour, None if there is little."""
     rows = np.flatnonzero(colour_mask(frame, colour).any(axis=1))
     return float(rows.mean()) if len(rows) >= 4 else None
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return which of the colours is nearest to the underside of the resting ball; None while it is not to be seen, and
-    of a question that offers no colours."""
+    """Return the offered colour nearest to the resting ball's underside, None if none."""
     if "choices" not in named:
         return None
     path = [rounded(frame, named["ball"]) for frame in frames[-3:]]

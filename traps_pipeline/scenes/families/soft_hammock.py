@@ -1,4 +1,4 @@
-"""A ball is tossed up and falls on a cloth that hangs between posts; the question is whether the cloth catches it.
+"""A ball falls on a cloth that hangs between posts: does the cloth catch it?
 
 Control: cloth, posts and tray are in view. Void: the occluder stands before them.
 Hidden element: the cloth, which is tied to the posts at both ends, so that the ball comes to lie in it, or at one end
@@ -36,7 +36,7 @@ PLAIN = shuffled("wood", "grey", "white")
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 has the cube on the right, and the cloth tied at the left where it is tied at one end."""
+    """Parameters; direction +1: cube on the right, cloth tied left if at one end."""
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()
@@ -60,7 +60,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return two pairs of posts with the cloth between them, the tray below, a board behind, a cube to one side."""
+    """Build two pairs of posts with the cloth, the tray, a board behind, and a cube."""
     course = Course(physics, p.direction, FELT)
     end, side, high = p.span_m / 2 + 0.06, p.deep_m / 2 + 0.03, p.post_m + 0.02
     outer, back = end + WALL_M, side + WALL_M
@@ -94,8 +94,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return 'no' from when the ball is below half the height of the posts, 'yes' from when it stays over that where it
-    ends. The margin is how far its middle ends from that height."""
+    """Read 'no' once the ball is below half the posts' height, 'yes' if it stays up."""
     ball = motion.pos("ball")
     over = ball[:, 2] - p.post_m / 2
     first = lasting_from(over < 0) if over[-1] < 0 else still_from(ball, within_m=STILL_M)
@@ -104,8 +103,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return whether the cloth, once the ball is at rest, is wider than high: it hangs from both sides and holds it.
-    None while either is not to be seen."""
+    """Return whether the cloth is wider than high once the ball rests, None if unseen."""
     path = [rounded(frame, named["ball"]) for frame in frames[-3:]]
     rows, columns = np.nonzero(colour_mask(frames[-1], named["cloth"]))
     if len(rows) < CLOTH_PX or not at_rest(path, tolerance_px=4):

@@ -1,4 +1,4 @@
-"""A ball strikes the pointer of a spinner; the question is which coloured sector the pointer stops in.
+"""A ball strikes the pointer of a spinner: in which sector does it stop?
 
 Control: spinner and ball are in view from above. Void: the occluder stands before the whole spinner; only the ball's
 run-up is seen.
@@ -38,7 +38,7 @@ PLAIN = shuffled("wood", "grey", "white")
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 rolls to the right and turns the pointer anticlockwise. sectors: in the order it passes them."""
+    """Parameters; direction +1: to the right, sectors: as the pointer passes them."""
 
     direction: int = one_of(-1, 1)
     sectors: tuple[str, ...] = drawn_by(lambda rng, so_far: distinct_colours(rng, int(rng.integers(3, 5)), SECTORS))
@@ -63,7 +63,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return the hub is at the origin."""
+    """Build spinner, pointer, peg and ball; the hub is at the origin."""
     course = Course(physics, p.direction)
     r, lane, side = p.radius_m, -LANE * p.disc_m, p.disc_m + 0.025
     start, end, rim = -side - p.run_m, side + 0.12, (0, TABLE_M + 0.035)
@@ -107,13 +107,13 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _place(radius: float, angle_deg: float) -> tuple[float, float]:
-    """Along and across, at an angle from the near side that turns the way the ball drives the pointer."""
+    """Return (along, across) at an angle from the near side as the pointer turns."""
     a = np.radians(angle_deg)
     return float(radius * np.sin(a)), float(radius * -np.cos(a))
 
 
 def _add_pointer(course: Course, p: Params) -> None:
-    """Add a bar that turns about the hub; at the start it points to the near side, across the ball's path."""
+    """Add a bar that turns about the hub; it starts at the near side."""
     half = POINTER * p.disc_m / 2
     body = course.hinge("pointer", (0, 0, TABLE_M + 0.03), axis=(0, 0, p.direction), damping=2e-4)
     joint = body.first_joint()
@@ -124,14 +124,13 @@ def _add_pointer(course: Course, p: Params) -> None:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return the sector that the pointer is in, from when it turns no more. The margin is how far its tip ends from the
-    nearest edge of that sector."""
+    """Read the pointer's sector, from when it turns no more."""
     tip = -motion.rot("pointer")[:, :2, 1]
     angles = np.degrees(np.arctan2(p.direction * tip[:, 0], -tip[:, 1])) % 360  # from the near side
     turned = np.abs(np.radians(angles - angles[-1] + 180) % (2 * np.pi) - np.pi)
     still = lasting_from(turned <= 0.02)
-    within = (angles[-1] - FIRST_DEG) % p.sector_deg
-    margin = np.radians(min(within, p.sector_deg - within)) * POINTER * p.disc_m
+    angle_in_sector = (angles[-1] - FIRST_DEG) % p.sector_deg
+    margin = np.radians(min(angle_in_sector, p.sector_deg - angle_in_sector)) * POINTER * p.disc_m
     index = np.floor((angles - FIRST_DEG) / p.sector_deg).astype(int)
     sectors = [p.sectors[k] if i >= still and 0 <= k < len(p.sectors) else None for i, k in enumerate(index)]
     return Reading(sectors, float(margin))
@@ -140,7 +139,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
 def observe(frames: np.ndarray, named: Mapping[str, str], ahead: float | None = None) -> str | None:
     """Return the colour that surrounds the black pointer once it is at rest."""
     pointers = [_pointer(frame) for frame in frames[-3:]]
-    if pointers[-1][0] is None or (ahead is None and not at_rest([found for found, _ in pointers])):
+    if pointers[-1][0] is None or (ahead is None and not at_rest([pointer for pointer, _ in pointers])):
         return None
     ring = cv2.dilate(pointers[-1][1], np.ones((15, 15), np.uint8)).astype(bool)
     counts = {c: int((ring & colour_mask(frames[-1], c)).sum()) for c in offered(named, SECTORS)}
@@ -149,15 +148,15 @@ def observe(frames: np.ndarray, named: Mapping[str, str], ahead: float | None = 
 
 
 def _pointer(frame: np.ndarray) -> tuple[Blob | None, np.ndarray]:
-    """Return the largest black thing, with the gap that the peg may cut into it closed, and its mask."""
+    """Return the largest black region and its mask, the peg's gap in it closed."""
     black = colour_mask(frame, POINTER_COLOUR).astype(np.uint8)
     black = cv2.morphologyEx(black, cv2.MORPH_CLOSE, np.ones((11, 11), np.uint8))
-    found = next(iter(blobs(black, 150)), None)
+    pointer = next(iter(blobs(black, 150)), None)
     mask = np.zeros_like(black)
-    if found is not None:
-        x, y, width, height = found.box
+    if pointer is not None:
+        x, y, width, height = pointer.box
         mask[y : y + height, x : x + width] = black[y : y + height, x : x + width]
-    return found, mask
+    return pointer, mask
 
 
 FAMILY = scene_family(

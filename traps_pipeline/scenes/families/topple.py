@@ -1,4 +1,4 @@
-"""A ball rolls off a ledge against a tall pillar; the question is whether the pillar topples over.
+"""A ball rolls off a ledge against a tall pillar: does the pillar topple over?
 
 Control: ledge, pillar and the ground behind it are in view. Void: the occluder stands before all of them but the ball's
 run-up.
@@ -32,7 +32,7 @@ PLAY, PLAIN = apart("red", "green", "blue", "orange", "cyan", "purple"), shuffle
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 rolls to the right. Heights in the ball's way are shares of the pillar's height."""
+    """Parameters; heights are shares of the pillar's, direction +1: to the right."""
 
     direction: int = one_of(-1, 1)
     pillar_colour: str = PLAY()
@@ -55,7 +55,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return lengths run along the ball's path from the middle of the pillar."""
+    """Build ledge, pillar, mat and prop; lengths run from the middle of the pillar."""
     course = Course(physics, p.direction)
     r, half_w, deep = p.radius_m, p.width_m / 2, HALF_DEPTH_M
     ledge = p.strike * p.pillar_m - r  # height of the ledge that the ball rolls on
@@ -100,15 +100,14 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return 'yes' while the pillar's top is below half its height; 'no' while it is not, from when neither the pillar
-    nor the ball moves any more. The margin is how far the top ends above or below half the height."""
+    """Read whether the pillar's top is low; 'no' only once pillar and ball rest."""
     top = top_m(motion, "pillar", p.pillar_m)
     still = still_from(motion.pos("pillar"), motion.pos("ball"), top, within_m=0.003)
     return Reading(yes_while(top < p.pillar_m / 2, still), float(abs(top[-1] - p.pillar_m / 2)))
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return the named pillar, seen at the start and at the end: is it still about as high in the picture as it was?"""
+    """Return whether the pillar is lower at the end than at the start, None if unseen."""
     path = track(frames, named["pillar"], 80)
     first, last = path[0], path[-1]
     if first is None or last is None or not at_rest(path) or first.box[3] < 1.2 * first.box[2]:
@@ -117,7 +116,7 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return whether the pillar leans: it is wider in the picture than it was, or lower."""
+    """Predict a fall: the pillar is wider in the picture than it was, or lower."""
     first, last = largest(frames[0], named["pillar"], 80), largest(frames[-1], named["pillar"], 80)
     if first is None or last is None or first.box[3] < 1.2 * first.box[2]:
         return None

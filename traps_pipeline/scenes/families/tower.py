@@ -1,4 +1,4 @@
-"""A ball rolls along a ledge towards a tower of blocks; the question is whether its top block is knocked down.
+"""A ball rolls along a ledge towards a tower: is its top block knocked down?
 
 Control: ledge, tower and tray are in view. Void: the occluder stands before all of them but the ball's run-up.
 Hidden element: a stop that stands in the ball's way or beside it, or a strip of the ledge that is rough or smooth:
@@ -33,7 +33,7 @@ GIVES = 0.25  # of its width: a block that is so far from its place falls
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 rolls to the right. The top block has a colour of its own; the others take turns."""
+    """Parameters; direction +1: to the right. Only the top block's colour is unique."""
 
     direction: int = one_of(-1, 1)
     blocks: int = one_of(3, 4)
@@ -70,7 +70,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return lengths run along the ball's path from the middle of the tower."""
+    """Build ledge, stop or strip, tower and tray."""
     course = Course(physics, p.direction)
     r, half_w, deep = p.radius_m, p.block_width_m / 2, (-HALF_DEPTH_M, HALF_DEPTH_M)
     ledge = p.strike * p.block_height_m - r  # height of the ledge that the ball rolls on
@@ -123,8 +123,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return 'yes' while the top block is on the ground; 'no' while it is at its height on the tower, from when neither
-    the ball nor the block moves any more. The margin is how far it ends from the middle of its fall."""
+    """Read whether the top block is on the ground; 'no' only once ball and block rest."""
     top = motion.pos(p.names[-1])
     down, up = top[:, 2] < 1.3 * p.block_height_m, top[:, 2] > p.tower_m - 0.6 * p.block_height_m
     still = still_from(top, motion.pos("ball"), within_m=STILL_M)
@@ -133,7 +132,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return the named block, seen at the start and at the end: has it come down by more than its own size?"""
+    """Return whether the named block has come down by more than its own size."""
     path = track(frames, named["top"], 60)
     first, last = path[0], path[-1]
     if first is None or last is None or not at_rest(path):
@@ -144,7 +143,7 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return whether the block has left its place at the top, or leans over: from there it falls."""
+    """Predict a fall: the block has left its place at the top, or leans over."""
     first, last = largest(frames[0], named["top"], 60), largest(frames[-1], named["top"], 60)
     if first is None or last is None:
         return None
@@ -152,7 +151,7 @@ def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def look(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return whether a block of another colour is higher in the end than the named one, which was the highest."""
+    """Return whether another colour's block is higher in the end than the top block."""
     top = end_of(track(frames, named["top"], 60))
     if top is None:
         return None

@@ -1,4 +1,4 @@
-"""A ball rolls down a covered ramp into a forked tunnel; the question is by which exit it comes out.
+"""A ball rolls into a forked tunnel: by which exit does it come out?
 
 Control: both exits and the tray at each of them are in view. Void: the occluder stands before the fork and the trays;
 the ramp is seen above it.
@@ -35,7 +35,7 @@ PLAY, PLAIN = apart(*NAMED), shuffled("wood", "grey", "white", "black")
 
 @dataclass(frozen=True)
 class Params:
-    """The ball rolls towards the camera. turn: +1 if the deflector leads it to the right."""
+    """Parameters; the ball rolls to the camera, turn +1: deflected to the right."""
 
     ball_colour: str = PLAY()
     tunnel_colour: str = PLAY()
@@ -57,7 +57,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return the fork stands in the middle, its front at the origin; the ramp leads down to it from the back."""
+    """Build the fork, its front at the origin, and the ramp down to it from the back."""
     course = Course(physics)
     r, wide, depth = p.radius_m, p.half_width_m, p.depth_m
     roof, bore, end = FLOOR_M + 2.8 * r, 1.3 * r, p.half_width_m + p.tray_m
@@ -102,7 +102,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _add_ramp(course: Course, p: Params, ramp: Ramp, bore: float) -> None:
-    """Add the ramp with its cover below, its rails above, and a post under its upper end."""
+    """Add the ramp, its cover below and rails above, and a post under its upper end."""
     length, outer, top = p.covered_m + p.open_m, bore + WALL_M, 2.7 * p.radius_m
 
     def board(name: str, across: Span, up: Span, over: Span, colour: str, side: int = 1) -> None:
@@ -119,7 +119,7 @@ def _add_ramp(course: Course, p: Params, ramp: Ramp, bore: float) -> None:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return the side on which the ball is wholly out of the tunnel. The margin is how far outside the fork it ends."""
+    """Read the side on which the ball is wholly out of the tunnel."""
     across = motion.pos("ball")[:, 0]
     outside = np.abs(across) - p.radius_m - p.half_width_m
     return Reading(side_while(outside > 0, across, over="right", under="left"), float(outside[-1]))

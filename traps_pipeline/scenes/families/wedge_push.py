@@ -1,4 +1,4 @@
-"""A ball strikes a wedge and pushes it along a track; the question is whether the wedge gets onto the mat.
+"""A ball pushes a wedge along a track: does the wedge get onto the mat?
 
 Control: track, wedge and mat are in view. Void: the occluder stands before all of them but the ball's run-up.
 Hidden element: a strip of the track before the mat that is slippery or rough, or a stop that stands on the track or
@@ -33,7 +33,7 @@ PLAY = apart("red", "green", "blue", "orange", "cyan", "purple")
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 rolls to the right."""
+    """Parameters; direction +1: to the right."""
 
     direction: int = one_of(-1, 1)
     wedge_colour: str = PLAY()
@@ -59,7 +59,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return lengths run along the track from the middle of the wedge."""
+    """Build track, strip or stop, mat and wedge; lengths run from the wedge's middle."""
     course = Course(physics, p.direction)
     r, half, end = p.radius_m, p.wedge_length_m / 2, p.mat_at_m + p.mat_m
     strip = (half + 0.03, half + 0.03 + STRIP_M)
@@ -105,7 +105,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _add_wedge(course: Course, p: Params) -> None:
-    """Add a free body that looks like a wedge, high end towards the ball; a base and a back plate inside it collide."""
+    """Add a wedge, high end to the ball; a base and a back plate inside it collide."""
     half, wide, high = p.wedge_length_m / 2, p.wedge_width_m / 2, p.wedge_height_m
     profile = ((-half, 0.0), (half, 0.0), (half, 0.025), (-half, high))
     body = course.spec.worldbody.add_body(name="wedge", pos=[0, 0, TRACK_M])
@@ -118,8 +118,7 @@ def _add_wedge(course: Course, p: Params) -> None:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return 'yes' while the middle of the wedge is past the edge of the mat; 'no' while it is not, from when neither
-    the wedge nor the ball moves any more. The margin is how far the nearer end of the wedge is from that edge."""
+    """Read whether the wedge's middle is on the mat; 'no' only once both bodies rest."""
     wedge = motion.pos("wedge")
     past = p.direction * wedge[:, 0] - p.mat_at_m
     still = still_from(wedge, motion.pos("ball"), within_m=0.002)
@@ -127,7 +126,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str], ahead: float | None = None) -> str | None:
-    """Return whether the wedge, once at rest, stands before or within the mat as the first frame shows it."""
+    """Return whether the resting wedge is on the mat as the first frame shows it."""
     path, mat = track(frames, named["wedge"], 100), largest(frames[0], named["mat"], 100)
     last = end_of(path, ahead)
     if path[0] is None or last is None or mat is None:
