@@ -144,8 +144,8 @@ def test_a_question_is_filled_and_read_back() -> None:
     aside = questions.colour_from("ball", "What colour is it: {choices}?", list(COLOURS), unlike=("ball",))
     words = asked.word(p, np.random.default_rng(0), [aside])
     assert words.question == f"Does the {p.ball_colour} ball pass?"
-    assert asked.named_in(words.question) == {"ball": p.ball_colour}
-    assert asked.named_in("Does it pass?") is None
+    assert asked.slots_in(words.question) == {"ball": p.ball_colour}
+    assert asked.slots_in("Does it pass?") is None
     assert words.aliases == {"it passes": "yes", "it stops": "no"}
     other = questions.yes_no("Does {it} pass?", yes=[], no=[], fills=lambda p, rng: {"it": str(rng.choice(["a", "b"]))})
     assert other.word(p, np.random.default_rng(0), [aside]).question in ("Does a pass?", "Does b pass?")

@@ -138,7 +138,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading([x if i >= landed else None for i, x in enumerate(sides)], float(abs(abs(rise[-1]) - LEVEL_M)))
 
 
-def _three(p: Params, rng: np.random.Generator) -> Filled:
+def _ends_or_level(p: Params, rng: np.random.Generator) -> Filled:
     """Return the choices: either end, or none."""
     forms = ("the {} end", "{} end", "to the {}", "tipped to the {}", "the {} side", "the {} end is lower")
     aliases = {form.format(side): side for side in ("left", "right") for form in forms}
@@ -146,9 +146,9 @@ def _three(p: Params, rng: np.random.Generator) -> Filled:
     return Filled(("left", "right", "balanced"), aliases, {})
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Compare the last slopes of beam and base; return None if the beam is unseen."""
-    slopes = [(_slope_deg(frame, named["beam"], 200), _slope_deg(frame, "black", 100)) for frame in frames[-3:]]
+    slopes = [(_slope_deg(frame, slots["beam"], 200), _slope_deg(frame, "black", 100)) for frame in frames[-3:]]
     tilts = [beam - base for beam, base in slopes if beam is not None and base is not None]
     if len(tilts) < len(slopes) or max(tilts) - min(tilts) > TIPPED_DEG:
         return None
@@ -156,9 +156,9 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
     return "balanced" if abs(tilt) < TIPPED_DEG else "right" if tilt > 0 else "left"
 
 
-def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Predict the end from the swing: as far over as at first, or level if it slows."""
-    slopes = [(_slope_deg(frame, named["beam"], 200), _slope_deg(frame, "black", 100)) for frame in frames]
+    slopes = [(_slope_deg(frame, slots["beam"], 200), _slope_deg(frame, "black", 100)) for frame in frames]
     tilts = [beam - base for beam, base in slopes if beam is not None and base is not None]
     if len(tilts) < 3 or abs(tilts[0]) < TIPPED_DEG:
         return None
@@ -195,7 +195,7 @@ FAMILY = scene_family(
             "How does the {beam} beam come to rest: tipped to the left, tipped to the right or balanced?",
             "To which side does the {beam} beam tip for good: left, right, or does it end up balanced?",
         ),
-        _three,
+        _ends_or_level,
     ),
     asides=[
         colour_of(

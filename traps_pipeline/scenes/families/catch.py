@@ -27,7 +27,7 @@ FLOOR_M = 0.02  # thickness of the pen's floor and of the basket's
 WALL_M = 0.012
 DEPTH_M = 0.17  # half of the pen's depth
 PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
-SEEN = ("ball", "pedestal", "basket")
+PARTS = ("ball", "pedestal", "basket")
 
 
 def _basket_half(rng: np.random.Generator, so_far: Drawn) -> float:
@@ -137,19 +137,19 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading(side_while(down, inside), float(abs(inside[-1])))
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return whether the resting ball is between the basket's sides in the picture."""
-    path = [rounded(frame, named["ball"]) for frame in frames[-3:]]
-    sides, ball = _sides(frames[-1], named["basket"]), end_of(path)
+    path = [rounded(frame, slots["ball"]) for frame in frames[-3:]]
+    sides, ball = _sides(frames[-1], slots["basket"]), end_of(path)
     if ball is None or sides is None:
         return None
-    return "yes" if _between(ball.x, sides) else "no"
+    return "yes" if _is_between(ball.x, sides) else "no"
 
 
-def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Predict whether the ball is in the basket when it has fallen to half its height."""
-    path = [rounded(frame, named["ball"]) for frame in frames[-3:]]
-    sides, flight = _sides(frames[-1], named["basket"]), [ball for ball in path if ball is not None]
+    path = [rounded(frame, slots["ball"]) for frame in frames[-3:]]
+    sides, flight = _sides(frames[-1], slots["basket"]), [ball for ball in path if ball is not None]
     if sides is None or len(flight) < 3:
         return None
     a, b, c = flight
@@ -157,7 +157,7 @@ def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
     down = (sides[2] + sides[3]) / 2 - c.y
     speed = falls + faster / 2
     frames_on = (math.sqrt(max(speed**2 + 2 * faster * down, 0.0)) - speed) / faster if faster > 0 else 0.0
-    return "yes" if _between(c.x + max(frames_on, 0.0) * (c.x - b.x), sides) else "no"
+    return "yes" if _is_between(c.x + max(frames_on, 0.0) * (c.x - b.x), sides) else "no"
 
 
 def _sides(frame: np.ndarray, colour: str) -> tuple[float, float, float, float] | None:
@@ -169,7 +169,7 @@ def _sides(frame: np.ndarray, colour: str) -> tuple[float, float, float, float] 
     return min(box[0] for box in boxes), right, min(box[1] for box in boxes), bottom
 
 
-def _between(x: float, sides: tuple[float, float, float, float]) -> bool:
+def _is_between(x: float, sides: tuple[float, float, float, float]) -> bool:
     left, right = sides[:2]
     return abs(x - (left + right) / 2) < 0.45 * (right - left)
 
@@ -189,8 +189,8 @@ FAMILY = scene_family(
     ),
     asides=[
         comes_from("From which side is the ball thrown, left or right?"),
-        colour_of("ball", "What colour is the ball that is thrown: {choices}?", SEEN),
-        colour_of("pedestal", "What colour is the pedestal that the ball is thrown from: {choices}?", SEEN),
+        colour_of("ball", "What colour is the ball that is thrown: {choices}?", PARTS),
+        colour_of("pedestal", "What colour is the pedestal that the ball is thrown from: {choices}?", PARTS),
     ],
     observe=observe,
     foresee=foresee,

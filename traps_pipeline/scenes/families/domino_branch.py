@@ -140,18 +140,18 @@ def _aside(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
     return AnswerableQuestion(question, choices, p.row_colour)
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return the side whose end domino alone is no longer where it stood at first."""
-    stands = [_stands(frames, named[side]) for side in SIDES]
-    if None in stands or stands[0] == stands[1]:
+    standing = [_is_standing(frames, slots[side]) for side in SIDES]
+    if None in standing or standing[0] == standing[1]:
         return None
-    return "right" if stands[0] else "left"
+    return "right" if standing[0] else "left"
 
 
-def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Predict the side whose end domino alone has left its place or is about to."""
     falls = []
-    for colour in (named["left"], named["right"]):
+    for colour in (slots["left"], slots["right"]):
         seen = blobs(colour_mask(frames[0], colour), 60)
         falls.append(
             any(not upper_half_stays(frames, colour, domino) or struck(frames, domino, 0.0) for domino in seen)
@@ -159,16 +159,16 @@ def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
     return None if falls[0] == falls[1] else "left" if falls[0] else "right"
 
 
-def look(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def look(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return the side whose end domino rests and is the flatter of the two."""
-    ends = [end_of(track(frames, named[side], 60)) for side in SIDES]
+    ends = [end_of(track(frames, slots[side], 60)) for side in SIDES]
     upright = [end.box[3] / end.box[2] for end in ends if end is not None]
     if len(upright) < 2 or max(upright) < FLATTER * min(upright):
         return None
     return SIDES[int(np.argmin(upright))]
 
 
-def _stands(frames: np.ndarray, colour: str) -> bool | None:
+def _is_standing(frames: np.ndarray, colour: str) -> bool | None:
     """Return whether a colour's upper half is where it was; None if out of view."""
     first, last = largest(frames[0], colour, 60), largest(frames[-1], colour, 60)
     if first is None or last is None or is_occluder(first) or is_occluder(last):

@@ -123,44 +123,46 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading(labels, float(np.abs(tops[-1] - FALLEN * p.height_m).min()))
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Count the second row's dominoes less those that stand where they stood at first."""
-    colour = named["second"]
+    colour = slots["second"]
     before, close, after = (colour_mask(frames[i], colour) for i in (0, -3, -1))
     standing = blobs(before, min_area=60)
-    ranges = _choices(named, len(standing))
+    ranges = _choices(slots, len(standing))
     if ranges is None or after.sum() < 0.3 * before.sum() or (after != close).sum() > 0.1 * after.sum():
         return None
     return range_of(ranges, sum(not upper_half_stays(frames, colour, domino) for domino in standing))
 
 
-def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Count the second row's dominoes that are out of place or about to be struck."""
-    standing, change = blobs(colour_mask(frames[0], named["second"]), min_area=60), moved(frames)
-    ranges = _choices(named, len(standing))
+    standing, change = blobs(colour_mask(frames[0], slots["second"]), min_area=60), moved(frames)
+    ranges = _choices(slots, len(standing))
     if ranges is None:
         return None
     falls = [
-        not upper_half_stays(frames, named["second"], each) or change[around(each, 0.0)].mean() > GIVES
-        for each in standing
+        not upper_half_stays(frames, slots["second"], domino) or change[around(domino, 0.0)].mean() > GIVES
+        for domino in standing
     ]
     return range_of(ranges, sum(falls))
 
 
-def look(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def look(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Count the second row by the choices, less the dominoes that stand at the end."""
-    close, after = (colour_mask(frames[i], named["second"]) for i in (-3, -1))
-    if "choices" not in named or not after.any() or (after != close).sum() > 0.1 * after.sum():
+    close, after = (colour_mask(frames[i], slots["second"]) for i in (-3, -1))
+    if "choices" not in slots or not after.any() or (after != close).sum() > 0.1 * after.sum():
         return None
-    ranges = [[int(n) for n in one.split("-")] for one in choices_in(named["choices"])]
+    ranges = [[int(n) for n in choice.split("-")] for choice in choices_in(slots["choices"])]
     stand = sum(domino.box[3] > UPRIGHT * domino.box[2] for domino in blobs(after, min_area=60))
     return range_of(ranges, ranges[-1][1] - stand)
 
 
-def _choices(named: Mapping[str, str], dominoes_seen: int) -> Sequence[Sequence[int]] | None:
+def _choices(slots: Mapping[str, str], dominoes_seen: int) -> Sequence[Sequence[int]] | None:
     """Return the offered ranges; with a count, None if they do not span that row."""
-    if "choices" in named:
-        offered: Sequence[Sequence[int]] = [[int(n) for n in one.split("-")] for one in choices_in(named["choices"])]
+    if "choices" in slots:
+        offered: Sequence[Sequence[int]] = [
+            [int(n) for n in choice.split("-")] for choice in choices_in(slots["choices"])
+        ]
         return offered if offered[-1][1] == dominoes_seen else None
     return next((ranges for ranges in RANGES if ranges[-1][1] == dominoes_seen), None)
 

@@ -119,7 +119,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading(side_while(ball[:, 2] < p.ridge_m, past, "right", "left"), float(abs(past[-1])))
 
 
-def _one_colour(part: str, question: str) -> Aside:
+def _ask_colour(part: str, question: str) -> Aside:
     """Ask for the colour of ball or cube; the third choice is a colour of neither."""
 
     def ask(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
@@ -136,18 +136,18 @@ def _middle_x(frame: np.ndarray, colour: str) -> float | None:
     return float(columns[0] + columns[-1]) / 2 if len(columns) >= 15 else None
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return whether the resting ball is nearer to the red or the blue bin's middle."""
-    path = [rounded(frame, named["ball"]) for frame in frames[-3:]]
+    path = [rounded(frame, slots["ball"]) for frame in frames[-3:]]
     ball, red, blue = path[-1], _middle_x(frames[-1], "red"), _middle_x(frames[-1], "blue")
     if ball is None or not at_rest(path) or red is None or blue is None:
         return None
     return "left" if abs(ball.x - red) < abs(ball.x - blue) else "right"
 
 
-def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Predict the side of the ridge's top, seen by its edges, on which the ball lands."""
-    ball = carried_on([rounded(frame, named["ball"]) for frame in frames], 0.5)
+    ball = carried_on([rounded(frame, slots["ball"]) for frame in frames], 0.5)
     red, blue = (colour_mask(frames[0], colour) for colour in ("red", "blue"))
     bins = [largest(frames[0], colour) for colour in ("red", "blue")]
     if ball is None or bins[0] is None or bins[1] is None:
@@ -182,8 +182,8 @@ FAMILY = scene_family(
             ("left", "right"),
             lambda p: "right" if p.cube_side > 0 else "left",
         ),
-        _one_colour("ball", "What colour is the ball: {choices}?"),
-        _one_colour("cube", "What colour is the cube beside the bins: {choices}?"),
+        _ask_colour("ball", "What colour is the ball: {choices}?"),
+        _ask_colour("cube", "What colour is the cube beside the bins: {choices}?"),
     ],
     observe=observe,
     foresee=foresee,

@@ -27,7 +27,7 @@ WALL_M = 0.014
 DEPTH_M = 0.12  # half of the funnel's and the cup's depth
 PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
 PLAIN = shuffled("grey", "black", "white")
-SEEN = ("ball", "shelf", "cup")
+PARTS = ("ball", "shelf", "cup")
 
 
 def _throats(rng: np.random.Generator, so_far: Drawn) -> list[float]:
@@ -135,10 +135,10 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading(["no" if is_stuck and still else None for still in at_rest], margin)
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return whether the resting ball is below the upper edge of the cup."""
-    path = [rounded(frame, named["ball"], fill=0.92, longer=2.5) for frame in frames[-3:]]
-    ball, cup = path[-1], largest(frames[-1], named["cup"], 150)
+    path = [rounded(frame, slots["ball"], fill=0.92, longer=2.5) for frame in frames[-3:]]
+    ball, cup = path[-1], largest(frames[-1], slots["cup"], 150)
     if ball is None or not at_rest(path) or cup is None:
         return None
     return "yes" if ball.y > cup.box[1] else "no"
@@ -159,8 +159,8 @@ FAMILY = scene_family(
     ),
     asides=[
         comes_from("On which side of the picture is the shelf that the ball rolls along, left or right?"),
-        colour_of("ball", "What colour is the rolling ball: {choices}?", SEEN),
-        colour_of("shelf", "What colour is the shelf on legs: {choices}?", SEEN),
+        colour_of("ball", "What colour is the rolling ball: {choices}?", PARTS),
+        colour_of("shelf", "What colour is the shelf on legs: {choices}?", PARTS),
     ],
     observe=observe,
     min_margin_m=0.01,

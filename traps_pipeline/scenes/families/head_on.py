@@ -133,10 +133,10 @@ def _aside(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
     return AnswerableQuestion(question, choices, p.colours[i])
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str], ahead: float | None = None) -> str | None:
+def observe(frames: np.ndarray, slots: Mapping[str, str], ahead: float | None = None) -> str | None:
     """Return the ball that ends on its own side of the black line, if both rest there."""
     line, at_home = largest(frames[0], "black"), []
-    for colour in colours_of_balls(frames, named, BALL_COLOURS):
+    for colour in colours_of_balls(frames, slots, BALL_COLOURS):
         path = track(frames, colour, 60)
         start, end = path[0], end_of(path, ahead)
         if line is None or start is None or end is None or is_occluder(start) or is_occluder(end):

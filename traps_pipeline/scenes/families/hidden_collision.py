@@ -113,7 +113,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading(labels, float(abs(ahead[-1])))
 
 
-def _either_order(p: Params, rng: np.random.Generator) -> Mapping[str, str]:
+def _shuffled_colours(p: Params, rng: np.random.Generator) -> Mapping[str, str]:
     """Return the two colours in random order."""
     first, second = (str(c) for c in rng.permutation(p.colours))
     return {"first": first, "second": second}
@@ -132,25 +132,25 @@ def _aside(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
     return AnswerableQuestion(question, ("same", "different"), "same" if p.lanes[0] == p.lanes[1] else "different")
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return 'no' once the balls have changed their order, 'yes' if they rest before."""
-    starts, ends, resting = [], [], True
+    starts, ends, is_at_rest = [], [], True
     for name in ("first", "second"):
-        path = [small(frame, named[name]) for frame in frames]
+        path = [small(frame, slots[name]) for frame in frames]
         start, end = next((blob for blob in path if blob), None), path[-1]
         if start is None or end is None:
             return None
         starts.append(start.x)
         ends.append(end.x)
-        resting &= at_rest(path, tolerance_px=4)
+        is_at_rest &= at_rest(path, tolerance_px=4)
     if (starts[0] < starts[1]) != (ends[0] < ends[1]):
         return "no"
-    return "yes" if resting else None
+    return "yes" if is_at_rest else None
 
 
-def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Predict a collision: the balls are in one lane when they are side by side."""
-    paths = [[small(frame, named[name]) for frame in frames] for name in ("first", "second")]
+    paths = [[small(frame, slots[name]) for frame in frames] for name in ("first", "second")]
     a, b = (carried_on(path, 0.0) for path in paths)
     a_next, b_next = (carried_on(path, 1.0) for path in paths)
     if a is None or b is None or a_next is None or b_next is None:
@@ -187,7 +187,7 @@ FAMILY = scene_family(
         "Do the two balls, the {first} one and the {second} one, bump into each other, yes or no?",
         yes=["they collide", "yes they collide", "they touch", "they bump into each other"],
         no=["they do not collide", "no they do not collide", "they pass each other", "they miss each other"],
-        fills=_either_order,
+        fills=_shuffled_colours,
     ),
     asides=[_aside],
     observe=observe,

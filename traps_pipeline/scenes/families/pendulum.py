@@ -134,19 +134,19 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading(yes_while(fallen, int(np.argmax(swing)) + 1), float(abs(top[-1] - p.block_height_m / 2)))
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return whether the block lies flat at the end; None if out of view."""
-    seen = [largest(frame, named["block"], 80) for frame in frames[-3:]]
-    shapes = [blob.box[3] / blob.box[2] for blob in seen if blob is not None]
-    if len(shapes) < 3 or largest(frames[-1], named["bob"], 80) is None:
+    blocks = [largest(frame, slots["block"], 80) for frame in frames[-3:]]
+    shapes = [blob.box[3] / blob.box[2] for blob in blocks if blob is not None]
+    if len(shapes) < 3 or largest(frames[-1], slots["bob"], 80) is None:
         return None
     return "no" if float(np.median(shapes)) > 1.0 else "yes"
 
 
-def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Predict a fall: the block gives way, or the bob is about to strike it."""
-    first, last = largest(frames[0], named["block"], 80), largest(frames[-1], named["block"], 80)
-    bob = carried_on(track(frames, named["bob"], 80), AHEAD)
+    first, last = largest(frames[0], slots["block"], 80), largest(frames[-1], slots["block"], 80)
+    bob = carried_on(track(frames, slots["bob"], 80), AHEAD)
     if first is None or last is None or bob is None:
         return None
     gives_way = abs(last.x - first.x) + abs(last.box[2] - first.box[2]) > GIVES_PX

@@ -19,8 +19,8 @@ from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, uniform
 
 BOARD_M = 0.016  # thickness of ramp and board
 WALL_M = 0.012
-NAMED = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
-PLAY, PLAIN = apart(*NAMED), shuffled("wood", "grey", "black")
+COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
+PLAY, PLAIN = apart(*COLOURS), shuffled("wood", "grey", "black")
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def build(p: Params, physics: Physics) -> Scene:
     outer = (-side - WALL_M, side + WALL_M)
     course.block("box_end", (end, end + WALL_M), outer, (0, p.deck_m + 0.03), p.box_colour)
 
-    high, covered = p.deck_m + 2 * r + 0.01, (p.mouth_m, end + WALL_M)
+    high, along = p.deck_m + 2 * r + 0.01, (p.mouth_m, end + WALL_M)
     across = (outer[0] - 0.01, outer[1] + 0.5 * high)
     highest = ramp.at(p.ramp_m)
     course.mark("box", "box_floor")
@@ -91,8 +91,8 @@ def build(p: Params, physics: Physics) -> Scene:
         p,
         decisive=["ball"],
         hidden=["board"],
-        cover=course.box(covered, across, (0, high), right=course.ahead(SHADOW_RIGHT * high)),
-        in_view=[course.box(covered, outer, deck), course.box((highest[0], 0), deep, (0, highest[2]))],
+        cover=course.box(along, across, (0, high), right=course.ahead(SHADOW_RIGHT * high)),
+        in_view=[course.box(along, outer, deck), course.box((highest[0], 0), deep, (0, highest[2]))],
         things=[f"{p.ball_colour} ball", f"{p.box_colour} box", "ramp", "deck"],
         also=["end"],
         shown_by={"end": ["box"]},
@@ -122,7 +122,7 @@ FAMILY = scene_family(
     ),
     asides=[
         comes_from("At which side is the ramp, left or right?"),
-        colour_from("ball", "What colour is the ball: {choices}?", NAMED, unlike=("ball", "box")),
+        colour_from("ball", "What colour is the ball: {choices}?", COLOURS, unlike=("ball", "box")),
         material_of("ramp", "What colour is the ramp: {choices}?"),
     ],
     observe=rests_over("ball", "box"),

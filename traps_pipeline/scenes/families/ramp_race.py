@@ -154,9 +154,9 @@ def _higher_or_side(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
 SETTLING_PX = 8.0  # so far a ball may still roll in the tray when an occluder comes
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return which ball is first near its place of rest, the same part of the tray."""
-    choices = colours_of_balls(frames, named, BALL_COLOURS)
+    choices = colours_of_balls(frames, slots, BALL_COLOURS)
     paths = [[compact(frame, colour) for frame in frames] for colour in choices]
     if len(choices) != 2 or not all(at_rest(path, tolerance_px=SETTLING_PX) for path in paths):
         return None
@@ -165,10 +165,10 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
     return None if near_end[0] == near_end[1] else choices[int(np.argmin(near_end))]
 
 
-def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Predict which ball will be lower in the picture if both gain speed as they do."""
     lower: dict[str, float] = {}
-    for colour in colours_of_balls(frames, named, BALL_COLOURS):
+    for colour in colours_of_balls(frames, slots, BALL_COLOURS):
         path = [compact(frame, colour) for frame in frames[-3:]]
         ys = [ball.y + ball.box[3] / 2 for ball in path if ball is not None]
         if len(ys) == len(path) == 3:

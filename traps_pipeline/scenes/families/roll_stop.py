@@ -28,7 +28,7 @@ LINE_M = 0.035  # width of a painted line
 STILL_M = 0.003  # a ball that moves less than this any more is at rest
 PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
 PLAIN = shuffled("wood", "grey", "white")
-SEEN = ("ball", "start", "line")
+PARTS = ("ball", "start", "line")
 
 
 @dataclass(frozen=True)
@@ -82,14 +82,14 @@ def build(p: Params, physics: Physics) -> Scene:
     course.block("end_wall", (end, end + WALL_M), outer, (0, TRACK_M + 2 * r), p.wall_colour)
     course.ball("ball", (0.05, 0, TRACK_M + r), r, p.ball_colour, speed=p.speed_m_s)
 
-    high, covered, across = TRACK_M + 2 * r + 0.01, (p.run_m, end + WALL_M), (outer[0] - 0.01, outer[1] + 0.03)
+    high, along, across = TRACK_M + 2 * r + 0.01, (p.run_m, end + WALL_M), (outer[0] - 0.01, outer[1] + 0.03)
     course.mark("line", "line")
     return course.scene(
         p,
         decisive=["ball"],
         hidden=["patch"],
-        cover=course.box(covered, across, (0, high), right=course.ahead(SHADOW_RIGHT * high)),
-        in_view=[course.box(covered, outer, (0, high)), course.box((-0.02, 0.02), outer, track)],
+        cover=course.box(along, across, (0, high), right=course.ahead(SHADOW_RIGHT * high)),
+        in_view=[course.box(along, outer, (0, high)), course.box((-0.02, 0.02), outer, track)],
         things=[f"{p.ball_colour} ball", f"{p.line_colour} line", f"{p.start_colour} line", "track"],
         also=["wall", "kerb", "end"],
     )
@@ -101,13 +101,13 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading(yes_while(past > 0, still_from(past, within_m=STILL_M)), clear_m(past, LINE_M))
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str], ahead: float | None = None) -> str | None:
+def observe(frames: np.ndarray, slots: Mapping[str, str], ahead: float | None = None) -> str | None:
     """Return whether the ball rests on the other side of the line than it came from."""
-    path = [compact(frame, named["ball"], shape=(0.5, 2.0)) for frame in frames]
+    path = [compact(frame, slots["ball"], shape=(0.5, 2.0)) for frame in frames]
     first, last = next((ball for ball in path if ball is not None), None), end_of(path, ahead)
     if first is None or last is None:
         return None
-    ys, xs = np.nonzero(colour_mask(frames[-1], named["line"]))
+    ys, xs = np.nonzero(colour_mask(frames[-1], slots["line"]))
     if len(xs) < 60 or np.ptp(ys) < 10:
         return None
     slope, offset = np.polyfit(ys, xs, 1)  # the line in the picture, x as a function of y
@@ -130,8 +130,8 @@ FAMILY = scene_family(
     ),
     asides=[
         comes_from("From which side does the ball come, left or right?"),
-        colour_of("ball", "What colour is the rolling ball: {choices}?", SEEN),
-        colour_of("start", "What colour is the first line that the ball rolls across: {choices}?", SEEN),
+        colour_of("ball", "What colour is the rolling ball: {choices}?", PARTS),
+        colour_of("start", "What colour is the first line that the ball rolls across: {choices}?", PARTS),
     ],
     observe=observe,
     foresee=partial(observe, ahead=AHEAD),

@@ -27,8 +27,8 @@ WALL_M = 0.012
 TILT_RAD = 0.015  # of the rough board: its near edge is below the deck in either position
 SUNK_M = 0.012
 STILL_M = 0.003  # a block that moves less than this any more is at rest
-NAMED = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
-PLAY = apart(*NAMED)
+COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
+PLAY = apart(*COLOURS)
 
 
 def _incline_colour(rng: np.random.Generator, so_far: Drawn) -> str:
@@ -100,7 +100,7 @@ def build(p: Params, physics: Physics) -> Scene:
     course.block("tray_back", tray, (side, outer[1]), (0, 0.07), p.tray_colour)
     course.block("tray_end", (end, end + WALL_M), outer, (0, p.deck_m + 0.02), p.tray_colour)
 
-    high, covered = p.deck_m + 2 * max(p.block_half_m) + 0.01, (p.mouth_m, end + WALL_M)
+    high, along = p.deck_m + 2 * max(p.block_half_m) + 0.01, (p.mouth_m, end + WALL_M)
     across = (outer[0] - 0.01, outer[1] + 0.5 * high)
     highest = ramp.at(p.incline_m)
     course.mark("tray", "tray_floor")
@@ -108,8 +108,8 @@ def build(p: Params, physics: Physics) -> Scene:
         p,
         decisive=["block"],
         hidden=["board"],
-        cover=course.box(covered, across, (0, high), right=course.ahead(SHADOW_RIGHT * high)),
-        in_view=[course.box(covered, outer, (0, p.deck_m)), course.box((highest[0], 0), deep, (0, highest[2]))],
+        cover=course.box(along, across, (0, high), right=course.ahead(SHADOW_RIGHT * high)),
+        in_view=[course.box(along, outer, (0, p.deck_m)), course.box((highest[0], 0), deep, (0, highest[2]))],
         things=[f"{p.block_colour} block", f"{p.tray_colour} tray", "incline", "deck"],
         also=["end"],
         shown_by={"end": ["deck"]},
@@ -150,7 +150,7 @@ FAMILY = scene_family(
     ),
     asides=[
         comes_from("From which side does the block start to slide, left or right?"),
-        colour_from("block", "What colour is the sliding block: {choices}?", NAMED, unlike=("block", "tray")),
+        colour_from("block", "What colour is the sliding block: {choices}?", COLOURS, unlike=("block", "tray")),
         material_of("incline", "What colour is the incline that the block slides down: {choices}?"),
     ],
     observe=rests_over("block", "tray", find=BLOCK),

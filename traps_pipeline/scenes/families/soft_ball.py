@@ -29,8 +29,8 @@ DEPTH_M = 0.13  # half of the tray's depth
 BAR_M = 0.026  # radius of the bars
 PIECES = 6
 STILL_M = 0.015
-NAMED = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
-PLAY, PLAIN = apart(*NAMED), shuffled("wood", "grey", "white")
+COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
+PLAY, PLAIN = apart(*COLOURS), shuffled("wood", "grey", "white")
 
 
 @dataclass(frozen=True)
@@ -130,13 +130,13 @@ def _height(frame: np.ndarray, colour: str) -> float | None:
     return float(rows.mean()) if len(rows) >= 4 else None
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return the offered colour nearest to the resting ball's underside, None if none."""
-    if "choices" not in named:
+    if "choices" not in slots:
         return None
-    path = [rounded(frame, named["ball"]) for frame in frames[-3:]]
+    path = [rounded(frame, slots["ball"]) for frame in frames[-3:]]
     end = path[-1]
-    heights = {colour: _height(frames[-1], colour) for colour in choices_in(named["choices"])}
+    heights = {colour: _height(frames[-1], colour) for colour in choices_in(slots["choices"])}
     if end is None or not at_rest(path, tolerance_px=4) or None in heights.values():
         return None
     under = end.box[1] + end.box[3]
@@ -157,7 +157,7 @@ FAMILY = scene_family(
         forms=["the {} one", "the {} ones", "on {}"],
     ),
     asides=[
-        colour_from("ball", "What colour is the soft ball: {choices}?", NAMED, unlike=("ball", "upper", "lower")),
+        colour_from("ball", "What colour is the soft ball: {choices}?", COLOURS, unlike=("ball", "upper", "lower")),
         either(
             "At which side of the bars is the {cube} cube, left or right?",
             ("left", "right"),

@@ -102,10 +102,10 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading([label if i >= first else None for i in range(len(over))], float(abs(over[-1])))
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return whether the cloth is wider than high once the ball rests, None if unseen."""
-    path = [rounded(frame, named["ball"]) for frame in frames[-3:]]
-    rows, columns = np.nonzero(colour_mask(frames[-1], named["cloth"]))
+    path = [rounded(frame, slots["ball"]) for frame in frames[-3:]]
+    rows, columns = np.nonzero(colour_mask(frames[-1], slots["cloth"]))
     if len(rows) < CLOTH_PX or not at_rest(path, tolerance_px=4):
         return None
     wide, high = (float(np.ptp(np.percentile(along, (1, 99)))) for along in (columns, rows))

@@ -103,9 +103,9 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading([label if i >= first else None for i in range(len(top))], float(abs(top[-1])))
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return whether the resting rope is tall and ends over the tray, None if unseen."""
-    path = [largest(frame, named["rope"], 60) for frame in frames[-3:]]
+    path = [largest(frame, slots["rope"], 60) for frame in frames[-3:]]
     end = path[-1]
     if end is None or not at_rest(path, tolerance_px=4):
         return None

@@ -25,7 +25,7 @@ from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, add_box, d
 
 SECTORS = ("red", "green", "blue", "yellow", "cyan", "purple")
 BALLS = ("red", "green", "blue", "orange", "purple", "cyan")
-NAMED = ("red", "green", "purple", "orange", "cyan")  # what a question after the ball's colour may offer
+COLOURS = ("red", "green", "purple", "orange", "cyan")  # what a question after the ball's colour may offer
 POINTER_COLOUR = "black"
 TABLE_M = 0.03  # thickness of the table
 FIRST_DEG, LAST_DEG = 48.0, 312.0  # where the sectors begin and end, from the near side onwards
@@ -136,13 +136,13 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading(sectors, float(margin))
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str], ahead: float | None = None) -> str | None:
+def observe(frames: np.ndarray, slots: Mapping[str, str], ahead: float | None = None) -> str | None:
     """Return the colour that surrounds the black pointer once it is at rest."""
     pointers = [_pointer(frame) for frame in frames[-3:]]
     if pointers[-1][0] is None or (ahead is None and not at_rest([pointer for pointer, _ in pointers])):
         return None
     ring = cv2.dilate(pointers[-1][1], np.ones((15, 15), np.uint8)).astype(bool)
-    counts = {c: int((ring & colour_mask(frames[-1], c)).sum()) for c in offered(named, SECTORS)}
+    counts = {c: int((ring & colour_mask(frames[-1], c)).sum()) for c in offered(slots, SECTORS)}
     best = max(counts, key=lambda c: counts[c])
     return best if counts[best] > 0.45 * sum(counts.values()) else None
 
@@ -173,7 +173,7 @@ FAMILY = scene_family(
         forms=["{} sector", "the {} sector", "on {}"],
     ),
     asides=[
-        colour_from("ball", "What colour is the ball that rolls towards the spinner: {choices}?", NAMED, ["ball"]),
+        colour_from("ball", "What colour is the ball that rolls towards the spinner: {choices}?", COLOURS, ["ball"]),
         comes_from("From which side does the ball roll towards the spinner, left or right?"),
     ],
     observe=observe,

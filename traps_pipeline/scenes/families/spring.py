@@ -26,7 +26,7 @@ LANE_M = 0.02  # height of the lower lane
 FEEL_M = 0.03  # the ball has met the plunger when it has been this near to it
 WALL_M = 0.014
 COILS = [f"coil_{i}" for i in range(4)]
-SEEN = ("ball", "deck", "line")
+PARTS = ("ball", "deck", "line")
 PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
 
 
@@ -139,11 +139,11 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading(side_while(has_met, back), float(abs(back[-1])))
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str], ahead: float | None = None) -> str | None:
+def observe(frames: np.ndarray, slots: Mapping[str, str], ahead: float | None = None) -> str | None:
     """Return whether the resting ball is on the side of the line that it came from."""
-    path = [rounded(frame, named["ball"]) for frame in frames[-3:]]
-    start, end = rounded(frames[0], named["ball"]), end_of(path, ahead)
-    parts = [blob for blob in blobs(colour_mask(frames[-1], named["line"]), 15) if blob.area < 4000]
+    path = [rounded(frame, slots["ball"]) for frame in frames[-3:]]
+    start, end = rounded(frames[0], slots["ball"]), end_of(path, ahead)
+    parts = [blob for blob in blobs(colour_mask(frames[-1], slots["line"]), 15) if blob.area < 4000]
     if start is None or end is None or not parts:
         return None
     line = sum(part.x * part.area for part in parts) / sum(part.area for part in parts)
@@ -165,8 +165,8 @@ FAMILY = scene_family(
     ),
     asides=[
         comes_from("From which side does the ball roll towards the spring, left or right?"),
-        colour_of("ball", "What colour is the ball that rolls along the deck: {choices}?", SEEN),
-        colour_of("deck", "What colour is the deck under the ball: {choices}?", SEEN),
+        colour_of("ball", "What colour is the ball that rolls along the deck: {choices}?", PARTS),
+        colour_of("deck", "What colour is the deck under the ball: {choices}?", PARTS),
     ],
     observe=observe,
     foresee=partial(observe, ahead=AHEAD),

@@ -99,15 +99,15 @@ def build(p: Params, physics: Physics) -> Scene:
     at = (start, 0, ledge + RADIUS_M)
     course.ball("ball", at, RADIUS_M, p.ball_colour, speed=p.speed_m_s, rolling=0.0002, density=7500)
 
-    covered, top = (screened, end + 0.02), ledge + p.stack_m + 0.03
+    along, top = (screened, end + 0.02), ledge + p.stack_m + 0.03
     course.mark("block", BLOCKS[-1])
     course.mark("stand", (0.0, 0.15), STAND_COLOUR)
     return course.scene(
         p,
         decisive=BLOCKS,
         hidden=["stand"],
-        cover=course.box(covered, (-0.17, 0.18), (0, top), right=course.ahead(0.06)),
-        in_view=[course.box(covered, (-0.165, 0.165), (0, high))],
+        cover=course.box(along, (-0.17, 0.18), (0, top), right=course.ahead(0.06)),
+        in_view=[course.box(along, (-0.165, 0.165), (0, high))],
         things=[f"{p.ball_colour} ball", "black stand", "ledge", *(f"{c} block" for c in p.block_colours)],
         also=["stack", "pusher", "wall"],
         colours=[*p.block_colours, STAND_COLOUR],
@@ -155,17 +155,17 @@ def legible(motion: Motion, p: Params) -> list[tuple[tuple[str, ...], float]]:
     return [*groups, (fallen, 200.0 * len(fallen))] if fallen else groups
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Count the block colours that lie above the black stand and within its width."""
-    counts = [_count(frame, named["stand"]) for frame in frames[-3:]]
+    counts = [_count(frame, slots["stand"]) for frame in frames[-3:]]
     if counts[-1] is None or len(set(counts)) > 1:
         return None
     return range_of(RANGES, counts[-1])
 
 
-def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Count the blocks that are over the stand in the last frame; the others fall."""
-    count = _count(frames[-1], named["stand"])
+    count = _count(frames[-1], slots["stand"])
     return None if count is None else range_of(RANGES, count)
 
 

@@ -120,34 +120,34 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading([p.tray_colours[i] if down else None for i, down in zip(over, low, strict=True)], float(margin))
 
 
-def _colours(named: Mapping[str, str]) -> Sequence[str]:
+def _colours(slots: Mapping[str, str]) -> Sequence[str]:
     """Return the colours that the question offers, or any a tray beside this ball has."""
-    return offered(named, [colour for colour in COLOURS if colour != named["ball"]])
+    return offered(slots, [colour for colour in COLOURS if colour != slots["ball"]])
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return the tray colour that most of the picture around the resting ball has."""
-    path = [rounded(frame, named["ball"]) for frame in frames[-3:]]
+    path = [rounded(frame, slots["ball"]) for frame in frames[-3:]]
     ball = path[-1]
     if ball is None or not at_rest(path):
         return None
     reach = 1.1 * max(ball.box[2:])
     rows, columns = np.ogrid[: frames.shape[1], : frames.shape[2]]
     near = (columns - ball.x) ** 2 + (rows - ball.y) ** 2 < reach**2
-    around = {c: int((colour_mask(frames[-1], c) & near).sum()) for c in _colours(named)}
+    around = {c: int((colour_mask(frames[-1], c) & near).sum()) for c in _colours(slots)}
     best = max(around, key=lambda c: around[c])
     return best if around[best] >= 60 else None
 
 
-def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Predict the tray that the chute's boards lead to; the middle if upright."""
-    trays = {colour: largest(frames[-1], colour, 200) for colour in _colours(named)}
-    seen = {colour: blob for colour, blob in trays.items() if blob is not None and blob.box[2] > TRAY_PX}
-    in_order = sorted(seen, key=lambda colour: seen[colour].x)
+    trays = {colour: largest(frames[-1], colour, 200) for colour in _colours(slots)}
+    visible = {colour: blob for colour, blob in trays.items() if blob is not None and blob.box[2] > TRAY_PX}
+    in_order = sorted(visible, key=lambda colour: visible[colour].x)
     if len(in_order) != 3:
         return None
-    left, right = seen[in_order[0]], seen[in_order[2]]
-    top = min(blob.y for blob in seen.values())
+    left, right = visible[in_order[0]], visible[in_order[2]]
+    top = min(blob.y for blob in visible.values())
     slopes = []
     for board in blobs(colour_mask(frames[0], "wood"), 200):
         x, y, width, height = board.box

@@ -81,7 +81,7 @@ def build(p: Params, physics: Physics) -> Scene:
     at = (start, 0, ledge + r)
     course.ball("ball", at, r, p.ball_colour, speed=p.speed_m_s, rolling=1e-4, sliding=0.1, density=1500)
 
-    covered, top = (screened, end + 0.02), p.pillar_m + 0.03
+    along, top = (screened, end + 0.02), p.pillar_m + 0.03
     across = (-deep - 0.02, max(deep + 0.05, 0.05 + SHADOW_BACK * p.pillar_m))
     props = [f"{p.prop_colour} block"] if has_prop else []
     course.mark("pillar", "pillar")
@@ -89,8 +89,8 @@ def build(p: Params, physics: Physics) -> Scene:
         p,
         decisive=["pillar"],
         hidden=[p.kind],
-        cover=course.box(covered, across, (0, top), right=course.ahead(0.04)),
-        in_view=[course.box(covered, (-deep - RIM_M, deep + RIM_M), (0, p.pillar_m))],
+        cover=course.box(along, across, (0, top), right=course.ahead(0.04)),
+        in_view=[course.box(along, (-deep - RIM_M, deep + RIM_M), (0, p.pillar_m))],
         things=[f"{p.ball_colour} ball", f"{p.pillar_colour} pillar", "ledge", "mat", *props],
         also=["block", "rim"],
     )
@@ -106,18 +106,18 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading(yes_while(top < p.pillar_m / 2, still), float(abs(top[-1] - p.pillar_m / 2)))
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return whether the pillar is lower at the end than at the start, None if unseen."""
-    path = track(frames, named["pillar"], 80)
+    path = track(frames, slots["pillar"], 80)
     first, last = path[0], path[-1]
     if first is None or last is None or not at_rest(path) or first.box[3] < 1.2 * first.box[2]:
         return None
     return "yes" if last.box[3] < 0.75 * first.box[3] else "no"
 
 
-def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Predict a fall: the pillar is wider in the picture than it was, or lower."""
-    first, last = largest(frames[0], named["pillar"], 80), largest(frames[-1], named["pillar"], 80)
+    first, last = largest(frames[0], slots["pillar"], 80), largest(frames[-1], slots["pillar"], 80)
     if first is None or last is None or first.box[3] < 1.2 * first.box[2]:
         return None
     return "yes" if last.box[2] > 1.3 * first.box[2] or last.box[3] < 0.75 * first.box[3] else "no"

@@ -131,31 +131,31 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading(yes_while(down, still, no_where=up), float(abs(top[-1, 2] - middle)))
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return whether the named block has come down by more than its own size."""
-    path = track(frames, named["top"], 60)
+    path = track(frames, slots["top"], 60)
     first, last = path[0], path[-1]
     if first is None or last is None or not at_rest(path):
         return None
-    if first.area > 0.08 * colour_mask(frames[0], named["top"]).size:
+    if first.area > 0.08 * colour_mask(frames[0], slots["top"]).size:
         return None
     return "yes" if last.y - first.y > 0.7 * first.box[3] else "no"
 
 
-def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Predict a fall: the block has left its place at the top, or leans over."""
-    first, last = largest(frames[0], named["top"], 60), largest(frames[-1], named["top"], 60)
+    first, last = largest(frames[0], slots["top"], 60), largest(frames[-1], slots["top"], 60)
     if first is None or last is None:
         return None
     return "yes" if abs(last.x - first.x) + abs(last.y - first.y) > GIVES * first.box[2] else "no"
 
 
-def look(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def look(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return whether another colour's block is higher in the end than the top block."""
-    top = end_of(track(frames, named["top"], 60))
+    top = end_of(track(frames, slots["top"], 60))
     if top is None:
         return None
-    others = [largest(frames[-1], colour, top.area // 3) for colour in COLOURS if colour != named["top"]]
+    others = [largest(frames[-1], colour, top.area // 3) for colour in COLOURS if colour != slots["top"]]
     higher = [other for other in others if other is not None and other.y < top.y - 0.5 * top.box[3]]
     return "yes" if higher else "no"
 

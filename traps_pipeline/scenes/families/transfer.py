@@ -82,14 +82,14 @@ def build(p: Params, physics: Physics) -> Scene:
     _add_target(course, p)
 
     high = DECK_M + max(p.block_m, 2 * r)
-    covered, across = (p.ramp_m - 0.04, end + WALL_M), (outer[0] - 0.02, outer[1] + SHADOW_BACK * high)
+    along, across = (p.ramp_m - 0.04, end + WALL_M), (outer[0] - 0.02, outer[1] + SHADOW_BACK * high)
     course.mark("block", "block")
     course.mark("zone", "zone")
     return course.scene(
         p,
         decisive=["block"],
         hidden=["board"],
-        cover=course.box(covered, across, (0, high), right=0.45 * high),
+        cover=course.box(along, across, (0, high), right=0.45 * high),
         in_view=[course.box((0, end), outer, (0, high))],
         things=[f"{p.ball_colour} ball", f"{p.block_colour} block", f"{p.zone_colour} zone", "ramp"],
         also=["deck", "wall"],

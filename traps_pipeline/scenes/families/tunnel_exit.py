@@ -28,9 +28,9 @@ TRAY_M = 0.02  # lower than the tunnel, so that no ball rolls back into it
 WALL_M = 0.012
 SLIPPERY = Surface(1e-5, sliding=0.03, spinning=0.001)  # a ball slides along it and keeps its speed
 FELT = Surface(0.004)
-NAMED = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
-SEEN = ("ball", "tunnel")
-PLAY, PLAIN = apart(*NAMED), shuffled("wood", "grey", "white", "black")
+COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
+PARTS = ("ball", "tunnel")
+PLAY, PLAIN = apart(*COLOURS), shuffled("wood", "grey", "white", "black")
 
 
 @dataclass(frozen=True)
@@ -125,10 +125,10 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading(side_while(outside > 0, across, over="right", under="left"), float(outside[-1]))
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str], ahead: float | None = None) -> str | None:
+def observe(frames: np.ndarray, slots: Mapping[str, str], ahead: float | None = None) -> str | None:
     """Return the side of the tunnel on which the ball lies at the end."""
-    path = [small(frame, named["ball"]) for frame in frames[-3:]]
-    tunnel, ball = largest(frames[-1], named["tunnel"], 200), end_of(path, ahead, tolerance_px=4)
+    path = [small(frame, slots["ball"]) for frame in frames[-3:]]
+    tunnel, ball = largest(frames[-1], slots["tunnel"], 200), end_of(path, ahead, tolerance_px=4)
     if ball is None or tunnel is None:
         return None
     middle = tunnel.box[0] + tunnel.box[2] / 2
@@ -150,8 +150,8 @@ FAMILY = scene_family(
         forms=["{} exit", "the {} exit", "on the {}", "{} side", "to the {}"],
     ),
     asides=[
-        colour_from("tunnel", "What colour is the tunnel that the ball rolls into: {choices}?", NAMED, unlike=SEEN),
-        colour_from("ball", "What colour is the ball that rolls down the ramp: {choices}?", NAMED, unlike=SEEN),
+        colour_from("tunnel", "What colour is the tunnel that the ball rolls into: {choices}?", COLOURS, unlike=PARTS),
+        colour_from("ball", "What colour is the ball that rolls down the ramp: {choices}?", COLOURS, unlike=PARTS),
     ],
     observe=observe,
     foresee=partial(observe, ahead=AHEAD),

@@ -125,9 +125,9 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading(yes_while(past > 0, still), float(abs(past[-1]) - p.wedge_length_m / 2))
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str], ahead: float | None = None) -> str | None:
+def observe(frames: np.ndarray, slots: Mapping[str, str], ahead: float | None = None) -> str | None:
     """Return whether the resting wedge is on the mat as the first frame shows it."""
-    path, mat = track(frames, named["wedge"], 100), largest(frames[0], named["mat"], 100)
+    path, mat = track(frames, slots["wedge"], 100), largest(frames[0], slots["mat"], 100)
     last = end_of(path, ahead)
     if path[0] is None or last is None or mat is None:
         return None

@@ -52,8 +52,8 @@ def scene_family(
         twins = vary.twins
 
     def seen(frames: np.ndarray, text: str) -> str | None:
-        named = question.named_in(text)
-        if named is None:
+        slots = question.slots_in(text)
+        if slots is None:
             return None
         if frames.shape[1:3] != (HEIGHT, WIDTH):  # what an observer takes for large is so at this size
             frames = np.stack([cv2.resize(frame, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA) for frame in frames])
@@ -61,10 +61,10 @@ def scene_family(
         unflagged = shown if twins is None else without_flags(shown)
         if foresee is not None and len(shown) < len(frames):
             at_rest = still(shown) or still(shown[:-1])  # the shadow of an occluder may come before it does
-            return _first(unflagged, named, (observe, foresee) if at_rest else (foresee, observe))
-        answer = observe(unflagged, named)
+            return _first(unflagged, slots, (observe, foresee) if at_rest else (foresee, observe))
+        answer = observe(unflagged, slots)
         if answer is None and look is not None and len(end := after_occluder(unflagged)) < len(unflagged):
-            return look(end, named)
+            return look(end, slots)
         return answer
 
     params = with_look(params)
@@ -91,6 +91,6 @@ def scene_family(
     )
 
 
-def _first(frames: np.ndarray, named: Mapping[str, str], observers: Sequence[Observer]) -> str | None:
+def _first(frames: np.ndarray, slots: Mapping[str, str], observers: Sequence[Observer]) -> str | None:
     """Return the answer of the first observer that has one."""
-    return next((said for observe in observers if (said := observe(frames, named)) is not None), None)
+    return next((answer for observe in observers if (answer := observe(frames, slots)) is not None), None)

@@ -1,6 +1,6 @@
 """What an observer sees, as values: each takes the frames and the words of the question, and answers or abstains.
 
-An `Observer(frames, named)` gets the sampled frames (N, 360, 480, 3) RGB and what the question names, read back from
+An `Observer(frames, slots)` gets the sampled frames (N, 360, 480, 3) RGB and what the question names, read back from
 its templates: part -> colour, and 'choices' where it offers some. It gives a label, or None if the decisive thing is
 not to be seen or not at rest. A `Finder(frame, colour)` finds one thing in one frame.
 
@@ -49,15 +49,15 @@ def compact(
     return None
 
 
-def offered(named: Mapping[str, str], otherwise: Sequence[str]) -> Sequence[str]:
+def offered(slots: Mapping[str, str], otherwise: Sequence[str]) -> Sequence[str]:
     """Return the choices that the question offers, or these where it offers none."""
-    return choices_in(named["choices"]) if "choices" in named else otherwise
+    return choices_in(slots["choices"]) if "choices" in slots else otherwise
 
 
-def colours_of_balls(frames: np.ndarray, named: Mapping[str, str], pool: Sequence[str]) -> Sequence[str]:
+def colours_of_balls(frames: np.ndarray, slots: Mapping[str, str], pool: Sequence[str]) -> Sequence[str]:
     """Return the colours that the question offers; where it offers none, those of the pool that a ball has at first."""
     seen = [colour for colour in pool if sum(compact(frame, colour) is not None for frame in frames[:3]) >= 2]
-    return offered(named, seen)
+    return offered(slots, seen)
 
 
 def rounded(frame: np.ndarray, colour: str, *, fill: float = 0.9, longer: float = 1.9) -> Blob | None:
@@ -123,8 +123,8 @@ def around(thing: Blob, reach: float) -> tuple[slice, slice]:
 def beyond(thing: str, mark: str, ahead: float | None = None) -> Observer:
     """Return 'yes' if the thing rests on the far side of the mark, seen from where it was first, else 'no'."""
 
-    def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-        path, line = track(frames, named[thing], 60), largest(frames[-1], named[mark], 60)
+    def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+        path, line = track(frames, slots[thing], 60), largest(frames[-1], slots[mark], 60)
         start, end = next((blob for blob in path if blob), None), end_of(path, ahead)
         if line is None or start is None or end is None:
             return None
@@ -138,10 +138,10 @@ def past_far_edge(thing: str, screen: str, ahead: float | None = None) -> Observ
     'no'.
     """
 
-    def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-        path = [small(frame, named[thing]) for frame in frames]
+    def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+        path = [small(frame, slots[thing]) for frame in frames]
         start = next((blob.x for blob in path if blob), None)
-        wall, end = largest(frames[-1], named[screen], 200), end_of(path, ahead, tolerance_px=4)
+        wall, end = largest(frames[-1], slots[screen], 200), end_of(path, ahead, tolerance_px=4)
         if start is None or wall is None or end is None:
             return None
         left, width = wall.box[0], wall.box[2]
@@ -153,9 +153,9 @@ def past_far_edge(thing: str, screen: str, ahead: float | None = None) -> Observ
 def rests_over(thing: str, goal: str, find: Finder = compact, ahead: float | None = None) -> Observer:
     """Return 'yes' if the thing rests within the goal from left to right (2 px more to either side), else 'no'."""
 
-    def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-        path = [find(frame, named[thing]) for frame in frames]
-        box, end = largest(frames[-1], named[goal], 60), end_of(path, ahead)
+    def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+        path = [find(frame, slots[thing]) for frame in frames]
+        box, end = largest(frames[-1], slots[goal], 60), end_of(path, ahead)
         if box is None or end is None:
             return None
         left, width = box.box[0], box.box[2]
@@ -177,9 +177,9 @@ def nearer_side(
     """Return 'left' or 'right': which of two marks the resting thing is nearer to. left, right: what the question
     names, or colours; least: of the marks (pixels)."""
 
-    def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-        path = [find(frame, named[thing]) for frame in frames[-3:]]
-        marks = [largest(frames[-1], named.get(mark, mark), least) for mark in (left, right)]
+    def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+        path = [find(frame, slots[thing]) for frame in frames[-3:]]
+        marks = [largest(frames[-1], slots.get(mark, mark), least) for mark in (left, right)]
         end = end_of(path, ahead, tolerance_px)
         if end is None or marks[0] is None or marks[1] is None:
             return None
@@ -197,8 +197,8 @@ def reaches(thing: str, goal: str, foot: float | None = None, ahead: float | Non
     def place(blob: Blob) -> np.ndarray:
         return np.array([blob.x, blob.y if foot is None else blob.box[1] + foot * blob.box[3]])
 
-    def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-        path, box = track(frames, named[thing], 60), largest(frames[0], named[goal], 60)
+    def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+        path, box = track(frames, slots[thing], 60), largest(frames[0], slots[goal], 60)
         first, last = path[0], end_of(path, ahead)
         if first is None or last is None or box is None or is_occluder(last) or is_occluder(box):
             return None
@@ -211,11 +211,11 @@ def reaches(thing: str, goal: str, foot: float | None = None, ahead: float | Non
 def has_fallen(thing: str) -> Observer:
     """Return 'yes' if the thing, once at rest, no longer stands where it stood at first, else 'no'."""
 
-    def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-        path = track(frames, named[thing], 60)
+    def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+        path = track(frames, slots[thing], 60)
         if path[0] is None or is_occluder(path[0]) or path[0].box[3] < path[0].box[2] or not at_rest(path):
             return None  # neither an occluder nor a flag stands like a domino
-        return "no" if upper_half_stays(frames, named[thing], path[0]) else "yes"
+        return "no" if upper_half_stays(frames, slots[thing], path[0]) else "yes"
 
     return observe
 
@@ -224,12 +224,12 @@ def has_begun(thing: str, reach: float) -> Observer:
     """Return 'yes' if the thing has left the place where it was first, or is about to: what moves is so near it (in its
     longer sides), else 'no'."""
 
-    def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-        first, last = largest(frames[0], named[thing], 60), largest(frames[-1], named[thing], 60)
+    def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+        first, last = largest(frames[0], slots[thing], 60), largest(frames[-1], slots[thing], 60)
         if first is None or last is None or is_occluder(first):
             return None
         left = np.hypot(last.x - first.x, last.y - first.y) > BEGUN_PX or not upper_half_stays(
-            frames, named[thing], first
+            frames, slots[thing], first
         )
         return "yes" if left or struck(frames, last, reach) else "no"
 
@@ -241,8 +241,8 @@ def will_clear(thing: str, mark: str) -> Observer:
     'no'.
     """
 
-    def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-        path, wall = track(frames, named[thing], 60), largest(frames[-1], named[mark], 60)
+    def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+        path, wall = track(frames, slots[thing], 60), largest(frames[-1], slots[mark], 60)
         start, now, then = next((blob for blob in path if blob), None), carried_on(path, 0.0), carried_on(path, 1.0)
         if wall is None or start is None or now is None or then is None:
             return None
@@ -261,9 +261,9 @@ def will_clear(thing: str, mark: str) -> Observer:
 def lies_on(thing: str, goal: str) -> Observer:
     """Return 'yes' if the thing rests between the left and the right end of all that is seen of the goal, else 'no'."""
 
-    def look(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-        end = end_of(track(frames, named[thing], 60))
-        boxes = [blob.box for blob in blobs(colour_mask(frames[-1], named[goal]), 30)]
+    def look(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+        end = end_of(track(frames, slots[thing], 60))
+        boxes = [blob.box for blob in blobs(colour_mask(frames[-1], slots[goal]), 30)]
         if end is None or not boxes:
             return None
         left, right = min(box[0] for box in boxes), max(box[0] + box[2] for box in boxes)
@@ -275,8 +275,8 @@ def lies_on(thing: str, goal: str) -> Observer:
 def lies_flat(thing: str) -> Observer:
     """Return 'yes' if the thing that should stand rests and is wider than high, 'no' if it is higher."""
 
-    def look(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-        end = end_of(track(frames, named[thing], 60))
+    def look(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+        end = end_of(track(frames, slots[thing], 60))
         return None if end is None else "yes" if end.box[2] > end.box[3] else "no"
 
     return look

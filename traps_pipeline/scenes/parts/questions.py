@@ -48,7 +48,7 @@ class Question:
         text = str(rng.choice(self.templates)).format_map({**coloured(p), **filled.fills})
         return Wording(text, filled.labels, filled.aliases, _one_of(asides, rng)(p, rng))
 
-    def named_in(self, question: str) -> dict[str, str] | None:
+    def slots_in(self, question: str) -> dict[str, str] | None:
         """Return what a question, read back, has in its placeholders; None if it is not this question."""
         return asked(self.templates, question)
 

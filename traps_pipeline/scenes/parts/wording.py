@@ -20,14 +20,14 @@ from traps_pipeline.scenes.physics.kit import COLOURS, Inventory, Taxonomy
 @cache
 def _pattern(template: str) -> re.Pattern[str]:
     parts = re.split(r"\{(\w+)\}", template)
-    named: set[str] = set()
+    slots: set[str] = set()
     pattern = ""
     for i, part in enumerate(parts):
         if i % 2 == 0:
             pattern += re.escape(part)
         else:
-            pattern += f"(?P={part})" if part in named else f"(?P<{part}>.+?)"
-            named.add(part)
+            pattern += f"(?P={part})" if part in slots else f"(?P<{part}>.+?)"
+            slots.add(part)
     return re.compile(pattern)
 
 

@@ -47,15 +47,15 @@ def with_labels(spec: SceneSpec, count: int) -> tuple[str, tuple[str, ...]]:
     """
     if spec.answer_type != "colour":
         raise Rejected(f"the answers {listed(spec.labels)} are no colours, so that no others can be offered")
-    named = asked(get_family(spec.family).questions, spec.question)
-    if named is None or set(choices_in(named.get("choices", ""))) != set(spec.labels):
+    slots = asked(get_family(spec.family).questions, spec.question)
+    if slots is None or set(choices_in(slots.get("choices", ""))) != set(spec.labels):
         raise Rejected(f"the choices of {spec.question!r} are part of its sentence")
-    others = [colour for colour in PALETTE if colour not in named.values()]
+    others = [colour for colour in PALETTE if colour not in slots.values()]
     pool = [spec.ground_truth, spec.twin.ground_truth, *_mixed(spec, spec.labels), *_mixed(spec, others)]
     labels = _mixed(spec, [*dict.fromkeys(pool)][:count])
     if len(labels) < count:
         raise Rejected(f"there are {len(labels)} answers to choose from, {count} are wanted")
-    return spec.question.replace(named["choices"], listed(labels)), tuple(labels)
+    return spec.question.replace(slots["choices"], listed(labels)), tuple(labels)
 
 
 def _mixed(spec: SceneSpec, labels: Sequence[str]) -> list[str]:
