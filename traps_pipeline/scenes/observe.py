@@ -10,7 +10,7 @@ from functools import cache
 from pathlib import Path
 
 from traps_pipeline.scenes.family_registry import families
-from traps_pipeline.scenes.parts.wording import asked
+from traps_pipeline.scenes.parts.wording import match_slots
 from traps_pipeline.scenes.physics.kit import Family
 from traps_pipeline.video.encode import decode_sampled
 from traps_pipeline.video.policies import SAMPLED, FramePolicy
@@ -19,7 +19,7 @@ from traps_pipeline.video.policies import SAMPLED, FramePolicy
 @cache
 def family_asking(question: str) -> Family | None:
     """Return the family whose templates the question fits, None if there is none."""
-    return next((family for family in families() if asked(family.questions, question) is not None), None)
+    return next((family for family in families() if match_slots(family.questions, question) is not None), None)
 
 
 def observe(clip: Path, question: str, shown: FramePolicy = SAMPLED) -> str | None:

@@ -15,7 +15,7 @@ from traps_pipeline.scenes.parts.course import Course, Span, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import AHEAD, past_far_edge
 from traps_pipeline.scenes.parts.questions import colour_from, comes_from, yes_no
-from traps_pipeline.scenes.parts.readings import Reading, came_through
+from traps_pipeline.scenes.parts.readings import Reading, read_passage
 from traps_pipeline.scenes.parts.vary import (
     Drawn,
     apart,
@@ -120,7 +120,7 @@ def _add_wall(course: Course, p: Params, across: Span) -> None:
 
 def outcome(motion: Motion, p: Params) -> Reading:
     """Read whether the ball is wholly past the wall, or stays where it is behind it."""
-    return came_through(p.direction * motion.pos("ball")[:, 0] - p.radius_m - p.wall_m, p.radius_m)
+    return read_passage(p.direction * motion.pos("ball")[:, 0] - p.radius_m - p.wall_m, p.radius_m)
 
 
 FAMILY = scene_family(

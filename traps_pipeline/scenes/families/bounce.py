@@ -16,7 +16,7 @@ from traps_pipeline.scenes.parts.course import DEAD, Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import AHEAD, beyond
 from traps_pipeline.scenes.parts.questions import colour_of, goes_to, yes_no
-from traps_pipeline.scenes.parts.readings import Reading, crossed
+from traps_pipeline.scenes.parts.readings import Reading, read_crossing
 from traps_pipeline.scenes.parts.vary import apart, between, facing, hidden, one_of, shuffled
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
@@ -89,7 +89,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
     """Read the side of the wall on which the ball stays low, on the tray or the pad."""
     ball = motion.pos("ball")
     low = ball[:, 2] < FLOOR_M + p.radius_m + 0.4 * p.wall_m
-    return crossed(p.direction * ball[:, 0] - p.wall_at_m, valid=low)
+    return read_crossing(p.direction * ball[:, 0] - p.wall_at_m, valid=low)
 
 
 FAMILY = scene_family(

@@ -16,7 +16,7 @@ import numpy as np
 from traps_pipeline.scenes.parts.course import SHADOW_RIGHT, Course
 from traps_pipeline.scenes.parts.dominoes import BALL, BALL_AT, PLANK, STILL_M
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import end_of, struck, upper_half_stays
+from traps_pipeline.scenes.parts.observers import end_of, is_struck, is_upper_half_in_place
 from traps_pipeline.scenes.parts.questions import left_or_right
 from traps_pipeline.scenes.parts.readings import Reading, still_from, top_m
 from traps_pipeline.scenes.parts.vary import apart, between, drawn_by, hidden, in_front, one_of, several_between
@@ -154,7 +154,7 @@ def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     for colour in (slots["left"], slots["right"]):
         seen = blobs(colour_mask(frames[0], colour), 60)
         falls.append(
-            any(not upper_half_stays(frames, colour, domino) or struck(frames, domino, 0.0) for domino in seen)
+            any(not is_upper_half_in_place(frames, colour, domino) or is_struck(frames, domino, 0.0) for domino in seen)
         )
     return None if falls[0] == falls[1] else "left" if falls[0] else "right"
 
@@ -173,7 +173,7 @@ def _is_standing(frames: np.ndarray, colour: str) -> bool | None:
     first, last = largest(frames[0], colour, 60), largest(frames[-1], colour, 60)
     if first is None or last is None or is_occluder(first) or is_occluder(last):
         return None
-    return upper_half_stays(frames, colour, first)
+    return is_upper_half_in_place(frames, colour, first)
 
 
 FAMILY = scene_family(

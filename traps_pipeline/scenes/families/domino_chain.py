@@ -14,7 +14,7 @@ import numpy as np
 
 from traps_pipeline.scenes.parts import dominoes
 from traps_pipeline.scenes.parts.course import Course
-from traps_pipeline.scenes.parts.dominoes import Size, Standing
+from traps_pipeline.scenes.parts.dominoes import Domino, Size
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import has_begun, has_fallen, lies_flat
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
@@ -68,7 +68,7 @@ def build(p: Params, physics: Physics) -> Scene:
     course = Course(physics, p.direction)
     colours = [p.row_colour] * (p.concealed - 1) + [p.last_colour]
     second = [
-        Standing(name, i, colour, aside=p.gap_open and i == p.gap_index)
+        Domino(name, i, colour, aside=p.gap_open and i == p.gap_index)
         for i, (name, colour) in enumerate(zip(p.second, colours, strict=True))
     ]
     along = dominoes.add_rows(

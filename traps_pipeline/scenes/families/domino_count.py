@@ -15,13 +15,13 @@ import numpy as np
 
 from traps_pipeline.scenes.parts import dominoes
 from traps_pipeline.scenes.parts.course import Course
-from traps_pipeline.scenes.parts.dominoes import Size, Standing
+from traps_pipeline.scenes.parts.dominoes import Domino, Size
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import around, upper_half_stays
+from traps_pipeline.scenes.parts.observers import around, is_upper_half_in_place
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, either, how_many, range_of
 from traps_pipeline.scenes.parts.readings import Reading, still_from, top_m
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, facing, one_of
-from traps_pipeline.scenes.parts.vision import blobs, colour_mask, moved
+from traps_pipeline.scenes.parts.vision import blobs, colour_mask, motion_mask
 from traps_pipeline.scenes.parts.wording import choices_in
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
@@ -85,7 +85,7 @@ def build(p: Params, physics: Physics) -> Scene:
         course,
         p.size,
         first=[p.first_colour] * p.visible,
-        second=[Standing(name, place, p.second_colour) for name, place in zip(p.second, places, strict=True)],
+        second=[Domino(name, place, p.second_colour) for name, place in zip(p.second, places, strict=True)],
         places=len(p.second),
         ball_colour=p.ball_colour,
         plank_colour=p.plank_colour,
@@ -131,17 +131,17 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     ranges = _choices(slots, len(standing))
     if ranges is None or after.sum() < 0.3 * before.sum() or (after != close).sum() > 0.1 * after.sum():
         return None
-    return range_of(ranges, sum(not upper_half_stays(frames, colour, domino) for domino in standing))
+    return range_of(ranges, sum(not is_upper_half_in_place(frames, colour, domino) for domino in standing))
 
 
 def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Count the second row's dominoes that are out of place or about to be struck."""
-    standing, change = blobs(colour_mask(frames[0], slots["second"]), min_area=60), moved(frames)
+    standing, change = blobs(colour_mask(frames[0], slots["second"]), min_area=60), motion_mask(frames)
     ranges = _choices(slots, len(standing))
     if ranges is None:
         return None
     falls = [
-        not upper_half_stays(frames, slots["second"], domino) or change[around(domino, 0.0)].mean() > GIVES
+        not is_upper_half_in_place(frames, slots["second"], domino) or change[around(domino, 0.0)].mean() > GIVES
         for domino in standing
     ]
     return range_of(ranges, sum(falls))

@@ -19,7 +19,7 @@ from traps_pipeline.scenes.parts.observers import carried_on, rounded
 from traps_pipeline.scenes.parts.questions import Aside, choice_of, either, left_or_right
 from traps_pipeline.scenes.parts.readings import Reading, side_while
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, in_front, one_of, shuffled
-from traps_pipeline.scenes.parts.vision import at_rest, colour_mask, largest, slanting_edges
+from traps_pipeline.scenes.parts.vision import colour_mask, is_at_rest, largest, slanting_edges
 from traps_pipeline.scenes.physics.kit import AnswerableQuestion, Motion, Physics, Scene, uniform
 
 GRAVITY = 9.81
@@ -140,7 +140,7 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return whether the resting ball is nearer to the red or the blue bin's middle."""
     path = [rounded(frame, slots["ball"]) for frame in frames[-3:]]
     ball, red, blue = path[-1], _middle_x(frames[-1], "red"), _middle_x(frames[-1], "blue")
-    if ball is None or not at_rest(path) or red is None or blue is None:
+    if ball is None or not is_at_rest(path) or red is None or blue is None:
         return None
     return "left" if abs(ball.x - red) < abs(ball.x - blue) else "right"
 

@@ -19,7 +19,7 @@ from traps_pipeline.scenes.parts.observers import rounded
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
 from traps_pipeline.scenes.parts.readings import Reading
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, facing, one_of, shuffled, together
-from traps_pipeline.scenes.parts.vision import at_rest, largest
+from traps_pipeline.scenes.parts.vision import is_at_rest, largest
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, uniform
 
 FLOOR_M = 0.02  # thickness of the cup's floor
@@ -130,16 +130,16 @@ def outcome(motion: Motion, p: Params) -> Reading:
     margin = -p.radius_m - end if end < 0 else (1 - p.half_throat) * p.radius_m
     if through[-1]:
         return Reading(["yes" if past else None for past in through], margin)
-    at_rest = np.linalg.norm(ball - ball[-1], axis=1) < 0.5 * p.radius_m
+    is_at_rest = np.linalg.norm(ball - ball[-1], axis=1) < 0.5 * p.radius_m
     is_stuck = 0 < end < 2 * p.radius_m
-    return Reading(["no" if is_stuck and still else None for still in at_rest], margin)
+    return Reading(["no" if is_stuck and still else None for still in is_at_rest], margin)
 
 
 def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return whether the resting ball is below the upper edge of the cup."""
     path = [rounded(frame, slots["ball"], fill=0.92, longer=2.5) for frame in frames[-3:]]
     ball, cup = path[-1], largest(frames[-1], slots["cup"], 150)
-    if ball is None or not at_rest(path) or cup is None:
+    if ball is None or not is_at_rest(path) or cup is None:
         return None
     return "yes" if ball.y > cup.box[1] else "no"
 

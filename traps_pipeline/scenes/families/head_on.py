@@ -17,7 +17,7 @@ from traps_pipeline.scenes.parts.course import Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import AHEAD, colours_of_balls, end_of
 from traps_pipeline.scenes.parts.questions import which_colour
-from traps_pipeline.scenes.parts.readings import Reading, held_from, still_from, undecided
+from traps_pipeline.scenes.parts.readings import Reading, label_from, still_from, undecided
 from traps_pipeline.scenes.parts.vary import apart, between, hidden, in_front, several_between, shuffled
 from traps_pipeline.scenes.parts.vision import is_occluder, largest, track
 from traps_pipeline.scenes.physics.kit import AnswerableQuestion, Motion, Physics, Scene, Vec3, listed
@@ -119,7 +119,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
     if left * right <= 0:
         return Reading(undecided(motion), margin)
     winner = p.colours[0] if left < 0 else p.colours[1]
-    return Reading(held_from(still_from(*ends, within_m=STILL_M), winner, motion), margin)
+    return Reading(label_from(still_from(*ends, within_m=STILL_M), winner, motion), margin)
 
 
 def _aside(p: Params, rng: np.random.Generator) -> AnswerableQuestion:

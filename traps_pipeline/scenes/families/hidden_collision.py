@@ -18,7 +18,7 @@ from traps_pipeline.scenes.parts.observers import carried_on, small
 from traps_pipeline.scenes.parts.questions import yes_no
 from traps_pipeline.scenes.parts.readings import Reading
 from traps_pipeline.scenes.parts.vary import apart, between, drawn_by, hidden, in_front, one_of, shuffled
-from traps_pipeline.scenes.parts.vision import Blob, at_rest
+from traps_pipeline.scenes.parts.vision import Blob, is_at_rest
 from traps_pipeline.scenes.physics.kit import AnswerableQuestion, Motion, Physics, Scene, uniform
 
 DECK_M = 0.03
@@ -134,7 +134,7 @@ def _aside(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
 
 def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return 'no' once the balls have changed their order, 'yes' if they rest before."""
-    starts, ends, is_at_rest = [], [], True
+    starts, ends, all_rest = [], [], True
     for name in ("first", "second"):
         path = [small(frame, slots[name]) for frame in frames]
         start, end = next((blob for blob in path if blob), None), path[-1]
@@ -142,10 +142,10 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
             return None
         starts.append(start.x)
         ends.append(end.x)
-        is_at_rest &= at_rest(path, tolerance_px=4)
+        all_rest &= is_at_rest(path, tolerance_px=4)
     if (starts[0] < starts[1]) != (ends[0] < ends[1]):
         return "no"
-    return "yes" if is_at_rest else None
+    return "yes" if all_rest else None
 
 
 def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:

@@ -17,7 +17,7 @@ from traps_pipeline.scenes.parts.course import DEAD, Course, Point, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import beyond, will_clear
 from traps_pipeline.scenes.parts.questions import colour_of, goes_to, yes_no
-from traps_pipeline.scenes.parts.readings import Reading, crossed
+from traps_pipeline.scenes.parts.readings import Reading, read_crossing
 from traps_pipeline.scenes.parts.vary import apart, between, facing, hidden, one_of, shuffled
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
@@ -101,7 +101,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
     """Read the side of the barrier on which the ball stays low, past the kicker."""
     ball = motion.pos("ball")
     past = p.direction * ball[:, 0] - p.way[-1][0] - p.barrier_at_m
-    return crossed(past, valid=(past > -p.barrier_at_m) & (ball[:, 2] < FLOOR_M + p.radius_m + 0.03))
+    return read_crossing(past, valid=(past > -p.barrier_at_m) & (ball[:, 2] < FLOOR_M + p.radius_m + 0.03))
 
 
 FAMILY = scene_family(

@@ -19,7 +19,7 @@ from traps_pipeline.scenes.parts.questions import which_colour
 from traps_pipeline.scenes.parts.ramp import Ramp
 from traps_pipeline.scenes.parts.readings import Reading, first_past
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, hidden, in_front
-from traps_pipeline.scenes.parts.vision import Blob, at_rest
+from traps_pipeline.scenes.parts.vision import Blob, is_at_rest
 from traps_pipeline.scenes.physics.kit import AnswerableQuestion, Motion, Physics, Scene, listed, uniform
 
 BOARD_M = 0.016  # thickness of a ramp
@@ -158,7 +158,7 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return which ball is first near its place of rest, the same part of the tray."""
     choices = colours_of_balls(frames, slots, BALL_COLOURS)
     paths = [[compact(frame, colour) for frame in frames] for colour in choices]
-    if len(choices) != 2 or not all(at_rest(path, tolerance_px=SETTLING_PX) for path in paths):
+    if len(choices) != 2 or not all(is_at_rest(path, tolerance_px=SETTLING_PX) for path in paths):
         return None
     rates = [_progress(path) for path in paths]
     near_end = [int(np.argmax(rate > 0.9 * rate.max())) for rate in rates]

@@ -19,7 +19,7 @@ from traps_pipeline.scenes.parts.questions import colour_from, either, which_col
 from traps_pipeline.scenes.parts.readings import Reading, still_from
 from traps_pipeline.scenes.parts.soft_bodies import soft_ball
 from traps_pipeline.scenes.parts.vary import apart, between, hidden, in_front, one_of, shuffled
-from traps_pipeline.scenes.parts.vision import at_rest, colour_mask
+from traps_pipeline.scenes.parts.vision import colour_mask, is_at_rest
 from traps_pipeline.scenes.parts.wording import choices_in
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
@@ -137,7 +137,7 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     path = [rounded(frame, slots["ball"]) for frame in frames[-3:]]
     end = path[-1]
     heights = {colour: _height(frames[-1], colour) for colour in choices_in(slots["choices"])}
-    if end is None or not at_rest(path, tolerance_px=4) or None in heights.values():
+    if end is None or not is_at_rest(path, tolerance_px=4) or None in heights.values():
         return None
     under = end.box[1] + end.box[3]
     return min(heights, key=lambda colour: abs((heights[colour] or 0.0) - under))

@@ -20,7 +20,7 @@ from traps_pipeline.scenes.parts.questions import colour_of, either, yes_no
 from traps_pipeline.scenes.parts.readings import Reading, lasting_from, still_from
 from traps_pipeline.scenes.parts.soft_bodies import hammock
 from traps_pipeline.scenes.parts.vary import apart, between, hidden, in_front, one_of, shuffled
-from traps_pipeline.scenes.parts.vision import at_rest, colour_mask
+from traps_pipeline.scenes.parts.vision import colour_mask, is_at_rest
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
 FLOOR_M = 0.02  # thickness of the tray's floor
@@ -106,7 +106,7 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return whether the cloth is wider than high once the ball rests, None if unseen."""
     path = [rounded(frame, slots["ball"]) for frame in frames[-3:]]
     rows, columns = np.nonzero(colour_mask(frames[-1], slots["cloth"]))
-    if len(rows) < CLOTH_PX or not at_rest(path, tolerance_px=4):
+    if len(rows) < CLOTH_PX or not is_at_rest(path, tolerance_px=4):
         return None
     wide, high = (float(np.ptp(np.percentile(along, (1, 99)))) for along in (columns, rows))
     return "yes" if wide > 1.2 * high else "no"

@@ -19,7 +19,7 @@ from traps_pipeline.scenes.parts.questions import colour_of, either, yes_no
 from traps_pipeline.scenes.parts.readings import Reading, lasting_from, still_from
 from traps_pipeline.scenes.parts.soft_bodies import rope
 from traps_pipeline.scenes.parts.vary import apart, between, hidden, in_front, one_of, shuffled
-from traps_pipeline.scenes.parts.vision import at_rest, largest
+from traps_pipeline.scenes.parts.vision import is_at_rest, largest
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
 FLOOR_M = 0.02  # thickness of the tray's floor
@@ -107,7 +107,7 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return whether the resting rope is tall and ends over the tray, None if unseen."""
     path = [largest(frame, slots["rope"], 60) for frame in frames[-3:]]
     end = path[-1]
-    if end is None or not at_rest(path, tolerance_px=4):
+    if end is None or not is_at_rest(path, tolerance_px=4):
         return None
     return "yes" if end.box[3] > 0.5 * end.box[2] else "no"
 

@@ -20,7 +20,7 @@ from traps_pipeline.scenes.parts.observers import AHEAD, offered
 from traps_pipeline.scenes.parts.questions import colour_from, comes_from, which_colour
 from traps_pipeline.scenes.parts.readings import Reading, lasting_from
 from traps_pipeline.scenes.parts.vary import between, drawn_by, facing, hidden_index, one_of, shuffled
-from traps_pipeline.scenes.parts.vision import Blob, at_rest, blobs, colour_mask
+from traps_pipeline.scenes.parts.vision import Blob, blobs, colour_mask, is_at_rest
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, add_box, distinct_colours
 
 SECTORS = ("red", "green", "blue", "yellow", "cyan", "purple")
@@ -139,7 +139,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
 def observe(frames: np.ndarray, slots: Mapping[str, str], ahead: float | None = None) -> str | None:
     """Return the colour that surrounds the black pointer once it is at rest."""
     pointers = [_pointer(frame) for frame in frames[-3:]]
-    if pointers[-1][0] is None or (ahead is None and not at_rest([pointer for pointer, _ in pointers])):
+    if pointers[-1][0] is None or (ahead is None and not is_at_rest([pointer for pointer, _ in pointers])):
         return None
     ring = cv2.dilate(pointers[-1][1], np.ones((15, 15), np.uint8)).astype(bool)
     counts = {c: int((ring & colour_mask(frames[-1], c)).sum()) for c in offered(slots, SECTORS)}

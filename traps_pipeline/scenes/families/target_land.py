@@ -19,7 +19,7 @@ from traps_pipeline.scenes.parts.observers import offered, rounded
 from traps_pipeline.scenes.parts.questions import choice_of, comes_from, which_colour
 from traps_pipeline.scenes.parts.readings import Reading
 from traps_pipeline.scenes.parts.vary import apart, between, facing, hidden, one_of, shuffled
-from traps_pipeline.scenes.parts.vision import at_rest, blobs, colour_mask, largest
+from traps_pipeline.scenes.parts.vision import blobs, colour_mask, is_at_rest, largest
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
 GRAVITY = 9.81
@@ -129,7 +129,7 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return the tray colour that most of the picture around the resting ball has."""
     path = [rounded(frame, slots["ball"]) for frame in frames[-3:]]
     ball = path[-1]
-    if ball is None or not at_rest(path):
+    if ball is None or not is_at_rest(path):
         return None
     reach = 1.1 * max(ball.box[2:])
     rows, columns = np.ogrid[: frames.shape[1], : frames.shape[2]]

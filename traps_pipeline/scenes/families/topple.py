@@ -19,7 +19,7 @@ from traps_pipeline.scenes.parts.observers import lies_flat
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
 from traps_pipeline.scenes.parts.readings import Reading, still_from, top_m, yes_while
 from traps_pipeline.scenes.parts.vary import apart, between, facing, hidden, one_of, shuffled
-from traps_pipeline.scenes.parts.vision import at_rest, largest, track
+from traps_pipeline.scenes.parts.vision import is_at_rest, largest, track
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
 FELT = Surface(2e-3)  # behind the occluder: no ball comes back from there
@@ -110,7 +110,7 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return whether the pillar is lower at the end than at the start, None if unseen."""
     path = track(frames, slots["pillar"], 80)
     first, last = path[0], path[-1]
-    if first is None or last is None or not at_rest(path) or first.box[3] < 1.2 * first.box[2]:
+    if first is None or last is None or not is_at_rest(path) or first.box[3] < 1.2 * first.box[2]:
         return None
     return "yes" if last.box[3] < 0.75 * first.box[3] else "no"
 

@@ -18,7 +18,7 @@ from traps_pipeline.scenes.parts.observers import end_of
 from traps_pipeline.scenes.parts.questions import choice_of, comes_from, yes_no
 from traps_pipeline.scenes.parts.readings import Reading, still_from, yes_while
 from traps_pipeline.scenes.parts.vary import apart, between, drawn_by, facing, hidden, one_of, shuffled
-from traps_pipeline.scenes.parts.vision import at_rest, colour_mask, largest, track
+from traps_pipeline.scenes.parts.vision import colour_mask, is_at_rest, largest, track
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, uniform
 
 STRIP_M = 0.16  # length of the strip that is rough or smooth
@@ -135,7 +135,7 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return whether the named block has come down by more than its own size."""
     path = track(frames, slots["top"], 60)
     first, last = path[0], path[-1]
-    if first is None or last is None or not at_rest(path):
+    if first is None or last is None or not is_at_rest(path):
         return None
     if first.area > 0.08 * colour_mask(frames[0], slots["top"]).size:
         return None

@@ -15,7 +15,7 @@ from traps_pipeline.scenes.parts.course import Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import AHEAD, past_far_edge
 from traps_pipeline.scenes.parts.questions import colour_from, comes_from, yes_no
-from traps_pipeline.scenes.parts.readings import Reading, came_through
+from traps_pipeline.scenes.parts.readings import Reading, read_passage
 from traps_pipeline.scenes.parts.vary import apart, between, facing, hidden, one_of, shuffled
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, Vec3
 
@@ -129,7 +129,7 @@ def _add_bridge(course: Course, p: Params) -> None:
 
 def outcome(motion: Motion, p: Params) -> Reading:
     """Read whether the ball is wholly past the bridge, or stays where it is under it."""
-    return came_through(p.direction * motion.pos("ball")[:, 0] - p.radius_m - p.bridge_m, p.radius_m)
+    return read_passage(p.direction * motion.pos("ball")[:, 0] - p.radius_m - p.bridge_m, p.radius_m)
 
 
 FAMILY = scene_family(

@@ -17,7 +17,7 @@ from traps_pipeline.base.digests import digest
 from traps_pipeline.protocol.datasets import FRAMINGS, OCCLUDER_DOSES, OCCLUDER_LOOKS, SCHEMAS
 from traps_pipeline.scenes.certification.certificates import legible_groups
 from traps_pipeline.scenes.family_registry import get_family
-from traps_pipeline.scenes.parts.wording import asked, choices_in
+from traps_pipeline.scenes.parts.wording import choices_in, match_slots
 from traps_pipeline.scenes.physics.kit import listed
 from traps_pipeline.scenes.picture import checks
 from traps_pipeline.scenes.picture.render import Renderer
@@ -47,7 +47,7 @@ def with_labels(spec: SceneSpec, count: int) -> tuple[str, tuple[str, ...]]:
     """
     if spec.answer_type != "colour":
         raise Rejected(f"the answers {listed(spec.labels)} are no colours, so that no others can be offered")
-    slots = asked(get_family(spec.family).questions, spec.question)
+    slots = match_slots(get_family(spec.family).questions, spec.question)
     if slots is None or set(choices_in(slots.get("choices", ""))) != set(spec.labels):
         raise Rejected(f"the choices of {spec.question!r} are part of its sentence")
     others = [colour for colour in PALETTE if colour not in slots.values()]
