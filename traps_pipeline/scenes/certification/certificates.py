@@ -33,7 +33,7 @@ from traps_pipeline.scenes.physics.flexes import flexes, is_carrier
 from traps_pipeline.scenes.physics.kit import Family, Motion, Physics, Scene, flag_of
 from traps_pipeline.scenes.physics.simulate import swept_points
 from traps_pipeline.scenes.picture import checks
-from traps_pipeline.scenes.picture.camera import in_frame
+from traps_pipeline.scenes.picture.camera import is_in_frame
 from traps_pipeline.scenes.picture.walls import FACES_THE_EYE_DEG, outlines
 from traps_pipeline.scenes.worlds.outcome import (
     Outcome,
@@ -47,7 +47,7 @@ from traps_pipeline.scenes.worlds.pace import (
     EARLIEST_SHARE,
     LATEST_SHARE,
     READ_S,
-    exchangeable,
+    is_exchangeable,
     lengths,
     moments,
     out_of_pace,
@@ -303,7 +303,7 @@ PHYSICS = Certificate(
 
 def _in_frame(pair: Pair) -> Evidence:
     control = pair.control
-    return {"in_frame": in_frame(control.camera, shown_points(control.model, control.scene, control.qpos))}
+    return {"in_frame": is_in_frame(control.camera, shown_points(control.model, control.scene, control.qpos))}
 
 
 def _judge_in_frame(e: Evidence, claim: Claim) -> Judged:
@@ -433,7 +433,7 @@ HIDDEN = Certificate(
 
 def _ablation(pair: Pair) -> Evidence:
     control = pair.control
-    return {"ablation_px": control.ablation_px(control.looked_at[_first_hidden(pair) :], control.concealed)}
+    return {"ablation_px": control.ablation_px(control.evidence_frames[_first_hidden(pair) :], control.concealed_geoms)}
 
 
 def _judge_ablation(e: Evidence, claim: Claim) -> Judged:
@@ -732,14 +732,14 @@ def _closing(pair: Pair) -> Evidence:
     if control.closing is None:
         unread = {"read_answer": None, "read_s": None, "closed_px": None, "closed_change_px": None}
         return {**_closes(None, control.physics), **unread}
-    outcome, end = control.outcome_read, control.closed_at
-    changed = control.ablation_px(end, control.closed_off)
+    outcome, end = control.outcome_read, control.closed_frames
+    changed = control.ablation_px(end, control.closed_geoms)
     differing, _ = checks.differing_pixels(control.behind_occluder(end), pair.other_world.behind_occluder(end))
     return {
         **_closes(control.closing.frame, control.physics),
         "read_answer": outcome.label,
         "read_s": (control.closing.frame - outcome.commit_frame) / fps,
-        "closed_px": float(control.pixels_of(control.closed_off, end).sum()),
+        "closed_px": float(control.pixels_of(control.closed_geoms, end).sum()),
         "closed_change_px": changed + differing,
     }
 
@@ -806,8 +806,8 @@ def _exchange(pair: Pair) -> Evidence:
     other, lost = pair.exchanged, None
     world, twin = other.control, other.other_world
     so_far: dict[str, Any] = {}
-    exact = exchangeable(world.family) and world.same_physics and twin.same_physics
-    for certificate in certificates_for("occluder", "control") if exchangeable(world.family) else ():
+    exact = is_exchangeable(world.family) and world.same_physics and twin.same_physics
+    for certificate in certificates_for("occluder", "control") if is_exchangeable(world.family) else ():
         so_far |= certificate.measured(other)
         failure = certificate.failure(so_far, other.claim)
         if failure is not None and lost is None:
@@ -821,7 +821,7 @@ def _exchange(pair: Pair) -> Evidence:
 
 
 def _judge_exchange(e: Evidence, claim: Claim) -> Judged:
-    if not exchangeable(claim.family):
+    if not is_exchangeable(claim.family):
         return
     if e.get("other_settings"):
         yield f"had the twin been the control, the {' and the '.join(e['other_settings'])} would be another"

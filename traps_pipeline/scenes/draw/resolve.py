@@ -28,7 +28,7 @@ from traps_pipeline.scenes.draw.trim import trim_candidates
 from traps_pipeline.scenes.physics.kit import Family, Physics, Wording, params_to_dict
 from traps_pipeline.scenes.picture.camera import fit_shot
 from traps_pipeline.scenes.worlds.outcome import Rejected, compile_scene, simulated
-from traps_pipeline.scenes.worlds.pace import cut_to, lengths
+from traps_pipeline.scenes.worlds.pace import lengths, shortened
 from traps_pipeline.scenes.worlds.shot import shot_of, shown_points
 from traps_pipeline.scenes.worlds.spec import SceneSpec, Twin, trajectory_digest
 from traps_pipeline.scenes.worlds.world import World
@@ -105,7 +105,7 @@ def _certify_some_length(
     rejected = Rejected("no other hidden element gives another outcome")
     for worlds in [(uncut,)] if void_kind == "truncation" else _with_other_worlds(uncut):
         for n_frames in lengths(worlds, seed):
-            control, *others = (cut_to(world, n_frames) for world in worlds)
+            control, *others = (shortened(world, n_frames) for world in worlds)
             end_s = (n_frames - 1) / control.physics.fps
             answer = control.outcome.label
             claim = Claim(

@@ -10,7 +10,7 @@
 
     PLAY = apart("red", "green", "blue")  # before the class: colours that differ from each other
 
-`drawn(Params, rng)` draws the fields in the order in which they stand; a field may depend on those before it only. So a
+`draw_params(Params, rng)` draws the fields in the order in which they stand; a field may depend on those before it only. So a
 hidden element that depends on nothing is as likely whatever is seen. `twins(p)` changes the hidden element.
 """
 
