@@ -10,8 +10,8 @@
 
     PLAY = apart("red", "green", "blue")  # before the class: colours that differ from each other
 
-`draw_params(Params, rng)` draws the fields in the order in which they stand; a field may depend on those before it only. So a
-hidden element that depends on nothing is as likely whatever is seen. `twins(p)` changes the hidden element.
+`draw_params(Params, rng)` draws the fields in their order; a field may depend on those before it only. So a hidden
+element that depends on nothing is as likely whatever is seen. `twins(p)` changes the hidden element.
 """
 
 from __future__ import annotations
