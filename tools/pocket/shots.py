@@ -106,7 +106,7 @@ def _jittered(jitter: Jitter, control: World, rng: np.random.Generator) -> tuple
     length = int(rng.integers(round(EARLIEST_CUT_S * fps) + 1, round(LATEST_CUT_S * fps) + 1))
     # A short control ends before the board comes into the picture: on its way it may cover the outcome. A void is held
     # to the very end: of lengths in between there are no controls, so that they alone would tell a void.
-    end = control.clear_frames
+    end = next((i for i, offset in enumerate(control.board) if offset is not None), n)
     return (end - length, end) if short else (0, n), (n if held else None)
 
 

@@ -180,14 +180,6 @@ def motion_mask(frames: np.ndarray) -> np.ndarray:
     return _levels(frames[-1], frames[-2]) > CHANGED if len(frames) > 1 else np.zeros(frames.shape[1:3], bool)
 
 
-def before_hold(frames: np.ndarray) -> np.ndarray:
-    """Return the frames without those at the end in which nothing moves any more; at least one."""
-    count = len(frames)
-    while count > 1 and motion_mask(frames[:count]).sum() < MOVED_PX:
-        count -= 1
-    return frames[:count]
-
-
 def is_still(frames: np.ndarray) -> bool:
     """Return whether nothing moves in the last two steps."""
     return motion_mask(frames).sum() < MOVED_PX and motion_mask(frames[:-1]).sum() < MOVED_PX

@@ -102,11 +102,6 @@ class World:
         """Offsets of the board that closes the control, by frame."""
         return coming_board(self.closing, self.camera, len(self.qpos), self.physics.fps)
 
-    @property
-    def clear_frames(self) -> int:
-        """Number of frames before the board that closes the control comes into the picture; all if none does."""
-        return next((n for n, offset in enumerate(self.board) if offset is not None), len(self.qpos))
-
     @cached_property
     def motion(self) -> Motion:
         """Poses of all bodies, replayed."""
