@@ -57,8 +57,8 @@ def resolve_scenario(workspace: Workspace, scenario: Scenario) -> ResolvedScenar
 def _resolved_anew(workspace: Workspace, scenario: Scenario) -> tuple[SceneSpec, Path]:
     """Return the scene of corrected parameters, with its family's words; stored once."""
     name = _resolved_name(scenario)
-    own = [workspace.trajectories / f"{name}{ending}" for ending in (".npz", ".json")]
-    workspace.store.bring(own)
+    files = [workspace.trajectories / f"{name}{ending}" for ending in (".npz", ".json")]
+    workspace.store.bring(files)
     for folder in (CORRECTIONS / "trajectories", workspace.trajectories):
         if (folder / f"{name}.json").is_file():
             record = (folder / f"{name}.json").read_text(encoding="utf-8")
@@ -70,7 +70,7 @@ def _resolved_anew(workspace: Workspace, scenario: Scenario) -> tuple[SceneSpec,
         raise TrapsError(f"{workspace.trajectories / name}.npz: cannot be written ({error.strerror})") from error
     record = json.dumps(spec.model_dump(mode="json"))
     write_text(workspace.trajectories / f"{name}.json", record)  # last, so that it vouches for the trajectory
-    workspace.store.keep(own)
+    workspace.store.keep(files)
     progress.current().note(
         f"{scenario.scenario_id}: simulated here after {scenario.where}; to freeze it for other machines copy "
         f"trajectories/{name}.* of the workspace to {CORRECTIONS / 'trajectories'}"
@@ -171,8 +171,8 @@ def expected_specs(workspace: Workspace, category: str) -> list[SceneSpecRow]:
 
     def is_resolved(scenario: Scenario) -> bool:
         name = f"{_resolved_name(scenario)}.json" if scenario.params is not None else ""
-        own = workspace.store.has(workspace.trajectories / name)
-        return not name or own or (CORRECTIONS / "trajectories" / name).is_file()
+        is_stored = workspace.store.has(workspace.trajectories / name)
+        return not name or is_stored or (CORRECTIONS / "trajectories" / name).is_file()
 
     scenarios = [s for s in load_scenarios(workspace.study).values() if s.category == category and is_resolved(s)]
     return [_row(workspace, resolve_scenario(workspace, scenario), "") for scenario in scenarios]
