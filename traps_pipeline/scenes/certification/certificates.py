@@ -519,14 +519,14 @@ def _referents(pair: Pair) -> Evidence:
         nouns = (noun, *scene.shown_by.get(noun, ()))
         has_flag = any(phrase.split()[-1] in nouns for phrase in scene.marks)
         bodies = [moves[body] for body in moves if _is_called(body, nouns)]
-        still = [name for name in control.geoms if _is_called(name, nouns) and not _is_of(model, name, moving)]
+        static = [name for name in control.geoms if _is_called(name, nouns) and not _is_of(model, name, moving)]
         if has_flag:
             visibility[noun] = "marked"
         elif bodies:
             visibility[noun] = "seen moving" if min(bodies) >= MOVING_S - _NOISE_S else "hidden"
             least_s.append(min(bodies))
         else:
-            least_px.append(float(control.pixels_of(still).min()))
+            least_px.append(float(control.pixels_of(static).min()))
             visibility[noun] = "in view" if least_px[-1] >= REFERENT_PIXELS else "hidden"
     swept = swept_points(model, control.qpos[:: control.physics.fps // checks.SAMPLED_FPS])
     return {
@@ -538,9 +538,9 @@ def _referents(pair: Pair) -> Evidence:
     }
 
 
-def _is_of(model: mujoco.MjModel, drawn: str, bodies: Collection[str]) -> bool:
+def _is_of(model: mujoco.MjModel, name: str, bodies: Collection[str]) -> bool:
     """Return whether a soft body, or a geom's body, is one of some bodies."""
-    return drawn in bodies if drawn in flexes(model) else model.body(int(model.geom(drawn).bodyid[0])).name in bodies
+    return name in bodies if name in flexes(model) else model.body(int(model.geom(name).bodyid[0])).name in bodies
 
 
 def _judge_referents(e: Evidence, claim: Claim) -> Failures:
@@ -598,11 +598,11 @@ CUT = Certificate(
 
 
 def _open(pair: Pair) -> Evidence:
-    here = {"same_physics": pair.control.same_physics}
+    machine = {"same_physics": pair.control.same_physics}
     evidence: Evidence = {}
     for rollouts in pair.futures.batches():
         evidence = ensemble.at_cut(rollouts, pair.void_from, pair.control.family.perturbation).evidence()
-        if OPEN.failure(here | evidence, pair.claim) is None:
+        if OPEN.failure(machine | evidence, pair.claim) is None:
             break
     return {**evidence, **open_from_state(pair.futures, pair.void_from, pair.claim)}
 
@@ -733,14 +733,14 @@ def _closing(pair: Pair) -> Evidence:
         unread = {"read_answer": None, "read_s": None, "closed_px": None, "closed_change_px": None}
         return {**_closes(None, control.physics), **unread}
     outcome, end = control.outcome_read, control.closed_frames
-    changed = control.ablation_px(end, control.closed_geoms)
+    ablated = control.ablation_px(end, control.closed_geoms)
     differing, _ = checks.differing_pixels(control.behind_occluder(end), pair.other_world.behind_occluder(end))
     return {
         **_closes(control.closing.frame, control.physics),
         "read_answer": outcome.label,
         "read_s": (control.closing.frame - outcome.commit_frame) / fps,
         "closed_px": float(control.pixels_of(control.closed_geoms, end).sum()),
-        "closed_change_px": changed + differing,
+        "closed_change_px": ablated + differing,
     }
 
 

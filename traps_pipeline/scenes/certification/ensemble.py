@@ -118,7 +118,7 @@ class Futures:
         """Return the future of one start, simulated here to its end. Raises Rejected."""
         self.start(number)
         existing = self._rollouts[number] if number < len(self._rollouts) else None
-        return self._roll(number, whole=True) if existing is None or existing.qpos is None else existing
+        return self._roll(number, to_end=True) if existing is None or existing.qpos is None else existing
 
     def after(self, cut: int, count: int = AT_CUT, *, beyond: int = 0) -> Counter[str | None]:
         """Return outcome counts of futures of the state before a cut (None: undecided).
@@ -190,8 +190,8 @@ class Futures:
             shown=np.stack([silhouette.pixels(row, scratch) for row in control.qpos]),
         )
 
-    def _roll(self, number: int, *, whole: bool = False) -> Rollout:
-        """Simulate one start; give up if it parts before `first`, unless `whole`."""
+    def _roll(self, number: int, *, to_end: bool = False) -> Rollout:
+        """Simulate one start; give up if it parts before `first`, unless `to_end`."""
         import mujoco
 
         control, prepared = self._control, self._prepared
@@ -204,7 +204,7 @@ class Futures:
             frames[i] = data.qpos
             if parted == len(shown) and np.abs(outline.pixels(data.qpos, scratch) - shown[i]).max() > self._alike_px:
                 parted = i
-                if i < self.first and not whole:
+                if i < self.first and not to_end:
                     return Rollout(number, parted, None)
             mujoco.mj_step(prepared.model, data, control.physics.substeps)
         if not np.isfinite(frames).all():

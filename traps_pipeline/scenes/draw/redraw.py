@@ -70,7 +70,7 @@ def relook_family(
 
 def reask_family(released: Path, name: str) -> list[str]:
     """Replace ill-posed questions that lose the certificate `words`; return the ids."""
-    seed, changed = load_tallies(released)[name].seed, list[str]()
+    seed, changed_ids = load_tallies(released)[name].seed, list[str]()
     lines = (released / f"{name}.jsonl").read_text(encoding="utf-8").splitlines()
     records = {spec.scenario_id: spec for spec in map(SceneSpec.model_validate_json, lines)}
     texts = Counter(spec.ill_posed_question for spec in records.values())
@@ -81,9 +81,9 @@ def reask_family(released: Path, name: str) -> list[str]:
             question = ill_posed_for(spec, seed, texts, len(records))
             texts[question] += 1
             records[spec.scenario_id] = spec.model_copy(update={"ill_posed_question": question})
-            changed.append(spec.scenario_id)
+            changed_ids.append(spec.scenario_id)
     write_text(released / f"{name}.jsonl", "".join(map(record_line, records.values())))
-    return changed
+    return changed_ids
 
 
 def _rewrite(

@@ -132,10 +132,10 @@ def outcome(motion: Motion, p: Params) -> Reading:
     turn = motion.rot("beam")
     ball = np.einsum("fji,fj->fi", turn, motion.pos("ball") - motion.pos("beam"))  # as the beam sees it
     cup = np.array([-p.direction * p.arm_m, 0.0, BEAM_HALF_M + p.radius_m])
-    landed = lasting_from(np.linalg.norm(ball - cup, axis=1) <= 0.02)
+    rest_frame = lasting_from(np.linalg.norm(ball - cup, axis=1) <= 0.02)
     rise = 2 * p.half_beam_m * turn[:, 2, 0]  # of the right end over the left one
     sides = ["balanced" if abs(x) < LEVEL_M else "left" if x > 0 else "right" for x in rise]
-    return Reading([x if i >= landed else None for i, x in enumerate(sides)], float(abs(abs(rise[-1]) - LEVEL_M)))
+    return Reading([x if i >= rest_frame else None for i, x in enumerate(sides)], float(abs(abs(rise[-1]) - LEVEL_M)))
 
 
 def _ends_or_level(p: Params, rng: np.random.Generator) -> Filled:

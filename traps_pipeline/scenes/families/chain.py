@@ -115,8 +115,8 @@ def outcome(motion: Motion, p: Params) -> Reading:
     """Read whether the last ball's middle is in the box; 'no' only once all rest."""
     along = {ball: p.direction * motion.pos(ball)[:, 0] for ball in ("striker", *p.balls)}
     ahead = along["last"] - p.box_at_m
-    still = still_from(*along.values(), within_m=STILL_M)
-    return Reading(yes_while(ahead > 0, still), clear_m(ahead, p.radius_m))
+    rest_frame = still_from(*along.values(), within_m=STILL_M)
+    return Reading(yes_while(ahead > 0, rest_frame), clear_m(ahead, p.radius_m))
 
 
 FAMILY = scene_family(

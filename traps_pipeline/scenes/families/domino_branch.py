@@ -124,9 +124,9 @@ def _add_domino(
 def outcome(motion: Motion, p: Params) -> Reading:
     """Read the side on which alone the end domino falls, once the branches are still."""
     tops = np.stack([top_m(motion, f"end_{side}", p.height_m) for side in SIDES], axis=1) - PLANK * p.height_m
-    still = still_from(*(motion.pos(body) for side in SIDES for body in p.bodies(side)), within_m=STILL_M)
+    rest_frame = still_from(*(motion.pos(body) for side in SIDES for body in p.bodies(side)), within_m=STILL_M)
     sides = [("left" if left else "right") if left != right else None for left, right in tops < p.height_m / 2]
-    labels = [side if i >= still else None for i, side in enumerate(sides)]
+    labels = [side if i >= rest_frame else None for i, side in enumerate(sides)]
     return Reading(labels, float(np.abs(tops[-1] - p.height_m / 2).min()))
 
 
@@ -152,9 +152,12 @@ def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Predict the side whose end domino alone has left its place or is about to."""
     falls = []
     for colour in (slots["left"], slots["right"]):
-        seen = blobs(colour_mask(frames[0], colour), 60)
+        dominoes = blobs(colour_mask(frames[0], colour), 60)
         falls.append(
-            any(not is_upper_half_in_place(frames, colour, domino) or is_struck(frames, domino, 0.0) for domino in seen)
+            any(
+                not is_upper_half_in_place(frames, colour, domino) or is_struck(frames, domino, 0.0)
+                for domino in dominoes
+            )
         )
     return None if falls[0] == falls[1] else "left" if falls[0] else "right"
 

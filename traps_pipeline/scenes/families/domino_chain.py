@@ -98,8 +98,8 @@ def build(p: Params, physics: Physics) -> Scene:
 def outcome(motion: Motion, p: Params) -> Reading:
     """Read whether the last domino's top is low; 'no' only once the others are still."""
     top = top_m(motion, "last", p.height_m, dominoes.PLANK * p.height_m)
-    still = still_from(*(motion.pos(body) for body in p.second), within_m=dominoes.STILL_M)
-    return Reading(yes_while(top < p.height_m / 2, still), float(abs(top[-1] - p.height_m / 2)))
+    rest_frame = still_from(*(motion.pos(body) for body in p.second), within_m=dominoes.STILL_M)
+    return Reading(yes_while(top < p.height_m / 2, rest_frame), float(abs(top[-1] - p.height_m / 2)))
 
 
 FAMILY = scene_family(

@@ -118,8 +118,8 @@ def outcome(motion: Motion, p: Params) -> Reading:
     """Read the choice for the number of low tops, once the second row is still."""
     tops = np.stack([top_m(motion, body, p.height_m) for body in p.second], axis=1) - dominoes.PLANK * p.height_m
     fallen = (tops < FALLEN * p.height_m).sum(axis=1)
-    still = still_from(*(motion.pos(body) for body in p.second), within_m=dominoes.STILL_M)
-    labels = [range_of(p.ranges, int(n)) if i >= still else None for i, n in enumerate(fallen)]
+    rest_frame = still_from(*(motion.pos(body) for body in p.second), within_m=dominoes.STILL_M)
+    labels = [range_of(p.ranges, int(n)) if i >= rest_frame else None for i, n in enumerate(fallen)]
     return Reading(labels, float(np.abs(tops[-1] - FALLEN * p.height_m).min()))
 
 

@@ -89,7 +89,7 @@ def build(p: Params, physics: Physics) -> Scene:
     at = (start, lane, TABLE_M + r)
     course.ball("ball", at, r, p.ball_colour, speed=p.speed_m_s, rolling=1e-4, sliding=0.1, density=2500)
 
-    seen = (-side, end + RIM_M)
+    span = (-side, end + RIM_M)
     course.mark("pointer", (0.0, 0.0), POINTER_COLOUR)
     for i, colour in enumerate(p.sectors):
         course.mark(f"{colour} sector", _place(p.disc_m, FIRST_DEG + (i + 0.5) * p.sector_deg), colour)
@@ -97,8 +97,8 @@ def build(p: Params, physics: Physics) -> Scene:
         p,
         decisive=["pointer"],
         hidden=["peg"],
-        cover=course.box(seen, (-side - 0.02, side + 0.03), (0, 0.10), right=0.03),
-        in_view=[course.box(seen, outer, (0, 0.09))],
+        cover=course.box(span, (-side - 0.02, side + 0.03), (0, 0.10), right=0.03),
+        in_view=[course.box(span, outer, (0, 0.09))],
         things=[f"{p.ball_colour} ball", "black pointer", "spinner", *(f"{c} sector" for c in p.sectors)],
         also=["table", "rim", "peg"],
         colours=[*p.sectors, POINTER_COLOUR],
@@ -128,11 +128,11 @@ def outcome(motion: Motion, p: Params) -> Reading:
     tip = -motion.rot("pointer")[:, :2, 1]
     angles = np.degrees(np.arctan2(p.direction * tip[:, 0], -tip[:, 1])) % 360  # from the near side
     turned = np.abs(np.radians(angles - angles[-1] + 180) % (2 * np.pi) - np.pi)
-    still = lasting_from(turned <= 0.02)
+    rest_frame = lasting_from(turned <= 0.02)
     angle_in_sector = (angles[-1] - FIRST_DEG) % p.sector_deg
     margin = np.radians(min(angle_in_sector, p.sector_deg - angle_in_sector)) * POINTER * p.disc_m
     index = np.floor((angles - FIRST_DEG) / p.sector_deg).astype(int)
-    sectors = [p.sectors[k] if i >= still and 0 <= k < len(p.sectors) else None for i, k in enumerate(index)]
+    sectors = [p.sectors[k] if i >= rest_frame and 0 <= k < len(p.sectors) else None for i, k in enumerate(index)]
     return Reading(sectors, float(margin))
 
 

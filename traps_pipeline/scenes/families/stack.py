@@ -140,10 +140,10 @@ def _standing(motion: Motion, p: Params) -> np.ndarray:
 
 def outcome(motion: Motion, p: Params) -> Reading:
     """Read the range of the number of standing blocks, once everything is still."""
-    still = still_from(*(motion.pos(block) for block in BLOCKS), within_m=0.003)
+    rest_frame = still_from(*(motion.pos(block) for block in BLOCKS), within_m=0.003)
     is_pushed = p.direction * (motion.pos("pusher") - motion.pos("pusher")[0])[:, 0] > 0.95 * p.travel_m
     counts = _standing(motion, p).sum(axis=1)
-    labels = [range_of(RANGES, n) if i >= still and is_pushed[i] else None for i, n in enumerate(counts)]
+    labels = [range_of(RANGES, n) if i >= rest_frame and is_pushed[i] else None for i, n in enumerate(counts)]
     return Reading(labels, min(float(abs(abs(motion.pos(block)[-1, 0]) - p.stand_half_m)) for block in BLOCKS))
 
 

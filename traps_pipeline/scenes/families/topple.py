@@ -102,8 +102,8 @@ def build(p: Params, physics: Physics) -> Scene:
 def outcome(motion: Motion, p: Params) -> Reading:
     """Read whether the pillar's top is low; 'no' only once pillar and ball rest."""
     top = top_m(motion, "pillar", p.pillar_m)
-    still = still_from(motion.pos("pillar"), motion.pos("ball"), top, within_m=0.003)
-    return Reading(yes_while(top < p.pillar_m / 2, still), float(abs(top[-1] - p.pillar_m / 2)))
+    rest_frame = still_from(motion.pos("pillar"), motion.pos("ball"), top, within_m=0.003)
+    return Reading(yes_while(top < p.pillar_m / 2, rest_frame), float(abs(top[-1] - p.pillar_m / 2)))
 
 
 def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:

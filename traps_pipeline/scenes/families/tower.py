@@ -99,8 +99,8 @@ def build(p: Params, physics: Physics) -> Scene:
     at = (start, 0, ledge + r)
     course.ball("ball", at, r, p.ball_colour, speed=p.speed_m_s, rolling=1e-4, sliding=0.3, density=2500)
 
-    seen = course.box((screened, end + 0.02), (-0.165, 0.165), (0, p.tower_m))
-    right = max(seen.high[0], SHADOW_RIGHT * p.tower_m + half_w) + course.ahead(0.07) - seen.high[0]
+    view_box = course.box((screened, end + 0.02), (-0.165, 0.165), (0, p.tower_m))
+    right = max(view_box.high[0], SHADOW_RIGHT * p.tower_m + half_w) + course.ahead(0.07) - view_box.high[0]
     across = (-0.17, half_w + SHADOW_BACK * p.tower_m)
     course.mark("block", p.names[-1])
     return course.scene(
@@ -108,7 +108,7 @@ def build(p: Params, physics: Physics) -> Scene:
         decisive=[p.names[-1]],
         hidden=[p.kind],
         cover=course.box((screened, end + 0.02), across, (0, p.tower_m + 0.02), right=right),
-        in_view=[seen],
+        in_view=[view_box],
         things=[
             f"{p.ball_colour} ball",
             f"{p.top_colour} block",
@@ -126,9 +126,9 @@ def outcome(motion: Motion, p: Params) -> Reading:
     """Read whether the top block is on the ground; 'no' only once ball and block rest."""
     top = motion.pos(p.names[-1])
     down, up = top[:, 2] < 1.3 * p.block_height_m, top[:, 2] > p.tower_m - 0.6 * p.block_height_m
-    still = still_from(top, motion.pos("ball"), within_m=STILL_M)
+    rest_frame = still_from(top, motion.pos("ball"), within_m=STILL_M)
     middle = (p.tower_m - p.block_height_m / 2 + p.block_width_m / 2) / 2
-    return Reading(yes_while(down, still, no_where=up), float(abs(top[-1, 2] - middle)))
+    return Reading(yes_while(down, rest_frame, no_where=up), float(abs(top[-1, 2] - middle)))
 
 
 def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
@@ -155,8 +155,8 @@ def look(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     top = end_of(track(frames, slots["top"], 60))
     if top is None:
         return None
-    others = [largest(frames[-1], colour, top.area // 3) for colour in COLOURS if colour != slots["top"]]
-    higher = [other for other in others if other is not None and other.y < top.y - 0.5 * top.box[3]]
+    blocks = [largest(frames[-1], colour, top.area // 3) for colour in COLOURS if colour != slots["top"]]
+    higher = [block for block in blocks if block is not None and block.y < top.y - 0.5 * top.box[3]]
     return "yes" if higher else "no"
 
 

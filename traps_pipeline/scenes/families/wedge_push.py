@@ -83,15 +83,15 @@ def build(p: Params, physics: Physics) -> Scene:
     at = (start, 0, TRACK_M + r)
     course.ball("ball", at, r, p.ball_colour, speed=p.speed_m_s, rolling=1e-4, sliding=0.1, density=2500)
 
-    seen, top, back = (screened, end + 0.015), TRACK_M + p.wedge_height_m + 0.02, HALF_TRACK_M + 0.11
+    span, top, back = (screened, end + 0.015), TRACK_M + p.wedge_height_m + 0.02, HALF_TRACK_M + 0.11
     course.mark("wedge", "base", p.wedge_colour)
     course.mark("mat", "mat")
     return course.scene(
         p,
         decisive=["wedge"],
         hidden=[p.kind],
-        cover=course.box(seen, (-HALF_TRACK_M - 0.02, back + 0.03), (0, top), right=0.05),
-        in_view=[course.box(seen, (-HALF_TRACK_M, back), (0, top))],
+        cover=course.box(span, (-HALF_TRACK_M - 0.02, back + 0.03), (0, top), right=0.05),
+        in_view=[course.box(span, (-HALF_TRACK_M, back), (0, top))],
         things=[
             f"{p.ball_colour} ball",
             f"{p.wedge_colour} wedge",
@@ -121,8 +121,8 @@ def outcome(motion: Motion, p: Params) -> Reading:
     """Read whether the wedge's middle is on the mat; 'no' only once both bodies rest."""
     wedge = motion.pos("wedge")
     past = p.direction * wedge[:, 0] - p.mat_at_m
-    still = still_from(wedge, motion.pos("ball"), within_m=0.002)
-    return Reading(yes_while(past > 0, still), float(abs(past[-1]) - p.wedge_length_m / 2))
+    rest_frame = still_from(wedge, motion.pos("ball"), within_m=0.002)
+    return Reading(yes_while(past > 0, rest_frame), float(abs(past[-1]) - p.wedge_length_m / 2))
 
 
 def observe(frames: np.ndarray, slots: Mapping[str, str], ahead: float | None = None) -> str | None:

@@ -39,16 +39,16 @@ def draw_frame() -> str:
 
 def opengl_variables() -> dict[str, str]:
     """Return the environment's variables that choose what draws, and how."""
-    chosen = {name: value for name, value in sorted(os.environ.items()) if _OPENGL.match(name)}
+    variables = {name: value for name, value in sorted(os.environ.items()) if _OPENGL.match(name)}
     # OpenCV adds a folder of its own to the loader's when it is imported: nobody chose that.
-    folders = [folder for folder in chosen.pop("LD_LIBRARY_PATH", "").split(":") if folder and "/cv2/" not in folder]
-    return chosen | ({"LD_LIBRARY_PATH": ":".join(folders)} if folders else {})
+    folders = [folder for folder in variables.pop("LD_LIBRARY_PATH", "").split(":") if folder and "/cv2/" not in folder]
+    return variables | ({"LD_LIBRARY_PATH": ":".join(folders)} if folders else {})
 
 
 def _unusable(reason: str) -> str:
-    chosen = ", ".join(f"{name}={value[:60]}" for name, value in opengl_variables().items())
+    variables = ", ".join(f"{name}={value[:60]}" for name, value in opengl_variables().items())
     return (
-        f"this machine cannot render clips with {chosen} ({' '.join(reason.split())[:300]}): unset these variables "
+        f"this machine cannot render clips with {variables} ({' '.join(reason.split())[:300]}): unset these variables "
         "and, on Debian, apt-get install libosmesa6"
     )
 

@@ -32,11 +32,11 @@ def outlines(model: mujoco.MjModel, camera: Camera, qpos: np.ndarray) -> Mapping
     data.qpos[:] = qpos
     mujoco.mj_kinematics(model, data)
     solid = (model.geom_contype | model.geom_conaffinity) != 0
-    still = model.body_weldid[model.geom_bodyid] == 0
-    drawn = model.geom_rgba[:, 3] > 0
-    edges = np.flatnonzero(still & drawn & ~solid)
+    static = model.body_weldid[model.geom_bodyid] == 0
+    visible = model.geom_rgba[:, 3] > 0
+    edges = np.flatnonzero(static & visible & ~solid)
     names: dict[str, tuple[str, ...]] = {}
-    for wall in np.flatnonzero(solid & ~drawn):
+    for wall in np.flatnonzero(solid & ~visible):
         if _is_facing_eye(model, data, camera, int(wall)):
             continue
         near = [

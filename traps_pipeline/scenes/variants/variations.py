@@ -50,8 +50,8 @@ def with_labels(spec: SceneSpec, count: int) -> tuple[str, tuple[str, ...]]:
     slots = match_slots(get_family(spec.family).questions, spec.question)
     if slots is None or set(choices_in(slots.get("choices", ""))) != set(spec.labels):
         raise Rejected(f"the choices of {spec.question!r} are part of its sentence")
-    others = [colour for colour in PALETTE if colour not in slots.values()]
-    pool = [spec.ground_truth, spec.twin.ground_truth, *_mixed(spec, spec.labels), *_mixed(spec, others)]
+    more_colours = [colour for colour in PALETTE if colour not in slots.values()]
+    pool = [spec.ground_truth, spec.twin.ground_truth, *_mixed(spec, spec.labels), *_mixed(spec, more_colours)]
     labels = _mixed(spec, [*dict.fromkeys(pool)][:count])
     if len(labels) < count:
         raise Rejected(f"there are {len(labels)} answers to choose from, {count} are wanted")
