@@ -18,8 +18,7 @@ from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import PACKAGE
 from traps_pipeline.benchmark.corrections import corrected_scenarios
 from traps_pipeline.benchmark.sharing import Filming, Row, existing_clips, share
-from traps_pipeline.benchmark.specs import released_in_study, spec_of, trajectory_of
-from traps_pipeline.benchmark.versions import clip_content, version_of
+from traps_pipeline.benchmark.specs import clips_version, released_in_study, spec_of, spec_rows, trajectory_of
 from traps_pipeline.protocol.datasets import ARMS as ARM_NAMES
 from traps_pipeline.protocol.datasets import CROSSED, GRADED, beside_of, sides_of, taxonomy_of_category
 from traps_pipeline.scenes.variants.arms import ARMS as SHORTCUT_ARMS
@@ -29,9 +28,8 @@ from traps_pipeline.scenes.variants.variations import VARIATIONS
 from traps_pipeline.scenes.worlds.clips import Clip, note_of, read_clip, save_clip
 from traps_pipeline.scenes.worlds.outcome import Rejected
 from traps_pipeline.scenes.worlds.spec import SceneSpec
-from traps_pipeline.storage.benchmark_tables import ARMS, SCENE_SPECS, VIDEOS, ArmRow
+from traps_pipeline.storage.benchmark_tables import ARMS, VIDEOS, ArmRow
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.video.encode import DamagedClip
 
 ARMS_BY_NAME: Mapping[str, Arm] = {**SHORTCUT_ARMS, GRADED: GRADED_CUT, **VARIATIONS}
 SECONDS_AN_ARM = 2.0  # mean of one core per arm, which is a clip, or two questions, or a proof that it is refused
@@ -74,7 +72,7 @@ def asked_arms(workspace: Workspace, category: str) -> list[str]:
 
 def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tuple[int, bool]:
     """Render missing arms of a category; return `share`'s result. Raises TrapsError."""
-    specs, arms = _specs(workspace, category), asked_arms(workspace, category)
+    specs, arms = spec_rows(workspace, category), asked_arms(workspace, category)
 
     def files(row: Row) -> list[Path]:
         return [file for clip in _clips(workspace, row, arms).values() for file in _files(clip)]
@@ -111,28 +109,18 @@ def seconds_left(workspace: Workspace, category: str) -> float:
 
 def build_arms(workspace: Workspace, category: str) -> list[ArmRow]:
     """Return a category's arms. Raises TrapsError for a missing or damaged one."""
-    specs, arms = _specs(workspace, category), asked_arms(workspace, category)
+    specs, arms = spec_rows(workspace, category), asked_arms(workspace, category)
     of_pairs = {
         (row["scenario_id"], row["side"]): row
         for row in workspace.tables.read(VIDEOS, {"category": category}).to_dict("records")
     }
     films = [clip for row in specs for clip in _clips(workspace, row, arms).values()]
     workspace.store.bring(map(_finding_of, films))
-    try:
-        clips = existing_clips(workspace.store, films)
-    except DamagedClip as error:
-        raise TrapsError(str(error)) from error
-    version = version_of(
-        (clip_content(id_, spec.scene_hash) for id_, spec in released_in_study(workspace, category).items()),
-        (clip_content(row["scenario_id"], row["scene_hash"]) for row in specs),
-    )
+    clips = existing_clips(workspace.store, films)
+    version = clips_version(workspace, category, specs)
     return [
         arm_row for row in specs for arm in arms for arm_row in _rows(workspace, row, arm, of_pairs, clips, version)
     ]
-
-
-def _specs(workspace: Workspace, category: str) -> list[dict[str, Any]]:
-    return workspace.tables.read(SCENE_SPECS, {"category": category}).to_dict("records")
 
 
 def _clips(workspace: Workspace, row: Row, arms: Sequence[str]) -> dict[str, Path]:

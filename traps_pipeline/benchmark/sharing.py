@@ -109,13 +109,16 @@ class _Sharing(Generic[Job]):
 
 
 def existing_clips(store: Store, clips: Iterable[Path]) -> dict[Path, Clip]:
-    """Return existing clips' notes, unfetched. Raises DamagedClip if one differs."""
+    """Return existing clips' notes, unfetched. Raises TrapsError if one differs."""
     paths = [*clips]
     store.bring(map(note_of, paths))
     digests = store.digests(paths)
-    notes = {path: note for path in digests if (note := read_note(path)) is not None}
-    for path, note in notes.items():
-        if digests[path] != note.file_sha256:
-            store.bring([path])
-            check_clip(path, note.file_sha256, note.size_bytes)
+    try:
+        notes = {path: note for path in digests if (note := read_note(path)) is not None}
+        for path, note in notes.items():
+            if digests[path] != note.file_sha256:
+                store.bring([path])
+                check_clip(path, note.file_sha256, note.size_bytes)
+    except DamagedClip as error:
+        raise TrapsError(str(error)) from error
     return notes

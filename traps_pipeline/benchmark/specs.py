@@ -17,11 +17,11 @@ from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import CORRECTIONS, RELEASED, ROOT
 from traps_pipeline.benchmark.corrections import WORDS, Scenario, apply_words, load_scenarios, subset
 from traps_pipeline.benchmark.records import load_released, parse_record
-from traps_pipeline.benchmark.versions import spec_content, version_of
+from traps_pipeline.benchmark.versions import version_of
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.physics.kit import Physics, Wording
 from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory, save_trajectory
-from traps_pipeline.storage.benchmark_tables import SceneSpecRow
+from traps_pipeline.storage.benchmark_tables import SCENE_SPECS, SceneSpecRow
 from traps_pipeline.storage.workspace import Workspace
 
 SECONDS_A_RECORD = 0.04  # measured on one core: read a scenario's trajectories, and recompute its evidence
@@ -153,7 +153,7 @@ def build_specs(workspace: Workspace, category: str) -> tuple[list[SceneSpecRow]
     scenarios = [s for s in load_scenarios(workspace.study).values() if s.category == category]
     resolved = [resolve_scenario(workspace, scenario) for scenario in scenarios]
     released = released_in_study(workspace, category).values()
-    version = version_of(map(spec_content, released), (spec_content(r.spec) for r in resolved))
+    version = version_of((spec.spec_hash for spec in released), (r.spec.spec_hash for r in resolved))
     for item in resolved:
         try:
             get_family(item.spec.family).params_from(item.spec.params)
@@ -161,6 +161,19 @@ def build_specs(workspace: Workspace, category: str) -> tuple[list[SceneSpecRow]
         except ValueError as error:
             raise TrapsError(f"{item.spec.scenario_id}: {error}") from error
     return [_row(workspace, item, version) for item in resolved], resolved
+
+
+def spec_rows(workspace: Workspace, category: str) -> list[dict[str, Any]]:
+    """Return a category's rows of scene_specs."""
+    return workspace.tables.read(SCENE_SPECS, {"category": category}).to_dict("records")
+
+
+def clips_version(workspace: Workspace, category: str, rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return the version of a category's clips, by its rows of scene_specs."""
+    released = released_in_study(workspace, category).items()
+    return version_of(
+        ([id_, spec.scene_hash] for id_, spec in released), ([row["scenario_id"], row["scene_hash"]] for row in rows)
+    )
 
 
 def expected_specs(workspace: Workspace, category: str) -> list[SceneSpecRow]:

@@ -24,16 +24,6 @@ def version_of(released: Iterable[Any], current: Iterable[Any]) -> str:
     return release if digests == sorted(digest(part) for part in released) else f"{release}+{digest(digests)[:8]}"
 
 
-def spec_content(spec: SceneSpec) -> str:
-    """Return the content behind the specs' version: everything."""
-    return spec.spec_hash
-
-
-def clip_content(scenario_id: str, scene_hash: str) -> list[str]:
-    """Return the content behind the clips' version."""
-    return [scenario_id, scene_hash]
-
-
 def item_content(dataset: str, record: Mapping[str, Any]) -> list[Any]:
     """Return a spec's or scene_specs row's content behind a dataset's version."""
     aliases = record["aliases"] if isinstance(record["aliases"], dict) else json.loads(record["aliases"])

@@ -6,19 +6,16 @@ import json
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.sharing import Filming, Row, existing_clips, share
-from traps_pipeline.benchmark.specs import released_in_study, spec_of, trajectory_of
-from traps_pipeline.benchmark.versions import clip_content, version_of
+from traps_pipeline.benchmark.specs import clips_version, released_in_study, spec_of, spec_rows, trajectory_of
 from traps_pipeline.scenes.parts.look import frame_size
 from traps_pipeline.scenes.worlds.clip_cache import ClipCache
 from traps_pipeline.scenes.worlds.clips import Clip, Job, note_of, read_clip, render_pair
-from traps_pipeline.storage.benchmark_tables import SCENE_SPECS, VIDEOS, VideoRow
+from traps_pipeline.storage.benchmark_tables import VIDEOS, VideoRow
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.video.encode import DamagedClip
 
 CLIPS = ("control", "void", "twin")
 SECONDS_A_CLIP = 1.4  # measured on one core (docs/engineering-notes.md)
@@ -26,7 +23,7 @@ SECONDS_A_CLIP = 1.4  # measured on one core (docs/engineering-notes.md)
 
 def render_videos(workspace: Workspace, category: str, *, wait: bool = True) -> tuple[int, bool]:
     """Render a category's missing clips; return `share`'s result. Raises TrapsError."""
-    specs = _specs(workspace, category)
+    specs = spec_rows(workspace, category)
 
     def missing(rows: Sequence[Row]) -> list[Row]:
         existing = workspace.store.there(file for row in rows for file in _files(workspace, row))
@@ -69,22 +66,12 @@ def seconds_left(workspace: Workspace, category: str) -> float:
 
 def build_videos(workspace: Workspace, category: str) -> tuple[list[VideoRow], dict[str, float]]:
     """Return clips, and occluded voids' leaked pixels. Raises TrapsError if missing."""
-    specs = _specs(workspace, category)
-    try:
-        clips = existing_clips(workspace.store, (clip for row in specs for clip in _clips(workspace, row)))
-    except DamagedClip as error:
-        raise TrapsError(str(error)) from error
-    version = version_of(
-        (clip_content(id_, spec.scene_hash) for id_, spec in released_in_study(workspace, category).items()),
-        (clip_content(row["scenario_id"], row["scene_hash"]) for row in specs),
-    )
+    specs = spec_rows(workspace, category)
+    clips = existing_clips(workspace.store, (clip for row in specs for clip in _clips(workspace, row)))
+    version = clips_version(workspace, category, specs)
     rows = [row for spec in specs for row in _rows(workspace, spec, clips, version)]
     voids = {row["scenario_id"]: clips[_clips(workspace, row)[1]].leaked_pixels for row in specs}
     return rows, {id_: pixels for id_, pixels in voids.items() if pixels is not None}
-
-
-def _specs(workspace: Workspace, category: str) -> list[dict[str, Any]]:
-    return workspace.tables.read(SCENE_SPECS, {"category": category}).to_dict("records")
 
 
 def _tick(category: str, total: int, finished: int) -> None:
