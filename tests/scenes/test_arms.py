@@ -118,7 +118,7 @@ def test_what_is_wanted_is_spread_evenly_whatever_the_family() -> None:
     for family in ("plinko", "pachinko_waterfall", "seesaw_sorter", "tumbling_dice"):
         members = [spec for spec in load_released().values() if spec.family == family]
         for first in (10, len(members)):
-            shares = np.sort([graded_cuts.wanted(spec) for spec in members[:first]])
+            shares = np.sort([graded_cuts.target_probability(spec) for spec in members[:first]])
             gaps = np.diff([graded_cuts.LEAST, *shares, 1.0])
             assert gaps.min() >= 0 and gaps.max() < 0.6 * 3 / first, family
 

@@ -18,7 +18,7 @@ from traps_pipeline.scenes.picture.camera import (
     fit_camera,
     fit_occluder,
     fit_shot,
-    in_frame,
+    is_in_frame,
 )
 
 VIEWS = [View(), View(20.0, -5.0, 45.0), View(90.0, -60.0, 30.0), View(200.0, -25.0, 60.0), View(-75.0, -15.0, 20.0)]
@@ -62,7 +62,7 @@ def test_all_points_are_in_frame_and_the_tightest_edges_touch_the_limit(view: Vi
         camera = fit_camera(view, points)
         across, up = fill(camera, points)
         assert max(across, up) == pytest.approx(FRAME_FILL, abs=1e-4)
-        assert in_frame(camera, points)
+        assert is_in_frame(camera, points)
 
 
 def test_a_nearer_camera_of_that_direction_would_lose_a_point() -> None:
@@ -78,9 +78,9 @@ def test_a_nearer_camera_of_that_direction_would_lose_a_point() -> None:
 def test_a_point_at_the_edge_of_the_frame_is_out() -> None:
     camera = Camera((0, 0, 0), 2.0, 90.0, 0.0, 90.0, 1.0, (0, 0, 0))
     edge = 2 * WIDTH / HEIGHT  # across, at a depth of 2 m
-    assert in_frame(camera, np.array([[edge - 0.01, 0, 0], [0, 0, 1.99]]))
-    assert not in_frame(camera, np.array([[edge + 0.01, 0, 0]]))
-    assert not in_frame(camera, np.array([[0, 0, -2.01]]))
+    assert is_in_frame(camera, np.array([[edge - 0.01, 0, 0], [0, 0, 1.99]]))
+    assert not is_in_frame(camera, np.array([[edge + 0.01, 0, 0]]))
+    assert not is_in_frame(camera, np.array([[0, 0, -2.01]]))
 
 
 def assert_hidden(camera: Camera, occluder: Occluder, cover: Box) -> None:
@@ -123,7 +123,7 @@ def test_camera_and_occluder_fit_together(view: View) -> None:
     camera, occluder = fit_shot(view, points, cover)
     assert occluder is not None
     assert_hidden(camera, occluder, cover)
-    assert in_frame(camera, np.concatenate([points, occluder.corners()]))
+    assert is_in_frame(camera, np.concatenate([points, occluder.corners()]))
     alone, none = fit_shot(view, points, None)
     assert none is None
     assert alone == fit_camera(view, points)

@@ -72,7 +72,7 @@ def test_another_scene_another_side_and_another_renderer_are_other_clips(
     cache.keep([clip], SCENE)
     assert not cache.bring(tmp_path / clip.name, "b" * 64)
     assert not cache.bring(tmp_path / clip.name.replace("void", "control"), SCENE)
-    monkeypatch.setattr(clip_cache, "_renderer", lambda: "Mesa 99")
+    monkeypatch.setattr(clip_cache, "_renderer_digest", lambda: "Mesa 99")
     assert not cache.bring(tmp_path / clip.name, SCENE)
 
 

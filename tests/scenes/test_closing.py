@@ -14,7 +14,7 @@ from tests.scenes.released import load
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.benchmark.stored_evidence import answerable_voids
 from traps_pipeline.scenes.certification.certificates import CLOSING, LEGIBLE, ORDER, pair_of
-from traps_pipeline.scenes.parts.vision import after_occluder, before_hold, before_occluder
+from traps_pipeline.scenes.parts.vision import after_occluder, before_occluder
 from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH, Camera, Closing, Occluder
 from traps_pipeline.scenes.picture.checks import closing_frames
 from traps_pipeline.scenes.picture.coming_board import LANDED, coming_board
@@ -166,10 +166,3 @@ def test_an_occluder_that_stands_from_the_start_that_goes_or_that_is_small_close
 def test_frames_after_an_occluder_that_stood_from_the_start_are_those_after_it_goes() -> None:
     assert [len(after_occluder(clip(0, until))) for until in (1, 12, 24)] == [24, 13, 1]
     assert [len(after_occluder(frames)) for frames in (clip(), clip(0), clip(5, 20))] == [25, 25, 25]
-
-
-def test_a_last_frame_that_is_held_is_shown_once() -> None:
-    moving = clip()
-    assert len(before_hold(moving)) == 25
-    assert len(before_hold(np.concatenate([moving[:8], np.repeat(moving[7:8], 17, axis=0)]))) == 8
-    assert len(before_hold(np.repeat(moving[:1], 5, axis=0))) == 1

@@ -14,7 +14,7 @@ from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.scenes.certification.certificates import EXCHANGE, pair_of, stored_evidence
 from traps_pipeline.scenes.certification.evidence import Pair
 from traps_pipeline.scenes.worlds.outcome import compile_scene, simulated
-from traps_pipeline.scenes.worlds.pace import cut_to, lengths, moments
+from traps_pipeline.scenes.worlds.pace import lengths, moments, shortened
 from traps_pipeline.scenes.worlds.shot import shot_of
 from traps_pipeline.scenes.worlds.world import World
 
@@ -52,7 +52,7 @@ def test_a_clip_is_so_long_that_the_outcome_of_neither_world_is_early_or_late() 
 
 
 def test_a_control_closes_when_the_outcome_of_either_world_has_been_in_view_for_a_second() -> None:
-    worlds = [cut_to(world, 40) for world in wholes(BOUNCE)]
+    worlds = [shortened(world, 40) for world in wholes(BOUNCE)]
     drawn = [list(moments(worlds, seed)) for seed in range(30)]
     assert drawn == [list(moments(worlds[::-1], seed)) for seed in range(30)]
     assert min(min(each) for each in drawn) >= 19 + 10
@@ -89,7 +89,7 @@ def of_both(found: Pair, change: Callable[[World], World]) -> Pair:
 
 def test_a_length_that_follows_from_the_control_alone_is_found() -> None:
     found, (control, twin) = pair(BOUNCE), wholes(BOUNCE)
-    early = replace(found, control=cut_to(control, 36), twin=cut_to(twin, 36))
+    early = replace(found, control=shortened(control, 36), twin=shortened(twin, 36))
     assert 36 in {n for seed in range(60) for n in lengths([control], seed)}
     assert "had the twin been the control, the length" in str(failure(early))
 

@@ -118,7 +118,7 @@ def test_an_occluder_of_slats_or_tiles_has_thin_paler_lines_and_is_as_opaque() -
         )
         with world.renderer() as renderer:
             (frame,) = renderer.frames(case.qpos[:1], occluder=True)
-            assert renderer.visible_pixels(case.qpos[-1:], world.concealed, occluder=True).sum() == 0
+            assert renderer.visible_pixels(case.qpos[-1:], world.concealed_geoms, occluder=True).sum() == 0
         shown[material] = frame.astype(int).sum(axis=2)
     paler = {name: (frame > shown["plain"] + 20).sum() for name, frame in shown.items()}
     changed = (shown["tiles"] != shown["plain"]).any(axis=None) and (shown["tiles"] < shown["plain"] - 20).sum()

@@ -11,7 +11,7 @@ from tests.scenes.released import SAMPLED, SIX, Released, first_of_each, load
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.scenes.observe import family_asking
 from traps_pipeline.scenes.parts.vision import blobs, colour_mask
-from traps_pipeline.scenes.parts.wording import asked
+from traps_pipeline.scenes.parts.wording import match_slots
 from traps_pipeline.scenes.physics.kit import COLOURS
 from traps_pipeline.scenes.physics.simulate import swept_points
 from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH
@@ -113,14 +113,14 @@ def test_an_ill_posed_question_belongs_to_no_family_or_asks_for_what_its_observe
 
 def test_a_question_gives_its_template_and_values_back() -> None:
     templates = ("Does the {ball} ball pass the {line} line, yes or no?", "Where is the {ball} ball: left or right?")
-    assert asked(templates, "Does the red ball pass the blue line, yes or no?") == {"ball": "red", "line": "blue"}
-    assert asked(templates, "Where is the red ball: left or right?") == {"ball": "red"}
-    assert asked(templates, "Where is the red ball?") is None
-    assert asked(("Which ball is first: {choices}?",), "Which ball is first: red or blue?") == {
+    assert match_slots(templates, "Does the red ball pass the blue line, yes or no?") == {"ball": "red", "line": "blue"}
+    assert match_slots(templates, "Where is the red ball: left or right?") == {"ball": "red"}
+    assert match_slots(templates, "Where is the red ball?") is None
+    assert match_slots(("Which ball is first: {choices}?",), "Which ball is first: red or blue?") == {
         "choices": "red or blue"
     }
-    assert asked(templates, "Where is the red ball: up or down?") is None
-    assert asked(("{a} or {a}?",), "x or y?") is None  # the same placeholder, two values
+    assert match_slots(templates, "Where is the red ball: up or down?") is None
+    assert match_slots(("{a} or {a}?",), "x or y?") is None  # the same placeholder, two values
 
 
 @pytest.mark.parametrize("colour", [c for c in COLOURS if c not in ("white", "grey", "wood", "black")])

@@ -14,7 +14,7 @@ from traps_pipeline.models.shortcut_rules import CUT_FRAMES
 from traps_pipeline.scenes.certification.certificates import PACE, pair_of, stored_evidence
 from traps_pipeline.scenes.physics.kit import Physics
 from traps_pipeline.scenes.worlds.outcome import compile_scene, simulated
-from traps_pipeline.scenes.worlds.pace import cut_to, lengths, settles_share
+from traps_pipeline.scenes.worlds.pace import lengths, settles_share, shortened
 from traps_pipeline.scenes.worlds.world import World
 
 EARLY, LATE = "catch-0001", "domino_branch-0001"
@@ -42,7 +42,7 @@ def test_an_outcome_that_is_not_early_leaves_the_clip_as_long_as_it_is() -> None
     world = whole(LATE)
     assert world.outcome.commit_frame >= 15
     assert lengths([world], 0) == [50]
-    assert cut_to(world, 50) is world
+    assert shortened(world, 50) is world
 
 
 def test_the_outcome_of_every_released_world_settles_between_three_and_eight_tenths_of_its_clip() -> None:
@@ -62,7 +62,7 @@ def test_a_clip_that_ends_earlier_is_the_beginning_of_the_same_motion() -> None:
 
 @pytest.mark.parametrize(("n_frames", "failure"), [(50, "after 16% of the clip"), (24, None)])
 def test_a_clip_that_goes_on_for_too_long_loses_the_certificate(n_frames: int, failure: str | None) -> None:
-    case, world = load(EARLY), cut_to(whole(EARLY), n_frames)
+    case, world = load(EARLY), shortened(whole(EARLY), n_frames)
     pair = replace(pair_of(case.spec, case.qpos, case.twin), control=world)
     said = PACE.failure(PACE.measured(pair), pair.claim)
     assert (said is None) if failure is None else (said is not None and failure in said)

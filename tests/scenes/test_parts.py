@@ -44,7 +44,7 @@ def world(**positions: list[list[float]]) -> Motion:
 
 
 def test_fields_are_drawn_in_their_order_and_a_group_at_its_first_field() -> None:
-    p, rng = vary.drawn(Params, np.random.default_rng(3)), np.random.default_rng(3)
+    p, rng = vary.draw_params(Params, np.random.default_rng(3)), np.random.default_rng(3)
     assert p.direction == rng.choice([-1, 1])
     colours = [str(c) for c in rng.permutation(["red", "green", "blue", "yellow"])[:3]]
     assert (p.ball_colour, *p.lane_colours) == tuple(colours)
@@ -55,14 +55,14 @@ def test_fields_are_drawn_in_their_order_and_a_group_at_its_first_field() -> Non
 
 
 def test_a_twin_has_another_value_of_the_hidden_element_and_nothing_else() -> None:
-    p = vary.drawn(Params, np.random.default_rng(0))
+    p = vary.draw_params(Params, np.random.default_rng(0))
     others = vary.twins(p)
     assert [other.gate for other in others] == [g for g in ("open", "shut", "ajar") if g != p.gate]
     assert all(vars(other) | {"gate": p.gate} == vars(p) for other in others)
 
 
 def test_the_hidden_element_is_as_likely_whatever_is_seen() -> None:
-    draws = [vary.drawn(Params, np.random.default_rng(seed)) for seed in range(600)]
+    draws = [vary.draw_params(Params, np.random.default_rng(seed)) for seed in range(600)]
     for direction in (-1, 1):
         share = np.mean([p.gate == "shut" for p in draws if p.direction == direction])
         assert abs(share - 1 / 3) < 0.08
@@ -72,8 +72,8 @@ def test_params_that_cannot_be_drawn_are_named() -> None:
     two = make_dataclass("Two", [("a", bool, vary.hidden(False, True)), ("b", bool, vary.hidden(False, True))])
     with raises(TypeError, "scenes.parts.vary.hidden_field"):
         vary.hidden_field(two)
-    with raises(TypeError, "scenes.parts.vary.drawn", "speed"):
-        vary.drawn(make_dataclass("Bare", [("speed", float)]), np.random.default_rng(0))
+    with raises(TypeError, "scenes.parts.vary.draw_params", "speed"):
+        vary.draw_params(make_dataclass("Bare", [("speed", float)]), np.random.default_rng(0))
     with raises(TypeError, "scenes.parts.vary.twins"):
         vary.twins(make_dataclass("Seen", [("speed", float, vary.between(0, 1))])(0.5))
 
@@ -92,7 +92,7 @@ def test_a_stage_mirrors_what_stands_on_it(direction: int) -> None:
     np.testing.assert_allclose(course.post("peg", (0.3, 0, 0.1), 0.02, 0.1, "red").pos, [direction * 0.3, 0, 0.1])
     course.hull("wedge", [(1.0, y, z) for y in (0, 1) for z in (0, 1)] + [(1.6, 0.5, 0)], "green")
     assert course.spec.mesh("wedge").uservert[0] == direction * 1.0
-    p = vary.drawn(Params, np.random.default_rng(0))
+    p = vary.draw_params(Params, np.random.default_rng(0))
     scene = course.scene(
         p, decisive=["ball"], hidden=["wall"], cover=None, in_view=[], things=["red wall"], also=["ball"]
     )
@@ -119,11 +119,11 @@ def test_readings_that_were_worked_by_hand() -> None:
     assert outcome.yes_while(holds, 4) == [None, None, "yes", None, "no"]
     assert outcome.side_while(holds, np.array([1, 1, -1, 1, 1.0])) == [None, None, "no", None, None]
     past = np.array([-0.3, 0.1, -0.1, 0.2, 0.25])
-    assert outcome.crossed(past) == outcome.Reading([None, None, None, "yes", "yes"], 0.25)
-    assert outcome.crossed(-past, np.arange(5) > 3) == outcome.Reading([None] * 4 + ["no"], 0.25)
+    assert outcome.read_crossing(past) == outcome.Reading([None, None, None, "yes", "yes"], 0.25)
+    assert outcome.read_crossing(-past, np.arange(5) > 3) == outcome.Reading([None] * 4 + ["no"], 0.25)
     stays = np.array([-0.6, -0.4, -0.31, -0.3])
-    assert outcome.came_through(stays, 0.05).labels == [None, None, "no", "no"]
-    assert outcome.came_through(stays, 0.05).margin_m == pytest.approx(0.2)
+    assert outcome.read_passage(stays, 0.05).labels == [None, None, "no", "no"]
+    assert outcome.read_passage(stays, 0.05).margin_m == pytest.approx(0.2)
     assert outcome.clear_m(stays, 0.1) == pytest.approx(0.2)
 
 
@@ -139,13 +139,13 @@ def test_the_first_past_a_line_needs_a_lead() -> None:
 
 
 def test_a_question_is_filled_and_read_back() -> None:
-    p = vary.drawn(Params, np.random.default_rng(1))
+    p = vary.draw_params(Params, np.random.default_rng(1))
     asked = questions.yes_no("Does the {ball} ball pass?", yes=["it passes"], no=["it stops"])
     aside = questions.colour_from("ball", "What colour is it: {choices}?", list(COLOURS), unlike=("ball",))
     words = asked.word(p, np.random.default_rng(0), [aside])
     assert words.question == f"Does the {p.ball_colour} ball pass?"
-    assert asked.named_in(words.question) == {"ball": p.ball_colour}
-    assert asked.named_in("Does it pass?") is None
+    assert asked.slots_in(words.question) == {"ball": p.ball_colour}
+    assert asked.slots_in("Does it pass?") is None
     assert words.aliases == {"it passes": "yes", "it stops": "no"}
     other = questions.yes_no("Does {it} pass?", yes=[], no=[], fills=lambda p, rng: {"it": str(rng.choice(["a", "b"]))})
     assert other.word(p, np.random.default_rng(0), [aside]).question in ("Does a pass?", "Does b pass?")

@@ -26,7 +26,7 @@ def test_a_pose_that_stays_is_drawn_once_and_looks_as_if_drawn_again() -> None:
         assert drawn.call_count == already + 1
         # Behind the occluder, without a part, and by segments the same pose is another picture.
         (behind,) = renderer.frames(last[:1], occluder=True)
-        (without,) = renderer.frames(last[:1], without=world.concealed)
+        (without,) = renderer.frames(last[:1], without=world.concealed_geoms)
         seen = renderer.visible_pixels(last[:2], world.geoms)
         (again,) = renderer.frames(last[:1])
         assert drawn.call_count == already + 5

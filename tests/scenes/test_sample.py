@@ -13,14 +13,20 @@ import pytest
 from tests.build.errors import raises
 from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.scenes.draw.likeness import NEAR_SHARE, alike, first_look, perceptual_hash, too_alike
+from traps_pipeline.scenes.draw.likeness import (
+    NEAR_SHARE,
+    excess_lookalike,
+    frame_hash,
+    lookalikes,
+    perceptual_hash,
+)
 from traps_pipeline.scenes.draw.redraw import draw_again
 from traps_pipeline.scenes.draw.sample import (
     _choices,
-    _closed,
+    _full_answers,
     answer_quota,
-    kind_of,
     load_tallies,
+    rejection_kind,
     sample_family,
     take_out,
 )
@@ -53,7 +59,7 @@ def test_an_answer_that_few_questions_offer_has_its_quota_sooner() -> None:
     assert shares["1"] == pytest.approx((1 / 5 + 1 / 6 + 1 / 7) / 3, abs=0.01)
     assert shares["7"] == pytest.approx(1 / 7 / 3, abs=0.01)
     counts = Counter({"1": 20, "7": 20})
-    assert _closed(counts, 125, plinko) == {"7"}  # 125 x 1.5 x .17 = 31 and 125 x 1.5 x .047 = 8 are allowed
+    assert _full_answers(counts, 125, plinko) == {"7"}  # 125 x 1.5 x .17 = 31 and 125 x 1.5 x .047 = 8 are allowed
 
 
 @pytest.fixture(scope="module")
@@ -87,9 +93,11 @@ def test_why_draws_are_rejected_is_said_at_the_first_draw_of_a_kind(tmp_path: Pa
 
 def test_a_reason_is_of_one_kind_whatever_was_measured() -> None:
     small = "outcome 'yes' has a margin of 0.0120 m, below 0.03 m"
-    assert kind_of(small) == kind_of("outcome 'no' has a margin of 0.0041 m, below 0.03 m")
-    assert kind_of("the twin's void differs from the void: in 5 pixels") == "the twin's void differs from the void"
-    assert kind_of("answer 'yes' has its quota") != kind_of(small)
+    assert rejection_kind(small) == rejection_kind("outcome 'no' has a margin of 0.0041 m, below 0.03 m")
+    assert (
+        rejection_kind("the twin's void differs from the void: in 5 pixels") == "the twin's void differs from the void"
+    )
+    assert rejection_kind("answer 'yes' has its quota") != rejection_kind(small)
 
 
 @pytest.mark.slow  # draws one scenario
@@ -184,21 +192,21 @@ def test_a_hash_tells_places_and_not_shades() -> None:
 
 
 def test_records_whose_hashes_differ_in_eight_bits_are_alike_and_in_nine_are_not() -> None:
-    assert alike({"a": 0, "b": 0xFF, "c": 0x1FF << 20}) == {"a": "b", "b": "a"}
+    assert lookalikes({"a": 0, "b": 0xFF, "c": 0x1FF << 20}) == {"a": "b", "b": "a"}
 
 
 def test_a_tenth_of_a_family_may_have_a_neighbour() -> None:
     looks = {f"x-{k}": 0xFFFF << 16 * k for k in range(4)}  # sixteen bits and more apart
-    assert too_alike(looks, 0xFFFF, 20) is None  # two of twenty
-    assert too_alike(looks, 0xFFFF, 19) == "x-0"
-    assert too_alike(looks, 0xFFFF0000 << 8, 19) is None
-    assert too_alike({**looks, "x-9": 0xFFFF}, 0xFFFF0001, 39) == "x-1"  # two were alike, four are more than 3.9
-    assert too_alike({**looks, "x-9": 0xFFFF}, 0xFFFF << 8, 19) is None  # it has no part in it
+    assert excess_lookalike(looks, 0xFFFF, 20) is None  # two of twenty
+    assert excess_lookalike(looks, 0xFFFF, 19) == "x-0"
+    assert excess_lookalike(looks, 0xFFFF0000 << 8, 19) is None
+    assert excess_lookalike({**looks, "x-9": 0xFFFF}, 0xFFFF0001, 39) == "x-1"  # two were alike, four are more than 3.9
+    assert excess_lookalike({**looks, "x-9": 0xFFFF}, 0xFFFF << 8, 19) is None  # it has no part in it
 
 
 @pytest.mark.slow
 def test_few_released_boards_of_plinko_look_like_another() -> None:  # of all families the one where most did
     specs = {id_: spec for id_, spec in load_released().items() if spec.family == "plinko"}
     files = {id_: RELEASED / "trajectories" / f"{id_}.npz" for id_ in specs}
-    looks = {id_: first_look(spec, load_trajectory(files[id_], spec.trajectory_sha256)) for id_, spec in specs.items()}
-    assert len(looks) == 50 and len(alike(looks)) <= NEAR_SHARE * 50
+    looks = {id_: frame_hash(spec, load_trajectory(files[id_], spec.trajectory_sha256)) for id_, spec in specs.items()}
+    assert len(looks) == 50 and len(lookalikes(looks)) <= NEAR_SHARE * 50

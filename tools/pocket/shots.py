@@ -15,10 +15,10 @@ from traps_pipeline.scenes.parts.wording import draw_ill_posed
 from traps_pipeline.scenes.physics.kit import Family, Wording
 from traps_pipeline.scenes.physics.simulate import replay
 from traps_pipeline.scenes.picture import checks
-from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH, Closing, View, fit_camera, fit_shot, in_frame
+from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH, Closing, View, fit_camera, fit_shot, is_in_frame
 from traps_pipeline.scenes.picture.render import Renderer
 from traps_pipeline.scenes.worlds.outcome import Outcome, Rejected, compile_scene, decisive_geoms, simulated
-from traps_pipeline.scenes.worlds.pace import cut_to, lengths
+from traps_pipeline.scenes.worlds.pace import lengths, shortened
 from traps_pipeline.scenes.worlds.world import World
 from traps_pipeline.storage.media import MediaSpec, pick
 
@@ -60,13 +60,13 @@ def draw_shot(family: Family, rng: np.random.Generator, jitter: Jitter | None = 
     outcome = settled_outcome(family, motion, params)
     points = shown_points(model, scene, qpos)
     camera, occluder = fit_shot(scene.view, points, scene.cover)
-    if not in_frame(camera, points):
+    if not is_in_frame(camera, points):
         raise Rejected("something decisive leaves the frame")
     cut = None if occluder is not None else _draw_cut(outcome, physics.fps, rng)
     ill_posed = draw_ill_posed(family.taxonomy, scene.inventory, rng)
     # A draw has one length: to try another one would take a certificate that says so.
     world, seed = World(family, params, physics, qpos, camera, occluder), int(rng.integers(2**31))
-    control = _closed(cut_to(world, lengths((world,), seed)[0]), seed)
+    control = _closed(shortened(world, lengths((world,), seed)[0]), seed)
     if control.outcome.label != outcome.label:
         raise Rejected("the clip ends before its outcome")
     span, held = (0, len(control.qpos)), None
@@ -85,7 +85,7 @@ def _closed(control: World, seed: int) -> World:
     for frame in moments((control,), seed):
         closing = replace(control, closing=Closing(frame, occluder_from(frame, control)))
         with closing.closed_renderer() as renderer:
-            if not renderer.visible_pixels(control.qpos[[frame, -1]], closing.closed_off, occluder=True).any():
+            if not renderer.visible_pixels(control.qpos[[frame, -1]], closing.closed_geoms, occluder=True).any():
                 return closing
     return control
 
@@ -106,7 +106,7 @@ def _jittered(jitter: Jitter, control: World, rng: np.random.Generator) -> tuple
     length = int(rng.integers(round(EARLIEST_CUT_S * fps) + 1, round(LATEST_CUT_S * fps) + 1))
     # A short control ends before the board comes into the picture: on its way it may cover the outcome. A void is held
     # to the very end: of lengths in between there are no controls, so that they alone would tell a void.
-    end = control.clear_frames
+    end = next((i for i, offset in enumerate(control.board) if offset is not None), n)
     return (end - length, end) if short else (0, n), (n if held else None)
 
 
@@ -126,7 +126,7 @@ def render_shot(shot: Shot, spec: MediaSpec) -> tuple[list[np.ndarray], list[np.
             held = qpos[np.minimum(before, shot.cut_frame - 1)]
             void = list(checks.closing_frames(renderer, held, [control.board[i] for i in before]))
             return list(checks.closing_frames(renderer, qpos[shown], [control.board[i] for i in shown])), void
-        if control.closing is None and renderer.visible_pixels(qpos[-1:], control.concealed, occluder=True).any():
+        if control.closing is None and renderer.visible_pixels(qpos[-1:], control.concealed_geoms, occluder=True).any():
             raise Rejected("the occluder does not hide the outcome")
         board = [control.board[i] for i in shown]
         drawn = int((shown < control.open_frames).sum())

@@ -36,7 +36,7 @@ class Case:
 
 def certify_all(
     folder: Path,
-    kept: Path,
+    cache_folder: Path,
     *,
     families: Sequence[str] | None = None,
     workers: int | None = None,
@@ -45,13 +45,13 @@ def certify_all(
 ) -> tuple[list[Verdict], list[str]]:
     """Return verdicts on a folder's records, and all problems, scenarios' ones first.
 
-    Verdicts are cached under `kept` by record and code, so that an interrupted call resumes.
+    Verdicts are cached in `cache_folder` by record and code, so that an interrupted call resumes.
     """
     released = folder / "released"
     specs = [s for s in load_released(released).values() if families is None or s.family in families]
     if not specs:
         raise TrapsError(f"{released}: holds no records of {', '.join(families or ())}")
-    cases = [_case(released, kept, spec) for spec in specs]
+    cases = [_case(released, cache_folder, spec) for spec in specs]
     if fresh:
         for case in cases:
             case.verdict.unlink(missing_ok=True)

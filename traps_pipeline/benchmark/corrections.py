@@ -134,13 +134,13 @@ def fold(released: Mapping[str, SceneSpec], corrections: Sequence[tuple[str, Cor
         id_: Scenario(id_, spec.family, spec.category, spec, where="released") for id_, spec in released.items()
     }
     for where, correction in corrections:
-        known = scenarios.get(correction.scenario_id)
+        scenario = scenarios.get(correction.scenario_id)
         if correction.action == "add":
-            if known is not None or correction.scenario_id in released:
+            if scenario is not None or correction.scenario_id in released:
                 raise TrapsError(
                     f"{where}: cannot add {correction.scenario_id!r}: the id is taken; choose a free number"
                 )
-            scenarios[correction.scenario_id] = _added(where, correction)
+            scenarios[correction.scenario_id] = _add(where, correction)
             continue
         if correction.action in ("keep", "discard", "restore") and correction.changes():
             raise TrapsError(
@@ -148,46 +148,46 @@ def fold(released: Mapping[str, SceneSpec], corrections: Sequence[tuple[str, Cor
                 "use `correct`"
             )
         if correction.action == "restore":
-            scenarios[correction.scenario_id] = _restored(where, correction.scenario_id, released)
+            scenarios[correction.scenario_id] = _restore(where, correction.scenario_id, released)
             continue
-        if known is None:
+        if scenario is None:
             state = "was discarded" if correction.scenario_id in released else "is unknown"
             raise TrapsError(f"{where}: scenario {correction.scenario_id!r} {state}; name a scenario of the benchmark")
         if correction.action == "discard":
             del scenarios[correction.scenario_id]
         elif correction.action == "correct":
-            scenarios[correction.scenario_id] = _corrected(where, known, correction)
+            scenarios[correction.scenario_id] = _correct(where, scenario, correction)
     return dict(sorted(scenarios.items()))
 
 
-def _restored(where: str, scenario_id: str, released: Mapping[str, SceneSpec]) -> Scenario:
+def _restore(where: str, scenario_id: str, released: Mapping[str, SceneSpec]) -> Scenario:
     spec = released.get(scenario_id)
     if spec is None:
         raise TrapsError(f"{where}: scenario {scenario_id!r} was never released; `discard` takes back an added one")
     return Scenario(scenario_id, spec.family, spec.category, spec, where="released")
 
 
-def _corrected(where: str, known: Scenario, correction: Correction) -> Scenario:
+def _correct(where: str, prior: Scenario, correction: Correction) -> Scenario:
     changes = correction.changes()
-    if correction.family not in (None, known.family):
-        raise TrapsError(f"{where}: {known.scenario_id} is of the family {known.family}; a correction cannot change it")
+    if correction.family not in (None, prior.family):
+        raise TrapsError(f"{where}: {prior.scenario_id} is of the family {prior.family}; a correction cannot change it")
     if not changes:
         raise TrapsError(f"{where}: `correct` gives no change; give words, answer or params, or use `keep`")
-    params = known.params
+    params = prior.params
     if "params" in changes:
-        base = params if params is not None else (known.released.params if known.released else {})
+        base = params if params is not None else (prior.released.params if prior.released else {})
         unknown = sorted(set(changes["params"]) - set(base))
         if unknown:
-            raise TrapsError(f"{where}: family {known.family} has no parameters {unknown}; it has {sorted(base)}")
+            raise TrapsError(f"{where}: family {prior.family} has no parameters {unknown}; it has {sorted(base)}")
         params = dict(base) | changes.pop("params")
-    words = dict(known.words) | changes
-    scenario = Scenario(known.scenario_id, known.family, known.category, known.released, words, params, where)
+    words = dict(prior.words) | changes
+    scenario = Scenario(prior.scenario_id, prior.family, prior.category, prior.released, words, params, where)
     if scenario.released is not None and params is None:
         scenario.changed_words()  # an unknown label is an error of this line, found before anything runs
     return scenario
 
 
-def _added(where: str, correction: Correction) -> Scenario:
+def _add(where: str, correction: Correction) -> Scenario:
     changes = correction.changes()
     if correction.family not in family_names() or "params" not in changes:
         raise TrapsError(
@@ -237,10 +237,10 @@ def subset(scenarios: Mapping[str, _OfFamily], study: Study) -> dict[str, _OfFam
     Discarded scenarios are left out without replacement.
     """
     if study.scenarios is not None:
-        unknown = sorted(set(study.scenarios) - set(scenarios) - _ever_known())
+        unknown = sorted(set(study.scenarios) - set(scenarios) - _all_ids())
         if unknown:
-            near = did_you_mean(unknown[0], scenarios) or "; `ls scene_specs/released` shows the families"
-            raise TrapsError(f"the study's `scenarios` name unknown ones, {unknown}{near}")
+            hint = did_you_mean(unknown[0], scenarios) or "; `ls scene_specs/released` shows the families"
+            raise TrapsError(f"the study's `scenarios` name unknown ones, {unknown}{hint}")
         return {id_: scenarios[id_] for id_ in sorted(study.scenarios) if id_ in scenarios}
     if study.per_family is None:
         return dict(scenarios)
@@ -253,7 +253,7 @@ def subset(scenarios: Mapping[str, _OfFamily], study: Study) -> dict[str, _OfFam
     return {id_: scenario for id_, scenario in scenarios.items() if id_ in scenario_ids}
 
 
-def _ever_known() -> set[str]:
+def _all_ids() -> set[str]:
     """Return ids that are or were in the benchmark: released, added, discarded."""
     return set(load_released()) | {correction.scenario_id for _, correction in read_corrections()}
 

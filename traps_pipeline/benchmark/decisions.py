@@ -23,7 +23,7 @@ from traps_pipeline.benchmark.corrections import Correction, Scenario, corrected
 from traps_pipeline.benchmark.records import load_released
 
 FILE = "review.jsonl"
-Signed = Callable[..., Correction]
+Sign = Callable[..., Correction]
 
 
 class DecidedMeanwhile(TrapsError):
@@ -40,60 +40,60 @@ def is_reviewed(decisions: Sequence[Correction]) -> bool:
     return bool(decisions) and decisions[-1].action != "restore"
 
 
-def decide(correction: Correction, seen: int, folder: Path = CORRECTIONS) -> None:
+def decide(correction: Correction, n_seen: int, folder: Path = CORRECTIONS) -> None:
     """Append a decision.
 
-    seen: the number of decisions about the scenario that the reviewer knew of. Raises DecidedMeanwhile if there are
+    n_seen: the number of decisions about the scenario that the reviewer knew of. Raises DecidedMeanwhile if there are
     more by now, and TrapsError if the decision does not fit the record; nothing is written then.
     """
     with _appending(folder) as append:
-        _require_known(correction.scenario_id, seen, folder)
+        _require_known(correction.scenario_id, n_seen, folder)
         append([correction])
 
 
-def undo(scenario_id: str, seen: int, *, who: str, why: str, folder: Path = CORRECTIONS) -> None:
+def undo(scenario_id: str, n_seen: int, *, who: str, why: str, folder: Path = CORRECTIONS) -> None:
     """Append decisions that take back the last one about a scenario.
 
     Raises DecidedMeanwhile as `decide` does, and TrapsError if there is no decision to take back.
     """
     with _appending(folder) as append:
-        own = _require_known(scenario_id, seen, folder)
-        if not is_reviewed(own):
+        decisions = _require_known(scenario_id, n_seen, folder)
+        if not is_reviewed(decisions):
             raise TrapsError(f"{scenario_id}: no decision stands that could be taken back")
         released = load_released()
         other_decisions = [(where, each) for where, each in read_corrections(folder) if each.scenario_id != scenario_id]
-        before = fold(released, [*other_decisions, *(("before", each) for each in own[:-1])]).get(scenario_id)
+        previous = fold(released, [*other_decisions, *(("before", each) for each in decisions[:-1])]).get(scenario_id)
 
-        def signed(action: str, **changes: Any) -> Correction:
-            about = {"who": who, "when": date.today(), "why": why}
-            return Correction.model_validate({"scenario_id": scenario_id, "action": action, **changes, **about})
+        def sign(action: str, **changes: Any) -> Correction:
+            signature = {"who": who, "when": date.today(), "why": why}
+            return Correction.model_validate({"scenario_id": scenario_id, "action": action, **changes, **signature})
 
-        append(_bring_back(scenario_id in released, before, was_reviewed=is_reviewed(own[:-1]), signed=signed))
+        append(_bring_back(scenario_id in released, previous, was_reviewed=is_reviewed(decisions[:-1]), sign=sign))
 
 
-def _bring_back(is_released: bool, before: Scenario | None, *, was_reviewed: bool, signed: Signed) -> list[Correction]:
+def _bring_back(is_released: bool, previous: Scenario | None, *, was_reviewed: bool, sign: Sign) -> list[Correction]:
     """Return decisions that restore a scenario's state, reviewed only if it was."""
     if not is_released:
-        if before is None:
-            return [signed("discard")]  # undo an addition
-        changes = {**before.words, "params": dict(before.params or {})}
-        return [signed("correct", **changes)]
-    steps = [signed("restore")]
-    if before is None:
-        return [*steps, signed("discard")]
-    changes = dict(before.words) | ({} if before.params is None else {"params": dict(before.params)})
+        if previous is None:
+            return [sign("discard")]  # undo an addition
+        changes = {**previous.words, "params": dict(previous.params or {})}
+        return [sign("correct", **changes)]
+    decisions = [sign("restore")]
+    if previous is None:
+        return [*decisions, sign("discard")]
+    changes = dict(previous.words) | ({} if previous.params is None else {"params": dict(previous.params)})
     if changes:
-        return [*steps, signed("correct", **changes)]
-    return [*steps, signed("keep")] if was_reviewed else steps
+        return [*decisions, sign("correct", **changes)]
+    return [*decisions, sign("keep")] if was_reviewed else decisions
 
 
-def _require_known(scenario_id: str, seen: int, folder: Path) -> list[Correction]:
-    own = decisions_on(scenario_id, folder)
-    if len(own) != seen:
+def _require_known(scenario_id: str, n_seen: int, folder: Path) -> list[Correction]:
+    decisions = decisions_on(scenario_id, folder)
+    if len(decisions) != n_seen:
         raise DecidedMeanwhile(
-            f"{scenario_id}: {own[-1].who if own else 'somebody'} decided meanwhile; look at the pair again"
+            f"{scenario_id}: {decisions[-1].who if decisions else 'somebody'} decided meanwhile; look at the pair again"
         )
-    return own
+    return decisions
 
 
 @contextmanager
@@ -103,10 +103,10 @@ def _appending(folder: Path) -> Iterator[Callable[[Sequence[Correction]], None]]
     Raises TrapsError if a later file would overrule them, and if the folder belongs to an installed wheel.
     """
     require_own_corrections(folder).mkdir(parents=True, exist_ok=True)
-    later = sorted(path.name for path in folder.glob("*.jsonl") if path.name > FILE)
-    if later:
+    overruling = sorted(path.name for path in folder.glob("*.jsonl") if path.name > FILE)
+    if overruling:
         raise TrapsError(
-            f"{folder / later[0]}: is read after {FILE}, to which reviews are appended, and would overrule them; "
+            f"{folder / overruling[0]}: is read after {FILE}, to which reviews are appended, and would overrule them; "
             f"rename it to a name that comes before {FILE}"
         )
     path = folder / FILE

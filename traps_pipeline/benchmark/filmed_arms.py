@@ -17,23 +17,21 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import PACKAGE
 from traps_pipeline.benchmark.corrections import corrected_scenarios
-from traps_pipeline.benchmark.sharing import Filming, Row, known_clips, share
-from traps_pipeline.benchmark.specs import released_in_study, spec_of, trajectory_of
-from traps_pipeline.benchmark.versions import clip_content, version_of
+from traps_pipeline.benchmark.sharing import Filming, Row, existing_clips, share
+from traps_pipeline.benchmark.specs import clips_version, released_in_study, spec_of, spec_rows, trajectory_of
 from traps_pipeline.protocol.datasets import ARMS as ARM_NAMES
 from traps_pipeline.protocol.datasets import CROSSED, GRADED, beside_of, sides_of, taxonomy_of_category
-from traps_pipeline.scenes.variants.arms import ARMS as OF_SHORTCUTS
+from traps_pipeline.scenes.variants.arms import ARMS as SHORTCUT_ARMS
 from traps_pipeline.scenes.variants.arms import Arm, Question, Scenario, crossed, partners
 from traps_pipeline.scenes.variants.graded_cuts import GRADED_CUT
 from traps_pipeline.scenes.variants.variations import VARIATIONS
 from traps_pipeline.scenes.worlds.clips import Clip, note_of, read_clip, save_clip
 from traps_pipeline.scenes.worlds.outcome import Rejected
 from traps_pipeline.scenes.worlds.spec import SceneSpec
-from traps_pipeline.storage.benchmark_tables import ARMS, SCENE_SPECS, VIDEOS, ArmRow
+from traps_pipeline.storage.benchmark_tables import ARMS, VIDEOS, ArmRow
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.video.encode import DamagedClip
 
-ARMS_BY_NAME: Mapping[str, Arm] = {**OF_SHORTCUTS, GRADED: GRADED_CUT, **VARIATIONS}
+ARMS_BY_NAME: Mapping[str, Arm] = {**SHORTCUT_ARMS, GRADED: GRADED_CUT, **VARIATIONS}
 SECONDS_AN_ARM = 2.0  # mean of one core per arm, which is a clip, or two questions, or a proof that it is refused
 _RESULT_SUFFIX = ".arm.json"  # suffix of the files with an arm's result
 
@@ -74,26 +72,26 @@ def asked_arms(workspace: Workspace, category: str) -> list[str]:
 
 def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tuple[int, bool]:
     """Render missing arms of a category; return `share`'s result. Raises TrapsError."""
-    specs, arms = _specs(workspace, category), asked_arms(workspace, category)
+    specs, arms = spec_rows(workspace, category), asked_arms(workspace, category)
 
     def files(row: Row) -> list[Path]:
         return [file for clip in _clips(workspace, row, arms).values() for file in _files(clip)]
 
     def missing(rows: Sequence[Row]) -> list[Row]:
-        every = [file for row in rows for file in files(row)]
-        workspace.store.bring(file for file in every if file.name.endswith(_RESULT_SUFFIX))
-        existing = workspace.store.there(every)
+        all_files = [file for row in rows for file in files(row)]
+        workspace.store.bring(file for file in all_files if file.name.endswith(_RESULT_SUFFIX))
+        existing = workspace.store.there(all_files)
         return [row for row in rows if _is_missing(row, _clips(workspace, row, arms), existing)]
 
     def job(row: Row) -> Job | None:
         spec, clips = spec_of(row), _clips(workspace, row, arms)
-        unmade = {arm: clip for arm, clip in clips.items() if not _is_made(spec, arm, clip)}
-        if not unmade:
+        missing_clips = {arm: clip for arm, clip in clips.items() if not _is_made(spec, arm, clip)}
+        if not missing_clips:
             return None
-        return Job(spec, trajectory_of(workspace, row), trajectory_of(workspace, row, "twin"), unmade)
+        return Job(spec, trajectory_of(workspace, row), trajectory_of(workspace, row, "twin"), missing_clips)
 
-    def tick(done: int) -> None:
-        progress.current().tick("arms", f"{category}, scenarios", done, len(specs))
+    def tick(finished: int) -> None:
+        progress.current().tick("arms", f"{category}, scenarios", finished, len(specs))
 
     filming = Filming(f"arms/{category}", missing, files, job, film)
     return share(workspace.store, specs, filming, tick, wait=wait)
@@ -111,28 +109,18 @@ def seconds_left(workspace: Workspace, category: str) -> float:
 
 def build_arms(workspace: Workspace, category: str) -> list[ArmRow]:
     """Return a category's arms. Raises TrapsError for a missing or damaged one."""
-    specs, arms = _specs(workspace, category), asked_arms(workspace, category)
+    specs, arms = spec_rows(workspace, category), asked_arms(workspace, category)
     of_pairs = {
         (row["scenario_id"], row["side"]): row
         for row in workspace.tables.read(VIDEOS, {"category": category}).to_dict("records")
     }
     films = [clip for row in specs for clip in _clips(workspace, row, arms).values()]
     workspace.store.bring(map(_finding_of, films))
-    try:
-        known = known_clips(workspace.store, films)
-    except DamagedClip as error:
-        raise TrapsError(str(error)) from error
-    version = version_of(
-        (clip_content(id_, spec.scene_hash) for id_, spec in released_in_study(workspace, category).items()),
-        (clip_content(row["scenario_id"], row["scene_hash"]) for row in specs),
-    )
+    clips = existing_clips(workspace.store, films)
+    version = clips_version(workspace, category, specs)
     return [
-        arm_row for row in specs for arm in arms for arm_row in _rows(workspace, row, arm, of_pairs, known, version)
+        arm_row for row in specs for arm in arms for arm_row in _rows(workspace, row, arm, of_pairs, clips, version)
     ]
-
-
-def _specs(workspace: Workspace, category: str) -> list[dict[str, Any]]:
-    return workspace.tables.read(SCENE_SPECS, {"category": category}).to_dict("records")
 
 
 def _clips(workspace: Workspace, row: Row, arms: Sequence[str]) -> dict[str, Path]:
@@ -199,16 +187,16 @@ def film(job: Job) -> int:
     """Render and certify a scenario's missing arms; return the number of frames."""
     scenario, frame_count = Scenario.of_record(job.spec, job.qpos, job.twin), 0
     for arm, clip in job.clips.items():
-        of = _record_digest(job.spec, arm)
+        record_digest = _record_digest(job.spec, arm)
         try:
-            known = arm_of(job.spec, arm)
-            known.ask(job.spec)
-            take = known.film(scenario)
+            variant = arm_of(job.spec, arm)
+            variant.ask(job.spec)
+            take = variant.film(scenario)
             if take.frames:
                 frame_count += save_clip(clip, take.frames, scenario.fps)
-            finding = ArmResult(of, None, take.evidence, len(take.frames))
-        except Rejected as why:
-            finding = ArmResult(of, str(why), {})
+            finding = ArmResult(record_digest, None, take.evidence, len(take.frames))
+        except Rejected as rejection:
+            finding = ArmResult(record_digest, str(rejection), {})
         write_text(_finding_of(clip), json.dumps(asdict(finding)))
     return frame_count
 
@@ -218,12 +206,12 @@ def _rows(
     row: Row,
     arm: str,
     of_pairs: Mapping[tuple[str, str], Row],
-    known: Mapping[Path, Clip],
+    clips: Mapping[Path, Clip],
     version: str,
 ) -> Iterator[ArmRow]:
     spec = spec_of(row)
     path = workspace.clip(spec.scenario_id, arm, row["scene_hash"])
-    finding, clip = ArmResult.read(_finding_of(path), _record_digest(spec, arm)), known.get(path)
+    finding, clip = ArmResult.read(_finding_of(path), _record_digest(spec, arm)), clips.get(path)
     if finding is None or (finding.frames and clip is None):
         raise TrapsError(f"{path}: was not filmed; run again")
     empty = ArmRow(
@@ -249,7 +237,7 @@ def _rows(
     for question in arm_of(spec, arm).ask(spec):
         of_pair = question.clip
         if of_pair is not None:
-            columns = _shown_in_pair(of_pairs[spec.scenario_id, of_pair])
+            columns = _pair_clip_columns(of_pairs[spec.scenario_id, of_pair])
         else:
             assert clip is not None, "what shows a clip of its own has frames"
             columns = _clip_columns(workspace.relative(path), clip)
@@ -270,7 +258,7 @@ def _clip_columns(path: str, clip: Clip) -> dict[str, Any]:
     }
 
 
-def _shown_in_pair(row: Row) -> dict[str, Any]:
+def _pair_clip_columns(row: Row) -> dict[str, Any]:
     return {
         "clip": row["path"],
         "media_digest": row["file_sha256"],
@@ -279,11 +267,11 @@ def _shown_in_pair(row: Row) -> dict[str, Any]:
     }
 
 
-def unmade(workspace: Workspace, category: str) -> list[str]:
+def incomplete_reasons(workspace: Workspace, category: str) -> list[str]:
     """Return why a category's table is incomplete: a new arm or a lost clip."""
-    table = workspace.tables.read(ARMS, {"category": category}, ["arm", "clip"])
-    present = set(table["arm"])
+    rows = workspace.tables.read(ARMS, {"category": category}, ["arm", "clip"])
+    present = set(rows["arm"])
     reasons = [f"arm {arm} is asked for now" for arm in asked_arms(workspace, category) if arm not in present]
-    clips = sorted({str(clip) for clip in table["clip"].dropna()})
+    clips = sorted({str(clip) for clip in rows["clip"].dropna()})
     sizes = workspace.sizes(clips)
     return reasons + [f"clip {clip} is gone" for clip in clips if clip not in sizes]

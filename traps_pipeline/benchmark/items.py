@@ -68,8 +68,8 @@ def expected_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
     """
     specs = [asdict(row) for category in categories_of_dataset(dataset) for row in expected_specs(workspace, category)]
     if dataset in UNPAIRED:
-        former = workspace.tables.read_all(SCENE_SPECS, ["spec_hash"])["spec_hash"]
-        unchanged = {spec["scenario_id"] for spec in specs if spec["spec_hash"] in {*former}}
+        stored_hashes = workspace.tables.read_all(SCENE_SPECS, ["spec_hash"])["spec_hash"]
+        unchanged = {spec["scenario_id"] for spec in specs if spec["spec_hash"] in {*stored_hashes}}
         rows = workspace.tables.read_all(ITEMS, dataset=dataset).to_dict("records")
         return [{str(name): value for name, value in row.items()} for row in rows if row["scenario_id"] in unchanged]
     scenes = {spec["scenario_id"]: spec["scene_hash"] for spec in specs}
@@ -121,8 +121,8 @@ def answer_type_of(labels: Sequence[str]) -> str:
     """Return the answer type of a question by its labels."""
     if all(label.isdigit() for label in labels):
         return "numeric"
-    known = {("left", "right"): "direction", ("no", "yes"): "binary"}
-    return next((kind for choices, kind in known.items() if sorted(labels) == [*choices]), "colour")
+    type_of = {("left", "right"): "direction", ("no", "yes"): "binary"}
+    return next((kind for choices, kind in type_of.items() if sorted(labels) == [*choices]), "colour")
 
 
 def commonest_answers(specs: Sequence[Record]) -> dict[str, str]:

@@ -42,7 +42,7 @@ class Filming(Generic[Job]):
 
 
 def share(
-    store: Store, rows: Sequence[Row], of: Filming[Job], tick: Callable[[int], None], *, wait: bool = True
+    store: Store, rows: Sequence[Row], filming: Filming[Job], tick: Callable[[int], None], *, wait: bool = True
 ) -> tuple[int, bool]:
     """Make the missing files of rows, concurrently with other processes.
 
@@ -51,50 +51,50 @@ def share(
     for a damaged clip.
     """
     try:
-        return _Sharing(store, rows, of, tick).work(wait=wait)
+        return _Sharing(store, rows, filming, tick).work(wait=wait)
     except DamagedClip as error:
         raise TrapsError(str(error)) from error
 
 
 class _Sharing(Generic[Job]):
-    def __init__(self, store: Store, rows: Sequence[Row], of: Filming[Job], tick: Callable[[int], None]) -> None:
-        self._store, self._of, self._tick = store, of, tick
-        missing = {id(row) for row in of.missing(rows)}
+    def __init__(self, store: Store, rows: Sequence[Row], filming: Filming[Job], tick: Callable[[int], None]) -> None:
+        self._store, self._filming, self._tick = store, filming, tick
+        missing = {id(row) for row in filming.missing(rows)}
         # By number, which is the same in every process.
-        self._left = {number: row for number, row in enumerate(rows) if id(row) in missing}
-        self._done = len(rows) - len(self._left)
+        self._pending = {number: row for number, row in enumerate(rows) if id(row) in missing}
+        self._finished = len(rows) - len(self._pending)
         self._drawing = deque[tuple[Row, Lease]]()  # in the order of the jobs
 
     def work(self, *, wait: bool) -> tuple[int, bool]:
         n_frames = 0
         try:
-            while self._left:
+            while self._pending:
                 # Draw the next row while files are published, and do not lease it earlier.
-                for _, frames in run_in_order(self._of.draw, self._jobs(), at_once=True):
+                for _, frames in run_in_order(self._filming.draw, self._jobs(), at_once=True):
                     n_frames += frames
                     self._finish(*self._drawing.popleft())
                 if not wait:
                     break
-                if self._left:  # wait only without a job in progress, or two processes might wait for each other
+                if self._pending:  # wait only without a job in progress, or two processes might wait for each other
                     time.sleep(POLL_S)
         finally:
             for _, lease in self._drawing:
                 lease.close()
-        return n_frames, not self._left
+        return n_frames, not self._pending
 
     def _jobs(self) -> Iterator[Job]:
         """Yield jobs of unleased rows, each leased when its job is requested."""
-        for number in [*self._left]:
-            lease = self._store.lease(f"{self._of.name}/{number:06d}")
+        for number in [*self._pending]:
+            lease = self._store.lease(f"{self._filming.name}/{number:06d}")
             if lease is None:
                 continue
-            row = self._left.pop(number)
+            row = self._pending.pop(number)
             self._drawing.append((row, lease))
             self._store.look()  # another process may have finished it
             job = None
-            if self._of.missing([row]):
-                self._store.bring(self._of.files(row))
-                job = self._of.job(row)
+            if self._filming.missing([row]):
+                self._store.bring(self._filming.files(row))
+                job = self._filming.job(row)
             if job is None:
                 self._finish(*self._drawing.pop())
             else:
@@ -103,19 +103,22 @@ class _Sharing(Generic[Job]):
     def _finish(self, row: Row, lease: Lease) -> None:
         """Publish a row's files to the study, and release its lease."""
         with closing(lease):
-            self._store.keep(file for file in self._of.files(row) if file.is_file())
-        self._done += 1
-        self._tick(self._done)
+            self._store.keep(file for file in self._filming.files(row) if file.is_file())
+        self._finished += 1
+        self._tick(self._finished)
 
 
-def known_clips(store: Store, clips: Iterable[Path]) -> dict[Path, Clip]:
-    """Return existing clips' notes, unfetched. Raises DamagedClip if one differs."""
+def existing_clips(store: Store, clips: Iterable[Path]) -> dict[Path, Clip]:
+    """Return existing clips' notes, unfetched. Raises TrapsError if one differs."""
     paths = [*clips]
     store.bring(map(note_of, paths))
     digests = store.digests(paths)
-    known = {path: note for path in digests if (note := read_note(path)) is not None}
-    for path, note in known.items():
-        if digests[path] != note.file_sha256:
-            store.bring([path])
-            check_clip(path, note.file_sha256, note.size_bytes)
-    return known
+    try:
+        notes = {path: note for path in digests if (note := read_note(path)) is not None}
+        for path, note in notes.items():
+            if digests[path] != note.file_sha256:
+                store.bring([path])
+                check_clip(path, note.file_sha256, note.size_bytes)
+    except DamagedClip as error:
+        raise TrapsError(str(error)) from error
+    return notes

@@ -26,15 +26,15 @@ COLUMNS = ("dataset", "cue", "n_pairs", "accuracy", "half_width")
 
 
 class _Cue(NamedTuple):
-    """A cue: what a classifier reads off items, as values that identify it; its features; and the classifier."""
+    """A cue: values that identify what a classifier reads, features, and classifier."""
 
-    seen: Callable[[pd.DataFrame], pd.Series]
+    values: Callable[[pd.DataFrame], pd.Series]
     features: Callable[[pd.DataFrame], np.ndarray]
     model: Callable[[], Pipeline]
 
 
 def shortcuts(
-    items: pd.DataFrame, videos: pd.DataFrame, root: Path, known: MutableMapping[str, list[float]] | None = None
+    items: pd.DataFrame, videos: pd.DataFrame, root: Path, cache: MutableMapping[str, list[float]] | None = None
 ) -> pd.DataFrame:
     """Return how accurately each cue predicts the side, per dataset; 0.5 is chance.
 
@@ -44,19 +44,19 @@ def shortcuts(
     """
     clips = videos.drop_duplicates("path").set_index("path")
     cues, code = _cues(clips, root), [file_digest(Path(__file__)), version("scikit-learn")]
-    rows, used = [], dict[str, list[float]]()
+    rows, results = [], dict[str, list[float]]()
     for dataset in DATASETS:
-        here = items.loc[items["dataset"] == dataset].reset_index(drop=True)
-        if here["scenario_id"].nunique() < FOLDS:
+        data = items.loc[items["dataset"] == dataset].reset_index(drop=True)
+        if data["scenario_id"].nunique() < FOLDS:
             continue
-        of_items: list[Any] = here[["scenario_id", "pair_id", "side"]].to_numpy().tolist()
+        of_items: list[Any] = data[["scenario_id", "pair_id", "side"]].to_numpy().tolist()
         for name, cue in cues.items():
-            key = digest([*code, dataset, name, of_items, cue.seen(here).tolist()])
-            used[key] = (known or {}).get(key) or _accuracy(_hits(here, cue.features(here), cue.model()))
-            rows.append((dataset, name, here["pair_id"].nunique(), *used[key]))
-    if known is not None:
-        known.clear()
-        known.update(used)
+            key = digest([*code, dataset, name, of_items, cue.values(data).tolist()])
+            results[key] = (cache or {}).get(key) or _accuracy(_hits(data, cue.features(data), cue.model()))
+            rows.append((dataset, name, data["pair_id"].nunique(), *results[key]))
+    if cache is not None:
+        cache.clear()
+        cache.update(results)
     return pd.DataFrame(rows, columns=list(COLUMNS))
 
 
@@ -69,8 +69,8 @@ def _cues(clips: pd.DataFrame, root: Path) -> dict[str, _Cue]:
         return lambda items: pd.Series(clips.loc[items["clip"], column])
 
     def by_clip(column: str) -> _Cue:
-        seen = of_clip(column)
-        return _Cue(seen, lambda items: seen(items).to_numpy(float)[:, None], _tree)
+        values = of_clip(column)
+        return _Cue(values, lambda items: values(items).to_numpy(float)[:, None], _tree)
 
     def first_frames(items: pd.DataFrame) -> np.ndarray:
         thumbnails = {path: _thumbnail(root / path) for path in items["clip"].unique()}

@@ -17,11 +17,11 @@ from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import CORRECTIONS, RELEASED, ROOT
 from traps_pipeline.benchmark.corrections import WORDS, Scenario, apply_words, load_scenarios, subset
 from traps_pipeline.benchmark.records import load_released, parse_record
-from traps_pipeline.benchmark.versions import spec_content, version_of
+from traps_pipeline.benchmark.versions import version_of
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.physics.kit import Physics, Wording
 from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory, save_trajectory
-from traps_pipeline.storage.benchmark_tables import SceneSpecRow
+from traps_pipeline.storage.benchmark_tables import SCENE_SPECS, SceneSpecRow
 from traps_pipeline.storage.workspace import Workspace
 
 SECONDS_A_RECORD = 0.04  # measured on one core: read a scenario's trajectories, and recompute its evidence
@@ -57,8 +57,8 @@ def resolve_scenario(workspace: Workspace, scenario: Scenario) -> ResolvedScenar
 def _resolved_anew(workspace: Workspace, scenario: Scenario) -> tuple[SceneSpec, Path]:
     """Return the scene of corrected parameters, with its family's words; stored once."""
     name = _resolved_name(scenario)
-    own = [workspace.trajectories / f"{name}{ending}" for ending in (".npz", ".json")]
-    workspace.store.bring(own)
+    files = [workspace.trajectories / f"{name}{ending}" for ending in (".npz", ".json")]
+    workspace.store.bring(files)
     for folder in (CORRECTIONS / "trajectories", workspace.trajectories):
         if (folder / f"{name}.json").is_file():
             record = (folder / f"{name}.json").read_text(encoding="utf-8")
@@ -70,7 +70,7 @@ def _resolved_anew(workspace: Workspace, scenario: Scenario) -> tuple[SceneSpec,
         raise TrapsError(f"{workspace.trajectories / name}.npz: cannot be written ({error.strerror})") from error
     record = json.dumps(spec.model_dump(mode="json"))
     write_text(workspace.trajectories / f"{name}.json", record)  # last, so that it vouches for the trajectory
-    workspace.store.keep(own)
+    workspace.store.keep(files)
     progress.current().note(
         f"{scenario.scenario_id}: simulated here after {scenario.where}; to freeze it for other machines copy "
         f"trajectories/{name}.* of the workspace to {CORRECTIONS / 'trajectories'}"
@@ -153,7 +153,7 @@ def build_specs(workspace: Workspace, category: str) -> tuple[list[SceneSpecRow]
     scenarios = [s for s in load_scenarios(workspace.study).values() if s.category == category]
     resolved = [resolve_scenario(workspace, scenario) for scenario in scenarios]
     released = released_in_study(workspace, category).values()
-    version = version_of(map(spec_content, released), (spec_content(r.spec) for r in resolved))
+    version = version_of((spec.spec_hash for spec in released), (r.spec.spec_hash for r in resolved))
     for item in resolved:
         try:
             get_family(item.spec.family).params_from(item.spec.params)
@@ -161,6 +161,19 @@ def build_specs(workspace: Workspace, category: str) -> tuple[list[SceneSpecRow]
         except ValueError as error:
             raise TrapsError(f"{item.spec.scenario_id}: {error}") from error
     return [_row(workspace, item, version) for item in resolved], resolved
+
+
+def spec_rows(workspace: Workspace, category: str) -> list[dict[str, Any]]:
+    """Return a category's rows of scene_specs."""
+    return workspace.tables.read(SCENE_SPECS, {"category": category}).to_dict("records")
+
+
+def clips_version(workspace: Workspace, category: str, rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return the version of a category's clips, by its rows of scene_specs."""
+    released = released_in_study(workspace, category).items()
+    return version_of(
+        ([id_, spec.scene_hash] for id_, spec in released), ([row["scenario_id"], row["scene_hash"]] for row in rows)
+    )
 
 
 def expected_specs(workspace: Workspace, category: str) -> list[SceneSpecRow]:
@@ -171,8 +184,8 @@ def expected_specs(workspace: Workspace, category: str) -> list[SceneSpecRow]:
 
     def is_resolved(scenario: Scenario) -> bool:
         name = f"{_resolved_name(scenario)}.json" if scenario.params is not None else ""
-        own = workspace.store.has(workspace.trajectories / name)
-        return not name or own or (CORRECTIONS / "trajectories" / name).is_file()
+        is_stored = workspace.store.has(workspace.trajectories / name)
+        return not name or is_stored or (CORRECTIONS / "trajectories" / name).is_file()
 
     scenarios = [s for s in load_scenarios(workspace.study).values() if s.category == category and is_resolved(s)]
     return [_row(workspace, resolve_scenario(workspace, scenario), "") for scenario in scenarios]

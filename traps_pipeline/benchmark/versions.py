@@ -20,18 +20,8 @@ from traps_pipeline.scenes.worlds.spec import SceneSpec
 def version_of(released: Iterable[Any], current: Iterable[Any]) -> str:
     """Return the release's version, as 0.2.0+3f2a9c01 if current content differs."""
     release = load_release().version
-    now = sorted(digest(part) for part in current)
-    return release if now == sorted(digest(part) for part in released) else f"{release}+{digest(now)[:8]}"
-
-
-def spec_content(spec: SceneSpec) -> str:
-    """Return the content behind the specs' version: everything."""
-    return spec.spec_hash
-
-
-def clip_content(scenario_id: str, scene_hash: str) -> list[str]:
-    """Return the content behind the clips' version."""
-    return [scenario_id, scene_hash]
+    digests = sorted(digest(part) for part in current)
+    return release if digests == sorted(digest(part) for part in released) else f"{release}+{digest(digests)[:8]}"
 
 
 def item_content(dataset: str, record: Mapping[str, Any]) -> list[Any]:

@@ -6,19 +6,16 @@ import json
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.benchmark.sharing import Filming, Row, known_clips, share
-from traps_pipeline.benchmark.specs import released_in_study, spec_of, trajectory_of
-from traps_pipeline.benchmark.versions import clip_content, version_of
+from traps_pipeline.benchmark.sharing import Filming, Row, existing_clips, share
+from traps_pipeline.benchmark.specs import clips_version, released_in_study, spec_of, spec_rows, trajectory_of
 from traps_pipeline.scenes.parts.look import frame_size
 from traps_pipeline.scenes.worlds.clip_cache import ClipCache
 from traps_pipeline.scenes.worlds.clips import Clip, Job, note_of, read_clip, render_pair
-from traps_pipeline.storage.benchmark_tables import SCENE_SPECS, VIDEOS, VideoRow
+from traps_pipeline.storage.benchmark_tables import VIDEOS, VideoRow
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.video.encode import DamagedClip
 
 CLIPS = ("control", "void", "twin")
 SECONDS_A_CLIP = 1.4  # measured on one core (docs/engineering-notes.md)
@@ -26,34 +23,34 @@ SECONDS_A_CLIP = 1.4  # measured on one core (docs/engineering-notes.md)
 
 def render_videos(workspace: Workspace, category: str, *, wait: bool = True) -> tuple[int, bool]:
     """Render a category's missing clips; return `share`'s result. Raises TrapsError."""
-    specs = _specs(workspace, category)
+    specs = spec_rows(workspace, category)
 
     def missing(rows: Sequence[Row]) -> list[Row]:
         existing = workspace.store.there(file for row in rows for file in _files(workspace, row))
         return [row for row in rows if not existing.issuperset(_files(workspace, row))]
 
-    rendered = ClipCache.of_user()
+    cache = ClipCache.of_user()
 
     def is_here(clip: Path, row: Row) -> bool:
-        return read_clip(clip) is not None or (rendered is not None and rendered.bring(clip, row["scene_hash"]))
+        return read_clip(clip) is not None or (cache is not None and cache.bring(clip, row["scene_hash"]))
 
     def job(row: Row) -> Job | None:
-        here = [is_here(clip, row) for clip in _clips(workspace, row)]
-        return None if all(here) else _job(workspace, row)
+        are_here = [is_here(clip, row) for clip in _clips(workspace, row)]
+        return None if all(are_here) else _job(workspace, row)
 
     tick = partial(_tick, category, len(specs))
     rendering = Filming(f"videos/{category}", missing, partial(_files, workspace), job, _render)
     frames, is_whole = share(workspace.store, specs, rendering, tick, wait=wait)
-    if frames and rendered is not None:
-        rendered.trim()
+    if frames and cache is not None:
+        cache.trim()
     return frames, is_whole
 
 
 def _render(job: Job) -> int:
     """Render a scenario's missing clips, cached for other studies; return frame count."""
-    frames, rendered = render_pair(job), ClipCache.of_user()
-    if rendered is not None:
-        rendered.keep(job.clips, job.spec.scene_hash)
+    frames, cache = render_pair(job), ClipCache.of_user()
+    if cache is not None:
+        cache.keep(job.clips, job.spec.scene_hash)
     return frames
 
 
@@ -69,26 +66,16 @@ def seconds_left(workspace: Workspace, category: str) -> float:
 
 def build_videos(workspace: Workspace, category: str) -> tuple[list[VideoRow], dict[str, float]]:
     """Return clips, and occluded voids' leaked pixels. Raises TrapsError if missing."""
-    specs = _specs(workspace, category)
-    try:
-        known = known_clips(workspace.store, (clip for row in specs for clip in _clips(workspace, row)))
-    except DamagedClip as error:
-        raise TrapsError(str(error)) from error
-    version = version_of(
-        (clip_content(id_, spec.scene_hash) for id_, spec in released_in_study(workspace, category).items()),
-        (clip_content(row["scenario_id"], row["scene_hash"]) for row in specs),
-    )
-    rows = [row for spec in specs for row in _rows(workspace, spec, known, version)]
-    voids = {row["scenario_id"]: known[_clips(workspace, row)[1]].leaked_pixels for row in specs}
+    specs = spec_rows(workspace, category)
+    clips = existing_clips(workspace.store, (clip for row in specs for clip in _clips(workspace, row)))
+    version = clips_version(workspace, category, specs)
+    rows = [row for spec in specs for row in _rows(workspace, spec, clips, version)]
+    voids = {row["scenario_id"]: clips[_clips(workspace, row)[1]].leaked_pixels for row in specs}
     return rows, {id_: pixels for id_, pixels in voids.items() if pixels is not None}
 
 
-def _specs(workspace: Workspace, category: str) -> list[dict[str, Any]]:
-    return workspace.tables.read(SCENE_SPECS, {"category": category}).to_dict("records")
-
-
-def _tick(category: str, total: int, done: int) -> None:
-    progress.current().tick("videos", f"{category}, scenarios", done, total)
+def _tick(category: str, total: int, finished: int) -> None:
+    progress.current().tick("videos", f"{category}, scenarios", finished, total)
 
 
 def _clips(workspace: Workspace, row: Row) -> tuple[Path, Path, Path]:
@@ -105,10 +92,10 @@ def _job(workspace: Workspace, row: Row) -> Job:
     return Job(spec_of(row), *trajectories, *_clips(workspace, row))
 
 
-def _rows(workspace: Workspace, spec: Row, known: Mapping[Path, Clip], version: str) -> list[VideoRow]:
+def _rows(workspace: Workspace, spec: Row, clips: Mapping[Path, Clip], version: str) -> list[VideoRow]:
     rows, (width, height) = [], frame_size(json.loads(spec["params"]))
     for side, path in zip(CLIPS, _clips(workspace, spec), strict=True):
-        clip = known.get(path)
+        clip = clips.get(path)
         if clip is None:
             raise TrapsError(f"{path}: was not rendered; run again")
         rows.append(

@@ -1,4 +1,4 @@
-"""Families by name. A family's module is imported when it is asked for; adding a file adds a family.
+"""Registry of scene families by name: a file in `families` adds one.
 
 What would spoil a benchmark is refused: an unknown category, a question that two families have, a hidden element that
 is drawn depending on what is seen.
@@ -31,8 +31,10 @@ def family_names() -> tuple[str, ...]:
 
 @cache
 def get_family(name: str) -> Family:
-    """Return the family of that name. Raises KeyError with the known names, TrapsError if there is none in its file, or
-    one of another name or of an unknown category."""
+    """Return the family of that name.
+
+    Raises KeyError for an unknown name, TrapsError if its file defines none, another name or an unknown category.
+    """
     if name not in family_names():
         raise KeyError(f"unknown family {name!r}; known: {', '.join(family_names())}")
     module = importlib.import_module(f"{package.__name__}.{name}")
@@ -44,17 +46,17 @@ def get_family(name: str) -> Family:
             f"{_file(name)} defines a family named {family.name!r}; give it the name of its file, {name!r}, or rename "
             "the file"
         )
-    known = CATEGORIES[family.taxonomy]
-    if family.category not in known:
+    categories = CATEGORIES[family.taxonomy]
+    if family.category not in categories:
         raise TrapsError(
             f"{_file(name)}: unknown category {family.category!r}; write one of the categories of {family.taxonomy} "
-            f"families: {', '.join(known)}"
+            f"families: {', '.join(categories)}"
         )
     return family
 
 
 def family_digest(name: str) -> str:
-    """Return hexadecimal SHA-256 of a family's file: records of one digest were drawn by the same text."""
+    """Return the SHA-256 of a family's file, the text that drew its records."""
     module_spec = importlib.util.find_spec(f"{package.__name__}.{name}")
     assert module_spec is not None and module_spec.origin is not None, f"{_file(name)} is a file"
     return file_digest(Path(module_spec.origin))
@@ -62,16 +64,15 @@ def family_digest(name: str) -> str:
 
 @cache
 def families() -> tuple[Family, ...]:
-    """Return all families, in the order of their names. Raises TrapsError if two have one question template: an
-    observer would not know which of them is asked."""
+    """Return all families by name. Raises TrapsError if two share a question template."""
     every_family = tuple(get_family(name) for name in family_names())
-    asking: dict[str, str] = {}
+    owner_of: dict[str, str] = {}
     for family in every_family:
         for template in family.questions:
-            other = asking.setdefault(re.sub(r"\{\w+\}", "{}", template), family.name)
-            if other != family.name:
+            owner = owner_of.setdefault(re.sub(r"\{\w+\}", "{}", template), family.name)
+            if owner != family.name:
                 raise TrapsError(
-                    f"{_file(other)} and {_file(family.name)} have one question template, {template!r}; "
+                    f"{_file(owner)} and {_file(family.name)} have one question template, {template!r}; "
                     "word it differently in the newer one"
                 )
     return every_family
@@ -79,8 +80,10 @@ def families() -> tuple[Family, ...]:
 
 @cache
 def fit_to_sample(name: str) -> Family:
-    """Return the family of that name, if scenarios may be drawn of it. Raises TrapsError if its question is another
-    family's too, or if its hidden element is drawn depending on what is seen."""
+    """Return a family that scenarios may be drawn of.
+
+    Raises TrapsError if another family has its question, or its hidden element depends on what is seen.
+    """
     families()
     family = get_family(name)
     dependent = dependence(family)

@@ -1,4 +1,4 @@
-"""The observer: what classical vision can answer from the sampled frames and the question alone.
+"""The observer: what classical vision answers from frames and the question.
 
 It shows that the benchmark is solvable from pixels. It finds the family by the words of the question, so a question
 that no family asks, an ill-posed one above all, is one it cannot answer.
@@ -10,7 +10,7 @@ from functools import cache
 from pathlib import Path
 
 from traps_pipeline.scenes.family_registry import families
-from traps_pipeline.scenes.parts.wording import asked
+from traps_pipeline.scenes.parts.wording import match_slots
 from traps_pipeline.scenes.physics.kit import Family
 from traps_pipeline.video.encode import decode_sampled
 from traps_pipeline.video.policies import SAMPLED, FramePolicy
@@ -18,14 +18,13 @@ from traps_pipeline.video.policies import SAMPLED, FramePolicy
 
 @cache
 def family_asking(question: str) -> Family | None:
-    """Return the family whose templates the question fits, None if there is none."""
-    return next((family for family in families() if asked(family.questions, question) is not None), None)
+    """Return the family whose templates fit the question, None if there is none."""
+    return next((family for family in families() if match_slots(family.questions, question) is not None), None)
 
 
-def observe(clip: Path, question: str, shown: FramePolicy = SAMPLED) -> str | None:
-    """Return the answer that is seen in a clip, of which these frames are shown; None where the decisive thing is not
-    to be seen. What follows something from frame to frame was made for 5 frames a second."""
+def observe(clip: Path, question: str, policy: FramePolicy = SAMPLED) -> str | None:
+    """Return the answer in a clip's frames, or None; made for 5 frames a second."""
     family = family_asking(question)
     if family is None or family.observe is None:
         return None
-    return family.observe(decode_sampled(clip, shown), question)
+    return family.observe(decode_sampled(clip, policy), question)

@@ -71,15 +71,15 @@ def decode(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
     try:
         with av.open(str(path)) as container:
-            promised = container.streams.video[0].frames
+            declared = container.streams.video[0].frames
             pairs = [(f.to_ndarray(format="rgb24"), float(f.time or 0.0)) for f in container.decode(video=0)]
     except (FFmpegError, OSError, IndexError) as error:  # IndexError: no video stream
         raise DamagedClip(
             f"{path}: cannot be decoded ({error}); delete the file and materialize videos again"
         ) from error
-    if not pairs or len(pairs) != promised:
+    if not pairs or len(pairs) != declared:
         raise DamagedClip(
-            f"{path}: holds {len(pairs)} of {promised} frames; delete the file and materialize videos again"
+            f"{path}: holds {len(pairs)} of {declared} frames; delete the file and materialize videos again"
         )
     return np.stack([p[0] for p in pairs]), np.array([p[1] for p in pairs])
 
@@ -112,10 +112,10 @@ def decode_first(path: Path) -> np.ndarray:
         ) from error
 
 
-def decode_sampled(path: Path, shown: FramePolicy = SAMPLED) -> np.ndarray:
+def decode_sampled(path: Path, policy: FramePolicy = SAMPLED) -> np.ndarray:
     """Return the frames (N, H, W, 3) uint8 RGB that a policy shows.
 
     By default 5 a second and at most 25 (docs/spec.md 3.1). Raises DamagedClip.
     """
     frames, times = decode(path)
-    return frames[shown.pick(times)]
+    return frames[policy.pick(times)]

@@ -24,18 +24,18 @@ class FramePolicy:
         return f"{self.uniform} evenly spaced" if self.fps is None else f"{self.fps:g} a second"
 
     def pick(self, times: np.ndarray) -> np.ndarray:
-        """Return indices of the frames nearest to the wanted times, none twice.
+        """Return indices of the frames nearest to the target times, none twice.
 
         times: (F,) seconds, ascending. A grid starts at 0; uniform includes the first frame and the last one. Of two
         equally near frames the earlier one is taken.
         """
         if self.uniform is not None and len(times) <= self.uniform:
             return np.arange(len(times))
-        away = np.abs(times[:, None] - self._wanted(times)).round(9)  # s; rounded, or noise would decide between equals
-        indices = np.unique(away.argmin(axis=0))[: self.uniform or self.most]
+        gaps = np.abs(times[:, None] - self._targets(times)).round(9)  # s; rounded, or noise would break ties
+        indices = np.unique(gaps.argmin(axis=0))[: self.uniform or self.most]
         return np.unique(np.minimum(indices + self.later, len(times) - 1))
 
-    def _wanted(self, times: np.ndarray) -> np.ndarray:
+    def _targets(self, times: np.ndarray) -> np.ndarray:
         if self.fps is None:
             return np.linspace(times[0], times[-1], self.uniform or 1)
         return np.arange(int(times[-1] * self.fps + 1e-6) + 1) / self.fps

@@ -175,9 +175,9 @@ def _seconds_of_filming(workspace: Workspace, category: str) -> float:
 
 
 def _lost_arms(workspace: Workspace, category: str) -> list[str]:
-    from traps_pipeline.benchmark.filmed_arms import unmade
+    from traps_pipeline.benchmark.filmed_arms import incomplete_reasons
 
-    return unmade(workspace, category)
+    return incomplete_reasons(workspace, category)
 
 
 @_stage(

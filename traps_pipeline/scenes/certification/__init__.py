@@ -1,1 +1,1 @@
-"""Certificates of a pair: the evidence, its thresholds, and the ensembles of possible futures."""
+"""Certificates of a pair: evidence, thresholds, and ensembles of possible futures."""

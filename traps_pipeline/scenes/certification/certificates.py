@@ -1,4 +1,4 @@
-"""The certificates of a pair: what each promises, how its evidence is measured, and what the evidence is held against.
+"""Certificates of a pair: promises, evidence, and thresholds.
 
 A certificate is one entry of `CERTIFICATES`. From there it is picked up by `resolve` (a draw that loses one is
 rejected, and what it measures goes into the record), by `certify` (all are measured again from the record and its two
@@ -22,7 +22,7 @@ from traps_pipeline.scenes.certification.evidence import (
     Certificate,
     Claim,
     Evidence,
-    Judged,
+    Failures,
     Number,
     Pair,
     VoidKind,
@@ -33,7 +33,7 @@ from traps_pipeline.scenes.physics.flexes import flexes, is_carrier
 from traps_pipeline.scenes.physics.kit import Family, Motion, Physics, Scene, flag_of
 from traps_pipeline.scenes.physics.simulate import swept_points
 from traps_pipeline.scenes.picture import checks
-from traps_pipeline.scenes.picture.camera import in_frame
+from traps_pipeline.scenes.picture.camera import is_in_frame
 from traps_pipeline.scenes.picture.walls import FACES_THE_EYE_DEG, outlines
 from traps_pipeline.scenes.worlds.outcome import (
     Outcome,
@@ -47,7 +47,7 @@ from traps_pipeline.scenes.worlds.pace import (
     EARLIEST_SHARE,
     LATEST_SHARE,
     READ_S,
-    exchangeable,
+    is_exchangeable,
     lengths,
     moments,
     out_of_pace,
@@ -91,12 +91,12 @@ _NOISE_S = 1e-6  # far below a frame
 
 
 def earliest_cut(physics: Physics) -> int:
-    """Return the first admissible cut frame: its last shown frame, frame - 1, is at 1.0 s or later."""
+    """Return the first admissible cut frame; the frame before is at 1.0 s or later."""
     return math.ceil(EARLIEST_CUT_S * physics.fps - 1e-9) + 1
 
 
 def least_entropy_bits(labels: int) -> float:
-    """Return the least entropy (bits) that a cut must leave open, by the number of answers that the question offers."""
+    """Return the least entropy (bits) of an open cut, by the number of answers."""
     return MIN_ENTROPY_THREE_LABELS_BITS if labels == 3 else MIN_ENTROPY_BITS
 
 
@@ -104,12 +104,12 @@ def least_entropy_bits(labels: int) -> float:
 
 
 def certificates_for(kind: VoidKind, *about: About) -> list[Certificate]:
-    """Return the certificates of pairs with a kind of void, in order; if things are named, only those about them."""
+    """Return the certificates of a kind of void, or those about something, in order."""
     return [c for c in CERTIFICATES if kind in c.kinds and (not about or c.about in about)]
 
 
 def pair_of(spec: SceneSpec, qpos: np.ndarray, twin: np.ndarray, *, frame_step: int = 1) -> Pair:
-    """Return the pair of a record from its trajectories, each (F, nq); nothing of its evidence is read.
+    """Return the pair of a record from its trajectories, (F, nq), without evidence.
 
     frame_step: pixel certificates look at every so many frames (1: full rate; 2: the 5 FPS sample).
     """
@@ -126,14 +126,14 @@ def pair_of(spec: SceneSpec, qpos: np.ndarray, twin: np.ndarray, *, frame_step: 
 
 
 def futures_of(control: World, seed: int, cut: int | None = None) -> ensemble.Futures:
-    """Return the futures of a control by which a cut is chosen, or, if it is chosen, certified."""
+    """Return the futures of a control to choose a cut by, or to certify the cut."""
     first = earliest_cut(control.physics) if cut is None else cut
     alike_px = MAX_DEVIATION_PX / fineness(control.params)
     return ensemble.Futures(control, seed, first=first, alike_px=alike_px, held_s=COMMITTED_BEFORE_END_S)
 
 
 def stored_evidence(spec: SceneSpec) -> dict[str, Any]:
-    """Return the evidence that a record holds, and what it says of void and twin elsewhere."""
+    """Return a record's evidence, and what it says elsewhere of void and twin."""
     evidence = spec.evidence | {"twin_answer": spec.twin.ground_truth}
     physics = Physics(**spec.physics)
     evidence |= _closes(spec.closes_frame, physics)
@@ -152,15 +152,15 @@ def _outcome_evidence(outcome: Outcome, fps: float) -> Evidence:
     return {"label": outcome.label, "commit_s": outcome.commit_frame / fps, "margin_m": outcome.margin_m}
 
 
-def _judge_outcome(e: Evidence, claim: Claim) -> Judged:
+def _judge_outcome(e: Evidence, claim: Claim) -> Failures:
     if "label" in e:
         if e["label"] is None:
             yield "the outcome is undecided at the end of the control"
         if e["label"] != claim.answer:
             yield f"the control shows {e['label']!r}, the record says {claim.answer!r}"
-    left = claim.end_s - e["commit_s"]
-    if left < COMMITTED_BEFORE_END_S - _NOISE_S:
-        yield f"outcome {claim.answer!r} is committed only {left:.1f} s before the end"
+    settled_s = claim.end_s - e["commit_s"]
+    if settled_s < COMMITTED_BEFORE_END_S - _NOISE_S:
+        yield f"outcome {claim.answer!r} is committed only {settled_s:.1f} s before the end"
     least = claim.family.min_margin_m
     if not e["margin_m"] >= least:
         yield f"outcome {claim.answer!r} has a margin of {e['margin_m']:.4f} m, below {least} m"
@@ -181,7 +181,7 @@ OUTCOME = Certificate(
 
 
 def settled_outcome(family: Family, motion: Motion, params: Any) -> Outcome:
-    """Return the outcome of a trajectory, if it could be certified whatever it is. Raises Rejected."""
+    """Return the outcome of a trajectory if it can be certified. Raises Rejected."""
     outcome = read_outcome(family, motion, params)
     fps = 1.0 / float(motion.times[1] - motion.times[0])
     claim = Claim(family, float(motion.times[-1]), 0, outcome.label)
@@ -192,17 +192,17 @@ def settled_outcome(family: Family, motion: Motion, params: Any) -> Outcome:
 
 
 def settled_answer(world: World) -> str | None:
-    """Return what a world ends in; None if it ends in nothing that could be certified."""
+    """Return what a world ends in; None if it cannot be certified."""
     try:
         return settled_outcome(world.family, world.motion, world.params).label
     except Rejected:
         return None
 
 
-def _judge_pace(e: Evidence, claim: Claim) -> Judged:
-    said = out_of_pace(e["settles_share"])
-    if said is not None:
-        yield said
+def _judge_pace(e: Evidence, claim: Claim) -> Failures:
+    failure = out_of_pace(e["settles_share"])
+    if failure is not None:
+        yield failure
 
 
 PACE = Certificate(
@@ -216,7 +216,7 @@ PACE = Certificate(
 )
 
 
-def _judge_turns(e: Evidence, claim: Claim) -> Judged:
+def _judge_turns(e: Evidence, claim: Claim) -> Failures:
     turns = e.get("turns_deg")
     if turns is not None and turns < TURNS_DEG:
         yield f"what the scene is about turns by {turns:.1f} degrees, {TURNS_DEG:.0f} wanted"
@@ -241,11 +241,11 @@ def _walls(pair: Pair) -> Evidence:
         return {"walls_px": {}}
     edges = sorted({edge for names in shown_by.values() for edge in names})
     with control.renderer() as renderer:
-        seen = dict(zip(edges, renderer.visible_pixels(control.qpos[:1], edges)[0].tolist(), strict=True))
-    return {"walls_px": {wall: sum(seen[edge] for edge in names) for wall, names in shown_by.items()}}
+        pixels_of = dict(zip(edges, renderer.visible_pixels(control.qpos[:1], edges)[0].tolist(), strict=True))
+    return {"walls_px": {wall: sum(pixels_of[edge] for edge in names) for wall, names in shown_by.items()}}
 
 
-def _judge_walls(e: Evidence, claim: Claim) -> Judged:
+def _judge_walls(e: Evidence, claim: Claim) -> Failures:
     for wall, pixels in e.get("walls_px", {}).items():
         if pixels < WALL_PIXELS:
             yield f"the edges of {wall!r}, a wall that is not drawn, have {pixels:.0f} pixels, {WALL_PIXELS:.0f} wanted"
@@ -271,16 +271,16 @@ def _physics(pair: Pair) -> Evidence:
     control = pair.control
     if control.same_physics:
         return {"same_physics": True, "simulated_answer": None, "parted_m": 0.0}
-    here = control.resimulated
-    if here.shape != control.qpos.shape:
-        raise Rejected(f"the scene has {here.shape[1]} coordinates, its trajectory others")
+    trajectory = control.resimulated
+    if trajectory.shape != control.qpos.shape:
+        raise Rejected(f"the scene has {trajectory.shape[1]} coordinates, its trajectory others")
     start = round(SAME_START_S * control.physics.fps) + 1
-    parted = float(np.abs(here[:start] - control.qpos[:start]).max())
-    answer = settled_answer(replace(control, qpos=here))
-    return {"same_physics": False, "simulated_answer": answer, "parted_m": parted}
+    parted_m = float(np.abs(trajectory[:start] - control.qpos[:start]).max())
+    answer = settled_answer(replace(control, qpos=trajectory))
+    return {"same_physics": False, "simulated_answer": answer, "parted_m": parted_m}
 
 
-def _judge_physics(e: Evidence, claim: Claim) -> Judged:
+def _judge_physics(e: Evidence, claim: Claim) -> Failures:
     if e.get("same_physics", True):
         return
     if claim.family.taxonomy == "occlusion" and e["simulated_answer"] != claim.answer:
@@ -303,10 +303,10 @@ PHYSICS = Certificate(
 
 def _in_frame(pair: Pair) -> Evidence:
     control = pair.control
-    return {"in_frame": in_frame(control.camera, shown_points(control.model, control.scene, control.qpos))}
+    return {"in_frame": is_in_frame(control.camera, shown_points(control.model, control.scene, control.qpos))}
 
 
-def _judge_in_frame(e: Evidence, claim: Claim) -> Judged:
+def _judge_in_frame(e: Evidence, claim: Claim) -> Failures:
     if not e.get("in_frame", True):
         yield "something decisive leaves the frame"
 
@@ -325,7 +325,7 @@ IN_FRAME = Certificate(
 def legible_groups(
     family: Family, model: mujoco.MjModel, scene: Scene, motion: Motion, params: Any
 ) -> list[tuple[tuple[str, ...], float]]:
-    """Return groups of geoms that must be seen at the end of the control, each with its least number of pixels."""
+    """Return groups of geoms with the least pixels of each at the control's end."""
     if family.legible is not None:
         return list(family.legible(motion, params))
     return [(decisive_geoms(model, [body]), LEGIBLE_PIXELS) for body in scene.decisive]
@@ -338,18 +338,18 @@ def _legible(pair: Pair) -> Evidence:
         raise Rejected("nothing says what must be seen at the end of the control")
     with control.renderer() as renderer:
         last_s = COMMITTED_BEFORE_END_S if control.closing is None else READ_S
-        shown_at = shown_at_end(len(control.qpos), control.physics.fps, last_s, control.open_frames)
-        frames = control.qpos[shown_at]
-        shown = checks.least_visible(renderer, frames, groups)
+        frames_shown = shown_at_end(len(control.qpos), control.physics.fps, last_s, control.open_frames)
+        frames = control.qpos[frames_shown]
+        pixels_by_group = checks.least_visible(renderer, frames, groups)
     too_small = [
         f"{pixels:.0f} of {least:.0f} pixels of {names[0]}"
-        for (names, least), pixels in zip(groups, shown, strict=True)
+        for (names, least), pixels in zip(groups, pixels_by_group, strict=True)
         if pixels < least
     ]
-    return {"too_small": too_small, "least_visible_px": min(shown)}
+    return {"too_small": too_small, "least_visible_px": min(pixels_by_group)}
 
 
-def _judge_legible(e: Evidence, claim: Claim) -> Judged:
+def _judge_legible(e: Evidence, claim: Claim) -> Failures:
     if e.get("too_small"):
         yield f"too small at the end: {e['too_small'][0]}"
     least = LEGIBLE_PIXELS if claim.family.legible is None else 1  # a family's own groups are told by `too_small` alone
@@ -378,7 +378,7 @@ def _order(pair: Pair) -> Evidence:
     return {"order_frames": fewest_within(len(control.qpos), control.physics.fps, span)}
 
 
-def _judge_order(e: Evidence, claim: Claim) -> Judged:
+def _judge_order(e: Evidence, claim: Claim) -> Failures:
     if e["order_frames"] == 0:
         yield "no sampled frame shows the first of two events before the second one has happened"
 
@@ -399,7 +399,7 @@ ORDER = Certificate(
 
 
 def _first_hidden(pair: Pair) -> int:
-    """Return the first frame, of those looked at, from which the void hides what decides."""
+    """Return the first evidence frame from which the void hides what decides."""
     return -(-pair.void_from // pair.control.frame_step)
 
 
@@ -410,7 +410,7 @@ def _hidden(pair: Pair) -> Evidence:
     }
 
 
-def _judge_hidden(e: Evidence, claim: Claim) -> Judged:
+def _judge_hidden(e: Evidence, claim: Claim) -> Failures:
     late = "the occluder does not hide the outcome before it is committed"
     if e.get("past_panel_px"):
         yield f"{late}: {e['past_panel_px']:.0f} pixels of decisive bodies or the hidden element are seen past it"
@@ -433,10 +433,10 @@ HIDDEN = Certificate(
 
 def _ablation(pair: Pair) -> Evidence:
     control = pair.control
-    return {"ablation_px": control.ablation_px(control.looked_at[_first_hidden(pair) :], control.concealed)}
+    return {"ablation_px": control.ablation_px(control.evidence_frames[_first_hidden(pair) :], control.concealed_geoms)}
 
 
-def _judge_ablation(e: Evidence, claim: Claim) -> Judged:
+def _judge_ablation(e: Evidence, claim: Claim) -> Failures:
     if e["ablation_px"] != 0:
         change = f"taking it away changes {e['ablation_px']} pixels of the void"
         yield f"something decisive reaches the eye past the occluder: {change}"
@@ -455,7 +455,7 @@ ABLATION = Certificate(
 )
 
 
-def _judge_answer_of_twin(e: Evidence, claim: Claim) -> Judged:
+def _judge_answer_of_twin(e: Evidence, claim: Claim) -> Failures:
     if e["twin_answer"] in (None, claim.answer) or e["twin_answer"] != claim.twin_answer:
         recorded = f"recorded {claim.twin_answer!r}, the scenario ends in {claim.answer!r}"
         yield f"the twin ends in {e['twin_answer']!r}; {recorded}"
@@ -471,7 +471,7 @@ def _twin_behind_occluder(pair: Pair) -> Evidence:
     }
 
 
-def _judge_twin_behind_occluder(e: Evidence, claim: Claim) -> Judged:
+def _judge_twin_behind_occluder(e: Evidence, claim: Claim) -> Failures:
     if not e.get("hidden_alone", True):
         yield "the twin differs in more, or in less, than the hidden element"
     yield from _judge_answer_of_twin(e, claim)
@@ -493,12 +493,12 @@ TWIN_BEHIND_OCCLUDER = Certificate(
 
 
 def named_nouns(question: str, scene: Scene) -> list[str]:
-    """Return the nouns of a scene's inventory that a question names, in the order of the inventory."""
+    """Return a scene's nouns that a question names, in the inventory's order."""
     text = question.lower()
     return [noun for noun in scene.inventory.objects if re.search(rf"\b{noun}(s|es)?\b", text)]
 
 
-def _called(name: str, nouns: Sequence[str]) -> bool:
+def _is_called(name: str, nouns: Sequence[str]) -> bool:
     return any(name == noun or name.startswith(f"{noun}_") for noun in nouns)
 
 
@@ -513,24 +513,24 @@ def _referents(pair: Pair) -> Evidence:
         pixels = control.pixels_of(decisive_geoms(model, [body]))
         places = control.camera.project(control.motion.pos(body)[:: control.frame_step])
         moves[body] = checks.seen_moving(pixels, places, least_px=REFERENT_PIXELS, step_px=MOVES_PX) / fps
-    flown = [float(control.pixels_of([flag_of(phrase)]).min()) for phrase in scene.marks]
-    shown, least_px, least_s = {}, flown, []
+    flag_px = [float(control.pixels_of([flag_of(phrase)]).min()) for phrase in scene.marks]
+    visibility, least_px, least_s = {}, flag_px, []
     for noun in named_nouns(pair.claim.question, scene):
         nouns = (noun, *scene.shown_by.get(noun, ()))
-        marked = any(phrase.split()[-1] in nouns for phrase in scene.marks)
-        bodies = [moves[body] for body in moves if _called(body, nouns)]
-        still = [name for name in control.geoms if _called(name, nouns) and not _is_of(model, name, moving)]
-        if marked:
-            shown[noun] = "marked"
+        has_flag = any(phrase.split()[-1] in nouns for phrase in scene.marks)
+        bodies = [moves[body] for body in moves if _is_called(body, nouns)]
+        static = [name for name in control.geoms if _is_called(name, nouns) and not _is_of(model, name, moving)]
+        if has_flag:
+            visibility[noun] = "marked"
         elif bodies:
-            shown[noun] = "seen moving" if min(bodies) >= MOVING_S - _NOISE_S else "hidden"
+            visibility[noun] = "seen moving" if min(bodies) >= MOVING_S - _NOISE_S else "hidden"
             least_s.append(min(bodies))
         else:
-            least_px.append(float(control.pixels_of(still).min()))
-            shown[noun] = "in view" if least_px[-1] >= REFERENT_PIXELS else "hidden"
+            least_px.append(float(control.pixels_of(static).min()))
+            visibility[noun] = "in view" if least_px[-1] >= REFERENT_PIXELS else "hidden"
     swept = swept_points(model, control.qpos[:: control.physics.fps // checks.SAMPLED_FPS])
     return {
-        "referents": shown,
+        "referents": visibility,
         "referents_px": min(least_px, default=None),
         "referents_moving_s": None if not least_s else round(min(least_s), 3),
         "cause_moving_s": round(max(moves.values(), default=0.0), 3),
@@ -538,20 +538,20 @@ def _referents(pair: Pair) -> Evidence:
     }
 
 
-def _is_of(model: mujoco.MjModel, drawn: str, bodies: Collection[str]) -> bool:
+def _is_of(model: mujoco.MjModel, name: str, bodies: Collection[str]) -> bool:
     """Return whether a soft body, or a geom's body, is one of some bodies."""
-    return drawn in bodies if drawn in flexes(model) else model.body(int(model.geom(drawn).bodyid[0])).name in bodies
+    return name in bodies if name in flexes(model) else model.body(int(model.geom(name).bodyid[0])).name in bodies
 
 
-def _judge_referents(e: Evidence, claim: Claim) -> Judged:
+def _judge_referents(e: Evidence, claim: Claim) -> Failures:
     if not e["referents"]:
         yield "the question names nothing that is in the scene"
     pixels, moving = e["referents_px"], e["referents_moving_s"]
     if pixels is not None and pixels < REFERENT_PIXELS:
         yield f"something that the question names has {pixels:.0f} pixels in a void frame, {REFERENT_PIXELS:.0f} wanted"
-    for what, seconds in (("something that the question names", moving), ("the cause", e["cause_moving_s"])):
+    for subject, seconds in (("something that the question names", moving), ("the cause", e["cause_moving_s"])):
         if seconds is not None and seconds < MOVING_S - _NOISE_S:
-            yield f"{what} is seen moving for {seconds:.1f} s, {MOVING_S} wanted"
+            yield f"{subject} is seen moving for {seconds:.1f} s, {MOVING_S} wanted"
 
 
 REFERENTS = Certificate(
@@ -580,7 +580,7 @@ def _cut_evidence(frame: int, fps: float) -> Evidence:
     return {"last_shown_s": (frame - 1) / fps, "cut_s": frame / fps}
 
 
-def _judge_cut(e: Evidence, claim: Claim) -> Judged:
+def _judge_cut(e: Evidence, claim: Claim) -> Failures:
     if e["last_shown_s"] < EARLIEST_CUT_S - _NOISE_S or e["cut_s"] > e["commit_s"] + _NOISE_S:
         yield f"the cut at {e['cut_s']:.1f} s is before {EARLIEST_CUT_S} s or after commitment"
 
@@ -598,17 +598,17 @@ CUT = Certificate(
 
 
 def _open(pair: Pair) -> Evidence:
-    here = {"same_physics": pair.control.same_physics}
+    machine = {"same_physics": pair.control.same_physics}
     evidence: Evidence = {}
     for rollouts in pair.futures.batches():
         evidence = ensemble.at_cut(rollouts, pair.void_from, pair.control.family.perturbation).evidence()
-        if OPEN.failure(here | evidence, pair.claim) is None:
+        if OPEN.failure(machine | evidence, pair.claim) is None:
             break
     return {**evidence, **open_from_state(pair.futures, pair.void_from, pair.claim)}
 
 
 def open_from_state(futures: ensemble.Futures, cut: int, claim: Claim) -> Evidence:
-    """Return what the state at a cut leaves open."""
+    """Return the evidence of what the state at a cut leaves open."""
     counts = {label: n for label, n in futures.after(cut).items() if label is not None}
     settled = sum(counts.values())
     return {
@@ -618,12 +618,12 @@ def open_from_state(futures: ensemble.Futures, cut: int, claim: Claim) -> Eviden
     }
 
 
-def _judge_open(e: Evidence, claim: Claim) -> Judged:
-    wanted, least, most = MIN_ACCEPTED, least_entropy_bits(claim.labels), TOP_SHARE
+def _judge_open(e: Evidence, claim: Claim) -> Failures:
+    accepted, least, most = MIN_ACCEPTED, least_entropy_bits(claim.labels), TOP_SHARE
     if not e.get("same_physics", True):
-        wanted, least, most = ELSEWHERE_ACCEPTED, round(least - ELSEWHERE_LESS_BITS, 2), ELSEWHERE_TOP_SHARE
-    if e["accepted"] < wanted:
-        yield f"{e['accepted']} futures that look alike up to the cut have an outcome, {wanted} wanted"
+        accepted, least, most = ELSEWHERE_ACCEPTED, round(least - ELSEWHERE_LESS_BITS, 2), ELSEWHERE_TOP_SHARE
+    if e["accepted"] < accepted:
+        yield f"{e['accepted']} futures that look alike up to the cut have an outcome, {accepted} wanted"
     if e["entropy_bits"] < least:
         yield f"the futures disagree by {e['entropy_bits']:.2f} bits, {least} wanted"
     if e["top_share"] > most:
@@ -632,7 +632,7 @@ def _judge_open(e: Evidence, claim: Claim) -> Judged:
         yield from _judge_open_at_cut(e)
 
 
-def _judge_open_at_cut(e: Evidence) -> Judged:
+def _judge_open_at_cut(e: Evidence) -> Failures:
     if e["cut_settled"] < CUT_SETTLED:
         yield f"{e['cut_settled']} futures of the state at the cut have an outcome, {CUT_SETTLED} wanted"
     if e["cut_top_share"] > CUT_TOP_SHARE:
@@ -689,7 +689,7 @@ def _twin_of_cut(pair: Pair) -> Evidence:
     }
 
 
-def _judge_twin_of_cut(e: Evidence, claim: Claim) -> Judged:
+def _judge_twin_of_cut(e: Evidence, claim: Claim) -> Failures:
     yield from _judge_answer_of_twin(e, claim)
     if e.get("start_off", 0.0) > SAME_TWIN_START:
         yield f"the twin's trajectory begins {e['start_off']:.1e} beside the start that the record names"
@@ -732,19 +732,19 @@ def _closing(pair: Pair) -> Evidence:
     if control.closing is None:
         unread = {"read_answer": None, "read_s": None, "closed_px": None, "closed_change_px": None}
         return {**_closes(None, control.physics), **unread}
-    outcome, end = control.outcome_read, control.closed_at
-    changed = control.ablation_px(end, control.closed_off)
+    outcome, end = control.outcome_read, control.closed_frames
+    ablated = control.ablation_px(end, control.closed_geoms)
     differing, _ = checks.differing_pixels(control.behind_occluder(end), pair.other_world.behind_occluder(end))
     return {
         **_closes(control.closing.frame, control.physics),
         "read_answer": outcome.label,
         "read_s": (control.closing.frame - outcome.commit_frame) / fps,
-        "closed_px": float(control.pixels_of(control.closed_off, end).sum()),
-        "closed_change_px": changed + differing,
+        "closed_px": float(control.pixels_of(control.closed_geoms, end).sum()),
+        "closed_change_px": ablated + differing,
     }
 
 
-def _judge_closing(e: Evidence, claim: Claim) -> Judged:
+def _judge_closing(e: Evidence, claim: Claim) -> Failures:
     if e["closes_s"] is None:
         return
     if e.get("read_answer", claim.answer) != claim.answer:
@@ -781,9 +781,8 @@ CLOSING = Certificate(
 # --- two worlds -------------------------------------------------------------------------------------------------------
 
 
-def _whole(world: World) -> World:
-    """Return a world of a record as it was before its clip was cut to a length: simulated here for as long as its
-    family says."""
+def _uncut(world: World) -> World:
+    """Return a record's world at its family's length, simulated here if it was cut."""
     physics = with_length(world.physics, world.family.physics.n_frames)
     if physics == world.physics:
         return world
@@ -791,37 +790,37 @@ def _whole(world: World) -> World:
 
 
 def _other_settings(pair: Pair) -> list[str]:
-    """Return which settings of a pair its two worlds, in this order, do not give."""
+    """Return the settings of a pair that its worlds, in this order, do not give."""
     worlds, seed = (pair.control, pair.other_world), pair.claim.seed
-    wholes = [_whole(world) for world in worlds]
-    closing, found = pair.control.closing, []
-    if len(pair.control.qpos) not in lengths(wholes, seed):
-        found.append("length")
+    full_worlds = [_uncut(world) for world in worlds]
+    closing, settings = pair.control.closing, []
+    if len(pair.control.qpos) not in lengths(full_worlds, seed):
+        settings.append("length")
     if closing is not None and closing.frame not in moments(worlds, seed):
-        found.append("closing")
-    return found
+        settings.append("closing")
+    return settings
 
 
 def _exchange(pair: Pair) -> Evidence:
-    other, lost = pair.exchanged, None
-    world, twin = other.control, other.other_world
-    so_far: dict[str, Any] = {}
-    exact = exchangeable(world.family) and world.same_physics and twin.same_physics
-    for certificate in certificates_for("occluder", "control") if exchangeable(world.family) else ():
-        so_far |= certificate.measured(other)
-        failure = certificate.failure(so_far, other.claim)
-        if failure is not None and lost is None:
-            lost = f"{certificate.name}: {failure}"
+    exchanged, first_failure = pair.exchanged, None
+    world, twin = exchanged.control, exchanged.other_world
+    evidence: dict[str, Any] = {}
+    exact = is_exchangeable(world.family) and world.same_physics and twin.same_physics
+    for certificate in certificates_for("occluder", "control") if is_exchangeable(world.family) else ():
+        evidence |= certificate.measured(exchanged)
+        failure = certificate.failure(evidence, exchanged.claim)
+        if failure is not None and first_failure is None:
+            first_failure = f"{certificate.name}: {failure}"
     return {
         "twin_commit_s": world.outcome.commit_frame / world.physics.fps,
         "twin_read_answer": None if world.closing is None else world.outcome_read.label,
-        "other_settings": _other_settings(other) if exact else [],
-        "lost_exchanged": lost,
+        "other_settings": _other_settings(exchanged) if exact else [],
+        "lost_exchanged": first_failure,
     }
 
 
-def _judge_exchange(e: Evidence, claim: Claim) -> Judged:
-    if not exchangeable(claim.family):
+def _judge_exchange(e: Evidence, claim: Claim) -> Failures:
+    if not is_exchangeable(claim.family):
         return
     if e.get("other_settings"):
         yield f"had the twin been the control, the {' and the '.join(e['other_settings'])} would be another"
@@ -862,16 +861,16 @@ EXCHANGE = Certificate(
 
 def _words(pair: Pair) -> Evidence:
     taxonomy, inventory = pair.control.family.taxonomy, pair.control.inventory
-    asked = pair.claim.ill_posed_question
+    question = pair.claim.ill_posed_question
     return {
-        "ill_posed_for": refutation(taxonomy, asked, inventory),
+        "ill_posed_for": refutation(taxonomy, question, inventory),
         "question_refuted": refutation(taxonomy, pair.claim.question, inventory),
-        "premises": 1 if taxonomy == "occlusion" else len(false_premises(asked, inventory, near=True)),
-        "true_answer": None if taxonomy == "occlusion" else none_as_answer(asked),
+        "premises": 1 if taxonomy == "occlusion" else len(false_premises(question, inventory, near=True)),
+        "true_answer": None if taxonomy == "occlusion" else none_as_answer(question),
     }
 
 
-def _judge_words(e: Evidence, claim: Claim) -> Judged:
+def _judge_words(e: Evidence, claim: Claim) -> Failures:
     if e["ill_posed_for"] is None:
         yield f"nothing shows that {claim.ill_posed_question!r} has no answer"
     if e["premises"] > 1:
@@ -922,13 +921,13 @@ CERTIFICATES = (
 
 
 def table() -> str:
-    """Return the certificates as the Markdown table of `docs/scenes.md`; a number in brackets depends on the OpenGL."""
+    """Return the certificates as a Markdown table; OpenGL decides numbers in brackets."""
     lines = ["| certificate | promises | does not promise | stored |", "| --- | --- | --- | --- |"]
     for certificate in CERTIFICATES:
         kinds = {"occluder": " (occlusion)", "truncation": " (chaotic)"}
         kind = kinds[certificate.kinds[0]] if len(certificate.kinds) == 1 else ""
-        kept = [number for number in certificate.numbers if number.kept]
-        stored = ", ".join(f"`{number.name}`" if number.compared else f"[`{number.name}`]" for number in kept)
+        numbers = [number for number in certificate.numbers if number.kept]
+        stored = ", ".join(f"`{number.name}`" if number.compared else f"[`{number.name}`]" for number in numbers)
         cells = (f"`{certificate.name}`{kind}", certificate.promises, certificate.does_not_promise, stored)
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)

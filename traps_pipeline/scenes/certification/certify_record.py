@@ -1,4 +1,4 @@
-"""Certifying a record: all its certificates are measured again from its two trajectories, believing nothing it says.
+"""Certification of a record from its two trajectories alone.
 
 `certificates` defines them; `docs/scenes.md` says what each promises and what it does not.
 """
@@ -21,7 +21,7 @@ from traps_pipeline.video.encode import frames_digest
 
 @dataclass(frozen=True)
 class Verdict:
-    """What came of certifying a record.
+    """The result of certifying a record.
 
     failures: certificate -> why it cannot be given; empty if the record passes. measured: the evidence of all
     certificates. same_physics: whether simulating here gives the frozen trajectory bit by bit. control_end, void_end:
@@ -46,25 +46,25 @@ class Verdict:
 
 
 def certify(spec: SceneSpec, qpos: np.ndarray, twin: np.ndarray, *, frame_step: int = 1) -> Verdict:
-    """Measure and judge all certificates of a record from its trajectories qpos and twin, each (F, nq).
+    """Measure and judge all certificates of a record from its trajectories, (F, nq).
 
     What is measured must also be what the record has stored of it. frame_step: pixel certificates look at every so
     many frames (1: full rate; 2: the 5 FPS sample).
     """
-    begun = time.process_time()
+    start_s = time.process_time()
     pair = pair_of(spec, qpos, twin, frame_step=frame_step)
     same_physics = _same_physics(pair)
     failures: dict[str, str] = {}
     measured: dict[str, Any] = {}
     for certificate in certificates_for(spec.void_kind):
         try:
-            found = certificate.measured(pair)
+            evidence = certificate.measured(pair)
         except Rejected as impossible:
             failures[certificate.name] = str(impossible)
             continue
-        measured |= found
+        measured |= evidence
         failure = certificate.failure(measured, pair.claim)
-        failure = failure or certificate.contradiction(found, spec.evidence, exact=same_physics)
+        failure = failure or certificate.contradiction(evidence, spec.evidence, exact=same_physics)
         if failure is not None:
             failures[certificate.name] = failure
     control_end, void_end = _last_frames(pair)
@@ -77,12 +77,12 @@ def certify(spec: SceneSpec, qpos: np.ndarray, twin: np.ndarray, *, frame_step: 
         control_end=control_end,
         void_end=void_end,
         at_cut=state_at_cut(qpos, pair.void_from).tolist() if spec.void_kind == "truncation" else [],
-        cpu_s=time.process_time() - begun,
+        cpu_s=time.process_time() - start_s,
     )
 
 
 def state_at_cut(qpos: np.ndarray, cut_frame: int) -> np.ndarray:
-    """Return poses in the last frame that a cut void shows, and how they changed since the frame before, (2 nq,)."""
+    """Return the last poses of a cut void, and their last change, shape (2 nq,)."""
     last, before = qpos[cut_frame - 1], qpos[max(cut_frame - 2, 0)]  # a void of one frame shows no change
     return np.concatenate([last, last - before])
 

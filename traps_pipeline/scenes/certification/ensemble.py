@@ -1,4 +1,4 @@
-"""The futures of many starts that look the same as a control up to a cut.
+"""Futures of many starts that look the same as a control up to a cut.
 
 The initial state is perturbed far below what a pixel shows and simulated on. A rollout counts for a cut while it cannot
 be told from the control by eye. How many must count, and how they must disagree, is the certificate's (`certificates`).
@@ -57,10 +57,10 @@ class Cut:
 
 @dataclass(frozen=True)
 class Rollout:
-    """One perturbed future. number: which of the starts. parted: first frame that looks different from the control
-    (n_frames if none does).
+    """One perturbed future of a start.
 
-    qpos (F, nq) float32: its trajectory, None if it was given up or diverged.
+    parted: first frame that looks different from the control (n_frames if none does). qpos (F, nq) float32: its
+    trajectory, None if it was given up or diverged.
     """
 
     number: int
@@ -70,15 +70,14 @@ class Rollout:
 
 
 def entropy_bits(counts: Mapping[str, int]) -> float:
-    """Return Shannon entropy (bits) of outcome counts; 0 for no outcome at all."""
+    """Return the Shannon entropy (bits) of outcome counts; 0 for none."""
     total = sum(counts.values())
     return sum(-n / total * math.log2(n / total) for n in counts.values() if n)
 
 
 @dataclass(frozen=True)
 class _Prepared:
-    """What all rollouts of a control have in common. starts (TRIED, nq), shown: outline points (F, N, 2) of the
-    control."""
+    """What all rollouts of a control share. starts (TRIED, nq), shown (F, N, 2) px."""
 
     model: mujoco.MjModel
     starts: np.ndarray
@@ -88,7 +87,7 @@ class _Prepared:
 
 
 class Futures:
-    """Rollouts of perturbed starts of a control, simulated as they are asked for, each once.
+    """Rollouts of perturbed starts of a control, each simulated once, on request.
 
     first: the cut, or the earliest that may be; a rollout that has parted before it counts nowhere and is given up.
     alike_px: a rollout parts from the control when a point of it is further off than this. held_s: so long a label must
@@ -98,7 +97,7 @@ class Futures:
     def __init__(self, control: World, seed: int, *, first: int, alike_px: float, held_s: float) -> None:
         self.first = first
         self._control, self._seed = control, seed
-        self._alike_px, self._held = alike_px, round(held_s * control.physics.fps)
+        self._alike_px, self._held_frames = alike_px, round(held_s * control.physics.fps)
         self._rollouts: list[Rollout] = []
         self._after: dict[tuple[int, int, int], Counter[str | None]] = {}
 
@@ -106,33 +105,32 @@ class Futures:
         """Yield all rollouts so far after each batch of `BATCHES`."""
         for tried in BATCHES:
             if len(self._rollouts) < tried:
-                self._rollouts += self._simulated(range(len(self._rollouts), tried))
+                self._rollouts += self._roll_all(range(len(self._rollouts), tried))
             yield self._rollouts[:tried]
 
     def start(self, number: int) -> np.ndarray:
-        """Return one of the starts, (nq,) float64: it follows from the seed and the control's first row. Raises
-        Rejected if there is none of that number."""
+        """Return a start, (nq,) float64, drawn around the first row. Raises Rejected."""
         if not 0 <= number < TRIED:
             raise Rejected(f"there is no start {number}; there are {TRIED}")
         return self._prepared.starts[number]
 
     def rollout(self, number: int) -> Rollout:
-        """Return the future of one start, simulated here to its end. Raises Rejected if there is none of that
-        number.
-        """
+        """Return the future of one start, simulated here to its end. Raises Rejected."""
         self.start(number)
-        known = self._rollouts[number] if number < len(self._rollouts) else None
-        return self._roll(number, whole=True) if known is None or known.qpos is None else known
+        existing = self._rollouts[number] if number < len(self._rollouts) else None
+        return self._roll(number, to_end=True) if existing is None or existing.qpos is None else existing
 
     def after(self, cut: int, count: int = AT_CUT, *, beyond: int = 0) -> Counter[str | None]:
-        """Return how often the futures of the state in the last frame before a cut end in which outcome (None:
-        undecided): of so many states that differ from it by what no viewer resolves (UNSEEN_PX, READ_OVER_S). Each
-        count has states of its own. beyond: frames after the clip in which what is undecided at its end may settle."""
+        """Return outcome counts of futures of the state before a cut (None: undecided).
+
+        The `count` states differ by what no viewer resolves (UNSEEN_PX, READ_OVER_S), and each count has states of its
+        own. beyond: frames after the clip in which what is undecided at its end may settle.
+        """
         if (cut, count, beyond) not in self._after:
-            self._after[cut, count, beyond] = self._simulated_after(cut, count, beyond)
+            self._after[cut, count, beyond] = self._count_after(cut, count, beyond)
         return self._after[cut, count, beyond]
 
-    def _simulated_after(self, cut: int, count: int, beyond: int) -> Counter[str | None]:
+    def _count_after(self, cut: int, count: int, beyond: int) -> Counter[str | None]:
         import mujoco
 
         model, control = self._prepared.model, self._control
@@ -143,37 +141,37 @@ class Futures:
                 mujoco.mj_step(model, state, control.physics.substeps)
             past[i] = state.qpos
         steps = np.random.default_rng([self._seed, count, cut]).normal(size=(count, 2, model.nv))
-        unseen = unseen_steps(model, state, control.camera)
+        unseen_step = unseen_steps(model, state, control.camera)
 
         def label(step: np.ndarray) -> str | None:
             data = mujoco.MjData(model)
             mujoco.mj_copyData(data, model, state)
-            moved = data.qpos.copy()
-            mujoco.mj_integratePos(model, moved, along_contacts(model, state, step[0] * unseen), 1.0)
-            data.qpos[:] = moved
-            data.qvel += step[1] * unseen * math.sqrt(2) / READ_OVER_S
-            frames, settled = past, None
-            for more in (len(control.qpos) - cut, beyond):
-                if settled is None and more:
-                    frames = np.concatenate([frames, np.empty((more, model.nq))])
-                    for i in range(len(frames) - more, len(frames)):
+            qpos = data.qpos.copy()
+            mujoco.mj_integratePos(model, qpos, along_contacts(model, state, step[0] * unseen_step), 1.0)
+            data.qpos[:] = qpos
+            data.qvel += step[1] * unseen_step * math.sqrt(2) / READ_OVER_S
+            frames, outcome = past, None
+            for n_frames in (len(control.qpos) - cut, beyond):
+                if outcome is None and n_frames:
+                    frames = np.concatenate([frames, np.empty((n_frames, model.nq))])
+                    for i in range(len(frames) - n_frames, len(frames)):
                         mujoco.mj_step(model, data, control.physics.substeps)
                         frames[i] = data.qpos
-                    settled = self._settled(frames) if np.isfinite(frames).all() else None
-            return settled
+                    outcome = self._settled_label(frames) if np.isfinite(frames).all() else None
+            return outcome
 
         with ThreadPoolExecutor(THREADS) as pool:
             return Counter(pool.map(label, steps))
 
-    def _settled(self, frames: np.ndarray) -> str | None:
-        """Return the outcome in which a trajectory (F, nq) ends; None if it is undecided, or not for long enough."""
+    def _settled_label(self, frames: np.ndarray) -> str | None:
+        """Return the settled outcome of a trajectory (F, nq); None if undecided."""
         control = self._control
         labels = control.family.outcome(replay(self._prepared.model, frames, control.physics), control.params).labels
-        return labels[-1] if last_run(labels) <= len(labels) - 1 - self._held else None
+        return labels[-1] if last_run(labels) <= len(labels) - 1 - self._held_frames else None
 
-    def _simulated(self, which: range) -> list[Rollout]:
+    def _roll_all(self, numbers: range) -> list[Rollout]:
         with ThreadPoolExecutor(THREADS) as pool:  # mj_step releases the GIL
-            return list(pool.map(self._roll, which))
+            return list(pool.map(self._roll, numbers))
 
     @cached_property
     def _prepared(self) -> _Prepared:
@@ -182,64 +180,63 @@ class Futures:
         control = self._control
         scene = control.family.build(control.params, control.physics)
         model = scene.spec.compile()
-        silhouette, placed = _Silhouette(model, control.camera), mujoco.MjData(model)
+        silhouette, scratch = _Silhouette(model, control.camera), mujoco.MjData(model)
         start = np.asarray(control.qpos[0], float)
         return _Prepared(
             model=model,
             starts=_perturbed_starts(model, start, control.family.perturbation, self._seed),
             velocity=initial_velocity(model, scene.velocity),
             silhouette=silhouette,
-            shown=np.stack([silhouette.pixels(row, placed) for row in control.qpos]),
+            shown=np.stack([silhouette.pixels(row, scratch) for row in control.qpos]),
         )
 
-    def _roll(self, number: int, *, whole: bool = False) -> Rollout:
-        """Simulate one start to the end of the control; give up if it parts before `first`, unless wanted `whole`."""
+    def _roll(self, number: int, *, to_end: bool = False) -> Rollout:
+        """Simulate one start; give up if it parts before `first`, unless `to_end`."""
         import mujoco
 
         control, prepared = self._control, self._prepared
         shown, outline = prepared.shown, prepared.silhouette
-        data, placed = mujoco.MjData(prepared.model), mujoco.MjData(prepared.model)
+        data, scratch = mujoco.MjData(prepared.model), mujoco.MjData(prepared.model)
         data.qpos[:], data.qvel[:] = prepared.starts[number], prepared.velocity
         frames = np.empty((len(shown), prepared.model.nq))
         parted = len(shown)
         for i in range(len(shown)):
             frames[i] = data.qpos
-            if parted == len(shown) and np.abs(outline.pixels(data.qpos, placed) - shown[i]).max() > self._alike_px:
+            if parted == len(shown) and np.abs(outline.pixels(data.qpos, scratch) - shown[i]).max() > self._alike_px:
                 parted = i
-                if i < self.first and not whole:
+                if i < self.first and not to_end:
                     return Rollout(number, parted, None)
             mujoco.mj_step(prepared.model, data, control.physics.substeps)
         if not np.isfinite(frames).all():
             return Rollout(number, parted, None)
-        return Rollout(number, parted, self._settled(frames), frames.astype(np.float32))
+        return Rollout(number, parted, self._settled_label(frames), frames.astype(np.float32))
 
 
 def at_cut(rollouts: Sequence[Rollout], frame: int, perturbation: float) -> Cut:
     """Return what a cut at one frame leaves open."""
-    alike = [r for r in rollouts if r.parted >= frame]
-    counts = Counter(r.label for r in alike if r.label is not None)
+    lookalikes = [r for r in rollouts if r.parted >= frame]
+    counts = Counter(r.label for r in lookalikes if r.label is not None)
     accepted = counts.total()
     top = max(counts.values(), default=0) / max(accepted, 1)
-    return Cut(frame, entropy_bits(counts), top, accepted, len(rollouts), len(alike) - accepted, perturbation)
+    return Cut(frame, entropy_bits(counts), top, accepted, len(rollouts), len(lookalikes) - accepted, perturbation)
 
 
 def twin_of(rollouts: Sequence[Rollout], frame: int, truth: str | None) -> Rollout:
-    """Return the first accepted rollout at a cut that ends otherwise than the truth: the same clip, another answer."""
+    """Return the first accepted rollout at a cut that does not end in the truth."""
     return next(r for r in rollouts if r.parted >= frame and r.label not in (None, truth))
 
 
 def deviation_px(model: mujoco.MjModel, camera: Camera, qpos: np.ndarray, twin: np.ndarray) -> float:
-    """Return the furthest (px) that any corner or outline point of a moving body is from its place in the other
-    trajectory."""
+    """Return the largest distance (px) between outline points of two trajectories."""
     import mujoco
 
-    silhouette, placed = _Silhouette(model, camera), mujoco.MjData(model)
-    pairs = ((silhouette.pixels(a, placed), silhouette.pixels(b, placed)) for a, b in zip(qpos, twin, strict=True))
+    silhouette, scratch = _Silhouette(model, camera), mujoco.MjData(model)
+    pairs = ((silhouette.pixels(a, scratch), silhouette.pixels(b, scratch)) for a, b in zip(qpos, twin, strict=True))
     return max(float(np.abs(a - b).max()) for a, b in pairs)
 
 
 def _perturbed_starts(model: mujoco.MjModel, start: np.ndarray, scale: float, seed: int) -> np.ndarray:
-    """Return TRIED starts, shape (TRIED, nq): a normal step of one scale (m, rad) on every degree of freedom."""
+    """Return TRIED starts, (TRIED, nq): a normal step on every degree of freedom."""
     import mujoco
 
     steps = np.random.default_rng([seed, TRIED]).normal(scale=scale, size=(TRIED, model.nv))
@@ -250,9 +247,10 @@ def _perturbed_starts(model: mujoco.MjModel, start: np.ndarray, scale: float, se
 
 
 def unseen_steps(model: mujoco.MjModel, data: mujoco.MjData, camera: Camera) -> np.ndarray:
-    """Return how much (m, rad) each degree of freedom may differ, for one standard deviation, where its body is seen
-    from a camera: a body by UNSEEN_PX, and what turns by so much at the point that is furthest from its middle. Shape
-    (nv,)."""
+    """Return the step (m, rad) of each degree of freedom that no viewer sees, (nv,).
+
+    It is one standard deviation: a body moves by UNSEEN_PX, and turns by so much at its furthest point.
+    """
     import mujoco
 
     scales = np.empty(model.nv)
@@ -270,24 +268,22 @@ def unseen_steps(model: mujoco.MjModel, data: mujoco.MjData, camera: Camera) -> 
 
 
 def along_contacts(model: mujoco.MjModel, data: mujoco.MjData, step: np.ndarray) -> np.ndarray:
-    """Return a step (nv,) without the parts that push free bodies into, or off, what they touch: these would hit or
-    drop."""
+    """Return a step (nv,) without parts that push free bodies into or off contacts."""
     normals: dict[int, list[np.ndarray]] = {}
     for contact in data.contact[: data.ncon]:
         for geom in contact.geom:
             normals.setdefault(int(model.geom_bodyid[geom]), []).append(contact.frame[:3])
     along = step.copy()
-    for body, found in normals.items():
+    for body, contact_normals in normals.items():
         if model.body_dofnum[body] == 6:
             dof = int(model.body_dofadr[body])
-            directions = np.array(found)
+            directions = np.array(contact_normals)
             along[dof : dof + 3] -= np.linalg.pinv(directions) @ directions @ along[dof : dof + 3]
     return along
 
 
 class _Silhouette:
-    """Pixels by which two poses are told apart: the corners of moving geoms' boxes, the outline of moving balls, the
-    vertices of soft bodies.
+    """Points by which two poses differ to the eye: boxes, balls' outlines, vertices.
 
     A ball's outline does not turn with the ball: its spin cannot be seen.
     """
@@ -307,8 +303,10 @@ class _Silhouette:
         self._outline = model.geom_size[self._balls, :1, None] * outline
 
     def pixels(self, qpos: np.ndarray, data: mujoco.MjData) -> np.ndarray:
-        """Return pixel coordinates of all outline points in one pose, shape (N, 2). data: where it is computed, of the
-        model; its own for each thread, and made once, since making it takes longer than all else here."""
+        """Return pixel coordinates of all outline points in one pose, shape (N, 2).
+
+        data: scratch space of the model, one for each thread, since making it takes longest.
+        """
         import mujoco
 
         data.qpos[:] = qpos

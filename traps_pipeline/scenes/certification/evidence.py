@@ -1,4 +1,4 @@
-"""What a certificate is: numbers measured of a pair, and a rule that they are held against.
+"""Certificates as such: numbers measured of a pair, and a rule that judges them.
 
 Measuring needs the pair. Judging is a pure function of numbers and of what the record claims, so that fresh evidence
 and stored evidence are judged alike.
@@ -20,12 +20,12 @@ from traps_pipeline.scenes.worlds.world import World
 Evidence = Mapping[str, Any]
 VoidKind = Literal["occluder", "truncation"]
 About = Literal["control", "void", "twin", "worlds", "words"]
-Judged = Iterator[str]  # the failures, in words
+Failures = Iterator[str]  # the failures, in words
 
 
 @dataclass(frozen=True)
 class Claim:
-    """What a record says of itself, which its evidence is held against besides the thresholds.
+    """What a record claims, which its evidence is held against besides thresholds.
 
     end_s: time of the control's last frame. labels: how many answers the question offers. seed: what is drawn of the
     pair follows from it.
@@ -58,7 +58,7 @@ class Claim:
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """A pair to be certified; a draw's has no void and no twin until they are found.
+    """A pair to certify; a draw's has no void and no twin until they are chosen.
 
     futures: of perturbed starts of the control. void_frame: from which the void shows nothing decisive: the first
     hidden frame, or the cut. rollout: which of the futures the twin is (chaotic).
@@ -73,30 +73,32 @@ class Pair:
 
     @property
     def void_from(self) -> int:
-        """`void_frame`. Raises Rejected as long as there is no void."""
+        """`void_frame`. Raises Rejected while there is no void."""
         if self.void_frame is None:
             raise Rejected("the pair has no void")
         return self.void_frame
 
     @property
     def other_world(self) -> World:
-        """The twin. Raises Rejected as long as there is none."""
+        """The twin. Raises Rejected while there is none."""
         if self.twin is None:
             raise Rejected("the pair has no twin")
         return self.twin
 
     @property
     def exchanged(self) -> Pair:
-        """The pair whose control is the twin, and whose twin is the control. Raises Rejected if there is no twin."""
+        """The pair with control and twin exchanged. Raises Rejected without a twin."""
         claim = replace(self.claim, answer=self.claim.twin_answer, twin_answer=self.claim.answer)
         return replace(self, control=self.other_world, twin=self.control, claim=claim)
 
 
 @dataclass(frozen=True)
 class Number:
-    """A piece of evidence. decimals: it is stored rounded to so many. kept: it is stored in the record.
-    compared: measured again it must be what is stored; not so what another OpenGL draws otherwise. of_futures: it
-    depends on the last bit of the arithmetic, so that it is compared only where that is the record's."""
+    """A piece of evidence, rounded to `decimals` and, if `kept`, stored in the record.
+
+    compared: measured again it must equal what is stored, which another OpenGL may draw otherwise. of_futures: it
+    depends on the last bit of arithmetic, so it is compared only where that is the record's.
+    """
 
     name: str
     decimals: int | None = None
@@ -105,13 +107,11 @@ class Number:
     of_futures: bool = False
 
     def stored(self, value: Any) -> Any:
-        """Return the value as a record has it."""
+        """Return the value as a record stores it."""
         return value if self.decimals is None else round(value, self.decimals)
 
     def is_stored(self, value: Any, stored: Any, *, exact: bool) -> bool:
-        """Return whether a value measured again is the stored one; if not exact, to one unit of the last stored
-        digit.
-        """
+        """Return whether a value is the stored one, within a last digit if not exact."""
         if exact or self.decimals is None:
             return self.stored(value) == stored
         return abs(self.stored(value) - stored) < 1.5 * 10**-self.decimals
@@ -134,25 +134,25 @@ class Certificate:
     does_not_promise: str
     numbers: tuple[Number, ...]
     measure: Callable[[Pair], Evidence]
-    judge: Callable[[Evidence, Claim], Judged]
+    judge: Callable[[Evidence, Claim], Failures]
     kinds: tuple[VoidKind, ...] = ("occluder", "truncation")
 
     def measured(self, pair: Pair) -> Evidence:
-        """Return the evidence. Raises Rejected if there is none in this pair."""
+        """Return the evidence of a pair. Raises Rejected if it has none."""
         evidence = self.measure(pair)
         if list(evidence) != [number.name for number in self.numbers]:
             raise TypeError(f"certificate {self.name}: measures {list(evidence)}, not what its `numbers` say")
         return evidence
 
     def failure(self, evidence: Evidence, claim: Claim) -> str | None:
-        """Return why the certificate cannot be given by some evidence, None if it can."""
+        """Return why some evidence does not earn the certificate, None if it does."""
         try:
             return next(self.judge(evidence, claim), None)
         except KeyError as missing:
             return f"no evidence {missing}"
 
     def contradiction(self, evidence: Evidence, stored: Evidence, *, exact: bool) -> str | None:
-        """Return how evidence that was measured again contradicts what a record has stored, None if it does not.
+        """Return how new evidence contradicts the stored, None if it does not.
 
         exact: this machine's arithmetic is that of the one which stored it, so that not even the last digit may differ.
         """
@@ -172,9 +172,9 @@ class Certificate:
         return {n.name: n.stored(evidence[n.name]) for n in self.numbers if n.kept and n.name in evidence}
 
 
-def required(certificates: Iterable[Certificate], pair: Pair, so_far: Evidence) -> dict[str, Any]:
-    """Return all evidence once these are measured too. Raises Rejected with the first failure."""
-    evidence = dict(so_far)
+def required(certificates: Iterable[Certificate], pair: Pair, evidence_so_far: Evidence) -> dict[str, Any]:
+    """Return evidence with that of some certificates. Raises Rejected at a failure."""
+    evidence = dict(evidence_so_far)
     for certificate in certificates:
         evidence |= certificate.measured(pair)
         failure = certificate.failure(evidence, pair.claim)

@@ -1,1 +1,1 @@
-"""Draw scenarios of a family: sample, resolve, trim the occluder, close the control, redraw."""
+"""Draws of scenarios: sample, resolve, trim the occluder, close the control."""

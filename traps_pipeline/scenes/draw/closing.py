@@ -1,9 +1,8 @@
-"""How a control ends: some time after its outcome has settled, an occluder comes before it and stands to the end.
+"""Closing of controls: an occluder comes once the outcome has settled, and stays.
 
-So the last frame tells nobody the answer, and a model must have watched. In an occlusion scene the occluder is that of
-the void, where the void has it: control and void then end in the same frames, and the last frame does not tell the one
-from the other. In a chaotic scene it stands before the place where all outcomes lie, and before whatever moves in
-either world, so that its place tells nothing of the answer.
+So the last frame does not tell the answer, and a model must have watched. In an occlusion scene the occluder is that of
+the void: control and void then end in the same frames. In a chaotic scene it stands before the place of all outcomes
+and before whatever moves in either world, so that its place tells nothing of the answer.
 
 Every control closes that can: drawn among them, an occluder at the end would tell something of the side after all.
 """
@@ -24,42 +23,39 @@ from traps_pipeline.scenes.worlds.shot import box_around
 from traps_pipeline.scenes.worlds.world import World
 
 
-def closed(pair: Pair, seed: int, so_far: Mapping[str, Any]) -> tuple[Pair, dict[str, Any]]:
-    """Return a pair whose control closes, at a moment that follows from the seed, with the evidence of it; the pair as
-    it is if its control can be closed at no moment that is tried. so_far: the evidence of all other certificates.
-    Raises Rejected if not even that can be certified."""
+def close_control(pair: Pair, seed: int, evidence: Mapping[str, Any]) -> tuple[Pair, dict[str, Any]]:
+    """Close the control at a moment drawn by seed, if one can be. Raises Rejected."""
     worlds = pair.control, pair.other_world
     for frame in moments(worlds[:1] if pair.control.occluder is None else worlds, seed):
         try:
-            return _certified(pair, Closing(frame, occluder_from(frame, *worlds)), so_far)
+            return _certified(pair, Closing(frame, occluder_from(frame, *worlds)), evidence)
         except Rejected:
             continue  # another moment may do
-    return _certified(pair, None, so_far)
+    return _certified(pair, None, evidence)
 
 
-def _certified(pair: Pair, closing: Closing | None, so_far: Mapping[str, Any]) -> tuple[Pair, dict[str, Any]]:
-    """Return a pair whose control ends like this, with all evidence. Raises Rejected."""
+def _certified(pair: Pair, closing: Closing | None, evidence: Mapping[str, Any]) -> tuple[Pair, dict[str, Any]]:
+    """Return a pair whose control ends like this, and all evidence. Raises Rejected."""
     control, twin = replace(pair.control, closing=closing), replace(pair.other_world, closing=closing)
     ending = replace(pair, control=control, twin=twin)
-    kind: VoidKind = "truncation" if control.occluder is None else "occluder"
-    certificates = (LEGIBLE, ORDER, CLOSING, *certificates_for(kind, "worlds"))
-    return ending, required(certificates, ending, so_far)
+    void_kind: VoidKind = "truncation" if control.occluder is None else "occluder"
+    certificates = (LEGIBLE, ORDER, CLOSING, *certificates_for(void_kind, "worlds"))
+    return ending, required(certificates, ending, evidence)
 
 
 def record_of(pair: Pair) -> dict[str, Any] | None:
-    """Return how the control closes, as a record has it."""
+    """Return how the control closes, in the form of a record."""
     closing = pair.control.closing
     if closing is None:
         return None
-    own = {} if pair.control.occluder is not None else {"panel": asdict(closing.occluder)}
-    return {"closes_frame": closing.frame, **own}
+    occluder = {} if pair.control.occluder is not None else {"panel": asdict(closing.occluder)}
+    return {"closes_frame": closing.frame, **occluder}
 
 
 def occluder_from(frame: int, control: World, *others: World) -> Occluder:
-    """Return the occluder that closes a control at a frame: that of its void, or one in front of where all outcomes lie
-    and of all that moves from then on, in the control and in other worlds that it must not be told from."""
+    """Return the void's occluder, or one before all outcomes and all that moves later."""
     if control.occluder is not None:
         return control.occluder
-    zone = control.scene.framed if control.scene.rest is None else (control.scene.rest,)
+    boxes = control.scene.framed if control.scene.rest is None else (control.scene.rest,)
     moving = [swept_points(world.model, world.qpos[frame:]) for world in (control, *others)]
-    return fit_occluder(control.camera, box_around([*moving, *(box.corners() for box in zone)]))
+    return fit_occluder(control.camera, box_around([*moving, *(box.corners() for box in boxes)]))

@@ -1,9 +1,9 @@
-"""Giving released records what new draws of their family have: another look, or whatever rule is new.
+"""Redraws of released records, for another look or whatever rule is new.
 
 A record of an occlusion family is drawn again from the number of its draw (`draw_again`), which takes seconds. Where
-the record cost thousands of rollouts, and its new look moves neither camera nor occluder, the worlds stay and what
-pixels say is measured again (`relook_family`). Either way it is the record that `sample_family` would have drawn;
-whoever uses it then runs `traps benchmark certify`.
+the record cost thousands of rollouts, and its new look moves neither camera nor occluder, the worlds stay and only what
+pixels say is measured again (`relook_family`). Either way the record is the one that `sample_family` would draw now;
+run `traps benchmark certify` afterwards.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from traps_pipeline.scenes.draw.resolve import Resolved, plain
 from traps_pipeline.scenes.draw.sample import (
     Draw,
     ill_posed_for,
-    kind_of,
     load_tallies,
     record_line,
+    rejection_kind,
     save_tallies,
     take_out,
     try_draw,
@@ -48,27 +48,29 @@ def draw_again(
     report: Callable[[str], None] = lambda _: None,
     only: Collection[str] | None = None,
 ) -> dict[str, str]:
-    """Draw all records of a family, or those of some ids, again, under its looks and by the rules of today; each keeps
-    its id and its ill-posed question. Takes out those that are rejected now, so that `sample_family` fills their
-    places, and returns why, by id."""
-    return _rewritten(released, name, _drawn_again, workers, report, only)
+    """Draw a family's records, or some ids, again by today's looks and rules.
+
+    Ids and ill-posed questions stay. Takes out those that are rejected now, so that `sample_family` fills their places,
+    and returns the reasons by id.
+    """
+    return _rewrite(released, name, _draw_record_again, workers, report, only)
 
 
 def relook_family(
     released: Path, name: str, workers: int | None = None, report: Callable[[str], None] = lambda _: None
 ) -> dict[str, str]:
-    """Give all records of a family, whose looks are in STILL, the look of their draw, and measure again what pixels
-    say. Takes out those that are no longer certified, so that `sample_family` fills their places, and returns why, by
-    id."""
+    """Give a family's records the look of their draw, and measure their pixels again.
+
+    All parts of the look must be in STILL. Takes out and returns rejected records as `draw_again` does.
+    """
     looks = get_family(name).looks
     assert set(looks) <= set(STILL), f"{name}: looks in {', '.join(looks)}, of which some move the camera"
-    return _rewritten(released, name, _relooked, workers, report)
+    return _rewrite(released, name, _relook_record, workers, report)
 
 
 def reask_family(released: Path, name: str) -> list[str]:
-    """Draw a new ill-posed question for each record of a family whose own loses the certificate `words`; return their
-    ids. Clips, worlds and all else stay."""
-    seed, changed = load_tallies(released)[name].seed, list[str]()
+    """Replace ill-posed questions that lose the certificate `words`; return the ids."""
+    seed, changed_ids = load_tallies(released)[name].seed, list[str]()
     lines = (released / f"{name}.jsonl").read_text(encoding="utf-8").splitlines()
     records = {spec.scenario_id: spec for spec in map(SceneSpec.model_validate_json, lines)}
     texts = Counter(spec.ill_posed_question for spec in records.values())
@@ -79,12 +81,12 @@ def reask_family(released: Path, name: str) -> list[str]:
             question = ill_posed_for(spec, seed, texts, len(records))
             texts[question] += 1
             records[spec.scenario_id] = spec.model_copy(update={"ill_posed_question": question})
-            changed.append(spec.scenario_id)
+            changed_ids.append(spec.scenario_id)
     write_text(released / f"{name}.jsonl", "".join(map(record_line, records.values())))
-    return changed
+    return changed_ids
 
 
-def _rewritten(
+def _rewrite(
     released: Path,
     name: str,
     change: Callable[[_Job], Resolved | str],
@@ -92,30 +94,29 @@ def _rewritten(
     report: Callable[[str], None],
     only: Collection[str] | None = None,
 ) -> dict[str, str]:
-    """Change the records of a family, or those of some ids; what it says of a record that it rejects, by id. Those are
-    taken out."""
+    """Change records of a family, take out those rejected, and return reasons by id."""
     seed, rejected = load_tallies(released)[name].seed, dict[str, str]()
     lines = (released / f"{name}.jsonl").read_text(encoding="utf-8").splitlines()
     records = {spec.scenario_id: spec for spec in map(SceneSpec.model_validate_json, lines)}
     chosen = [id_ for id_ in records if only is None or id_ in only]
     jobs = [(records[id_], released / "trajectories", seed) for id_ in chosen]
-    for done, ((spec, folder, _), result) in enumerate(run_in_order(change, jobs, workers), start=1):
+    for finished, ((spec, folder, _), result) in enumerate(run_in_order(change, jobs, workers), start=1):
         if isinstance(result, str):
             rejected[spec.scenario_id] = result
         else:
             save_trajectory(folder, spec.scenario_id, result.qpos, result.twin)
             records[spec.scenario_id] = result.spec
-        report(f"{spec.scenario_id}: {rejected.get(spec.scenario_id, 'written again')}; {done} of {len(jobs)}")
+        report(f"{spec.scenario_id}: {rejected.get(spec.scenario_id, 'written again')}; {finished} of {len(jobs)}")
     write_text(released / f"{name}.jsonl", "".join(map(record_line, records.values())))
     tallies = load_tallies(released)
     tallies[name] = replace(tallies[name], file=family_digest(name), look=sorted(get_family(name).looks))
     save_tallies(released, tallies)
-    take_out(released, {id_: kind_of(why) for id_, why in rejected.items()})
+    take_out(released, {id_: rejection_kind(why) for id_, why in rejected.items()})
     return rejected
 
 
-def _drawn_again(job: _Job) -> Resolved | str:
-    """Return what the draw of a record gives today, under the record's names, or why it is rejected."""
+def _draw_record_again(job: _Job) -> Resolved | str:
+    """Return today's result of a record's draw under its old names, or a rejection."""
     spec, _, seed = job
     result = try_draw(Draw(spec.family, seed, spec.seed, frozenset(), tuple(sorted(get_family(spec.family).looks))))
     if isinstance(result, str):
@@ -127,8 +128,8 @@ def _drawn_again(job: _Job) -> Resolved | str:
     return Resolved(result.spec.model_copy(update=names), result.qpos, result.twin)
 
 
-def _relooked(job: _Job) -> Resolved | str:
-    """Return a record with the look of its draw, or which certificate it loses under it."""
+def _relook_record(job: _Job) -> Resolved | str:
+    """Return a record with the look of its draw, or the certificate it then loses."""
     spec, folder, seed = job
     family, path = get_family(spec.family), folder / f"{spec.scenario_id}.npz"
     look = look_of_draw(seed, spec.family, spec.seed, sorted(family.looks))
@@ -139,15 +140,14 @@ def _relooked(job: _Job) -> Resolved | str:
 
 
 def with_look(spec: SceneSpec, look: Look | None, qpos: np.ndarray, twin: np.ndarray) -> SceneSpec | str:
-    """Return a record under a look that moves neither camera nor occluder, or which certificate it loses; those of
-    rollouts stay. qpos, twin: its trajectories, (F, nq) each."""
+    """Return a record under a look in STILL, or the certificate it then loses."""
     family = get_family(spec.family)
-    dressed = plain(params_to_dict(replace(family.params_from(spec.params), look=look)))
-    other = spec.twin.params
-    if other is not None:
-        other = plain(params_to_dict(replace(family.params_from(other), look=look)))
-    changed = spec.model_copy(update={"params": dressed, "twin": spec.twin.model_copy(update={"params": other})})
-    pair, evidence = pair_of(changed, qpos, twin), dict(spec.evidence)
+    params = plain(params_to_dict(replace(family.params_from(spec.params), look=look)))
+    twin_params = spec.twin.params
+    if twin_params is not None:
+        twin_params = plain(params_to_dict(replace(family.params_from(twin_params), look=look)))
+    record = spec.model_copy(update={"params": params, "twin": spec.twin.model_copy(update={"params": twin_params})})
+    pair, evidence = pair_of(record, qpos, twin), dict(spec.evidence)
     for certificate in certificates_for(spec.void_kind):
         if any(number.of_futures for number in certificate.numbers):
             continue  # thousands of rollouts, of which no picture is drawn
@@ -159,4 +159,4 @@ def with_look(spec: SceneSpec, look: Look | None, qpos: np.ndarray, twin: np.nda
         if failure is not None:
             return f"{certificate.name}: {failure}"
         evidence |= certificate.kept(measured)
-    return changed.model_copy(update={"evidence": evidence})
+    return record.model_copy(update={"evidence": evidence})

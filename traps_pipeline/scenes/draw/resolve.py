@@ -1,4 +1,4 @@
-"""From a family's parameters to a resolved scenario: simulate, read the outcome, fit the shot, choose void and twin.
+"""Resolution of parameters to a scenario: simulate, frame, choose void and twin.
 
 `resolve` is the only way a record comes to be; it raises `Rejected` with the reason when the draw makes no good pair.
 """
@@ -23,12 +23,12 @@ from traps_pipeline.scenes.certification.certificates import (
 )
 from traps_pipeline.scenes.certification.ensemble import Cut, Futures, Rollout
 from traps_pipeline.scenes.certification.evidence import Claim, Evidence, Pair, VoidKind, required
-from traps_pipeline.scenes.draw.closing import closed, record_of
-from traps_pipeline.scenes.draw.trim import trimmed
+from traps_pipeline.scenes.draw.closing import close_control, record_of
+from traps_pipeline.scenes.draw.trim import trim_candidates
 from traps_pipeline.scenes.physics.kit import Family, Physics, Wording, params_to_dict
 from traps_pipeline.scenes.picture.camera import fit_shot
 from traps_pipeline.scenes.worlds.outcome import Rejected, compile_scene, simulated
-from traps_pipeline.scenes.worlds.pace import cut_to, lengths
+from traps_pipeline.scenes.worlds.pace import lengths, shortened
 from traps_pipeline.scenes.worlds.shot import shot_of, shown_points
 from traps_pipeline.scenes.worlds.spec import SceneSpec, Twin, trajectory_digest
 from traps_pipeline.scenes.worlds.world import World
@@ -55,14 +55,14 @@ def resolve(
     seed: int,
     physics: Physics | None = None,
 ) -> Resolved:
-    """Return the record of a scenario with its trajectories. Raises Rejected when it makes no valid pair."""
+    """Return a scenario's record and trajectories. Raises Rejected for no valid pair."""
     physics = physics or family.physics
     full = _control(family, params, physics)
     answer = full.outcome.label
     if answer is not None and answer not in wording.labels:
         raise ValueError(f"{family.name}: reading {answer!r} is not one of the labels {list(wording.labels)}")
-    kind: VoidKind = "truncation" if full.occluder is None else "occluder"
-    pair, evidence = _of_some_length(full, kind, wording, ill_posed_question, seed)
+    void_kind: VoidKind = "truncation" if full.occluder is None else "occluder"
+    pair, evidence = _certify_some_length(full, void_kind, wording, ill_posed_question, seed)
     control, physics = pair.control, pair.control.physics
     twin, frame = pair.other_world, pair.void_from
     occluder = None if control.occluder is None else asdict(control.occluder)
@@ -76,7 +76,7 @@ def resolve(
         params=plain(params_to_dict(params)),
         physics=asdict(physics),
         camera=plain(asdict(control.camera)),
-        void_kind=kind,
+        void_kind=void_kind,
         void=plain({"cut_frame": frame} if occluder is None else {"panel": occluder, "hidden_from_frame": frame}),
         control=plain(record_of(pair)),
         question=wording.question,
@@ -93,37 +93,36 @@ def resolve(
             ground_truth=twin.outcome.answer,
             trajectory_sha256=trajectory_digest(twin.qpos),
         ),
-        evidence={name: value for each in certificates_for(kind) for name, value in each.kept(evidence).items()},
+        evidence={name: value for each in certificates_for(void_kind) for name, value in each.kept(evidence).items()},
     )
     return Resolved(spec, control.qpos, twin.qpos)
 
 
-def _of_some_length(
-    full: World, kind: VoidKind, wording: Wording, ill_posed_question: str, seed: int
+def _certify_some_length(
+    uncut: World, void_kind: VoidKind, wording: Wording, ill_posed_question: str, seed: int
 ) -> tuple[Pair, Mapping[str, Any]]:
-    """Return the pair of a simulated control, with all its evidence, of the first other world and the first length for
-    which it has all certificates. Raises Rejected if there is none."""
+    """Return the first pair with all certificates, and its evidence. Raises Rejected."""
     rejected = Rejected("no other hidden element gives another outcome")
-    for worlds in [(full,)] if kind == "truncation" else _with_others(full):
+    for worlds in [(uncut,)] if void_kind == "truncation" else _with_other_worlds(uncut):
         for n_frames in lengths(worlds, seed):
-            control, *others = (cut_to(world, n_frames) for world in worlds)
+            control, *others = (shortened(world, n_frames) for world in worlds)
             end_s = (n_frames - 1) / control.physics.fps
             answer = control.outcome.label
             claim = Claim(
-                full.family, end_s, len(wording.labels), answer, None, wording.question, ill_posed_question, seed
+                uncut.family, end_s, len(wording.labels), answer, None, wording.question, ill_posed_question, seed
             )
             try:
                 pair = Pair(control, claim, futures_of(control, seed))
-                evidence = required(certificates_for(kind, "control"), pair, {})
-                candidates = trimmed(_with_twin(pair, None, others[0])) if others else _cut_short(pair)
-                return _first_certified(candidates, kind, seed, evidence)
+                evidence = required(certificates_for(void_kind, "control"), pair, {})
+                candidates = trim_candidates(_with_twin(pair, None, others[0])) if others else _at_latest_cut(pair)
+                return _first_certified(candidates, void_kind, seed, evidence)
             except Rejected as failure:
                 rejected = failure  # another length, or another world, may do
     raise rejected
 
 
 def _control(family: Family, params: Any, physics: Physics) -> World:
-    """Return the control of a draw: simulated, and with its camera and occluder fitted to itself."""
+    """Simulate the control of a draw, and fit camera and occluder to it."""
     model, scene = compile_scene(family, params, physics)
     qpos = simulated(model, scene, physics)
     camera, occluder = fit_shot(scene.view, shown_points(model, scene, qpos), scene.cover)
@@ -131,14 +130,13 @@ def _control(family: Family, params: Any, physics: Physics) -> World:
 
 
 def _first_certified(
-    candidates: Iterable[Pair], kind: VoidKind, seed: int, so_far: Evidence
+    candidates: Iterable[Pair], void_kind: VoidKind, seed: int, evidence: Evidence
 ) -> tuple[Pair, Mapping[str, Any]]:
-    """Return the first of some pairs, which differ in their occluder, whose void and twin are certified and whose
-    control can end. Raises Rejected if none is."""
+    """Return the first pair whose void, twin and closing certify. Raises Rejected."""
     rejected = Rejected("there is no twin")
     for pair in candidates:
         try:
-            return closed(pair, seed, required(certificates_for(kind, "void", "twin"), pair, so_far))
+            return close_control(pair, seed, required(certificates_for(void_kind, "void", "twin"), pair, evidence))
         except Rejected as failure:
             rejected = failure  # the next one may hide more, or be alike
     raise rejected
@@ -152,9 +150,8 @@ def _with_twin(pair: Pair, frame: int | None, twin: World) -> Pair:
     return replace(pair, claim=claim, void_frame=frame, twin=twin)
 
 
-def _with_others(control: World) -> Iterator[tuple[World, World]]:
-    """Yield the control with each world that has another hidden element and another settled outcome, seen by one
-    camera."""
+def _with_other_worlds(control: World) -> Iterator[tuple[World, World]]:
+    """Yield the control with each world of another hidden element and another outcome."""
     family, physics = control.family, control.physics
     assert family.twins is not None, f"{family.name}: an occlusion family needs twins"
     for params in family.twins(control.params):
@@ -171,25 +168,24 @@ def _with_others(control: World) -> Iterator[tuple[World, World]]:
 # --- chaotic ----------------------------------------------------------------------------------------------------------
 
 
-def _cut_short(pair: Pair) -> list[Pair]:
-    """Return the pair with the latest cut that leaves its outcome open, and a future of that cut as its twin."""
+def _at_latest_cut(pair: Pair) -> list[Pair]:
+    """Return the pair at the latest open cut, with a future of that cut as its twin."""
     choice = choose_cut(pair.futures, pair.claim, pair.control.outcome.commit_frame)
     if choice is None:
         raise Rejected("no cut at 1.0 s or later leaves the outcome open")
     cut, twin = choice
     assert twin.qpos is not None
-    other = _with_twin(pair, cut.frame, replace(pair.control, qpos=twin.qpos, simulated=None))
-    return [replace(other, rollout=twin.number)]
+    cut_pair = _with_twin(pair, cut.frame, replace(pair.control, qpos=twin.qpos, simulated=None))
+    return [replace(cut_pair, rollout=twin.number)]
 
 
 def choose_cut(futures: Futures, claim: Claim, commit_frame: int) -> tuple[Cut, Rollout] | None:
-    """Return the latest cut, not too early and not after commitment, that leaves the outcome open, and a twin: the
-    first rollout that looks like the control up to there and ends otherwise. None if there is no such cut."""
+    """Return the latest cut that leaves the outcome open, and a twin; or None."""
     if commit_frame < futures.first:
         return None
     for rollouts in futures.batches():
         if len(rollouts) == ensemble.BATCHES[0]:
-            if _hopeless(rollouts, futures.first):
+            if _is_hopeless(rollouts, futures.first):
                 return None
             continue
         for cut in open_cuts(rollouts, range(futures.first, commit_frame + 1), claim):
@@ -199,21 +195,20 @@ def choose_cut(futures: Futures, claim: Claim, commit_frame: int) -> tuple[Cut, 
 
 
 def open_cuts(rollouts: Sequence[Rollout], frames: range, claim: Claim) -> Iterator[Cut]:
-    """Return the cuts at which the futures of many starts leave the outcome open, latest first."""
+    """Yield the cuts at which the futures leave the outcome open, latest first."""
     cuts = (ensemble.at_cut(rollouts, frame, claim.family.perturbation) for frame in reversed(frames))
     return (cut for cut in cuts if OPEN.failure(cut.evidence(), claim) is None)
 
 
-def _hopeless(scouts: Sequence[Rollout], first: int) -> bool:
-    """Return whether hardly any scout looks like the control at the earliest cut, or nearly all of them end alike."""
+def _is_hopeless(scouts: Sequence[Rollout], first: int) -> bool:
+    """Return whether too few scouts pass the earliest cut, or nearly all end alike."""
     counts = Counter(r.label for r in scouts if r.parted >= first and r.label is not None)
-    few = counts.total() < len(scouts) * MIN_ACCEPTED / ensemble.TRIED / 2
-    return few or max(counts.values(), default=0) > HOPELESS_SHARE * counts.total()
+    is_short = counts.total() < len(scouts) * MIN_ACCEPTED / ensemble.TRIED / 2
+    return is_short or max(counts.values(), default=0) > HOPELESS_SHARE * counts.total()
 
 
 def plain(value: Any) -> Any:
-    """Return tuples to lists, numpy numbers to Python's, so that a record equals itself after a round trip through
-    JSON."""
+    """Return a value as JSON gives it back: lists, and numbers of Python."""
     if isinstance(value, dict):
         return {key: plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

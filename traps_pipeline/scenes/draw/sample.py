@@ -1,4 +1,4 @@
-"""Drawing scenarios of a family until its quotas are full, and writing them down as released records.
+"""Sampling of a family's scenarios, until its quotas are full, into records.
 
 Draws are numbered and independent, so they run on all cores; acceptance goes through them in order, so that the same
 seed gives the same scenarios. Every accepted scenario is written at once: a sampling that was stopped goes on.
@@ -21,7 +21,7 @@ import numpy as np
 from traps_pipeline.base.files import write_text
 from traps_pipeline.base.workers import run_in_order
 from traps_pipeline.scenes.certification.certificates import settled_outcome
-from traps_pipeline.scenes.draw.likeness import first_look, too_alike
+from traps_pipeline.scenes.draw.likeness import excess_lookalike, frame_hash
 from traps_pipeline.scenes.draw.resolve import Resolved, resolve
 from traps_pipeline.scenes.family_registry import family_digest, fit_to_sample, get_family
 from traps_pipeline.scenes.parts.look import look_of_draw
@@ -35,14 +35,13 @@ from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory, save_t
 MOST_DRAWS = 40  # for each scenario wanted; a family that needs more is not worth its time
 DRAWS = "draws.json"  # beside the records: how each family was drawn
 _MEASURED = re.compile(r"\d[\d.]*|'\w+'(?=\s)")  # numbers and answers in a reason, which differ from draw to draw
-_WORDED = 128  # questions by which the share of an answer is known
-_UNASKED = "?"  # stands for the ill-posed question until the scenario has its place
+_WORDED_DRAWS = 128  # questions by which the share of an answer is known
+_NO_QUESTION = "?"  # stands for the ill-posed question until the scenario has its place
 
 
 @dataclass
 class Tally:
-    """How a family was drawn: the seed, scenarios wanted, draws made, why the others were rejected, the digest of the
-    family's file (empty in notes that were written before it was kept), and the parts of the look that vary."""
+    """How a family was drawn. file: digest of the family's file, empty in old notes."""
 
     seed: int
     wanted: int
@@ -53,7 +52,7 @@ class Tally:
 
 
 def load_tallies(released: Path) -> dict[str, Tally]:
-    """Return family to how its records were drawn, from `draws.json` beside them."""
+    """Return how each family's records were drawn, from `draws.json` beside them."""
     path = released / DRAWS
     if not path.is_file():
         return {}
@@ -72,13 +71,13 @@ def answer_quota(count: int, n_labels: float) -> int:
 
 
 def ill_posed_quota(taxonomy: str, count: int) -> int:
-    """Return how often one ill-posed text may occur: once in an occlusion family, in 5 % of a chaotic one."""
+    """Return how often an ill-posed text may occur: once, or in 5 % (chaotic)."""
     return 1 if taxonomy == "occlusion" else max(1, count // 20)
 
 
 @dataclass(frozen=True)
 class Draw:
-    """One numbered draw of a family. closed: answers that have their quota already and need not be resolved."""
+    """One numbered draw of a family. closed: answers with a full quota, not resolved."""
 
     family: str
     seed: int
@@ -97,13 +96,15 @@ def sample_family(
     workers: int | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> Tally:
-    """Draw until `released` holds `count` scenarios of a family; the same seed gives the same ones on a machine type.
+    """Draw until `released` holds `count` scenarios of a family.
 
-    Goes on where a stopped call with the same seed and count was, and fills the places of records that were taken out
-    (`take_out`); anything else of the family is replaced, as are records of another version of the family's file.
-    look: parts of the look (`look.PARTS`) that vary besides those that always do in the family.
-    `report` gets a line for each record and for the first rejection of each kind. Raises RuntimeError with the tally of
-    rejections when 40 draws a scenario are not enough, TrapsError for an unfit family.
+    The same seed gives the same ones on a machine type. A stopped call goes on at the same seed and count, and fills
+    the places of records that were taken out (`take_out`); anything else of the family is replaced, as are records of
+    another version of its file.
+
+    look: parts of the look (`look.PARTS`) that vary besides those that always do in the family. report: gets a line for
+    each record and for the first rejection of each kind. Raises RuntimeError with the tally of rejections when 40 draws
+    a scenario are not enough, TrapsError for an unfit family.
     """
     family, records = fit_to_sample(name), Records(released, name)
     tally, file, parts = load_tallies(released).get(name), family_digest(name), sorted({*family.looks, *look})
@@ -116,7 +117,7 @@ def sample_family(
     specs = records.read(tally)
     answers = Counter(spec.ground_truth for spec in specs)
     texts = Counter(spec.ill_posed_question for spec in specs)
-    looks = {} if len(specs) == count else {spec.scenario_id: first_look(spec, records.qpos(spec)) for spec in specs}
+    hashes = {} if len(specs) == count else {spec.scenario_id: frame_hash(spec, records.qpos(spec)) for spec in specs}
     occupied = {int(spec.scenario_id.rpartition("-")[2]) for spec in specs}
     places = [place for place in range(1, count + 1) if place not in occupied]
     if not places:
@@ -124,7 +125,7 @@ def sample_family(
 
     def jobs() -> Iterator[Draw]:
         for number in range(tally.draws, MOST_DRAWS * count):
-            yield Draw(name, seed, number, _closed(answers, count, family), tuple(parts))
+            yield Draw(name, seed, number, _full_answers(answers, count, family), tuple(parts))
 
     reported: set[str] = set()  # kinds of rejections that the report has
     # A draw takes seconds, and those that were begun are waited for: no more than could all be wanted.
@@ -132,19 +133,19 @@ def sample_family(
     try:
         for draw, result in results:
             tally.draws += 1
-            if isinstance(result, Resolved) and result.spec.ground_truth in _closed(answers, count, family):
+            if isinstance(result, Resolved) and result.spec.ground_truth in _full_answers(answers, count, family):
                 result = f"answer {result.spec.ground_truth!r} has its quota"
-            picture = first_look(result.spec, result.qpos) if isinstance(result, Resolved) else 0
-            if isinstance(result, Resolved) and (other := too_alike(looks, picture, count)):
-                result = f"its first frame looks like that of another: {other}"
+            picture_hash = frame_hash(result.spec, result.qpos) if isinstance(result, Resolved) else 0
+            if isinstance(result, Resolved) and (lookalike := excess_lookalike(hashes, picture_hash, count)):
+                result = f"its first frame looks like that of another: {lookalike}"
             if isinstance(result, str):
                 tally.rejected[result.split(":")[0]] += 1
-                if kind_of(result) not in reported:  # so that a family that never passes says why at once
-                    reported.add(kind_of(result))
+                if rejection_kind(result) not in reported:  # so that a family that never passes says why at once
+                    reported.add(rejection_kind(result))
                     report(f"{name}: draw {draw.number + 1} is rejected: {result}")
                 continue
-            placed = _named(family, result, draw, places.pop(0), texts, count)
-            looks[placed.spec.scenario_id] = picture
+            placed = _with_id(family, result, draw, places.pop(0), texts, count)
+            hashes[placed.spec.scenario_id] = picture_hash
             answers[placed.spec.ground_truth] += 1
             texts[placed.spec.ill_posed_question] += 1
             records.append(placed, tally)
@@ -158,27 +159,26 @@ def sample_family(
     raise RuntimeError(f"{name}: {answers.total()} of {count} after {tally.draws} draws; rejected: {reasons}")
 
 
-def kind_of(reason: str) -> str:
-    """Return what a rejection has in common with others: its reason without what was measured, and without details."""
+def rejection_kind(reason: str) -> str:
+    """Return what a rejection has in common with others: no numbers, no details."""
     return _MEASURED.sub("", reason.split(":")[0])
 
 
 class Records:
-    """The released files of a family: `<family>.jsonl`, one record a line, `trajectories/<scenario_id>.npz`, and the
-    family's place in `draws.json`, which is written last and so vouches for the others."""
+    """Released files of a family; its place in `draws.json` vouches for the others."""
 
     def __init__(self, released: Path, family: str) -> None:
         self._released, self._family = released, family
         self._lines = released / f"{family}.jsonl"
 
     def clear(self) -> None:
-        """Take away whatever is there of the family."""
+        """Remove all files of the family."""
         self._lines.unlink(missing_ok=True)
-        for old in (self._released / "trajectories").glob(f"{self._family}-*.npz"):
-            old.unlink()
+        for trajectory in (self._released / "trajectories").glob(f"{self._family}-*.npz"):
+            trajectory.unlink()
 
     def read(self, tally: Tally) -> list[SceneSpec]:
-        """Return the records of the draws that the tally counts; a record after them was cut off and is dropped."""
+        """Return the records of the draws in the tally; drop a record after them."""
         if not self._lines.is_file():
             return []
         specs = []
@@ -187,22 +187,22 @@ class Records:
                 specs.append(SceneSpec.model_validate(json.loads(line)))
             except ValueError:  # a line that a kill tore
                 break
-        counted = [spec for spec in specs if spec.seed < tally.draws]
-        write_text(self._lines, "".join(record_line(spec) for spec in counted))
-        return counted
+        in_tally = [spec for spec in specs if spec.seed < tally.draws]
+        write_text(self._lines, "".join(record_line(spec) for spec in in_tally))
+        return in_tally
 
     def qpos(self, spec: SceneSpec) -> np.ndarray:
-        """Return the trajectory of a record that was read."""
+        """Return the trajectory of a record."""
         return load_trajectory(self._released / "trajectories" / f"{spec.scenario_id}.npz", spec.trajectory_sha256)
 
     def sort(self) -> None:
-        """Put the records in the order of their ids: those that fill a place were added last."""
+        """Sort the records by id: those that fill a place were added last."""
         lines = self._lines.read_text(encoding="utf-8").splitlines()
         lines.sort(key=lambda line: json.loads(line)["scenario_id"])
         write_text(self._lines, "".join(f"{line}\n" for line in lines))
 
     def append(self, resolved: Resolved, tally: Tally) -> None:
-        """Add a scenario and note how far the drawing is."""
+        """Append a scenario and note the number of draws."""
         save_trajectory(self._released / "trajectories", resolved.spec.scenario_id, resolved.qpos, resolved.twin)
         with self._lines.open("a", encoding="utf-8") as lines:
             lines.write(record_line(resolved.spec))
@@ -210,9 +210,10 @@ class Records:
 
 
 def take_out(released: Path, reasons: Mapping[str, str]) -> None:
-    """Take records (id -> why, as it is counted in `draws.json`) out of their families, with their trajectories: the
-    next `sample_family` with the same seed and count fills their places with later draws. Raises KeyError for an id
-    that is not there."""
+    """Remove records and trajectories by id, and count the reasons in `draws.json`.
+
+    The next `sample_family` with the same seed and count fills their places. Raises KeyError for an unknown id.
+    """
     tallies = load_tallies(released)
     for family in sorted({scenario_id.rpartition("-")[0] for scenario_id in reasons}):
         lines = released / f"{family}.jsonl"
@@ -232,31 +233,30 @@ def save_tallies(released: Path, tallies: Mapping[str, Tally]) -> None:
 
 
 def record_line(spec: SceneSpec) -> str:
-    """Return a record as its file has it."""
+    """Return a record as a line of its file."""
     return json.dumps(spec.model_dump(mode="json"), ensure_ascii=False) + "\n"
 
 
-def _closed(answers: Counter[str], count: int, family: Family) -> frozenset[str]:
+def _full_answers(answers: Counter[str], count: int, family: Family) -> frozenset[str]:
     choices = _choices(family)
     return frozenset(answer for answer, n in answers.items() if n >= answer_quota(count, choices[answer]))
 
 
 @cache
 def _choices(family: Family) -> Mapping[str, float]:
-    """Answer to the number of choices of which it would be one as often as chance gives it, over many draws: that of
-    the questions, where each offers the same ones, and more for an answer that not all of them offer."""
+    """Return how many choices each answer competes with, on average over many draws."""
     rng = np.random.default_rng(0)
-    drawn = [family.word(family.draw(rng), rng).labels for _ in range(_WORDED)]
+    choices_by_draw = [family.word(family.draw(rng), rng).labels for _ in range(_WORDED_DRAWS)]
     shares = defaultdict[str, float](float)
-    for labels in drawn:
+    for labels in choices_by_draw:
         for label in labels:
-            shares[label] += 1 / len(labels) / len(drawn)
-    rare = float(len(drawn))  # an answer that none of them offers
+            shares[label] += 1 / len(labels) / len(choices_by_draw)
+    rare = float(len(choices_by_draw))  # an answer that none of them offers
     return defaultdict(lambda: rare, {label: 1 / share for label, share in shares.items()})
 
 
 def try_draw(draw: Draw) -> Resolved | str:
-    """Return a draw, resolved, or why it is rejected."""
+    """Return a draw, resolved, or the reason why it is rejected."""
     family = get_family(draw.family)
     rng = np.random.default_rng([draw.seed, *draw.family.encode(), draw.number])
     params = family.draw(rng)
@@ -266,21 +266,23 @@ def try_draw(draw: Draw) -> Resolved | str:
         answer = simulated_answer(family, params)
         if answer in draw.closed:
             return f"answer {answer!r} has its quota"
-        return resolve(family, params, wording, _UNASKED, scenario_id=f"{family.name}-0000", seed=draw.number)
+        return resolve(family, params, wording, _NO_QUESTION, scenario_id=f"{family.name}-0000", seed=draw.number)
     except Rejected as rejected:
         return str(rejected)
 
 
-def _named(family: Family, resolved: Resolved, draw: Draw, place: int, texts: Counter[str], count: int) -> Resolved:
-    """Return the scenario with its id and an ill-posed question that its family still has room for."""
-    named = resolved.spec.model_copy(update={"scenario_id": f"{family.name}-{place:04d}"})
-    question = ill_posed_for(named, draw.seed, texts, count)
-    return Resolved(named.model_copy(update={"ill_posed_question": question}), resolved.qpos, resolved.twin)
+def _with_id(family: Family, resolved: Resolved, draw: Draw, place: int, texts: Counter[str], count: int) -> Resolved:
+    """Return the scenario with its id and an ill-posed question within its quota."""
+    spec = resolved.spec.model_copy(update={"scenario_id": f"{family.name}-{place:04d}"})
+    question = ill_posed_for(spec, draw.seed, texts, count)
+    return Resolved(spec.model_copy(update={"ill_posed_question": question}), resolved.qpos, resolved.twin)
 
 
 def ill_posed_for(spec: SceneSpec, seed: int, texts: Counter[str], count: int) -> str:
-    """Draw the ill-posed question of a record that has its id. seed: its family's. texts: questions of the family's
-    other records, `count` in all. Raises ValueError when all questions are taken."""
+    """Draw the ill-posed question of a record that has its id.
+
+    seed: its family's. texts: questions of its family's `count` records. Raises ValueError when all are taken.
+    """
     family = get_family(spec.family)
     inventory = family.build(family.params_from(spec.params), family.physics).inventory
     most, place = ill_posed_quota(spec.taxonomy, count), int(spec.scenario_id.rpartition("-")[2])
@@ -289,13 +291,11 @@ def ill_posed_for(spec: SceneSpec, seed: int, texts: Counter[str], count: int) -
 
 
 def simulated_answer(family: Family, params: Any) -> str:
-    """Return what the control of a draw shows: a second's work, so that a draw without a place costs no
-    certificates.
-    """
+    """Return what a draw's control shows, in a second, before certificates cost more."""
     model, scene = compile_scene(family, params, family.physics)
     qpos = simulated(model, scene, family.physics)
     outcome = settled_outcome(family, replay(model, qpos, family.physics), params)
-    share = settles_share(outcome.commit_frame, len(qpos))
-    if share > LATEST_SHARE:  # where it settles too early the clip will end earlier
-        raise Rejected(str(out_of_pace(share)))
+    settled_at = settles_share(outcome.commit_frame, len(qpos))
+    if settled_at > LATEST_SHARE:  # where it settles too early the clip will end earlier
+        raise Rejected(str(out_of_pace(settled_at)))
     return outcome.answer

@@ -1,4 +1,4 @@
-"""How little an occluder covers: no more than its twin needs.
+"""Trimming of occluders to what the twin needs.
 
 A family says what its occluder hides at the most, as a box (`Scene.cover`). How much of that must be hidden follows
 from the pair: where control and twin differ in any frame, where anything of the hidden element shows, and where
@@ -21,10 +21,8 @@ from traps_pipeline.scenes.worlds.outcome import decisive_geoms
 MARGINS_PX = (3, 9)  # around what must be hidden, to be tried one after the other
 
 
-def trimmed(pair: Pair) -> Iterator[Pair]:
-    """Yield the pair behind one occluder after another, the smallest first: cut to what its twin needs with the one
-    margin and with the other, and as it is. Each may still lose a certificate. The pair must have an occluder, a twin
-    and an outcome."""
+def trim_candidates(pair: Pair) -> Iterator[Pair]:
+    """Yield a pair behind ever larger occluders, of which each may lose a certificate."""
     occluder = pair.control.occluder
     assert occluder is not None, "only an occluder can be trimmed"
     needed = must_hide(pair)
@@ -35,23 +33,21 @@ def trimmed(pair: Pair) -> Iterator[Pair]:
 
 
 def must_hide(pair: Pair) -> np.ndarray:
-    """Return the pixels of a 480x360 frame that an occluder must cover, (H, W) bool, found without any occluder; the
-    same if the two worlds are exchanged."""
-    needed, drawn = np.zeros((HEIGHT, WIDTH), bool), list[list[np.ndarray]]()
+    """Return the pixels (H, W) that an occluder must cover to hide what differs."""
+    needed, videos = np.zeros((HEIGHT, WIDTH), bool), list[list[np.ndarray]]()
     for world in (pair.control, pair.other_world):
-        until = max(world.outcome.commit_frame - 1, 0)
+        settled_from = max(world.outcome.commit_frame - 1, 0)
         decisive = decisive_geoms(world.model, world.scene.decisive)
         with world.renderer(supersample=1) as renderer:  # a margin is left, and certificates judge
-            full = list(renderer.frames(world.qpos))
-            needed |= _differ(full, renderer.frames(world.qpos, without=world.scene.hidden))
-            needed |= _differ(full[until:], renderer.frames(world.qpos[until:], without=decisive))
-        drawn.append(full)
-    return needed | _differ(*drawn)
+            frames = list(renderer.frames(world.qpos))
+            needed |= _differing(frames, renderer.frames(world.qpos, without=world.scene.hidden))
+            needed |= _differing(frames[settled_from:], renderer.frames(world.qpos[settled_from:], without=decisive))
+        videos.append(frames)
+    return needed | _differing(*videos)
 
 
 def cut_to(occluder: Occluder, camera: Camera, needed: np.ndarray, margin_px: int) -> Occluder:
-    """Return the least upright occluder in an occluder's plane, and within it, that covers some pixels (H, W) and so
-    many around them; the occluder as it is if there are none."""
+    """Return the least occluder in its plane, and within it, around pixels (H, W)."""
     rows, columns = np.nonzero(needed)
     if not len(rows):
         return occluder
@@ -69,24 +65,24 @@ def cut_to(occluder: Occluder, camera: Camera, needed: np.ndarray, margin_px: in
     return replace(occluder, centre=(x, y, half[2]), half=half)
 
 
-def _differ(frames: Iterable[np.ndarray], others: Iterable[np.ndarray]) -> np.ndarray:
-    """Return where any frame differs from its other one, on the grid of 480x360."""
-    masks = np.zeros((HEIGHT, WIDTH), bool)
-    for frame, other in zip(frames, others, strict=True):
-        unlike = (frame != other).any(axis=2)
-        fine = unlike.shape[0] // HEIGHT
-        masks |= unlike.reshape(HEIGHT, fine, WIDTH, fine).any(axis=(1, 3))
-    return masks
+def _differing(frames: Iterable[np.ndarray], counterparts: Iterable[np.ndarray]) -> np.ndarray:
+    """Return where any frame differs from its counterpart, on the grid of 480x360."""
+    mask = np.zeros((HEIGHT, WIDTH), bool)
+    for frame, counterpart in zip(frames, counterparts, strict=True):
+        differs = (frame != counterpart).any(axis=2)
+        fine = differs.shape[0] // HEIGHT
+        mask |= differs.reshape(HEIGHT, fine, WIDTH, fine).any(axis=(1, 3))
+    return mask
 
 
 def _directions(occluder: Occluder) -> tuple[np.ndarray, np.ndarray]:
-    """Return unit vectors of an occluder: away from the camera, and to the camera's right."""
+    """Return unit vectors of an occluder: away from the camera, to the camera's right."""
     azimuth = np.radians(occluder.yaw_deg + 90.0)
     return np.array([np.cos(azimuth), np.sin(azimuth), 0.0]), np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
 
 
 def _on_plane(camera: Camera, pixels: np.ndarray, ahead: np.ndarray, front: float) -> np.ndarray:
-    """Return where the lines of sight through pixels (N, 2) meet the upright plane so far ahead, (N, 3)."""
+    """Return where lines of sight through pixels (N, 2) meet an upright plane, (N, 3)."""
     right, up, forward = camera.axes()
     focal = HEIGHT / 2 / np.tan(np.radians(camera.fovy_deg) / 2)
     sideways, upwards = (pixels[:, 0] - WIDTH / 2) / focal, (HEIGHT / 2 - pixels[:, 1]) / focal

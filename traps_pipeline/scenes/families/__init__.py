@@ -1,1 +1,1 @@
-"""One file a scene family; the file's name is the family's. See docs/scenes.md for how to add one."""
+"""Scene families, one a file of the same name; docs/scenes.md says how to add one."""

@@ -1,4 +1,4 @@
-"""A ball rolls off a shelf into a cup on one arm of a beam; the question is how the beam comes to rest.
+"""A ball rolls off a shelf into a cup on a beam: how does the beam come to rest?
 
 Control: the whole beam is in view. Void: the occluder stands before it, and only the shelf with the ball is seen.
 Hidden element: the place of a counterweight on the other arm. Close to the pivot the ball outweighs it, far out it
@@ -35,7 +35,7 @@ PLAY, PLAIN = apart("red", "green", "blue", "cyan", "purple"), shuffled("wood", 
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 if the ball rolls to the right and drops on the left arm. Lengths are measured from the pivot."""
+    """Parameters; lengths from the pivot, direction +1: the ball drops on the left."""
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()
@@ -64,7 +64,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return shelf and beam before a board that carries the beam and catches the shadows."""
+    """Build shelf, beam, and the board that carries the beam and catches shadows."""
     course = Course(physics, p.direction)
     r, side = p.radius_m, 1.7 * p.radius_m
     sin, cos = np.sin(np.radians(p.tilt_deg)), np.cos(np.radians(p.tilt_deg))
@@ -102,7 +102,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _add_beam(course: Course, p: Params) -> None:
-    """Add the beam with cup and counterweight, on a hinge; it starts at the stop to which the counterweight pulls."""
+    """Add the hinged beam with cup and counterweight, at the counterweight's stop."""
     d, half = p.direction, p.direction * float(np.radians(p.tilt_deg)) / 2
     low, high = sorted((-2 * d * p.tilt_deg, 0.0))
     body = course.hinge("beam", (0, 0, p.pivot_z_m), damping=0.5, range_deg=(low, high))
@@ -124,30 +124,31 @@ def _add_beam(course: Course, p: Params) -> None:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return the lower end, or 'balanced', from when the ball lies in the cup. A ball that misses the cup has no
-    reading. The margin is how far the height difference of the beam's ends is from the one that parts tipped from
-    balanced."""
+    """Read the lower end, or 'balanced', once the ball lies in the cup.
+
+    A ball that misses the cup has no reading. The margin is how far the height difference of the beam's ends is from
+    the threshold between tipped and balanced.
+    """
     turn = motion.rot("beam")
     ball = np.einsum("fji,fj->fi", turn, motion.pos("ball") - motion.pos("beam"))  # as the beam sees it
     cup = np.array([-p.direction * p.arm_m, 0.0, BEAM_HALF_M + p.radius_m])
-    landed = lasting_from(np.linalg.norm(ball - cup, axis=1) <= 0.02)
+    rest_frame = lasting_from(np.linalg.norm(ball - cup, axis=1) <= 0.02)
     rise = 2 * p.half_beam_m * turn[:, 2, 0]  # of the right end over the left one
     sides = ["balanced" if abs(x) < LEVEL_M else "left" if x > 0 else "right" for x in rise]
-    return Reading([x if i >= landed else None for i, x in enumerate(sides)], float(abs(abs(rise[-1]) - LEVEL_M)))
+    return Reading([x if i >= rest_frame else None for i, x in enumerate(sides)], float(abs(abs(rise[-1]) - LEVEL_M)))
 
 
-def _three(p: Params, rng: np.random.Generator) -> Filled:
-    """Either end, or none."""
+def _ends_or_level(p: Params, rng: np.random.Generator) -> Filled:
+    """Return the choices: either end, or none."""
     forms = ("the {} end", "{} end", "to the {}", "tipped to the {}", "the {} side", "the {} end is lower")
     aliases = {form.format(side): side for side in ("left", "right") for form in forms}
     aliases |= dict.fromkeys(("level", "it is balanced", "in balance"), "balanced")
     return Filled(("left", "right", "balanced"), aliases, {})
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return the slope of the beam against that of the black base below it, in the last frames; None while the beam is
-    not to be seen."""
-    slopes = [(_slope_deg(frame, named["beam"], 200), _slope_deg(frame, "black", 100)) for frame in frames[-3:]]
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Compare the last slopes of beam and base; return None if the beam is unseen."""
+    slopes = [(_slope_deg(frame, slots["beam"], 200), _slope_deg(frame, "black", 100)) for frame in frames[-3:]]
     tilts = [beam - base for beam, base in slopes if beam is not None and base is not None]
     if len(tilts) < len(slopes) or max(tilts) - min(tilts) > TIPPED_DEG:
         return None
@@ -155,22 +156,20 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
     return "balanced" if abs(tilt) < TIPPED_DEG else "right" if tilt > 0 else "left"
 
 
-def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return a beam that turns as far over as it leaned at first, or does not turn at all, stays at that end; one that
-    slows down in between comes to rest level."""
-    slopes = [(_slope_deg(frame, named["beam"], 200), _slope_deg(frame, "black", 100)) for frame in frames]
+def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Predict the end from the swing: as far over as at first, or level if it slows."""
+    slopes = [(_slope_deg(frame, slots["beam"], 200), _slope_deg(frame, "black", 100)) for frame in frames]
     tilts = [beam - base for beam, base in slopes if beam is not None and base is not None]
     if len(tilts) < 3 or abs(tilts[0]) < TIPPED_DEG:
         return None
-    then = tilts[-1] + AHEAD * (tilts[-1] - tilts[-2])
-    if min(abs(then), abs(tilts[-1])) < OVER * abs(tilts[0]):
+    next_tilt = tilts[-1] + AHEAD * (tilts[-1] - tilts[-2])
+    if min(abs(next_tilt), abs(tilts[-1])) < OVER * abs(tilts[0]):
         return "balanced"
-    return "right" if then > 0 else "left"
+    return "right" if next_tilt > 0 else "left"
 
 
 def _slope_deg(frame: np.ndarray, colour: str, min_area: int) -> float | None:
-    """Return slope of the largest region of a colour, positive if it falls to the right; None unless it is a long
-    strip."""
+    """Return the slope of a colour's longest strip, positive if it falls to the right."""
     blob = largest(frame, colour, min_area)
     if blob is None or blob.box[2] < 80:
         return None
@@ -196,7 +195,7 @@ FAMILY = scene_family(
             "How does the {beam} beam come to rest: tipped to the left, tipped to the right or balanced?",
             "To which side does the {beam} beam tip for good: left, right, or does it end up balanced?",
         ),
-        _three,
+        _ends_or_level,
     ),
     asides=[
         colour_of(

@@ -1,4 +1,4 @@
-"""A ball rolls along a lane behind a wall with two windows; the question is whether it comes out at the other end.
+"""A ball rolls behind a wall with two windows: does it come out at the other end?
 
 Control: the windows and the tray at the end are in view, so that a ball which stays behind the wall is seen in the
 second window. Void: the occluder stands before the wall and the tray.
@@ -15,7 +15,7 @@ from traps_pipeline.scenes.parts.course import Course, Span, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import AHEAD, past_far_edge
 from traps_pipeline.scenes.parts.questions import colour_from, comes_from, yes_no
-from traps_pipeline.scenes.parts.readings import Reading, came_through
+from traps_pipeline.scenes.parts.readings import Reading, read_passage
 from traps_pipeline.scenes.parts.vary import (
     Drawn,
     apart,
@@ -38,14 +38,14 @@ PLAIN = shuffled("wood", "grey", "white", "black", without="wall_colour")
 
 
 def _windows(rng: np.random.Generator, so_far: Drawn) -> tuple[float, float]:
-    """Return the first window is at the same share of the wall; the second one varies."""
+    """Draw the windows: the first at a fixed share of the wall, the second anywhere."""
     wall_m = so_far["wall_m"]
     return round(0.30 * wall_m, 4), round(wall_m * uniform(rng, 0.70, 0.76), 4)
 
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 rolls to the right. Lengths run along the lane, from where the wall begins."""
+    """Parameters; lengths run from the wall's start, direction +1: to the right."""
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()
@@ -69,7 +69,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return a lane, a wall with windows and merlons before it, a tray at its end."""
+    """Build a lane, a wall with windows and merlons before it, and a tray at its end."""
     course = Course(physics, p.direction)
     r, rail, front = p.radius_m, 0.012, -1.35 * p.radius_m - WALL_M
     side, far = 1.25 * r, p.wall_m + p.tray_m
@@ -119,8 +119,8 @@ def _add_wall(course: Course, p: Params, across: Span) -> None:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return whether the ball is wholly past the wall, or stays where it is behind it."""
-    return came_through(p.direction * motion.pos("ball")[:, 0] - p.radius_m - p.wall_m, p.radius_m)
+    """Read whether the ball is wholly past the wall, or stays where it is behind it."""
+    return read_passage(p.direction * motion.pos("ball")[:, 0] - p.radius_m - p.wall_m, p.radius_m)
 
 
 FAMILY = scene_family(

@@ -1,4 +1,4 @@
-"""A ball rolls off a table and drops; the question is whether it bounces over a wall.
+"""A ball rolls off a table and drops: does it bounce over a wall?
 
 Control: the pad under the table's edge, the wall and the tray behind it are in view. Void: the occluder stands before
 all of that.
@@ -16,7 +16,7 @@ from traps_pipeline.scenes.parts.course import DEAD, Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import AHEAD, beyond
 from traps_pipeline.scenes.parts.questions import colour_of, goes_to, yes_no
-from traps_pipeline.scenes.parts.readings import Reading, crossed
+from traps_pipeline.scenes.parts.readings import Reading, read_crossing
 from traps_pipeline.scenes.parts.vary import apart, between, facing, hidden, one_of, shuffled
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
@@ -28,7 +28,7 @@ PLAY, PLAIN = apart("red", "green", "blue", "yellow", "cyan", "purple"), shuffle
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 rolls to the right. Lengths along the way are measured from the table's edge."""
+    """Parameters; lengths run from the table's edge, direction +1: to the right."""
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()
@@ -49,13 +49,13 @@ class Params:
 
     @property
     def wall_at_m(self) -> float:
-        """Where the wall stands: below the highest point of the bounce."""
+        """Where the wall stands: below the top of the bounce."""
         fall_s = float(np.sqrt(2 * self.drop_m / 9.81))
         return (1 + LIVELY) * self.speed_m_s * fall_s + 0.3 * self.radius_m
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return a table, then pad, wall and tray before a board that catches the shadows."""
+    """Build a table, then pad, wall and tray before a board that catches the shadows."""
     course = Course(physics, p.direction)
     r, side, rim, top = p.radius_m, 1.7 * p.radius_m, 0.012, FLOOR_M + p.drop_m
     near, far, end = p.wall_at_m - WALL_HALF_M, p.wall_at_m + WALL_HALF_M, p.wall_at_m + p.tray_m
@@ -86,10 +86,10 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """On which side of the wall the ball is, from when it stays low there: it lies in the tray or on the pad."""
+    """Read the side of the wall on which the ball stays low, on the tray or the pad."""
     ball = motion.pos("ball")
     low = ball[:, 2] < FLOOR_M + p.radius_m + 0.4 * p.wall_m
-    return crossed(p.direction * ball[:, 0] - p.wall_at_m, valid=low)
+    return read_crossing(p.direction * ball[:, 0] - p.wall_at_m, valid=low)
 
 
 FAMILY = scene_family(

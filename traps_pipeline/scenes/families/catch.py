@@ -1,4 +1,4 @@
-"""A ball is thrown in a high arc; the question is whether it lands in the basket.
+"""A ball is thrown in a high arc: does it land in the basket?
 
 Control: the walled pen that it comes down in is in view, and the basket in it. Void: the occluder stands before the
 pen. Hidden element: the basket, which stands where the ball comes down or a step before or beyond. The throw is the
@@ -27,24 +27,24 @@ FLOOR_M = 0.02  # thickness of the pen's floor and of the basket's
 WALL_M = 0.012
 DEPTH_M = 0.17  # half of the pen's depth
 PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
-SEEN = ("ball", "pedestal", "basket")
+PARTS = ("ball", "pedestal", "basket")
 
 
 def _basket_half(rng: np.random.Generator, so_far: Drawn) -> float:
-    """Twice the ball's radius and a little more; `step_m` needs it unrounded."""
+    """Return the ball's diameter and a little more; `step_m` needs it unrounded."""
     so_far["half"] = uniform(rng, 2.0, 2.2) * so_far["radius_m"]
     return round(so_far["half"], 4)
 
 
 def _step(rng: np.random.Generator, so_far: Drawn) -> float:
-    """So far to either side that the ball misses the basket."""
+    """Draw a sideways step, so long that the ball misses the basket."""
     side = int(rng.choice([-1, 1]))
     return round(side * (so_far["half"] + so_far["radius_m"] + uniform(rng, 0.07, 0.10)), 4)
 
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 throws to the right. Places are along the throw, from the pedestal's middle."""
+    """Parameters; lengths run from the pedestal's middle, direction +1: to the right."""
 
     direction: int = one_of(-1, 1)
     radius_m: float = between(0.068, 0.080)
@@ -76,7 +76,7 @@ class Params:
 
     @property
     def pen_m(self) -> Span:
-        """Where the pen begins and ends: it has room for both places of the basket and for a ball beside it."""
+        """Ends of the pen, which holds both places of the basket and a ball beside it."""
         aside = self.basket_half_m + 0.03
         room = 2.9 * self.radius_m
         low = self.landing_m + min(0.0, self.step_m) - (aside if self.step_m < 0 else max(room, aside))
@@ -85,7 +85,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return pedestal, pen with a back wall and a low front, basket."""
+    """Build the pedestal, the pen with a high back and a low front, and the basket."""
     course = Course(physics, p.direction, Surface(0.004, solref=SOFT))
     r, rim, deep, colour = p.radius_m, p.rim_m, (-DEPTH_M, DEPTH_M), p.pen_colour
     course.block("pedestal", (-0.09, 0.09), (-0.09, 0.09), (0, p.pedestal_m), p.pedestal_colour)
@@ -129,8 +129,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return 'yes' while the ball is all but down on a floor between the basket's sides, 'no' when it is beside the
-    basket; None while it is higher. The margin is how far its centre ends from the nearest side of the basket."""
+    """Read 'yes' while the low ball is between the basket's sides, 'no' beside them."""
     ball = motion.pos("ball")
     along = p.direction * ball[:, 0]
     inside = p.basket_half_m - np.abs(along - p.basket_m)
@@ -138,20 +137,19 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading(side_while(down, inside), float(abs(inside[-1])))
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return whether the resting ball is between the sides of the basket in the picture."""
-    path = [rounded(frame, named["ball"]) for frame in frames[-3:]]
-    sides, ball = _sides(frames[-1], named["basket"]), end_of(path)
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Return whether the resting ball is between the basket's sides in the picture."""
+    path = [rounded(frame, slots["ball"]) for frame in frames[-3:]]
+    sides, ball = _sides(frames[-1], slots["basket"]), end_of(path)
     if ball is None or sides is None:
         return None
-    return "yes" if _between(ball.x, sides) else "no"
+    return "yes" if _is_between(ball.x, sides) else "no"
 
 
-def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return whether the flying ball is between the sides of the basket when it has fallen to the middle of their
-    height."""
-    path = [rounded(frame, named["ball"]) for frame in frames[-3:]]
-    sides, flight = _sides(frames[-1], named["basket"]), [ball for ball in path if ball is not None]
+def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Predict whether the ball is in the basket when it has fallen to half its height."""
+    path = [rounded(frame, slots["ball"]) for frame in frames[-3:]]
+    sides, flight = _sides(frames[-1], slots["basket"]), [ball for ball in path if ball is not None]
     if sides is None or len(flight) < 3:
         return None
     a, b, c = flight
@@ -159,11 +157,11 @@ def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
     down = (sides[2] + sides[3]) / 2 - c.y
     speed = falls + faster / 2
     frames_on = (math.sqrt(max(speed**2 + 2 * faster * down, 0.0)) - speed) / faster if faster > 0 else 0.0
-    return "yes" if _between(c.x + max(frames_on, 0.0) * (c.x - b.x), sides) else "no"
+    return "yes" if _is_between(c.x + max(frames_on, 0.0) * (c.x - b.x), sides) else "no"
 
 
 def _sides(frame: np.ndarray, colour: str) -> tuple[float, float, float, float] | None:
-    """Return the left and the right end, the top and the bottom (px) of all that has the basket's colour."""
+    """Return left, right, top and bottom (px) of all that has the basket's colour."""
     boxes = [part.box for part in blobs(colour_mask(frame, colour), 40)]
     if not boxes:
         return None
@@ -171,7 +169,7 @@ def _sides(frame: np.ndarray, colour: str) -> tuple[float, float, float, float] 
     return min(box[0] for box in boxes), right, min(box[1] for box in boxes), bottom
 
 
-def _between(x: float, sides: tuple[float, float, float, float]) -> bool:
+def _is_between(x: float, sides: tuple[float, float, float, float]) -> bool:
     left, right = sides[:2]
     return abs(x - (left + right) / 2) < 0.45 * (right - left)
 
@@ -191,8 +189,8 @@ FAMILY = scene_family(
     ),
     asides=[
         comes_from("From which side is the ball thrown, left or right?"),
-        colour_of("ball", "What colour is the ball that is thrown: {choices}?", SEEN),
-        colour_of("pedestal", "What colour is the pedestal that the ball is thrown from: {choices}?", SEEN),
+        colour_of("ball", "What colour is the ball that is thrown: {choices}?", PARTS),
+        colour_of("pedestal", "What colour is the pedestal that the ball is thrown from: {choices}?", PARTS),
     ],
     observe=observe,
     foresee=foresee,

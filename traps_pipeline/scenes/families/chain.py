@@ -1,5 +1,4 @@
-"""A ball rolls down a ramp into a row of balls that pass the impact on; the question is whether the last one rolls into
-the coloured box.
+"""A ball strikes a row of balls: does the last one roll into the coloured box?
 
 Control: the whole row and the box are in view. Void: the occluder stands before them; the striker rolls in behind it.
 Hidden element: a peg that stands between two balls of the row and stops the impact there, or stands beside the row.
@@ -31,7 +30,7 @@ PLAY, PLAIN = apart("red", "green", "blue", "yellow", "cyan", "purple"), shuffle
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 rolls to the right. Lengths run along the track, from the upper end of the ramp."""
+    """Parameters; lengths run from the ramp's upper end, direction +1: to the right."""
 
     direction: int = one_of(-1, 1)
     striker_colour: str = PLAY()
@@ -72,7 +71,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return ramp, step, deck with the row between low rims, sunken box."""
+    """Build ramp, step, deck with the row between low rims, and sunken box."""
     course = Course(physics, p.direction)
     r, side, end = p.radius_m, 1.35 * p.radius_m, p.box_at_m + p.box_m
     deep, outer = (-side, side), (-side - WALL_M, side + WALL_M)
@@ -113,12 +112,11 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return 'yes' while the middle of the last ball is in the box; 'no' while it is not, from when all balls are as
-    good as at rest. The margin is how far it ends inside the box by its middle, or short of it by its front."""
+    """Read whether the last ball's middle is in the box; 'no' only once all rest."""
     along = {ball: p.direction * motion.pos(ball)[:, 0] for ball in ("striker", *p.balls)}
     ahead = along["last"] - p.box_at_m
-    still = still_from(*along.values(), within_m=STILL_M)
-    return Reading(yes_while(ahead > 0, still), clear_m(ahead, p.radius_m))
+    rest_frame = still_from(*along.values(), within_m=STILL_M)
+    return Reading(yes_while(ahead > 0, rest_frame), clear_m(ahead, p.radius_m))
 
 
 FAMILY = scene_family(

@@ -1,5 +1,4 @@
-"""A row of dominoes comes towards the camera and splits in two branches; the question is at the end of which branch the
-domino falls, the left one or the right one.
+"""A row of dominoes splits in two branches: at whose end does the domino fall?
 
 Control: both branches are in view. Void: the occluder stands before them; the row is seen to fall behind it.
 Hidden element: one domino of either branch, of which one stands in its branch and the other lies beside it.
@@ -17,7 +16,7 @@ import numpy as np
 from traps_pipeline.scenes.parts.course import SHADOW_RIGHT, Course
 from traps_pipeline.scenes.parts.dominoes import BALL, BALL_AT, PLANK, STILL_M
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import end_of, struck, upper_half_stays
+from traps_pipeline.scenes.parts.observers import end_of, is_struck, is_upper_half_in_place
 from traps_pipeline.scenes.parts.questions import left_or_right
 from traps_pipeline.scenes.parts.readings import Reading, still_from, top_m
 from traps_pipeline.scenes.parts.vary import apart, between, drawn_by, hidden, in_front, one_of, several_between
@@ -33,7 +32,7 @@ PLAY = apart("red", "green", "blue", "yellow", "cyan", "purple")
 
 @dataclass(frozen=True)
 class Params:
-    """Lengths without a unit in the name are in domino heights; angles are between a branch and the row."""
+    """Parameters; lengths without a unit in domino heights, angles from the row."""
 
     row_colour: str = PLAY()
     ball_colour: str = PLAY()
@@ -59,9 +58,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return the row runs along -y from the first domino at the origin; the branches start where the kicked ball
-    stops.
-    """
+    """Build the row along -y, and two branches from where the kicked ball stops."""
     course, h = Course(physics), p.height_m
     face = (p.visible - 1) * p.spacing + p.thickness / 2
     junction = face + STOP_AT
@@ -101,7 +98,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _add_branch(course: Course, p: Params, side: str, yaw: float, junction: float) -> None:
-    """Add the dominoes of a branch, one of which may lie beside it, on the inner side."""
+    """Add the dominoes of a branch, of which one may lie beside it, on the inner side."""
     ahead, inwards = np.array([np.sin(yaw), np.cos(yaw)]), np.sign(yaw) * np.array([-np.cos(yaw), np.sin(yaw)])
     start = np.array([0.0, junction]) + (BALL - PUSH + p.thickness / 2) * ahead
     colours = [p.row_colour] * (p.branch - 1) + [p.left_colour if side == "left" else p.right_colour]
@@ -115,9 +112,7 @@ def _add_branch(course: Course, p: Params, side: str, yaw: float, junction: floa
 def _add_domino(
     course: Course, p: Params, name: str, at: np.ndarray, yaw: float, colour: str, *, lying: bool = False
 ) -> None:
-    """Add a free domino (body and geom `name`) at (across, along), its thickness along a direction `yaw` from the
-    row.
-    """
+    """Add a free domino at (across, along), its thickness along `yaw` from the row."""
     h = p.height_m
     deep, high = (1.0, p.thickness) if lying else (p.thickness, 1.0)
     place = (float(at[0]) * h, -float(at[1]) * h, (PLANK + high / 2) * h)
@@ -127,17 +122,16 @@ def _add_domino(
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return the side on which alone the end domino's top is below half a domino's height, from when no domino of the
-    branches moves any more. The margin is how far either top ends from that height, at least."""
+    """Read the side on which alone the end domino falls, once the branches are still."""
     tops = np.stack([top_m(motion, f"end_{side}", p.height_m) for side in SIDES], axis=1) - PLANK * p.height_m
-    still = still_from(*(motion.pos(body) for side in SIDES for body in p.bodies(side)), within_m=STILL_M)
+    rest_frame = still_from(*(motion.pos(body) for side in SIDES for body in p.bodies(side)), within_m=STILL_M)
     sides = [("left" if left else "right") if left != right else None for left, right in tops < p.height_m / 2]
-    labels = [side if i >= still else None for i, side in enumerate(sides)]
+    labels = [side if i >= rest_frame else None for i, side in enumerate(sides)]
     return Reading(labels, float(np.abs(tops[-1] - p.height_m / 2).min()))
 
 
 def _aside(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
-    """After the order of the choices, which is drawn first, either what starts the fall or what falls first."""
+    """Draw a question: what starts the fall, or what falls first."""
     choices = tuple(str(c) for c in rng.permutation([p.row_colour, p.ball_colour, p.left_colour, p.right_colour]))
     if rng.integers(2):
         question = f"What colour is the ball that sets off the row of dominoes: {listed(choices)}?"
@@ -146,39 +140,43 @@ def _aside(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
     return AnswerableQuestion(question, choices, p.row_colour)
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return the side whose end domino alone is no longer where it stood at first."""
-    stands = [_stands(frames, named[side]) for side in SIDES]
-    if None in stands or stands[0] == stands[1]:
+    standing = [_is_standing(frames, slots[side]) for side in SIDES]
+    if None in standing or standing[0] == standing[1]:
         return None
-    return "right" if stands[0] else "left"
+    return "right" if standing[0] else "left"
 
 
-def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return the side whose end domino alone has left its place or is about to; a flag of its colour does neither."""
+def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Predict the side whose end domino alone has left its place or is about to."""
     falls = []
-    for colour in (named["left"], named["right"]):
-        seen = blobs(colour_mask(frames[0], colour), 60)
-        falls.append(any(not upper_half_stays(frames, colour, one) or struck(frames, one, 0.0) for one in seen))
+    for colour in (slots["left"], slots["right"]):
+        dominoes = blobs(colour_mask(frames[0], colour), 60)
+        falls.append(
+            any(
+                not is_upper_half_in_place(frames, colour, domino) or is_struck(frames, domino, 0.0)
+                for domino in dominoes
+            )
+        )
     return None if falls[0] == falls[1] else "left" if falls[0] else "right"
 
 
-def look(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def look(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return the side whose end domino rests and is the flatter of the two."""
-    ends = [end_of(track(frames, named[side], 60)) for side in SIDES]
+    ends = [end_of(track(frames, slots[side], 60)) for side in SIDES]
     upright = [end.box[3] / end.box[2] for end in ends if end is not None]
     if len(upright) < 2 or max(upright) < FLATTER * min(upright):
         return None
     return SIDES[int(np.argmin(upright))]
 
 
-def _stands(frames: np.ndarray, colour: str) -> bool | None:
-    """Return whether the upper half of the thing of that colour is where it was; None if it is not to be seen at the
-    end."""
+def _is_standing(frames: np.ndarray, colour: str) -> bool | None:
+    """Return whether a colour's upper half is where it was; None if out of view."""
     first, last = largest(frames[0], colour, 60), largest(frames[-1], colour, 60)
     if first is None or last is None or is_occluder(first) or is_occluder(last):
         return None
-    return upper_half_stays(frames, colour, first)
+    return is_upper_half_in_place(frames, colour, first)
 
 
 FAMILY = scene_family(

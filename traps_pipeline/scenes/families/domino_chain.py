@@ -1,4 +1,4 @@
-"""A row of dominoes is set off by a rolling ball; the question is whether the last one falls.
+"""A row of dominoes is set off by a rolling ball: does the last one fall?
 
 Control: the whole row is in view. Void: the occluder stands before its second part.
 Hidden element: one domino of the second part, which stands in the row or lies beside it and leaves a gap.
@@ -14,7 +14,7 @@ import numpy as np
 
 from traps_pipeline.scenes.parts import dominoes
 from traps_pipeline.scenes.parts.course import Course
-from traps_pipeline.scenes.parts.dominoes import Size, Standing
+from traps_pipeline.scenes.parts.dominoes import Domino, Size
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import has_begun, has_fallen, lies_flat
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
@@ -26,13 +26,13 @@ PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
 
 
 def _plank_colour(rng: np.random.Generator, so_far: Drawn) -> str:
-    """Not wood beside orange, which it looks like."""
+    """Draw a colour; never wood beside orange, which it looks like."""
     return str(rng.choice(["grey", "black"] if "orange" in so_far.values() else ["wood", "grey", "black"]))
 
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 falls to the right. Lengths without a unit in the name are in domino heights."""
+    """Parameters; lengths without a unit in domino heights, direction +1: right."""
 
     direction: int = one_of(-1, 1)
     concealed: int = one_of(3, 4)  # dominoes after the hand-off, the last one included
@@ -54,7 +54,7 @@ class Params:
 
     @property
     def size(self) -> Size:
-        """Of every domino."""
+        """Size of each domino."""
         return Size(self.height_m, self.width, self.thickness, self.spacing)
 
     @property
@@ -64,11 +64,11 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return both parts of the row on a plank, a ball before each, posts that stop the second ball."""
+    """Build both parts of the row, a ball before each, and posts that stop the second."""
     course = Course(physics, p.direction)
     colours = [p.row_colour] * (p.concealed - 1) + [p.last_colour]
     second = [
-        Standing(name, i, colour, aside=p.gap_open and i == p.gap_index)
+        Domino(name, i, colour, aside=p.gap_open and i == p.gap_index)
         for i, (name, colour) in enumerate(zip(p.second, colours, strict=True))
     ]
     along = dominoes.add_rows(
@@ -96,11 +96,10 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return 'yes' from when the top of the last domino is below half a domino's height; 'no' while it is not, from
-    when no concealed domino moves any more. The margin is how far that top ends from half a domino's height."""
+    """Read whether the last domino's top is low; 'no' only once the others are still."""
     top = top_m(motion, "last", p.height_m, dominoes.PLANK * p.height_m)
-    still = still_from(*(motion.pos(body) for body in p.second), within_m=dominoes.STILL_M)
-    return Reading(yes_while(top < p.height_m / 2, still), float(abs(top[-1] - p.height_m / 2)))
+    rest_frame = still_from(*(motion.pos(body) for body in p.second), within_m=dominoes.STILL_M)
+    return Reading(yes_while(top < p.height_m / 2, rest_frame), float(abs(top[-1] - p.height_m / 2)))
 
 
 FAMILY = scene_family(

@@ -1,5 +1,4 @@
-"""A short row of dominoes is set off by a rolling ball, and kicks a ball into a second row; the question is how many
-dominoes of the second row fall.
+"""A row of dominoes kicks a ball into a second row: how many of that row fall?
 
 Control: both rows are in view. Void: the occluder stands before the second row.
 Hidden element: where the second row has its gap, which the fall does not bridge.
@@ -16,13 +15,13 @@ import numpy as np
 
 from traps_pipeline.scenes.parts import dominoes
 from traps_pipeline.scenes.parts.course import Course
-from traps_pipeline.scenes.parts.dominoes import Size, Standing
+from traps_pipeline.scenes.parts.dominoes import Domino, Size
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import around, upper_half_stays
+from traps_pipeline.scenes.parts.observers import around, is_upper_half_in_place
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, either, how_many, range_of
 from traps_pipeline.scenes.parts.readings import Reading, still_from, top_m
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, facing, one_of
-from traps_pipeline.scenes.parts.vision import blobs, colour_mask, moved
+from traps_pipeline.scenes.parts.vision import blobs, colour_mask, motion_mask
 from traps_pipeline.scenes.parts.wording import choices_in
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
@@ -35,21 +34,21 @@ PLAY = apart("red", "green", "blue", "yellow", "cyan", "purple")
 
 
 def _ranges(rng: np.random.Generator, so_far: Drawn) -> Ranges:
-    """Then the choice that shall be right: every choice is as often, however many dominoes it spans."""
+    """Draw the choices, then the right one of them, each as often."""
     ranges = RANGES[int(rng.integers(len(RANGES)))]
     so_far["right"] = ranges[int(rng.integers(len(ranges)))]
     return ranges
 
 
 def _gap_after(rng: np.random.Generator, so_far: Drawn) -> int:
-    """Return any place for which that choice is right."""
+    """Draw the gap's place among those for which that choice is right."""
     low, high = so_far["right"]
     return int(rng.integers(low, high + 1))
 
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 falls to the right. Lengths without a unit in the name are in domino heights."""
+    """Parameters; lengths without a unit in domino heights, direction +1: right."""
 
     direction: int = one_of(-1, 1)
     first_colour: str = PLAY()
@@ -69,7 +68,7 @@ class Params:
 
     @property
     def size(self) -> Size:
-        """Of every domino."""
+        """Size of each domino."""
         return Size(self.height_m, self.width, self.thickness, self.spacing)
 
     @property
@@ -79,14 +78,14 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return both rows on a plank, a ball before each, posts that stop the second ball."""
+    """Build both rows on a plank, a ball before each, posts that stop the second ball."""
     course = Course(physics, p.direction)
     places = [i if i < p.gap_after else i + 1 for i in range(len(p.second))]
     along = dominoes.add_rows(
         course,
         p.size,
         first=[p.first_colour] * p.visible,
-        second=[Standing(name, place, p.second_colour) for name, place in zip(p.second, places, strict=True)],
+        second=[Domino(name, place, p.second_colour) for name, place in zip(p.second, places, strict=True)],
         places=len(p.second),
         ball_colour=p.ball_colour,
         plank_colour=p.plank_colour,
@@ -116,55 +115,54 @@ def twins(p: Params) -> list[Params]:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return the choice for how many tops are below 0.6 of a domino's height, from when none of the second row moves.
-    The margin is how far any top ends from that height, at least."""
+    """Read the choice for the number of low tops, once the second row is still."""
     tops = np.stack([top_m(motion, body, p.height_m) for body in p.second], axis=1) - dominoes.PLANK * p.height_m
     fallen = (tops < FALLEN * p.height_m).sum(axis=1)
-    still = still_from(*(motion.pos(body) for body in p.second), within_m=dominoes.STILL_M)
-    labels = [range_of(p.ranges, int(n)) if i >= still else None for i, n in enumerate(fallen)]
+    rest_frame = still_from(*(motion.pos(body) for body in p.second), within_m=dominoes.STILL_M)
+    labels = [range_of(p.ranges, int(n)) if i >= rest_frame else None for i, n in enumerate(fallen)]
     return Reading(labels, float(np.abs(tops[-1] - FALLEN * p.height_m).min()))
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return all dominoes of the second row less those that still stand where they stood at first."""
-    colour = named["second"]
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Count the second row's dominoes less those that stand where they stood at first."""
+    colour = slots["second"]
     before, close, after = (colour_mask(frames[i], colour) for i in (0, -3, -1))
     standing = blobs(before, min_area=60)
-    ranges = _choices(named, len(standing))
+    ranges = _choices(slots, len(standing))
     if ranges is None or after.sum() < 0.3 * before.sum() or (after != close).sum() > 0.1 * after.sum():
         return None
-    return range_of(ranges, sum(not upper_half_stays(frames, colour, domino) for domino in standing))
+    return range_of(ranges, sum(not is_upper_half_in_place(frames, colour, domino) for domino in standing))
 
 
-def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return the dominoes of the second row that no longer stand where they stood, or that something moves at."""
-    standing, change = blobs(colour_mask(frames[0], named["second"]), min_area=60), moved(frames)
-    ranges = _choices(named, len(standing))
+def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Count the second row's dominoes that are out of place or about to be struck."""
+    standing, change = blobs(colour_mask(frames[0], slots["second"]), min_area=60), motion_mask(frames)
+    ranges = _choices(slots, len(standing))
     if ranges is None:
         return None
     falls = [
-        not upper_half_stays(frames, named["second"], each) or change[around(each, 0.0)].mean() > GIVES
-        for each in standing
+        not is_upper_half_in_place(frames, slots["second"], domino) or change[around(domino, 0.0)].mean() > GIVES
+        for domino in standing
     ]
     return range_of(ranges, sum(falls))
 
 
-def look(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return the dominoes of the second row, of which the choices tell the number, less those that stand at the end."""
-    close, after = (colour_mask(frames[i], named["second"]) for i in (-3, -1))
-    if "choices" not in named or not after.any() or (after != close).sum() > 0.1 * after.sum():
+def look(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Count the second row by the choices, less the dominoes that stand at the end."""
+    close, after = (colour_mask(frames[i], slots["second"]) for i in (-3, -1))
+    if "choices" not in slots or not after.any() or (after != close).sum() > 0.1 * after.sum():
         return None
-    ranges = [[int(n) for n in one.split("-")] for one in choices_in(named["choices"])]
+    ranges = [[int(n) for n in choice.split("-")] for choice in choices_in(slots["choices"])]
     stand = sum(domino.box[3] > UPRIGHT * domino.box[2] for domino in blobs(after, min_area=60))
     return range_of(ranges, ranges[-1][1] - stand)
 
 
-def _choices(named: Mapping[str, str], dominoes_seen: int) -> Sequence[Sequence[int]] | None:
-    """Return the ranges that are offered, or those that are for so many dominoes; None if these are not all of the
-    row.
-    """
-    if "choices" in named:
-        offered: Sequence[Sequence[int]] = [[int(n) for n in one.split("-")] for one in choices_in(named["choices"])]
+def _choices(slots: Mapping[str, str], dominoes_seen: int) -> Sequence[Sequence[int]] | None:
+    """Return the offered ranges; with a count, None if they do not span that row."""
+    if "choices" in slots:
+        offered: Sequence[Sequence[int]] = [
+            [int(n) for n in choice.split("-")] for choice in choices_in(slots["choices"])
+        ]
         return offered if offered[-1][1] == dominoes_seen else None
     return next((ranges for ranges in RANGES if ranges[-1][1] == dominoes_seen), None)
 

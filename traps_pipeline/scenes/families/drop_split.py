@@ -1,4 +1,4 @@
-"""A ball drops onto a ridge between two bins; the question is on which side it comes down.
+"""A ball drops onto a ridge between two bins: on which side does it come down?
 
 Control: ridge and bins are in view, the left bin red and the right one blue. Void: the occluder stands before them.
 Hidden element: the ridge, which stands a little to the left or to the right of where the ball comes down. The drop is
@@ -19,7 +19,7 @@ from traps_pipeline.scenes.parts.observers import carried_on, rounded
 from traps_pipeline.scenes.parts.questions import Aside, choice_of, either, left_or_right
 from traps_pipeline.scenes.parts.readings import Reading, side_while
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, in_front, one_of, shuffled
-from traps_pipeline.scenes.parts.vision import at_rest, colour_mask, largest, slanting_edges
+from traps_pipeline.scenes.parts.vision import colour_mask, is_at_rest, largest, slanting_edges
 from traps_pipeline.scenes.physics.kit import AnswerableQuestion, Motion, Physics, Scene, uniform
 
 GRAVITY = 9.81
@@ -34,13 +34,13 @@ PLAY, PLAIN = apart(*FREE), shuffled("grey", "black", "white")
 
 
 def _offset(rng: np.random.Generator, so_far: Drawn) -> float:
-    """To either side, so far that the ridge surely turns the ball that way."""
+    """Draw an offset to either side that surely turns the ball that way."""
     return round(int(rng.choice([-1, 1])) * uniform(rng, 0.45, 0.75) * so_far["radius_m"], 4)
 
 
 @dataclass(frozen=True)
 class Params:
-    """drift_m_s: how fast the ball moves to the right as it drops. cube_side: +1 stands to the right of the bins."""
+    """Parameters; drift: m/s to the right, cube_side +1: to the right of the bins."""
 
     radius_m: float = between(0.068, 0.080)
     ball_colour: str = PLAY()
@@ -66,7 +66,7 @@ def twins(p: Params) -> list[Params]:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return bins with a high back and a low front, the ridge of two boards that lean together, a cube to one side."""
+    """Build bins with a high back and a low front, a ridge of two boards, and a cube."""
     course = Course(physics, surface=FELT)
     r, end, high = p.radius_m, p.bin_m, p.ridge_m + 0.10
     outer, deep = end + WALL_M, (-DEPTH_M, DEPTH_M)
@@ -108,25 +108,24 @@ def build(p: Params, physics: Physics) -> Scene:
         colours=["red", "blue"],
         shown_by={"side": ["bin"]},
     )
-    named = (*things, "ridge between the bins")  # which does not end in its noun
-    return replace(scene, inventory=replace(scene.inventory, things=named))
+    phrases = (*things, "ridge between the bins")  # which does not end in its noun
+    return replace(scene, inventory=replace(scene.inventory, things=phrases))
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return the side of the ridge that the ball is on while its centre is lower than the ridge; None while it is
-    higher. The margin is how far its centre ends from the middle of the ridge."""
+    """Read the side of the ridge that the ball is on, while it is below the top."""
     ball = motion.pos("ball")
     past = ball[:, 0] - p.offset_m
     return Reading(side_while(ball[:, 2] < p.ridge_m, past, "right", "left"), float(abs(past[-1])))
 
 
-def _one_colour(part: str, question: str) -> Aside:
-    """Return a question after the colour of ball or cube; a third choice is one that neither has."""
+def _ask_colour(part: str, question: str) -> Aside:
+    """Ask for the colour of ball or cube; the third choice is a colour of neither."""
 
     def ask(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
         colours = [p.ball_colour, p.cube_colour]
-        other = next(str(c) for c in rng.permutation(FREE) if c not in colours)
-        return choice_of(question, lambda p: [*colours, other], lambda p: coloured(p)[part])(p, rng)
+        third = next(str(c) for c in rng.permutation(FREE) if c not in colours)
+        return choice_of(question, lambda p: [*colours, third], lambda p: coloured(p)[part])(p, rng)
 
     return ask
 
@@ -137,19 +136,18 @@ def _middle_x(frame: np.ndarray, colour: str) -> float | None:
     return float(columns[0] + columns[-1]) / 2 if len(columns) >= 15 else None
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return whether the resting ball is nearer to the middle of what is red or of what is blue."""
-    path = [rounded(frame, named["ball"]) for frame in frames[-3:]]
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Return whether the resting ball is nearer to the red or the blue bin's middle."""
+    path = [rounded(frame, slots["ball"]) for frame in frames[-3:]]
     ball, red, blue = path[-1], _middle_x(frames[-1], "red"), _middle_x(frames[-1], "blue")
-    if ball is None or not at_rest(path) or red is None or blue is None:
+    if ball is None or not is_at_rest(path) or red is None or blue is None:
         return None
     return "left" if abs(ball.x - red) < abs(ball.x - blue) else "right"
 
 
-def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return the side of the ridge's top on which the ball comes down. The top is halfway between the edges that fall
-    to the left and those that fall to the right; the ball meets it about half a frame later."""
-    ball = carried_on([rounded(frame, named["ball"]) for frame in frames], 0.5)
+def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Predict the side of the ridge's top, seen by its edges, on which the ball lands."""
+    ball = carried_on([rounded(frame, slots["ball"]) for frame in frames], 0.5)
     red, blue = (colour_mask(frames[0], colour) for colour in ("red", "blue"))
     bins = [largest(frames[0], colour) for colour in ("red", "blue")]
     if ball is None or bins[0] is None or bins[1] is None:
@@ -184,8 +182,8 @@ FAMILY = scene_family(
             ("left", "right"),
             lambda p: "right" if p.cube_side > 0 else "left",
         ),
-        _one_colour("ball", "What colour is the ball: {choices}?"),
-        _one_colour("cube", "What colour is the cube beside the bins: {choices}?"),
+        _ask_colour("ball", "What colour is the ball: {choices}?"),
+        _ask_colour("cube", "What colour is the cube beside the bins: {choices}?"),
     ],
     observe=observe,
     foresee=foresee,

@@ -1,4 +1,4 @@
-"""A ball rolls off a shelf into a funnel; the question is whether it comes through into the cup below.
+"""A ball rolls off a shelf into a funnel: does it come through into the cup below?
 
 Control: funnel and cup are in view. Void: the occluder stands before them, the shelf beside it stays in view.
 Hidden element: the two boards of the funnel, which leave a throat that is wider or narrower than the ball. The ball
@@ -19,7 +19,7 @@ from traps_pipeline.scenes.parts.observers import rounded
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
 from traps_pipeline.scenes.parts.readings import Reading
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, facing, one_of, shuffled, together
-from traps_pipeline.scenes.parts.vision import at_rest, largest
+from traps_pipeline.scenes.parts.vision import is_at_rest, largest
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, uniform
 
 FLOOR_M = 0.02  # thickness of the cup's floor
@@ -27,11 +27,11 @@ WALL_M = 0.014
 DEPTH_M = 0.12  # half of the funnel's and the cup's depth
 PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
 PLAIN = shuffled("grey", "black", "white")
-SEEN = ("ball", "shelf", "cup")
+PARTS = ("ball", "shelf", "cup")
 
 
 def _throats(rng: np.random.Generator, so_far: Drawn) -> list[float]:
-    """Return a throat that is wider than the ball and one that is narrower, in random order."""
+    """Draw a throat wider than the ball and one narrower, in random order."""
     throats = [uniform(rng, 1.3, 1.5), uniform(rng, 0.55, 0.75)]
     return throats if rng.integers(2) == 0 else throats[::-1]
 
@@ -41,7 +41,7 @@ THROATS = together(_throats)
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 rolls to the right. The funnel is in the middle."""
+    """Parameters; direction +1: to the right. The funnel is in the middle."""
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()
@@ -70,8 +70,7 @@ def twins(p: Params) -> list[Params]:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return shelf on two legs, cup, funnel before a back wall. Lengths run along the roll, from the middle of the
-    funnel."""
+    """Build shelf on two legs, cup, and funnel before a back wall."""
     course = Course(physics, p.direction, Surface(0.003, sliding=0.5, solref=SOFT))
     r, half, slope, deep = p.radius_m, p.cup_half_m, radians(p.slope_deg), (-DEPTH_M, DEPTH_M)
     mouth = p.throat_at_m + p.board_m * sin(slope)  # height of the funnel's upper edges
@@ -123,9 +122,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return 'yes' while the ball is wholly below the throat and over the cup, if it ends there; 'no' while it is where
-    it ends between the boards. The margin is how far it ends from being just through the throat, or how much too narrow
-    the throat is for it."""
+    """Read 'yes' while the ball is below the throat, 'no' while it is stuck above."""
     ball = motion.pos("ball")
     height = ball[:, 2] - p.throat_at_m
     through = (height < -p.radius_m) & (np.abs(ball[:, 0]) < p.cup_half_m)
@@ -133,16 +130,16 @@ def outcome(motion: Motion, p: Params) -> Reading:
     margin = -p.radius_m - end if end < 0 else (1 - p.half_throat) * p.radius_m
     if through[-1]:
         return Reading(["yes" if past else None for past in through], margin)
-    settled = np.linalg.norm(ball - ball[-1], axis=1) < 0.5 * p.radius_m
-    caught = 0 < end < 2 * p.radius_m
-    return Reading(["no" if caught and still else None for still in settled], margin)
+    is_at_rest = np.linalg.norm(ball - ball[-1], axis=1) < 0.5 * p.radius_m
+    is_stuck = 0 < end < 2 * p.radius_m
+    return Reading(["no" if is_stuck and still else None for still in is_at_rest], margin)
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return whether the resting ball, of which the boards may hide a part, is below the upper edge of the cup."""
-    path = [rounded(frame, named["ball"], fill=0.92, longer=2.5) for frame in frames[-3:]]
-    ball, cup = path[-1], largest(frames[-1], named["cup"], 150)
-    if ball is None or not at_rest(path) or cup is None:
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Return whether the resting ball is below the upper edge of the cup."""
+    path = [rounded(frame, slots["ball"], fill=0.92, longer=2.5) for frame in frames[-3:]]
+    ball, cup = path[-1], largest(frames[-1], slots["cup"], 150)
+    if ball is None or not is_at_rest(path) or cup is None:
         return None
     return "yes" if ball.y > cup.box[1] else "no"
 
@@ -162,8 +159,8 @@ FAMILY = scene_family(
     ),
     asides=[
         comes_from("On which side of the picture is the shelf that the ball rolls along, left or right?"),
-        colour_of("ball", "What colour is the rolling ball: {choices}?", SEEN),
-        colour_of("shelf", "What colour is the shelf on legs: {choices}?", SEEN),
+        colour_of("ball", "What colour is the rolling ball: {choices}?", PARTS),
+        colour_of("shelf", "What colour is the shelf on legs: {choices}?", PARTS),
     ],
     observe=observe,
     min_margin_m=0.01,

@@ -1,5 +1,4 @@
-"""Two balls roll down ramps at each other, collide on the deck between them and end on one half of it; the question is
-which of them came from that half.
+"""Two balls collide on a deck and end on one half: which came from that half?
 
 Control: the whole deck is in view. Void: the occluder stands before it; both balls are seen to roll in behind it.
 Hidden element: a rough board on one half of the deck. The ball that crosses it arrives slowly and is knocked back. The
@@ -18,7 +17,7 @@ from traps_pipeline.scenes.parts.course import Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import AHEAD, colours_of_balls, end_of
 from traps_pipeline.scenes.parts.questions import which_colour
-from traps_pipeline.scenes.parts.readings import Reading, held_from, still_from, undecided
+from traps_pipeline.scenes.parts.readings import Reading, label_from, still_from, undecided
 from traps_pipeline.scenes.parts.vary import apart, between, hidden, in_front, several_between, shuffled
 from traps_pipeline.scenes.parts.vision import is_occluder, largest, track
 from traps_pipeline.scenes.physics.kit import AnswerableQuestion, Motion, Physics, Scene, Vec3, listed
@@ -38,7 +37,7 @@ PLAY, PLAIN = apart(*BALL_COLOURS), shuffled("grey", "white")
 
 @dataclass(frozen=True)
 class Params:
-    """Pairs are for the left and the right ball. Lengths run outwards from the centre line."""
+    """Parameters; pairs are left and right, lengths run outwards from the centre line."""
 
     colours: tuple[str, str] = PLAY(2)
     deck_colour: str = PLAIN()
@@ -55,9 +54,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return two ramps, steps, and a deck with a centre line and low rims. The boards are alike but for their
-    friction.
-    """
+    """Build two ramps, steps, and a deck whose two boards differ only in friction."""
     course = Course(physics)
     r, half, side, high = p.radius_m, p.half_deck_m, 1.7 * p.radius_m, DECK_M + 2 * p.radius_m
     deep, on_deck, board_at = (-side, side), (0, DECK_M), half - 0.10
@@ -89,13 +86,16 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _roughness(p: Params) -> float:
-    """Return rolling friction (m) that leaves a ball its share of its speed: a solid ball slows at 5 g mu / 7 r."""
+    """Return rolling friction (m) that leaves a ball its share of its speed.
+
+    A solid ball slows at 5 g mu / 7 r.
+    """
     drop = (p.ramp_m - sum(p.starts_m) / 2) * np.tan(np.radians(p.slope_deg)) * 10 / 7
     return float(7 / 5 * p.radius_m * drop * (1 - p.slowed**2) / (2 * BOARD_M))
 
 
 def _on_ramp(p: Params, along: float, over: float = 0.0) -> Vec3:
-    """Return the place so far from the foot of a ramp, and from the surface there so far out of it."""
+    """Return the place at a distance from a ramp's foot and from its surface."""
     slope = np.radians(p.slope_deg)
     high = DECK_M + STEP_M + along * np.tan(slope)
     return float(p.half_deck_m + along - over * np.sin(slope)), 0.0, float(high + over * np.cos(slope))
@@ -112,19 +112,18 @@ def _add_ramp(course: Course, p: Params, name: str, side: float) -> None:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """From when both balls are at rest: the colour of the one that is on its own side while the other is there too. No
-    reading at all if they do not end on one side. The margin is how far past the centre line the other one ends."""
+    """Read the colour of the ball on its own side, once both rest on that side."""
     ends = [motion.pos(f"ball_{name}")[:, 0] for name in SIDES]
     left, right = (float(x[-1]) for x in ends)
     margin = min(abs(left), abs(right))
     if left * right <= 0:
         return Reading(undecided(motion), margin)
-    kept = p.colours[0] if left < 0 else p.colours[1]
-    return Reading(held_from(still_from(*ends, within_m=STILL_M), kept, motion), margin)
+    winner = p.colours[0] if left < 0 else p.colours[1]
+    return Reading(label_from(still_from(*ends, within_m=STILL_M), winner, motion), margin)
 
 
 def _aside(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
-    """Return of one ball, which is drawn first: its side or its colour."""
+    """Ask for the side or the colour of one ball, which is drawn first."""
     i = int(rng.integers(2))
     if rng.integers(2):
         question = f"On which ramp does the {p.colours[i]} ball start, the left one or the right one?"
@@ -134,17 +133,17 @@ def _aside(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
     return AnswerableQuestion(question, choices, p.colours[i])
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str], ahead: float | None = None) -> str | None:
-    """Return the ball that ends on its own side of the black line, if both are at rest on that side."""
-    line, kept = largest(frames[0], "black"), []
-    for colour in colours_of_balls(frames, named, BALL_COLOURS):
+def observe(frames: np.ndarray, slots: Mapping[str, str], ahead: float | None = None) -> str | None:
+    """Return the ball that ends on its own side of the black line, if both rest there."""
+    line, at_home = largest(frames[0], "black"), []
+    for colour in colours_of_balls(frames, slots, BALL_COLOURS):
         path = track(frames, colour, 60)
         start, end = path[0], end_of(path, ahead)
         if line is None or start is None or end is None or is_occluder(start) or is_occluder(end):
             return None
         if (start.x - line.x) * (end.x - line.x) > 0:
-            kept.append(colour)
-    return kept[0] if len(kept) == 1 else None
+            at_home.append(colour)
+    return at_home[0] if len(at_home) == 1 else None
 
 
 FAMILY = scene_family(

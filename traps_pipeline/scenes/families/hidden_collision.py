@@ -1,4 +1,4 @@
-"""Two balls roll towards each other on a track of two lanes; the question is whether they collide.
+"""Two balls roll towards each other on a track of two lanes: do they collide?
 
 Control: the middle of the track, where the lanes are linked, is in view. Void: the occluder stands before it.
 Hidden element: a switch board, which lies between the lanes or is turned so that it leads one ball to the other lane.
@@ -18,7 +18,7 @@ from traps_pipeline.scenes.parts.observers import carried_on, small
 from traps_pipeline.scenes.parts.questions import yes_no
 from traps_pipeline.scenes.parts.readings import Reading
 from traps_pipeline.scenes.parts.vary import apart, between, drawn_by, hidden, in_front, one_of, shuffled
-from traps_pipeline.scenes.parts.vision import Blob, at_rest
+from traps_pipeline.scenes.parts.vision import Blob, is_at_rest
 from traps_pipeline.scenes.physics.kit import AnswerableQuestion, Motion, Physics, Scene, uniform
 
 DECK_M = 0.03
@@ -33,10 +33,10 @@ PLAIN = shuffled("wood", "grey", "white", "black")
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 if the first ball, which the switch may turn aside, rolls to the right. lanes: -1 front, +1 back.
+    """Parameters; pairs: first and second ball, lanes: -1 front, +1 back.
 
-    Pairs are for the first and the second ball. Lengths run along the first ball's way from the middle of the covered
-    part.
+    direction: +1 if the first ball, which the switch may turn, rolls to the right. Lengths run along its way from the
+    middle of the covered part.
     """
 
     deck_colour: str = PLAIN()
@@ -56,7 +56,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return a flat track with rails; of each lane the end is closed by which no ball enters."""
+    """Build a flat track with rails; each lane is closed where no ball enters."""
     course = Course(physics, p.direction)
     r, half, side = p.radius_m, p.middle_m / 2, 2 * HALF_PITCH * p.radius_m
     end, switch_at, length = half + p.run_m, -half + p.switch_m, float(np.hypot(*SWITCH)) * r
@@ -103,25 +103,24 @@ def _add_switch(course: Course, p: Params, at: float, length: float) -> None:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return 'no' from when the balls have passed each other; 'yes' from when they are closest, if they touch. The
-    margin is how far apart they end along the track."""
+    """Read 'no' once the balls have passed each other, 'yes' once they touch."""
     between_them = motion.pos("ball_1") - motion.pos("ball_0")
     ahead = p.direction * between_them[:, 0]  # of the second ball on the first one's way
     distance = np.linalg.norm(between_them, axis=1)
     closest = int(distance.argmin())
-    met = distance[closest] < 2 * p.radius_m + 0.01
-    labels = ["no" if x < -p.radius_m else "yes" if met and i >= closest else None for i, x in enumerate(ahead)]
+    has_touched = distance[closest] < 2 * p.radius_m + 0.01
+    labels = ["no" if x < -p.radius_m else "yes" if has_touched and i >= closest else None for i, x in enumerate(ahead)]
     return Reading(labels, float(abs(ahead[-1])))
 
 
-def _either_order(p: Params, rng: np.random.Generator) -> Mapping[str, str]:
-    """Return the two colours, in random order."""
+def _shuffled_colours(p: Params, rng: np.random.Generator) -> Mapping[str, str]:
+    """Return the two colours in random order."""
     first, second = (str(c) for c in rng.permutation(p.colours))
     return {"first": first, "second": second}
 
 
 def _aside(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
-    """Return the side or the lane of one ball, which is drawn whatever is asked, or whether the lanes are the same."""
+    """Ask for one ball's side or lane (always drawn), or if both lanes are the same."""
     kind, i = rng.integers(3), int(rng.integers(2))
     if kind == 0:
         question = f"From which side does the {p.colours[i]} ball roll in, left or right?"
@@ -133,27 +132,25 @@ def _aside(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
     return AnswerableQuestion(question, ("same", "different"), "same" if p.lanes[0] == p.lanes[1] else "different")
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return 'no' once the balls are in the other order from left to right than they start in; 'yes' if they come to
-    rest without that."""
-    starts, ends, resting = [], [], True
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Return 'no' once the balls have changed their order, 'yes' if they rest before."""
+    starts, ends, all_rest = [], [], True
     for name in ("first", "second"):
-        path = [small(frame, named[name]) for frame in frames]
+        path = [small(frame, slots[name]) for frame in frames]
         start, end = next((blob for blob in path if blob), None), path[-1]
         if start is None or end is None:
             return None
         starts.append(start.x)
         ends.append(end.x)
-        resting &= at_rest(path, tolerance_px=4)
+        all_rest &= is_at_rest(path, tolerance_px=4)
     if (starts[0] < starts[1]) != (ends[0] < ends[1]):
         return "no"
-    return "yes" if resting else None
+    return "yes" if all_rest else None
 
 
-def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return whether the balls, if they go on as they do, are in one lane when they are side by side: then they
-    collide."""
-    paths = [[small(frame, named[name]) for frame in frames] for name in ("first", "second")]
+def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Predict a collision: the balls are in one lane when they are side by side."""
+    paths = [[small(frame, slots[name]) for frame in frames] for name in ("first", "second")]
     a, b = (carried_on(path, 0.0) for path in paths)
     a_next, b_next = (carried_on(path, 1.0) for path in paths)
     if a is None or b is None or a_next is None or b_next is None:
@@ -170,7 +167,7 @@ def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def _along(paths: Sequence[Sequence[Blob | None]]) -> np.ndarray | None:
-    """Return which way the track runs in the picture: the balls start at its ends."""
+    """Return the track's direction in the picture, from the balls' first places."""
     first, second = (next((blob for blob in path if blob), None) for path in paths)
     if first is None or second is None:
         return None
@@ -190,7 +187,7 @@ FAMILY = scene_family(
         "Do the two balls, the {first} one and the {second} one, bump into each other, yes or no?",
         yes=["they collide", "yes they collide", "they touch", "they bump into each other"],
         no=["they do not collide", "no they do not collide", "they pass each other", "they miss each other"],
-        fills=_either_order,
+        fills=_shuffled_colours,
     ),
     asides=[_aside],
     observe=observe,

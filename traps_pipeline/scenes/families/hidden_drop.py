@@ -1,4 +1,4 @@
-"""A ball rolls along a high track into a chute and drops on a plate; the question is to which side it drops off.
+"""A ball drops through a chute on a plate: to which side does it drop off?
 
 Control: the plate below the chute and the two bins are in view. Void: the occluder stands before them.
 Hidden element: the plate is tilted to the left or to the right. The ball drops straight on its middle, whatever the
@@ -23,15 +23,15 @@ from traps_pipeline.scenes.parts.vision import largest, slanting_edges
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
 WALL_M = 0.012
-NAMED = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
+COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
 EDGE_PX = 60  # least length of the plate's edges
 SLANTS = 0.36, 1.2  # rows a column, of the plate's edges in the picture
-PLAY, PLAIN = apart(*NAMED), shuffled("wood", "grey", "white")
+PLAY, PLAIN = apart(*COLOURS), shuffled("wood", "grey", "white")
 
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 rolls to the right. tilt: +1 if the plate sheds the ball to the right."""
+    """Parameters; direction +1: to the right, tilt +1: the plate sheds to the right."""
 
     left_colour: str = PLAY()
     right_colour: str = PLAY()
@@ -54,9 +54,9 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return track on a post, chute, tilting plate on a partition, one bin on each side of it, board at the back.
+    """Build track, chute, tilting plate on a partition, two bins, and back board.
 
-    Only track, post, chute and ball are mirrored by `direction`; bins and board are left and right in the picture.
+    `direction` mirrors only track, post, chute and ball; bins and board stay as in the picture.
     """
     course = Course(physics)
     r, d, half_y, half_x = p.radius_m, p.direction, 1.5 * p.radius_m, p.bin_m + WALL_M
@@ -89,41 +89,38 @@ def build(p: Params, physics: Physics) -> Scene:
         ("left", p.left_colour, (-p.bin_m, 0), (-half_x, -p.bin_m), (-half_x, 0)),
         ("right", p.right_colour, (0, p.bin_m), (p.bin_m, half_x), (0, half_x)),
     )
-    for name, colour, floor, end, whole in bins:
+    for name, colour, floor, end, span in bins:
         course.block(f"bin_{name}", floor, across, (0, 0.015), colour, Surface(0.004))
         course.block(f"end_{name}", end, across, (0, p.rim_m), colour)
-        course.block(f"front_{name}", whole, front, (0, 0.5 * r), colour)
+        course.block(f"front_{name}", span, front, (0, 0.5 * r), colour)
     back, board = half_y + 2 * WALL_M, (-half_x - 0.02, half_x + SHADOW_RIGHT * p.chute_m)
     course.block("board", board, (half_y + WALL_M, back), (0, p.chute_m + 0.12), p.board_colour)
     course.ball("ball", (-d * p.start_m, 0, track + r), r, p.ball_colour, speed=d * p.speed_m_s)
 
-    covered = course.box(board, (front[0], back), (0, p.chute_m + 0.02))
+    cover = course.box(board, (front[0], back), (0, p.chute_m + 0.02))
     for side in ("left", "right"):
         course.mark(f"{side} bin", f"bin_{side}")
     return course.scene(
         p,
         decisive=["ball"],
         hidden=["plate"],
-        cover=covered,
-        in_view=[covered, course.box((-bore, bore), across, (p.chute_m, top))],
+        cover=cover,
+        in_view=[cover, course.box((-bore, bore), across, (p.chute_m, top))],
         things=[f"{p.ball_colour} ball", "high track", "chute", "post"],
         also=["bin", "board", "plate"],
     )
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return the side of the bin in which the ball is, while it is below the bins' outer walls. The margin is how far
-    it ends from the partition."""
+    """Read the bin that the ball is in, while it is below the outer walls."""
     ball = motion.pos("ball")
     x = ball[:, 0]
     return Reading(side_while(ball[:, 2] < p.rim_m + p.radius_m, x, "right", "left"), float(abs(x[-1]) - p.radius_m))
 
 
-def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return the side that the plate above the middle of the bins falls to, by the slopes of its edges in the
-    picture.
-    """
-    left, right = (largest(frames[0], named[side], 60) for side in ("left", "right"))
+def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Predict the side to which the plate falls, by the slopes of its edges."""
+    left, right = (largest(frames[0], slots[side], 60) for side in ("left", "right"))
     if left is None or right is None or left.x > right.x:
         return None
     middle, wide = (left.box[0] + left.box[2] + right.box[0]) / 2, (left.box[2] + right.box[2]) / 2
@@ -150,7 +147,7 @@ FAMILY = scene_family(
     ),
     asides=[
         colour_from(
-            "ball", "What colour is the ball on the track: {choices}?", NAMED, unlike=("ball", "left", "right")
+            "ball", "What colour is the ball on the track: {choices}?", COLOURS, unlike=("ball", "left", "right")
         ),
         comes_from("From which side does the ball roll in, left or right?"),
     ],

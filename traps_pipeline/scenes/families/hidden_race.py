@@ -1,4 +1,4 @@
-"""Balls race through a tunnel in lanes of their own; the question is which colour comes out first.
+"""Balls race through a tunnel in lanes of their own: which colour is first out?
 
 Control: the far end of the tunnel and the tray behind it are in view. Void: the occluder stands before them.
 Hidden element: inside the tunnel every lane but one crosses a rough board that slows its ball to a creep. The visible
@@ -41,14 +41,14 @@ PLAIN = shuffled("wood", "grey", "white")
 
 
 def _direction(rng: np.random.Generator, so_far: Drawn) -> int:
-    """Before it, the number of lanes, which no field stores: there are as many as colours."""
+    """Draw the direction, and before it the number of lanes, which no field stores."""
     so_far["lanes"] = int(rng.choice([2, 3, 3]))
     return int(rng.choice([-1, 1]))
 
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 rolls to the right. colours, speeds, starts: one per lane, front lane first."""
+    """Parameters by lane, front lane first; direction +1: to the right."""
 
     direction: int = drawn_by(_direction)
     tunnel_colour: str = PLAIN()
@@ -69,7 +69,7 @@ class Params:
 
     @property
     def balls(self) -> list[str]:
-        """One a lane, front lane first."""
+        """Bodies of the balls, front lane first."""
         return [f"ball_{i}" for i in range(len(self.colours))]
 
     @property
@@ -79,7 +79,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return deck with rails, opaque tunnel, sunken tray. Lengths run along the lanes."""
+    """Build deck with rails, opaque tunnel, sunken tray."""
     course = Course(physics, p.direction)
     lanes, r, pitch, wall = len(p.colours), p.radius_m, 2.8 * p.radius_m, 0.012
     side, roof, rim, end = lanes * pitch / 2, DECK_M + 2.6 * r, TRAY_M + 0.9 * r, p.exit_m + p.tray_m
@@ -105,14 +105,14 @@ def build(p: Params, physics: Physics) -> Scene:
     course.sides("tray", (p.exit_m, end), side, wall, (0, rim), p.tunnel_colour)
     course.block("tray_end", (end, end + wall), outer, (0, rim), p.tunnel_colour)
 
-    covered, up = (p.run_m + p.mouth_m, end + wall), (0, roof + wall)
+    along, up = (p.run_m + p.mouth_m, end + wall), (0, roof + wall)
     across = (-side - wall - 0.02, side + wall + SHADOW_BACK * roof)
     return course.scene(
         p,
         decisive=p.balls,
         hidden=[f"board_{i}" for i in range(lanes)],
-        cover=course.box(covered, across, up, right=course.ahead(SHADOW_RIGHT * roof)),
-        in_view=[course.box(covered, outer, up)],
+        cover=course.box(along, across, up, right=course.ahead(SHADOW_RIGHT * roof)),
+        in_view=[course.box(along, outer, up)],
         things=[*(f"{colour} ball" for colour in p.colours), "tunnel", "tray"],
         also=["lane"],
         colours=p.colours,
@@ -121,34 +121,34 @@ def build(p: Params, physics: Physics) -> Scene:
 
 def _roughness(p: Params, lane: int, physics: Physics) -> float:
     """Return rolling friction (m) that brings this lane's ball down to `creep_m_s`."""
-    lost = (ARRIVING * p.speeds_m_s[lane]) ** 2 - p.creep_m_s**2
-    return brake(p.radius_m, lost, ROUGH_BOARD_M, physics)
+    loss = (ARRIVING * p.speeds_m_s[lane]) ** 2 - p.creep_m_s**2
+    return brake(p.radius_m, loss, ROUGH_BOARD_M, physics)
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return the colour that came out first, from when its ball is wholly out."""
+    """Read the colour that came out first, from when its ball is wholly out."""
     along = [p.direction * motion.pos(ball)[:, 0] for ball in p.balls]
     return first_past(motion, np.stack(along, axis=1) - p.radius_m - p.exit_m, p.colours, MIN_LEAD_S)
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return the ball that is seen again first after it was out of sight, once all of them are."""
-    colours = colours_of_balls(frames, named, BALL_COLOURS)
-    out = [_seen_again(frames, colour) for colour in colours]
-    seen = [frame for frame in out if frame is not None]
-    if not seen or len(seen) < len(out) or seen.count(min(seen)) > 1:
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Return the ball seen first after it was out of sight, once all are seen again."""
+    colours = colours_of_balls(frames, slots, BALL_COLOURS)
+    returns = [_return_frame(frames, colour) for colour in colours]
+    returned = [frame for frame in returns if frame is not None]
+    if not returned or len(returned) < len(returns) or returned.count(min(returned)) > 1:
         return None
-    return colours[seen.index(min(seen))]
+    return colours[returned.index(min(returned))]
 
 
-def _seen_again(frames: np.ndarray, colour: str) -> int | None:
-    """Return first frame that shows at least half of the ball after the tunnel, None if it stays out of sight."""
+def _return_frame(frames: np.ndarray, colour: str) -> int | None:
+    """Return the first frame with half of the ball after the tunnel, None if none."""
     areas = np.array([_ball_pixels(frame, colour) for frame in frames])
     gone = np.flatnonzero(areas == 0)
     if not gone.size or areas[-3:].min() == 0:
         return None
-    back = np.flatnonzero(areas >= np.median(areas[-3:]) / 2)
-    return int(back[back > gone[0]][0])
+    half_seen = np.flatnonzero(areas >= np.median(areas[-3:]) / 2)
+    return int(half_seen[half_seen > gone[0]][0])
 
 
 def _ball_pixels(frame: np.ndarray, colour: str) -> int:
@@ -156,15 +156,15 @@ def _ball_pixels(frame: np.ndarray, colour: str) -> int:
     return max(sizes, default=0)
 
 
-def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return the ball that is the first to be seen again, be it a part of it."""
-    back: dict[str, int] = {}
-    for colour in colours_of_balls(frames, named, BALL_COLOURS):
-        gone = [at for at, frame in enumerate(frames) if _ball_pixels(frame, colour) == 0]
-        again = [at for at in range(gone[0], len(frames)) if _ball_pixels(frames[at], colour)] if gone else []
-        if again:
-            back[colour] = again[0]
-    first = [colour for colour, at in back.items() if at == min(back.values())]
+def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Predict the ball of which any part is seen first after the tunnel."""
+    returned_at: dict[str, int] = {}
+    for colour in colours_of_balls(frames, slots, BALL_COLOURS):
+        gone = [i for i, frame in enumerate(frames) if _ball_pixels(frame, colour) == 0]
+        after_tunnel = [i for i in range(gone[0], len(frames)) if _ball_pixels(frames[i], colour)] if gone else []
+        if after_tunnel:
+            returned_at[colour] = after_tunnel[0]
+    first = [colour for colour, i in returned_at.items() if i == min(returned_at.values())]
     return first[0] if len(first) == 1 else None
 
 

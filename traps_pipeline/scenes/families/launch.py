@@ -1,4 +1,4 @@
-"""A ball runs down a slide and up a kicker that throws it into the air; the question is whether it clears a barrier.
+"""A ball runs down a slide and up a kicker: does it fly over a barrier?
 
 Control: slide, kicker, barrier and the tray behind it are in view. Void: the occluder stands before all but the upper
 slide.
@@ -17,7 +17,7 @@ from traps_pipeline.scenes.parts.course import DEAD, Course, Point, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import beyond, will_clear
 from traps_pipeline.scenes.parts.questions import colour_of, goes_to, yes_no
-from traps_pipeline.scenes.parts.readings import Reading, crossed
+from traps_pipeline.scenes.parts.readings import Reading, read_crossing
 from traps_pipeline.scenes.parts.vary import apart, between, facing, hidden, one_of, shuffled
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
@@ -29,7 +29,7 @@ PLAY, PLAIN = apart("red", "green", "blue", "yellow", "cyan", "purple"), shuffle
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 runs to the right. Lengths along the way are measured from the end of the ledge."""
+    """Parameters; lengths run from the ledge's end, direction +1: to the right."""
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()
@@ -54,7 +54,7 @@ class Params:
 
     @property
     def way(self) -> list[Point]:
-        """From the ledge to the lip: a straight slide, then a curve of short flat pieces up to the kicker."""
+        """Points of the way: a straight slide, then a curve of flat pieces to the lip."""
         bends = np.linspace(-self.slide_deg, self.kicker_deg, 10)[1:]
         steps = [(0.035 * np.cos(np.radians(b)), 0.035 * np.sin(np.radians(b))) for b in bends]
         fall = self.slide_m * np.tan(np.radians(self.slide_deg))
@@ -64,7 +64,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return ledge, slide, kicker, pit, barrier and tray before a board that catches the shadows."""
+    """Build ledge, slide, kicker, pit, barrier and tray before a board for shadows."""
     course = Course(physics, p.direction)
     r, side, rim = p.radius_m, 1.6 * p.radius_m, 0.012
     (_, top), (lip, lip_z) = p.way[0], p.way[-1]
@@ -98,10 +98,10 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """On which side of the barrier the ball is, from when it stays low there, past the kicker."""
+    """Read the side of the barrier on which the ball stays low, past the kicker."""
     ball = motion.pos("ball")
     past = p.direction * ball[:, 0] - p.way[-1][0] - p.barrier_at_m
-    return crossed(past, valid=(past > -p.barrier_at_m) & (ball[:, 2] < FLOOR_M + p.radius_m + 0.03))
+    return read_crossing(past, valid=(past > -p.barrier_at_m) & (ball[:, 2] < FLOOR_M + p.radius_m + 0.03))
 
 
 FAMILY = scene_family(

@@ -1,4 +1,4 @@
-"""A ball rolls towards a gate that hangs from a lever; the question is whether it gets past.
+"""A ball rolls towards a gate that hangs from a lever: does it get past?
 
 Control: lever, gate and the lane beyond are in view. Void: the occluder stands before them.
 Hidden element: the counterweight on the lever, which sits far out (the lever holds the gate up) or close to the pivot
@@ -30,7 +30,7 @@ PLAY, PLAIN = apart("red", "green", "blue", "yellow", "cyan", "purple"), shuffle
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 rolls to the right. Lengths along the lane are measured from the edge of the occluder."""
+    """Parameters; lengths run from the occluder's edge, direction +1: to the right."""
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()
@@ -59,7 +59,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return a lane with a step before a board that carries the lever and catches the shadows."""
+    """Build a lane with a step before a board that carries the lever."""
     course = Course(physics, p.direction)
     r, side, rim, top, (pivot, pivot_z) = p.radius_m, 1.7 * p.radius_m, 0.012, FLOOR_M + STEP_M, p.pivot_m
     end = p.gate_at_m + 2 * p.arm_m + p.tail_m
@@ -91,7 +91,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _add_lever(course: Course, p: Params, side: float) -> None:
-    """Add the lever with gate and counterweight, at rest where the counterweight holds it."""
+    """Add lever, gate and counterweight, at rest where the counterweight holds them."""
     start, d = p.swing_deg if p.held_open else 0.0, p.direction
     low, high = sorted((d * -start, d * (p.swing_deg - start)))
     body = course.hinge("lever", (p.pivot_m[0], 0, p.pivot_m[1]), damping=0.05, range_deg=(low, high))
@@ -106,8 +106,7 @@ def _add_lever(course: Course, p: Params, side: float) -> None:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return 'yes' from when the ball is wholly past the gate; 'no' while it is not, from when it lies within a
-    centimetre of its last place. The margin is how far its rear ends from the gate."""
+    """Read whether the ball is wholly past the gate; 'no' only once it stays in place."""
     along = motion.pos("ball")[:, 0]
     past = p.direction * along - p.gate_at_m - GATE_HALF_M - p.radius_m
     return Reading(yes_while(past > 0, still_from(along, within_m=0.01)), float(abs(past[-1])))

@@ -1,4 +1,4 @@
-"""A ball strikes the bob of a hanging pendulum; the question is whether the pendulum knocks over a block.
+"""A ball strikes a pendulum's bob: does the pendulum knock over a block?
 
 Control: pendulum and block are in view. Void: the occluder stands before them and only the ball's run-up is seen.
 Hidden element: a peg in the board behind the pendulum. It sticks out just before the rod, and stops the swing before
@@ -35,7 +35,7 @@ PLAY, PLAIN = apart("red", "green", "blue", "cyan", "purple"), shuffled("wood", 
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 rolls to the right. Lengths along the way are measured from the edge of the occluder."""
+    """Parameters; lengths run from the occluder's edge, direction +1: to the right."""
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()
@@ -76,7 +76,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return a raised lane, then floor and block before a board that carries pendulum and peg."""
+    """Build a raised lane, floor and block before a board with pendulum and peg."""
     course = Course(physics, p.direction)
     r, side, rim, high = p.radius_m, 1.6 * p.radius_m, 0.012, p.pivot_z_m + 0.05
     deep, top = (-side, side), FLOOR_M + p.lane_m
@@ -114,7 +114,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _add_pendulum(course: Course, p: Params, side: float) -> None:
-    """Add a bob on a rod that hangs from an axle in the board and swings along the way."""
+    """Add a bob on a rod that swings along the way from an axle in the board."""
     import mujoco
 
     body = course.hinge("pendulum", (p.pivot_at_m, 0, p.pivot_z_m), damping=0.02)
@@ -127,32 +127,31 @@ def _add_pendulum(course: Course, p: Params, side: float) -> None:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return 'yes' from when the block's top is below half the block's height; 'no' while it is not, from when the
-    pendulum has swung out farthest and comes back. The margin is how far that top ends from half the height."""
+    """Read 'yes' once the block's top is low, 'no' once the pendulum swings back."""
     top = top_m(motion, "block", p.block_height_m, FLOOR_M)
     swing = -p.direction * motion.rot("pendulum")[:, 0, 2]
     fallen = top < p.block_height_m / 2
     return Reading(yes_while(fallen, int(np.argmax(swing)) + 1), float(abs(top[-1] - p.block_height_m / 2)))
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return the block is tall and narrow at the end, or it lies flat; None while it is not to be seen."""
-    seen = [largest(frame, named["block"], 80) for frame in frames[-3:]]
-    shapes = [blob.box[3] / blob.box[2] for blob in seen if blob is not None]
-    if len(shapes) < 3 or largest(frames[-1], named["bob"], 80) is None:
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Return whether the block lies flat at the end; None if out of view."""
+    blocks = [largest(frame, slots["block"], 80) for frame in frames[-3:]]
+    shapes = [blob.box[3] / blob.box[2] for blob in blocks if blob is not None]
+    if len(shapes) < 3 or largest(frames[-1], slots["bob"], 80) is None:
         return None
     return "no" if float(np.median(shapes)) > 1.0 else "yes"
 
 
-def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return whether the block has begun to give way, or the bob swings against it if it goes on as it does."""
-    first, last = largest(frames[0], named["block"], 80), largest(frames[-1], named["block"], 80)
-    bob = carried_on(track(frames, named["bob"], 80), AHEAD)
+def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Predict a fall: the block gives way, or the bob is about to strike it."""
+    first, last = largest(frames[0], slots["block"], 80), largest(frames[-1], slots["block"], 80)
+    bob = carried_on(track(frames, slots["bob"], 80), AHEAD)
     if first is None or last is None or bob is None:
         return None
-    pushed = abs(last.x - first.x) + abs(last.box[2] - first.box[2]) > GIVES_PX
-    reached = abs(bob.x - first.x) < (bob.box[2] + first.box[2]) / 2
-    return "yes" if pushed or reached else "no"
+    gives_way = abs(last.x - first.x) + abs(last.box[2] - first.box[2]) > GIVES_PX
+    is_struck = abs(bob.x - first.x) < (bob.box[2] + first.box[2]) / 2
+    return "yes" if gives_way or is_struck else "no"
 
 
 FAMILY = scene_family(

@@ -1,4 +1,4 @@
-"""A ball rolls down a ramp towards the camera and onto a table; the question is into which bin it is deflected.
+"""A ball rolls down a ramp onto a table: into which bin is it deflected?
 
 Control: the table and the bins at its sides are in view. Void: the occluder stands before them, the ramp is in view.
 Hidden element: the deflector on the table, a board that is turned to the left or to the right.
@@ -27,7 +27,7 @@ PLAIN = shuffled("wood", "grey", "black")
 
 @dataclass(frozen=True)
 class Params:
-    """Lengths in y run from the front edge of the table to the back, in x from its middle to the right."""
+    """Parameters; y from the table's front edge to the back, x from its middle, right."""
 
     ramp_colour: str = PLAIN()
     table_colour: str = PLAIN()
@@ -50,7 +50,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return table with a front and a back wall, deflector, a bin at either side, ramp behind."""
+    """Build table with front and back wall, deflector, two bins, and a ramp behind."""
     course = Course(physics)
     r, top, wide, rim, side = p.radius_m, p.table_m, p.half_width_m, p.table_m + 1.1 * p.radius_m, 1.5 * p.radius_m
 
@@ -107,8 +107,7 @@ def _add_bin(course: Course, p: Params, name: str, sign: int, colour: str) -> No
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return 'left' or 'right' from when the ball is past that end of the table. The margin is how far its middle ends
-    past that end."""
+    """Read the end of the table that the ball is past, and by how far its middle."""
     x = motion.pos("ball")[:, 0]
     past = np.abs(x) - p.half_width_m
     return Reading(side_while(past > 0, x, "right", "left"), float(past[-1]))

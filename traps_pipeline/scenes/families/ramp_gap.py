@@ -1,4 +1,4 @@
-"""A ball rolls down a ramp and along a deck with a box at its end; the question is whether it reaches the box.
+"""A ball rolls along a deck with a box at its end: does it reach the box?
 
 Control: the whole deck and the box are in view. Void: the occluder stands before all but the beginning of the deck.
 Hidden element: a board that bridges a gap in the deck, or lies on the ground below it, so that the ball falls in.
@@ -19,13 +19,13 @@ from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, uniform
 
 BOARD_M = 0.016  # thickness of ramp and board
 WALL_M = 0.012
-NAMED = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
-PLAY, PLAIN = apart(*NAMED), shuffled("wood", "grey", "black")
+COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
+PLAY, PLAIN = apart(*COLOURS), shuffled("wood", "grey", "black")
 
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 rolls to the right. Lengths run along the deck from the foot of the ramp."""
+    """Parameters; lengths run from the ramp's foot, direction +1: to the right."""
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()
@@ -60,7 +60,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return ramp with rails and support, deck in two parts with the gap between them, box."""
+    """Build ramp with rails and support, deck in two parts with a gap, and box."""
     course = Course(physics, p.direction)
     r, side, gap, end = p.radius_m, 1.7 * p.radius_m, p.gap_span, p.deck_end_m + p.box_m
     deep, deck, box = (-side, side), (0, p.deck_m), (p.deck_end_m, end)
@@ -83,7 +83,7 @@ def build(p: Params, physics: Physics) -> Scene:
     outer = (-side - WALL_M, side + WALL_M)
     course.block("box_end", (end, end + WALL_M), outer, (0, p.deck_m + 0.03), p.box_colour)
 
-    high, covered = p.deck_m + 2 * r + 0.01, (p.mouth_m, end + WALL_M)
+    high, along = p.deck_m + 2 * r + 0.01, (p.mouth_m, end + WALL_M)
     across = (outer[0] - 0.01, outer[1] + 0.5 * high)
     highest = ramp.at(p.ramp_m)
     course.mark("box", "box_floor")
@@ -91,8 +91,8 @@ def build(p: Params, physics: Physics) -> Scene:
         p,
         decisive=["ball"],
         hidden=["board"],
-        cover=course.box(covered, across, (0, high), right=course.ahead(SHADOW_RIGHT * high)),
-        in_view=[course.box(covered, outer, deck), course.box((highest[0], 0), deep, (0, highest[2]))],
+        cover=course.box(along, across, (0, high), right=course.ahead(SHADOW_RIGHT * high)),
+        in_view=[course.box(along, outer, deck), course.box((highest[0], 0), deep, (0, highest[2]))],
         things=[f"{p.ball_colour} ball", f"{p.box_colour} box", "ramp", "deck"],
         also=["end"],
         shown_by={"end": ["box"]},
@@ -100,12 +100,11 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return 'yes' from when the ball is past the end of the deck, 'no' from when it is half its radius down in the
-    gap. The margin is how far it ends past the deck, or below it."""
+    """Read 'yes' once the ball is past the deck, 'no' once it is down in the gap."""
     ball = motion.pos("ball")
-    past, sunk = p.direction * ball[:, 0] - p.deck_end_m, p.deck_m + p.radius_m - ball[:, 2]
-    labels = ["yes" if x > 0 else "no" if z > 0.5 * p.radius_m else None for x, z in zip(past, sunk, strict=True)]
-    return Reading(labels, float(past[-1] if past[-1] > 0 else sunk[-1]))
+    past, depth = p.direction * ball[:, 0] - p.deck_end_m, p.deck_m + p.radius_m - ball[:, 2]
+    labels = ["yes" if x > 0 else "no" if z > 0.5 * p.radius_m else None for x, z in zip(past, depth, strict=True)]
+    return Reading(labels, float(past[-1] if past[-1] > 0 else depth[-1]))
 
 
 FAMILY = scene_family(
@@ -123,7 +122,7 @@ FAMILY = scene_family(
     ),
     asides=[
         comes_from("At which side is the ramp, left or right?"),
-        colour_from("ball", "What colour is the ball: {choices}?", NAMED, unlike=("ball", "box")),
+        colour_from("ball", "What colour is the ball: {choices}?", COLOURS, unlike=("ball", "box")),
         material_of("ramp", "What colour is the ramp: {choices}?"),
     ],
     observe=rests_over("ball", "box"),

@@ -1,4 +1,4 @@
-"""Two balls roll down ramps side by side, towards the camera; the question is which one is first in the tray.
+"""Two balls roll down ramps side by side: which one is first in the tray?
 
 Control: tracks and tray are in view. Void: the occluder stands before them, only the upper parts of the ramps are in
 view. Hidden element: one of the tracks crosses a rough board that slows its ball to a creep. The starting
@@ -19,7 +19,7 @@ from traps_pipeline.scenes.parts.questions import which_colour
 from traps_pipeline.scenes.parts.ramp import Ramp
 from traps_pipeline.scenes.parts.readings import Reading, first_past
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, hidden, in_front
-from traps_pipeline.scenes.parts.vision import Blob, at_rest
+from traps_pipeline.scenes.parts.vision import Blob, is_at_rest
 from traps_pipeline.scenes.physics.kit import AnswerableQuestion, Motion, Physics, Scene, listed, uniform
 
 BOARD_M = 0.016  # thickness of a ramp
@@ -34,18 +34,18 @@ PLAY = apart(*BALL_COLOURS)
 
 
 def _tray_colour(rng: np.random.Generator, so_far: Drawn) -> str:
-    """With it, the two colours that the tracks may have."""
+    """Draw the tray's colour, and the two colours that the tracks may have."""
     tray, so_far["first"], so_far["second"] = (str(c) for c in rng.permutation(["wood", "grey", "black"]))
     return tray
 
 
 def _track_colours(rng: np.random.Generator, so_far: Drawn) -> tuple[str, str]:
-    """Return the same for both tracks, or one each."""
+    """Draw the tracks' colours: the same for both, or one each."""
     return so_far["first"], so_far["first" if rng.integers(2) else "second"]
 
 
 def _starts(rng: np.random.Generator, so_far: Drawn) -> tuple[float, float]:
-    """Return one near the top of its ramp, the other lower, either on the left."""
+    """Draw the starts: one near the top of its ramp, one lower, either on the left."""
     top, lower = so_far["ramp_m"] - 0.07, uniform(rng, 0.08, 0.13)
     high, low = round(top, 4), round(top - lower, 4)
     return (low, high) if rng.integers(2) else (high, low)
@@ -53,7 +53,7 @@ def _starts(rng: np.random.Generator, so_far: Drawn) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Params:
-    """Pairs are for the left and the right track. Lengths in y run from the front edge of the tray to the back."""
+    """Parameters; pairs: left and right track, y from the tray's front to the back."""
 
     colours: tuple[str, str] = PLAY(2)
     tray_colour: str = drawn_by(_tray_colour)
@@ -74,7 +74,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return two tracks that run to the front, each behind a ramp of its own, and one tray before both."""
+    """Build two tracks towards the front, a ramp behind each, and one tray."""
     course = Course(physics)
     r, side, track = p.radius_m, 1.5 * p.radius_m, (0, p.track_m)
     rough = (p.tray_m + p.after_m, p.tray_m + p.after_m + ROUGH_M)
@@ -135,13 +135,13 @@ def _roughness(p: Params, track: int, physics: Physics) -> float:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return the colour that came into the tray first, from when the middle of its ball is past the edge."""
+    """Read the colour whose ball is the first with its middle past the tray's edge."""
     ahead = p.tray_m - np.stack([motion.pos(ball)[:, 1] for ball in BALLS], axis=1)
     return first_past(motion, ahead, p.colours, MIN_LEAD_S)
 
 
 def _higher_or_side(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
-    """Return which ball starts higher up, or which is on one of the ramps."""
+    """Ask which ball starts higher up, or which is on one of the ramps."""
     choices = tuple(str(c) for c in rng.permutation(p.colours))
     if rng.integers(2):
         higher = p.colours[int(np.argmax(p.starts_m))]
@@ -154,21 +154,21 @@ def _higher_or_side(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
 SETTLING_PX = 8.0  # so far a ball may still roll in the tray when an occluder comes
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return which ball is first near the place where it rests in the end: the same part of the tray for both."""
-    choices = colours_of_balls(frames, named, BALL_COLOURS)
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Return which ball is first near its place of rest, the same part of the tray."""
+    choices = colours_of_balls(frames, slots, BALL_COLOURS)
     paths = [[compact(frame, colour) for frame in frames] for colour in choices]
-    if len(choices) != 2 or not all(at_rest(path, tolerance_px=SETTLING_PX) for path in paths):
+    if len(choices) != 2 or not all(is_at_rest(path, tolerance_px=SETTLING_PX) for path in paths):
         return None
     rates = [_progress(path) for path in paths]
     near_end = [int(np.argmax(rate > 0.9 * rate.max())) for rate in rates]
     return None if near_end[0] == near_end[1] else choices[int(np.argmin(near_end))]
 
 
-def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return which ball will be lower in the picture, nearer to the tray, if both gain speed as they do."""
+def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Predict which ball will be lower in the picture if both gain speed as they do."""
     lower: dict[str, float] = {}
-    for colour in colours_of_balls(frames, named, BALL_COLOURS):
+    for colour in colours_of_balls(frames, slots, BALL_COLOURS):
         path = [compact(frame, colour) for frame in frames[-3:]]
         ys = [ball.y + ball.box[3] / 2 for ball in path if ball is not None]
         if len(ys) == len(path) == 3:

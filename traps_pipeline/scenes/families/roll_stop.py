@@ -1,4 +1,4 @@
-"""A ball rolls along a track with a line across it; the question is whether it passes the line.
+"""A ball rolls along a track with a line across it: does it pass the line?
 
 Control: the whole track is in view. Void: the occluder stands before all but its first part.
 Hidden element: a patch of the track before the line, rough enough to stop the ball, or as smooth as the track.
@@ -28,12 +28,12 @@ LINE_M = 0.035  # width of a painted line
 STILL_M = 0.003  # a ball that moves less than this any more is at rest
 PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
 PLAIN = shuffled("wood", "grey", "white")
-SEEN = ("ball", "start", "line")
+PARTS = ("ball", "start", "line")
 
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 rolls to the right. Lengths run along the track from its beginning."""
+    """Parameters; lengths run from the track's beginning, direction +1: to the right."""
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()
@@ -63,7 +63,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return track with kerbs, patch, two lines and end wall."""
+    """Build track with kerbs, patch, two lines and end wall."""
     course = Course(physics, p.direction)
     r, side, end = p.radius_m, p.half_width_m, p.line_m + p.felt_m
     deep, outer, track = (-side, side), (-side - WALL_M, side + WALL_M), (0, TRACK_M)
@@ -82,33 +82,32 @@ def build(p: Params, physics: Physics) -> Scene:
     course.block("end_wall", (end, end + WALL_M), outer, (0, TRACK_M + 2 * r), p.wall_colour)
     course.ball("ball", (0.05, 0, TRACK_M + r), r, p.ball_colour, speed=p.speed_m_s)
 
-    high, covered, across = TRACK_M + 2 * r + 0.01, (p.run_m, end + WALL_M), (outer[0] - 0.01, outer[1] + 0.03)
+    high, along, across = TRACK_M + 2 * r + 0.01, (p.run_m, end + WALL_M), (outer[0] - 0.01, outer[1] + 0.03)
     course.mark("line", "line")
     return course.scene(
         p,
         decisive=["ball"],
         hidden=["patch"],
-        cover=course.box(covered, across, (0, high), right=course.ahead(SHADOW_RIGHT * high)),
-        in_view=[course.box(covered, outer, (0, high)), course.box((-0.02, 0.02), outer, track)],
+        cover=course.box(along, across, (0, high), right=course.ahead(SHADOW_RIGHT * high)),
+        in_view=[course.box(along, outer, (0, high)), course.box((-0.02, 0.02), outer, track)],
         things=[f"{p.ball_colour} ball", f"{p.line_colour} line", f"{p.start_colour} line", "track"],
         also=["wall", "kerb", "end"],
     )
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return 'yes' while the middle of the ball is past the far edge of the line; 'no' while it is not, from when it
-    moves no more. The margin is how far it ends from the line."""
+    """Read whether the ball's middle is past the line; 'no' only once it rests."""
     past = p.direction * motion.pos("ball")[:, 0] - p.line_m - LINE_M / 2
     return Reading(yes_while(past > 0, still_from(past, within_m=STILL_M)), clear_m(past, LINE_M))
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str], ahead: float | None = None) -> str | None:
-    """On which side of the line the ball rests; it came from the side where it was seen first."""
-    path = [compact(frame, named["ball"], shape=(0.5, 2.0)) for frame in frames]
+def observe(frames: np.ndarray, slots: Mapping[str, str], ahead: float | None = None) -> str | None:
+    """Return whether the ball rests on the other side of the line than it came from."""
+    path = [compact(frame, slots["ball"], shape=(0.5, 2.0)) for frame in frames]
     first, last = next((ball for ball in path if ball is not None), None), end_of(path, ahead)
     if first is None or last is None:
         return None
-    ys, xs = np.nonzero(colour_mask(frames[-1], named["line"]))
+    ys, xs = np.nonzero(colour_mask(frames[-1], slots["line"]))
     if len(xs) < 60 or np.ptp(ys) < 10:
         return None
     slope, offset = np.polyfit(ys, xs, 1)  # the line in the picture, x as a function of y
@@ -131,8 +130,8 @@ FAMILY = scene_family(
     ),
     asides=[
         comes_from("From which side does the ball come, left or right?"),
-        colour_of("ball", "What colour is the rolling ball: {choices}?", SEEN),
-        colour_of("start", "What colour is the first line that the ball rolls across: {choices}?", SEEN),
+        colour_of("ball", "What colour is the rolling ball: {choices}?", PARTS),
+        colour_of("start", "What colour is the first line that the ball rolls across: {choices}?", PARTS),
     ],
     observe=observe,
     foresee=partial(observe, ahead=AHEAD),

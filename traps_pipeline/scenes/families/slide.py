@@ -1,4 +1,4 @@
-"""A block slides down an incline and across a slick deck; the question is whether it slides off the end.
+"""A block slides down an incline and across a deck: does it slide off the end?
 
 Control: deck and tray are in view. Void: the occluder stands before them, the incline is in view.
 Hidden element: a rough board in the deck, which stands out of it and stops the block, or is sunk into it. A block that
@@ -27,18 +27,18 @@ WALL_M = 0.012
 TILT_RAD = 0.015  # of the rough board: its near edge is below the deck in either position
 SUNK_M = 0.012
 STILL_M = 0.003  # a block that moves less than this any more is at rest
-NAMED = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
-PLAY = apart(*NAMED)
+COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
+PLAY = apart(*COLOURS)
 
 
 def _incline_colour(rng: np.random.Generator, so_far: Drawn) -> str:
-    """Return any but that of the deck."""
+    """Draw any colour but that of the deck."""
     return str(rng.choice([c for c in ("wood", "grey", "black") if c != so_far["deck_colour"]]))
 
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 slides to the right. Lengths run along the deck from the foot of the incline."""
+    """Parameters; lengths run from the incline's foot, direction +1: to the right."""
 
     direction: int = one_of(-1, 1)
     block_colour: str = PLAY()
@@ -77,7 +77,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return deck, incline with its support and the block on it, the board in the deck, tray."""
+    """Build deck, incline with its support and block, the board in the deck, and tray."""
     course = Course(physics, p.direction)
     side, far, end = p.block_half_m[1] + 0.04, p.deck_end_m, p.deck_end_m + p.tray_m
     deep, outer, tray = (-side, side), (-side - WALL_M, side + WALL_M), (p.deck_end_m, end)
@@ -100,7 +100,7 @@ def build(p: Params, physics: Physics) -> Scene:
     course.block("tray_back", tray, (side, outer[1]), (0, 0.07), p.tray_colour)
     course.block("tray_end", (end, end + WALL_M), outer, (0, p.deck_m + 0.02), p.tray_colour)
 
-    high, covered = p.deck_m + 2 * max(p.block_half_m) + 0.01, (p.mouth_m, end + WALL_M)
+    high, along = p.deck_m + 2 * max(p.block_half_m) + 0.01, (p.mouth_m, end + WALL_M)
     across = (outer[0] - 0.01, outer[1] + 0.5 * high)
     highest = ramp.at(p.incline_m)
     course.mark("tray", "tray_floor")
@@ -108,8 +108,8 @@ def build(p: Params, physics: Physics) -> Scene:
         p,
         decisive=["block"],
         hidden=["board"],
-        cover=course.box(covered, across, (0, high), right=course.ahead(SHADOW_RIGHT * high)),
-        in_view=[course.box(covered, outer, (0, p.deck_m)), course.box((highest[0], 0), deep, (0, highest[2]))],
+        cover=course.box(along, across, (0, high), right=course.ahead(SHADOW_RIGHT * high)),
+        in_view=[course.box(along, outer, (0, p.deck_m)), course.box((highest[0], 0), deep, (0, highest[2]))],
         things=[f"{p.block_colour} block", f"{p.tray_colour} tray", "incline", "deck"],
         also=["end"],
         shown_by={"end": ["deck"]},
@@ -117,7 +117,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _add_board(course: Course, p: Params, side: float) -> None:
-    """Add the rough board, tilted up a little along the deck: it rises out of the deck, or stays below its surface."""
+    """Add the rough board, tilted a little; it stands out of the deck or stays below."""
     begin, end = p.board_span
     half, thick = (end - begin) / 2, 0.03
     rise = half * TILT_RAD - 0.001  # of its middle over the deck when the near edge is just below the surface
@@ -127,12 +127,11 @@ def _add_board(course: Course, p: Params, side: float) -> None:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return 'yes' while the block is lower than the deck, past its end; 'no' while it is not, from when it moves no
-    more. The margin is how far its middle ends from the end of the deck."""
+    """Read whether the block is off the deck, past its end; 'no' only once it rests."""
     block = motion.pos("block")
     past = p.direction * block[:, 0] - p.deck_end_m
-    off = (past > 0) & (block[:, 2] < p.deck_m)
-    return Reading(yes_while(off, still_from(block, within_m=STILL_M)), float(abs(past[-1])))
+    is_off = (past > 0) & (block[:, 2] < p.deck_m)
+    return Reading(yes_while(is_off, still_from(block, within_m=STILL_M)), float(abs(past[-1])))
 
 
 BLOCK = partial(compact, area=4500, shape=(0.3, 3.5), fill=0.4)
@@ -151,7 +150,7 @@ FAMILY = scene_family(
     ),
     asides=[
         comes_from("From which side does the block start to slide, left or right?"),
-        colour_from("block", "What colour is the sliding block: {choices}?", NAMED, unlike=("block", "tray")),
+        colour_from("block", "What colour is the sliding block: {choices}?", COLOURS, unlike=("block", "tray")),
         material_of("incline", "What colour is the incline that the block slides down: {choices}?"),
     ],
     observe=rests_over("block", "tray", find=BLOCK),

@@ -1,4 +1,4 @@
-"""A soft ball is tossed up and falls between two pairs of bars; the question is on which of them it gets stuck.
+"""A soft ball falls between two pairs of bars: on which does it get stuck?
 
 Control: both pairs and the tray below are in view. Void: the occluder stands before them.
 Hidden element: how far apart the bars are. No gap is as wide as the ball: through the wider ones it squeezes, on the
@@ -19,7 +19,7 @@ from traps_pipeline.scenes.parts.questions import colour_from, either, which_col
 from traps_pipeline.scenes.parts.readings import Reading, still_from
 from traps_pipeline.scenes.parts.soft_bodies import soft_ball
 from traps_pipeline.scenes.parts.vary import apart, between, hidden, in_front, one_of, shuffled
-from traps_pipeline.scenes.parts.vision import at_rest, colour_mask
+from traps_pipeline.scenes.parts.vision import colour_mask, is_at_rest
 from traps_pipeline.scenes.parts.wording import choices_in
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
@@ -29,13 +29,13 @@ DEPTH_M = 0.13  # half of the tray's depth
 BAR_M = 0.026  # radius of the bars
 PIECES = 6
 STILL_M = 0.015
-NAMED = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
-PLAY, PLAIN = apart(*NAMED), shuffled("wood", "grey", "white")
+COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
+PLAY, PLAIN = apart(*COLOURS), shuffled("wood", "grey", "white")
 
 
 @dataclass(frozen=True)
 class Params:
-    """passes: through how many pairs of bars the ball squeezes. wide, narrow: gaps as shares of the ball's diameter."""
+    """Parameters; passes: pairs of bars passed, wide, narrow: gaps in ball diameters."""
 
     ball_colour: str = PLAY()
     upper_colour: str = PLAY()
@@ -65,7 +65,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return two pairs of bars that reach out of a board, one above the other, the tray below, a cube to one side."""
+    """Build two pairs of bars on a board, the tray below, and a cube to one side."""
     course = Course(physics, surface=Surface(solref=SOFT))
     end, high = p.half_m, p.upper_m + 0.10
     outer, deep = end + WALL_M, (-DEPTH_M, DEPTH_M)
@@ -113,8 +113,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return what is nearest below the ball where it ends, from when it stays there: the upper bars, the lower ones or
-    the tray. The margin is how far its middle ends from the height halfway to where it would lie otherwise."""
+    """Read what is nearest below the resting ball: a pair of bars, or the tray."""
     height = motion.pos("ball")[:, 2]
     lies = [p.upper_m + 0.9 * p.radius_m, p.lower_m + 0.9 * p.radius_m, FLOOR_M + p.radius_m]
     halfway = [(lies[0] + lies[1]) / 2, (lies[1] + lies[2]) / 2]
@@ -126,20 +125,19 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 
 def _height(frame: np.ndarray, colour: str) -> float | None:
-    """Return the mean row (px) of all that has a colour; None if there is little of it."""
+    """Return the mean row (px) of all that has a colour, None if there is little."""
     rows = np.flatnonzero(colour_mask(frame, colour).any(axis=1))
     return float(rows.mean()) if len(rows) >= 4 else None
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return which of the colours is nearest to the underside of the resting ball; None while it is not to be seen, and
-    of a question that offers no colours."""
-    if "choices" not in named:
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Return the offered colour nearest to the resting ball's underside, None if none."""
+    if "choices" not in slots:
         return None
-    path = [rounded(frame, named["ball"]) for frame in frames[-3:]]
+    path = [rounded(frame, slots["ball"]) for frame in frames[-3:]]
     end = path[-1]
-    heights = {colour: _height(frames[-1], colour) for colour in choices_in(named["choices"])}
-    if end is None or not at_rest(path, tolerance_px=4) or None in heights.values():
+    heights = {colour: _height(frames[-1], colour) for colour in choices_in(slots["choices"])}
+    if end is None or not is_at_rest(path, tolerance_px=4) or None in heights.values():
         return None
     under = end.box[1] + end.box[3]
     return min(heights, key=lambda colour: abs((heights[colour] or 0.0) - under))
@@ -159,7 +157,7 @@ FAMILY = scene_family(
         forms=["the {} one", "the {} ones", "on {}"],
     ),
     asides=[
-        colour_from("ball", "What colour is the soft ball: {choices}?", NAMED, unlike=("ball", "upper", "lower")),
+        colour_from("ball", "What colour is the soft ball: {choices}?", COLOURS, unlike=("ball", "upper", "lower")),
         either(
             "At which side of the bars is the {cube} cube, left or right?",
             ("left", "right"),

@@ -1,4 +1,4 @@
-"""A ball is tossed up and falls on a cloth that hangs between posts; the question is whether the cloth catches it.
+"""A ball falls on a cloth that hangs between posts: does the cloth catch it?
 
 Control: cloth, posts and tray are in view. Void: the occluder stands before them.
 Hidden element: the cloth, which is tied to the posts at both ends, so that the ball comes to lie in it, or at one end
@@ -20,7 +20,7 @@ from traps_pipeline.scenes.parts.questions import colour_of, either, yes_no
 from traps_pipeline.scenes.parts.readings import Reading, lasting_from, still_from
 from traps_pipeline.scenes.parts.soft_bodies import hammock
 from traps_pipeline.scenes.parts.vary import apart, between, hidden, in_front, one_of, shuffled
-from traps_pipeline.scenes.parts.vision import at_rest, colour_mask
+from traps_pipeline.scenes.parts.vision import colour_mask, is_at_rest
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
 FLOOR_M = 0.02  # thickness of the tray's floor
@@ -36,7 +36,7 @@ PLAIN = shuffled("wood", "grey", "white")
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 has the cube on the right, and the cloth tied at the left where it is tied at one end."""
+    """Parameters; direction +1: cube on the right, cloth tied left if at one end."""
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()
@@ -60,7 +60,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return two pairs of posts with the cloth between them, the tray below, a board behind, a cube to one side."""
+    """Build two pairs of posts with the cloth, the tray, a board behind, and a cube."""
     course = Course(physics, p.direction, FELT)
     end, side, high = p.span_m / 2 + 0.06, p.deep_m / 2 + 0.03, p.post_m + 0.02
     outer, back = end + WALL_M, side + WALL_M
@@ -94,8 +94,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return 'no' from when the ball is below half the height of the posts, 'yes' from when it stays over that where it
-    ends. The margin is how far its middle ends from that height."""
+    """Read 'no' once the ball is below half the posts' height, 'yes' if it stays up."""
     ball = motion.pos("ball")
     over = ball[:, 2] - p.post_m / 2
     first = lasting_from(over < 0) if over[-1] < 0 else still_from(ball, within_m=STILL_M)
@@ -103,12 +102,11 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading([label if i >= first else None for i in range(len(over))], float(abs(over[-1])))
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return whether the cloth, once the ball is at rest, is wider than high: it hangs from both sides and holds it.
-    None while either is not to be seen."""
-    path = [rounded(frame, named["ball"]) for frame in frames[-3:]]
-    rows, columns = np.nonzero(colour_mask(frames[-1], named["cloth"]))
-    if len(rows) < CLOTH_PX or not at_rest(path, tolerance_px=4):
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Return whether the cloth is wider than high once the ball rests, None if unseen."""
+    path = [rounded(frame, slots["ball"]) for frame in frames[-3:]]
+    rows, columns = np.nonzero(colour_mask(frames[-1], slots["cloth"]))
+    if len(rows) < CLOTH_PX or not is_at_rest(path, tolerance_px=4):
         return None
     wide, high = (float(np.ptp(np.percentile(along, (1, 99)))) for along in (columns, rows))
     return "yes" if wide > 1.2 * high else "no"

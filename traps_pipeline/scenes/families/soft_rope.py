@@ -1,4 +1,4 @@
-"""A rope is tossed up and falls onto a peg; the question is whether it stays hanging there.
+"""A rope is tossed up and falls onto a peg: does it stay hanging there?
 
 Control: the peg in the board and the tray below are in view. Void: the occluder stands before them.
 Hidden element: the peg, which sticks out of the board below the middle of the rope, where the rope comes to hang over
@@ -19,7 +19,7 @@ from traps_pipeline.scenes.parts.questions import colour_of, either, yes_no
 from traps_pipeline.scenes.parts.readings import Reading, lasting_from, still_from
 from traps_pipeline.scenes.parts.soft_bodies import rope
 from traps_pipeline.scenes.parts.vary import apart, between, hidden, in_front, one_of, shuffled
-from traps_pipeline.scenes.parts.vision import at_rest, largest
+from traps_pipeline.scenes.parts.vision import is_at_rest, largest
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
 FLOOR_M = 0.02  # thickness of the tray's floor
@@ -34,7 +34,7 @@ PLAIN = shuffled("wood", "grey", "white")
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 has the cube on the right, and the peg off to the right where it is not below the middle."""
+    """Parameters; direction +1: cube on the right, as is a peg beside the middle."""
 
     direction: int = one_of(-1, 1)
     rope_colour: str = PLAY()
@@ -56,7 +56,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return a board with the peg in it, the tray before it, a cube to one side."""
+    """Build a board with the peg in it, the tray before it, and a cube to one side."""
     course = Course(physics, p.direction)
     end, high = p.length_m / 2 + 0.08, p.peg_m + 0.06
     outer, deep = end + WALL_M, (-DEPTH_M, DEPTH_M)
@@ -95,8 +95,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return 'no' from when the whole rope is below half the height of the peg, 'yes' from when it stays over that
-    where it ends. The margin is how far its highest point ends from that height."""
+    """Read 'no' once the rope is below half the peg's height, 'yes' if it stays above."""
     rope = motion.vertices["rope"]
     top = rope[:, :, 2].max(axis=1) - p.peg_m / 2
     first = lasting_from(top < 0) if top[-1] < 0 else still_from(rope, within_m=STILL_M)
@@ -104,11 +103,11 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading([label if i >= first else None for i in range(len(top))], float(abs(top[-1])))
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return the rope, at rest, is tall and ends over the tray, or lies low in it; None while it is not to be seen."""
-    path = [largest(frame, named["rope"], 60) for frame in frames[-3:]]
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Return whether the resting rope is tall and ends over the tray, None if unseen."""
+    path = [largest(frame, slots["rope"], 60) for frame in frames[-3:]]
     end = path[-1]
-    if end is None or not at_rest(path, tolerance_px=4):
+    if end is None or not is_at_rest(path, tolerance_px=4):
         return None
     return "yes" if end.box[3] > 0.5 * end.box[2] else "no"
 

@@ -1,4 +1,4 @@
-"""A ball strikes the pointer of a spinner; the question is which coloured sector the pointer stops in.
+"""A ball strikes the pointer of a spinner: in which sector does it stop?
 
 Control: spinner and ball are in view from above. Void: the occluder stands before the whole spinner; only the ball's
 run-up is seen.
@@ -20,12 +20,12 @@ from traps_pipeline.scenes.parts.observers import AHEAD, offered
 from traps_pipeline.scenes.parts.questions import colour_from, comes_from, which_colour
 from traps_pipeline.scenes.parts.readings import Reading, lasting_from
 from traps_pipeline.scenes.parts.vary import between, drawn_by, facing, hidden_index, one_of, shuffled
-from traps_pipeline.scenes.parts.vision import Blob, at_rest, blobs, colour_mask
+from traps_pipeline.scenes.parts.vision import Blob, blobs, colour_mask, is_at_rest
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, add_box, distinct_colours
 
 SECTORS = ("red", "green", "blue", "yellow", "cyan", "purple")
 BALLS = ("red", "green", "blue", "orange", "purple", "cyan")
-NAMED = ("red", "green", "purple", "orange", "cyan")  # what a question after the ball's colour may offer
+COLOURS = ("red", "green", "purple", "orange", "cyan")  # what a question after the ball's colour may offer
 POINTER_COLOUR = "black"
 TABLE_M = 0.03  # thickness of the table
 FIRST_DEG, LAST_DEG = 48.0, 312.0  # where the sectors begin and end, from the near side onwards
@@ -38,7 +38,7 @@ PLAIN = shuffled("wood", "grey", "white")
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 rolls to the right and turns the pointer anticlockwise. sectors: in the order it passes them."""
+    """Parameters; direction +1: to the right, sectors: as the pointer passes them."""
 
     direction: int = one_of(-1, 1)
     sectors: tuple[str, ...] = drawn_by(lambda rng, so_far: distinct_colours(rng, int(rng.integers(3, 5)), SECTORS))
@@ -63,7 +63,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return the hub is at the origin."""
+    """Build spinner, pointer, peg and ball; the hub is at the origin."""
     course = Course(physics, p.direction)
     r, lane, side = p.radius_m, -LANE * p.disc_m, p.disc_m + 0.025
     start, end, rim = -side - p.run_m, side + 0.12, (0, TABLE_M + 0.035)
@@ -89,7 +89,7 @@ def build(p: Params, physics: Physics) -> Scene:
     at = (start, lane, TABLE_M + r)
     course.ball("ball", at, r, p.ball_colour, speed=p.speed_m_s, rolling=1e-4, sliding=0.1, density=2500)
 
-    seen = (-side, end + RIM_M)
+    span = (-side, end + RIM_M)
     course.mark("pointer", (0.0, 0.0), POINTER_COLOUR)
     for i, colour in enumerate(p.sectors):
         course.mark(f"{colour} sector", _place(p.disc_m, FIRST_DEG + (i + 0.5) * p.sector_deg), colour)
@@ -97,8 +97,8 @@ def build(p: Params, physics: Physics) -> Scene:
         p,
         decisive=["pointer"],
         hidden=["peg"],
-        cover=course.box(seen, (-side - 0.02, side + 0.03), (0, 0.10), right=0.03),
-        in_view=[course.box(seen, outer, (0, 0.09))],
+        cover=course.box(span, (-side - 0.02, side + 0.03), (0, 0.10), right=0.03),
+        in_view=[course.box(span, outer, (0, 0.09))],
         things=[f"{p.ball_colour} ball", "black pointer", "spinner", *(f"{c} sector" for c in p.sectors)],
         also=["table", "rim", "peg"],
         colours=[*p.sectors, POINTER_COLOUR],
@@ -107,13 +107,13 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _place(radius: float, angle_deg: float) -> tuple[float, float]:
-    """Along and across, at an angle from the near side that turns the way the ball drives the pointer."""
+    """Return (along, across) at an angle from the near side as the pointer turns."""
     a = np.radians(angle_deg)
     return float(radius * np.sin(a)), float(radius * -np.cos(a))
 
 
 def _add_pointer(course: Course, p: Params) -> None:
-    """Add a bar that turns about the hub; at the start it points to the near side, across the ball's path."""
+    """Add a bar that turns about the hub; it starts at the near side."""
     half = POINTER * p.disc_m / 2
     body = course.hinge("pointer", (0, 0, TABLE_M + 0.03), axis=(0, 0, p.direction), damping=2e-4)
     joint = body.first_joint()
@@ -124,40 +124,39 @@ def _add_pointer(course: Course, p: Params) -> None:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return the sector that the pointer is in, from when it turns no more. The margin is how far its tip ends from the
-    nearest edge of that sector."""
+    """Read the pointer's sector, from when it turns no more."""
     tip = -motion.rot("pointer")[:, :2, 1]
     angles = np.degrees(np.arctan2(p.direction * tip[:, 0], -tip[:, 1])) % 360  # from the near side
     turned = np.abs(np.radians(angles - angles[-1] + 180) % (2 * np.pi) - np.pi)
-    still = lasting_from(turned <= 0.02)
-    within = (angles[-1] - FIRST_DEG) % p.sector_deg
-    margin = np.radians(min(within, p.sector_deg - within)) * POINTER * p.disc_m
+    rest_frame = lasting_from(turned <= 0.02)
+    angle_in_sector = (angles[-1] - FIRST_DEG) % p.sector_deg
+    margin = np.radians(min(angle_in_sector, p.sector_deg - angle_in_sector)) * POINTER * p.disc_m
     index = np.floor((angles - FIRST_DEG) / p.sector_deg).astype(int)
-    sectors = [p.sectors[k] if i >= still and 0 <= k < len(p.sectors) else None for i, k in enumerate(index)]
+    sectors = [p.sectors[k] if i >= rest_frame and 0 <= k < len(p.sectors) else None for i, k in enumerate(index)]
     return Reading(sectors, float(margin))
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str], ahead: float | None = None) -> str | None:
+def observe(frames: np.ndarray, slots: Mapping[str, str], ahead: float | None = None) -> str | None:
     """Return the colour that surrounds the black pointer once it is at rest."""
     pointers = [_pointer(frame) for frame in frames[-3:]]
-    if pointers[-1][0] is None or (ahead is None and not at_rest([found for found, _ in pointers])):
+    if pointers[-1][0] is None or (ahead is None and not is_at_rest([pointer for pointer, _ in pointers])):
         return None
     ring = cv2.dilate(pointers[-1][1], np.ones((15, 15), np.uint8)).astype(bool)
-    counts = {c: int((ring & colour_mask(frames[-1], c)).sum()) for c in offered(named, SECTORS)}
+    counts = {c: int((ring & colour_mask(frames[-1], c)).sum()) for c in offered(slots, SECTORS)}
     best = max(counts, key=lambda c: counts[c])
     return best if counts[best] > 0.45 * sum(counts.values()) else None
 
 
 def _pointer(frame: np.ndarray) -> tuple[Blob | None, np.ndarray]:
-    """Return the largest black thing, with the gap that the peg may cut into it closed, and its mask."""
+    """Return the largest black region and its mask, the peg's gap in it closed."""
     black = colour_mask(frame, POINTER_COLOUR).astype(np.uint8)
     black = cv2.morphologyEx(black, cv2.MORPH_CLOSE, np.ones((11, 11), np.uint8))
-    found = next(iter(blobs(black, 150)), None)
+    pointer = next(iter(blobs(black, 150)), None)
     mask = np.zeros_like(black)
-    if found is not None:
-        x, y, width, height = found.box
+    if pointer is not None:
+        x, y, width, height = pointer.box
         mask[y : y + height, x : x + width] = black[y : y + height, x : x + width]
-    return found, mask
+    return pointer, mask
 
 
 FAMILY = scene_family(
@@ -174,7 +173,7 @@ FAMILY = scene_family(
         forms=["{} sector", "the {} sector", "on {}"],
     ),
     asides=[
-        colour_from("ball", "What colour is the ball that rolls towards the spinner: {choices}?", NAMED, ["ball"]),
+        colour_from("ball", "What colour is the ball that rolls towards the spinner: {choices}?", COLOURS, ["ball"]),
         comes_from("From which side does the ball roll towards the spinner, left or right?"),
     ],
     observe=observe,

@@ -1,4 +1,4 @@
-"""A ball rolls through a tunnel and off a deck to a plunger; the question is whether it is thrown back over a line.
+"""A ball rolls off a deck to a plunger: is it thrown back over a line?
 
 Control: plunger and line are in view. Void: the occluder stands before both.
 Hidden element: the plunger, whose spring is lively or stuck fast in thick grease. The ball arrives the same either way;
@@ -26,13 +26,12 @@ LANE_M = 0.02  # height of the lower lane
 FEEL_M = 0.03  # the ball has met the plunger when it has been this near to it
 WALL_M = 0.014
 COILS = [f"coil_{i}" for i in range(4)]
-SEEN = ("ball", "deck", "line")
+PARTS = ("ball", "deck", "line")
 PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
 
 
 def _plungers(rng: np.random.Generator, so_far: Drawn) -> tuple[float, float, str, str]:
-    """Return the damping of this plunger and of the twin's, one lively and one stuck, and the colours of lane and
-    tunnel."""
+    """Draw a lively and a stuck damping, and the colours of lane and tunnel."""
     dampings = (uniform(rng, 0.4, 1.0), uniform(rng, 60, 90))
     lane, tunnel = rng.permutation(["grey", "white", "black"])[:2]
     first = int(rng.integers(2))
@@ -44,7 +43,7 @@ PLUNGER = together(_plungers)
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 rolls to the right. Places are along the roll, from where the ball starts."""
+    """Parameters; lengths run from where the ball starts, direction +1: to the right."""
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()
@@ -78,7 +77,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return deck with a tunnel, step, lower lane with a line across, plunger. Lengths run along the roll."""
+    """Build deck with tunnel, step, lower lane with a line across, and plunger."""
     course = Course(physics, p.direction, Surface(2e-5, solref=SOFT))
     r, wide = p.radius_m, 1.9 * p.radius_m
     deck, end, line = LANE_M + p.step_m, p.head_m + 0.32, p.head_m - p.line_m
@@ -115,7 +114,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _add_plunger(course: Course, p: Params) -> None:
-    """Head and rod on a sprung slide joint; the rod and the spring's coils slide into the housing behind them."""
+    """Add head and rod on a sprung slide joint, and the housing behind them."""
     import mujoco
 
     r, way = p.radius_m, p.direction
@@ -134,18 +133,17 @@ def _add_plunger(course: Course, p: Params) -> None:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return 'yes' from when the ball's centre is back over the line after it has met the plunger, 'no' while it is
-    not; None before it has met the plunger. The margin is how far that centre ends from the line."""
+    """Read whether the ball is back over the line; None before it meets the plunger."""
     back = p.head_m - p.line_m - p.direction * motion.pos("ball")[:, 0]
-    met = np.maximum.accumulate(-back) > p.line_m - p.radius_m - FEEL_M
-    return Reading(side_while(met, back), float(abs(back[-1])))
+    has_met = np.maximum.accumulate(-back) > p.line_m - p.radius_m - FEEL_M
+    return Reading(side_while(has_met, back), float(abs(back[-1])))
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str], ahead: float | None = None) -> str | None:
+def observe(frames: np.ndarray, slots: Mapping[str, str], ahead: float | None = None) -> str | None:
     """Return whether the resting ball is on the side of the line that it came from."""
-    path = [rounded(frame, named["ball"]) for frame in frames[-3:]]
-    start, end = rounded(frames[0], named["ball"]), end_of(path, ahead)
-    parts = [blob for blob in blobs(colour_mask(frames[-1], named["line"]), 15) if blob.area < 4000]
+    path = [rounded(frame, slots["ball"]) for frame in frames[-3:]]
+    start, end = rounded(frames[0], slots["ball"]), end_of(path, ahead)
+    parts = [blob for blob in blobs(colour_mask(frames[-1], slots["line"]), 15) if blob.area < 4000]
     if start is None or end is None or not parts:
         return None
     line = sum(part.x * part.area for part in parts) / sum(part.area for part in parts)
@@ -167,8 +165,8 @@ FAMILY = scene_family(
     ),
     asides=[
         comes_from("From which side does the ball roll towards the spring, left or right?"),
-        colour_of("ball", "What colour is the ball that rolls along the deck: {choices}?", SEEN),
-        colour_of("deck", "What colour is the deck under the ball: {choices}?", SEEN),
+        colour_of("ball", "What colour is the ball that rolls along the deck: {choices}?", PARTS),
+        colour_of("deck", "What colour is the deck under the ball: {choices}?", PARTS),
     ],
     observe=observe,
     foresee=partial(observe, ahead=AHEAD),

@@ -1,4 +1,4 @@
-"""A rolling ball drives a pusher that sweeps blocks off a stack; the question is how many stay on the stand.
+"""A pusher sweeps blocks off a stack: how many stay on the stand?
 
 Control: ball, pusher, stack and tray are in view. Void: the occluder stands before all of them but the ball's run-up.
 Hidden element: the height of the stand. The pusher's plate passes just over the ledge that the ball rolls on, so the
@@ -32,7 +32,7 @@ STACKED, PLAIN = shuffled(*COLOURS), shuffled("wood", "grey", "white")
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 rolls to the right. block_colours: from the bottom of the stack upwards."""
+    """Parameters; direction +1: to the right, block_colours: from the stand upwards."""
 
     direction: int = one_of(-1, 1)
     ledge_colour: str = PLAIN()
@@ -76,7 +76,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return lengths run along the ball's path from the middle of the stack."""
+    """Build ledge, pusher, stand with the stack, and tray."""
     course = Course(physics, p.direction)
     ledge, stand, half_w = p.ledge_m, p.stand_half_m, p.block_width_m / 2
     plate, end = -half_w - 0.025, stand + p.tray_m
@@ -99,15 +99,15 @@ def build(p: Params, physics: Physics) -> Scene:
     at = (start, 0, ledge + RADIUS_M)
     course.ball("ball", at, RADIUS_M, p.ball_colour, speed=p.speed_m_s, rolling=0.0002, density=7500)
 
-    covered, top = (screened, end + 0.02), ledge + p.stack_m + 0.03
+    along, top = (screened, end + 0.02), ledge + p.stack_m + 0.03
     course.mark("block", BLOCKS[-1])
     course.mark("stand", (0.0, 0.15), STAND_COLOUR)
     return course.scene(
         p,
         decisive=BLOCKS,
         hidden=["stand"],
-        cover=course.box(covered, (-0.17, 0.18), (0, top), right=course.ahead(0.06)),
-        in_view=[course.box(covered, (-0.165, 0.165), (0, high))],
+        cover=course.box(along, (-0.17, 0.18), (0, top), right=course.ahead(0.06)),
+        in_view=[course.box(along, (-0.165, 0.165), (0, high))],
         things=[f"{p.ball_colour} ball", "black stand", "ledge", *(f"{c} block" for c in p.block_colours)],
         also=["stack", "pusher", "wall"],
         colours=[*p.block_colours, STAND_COLOUR],
@@ -139,34 +139,33 @@ def _standing(motion: Motion, p: Params) -> np.ndarray:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return the range of the number of standing blocks, from when the pusher has gone all its way and no block moves.
-    The margin is how far the block nearest to the edge of the stand is from it."""
-    still = still_from(*(motion.pos(block) for block in BLOCKS), within_m=0.003)
-    pushed = p.direction * (motion.pos("pusher") - motion.pos("pusher")[0])[:, 0] > 0.95 * p.travel_m
+    """Read the range of the number of standing blocks, once everything is still."""
+    rest_frame = still_from(*(motion.pos(block) for block in BLOCKS), within_m=0.003)
+    is_pushed = p.direction * (motion.pos("pusher") - motion.pos("pusher")[0])[:, 0] > 0.95 * p.travel_m
     counts = _standing(motion, p).sum(axis=1)
-    labels = [range_of(RANGES, n) if i >= still and pushed[i] else None for i, n in enumerate(counts)]
+    labels = [range_of(RANGES, n) if i >= rest_frame and is_pushed[i] else None for i, n in enumerate(counts)]
     return Reading(labels, min(float(abs(abs(motion.pos(block)[-1, 0]) - p.stand_half_m)) for block in BLOCKS))
 
 
 def legible(motion: Motion, p: Params) -> list[tuple[tuple[str, ...], float]]:
-    """Return every standing block; of the fallen ones, which may lie behind each other, enough to be seen there."""
+    """Return the blocks to be seen: all standing ones, and enough of the fallen ones."""
     standing = _standing(motion, p)[-1]
     groups = [((BLOCKS[i],), 150.0) for i in np.flatnonzero(standing)]
     fallen = tuple(BLOCKS[i] for i in np.flatnonzero(~standing))
     return [*groups, (fallen, 200.0 * len(fallen))] if fallen else groups
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return counts the block colours that lie above the black stand and within its width."""
-    counts = [_count(frame, named["stand"]) for frame in frames[-3:]]
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Count the block colours that lie above the black stand and within its width."""
+    counts = [_count(frame, slots["stand"]) for frame in frames[-3:]]
     if counts[-1] is None or len(set(counts)) > 1:
         return None
     return range_of(RANGES, counts[-1])
 
 
-def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return counts the blocks that are over the stand in the last frame: whatever is beside it falls."""
-    count = _count(frames[-1], named["stand"])
+def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Count the blocks that are over the stand in the last frame; the others fall."""
+    count = _count(frames[-1], slots["stand"])
     return None if count is None else range_of(RANGES, count)
 
 

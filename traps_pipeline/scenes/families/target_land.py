@@ -1,4 +1,4 @@
-"""A ball is thrown into a chute over three coloured trays; the question is in which tray it lands.
+"""A ball is thrown into a chute over three trays: in which tray does it land?
 
 Control: chute and trays are in view. Void: the occluder stands before them.
 Hidden element: the two parallel boards of the chute, which hang straight down over the middle tray or slant towards the
@@ -19,7 +19,7 @@ from traps_pipeline.scenes.parts.observers import offered, rounded
 from traps_pipeline.scenes.parts.questions import choice_of, comes_from, which_colour
 from traps_pipeline.scenes.parts.readings import Reading
 from traps_pipeline.scenes.parts.vary import apart, between, facing, hidden, one_of, shuffled
-from traps_pipeline.scenes.parts.vision import at_rest, blobs, colour_mask, largest
+from traps_pipeline.scenes.parts.vision import blobs, colour_mask, is_at_rest, largest
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
 GRAVITY = 9.81
@@ -37,7 +37,7 @@ PLAY, PLAIN = apart(*COLOURS), shuffled(*GREYS)
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 throws to the right. Everything else is laid out as the camera sees it, from left to right."""
+    """Parameters, left to right as the camera sees them; direction +1: to the right."""
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()
@@ -70,8 +70,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return pedestal, three trays with a high back and a low front, two boards before the back that hang from their
-    upper edges."""
+    """Build pedestal, three trays with a high back, and two boards over them."""
     course = Course(physics, surface=Surface(0.006, sliding=0.5, solref=SOFT))
     r, side, start = p.radius_m, 1.5 * p.tray_m, -p.direction * p.range_m
     deep, outer, foot = (-DEPTH_M, DEPTH_M), (-side - WALL_M, side + WALL_M), (start - 0.08, start + 0.08)
@@ -112,8 +111,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return the colour of the tray that the ball is over while its centre is hardly higher than the dividers; None
-    while it is higher. The margin is how far that centre ends from the nearest divider, or below its upper edge."""
+    """Read the colour of the tray that the ball is over, while it is that low."""
     ball = motion.pos("ball")
     place = ball[:, 0] / p.tray_m + 1.5  # in tray widths from the left end
     over, low = np.clip(np.floor(place), 0, 2).astype(int), ball[:, 2] < DIVIDER_M + 0.02
@@ -122,34 +120,34 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading([p.tray_colours[i] if down else None for i, down in zip(over, low, strict=True)], float(margin))
 
 
-def _colours(named: Mapping[str, str]) -> Sequence[str]:
-    """Return the colours that the question offers, or all that a tray beside this ball may have."""
-    return offered(named, [colour for colour in COLOURS if colour != named["ball"]])
+def _colours(slots: Mapping[str, str]) -> Sequence[str]:
+    """Return the colours that the question offers, or any a tray beside this ball has."""
+    return offered(slots, [colour for colour in COLOURS if colour != slots["ball"]])
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return the tray colour that most of the picture around the resting ball has."""
-    path = [rounded(frame, named["ball"]) for frame in frames[-3:]]
+    path = [rounded(frame, slots["ball"]) for frame in frames[-3:]]
     ball = path[-1]
-    if ball is None or not at_rest(path):
+    if ball is None or not is_at_rest(path):
         return None
     reach = 1.1 * max(ball.box[2:])
     rows, columns = np.ogrid[: frames.shape[1], : frames.shape[2]]
     near = (columns - ball.x) ** 2 + (rows - ball.y) ** 2 < reach**2
-    around = {c: int((colour_mask(frames[-1], c) & near).sum()) for c in _colours(named)}
+    around = {c: int((colour_mask(frames[-1], c) & near).sum()) for c in _colours(slots)}
     best = max(around, key=lambda c: around[c])
     return best if around[best] >= 60 else None
 
 
-def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return the tray that the boards of the chute lead to: the middle one if they hang straight down."""
-    trays = {colour: largest(frames[-1], colour, 200) for colour in _colours(named)}
-    seen = {colour: blob for colour, blob in trays.items() if blob is not None and blob.box[2] > TRAY_PX}
-    in_order = sorted(seen, key=lambda colour: seen[colour].x)
+def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Predict the tray that the chute's boards lead to; the middle if upright."""
+    trays = {colour: largest(frames[-1], colour, 200) for colour in _colours(slots)}
+    visible = {colour: blob for colour, blob in trays.items() if blob is not None and blob.box[2] > TRAY_PX}
+    in_order = sorted(visible, key=lambda colour: visible[colour].x)
     if len(in_order) != 3:
         return None
-    left, right = seen[in_order[0]], seen[in_order[2]]
-    top = min(blob.y for blob in seen.values())
+    left, right = visible[in_order[0]], visible[in_order[2]]
+    top = min(blob.y for blob in visible.values())
     slopes = []
     for board in blobs(colour_mask(frames[0], "wood"), 200):
         x, y, width, height = board.box

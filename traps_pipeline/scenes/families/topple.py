@@ -1,4 +1,4 @@
-"""A ball rolls off a ledge against a tall pillar; the question is whether the pillar topples over.
+"""A ball rolls off a ledge against a tall pillar: does the pillar topple over?
 
 Control: ledge, pillar and the ground behind it are in view. Void: the occluder stands before all of them but the ball's
 run-up.
@@ -19,7 +19,7 @@ from traps_pipeline.scenes.parts.observers import lies_flat
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
 from traps_pipeline.scenes.parts.readings import Reading, still_from, top_m, yes_while
 from traps_pipeline.scenes.parts.vary import apart, between, facing, hidden, one_of, shuffled
-from traps_pipeline.scenes.parts.vision import at_rest, largest, track
+from traps_pipeline.scenes.parts.vision import is_at_rest, largest, track
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
 FELT = Surface(2e-3)  # behind the occluder: no ball comes back from there
@@ -32,7 +32,7 @@ PLAY, PLAIN = apart("red", "green", "blue", "orange", "cyan", "purple"), shuffle
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 rolls to the right. Heights in the ball's way are shares of the pillar's height."""
+    """Parameters; heights are shares of the pillar's, direction +1: to the right."""
 
     direction: int = one_of(-1, 1)
     pillar_colour: str = PLAY()
@@ -55,7 +55,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return lengths run along the ball's path from the middle of the pillar."""
+    """Build ledge, pillar, mat and prop; lengths run from the middle of the pillar."""
     course = Course(physics, p.direction)
     r, half_w, deep = p.radius_m, p.width_m / 2, HALF_DEPTH_M
     ledge = p.strike * p.pillar_m - r  # height of the ledge that the ball rolls on
@@ -81,7 +81,7 @@ def build(p: Params, physics: Physics) -> Scene:
     at = (start, 0, ledge + r)
     course.ball("ball", at, r, p.ball_colour, speed=p.speed_m_s, rolling=1e-4, sliding=0.1, density=1500)
 
-    covered, top = (screened, end + 0.02), p.pillar_m + 0.03
+    along, top = (screened, end + 0.02), p.pillar_m + 0.03
     across = (-deep - 0.02, max(deep + 0.05, 0.05 + SHADOW_BACK * p.pillar_m))
     props = [f"{p.prop_colour} block"] if has_prop else []
     course.mark("pillar", "pillar")
@@ -89,8 +89,8 @@ def build(p: Params, physics: Physics) -> Scene:
         p,
         decisive=["pillar"],
         hidden=[p.kind],
-        cover=course.box(covered, across, (0, top), right=course.ahead(0.04)),
-        in_view=[course.box(covered, (-deep - RIM_M, deep + RIM_M), (0, p.pillar_m))],
+        cover=course.box(along, across, (0, top), right=course.ahead(0.04)),
+        in_view=[course.box(along, (-deep - RIM_M, deep + RIM_M), (0, p.pillar_m))],
         things=[f"{p.ball_colour} ball", f"{p.pillar_colour} pillar", "ledge", "mat", *props],
         also=["block", "rim"],
     )
@@ -100,25 +100,24 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return 'yes' while the pillar's top is below half its height; 'no' while it is not, from when neither the pillar
-    nor the ball moves any more. The margin is how far the top ends above or below half the height."""
+    """Read whether the pillar's top is low; 'no' only once pillar and ball rest."""
     top = top_m(motion, "pillar", p.pillar_m)
-    still = still_from(motion.pos("pillar"), motion.pos("ball"), top, within_m=0.003)
-    return Reading(yes_while(top < p.pillar_m / 2, still), float(abs(top[-1] - p.pillar_m / 2)))
+    rest_frame = still_from(motion.pos("pillar"), motion.pos("ball"), top, within_m=0.003)
+    return Reading(yes_while(top < p.pillar_m / 2, rest_frame), float(abs(top[-1] - p.pillar_m / 2)))
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return the named pillar, seen at the start and at the end: is it still about as high in the picture as it was?"""
-    path = track(frames, named["pillar"], 80)
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Return whether the pillar is lower at the end than at the start, None if unseen."""
+    path = track(frames, slots["pillar"], 80)
     first, last = path[0], path[-1]
-    if first is None or last is None or not at_rest(path) or first.box[3] < 1.2 * first.box[2]:
+    if first is None or last is None or not is_at_rest(path) or first.box[3] < 1.2 * first.box[2]:
         return None
     return "yes" if last.box[3] < 0.75 * first.box[3] else "no"
 
 
-def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return whether the pillar leans: it is wider in the picture than it was, or lower."""
-    first, last = largest(frames[0], named["pillar"], 80), largest(frames[-1], named["pillar"], 80)
+def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Predict a fall: the pillar is wider in the picture than it was, or lower."""
+    first, last = largest(frames[0], slots["pillar"], 80), largest(frames[-1], slots["pillar"], 80)
     if first is None or last is None or first.box[3] < 1.2 * first.box[2]:
         return None
     return "yes" if last.box[2] > 1.3 * first.box[2] or last.box[3] < 0.75 * first.box[3] else "no"

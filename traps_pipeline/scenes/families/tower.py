@@ -1,4 +1,4 @@
-"""A ball rolls along a ledge towards a tower of blocks; the question is whether its top block is knocked down.
+"""A ball rolls along a ledge towards a tower: is its top block knocked down?
 
 Control: ledge, tower and tray are in view. Void: the occluder stands before all of them but the ball's run-up.
 Hidden element: a stop that stands in the ball's way or beside it, or a strip of the ledge that is rough or smooth:
@@ -18,7 +18,7 @@ from traps_pipeline.scenes.parts.observers import end_of
 from traps_pipeline.scenes.parts.questions import choice_of, comes_from, yes_no
 from traps_pipeline.scenes.parts.readings import Reading, still_from, yes_while
 from traps_pipeline.scenes.parts.vary import apart, between, drawn_by, facing, hidden, one_of, shuffled
-from traps_pipeline.scenes.parts.vision import at_rest, colour_mask, largest, track
+from traps_pipeline.scenes.parts.vision import colour_mask, is_at_rest, largest, track
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, uniform
 
 STRIP_M = 0.16  # length of the strip that is rough or smooth
@@ -33,7 +33,7 @@ GIVES = 0.25  # of its width: a block that is so far from its place falls
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 rolls to the right. The top block has a colour of its own; the others take turns."""
+    """Parameters; direction +1: to the right. Only the top block's colour is unique."""
 
     direction: int = one_of(-1, 1)
     blocks: int = one_of(3, 4)
@@ -70,7 +70,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return lengths run along the ball's path from the middle of the tower."""
+    """Build ledge, stop or strip, tower and tray."""
     course = Course(physics, p.direction)
     r, half_w, deep = p.radius_m, p.block_width_m / 2, (-HALF_DEPTH_M, HALF_DEPTH_M)
     ledge = p.strike * p.block_height_m - r  # height of the ledge that the ball rolls on
@@ -99,8 +99,8 @@ def build(p: Params, physics: Physics) -> Scene:
     at = (start, 0, ledge + r)
     course.ball("ball", at, r, p.ball_colour, speed=p.speed_m_s, rolling=1e-4, sliding=0.3, density=2500)
 
-    seen = course.box((screened, end + 0.02), (-0.165, 0.165), (0, p.tower_m))
-    right = max(seen.high[0], SHADOW_RIGHT * p.tower_m + half_w) + course.ahead(0.07) - seen.high[0]
+    view_box = course.box((screened, end + 0.02), (-0.165, 0.165), (0, p.tower_m))
+    right = max(view_box.high[0], SHADOW_RIGHT * p.tower_m + half_w) + course.ahead(0.07) - view_box.high[0]
     across = (-0.17, half_w + SHADOW_BACK * p.tower_m)
     course.mark("block", p.names[-1])
     return course.scene(
@@ -108,7 +108,7 @@ def build(p: Params, physics: Physics) -> Scene:
         decisive=[p.names[-1]],
         hidden=[p.kind],
         cover=course.box((screened, end + 0.02), across, (0, p.tower_m + 0.02), right=right),
-        in_view=[seen],
+        in_view=[view_box],
         things=[
             f"{p.ball_colour} ball",
             f"{p.top_colour} block",
@@ -123,41 +123,40 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return 'yes' while the top block is on the ground; 'no' while it is at its height on the tower, from when neither
-    the ball nor the block moves any more. The margin is how far it ends from the middle of its fall."""
+    """Read whether the top block is on the ground; 'no' only once ball and block rest."""
     top = motion.pos(p.names[-1])
     down, up = top[:, 2] < 1.3 * p.block_height_m, top[:, 2] > p.tower_m - 0.6 * p.block_height_m
-    still = still_from(top, motion.pos("ball"), within_m=STILL_M)
+    rest_frame = still_from(top, motion.pos("ball"), within_m=STILL_M)
     middle = (p.tower_m - p.block_height_m / 2 + p.block_width_m / 2) / 2
-    return Reading(yes_while(down, still, no_where=up), float(abs(top[-1, 2] - middle)))
+    return Reading(yes_while(down, rest_frame, no_where=up), float(abs(top[-1, 2] - middle)))
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return the named block, seen at the start and at the end: has it come down by more than its own size?"""
-    path = track(frames, named["top"], 60)
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Return whether the named block has come down by more than its own size."""
+    path = track(frames, slots["top"], 60)
     first, last = path[0], path[-1]
-    if first is None or last is None or not at_rest(path):
+    if first is None or last is None or not is_at_rest(path):
         return None
-    if first.area > 0.08 * colour_mask(frames[0], named["top"]).size:
+    if first.area > 0.08 * colour_mask(frames[0], slots["top"]).size:
         return None
     return "yes" if last.y - first.y > 0.7 * first.box[3] else "no"
 
 
-def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return whether the block has left its place at the top, or leans over: from there it falls."""
-    first, last = largest(frames[0], named["top"], 60), largest(frames[-1], named["top"], 60)
+def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Predict a fall: the block has left its place at the top, or leans over."""
+    first, last = largest(frames[0], slots["top"], 60), largest(frames[-1], slots["top"], 60)
     if first is None or last is None:
         return None
     return "yes" if abs(last.x - first.x) + abs(last.y - first.y) > GIVES * first.box[2] else "no"
 
 
-def look(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return whether a block of another colour is higher in the end than the named one, which was the highest."""
-    top = end_of(track(frames, named["top"], 60))
+def look(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Return whether another colour's block is higher in the end than the top block."""
+    top = end_of(track(frames, slots["top"], 60))
     if top is None:
         return None
-    others = [largest(frames[-1], colour, top.area // 3) for colour in COLOURS if colour != named["top"]]
-    higher = [other for other in others if other is not None and other.y < top.y - 0.5 * top.box[3]]
+    blocks = [largest(frames[-1], colour, top.area // 3) for colour in COLOURS if colour != slots["top"]]
+    higher = [block for block in blocks if block is not None and block.y < top.y - 0.5 * top.box[3]]
     return "yes" if higher else "no"
 
 

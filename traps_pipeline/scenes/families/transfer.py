@@ -1,5 +1,4 @@
-"""A ball rolls down a ramp and strikes a block, which slides on with its momentum; the question is whether the block
-reaches the coloured zone at the end of the deck.
+"""A ball strikes a block, which slides on: does the block reach the zone?
 
 Control: deck and zone are in view. Void: the occluder stands before them; the ball is seen to roll in behind it.
 Hidden element: the board between block and zone, which is slick or rough. The ramp ends in a step, so that nothing
@@ -30,7 +29,7 @@ PLAIN = shuffled("wood", "grey", "white")
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 rolls to the right. Lengths run along the track, from the upper end of the ramp."""
+    """Parameters; lengths run from the ramp's upper end, direction +1: to the right."""
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()
@@ -65,7 +64,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return ramp, step, deck with low rims, zone before an end wall."""
+    """Build ramp, step, deck with low rims, and zone before an end wall."""
     course = Course(physics, p.direction)
     r, end, board_at = p.radius_m, p.zone_at_m + p.zone_m, p.block_at_m - p.block_m / 2 - 0.03
     deep, outer, deck = (-SIDE_M, SIDE_M), (-SIDE_M - WALL_M, SIDE_M + WALL_M), (0, DECK_M)
@@ -83,14 +82,14 @@ def build(p: Params, physics: Physics) -> Scene:
     _add_target(course, p)
 
     high = DECK_M + max(p.block_m, 2 * r)
-    covered, across = (p.ramp_m - 0.04, end + WALL_M), (outer[0] - 0.02, outer[1] + SHADOW_BACK * high)
+    along, across = (p.ramp_m - 0.04, end + WALL_M), (outer[0] - 0.02, outer[1] + SHADOW_BACK * high)
     course.mark("block", "block")
     course.mark("zone", "zone")
     return course.scene(
         p,
         decisive=["block"],
         hidden=["board"],
-        cover=course.box(covered, across, (0, high), right=0.45 * high),
+        cover=course.box(along, across, (0, high), right=0.45 * high),
         in_view=[course.box((0, end), outer, (0, high))],
         things=[f"{p.ball_colour} ball", f"{p.block_colour} block", f"{p.zone_colour} zone", "ramp"],
         also=["deck", "wall"],
@@ -112,8 +111,7 @@ def _add_target(course: Course, p: Params) -> None:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return 'yes' while the middle of the block is in the zone; 'no' while it is not, from when the block moves no
-    more. The margin is how far it ends inside the zone by its middle, or short of it by its front."""
+    """Read whether the block's middle is in the zone; 'no' only once it rests."""
     ahead = p.direction * motion.pos("block")[:, 0] - p.zone_at_m
     return Reading(yes_while(ahead > 0, still_from(ahead, within_m=STILL_M)), clear_m(ahead, p.block_m / 2))
 

@@ -1,4 +1,4 @@
-"""A ball rolls down a covered ramp into a forked tunnel; the question is by which exit it comes out.
+"""A ball rolls into a forked tunnel: by which exit does it come out?
 
 Control: both exits and the tray at each of them are in view. Void: the occluder stands before the fork and the trays;
 the ramp is seen above it.
@@ -28,14 +28,14 @@ TRAY_M = 0.02  # lower than the tunnel, so that no ball rolls back into it
 WALL_M = 0.012
 SLIPPERY = Surface(1e-5, sliding=0.03, spinning=0.001)  # a ball slides along it and keeps its speed
 FELT = Surface(0.004)
-NAMED = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
-SEEN = ("ball", "tunnel")
-PLAY, PLAIN = apart(*NAMED), shuffled("wood", "grey", "white", "black")
+COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
+PARTS = ("ball", "tunnel")
+PLAY, PLAIN = apart(*COLOURS), shuffled("wood", "grey", "white", "black")
 
 
 @dataclass(frozen=True)
 class Params:
-    """The ball rolls towards the camera. turn: +1 if the deflector leads it to the right."""
+    """Parameters; the ball rolls to the camera, turn +1: deflected to the right."""
 
     ball_colour: str = PLAY()
     tunnel_colour: str = PLAY()
@@ -57,7 +57,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return the fork stands in the middle, its front at the origin; the ramp leads down to it from the back."""
+    """Build the fork, its front at the origin, and the ramp down to it from the back."""
     course = Course(physics)
     r, wide, depth = p.radius_m, p.half_width_m, p.depth_m
     roof, bore, end = FLOOR_M + 2.8 * r, 1.3 * r, p.half_width_m + p.tray_m
@@ -102,7 +102,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _add_ramp(course: Course, p: Params, ramp: Ramp, bore: float) -> None:
-    """Add the ramp with its cover below, its rails above, and a post under its upper end."""
+    """Add the ramp, its cover below and rails above, and a post under its upper end."""
     length, outer, top = p.covered_m + p.open_m, bore + WALL_M, 2.7 * p.radius_m
 
     def board(name: str, across: Span, up: Span, over: Span, colour: str, side: int = 1) -> None:
@@ -119,16 +119,16 @@ def _add_ramp(course: Course, p: Params, ramp: Ramp, bore: float) -> None:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return the side on which the ball is wholly out of the tunnel. The margin is how far outside the fork it ends."""
+    """Read the side on which the ball is wholly out of the tunnel."""
     across = motion.pos("ball")[:, 0]
     outside = np.abs(across) - p.radius_m - p.half_width_m
     return Reading(side_while(outside > 0, across, over="right", under="left"), float(outside[-1]))
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str], ahead: float | None = None) -> str | None:
+def observe(frames: np.ndarray, slots: Mapping[str, str], ahead: float | None = None) -> str | None:
     """Return the side of the tunnel on which the ball lies at the end."""
-    path = [small(frame, named["ball"]) for frame in frames[-3:]]
-    tunnel, ball = largest(frames[-1], named["tunnel"], 200), end_of(path, ahead, tolerance_px=4)
+    path = [small(frame, slots["ball"]) for frame in frames[-3:]]
+    tunnel, ball = largest(frames[-1], slots["tunnel"], 200), end_of(path, ahead, tolerance_px=4)
     if ball is None or tunnel is None:
         return None
     middle = tunnel.box[0] + tunnel.box[2] / 2
@@ -150,8 +150,8 @@ FAMILY = scene_family(
         forms=["{} exit", "the {} exit", "on the {}", "{} side", "to the {}"],
     ),
     asides=[
-        colour_from("tunnel", "What colour is the tunnel that the ball rolls into: {choices}?", NAMED, unlike=SEEN),
-        colour_from("ball", "What colour is the ball that rolls down the ramp: {choices}?", NAMED, unlike=SEEN),
+        colour_from("tunnel", "What colour is the tunnel that the ball rolls into: {choices}?", COLOURS, unlike=PARTS),
+        colour_from("ball", "What colour is the ball that rolls down the ramp: {choices}?", COLOURS, unlike=PARTS),
     ],
     observe=observe,
     foresee=partial(observe, ahead=AHEAD),

@@ -1,4 +1,4 @@
-"""A ball rolls down a ramp on to a road that leads under a footbridge; does it come out at the other end?
+"""A ball rolls on to a road under a footbridge: does it come out beyond?
 
 Control: the road under the bridge and beyond is in view. Void: the occluder stands before the far half of the bridge
 and the road beyond.
@@ -15,7 +15,7 @@ from traps_pipeline.scenes.parts.course import Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import AHEAD, past_far_edge
 from traps_pipeline.scenes.parts.questions import colour_from, comes_from, yes_no
-from traps_pipeline.scenes.parts.readings import Reading, came_through
+from traps_pipeline.scenes.parts.readings import Reading, read_passage
 from traps_pipeline.scenes.parts.vary import apart, between, facing, hidden, one_of, shuffled
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, Vec3
 
@@ -28,7 +28,7 @@ PLAY, PLAIN = apart(*BALL_COLOURS), shuffled("wood", "grey", "white", "black")
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 rolls to the right. Lengths run along the road, from the bridge's near edge."""
+    """Parameters; lengths run from the bridge's near edge, direction +1: to the right."""
 
     ball_colour: str = PLAY()
     bridge_colour: str = PLAY()
@@ -53,7 +53,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return a ramp, a road with an end wall, a bridge on four legs across the road."""
+    """Build a ramp, a road with an end wall, and a bridge on four legs across it."""
     course = Course(physics, p.direction)
     r, end, side = p.radius_m, p.bridge_m + p.beyond_m, 1.6 * p.radius_m
     deep, road = (-side, side), (0, ROAD_M)
@@ -96,7 +96,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _add_ramp(course: Course, p: Params, side: float) -> Vec3:
-    """Return the ramp down to the road; gives the place where the ball starts on it."""
+    """Add the ramp down to the road; return where the ball starts on it."""
     slope, thick = float(np.radians(p.slope_deg)), 0.012
     length = p.ramp_m / np.cos(slope)
     foot = np.array([-p.flat_m, ROAD_M])
@@ -128,8 +128,8 @@ def _add_bridge(course: Course, p: Params) -> None:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return whether the ball is wholly past the bridge, or stays where it is under it."""
-    return came_through(p.direction * motion.pos("ball")[:, 0] - p.radius_m - p.bridge_m, p.radius_m)
+    """Read whether the ball is wholly past the bridge, or stays where it is under it."""
+    return read_passage(p.direction * motion.pos("ball")[:, 0] - p.radius_m - p.bridge_m, p.radius_m)
 
 
 FAMILY = scene_family(

@@ -1,4 +1,4 @@
-"""A ball strikes a wedge and pushes it along a track; the question is whether the wedge gets onto the mat.
+"""A ball pushes a wedge along a track: does the wedge get onto the mat?
 
 Control: track, wedge and mat are in view. Void: the occluder stands before all of them but the ball's run-up.
 Hidden element: a strip of the track before the mat that is slippery or rough, or a stop that stands on the track or
@@ -33,7 +33,7 @@ PLAY = apart("red", "green", "blue", "orange", "cyan", "purple")
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 rolls to the right."""
+    """Parameters; direction +1: to the right."""
 
     direction: int = one_of(-1, 1)
     wedge_colour: str = PLAY()
@@ -59,7 +59,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return lengths run along the track from the middle of the wedge."""
+    """Build track, strip or stop, mat and wedge; lengths run from the wedge's middle."""
     course = Course(physics, p.direction)
     r, half, end = p.radius_m, p.wedge_length_m / 2, p.mat_at_m + p.mat_m
     strip = (half + 0.03, half + 0.03 + STRIP_M)
@@ -83,15 +83,15 @@ def build(p: Params, physics: Physics) -> Scene:
     at = (start, 0, TRACK_M + r)
     course.ball("ball", at, r, p.ball_colour, speed=p.speed_m_s, rolling=1e-4, sliding=0.1, density=2500)
 
-    seen, top, back = (screened, end + 0.015), TRACK_M + p.wedge_height_m + 0.02, HALF_TRACK_M + 0.11
+    span, top, back = (screened, end + 0.015), TRACK_M + p.wedge_height_m + 0.02, HALF_TRACK_M + 0.11
     course.mark("wedge", "base", p.wedge_colour)
     course.mark("mat", "mat")
     return course.scene(
         p,
         decisive=["wedge"],
         hidden=[p.kind],
-        cover=course.box(seen, (-HALF_TRACK_M - 0.02, back + 0.03), (0, top), right=0.05),
-        in_view=[course.box(seen, (-HALF_TRACK_M, back), (0, top))],
+        cover=course.box(span, (-HALF_TRACK_M - 0.02, back + 0.03), (0, top), right=0.05),
+        in_view=[course.box(span, (-HALF_TRACK_M, back), (0, top))],
         things=[
             f"{p.ball_colour} ball",
             f"{p.wedge_colour} wedge",
@@ -105,7 +105,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _add_wedge(course: Course, p: Params) -> None:
-    """Add a free body that looks like a wedge, high end towards the ball; a base and a back plate inside it collide."""
+    """Add a wedge, high end to the ball; a base and a back plate inside it collide."""
     half, wide, high = p.wedge_length_m / 2, p.wedge_width_m / 2, p.wedge_height_m
     profile = ((-half, 0.0), (half, 0.0), (half, 0.025), (-half, high))
     body = course.spec.worldbody.add_body(name="wedge", pos=[0, 0, TRACK_M])
@@ -118,17 +118,16 @@ def _add_wedge(course: Course, p: Params) -> None:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return 'yes' while the middle of the wedge is past the edge of the mat; 'no' while it is not, from when neither
-    the wedge nor the ball moves any more. The margin is how far the nearer end of the wedge is from that edge."""
+    """Read whether the wedge's middle is on the mat; 'no' only once both bodies rest."""
     wedge = motion.pos("wedge")
     past = p.direction * wedge[:, 0] - p.mat_at_m
-    still = still_from(wedge, motion.pos("ball"), within_m=0.002)
-    return Reading(yes_while(past > 0, still), float(abs(past[-1]) - p.wedge_length_m / 2))
+    rest_frame = still_from(wedge, motion.pos("ball"), within_m=0.002)
+    return Reading(yes_while(past > 0, rest_frame), float(abs(past[-1]) - p.wedge_length_m / 2))
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str], ahead: float | None = None) -> str | None:
-    """Return whether the wedge, once at rest, stands before or within the mat as the first frame shows it."""
-    path, mat = track(frames, named["wedge"], 100), largest(frames[0], named["mat"], 100)
+def observe(frames: np.ndarray, slots: Mapping[str, str], ahead: float | None = None) -> str | None:
+    """Return whether the resting wedge is on the mat as the first frame shows it."""
+    path, mat = track(frames, slots["wedge"], 100), largest(frames[0], slots["mat"], 100)
     last = end_of(path, ahead)
     if path[0] is None or last is None or mat is None:
         return None

@@ -1,4 +1,4 @@
-"""A tilted board under glass on which balls run down past pegs: plinko, pachinko and the seesaw stand on it.
+"""A tilted board under glass on which balls run down past pegs.
 
 Places are (across, up, out) in metres: from the middle of the board to the right, up its slope from its lower edge, and
 out of it towards the glass. Everything is added in the order of the calls, which is the order of the compiled model.
@@ -29,8 +29,7 @@ GLASS_GAP_M = 0.006  # play of a ball under the glass that keeps it on the board
 
 
 def peg_rows(least: int, most: int) -> Group:
-    """Return the fields `rows` (their number), `peg_gap_m` (from peg to peg in a row) and `row_shifts_m` (sideways
-    shift of every row, lowest first) of staggered rows, in half of the draws skewed as well."""
+    """Return the fields `rows`, `peg_gap_m`, `row_shifts_m` of staggered rows of pegs."""
 
     def draw(rng: np.random.Generator, so_far: Drawn) -> tuple[int, float, tuple[float, ...]]:
         rows, gap = int(rng.integers(least, most + 1)), uniform(rng, 0.126, 0.140)
@@ -42,8 +41,7 @@ def peg_rows(least: int, most: int) -> Group:
 
 
 def looking_on(low: float, high: float) -> Any:
-    """Return elevation (degrees) of a camera that looks onto the board, off its normal by so many degrees. Needs a
-    field `tilt_deg` above it."""
+    """Return the elevation of a camera off the normal of a board with a `tilt_deg`."""
     return drawn_by(lambda rng, so_far: uniform(rng, low, high) + so_far["tilt_deg"] - 90)
 
 
@@ -57,7 +55,7 @@ def slope(tilt_deg: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def turned(angle_rad: float, axis: int) -> list[float]:
-    """Return quaternion of a turn about the x axis (1), y axis (2) or z axis (3)."""
+    """Return the quaternion of a turn about the x axis (1), y axis (2) or z axis (3)."""
     return [math.cos(angle_rad / 2), *(math.sin(angle_rad / 2) * (i == axis) for i in (1, 2, 3))]
 
 
@@ -97,7 +95,7 @@ class Board:
         )
 
     def block(self, name: str, across: Span, up: Span, out: Span, colour: str, *, solid: bool = True) -> mujoco.MjsGeom:
-        """Return a box of the board from its three spans. solid=False: paint, which is drawn and touches nothing."""
+        """Return a box of the board from its three spans; without solid, paint only."""
         spans = (across, up, out)
         centre, half = [sum(s) / 2 for s in spans], [(s[1] - s[0]) / 2 for s in spans]
         geom = add_box(self.body, name, centre, half, colour)
@@ -108,12 +106,11 @@ class Board:
         return geom
 
     def paint(self, name: str, centre: Vec3, half: Vec3, colour: str) -> mujoco.MjsGeom:
-        """Return a box from its centre and half sizes that is drawn and touches nothing."""
+        """Return a box from its centre and half sizes that collides with nothing."""
         return add_box(self.body, name, centre, half, colour, contype=0, conaffinity=0)
 
     def frame(self, bottom: float, top: float, colour: str, *, sill: bool = True) -> None:
-        """Add sill, head and sides around the part from `bottom` to `top`, and the glass over it, which is never
-        drawn."""
+        """Add sill, head and sides from `bottom` to `top`, and the glass, never drawn."""
         side, outer, out = self.side, self.outer, (0, self.deep)
         if sill:
             self.block("sill", (-outer, outer), (bottom - 2 * WALL_M, bottom), out, colour)
@@ -124,8 +121,7 @@ class Board:
         glass.rgba, glass.friction, glass.priority = [1, 1, 1, 0], [0, 0, 0], 1
 
     def post(self, name: str, at: tuple[float, float], radius: float, colour: str, *, square: bool) -> None:
-        """Add a lively post from the board to the glass: round, or square with a corner up so that nothing rests on
-        it."""
+        """Add a lively post up to the glass: round, or square with a corner up."""
         import mujoco
 
         half = self.deep / 2
@@ -141,7 +137,7 @@ class Board:
             post.quat = turned(math.pi / 4, 3)
 
     def divider(self, i: int, x: float, up: Span, half_m: float, colour: str) -> None:
-        """Add a wall `wall_<i>` between two buckets, and on it a post `tip_<i>`: a flat end could hold a ball."""
+        """Add a wall `wall_<i>` between buckets, and a post on it: a flat end holds balls."""
         self.block(f"wall_{i}", (x - half_m, x + half_m), up, (0, self.deep), colour)
         self.post(f"tip_{i}", (x, up[1]), half_m, colour, square=True)
 
@@ -156,7 +152,7 @@ class Board:
         square: bool,
         where: Callable[[float, float], bool] = lambda across, up: True,
     ) -> None:
-        """Add rows of pegs from side to side, without those that leave a ball just enough room to jam at a side.
+        """Add rows of pegs, without those that leave a ball just room to jam at a side.
 
         heights: up the board; shifts: sideways; one a row. gap: from peg to peg. where: whether a peg may stand at a
         place (across, up).
@@ -180,25 +176,25 @@ class Board:
         return geom
 
     def throw(self, push_m_s: float, rise_m: float) -> tuple[float, ...]:
-        """Return velocity of a ball that rolls, without slipping, sideways at a speed and just so far up the slope."""
+        """Return the velocity of a ball that rolls sideways and so far up the slope."""
         slowing = 5 / 7 * self.physics.gravity_m_s2 * math.sin(math.radians(self.tilt_deg))
         velocity = self.up * math.sqrt(2 * slowing * rise_m) + np.array([push_m_s, 0, 0])
         return (*velocity.tolist(), *(np.cross(self.normal, velocity) / self.ball_radius_m).tolist())
 
     def region(self, up: Span, out: float) -> Box:
-        """Return the box around a strip of the board from side to side, so far out of it (m)."""
+        """Return the box around a strip of the board from side to side, `out` thick (m)."""
         corners = np.array([self.up * height + self.normal * away for height in up for away in (0.0, out)])
         (_, near, low), (_, far, high) = corners.min(axis=0).tolist(), corners.max(axis=0).tolist()
         return Box((-self.outer, near, low + LIFT_M), (self.outer, far, high + LIFT_M))
 
     def ends(self, top: float) -> tuple[Box, ...]:
-        """Return the lower edge of the board and the upper one of its frame, which the camera must see."""
+        """Return the board's lower and the frame's upper edge, which must be in frame."""
         edges = [(self.up * height).tolist() for height in (0.0, top + 2 * WALL_M)]
         return tuple(Box((-self.outer, y, z + LIFT_M), (self.outer, y, z + LIFT_M)) for _, y, z in edges)
 
 
 def place(motion: Motion, body: str, tilt_deg: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return where a body is across the board, from its middle, and up the board (m), each (F,)."""
+    """Return where a body is across the board's middle and up it (m), each (F,)."""
     position = motion.pos(body) - np.array([0, 0, LIFT_M])
     return position[:, 0], position @ slope(tilt_deg)[0]
 

@@ -75,18 +75,19 @@ DEAD = (-4000.0, -160.0)  # solref of a contact without rebound
 SOFT = (0.01, 1.0)  # solref of a contact that swallows a fall
 
 
-def brake(radius_m: float, lost: float, length_m: float, physics: Physics) -> float:
-    """Return rolling friction (m) that takes, over a length, so much (m2/s2) of the square of a rolling ball's speed: a
-    solid ball slows at 5 g mu / 7 r."""
-    return 7 / 5 * radius_m * lost / (2 * length_m * physics.gravity_m_s2)
+def brake(radius_m: float, loss: float, length_m: float, physics: Physics) -> float:
+    """Return rolling friction (m) that takes `loss` (m2/s2) off v^2 over a length.
+
+    A solid ball slows at 5 g mu / 7 r.
+    """
+    return 7 / 5 * radius_m * loss / (2 * length_m * physics.gravity_m_s2)
 
 
 # --- the course -------------------------------------------------------------------------------------------------------
 
 
 class Course:
-    """A world under construction. spec: MuJoCo's description of it. surface: what every block has that is given none;
-    None leaves MuJoCo's own."""
+    """A world under construction. surface: of blocks without one, None: MuJoCo's own."""
 
     def __init__(self, physics: Physics, direction: int = 1, surface: Surface | None = None) -> None:
         self.spec = new_spec(physics)
@@ -96,10 +97,10 @@ class Course:
         self._marks: dict[str, tuple[Vec3, Sequence[float]]] = {}  # phrase -> foot in the world, colour
 
     def towards(self, direction: int) -> Course:
-        """Return the same world with its way to a side: what stands on both sides of a middle is written once."""
-        other = copy(self)
-        other.direction = direction
-        return other
+        """Return the same world with its way to a side, to write two sides once."""
+        course = copy(self)
+        course.direction = direction
+        return course
 
     # --- what stands still ---
 
@@ -114,7 +115,7 @@ class Course:
         *,
         solid: bool = True,
     ) -> mujoco.MjsGeom:
-        """Return a static box from its three spans. solid=False: paint, which is drawn and touches nothing."""
+        """Return a static box from its three spans; without solid, paint only."""
         middle = (self.direction * sum(along) / 2, sum(across) / 2, sum(up) / 2)
         half = ((along[1] - along[0]) / 2, (across[1] - across[0]) / 2, (up[1] - up[0]) / 2)
         geom = add_box(self.spec.worldbody, name, middle, half, colour)
@@ -135,12 +136,12 @@ class Course:
         colour: str,
         surface: Surface | None = None,
     ) -> None:
-        """Add the walls `<name>_front` and `<name>_back` outside a width, the front one first."""
+        """Add the walls `<name>_front` and `<name>_back` outside a width."""
         for part, across in (("front", (-half_width - thick, -half_width)), ("back", (half_width, half_width + thick))):
             self.block(f"{name}_{part}", along, across, up, colour, surface)
 
     def plank(self, name: str, a: Point, b: Point, half_width: float, colour: str) -> mujoco.MjsGeom:
-        """Return a plank, 16 mm thick, whose upper face runs from one point of the way to the next."""
+        """Return a plank, 16 mm thick, whose upper face runs from point to point."""
         (xa, za), (xb, zb) = sorted(((self.direction * u, z) for u, z in (a, b)))
         angle, half_thick = -float(np.arctan2(zb - za, xb - xa)), 0.008
         centre = ((xa + xb) / 2 - half_thick * np.sin(angle), 0.0, (za + zb) / 2 - half_thick * np.cos(angle))
@@ -148,9 +149,7 @@ class Course:
         return add_box(self.spec.worldbody, name, centre, half, colour, euler_y=angle)
 
     def slab(self, name: str, centre: Vec3, half: Vec3, colour: str, *, falls_rad: float = 0.0) -> mujoco.MjsGeom:
-        """Return a static box from its centre and half sizes, which may fall by an angle along the way, as a ramp
-        does.
-        """
+        """Return a static box from its centre and half sizes, tilted along the way."""
         at = (self.direction * centre[0], centre[1], centre[2])
         return add_box(self.spec.worldbody, name, at, half, colour, euler_y=self.direction * falls_rad)
 
@@ -169,10 +168,10 @@ class Course:
         front: float | None = None,
         floor: Surface | None = None,
     ) -> tuple[str, ...]:
-        """Return a floor with the walls that are given a height of their upper edge (m, over the ground): near and far
-        stand outside `along`, back and front inside `across`, on the level of the floor's lower face.
+        """Add a floor, and walls with an upper edge (m) given; return the geoms' names.
 
-        The geoms are `<name>_floor`, `<name>_near` and so on; their names are returned.
+        Walls stand on the level of the floor's lower face: near and far outside `along`, back and front inside
+        `across`.
         """
         spans = {
             "near": ((along[0] - wall, along[0]), across, near),
@@ -199,8 +198,7 @@ class Course:
         solid: bool = True,
         body: mujoco.MjsBody | None = None,
     ) -> mujoco.MjsGeom:
-        """Return a round rod from one place to another; of a body that moves if one is given, in that body's own
-        places."""
+        """Return a round rod between two places, which are those of `body` if given."""
         import mujoco
 
         ends = [value for at in (a, b) for value in (self.direction * at[0], at[1], at[2])]
@@ -213,7 +211,7 @@ class Course:
     def post(
         self, name: str, at: Vec3, radius: float, half: float, colour: str, *, body: mujoco.MjsBody | None = None
     ) -> mujoco.MjsGeom:
-        """Return an upright cylinder of half a height, its middle at a place; `body` as in `rod`."""
+        """Return an upright cylinder of half a height around a place; `body` as in `rod`."""
         import mujoco
 
         geom = (body or self.spec.worldbody).add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_CYLINDER)
@@ -223,7 +221,7 @@ class Course:
     def hull(
         self, name: str, corners: Sequence[Vec3], colour: str, *, body: mujoco.MjsBody | None = None
     ) -> mujoco.MjsGeom:
-        """Return the convex body around some corners, which is drawn and touches nothing; `body` as in `rod`."""
+        """Return a convex body around corners, without contact; `body` as in `rod`."""
         import mujoco
 
         places = [value for at in corners for value in (self.direction * at[0], at[1], at[2])]
@@ -277,7 +275,7 @@ class Course:
         sliding: float | None = None,
         solref: tuple[float, float] | None = None,
     ) -> mujoco.MjsBody:
-        """Return a box that can be pushed and can fall: body and geom `name`, centre at a place. density: kg/m3.
+        """Return a free box, body and geom `name`, its centre at a place. density: kg/m3.
 
         sliding, solref: as in `Surface`; None leaves MuJoCo's own.
         """
@@ -302,7 +300,7 @@ class Course:
         solref: tuple[float, float] | None = None,
         base: float = 0.0,
     ) -> None:
-        """Add free boxes one on top of the other, at the origin, the first on the ground or so high (m)."""
+        """Stack free boxes at the origin, from the ground or from a base (m)."""
         height = 2 * half[2]
         for i, (name, colour) in enumerate(zip(names, colours, strict=True)):
             at = (0.0, 0.0, base + (i + 0.5) * height)
@@ -317,7 +315,7 @@ class Course:
         damping: float = 0.0,
         range_deg: Span | None = None,
     ) -> mujoco.MjsBody:
-        """Return a body that turns about an axis through a place; parts are added to it with `add_box` and `rod`.
+        """Return a body that turns about an axis; add its parts with `add_box` and `rod`.
 
         damping: N m s/rad. range_deg: how far it turns, as MuJoCo counts it; None turns freely. A spring is set on
         `body.first_joint()`.
@@ -333,8 +331,9 @@ class Course:
     # --- what stands for hidden things ---
 
     def mark(self, phrase: str, at: str | tuple[float, float], colour: str | None = None) -> None:
-        """Add a flag over the occluder for what a question names and the occluder hides. It is drawn only, and is the
-        same whatever the hidden element is: so it may stand only where something is in every world, or begins.
+        """Add a flag over the occluder for what a question names and the occluder hides.
+
+        It is only drawn, and is the same in every world, so put it only where something is, or begins, in every world.
 
         at: the geom, or the body at its start, behind which it stands, or a place (along, across). colour: None takes
         that geom's.
@@ -351,7 +350,7 @@ class Course:
         self._marks[phrase] = ((x, back, 0.0), list(geom.rgba) if colour is None else rgba(colour))
 
     def _raise_flags(self, p: Any, cover: Box, in_view: Sequence[Box]) -> list[Box]:
-        """Draw the flags of all marks; returns what the camera must see of them.
+        """Draw the flags of all marks; return what the camera must see of them.
 
         A line of sight over the occluder falls as it goes back: it meets the upper edges of `cover`, and the flag flies
         where it passes over the mark. Flags side by side fly at different heights.
@@ -359,18 +358,18 @@ class Course:
         azimuth, down = np.radians(p.azimuth_deg), np.radians(-p.elevation_deg)
         ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
         across = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
-        seen = np.concatenate([box.corners() for box in (*in_view, cover)])
+        points = np.concatenate([box.corners() for box in (*in_view, cover)])
         upright = np.array([0.0, 0.0, np.cos(down)]) + ahead * np.sin(down)
-        scale = max(np.ptp(_along(seen, across)), np.ptp(_along(seen, upright)) * 4 / 3)
+        scale = max(np.ptp(_along(points, across)), np.ptp(_along(points, upright)) * 4 / 3)
         wide, high = FLAG * scale, FLAG_SHAPE * FLAG * scale / float(np.cos(down))
-        corners, flown, boxes = cover.corners(), [], []
+        corners, flags, boxes = cover.corners(), [], []
         for phrase, (foot, colour) in sorted(self._marks.items(), key=lambda mark: float(_along(mark[1][0], across))):
             place = np.array(foot)
             over = float((corners[:, 2] + _along(corners - place, ahead) * np.tan(down)).max())
             over += FLAG_CLEAR_M + high / 2
             at = float(_along(place, across))
-            over += high * 1.2 * max((n + 1 for n, other in flown if abs(at - other) < 1.15 * wide), default=0)
-            flown.append((int(any(abs(at - other) < 1.15 * wide for _, other in flown)), at))
+            over += high * 1.2 * max((n + 1 for n, flag_at in flags if abs(at - flag_at) < 1.15 * wide), default=0)
+            flags.append((int(any(abs(at - flag_at) < 1.15 * wide for _, flag_at in flags)), at))
             centre = place + across * wide / 2 + np.array([0, 0, over - place[2]])
             boxes.append(self._add_flag(phrase, place, centre, (wide, high), p.azimuth_deg, colour))
         return boxes
@@ -384,7 +383,7 @@ class Course:
         azimuth_deg: float,
         colour: Sequence[float],
     ) -> Box:
-        """Return a mast and its flag, which touch nothing and weigh nothing. Returns the box around the flag."""
+        """Add a mast and its flag, without mass or contact; return the flag's box."""
         import mujoco
 
         top, half = float(centre[2] + size[1] / 2), np.radians(azimuth_deg - 90) / 2
@@ -401,19 +400,16 @@ class Course:
     # --- what occluder and camera must reach ---
 
     def box(self, along: Span, across: Span, up: Span, *, left: float = 0.0, right: float = 0.0) -> Box:
-        """Return a box in the world. left, right: how much longer (m) it is at its left and right end in the picture,
-        whichever the direction: shadows fall to the right."""
+        """Return a box in the world, longer (m) at its left and right end for shadows."""
         low, high = sorted((self.direction * along[0], self.direction * along[1]))
         return Box((low - left, across[0], up[0]), (high + right, across[1], up[1]))
 
     def ahead(self, length: float) -> float:
-        """Return the length if the way leads to the right, else 0: a shadow that only then falls beyond the way's
-        end.
-        """
+        """Return the length if the way leads to the right, as shadows fall, else 0."""
         return length if self.direction > 0 else 0.0
 
     def cover(self, along: Span, across: Span, high: float) -> Box:
-        """Return what the occluder must hide of things that are up to `high`, their shadows included."""
+        """Return what the occluder must hide of things up to `high`, with their shadows."""
         right = SHADOW_RIGHT * high if self.direction > 0 else 0.01
         return self.box(along, (across[0], across[1] + SHADOW_BACK * high), (0, high), left=0.01, right=right)
 
@@ -459,12 +455,14 @@ class Course:
 
 
 def coloured(p: Any) -> dict[str, str]:
-    """Return part -> its colour, from the fields `<part>_colour` of the parameters."""
+    """Return part -> colour, from the fields `<part>_colour` of the parameters."""
     names = [each.name for each in fields(p) if each.name.endswith("_colour")]
     return {name.removesuffix("_colour"): getattr(p, name) for name in names}
 
 
 def _along(points: Any, axis: np.ndarray) -> np.ndarray:
-    """Return how far points (..., 3) lie along an axis (3,). These numbers go into the model as they are, so they are
-    added in one order: the last bit of a product of matrices is another one on another CPU."""
+    """Return how far points (..., 3) lie along an axis (3,), summed in one order.
+
+    The last bit of a matrix product differs between CPUs, and these numbers go into the model.
+    """
     return (np.asarray(points) * axis).sum(axis=-1)

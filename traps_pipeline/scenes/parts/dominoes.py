@@ -1,4 +1,4 @@
-"""Two rows of dominoes with a hand-off between them, such that nothing of the second row pushes back on the first.
+"""Two rows of dominoes with a hand-off: the second never pushes back on the first.
 
 A rolling ball sets off the first row, which is in view. Its last domino only kicks a second ball, which is behind the
 occluder from the start and which two posts stop after it has struck the second row. Lengths are in domino heights
@@ -24,7 +24,7 @@ STILL_M = 0.002  # a domino that moves less than this any more is at rest
 
 @dataclass(frozen=True)
 class Size:
-    """Of a domino: its height in metres, the rest in heights. spacing: from domino to domino in a row."""
+    """Size of a domino: height in metres, the rest, and the row's spacing, in heights."""
 
     height_m: float
     width: float
@@ -33,8 +33,8 @@ class Size:
 
 
 @dataclass(frozen=True)
-class Standing:
-    """A domino of the second row: place counts spacings from its first place; aside: lies flat behind the row."""
+class Domino:
+    """A domino of the second row. place: in spacings, aside: lies flat behind the row."""
 
     name: str
     place: int
@@ -47,13 +47,13 @@ def add_rows(
     size: Size,
     *,
     first: Sequence[str],
-    second: Sequence[Standing],
+    second: Sequence[Domino],
     places: int,
     ball_colour: str,
     plank_colour: str,
     speed_m_s: float,
 ) -> Span:
-    """Return plank, balls, both rows and the posts. Returns where the covered part of the way begins and ends (m).
+    """Add plank, balls, both rows and posts; return where the covered part is (m).
 
     first: the colours of the first row, whose bodies are `domino_0` and so on. places: how many spacings the second row
     is long. speed_m_s: of the ball that sets all off.
@@ -71,9 +71,9 @@ def add_rows(
         # The plank grips the ball; a domino slides over it and squeezes it out.
         course.ball(name, at, BALL * h, ball_colour, speed=speed, rolling=0.0004, sliding=0.1, density=300)
     for i, colour in enumerate(first):
-        add_domino(course, size, Standing(f"domino_{i}", i, colour), 0.0)
-    for standing in second:
-        add_domino(course, size, standing, second_at)
+        add_domino(course, size, Domino(f"domino_{i}", i, colour), 0.0)
+    for domino in second:
+        add_domino(course, size, domino, second_at)
     for side in (-1, 1):
         y = side * h * (0.8 * BALL + 0.06)  # closer together than the ball is wide: it leans through, and stops
         post = (h * (face + POSTS_AT + 0.03), y, 0.5 * h)
@@ -81,8 +81,8 @@ def add_rows(
     return h * (face + BALL_AT - BALL - 0.03), h * end
 
 
-def add_domino(course: Course, size: Size, domino: Standing, row_at: float) -> None:
-    """Add a free domino (body and geom of its name) of a row that begins at `row_at`."""
+def add_domino(course: Course, size: Size, domino: Domino, row_at: float) -> None:
+    """Add a free domino, body and geom of its name, to a row that begins at `row_at`."""
     h = size.height_m
     x = (row_at + domino.place * size.spacing) * h
     at = (x, h * (size.width + 0.10), size.thickness * h / 2) if domino.aside else (x, 0.0, (PLANK + 0.5) * h)
@@ -93,8 +93,7 @@ def add_domino(course: Course, size: Size, domino: Standing, row_at: float) -> N
 
 
 def cover(course: Course, size: Size, along: Span, back: float) -> Box:
-    """Return what the occluder must hide of the covered part, which reaches to the back by so many heights; whatever a
-    gap changes casts its shadow behind the occluder too."""
+    """Return what the occluder must hide, `back` heights deep, with all shadows."""
     h = size.height_m
     across = (-h * (size.width / 2 + 0.10), h * back)
     return course.box(along, across, (0, (PLANK + 1.04) * h), right=course.ahead(SHADOW_RIGHT * h))

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 
 from traps_pipeline.scenes.parts import vary
-from traps_pipeline.scenes.parts.look import OF_OCCLUSION, dressed, look_of, with_look
+from traps_pipeline.scenes.parts.look import OF_OCCLUSION, apply_look, look_of, with_look
 from traps_pipeline.scenes.parts.observers import Observer
 from traps_pipeline.scenes.parts.questions import Aside, Question
-from traps_pipeline.scenes.parts.vision import after_occluder, before_occluder, still, without_flags
+from traps_pipeline.scenes.parts.vision import after_occluder, before_occluder, is_still, without_flags
 from traps_pipeline.scenes.physics.kit import Family, Motion, Physics, Reading, Scene
 from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH
 
@@ -39,7 +39,7 @@ def scene_family(
     perturbation: float = 1e-4,
     looks: tuple[str, ...] | None = None,
 ) -> Family:
-    """Return a family from its parts; `kit.Family` says what the other fields mean.
+    """Return a family put together from its parts; fields as in `kit.Family`.
 
     Parameters with a hidden element make an occlusion family, whose twins follow from it; parameters without one make a
     chaotic family. observe: what is seen of the outcome. foresee: what follows from the frames before an occluder,
@@ -51,20 +51,20 @@ def scene_family(
     if twins is None and vary.hidden_field(params) is not None:
         twins = vary.twins
 
-    def seen(frames: np.ndarray, text: str) -> str | None:
-        named = question.named_in(text)
-        if named is None:
+    def observe_question(frames: np.ndarray, text: str) -> str | None:
+        slots = question.slots_in(text)
+        if slots is None:
             return None
         if frames.shape[1:3] != (HEIGHT, WIDTH):  # what an observer takes for large is so at this size
             frames = np.stack([cv2.resize(frame, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA) for frame in frames])
-        shown = before_occluder(frames)  # what an occluder covers at the end was seen before it came
-        unflagged = shown if twins is None else without_flags(shown)
-        if foresee is not None and len(shown) < len(frames):
-            at_rest = still(shown) or still(shown[:-1])  # the shadow of an occluder may come before it does
-            return _first(unflagged, named, (observe, foresee) if at_rest else (foresee, observe))
-        answer = observe(unflagged, named)
+        visible = before_occluder(frames)  # what an occluder covers at the end was seen before it came
+        unflagged = visible if twins is None else without_flags(visible)
+        if foresee is not None and len(visible) < len(frames):
+            rests = is_still(visible) or is_still(visible[:-1])  # the shadow of an occluder may come before it does
+            return _first(unflagged, slots, (observe, foresee) if rests else (foresee, observe))
+        answer = observe(unflagged, slots)
         if answer is None and look is not None and len(end := after_occluder(unflagged)) < len(unflagged):
-            return look(end, named)
+            return look(end, slots)
         return answer
 
     params = with_look(params)
@@ -75,12 +75,12 @@ def scene_family(
         sub_scenario=sub_scenario or name,
         answer_type=question.answer_type,
         params=params,
-        draw=lambda rng: vary.drawn(params, rng),
-        build=lambda p, physics: dressed(build(p, physics), look_of(p)),
+        draw=lambda rng: vary.draw_params(params, rng),
+        build=lambda p, physics: apply_look(build(p, physics), look_of(p)),
         outcome=outcome,
         word=lambda p, rng: question.word(p, rng, asides),
         questions=question.templates,
-        observe=seen,
+        observe=observe_question,
         legible=legible,
         physics=physics,
         min_margin_m=min_margin_m,
@@ -91,6 +91,6 @@ def scene_family(
     )
 
 
-def _first(frames: np.ndarray, named: Mapping[str, str], observers: Sequence[Observer]) -> str | None:
+def _first(frames: np.ndarray, slots: Mapping[str, str], observers: Sequence[Observer]) -> str | None:
     """Return the answer of the first observer that has one."""
-    return next((said for observe in observers if (said := observe(frames, named)) is not None), None)
+    return next((answer for observe in observers if (answer := observe(frames, slots)) is not None), None)

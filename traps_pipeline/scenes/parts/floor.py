@@ -1,4 +1,4 @@
-"""Floors that differ to the eye: two muted colours in a pattern. A floor's look touches nothing that moves on it."""
+"""Floors of two muted colours in a pattern, which nothing that moves depends on."""
 
 from __future__ import annotations
 
@@ -29,8 +29,7 @@ TEXELS = 256  # of a side of the texture, which shows one repeat of the pattern
 
 
 def floors(tones: Sequence[str] = tuple(TONES)) -> Group:
-    """Return of some tones, the fields `floor_pattern`, `floor_tones` (two), `floor_repeat_m` (from one repeat to the
-    next), `floor_turn_deg` and `floor_shift_m` (along both sides of the pattern)."""
+    """Return a group of the fields `floor_*` of `Look`, drawn of some tones."""
 
     def draw(rng: np.random.Generator, so_far: Drawn) -> tuple[str, tuple[str, ...], float, float, tuple[float, ...]]:
         pattern = PATTERNS[int(rng.integers(len(PATTERNS)))] if rng.random() > PLAIN_SHARE else "plain"
@@ -42,8 +41,8 @@ def floors(tones: Sequence[str] = tuple(TONES)) -> Group:
     return together(draw)
 
 
-def lay(spec: mujoco.MjSpec, p: Any) -> None:
-    """Give the floor of a world the look that the fields of `floors` say."""
+def lay_floor(spec: mujoco.MjSpec, p: Any) -> None:
+    """Give the floor of a world its pattern, from the fields of `floors`."""
     import mujoco
 
     first, second = (np.array(TONES[tone]) * 255 for tone in p.floor_tones)
@@ -62,8 +61,7 @@ def lay(spec: mujoco.MjSpec, p: Any) -> None:
 
 
 def _shares(pattern: str) -> np.ndarray:
-    """Return how much of the second tone each texel has, (TEXELS, TEXELS) in [0, 1]. Raises ValueError for another
-    pattern."""
+    """Return the share of the second tone in each texel, (TEXELS, TEXELS)."""
     down, right = np.mgrid[:TEXELS, :TEXELS] / TEXELS
     match pattern:
         case "plain":

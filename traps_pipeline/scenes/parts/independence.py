@@ -1,4 +1,4 @@
-"""Whether what is hidden is drawn independently of what is seen: otherwise the void would give its answer away.
+"""Independence of the hidden element from what is seen, so that no void tells it.
 
 Tested over draws: which of a scene's possible worlds was drawn (it and its twins, in a fixed order) must not go with a
 parameter that they share, nor with two of them together. So it does not matter how a family draws and makes its twins.
@@ -21,31 +21,29 @@ LEAST_EXPECTED = 5  # draws of each world in a row of a table; rarer values shar
 
 
 def dependence(family: Family) -> str | None:
-    """Return how the hidden element goes with what is seen: '`rough` goes with `direction`'; None if it does not."""
+    """Return how the hidden element goes with what is seen, in words; None if not."""
     if family.twins is None:
         return None
     scenes = [_worlds(family, family.draw(np.random.default_rng(seed))) for seed in range(DRAWS)]
-    hidden = sorted(
-        {name for first, *others in scenes for other in others for name in first if other[name] != first[name]}
-    )
+    hidden = sorted({name for scene, *twins in scenes for twin in twins for name in scene if twin[name] != scene[name]})
     keys = [[[world[name] for name in hidden] for world in worlds] for worlds in scenes]
-    drawn = np.array([sorted(of_worlds).index(of_worlds[0]) for of_worlds in keys])
+    drawn_index = np.array([sorted(of_worlds).index(of_worlds[0]) for of_worlds in keys])
     numbers = np.array([len(worlds) for worlds in scenes])
     for number in np.unique(numbers):  # which of three lanes, which of four: each number of worlds by itself
         chosen = np.flatnonzero(numbers == number)
         if number < 2 or len(chosen) < 4 * LEAST_EXPECTED * number:
             continue
-        seen = _rows([_flat({k: v for k, v in scenes[i][0].items() if k not in hidden}) for i in chosen])
-        tables = [((name,), rows) for name, rows in seen.items()]
-        tables += [((a, b), seen[a] * (seen[b].max() + 1) + seen[b]) for a, b in combinations(seen, 2)]
+        columns = _rows([_flat({k: v for k, v in scenes[i][0].items() if k not in hidden}) for i in chosen])
+        tables = [((name,), rows) for name, rows in columns.items()]
+        tables += [((a, b), columns[a] * (columns[b].max() + 1) + columns[b]) for a, b in combinations(columns, 2)]
         for names, rows in tables:
-            if _goes_together(drawn[chosen], _pooled(rows, LEAST_EXPECTED * int(number))):
+            if _is_associated(drawn_index[chosen], _pooled(rows, LEAST_EXPECTED * int(number))):
                 return f"`{', '.join(hidden)}` goes with {' and '.join(f'`{name}`' for name in names)}"
     return None
 
 
 def _worlds(family: Family, params: Any) -> list[dict[str, Any]]:
-    """Return a scene and its twins, their twins and so on, each once: all that may be behind the occluder."""
+    """Return a scene, its twins, their twins and so on, each once, up to MOST_WORLDS."""
     assert family.twins is not None
     worlds, waiting = [], [params]
     while waiting and len(worlds) < MOST_WORLDS:
@@ -57,7 +55,7 @@ def _worlds(family: Family, params: Any) -> list[dict[str, Any]]:
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return numbers and names by where they stand: tuples by length and place."""
+    """Return numbers and names by their place: tuples by length and index."""
     fields: dict[str, Any] = {}
     for name, value in values.items():
         if isinstance(value, list | tuple):
@@ -69,8 +67,7 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _rows(scenes: list[dict[str, Any]]) -> dict[str, np.ndarray]:
-    """Return, for every parameter that varies, the row that each scene falls into: its value, or the quarter that holds
-    it."""
+    """Return the row of each scene for every varying parameter: its value or quarter."""
     columns = {}
     for name in sorted(set().union(*scenes)):
         values = [scene.get(name) for scene in scenes]
@@ -86,13 +83,13 @@ def _rows(scenes: list[dict[str, Any]]) -> dict[str, np.ndarray]:
 
 
 def _pooled(rows: np.ndarray, least: int) -> np.ndarray:
-    """Return rows from 0 on, those with fewer scenes than `least` in one."""
+    """Return rows from 0 on, those with fewer scenes than `least` pooled in one."""
     _, rows, counts = np.unique(rows, return_inverse=True, return_counts=True)
     return np.unique(np.where(counts[rows] < least, -1, rows), return_inverse=True)[1]
 
 
-def _goes_together(worlds: np.ndarray, rows: np.ndarray) -> bool:
-    """Return Pearson's chi-square test of a table of counts."""
+def _is_associated(worlds: np.ndarray, rows: np.ndarray) -> bool:
+    """Return whether a table of counts fails Pearson's chi-square test at CHANCE."""
     from scipy.special import chdtrc
 
     table = np.zeros((worlds.max() + 1, rows.max() + 1))

@@ -1,4 +1,4 @@
-"""How a scene looks, beside what happens in it: floor, light, the occluder's colour, what stands behind it, the camera.
+"""Looks of a scene: floor, light, occluder, bystanders, camera, frame size.
 
 A look is a value that is drawn with a scenario and stored with its parameters, as `look`; a record without one looks as
 scenes did before there were looks. It touches nothing that moves, so the trajectory is the same; camera, occluder and
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.scenes.parts.floor import PALE, TEXELS, TONES, floors, lay
+from traps_pipeline.scenes.parts.floor import PALE, TEXELS, TONES, floors, lay_floor
 from traps_pipeline.scenes.physics.kit import COLOURS, READ, Scene, uniform
 from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH
 from traps_pipeline.scenes.picture.render import SUPERSAMPLE
@@ -45,7 +45,7 @@ BEHIND_M = (0.25, 0.9)  # so far behind all that is shown a bystander stands: it
 
 @dataclass(frozen=True)
 class Look:
-    """What a scene looks like. A field that is None or empty leaves things as they are without a look.
+    """Look of a scene. None or an empty field leaves things as without a look.
 
     floor_*: `parts.floor`. light_turn_deg: of the key light about the vertical; light: what its brightness is
     multiplied by, RGB. panel: a name of `OCCLUDERS`. bystanders: (across, behind, half width, half height) in metres,
@@ -69,8 +69,7 @@ class Look:
 
     @staticmethod
     def from_record(record: Mapping[str, Any]) -> Look:
-        """Return the look in a record's parameters. Raises ValueError for an unknown field, tone, colour of the
-        occluder, material or size."""
+        """Return the look in a record's parameters. Raises ValueError."""
         try:
             look = Look(**{name: _tuples(value) for name, value in record.items()})
         except TypeError as error:
@@ -80,56 +79,56 @@ class Look:
                 raise ValueError(f"look: no tone {name!r}; there are {', '.join(TONES)}")
         if look.panel not in (None, *OCCLUDERS):
             raise ValueError(f"look: no panel {look.panel!r}; there are {', '.join(OCCLUDERS)}")
-        for name, known in (("material", MATERIALS), ("size", SIZES)):
-            if getattr(look, name) not in known:
-                raise ValueError(f"look: no {name} {getattr(look, name)!r}; there are {', '.join(known)}")
+        for name, allowed in (("material", MATERIALS), ("size", SIZES)):
+            if getattr(look, name) not in allowed:
+                raise ValueError(f"look: no {name} {getattr(look, name)!r}; there are {', '.join(allowed)}")
         return look
 
 
 def look_of_draw(seed: int, family: str, number: int, parts: Collection[str]) -> Look | None:
-    """Return the look of a numbered draw of a family, whatever else is drawn of it."""
+    """Return the look of a numbered draw of a family, drawn by itself."""
     return draw_look(np.random.default_rng([seed, *family.encode(), number, *b"look"]), parts)
 
 
 def draw_look(rng: np.random.Generator, parts: Collection[str]) -> Look | None:
-    """Return a look that varies in these parts (of `PARTS`); None if there are none."""
+    """Return a look that varies in some of `PARTS`; None if there are none."""
     if not parts:
         return None
-    drawn: dict[str, Any] = {}
+    fields_drawn: dict[str, Any] = {}
     floor = next((floor for part, floor in _FLOORS.items() if part in parts), None)
     if floor is not None:
-        drawn |= dict(zip(_FLOOR_FIELDS, floor.draw(rng, {}, len(_FLOOR_FIELDS)), strict=True))
+        fields_drawn |= dict(zip(_FLOOR_FIELDS, floor.draw(rng, {}, len(_FLOOR_FIELDS)), strict=True))
     if "light" in parts:
         bright, warm = uniform(rng, 0.8, 1.1), uniform(rng, -0.06, 0.06)
-        drawn["light_turn_deg"] = uniform(rng, -15, 15)
-        drawn["light"] = tuple(round(bright * (1 + tint), 3) for tint in (warm, 0.0, -warm))
+        fields_drawn["light_turn_deg"] = uniform(rng, -15, 15)
+        fields_drawn["light"] = tuple(round(bright * (1 + tint), 3) for tint in (warm, 0.0, -warm))
     if "panel" in parts:
-        drawn["panel"] = str(rng.choice(list(OCCLUDERS)))
+        fields_drawn["panel"] = str(rng.choice(list(OCCLUDERS)))
     if "bystanders" in parts:
         places = [
             (uniform(rng, -0.9, 0.9), uniform(rng, *BEHIND_M), uniform(rng, 0.04, 0.12), uniform(rng, 0.04, 0.2))
             for _ in range(int(rng.choice(BYSTANDERS)))
         ]
-        drawn["bystanders"] = tuple(places)
-        drawn["bystander_tones"] = tuple(str(tone) for tone in rng.choice(list(TONES), len(places)))
+        fields_drawn["bystanders"] = tuple(places)
+        fields_drawn["bystander_tones"] = tuple(str(tone) for tone in rng.choice(list(TONES), len(places)))
     if "camera" in parts:
-        drawn["orbit_deg"] = (uniform(rng, -8, 8), uniform(rng, -4, 4))
+        fields_drawn["orbit_deg"] = (uniform(rng, -8, 8), uniform(rng, -4, 4))
     if "material" in parts:
-        drawn["material"] = str(rng.choice(MATERIALS))
+        fields_drawn["material"] = str(rng.choice(MATERIALS))
     if "size" in parts:
-        drawn["size"] = "720p"  # of all alike: a size that varied would be a cue
-    return Look(**drawn)
+        fields_drawn["size"] = "720p"  # of all alike: a size that varied would be a cue
+    return Look(**fields_drawn)
 
 
 # --- parameters that have one -----------------------------------------------------------------------------------------
 
 
 def with_look(params: type) -> type:
-    """Return the same parameters with a last field `look`, which no family draws."""
-    looked = field(default=None, metadata={READ: lambda value: None if value is None else Look.from_record(value)})
-    named = make_dataclass(params.__name__, [("look", Look | None, looked)], bases=(params,), frozen=True)
-    named.__module__, named.__doc__ = params.__module__, params.__doc__
-    return named
+    """Return the parameters' class with a last field `look`, which no family draws."""
+    look_field = field(default=None, metadata={READ: lambda value: None if value is None else Look.from_record(value)})
+    extended = make_dataclass(params.__name__, [("look", Look | None, look_field)], bases=(params,), frozen=True)
+    extended.__module__, extended.__doc__ = params.__module__, params.__doc__
+    return extended
 
 
 def look_of(params: Any) -> Look | None:
@@ -151,8 +150,7 @@ def frame_size(record: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def paint_occluders(spec: mujoco.MjSpec, occluders: Sequence[mujoco.MjsGeom], params: Any) -> None:
-    """Give occluders of one size their colour and their material. What they are of is seen on them alone: they neither
-    mirror nor let anything through."""
+    """Give occluders of one size the look's colour and material."""
     import mujoco
 
     look = look_of(params)
@@ -178,17 +176,17 @@ def paint_occluders(spec: mujoco.MjSpec, occluders: Sequence[mujoco.MjsGeom], pa
         geom.size, geom.quat = [wide, tall, thick], [part / np.sqrt(2) for part in (cos, cos, sin, sin)]
 
 
-def dressed(scene: Scene, look: Look | None) -> Scene:
-    """Return a built scene with its look."""
+def apply_look(scene: Scene, look: Look | None) -> Scene:
+    """Apply a look to a built scene; return the scene."""
     if look is None:
         return scene
     if look.floor_pattern is not None:
-        lay(scene.spec, SimpleNamespace(**{name: getattr(look, name) for name in _FLOOR_FIELDS}))
+        lay_floor(scene.spec, SimpleNamespace(**{name: getattr(look, name) for name in _FLOOR_FIELDS}))
     _light(scene, look)
     _add_bystanders(scene, look)
     if SIZES[look.size] > 1:  # a renderer reads from the model how fine it draws
-        drawn = SUPERSAMPLE * SIZES[look.size]
-        scene.spec.visual.global_.offwidth, scene.spec.visual.global_.offheight = WIDTH * drawn, HEIGHT * drawn
+        scale = SUPERSAMPLE * SIZES[look.size]
+        scene.spec.visual.global_.offwidth, scene.spec.visual.global_.offheight = WIDTH * scale, HEIGHT * scale
     around, up = look.orbit_deg
     view = scene.view
     return replace(
@@ -205,7 +203,7 @@ def _light(scene: Scene, look: Look) -> None:
 
 
 def _add_bystanders(scene: Scene, look: Look) -> None:
-    """Add boxes on the floor behind everything, which nothing touches."""
+    """Add boxes on the floor behind everything, without contact."""
     import mujoco
 
     corners = np.concatenate([box.corners() for box in (*scene.framed, *([scene.cover] if scene.cover else []))])
@@ -218,4 +216,4 @@ def _add_bystanders(scene: Scene, look: Look) -> None:
 
 
 def _tuples(value: Any) -> Any:
-    return tuple(_tuples(one) for one in value) if isinstance(value, list | tuple) else value
+    return tuple(_tuples(item) for item in value) if isinstance(value, list | tuple) else value

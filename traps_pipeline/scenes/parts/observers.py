@@ -1,6 +1,6 @@
-"""What an observer sees, as values: each takes the frames and the words of the question, and answers or abstains.
+"""Observers, which answer a question by its slots from frames, or abstain.
 
-An `Observer(frames, named)` gets the sampled frames (N, 360, 480, 3) RGB and what the question names, read back from
+An `Observer(frames, slots)` gets the sampled frames (N, 360, 480, 3) RGB and what the question names, read back from
 its templates: part -> colour, and 'choices' where it offers some. It gives a label, or None if the decisive thing is
 not to be seen or not at rest. A `Finder(frame, colour)` finds one thing in one frame.
 
@@ -15,7 +15,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from traps_pipeline.scenes.parts.vision import Blob, at_rest, blobs, colour_mask, is_occluder, largest, moved, track
+from traps_pipeline.scenes.parts.vision import (
+    Blob,
+    blobs,
+    colour_mask,
+    is_at_rest,
+    is_occluder,
+    largest,
+    motion_mask,
+    track,
+)
 from traps_pipeline.scenes.parts.wording import choices_in
 
 Observer = Callable[[np.ndarray, Mapping[str, str]], str | None]
@@ -39,7 +48,7 @@ def small(frame: np.ndarray, colour: str) -> Blob | None:
 def compact(
     frame: np.ndarray, colour: str, *, area: int = 4000, shape: tuple[float, float] = (0.4, 2.5), fill: float = 0.5
 ) -> Blob | None:
-    """Return the largest region of a colour that may be a ball: filled, about as wide as high, small beside the frame.
+    """Return the largest region of a colour that may be a ball: filled, about round.
 
     area: at most so many pixels. shape: width over height, between. fill: least share of its bounding box.
     """
@@ -49,19 +58,19 @@ def compact(
     return None
 
 
-def offered(named: Mapping[str, str], otherwise: Sequence[str]) -> Sequence[str]:
-    """Return the choices that the question offers, or these where it offers none."""
-    return choices_in(named["choices"]) if "choices" in named else otherwise
+def offered(slots: Mapping[str, str], otherwise: Sequence[str]) -> Sequence[str]:
+    """Return the choices that the question offers, or `otherwise` if it offers none."""
+    return choices_in(slots["choices"]) if "choices" in slots else otherwise
 
 
-def colours_of_balls(frames: np.ndarray, named: Mapping[str, str], pool: Sequence[str]) -> Sequence[str]:
-    """Return the colours that the question offers; where it offers none, those of the pool that a ball has at first."""
-    seen = [colour for colour in pool if sum(compact(frame, colour) is not None for frame in frames[:3]) >= 2]
-    return offered(named, seen)
+def colours_of_balls(frames: np.ndarray, slots: Mapping[str, str], pool: Sequence[str]) -> Sequence[str]:
+    """Return the offered colours, or else those of the pool that a ball has at first."""
+    at_first = [colour for colour in pool if sum(compact(frame, colour) is not None for frame in frames[:3]) >= 2]
+    return offered(slots, at_first)
 
 
 def rounded(frame: np.ndarray, colour: str, *, fill: float = 0.9, longer: float = 1.9) -> Blob | None:
-    """Return the largest region of a colour that may be a ball: neither as large nor as rectangular as an occluder.
+    """Return the largest region of a colour that may be a ball, and no occluder.
 
     fill: greatest share of its bounding box. longer: how many times as long as it is wide, at most.
     """
@@ -71,8 +80,8 @@ def rounded(frame: np.ndarray, colour: str, *, fill: float = 0.9, longer: float 
     return None
 
 
-def upper_half_stays(frames: np.ndarray, colour: str, first: Blob) -> bool:
-    """Return whether the upper half of a thing that the first frame shows is still where it was in the last frame."""
+def is_upper_half_in_place(frames: np.ndarray, colour: str, first: Blob) -> bool:
+    """Return whether a thing's upper half is in the last frame where it was at first."""
     x, y, width, height = first.box
     part = np.s_[y : y + height // 2, x : x + width]
     before, after = (colour_mask(frame, colour)[part] for frame in (frames[0], frames[-1]))
@@ -83,35 +92,34 @@ def upper_half_stays(frames: np.ndarray, colour: str, first: Blob) -> bool:
 
 
 def end_of(path: Sequence[Blob | None], ahead: float | None = None, tolerance_px: float = 1.5) -> Blob | None:
-    """Return the thing where it rests, None while it does not rest; with `ahead`, where it is so many frames later."""
+    """Return the thing at rest, or, with `ahead`, so many frames later; else None."""
     if ahead is not None:
         return carried_on(path, ahead)
-    return path[-1] if at_rest(path, tolerance_px=tolerance_px) else None
+    return path[-1] if is_at_rest(path, tolerance_px=tolerance_px) else None
 
 
 def carried_on(path: Sequence[Blob | None], ahead: float) -> Blob | None:
-    """Return the thing so many frames after the last one, if it goes on as it was seen to move last; None if it has
-    been out of sight for longer than LOST frames."""
-    seen = [(at, blob) for at, blob in enumerate(path) if blob is not None]
-    if not seen or len(path) - 1 - seen[-1][0] > LOST:
+    """Return the thing so many frames on, at its last speed; None if lost for long."""
+    sightings = [(index, blob) for index, blob in enumerate(path) if blob is not None]
+    if not sightings or len(path) - 1 - sightings[-1][0] > LOST:
         return None
-    at, last = seen[-1]
-    if len(seen) == 1 or at - seen[-2][0] > LOST + 1:
+    index, last = sightings[-1]
+    if len(sightings) == 1 or index - sightings[-2][0] > LOST + 1:
         return last
-    before, frames = seen[-2], ahead + len(path) - 1 - at
-    steps = frames / (at - before[0])
+    before, frames = sightings[-2], ahead + len(path) - 1 - index
+    steps = frames / (index - before[0])
     dx, dy = steps * (last.x - before[1].x), steps * (last.y - before[1].y)
     x, y, width, height = last.box
     return replace(last, x=last.x + dx, y=last.y + dy, box=(round(x + dx), round(y + dy), width, height))
 
 
-def struck(frames: np.ndarray, thing: Blob, reach: float) -> bool:
-    """Return whether in the last step much moved at a thing, or so near it (in its longer sides)."""
-    return bool(moved(frames)[around(thing, reach)].sum() > STRUCK * thing.area)
+def is_struck(frames: np.ndarray, thing: Blob, reach: float) -> bool:
+    """Return whether much moved at a thing, or `reach` lengths off, in the last step."""
+    return bool(motion_mask(frames)[around(thing, reach)].sum() > STRUCK * thing.area)
 
 
 def around(thing: Blob, reach: float) -> tuple[slice, slice]:
-    """Return the part of a frame that a thing is in, with so much around it (in its longer sides)."""
+    """Return the slices of a frame around a thing, with a margin in its longer sides."""
     x, y, width, height = thing.box
     beside = round(reach * max(width, height))
     return slice(max(0, y - beside), y + height + beside), slice(max(0, x - beside), x + width + beside)
@@ -121,10 +129,10 @@ def around(thing: Blob, reach: float) -> tuple[slice, slice]:
 
 
 def beyond(thing: str, mark: str, ahead: float | None = None) -> Observer:
-    """Return 'yes' if the thing rests on the far side of the mark, seen from where it was first, else 'no'."""
+    """Return an observer of whether the thing rests on the far side of the mark."""
 
-    def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-        path, line = track(frames, named[thing], 60), largest(frames[-1], named[mark], 60)
+    def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+        path, line = track(frames, slots[thing], 60), largest(frames[-1], slots[mark], 60)
         start, end = next((blob for blob in path if blob), None), end_of(path, ahead)
         if line is None or start is None or end is None:
             return None
@@ -134,14 +142,12 @@ def beyond(thing: str, mark: str, ahead: float | None = None) -> Observer:
 
 
 def past_far_edge(thing: str, screen: str, ahead: float | None = None) -> Observer:
-    """Return 'yes' if the thing rests past that edge of the screen which is farther from where it was first, else
-    'no'.
-    """
+    """Return an observer of whether the thing rests past the screen's farther edge."""
 
-    def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-        path = [small(frame, named[thing]) for frame in frames]
+    def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+        path = [small(frame, slots[thing]) for frame in frames]
         start = next((blob.x for blob in path if blob), None)
-        wall, end = largest(frames[-1], named[screen], 200), end_of(path, ahead, tolerance_px=4)
+        wall, end = largest(frames[-1], slots[screen], 200), end_of(path, ahead, tolerance_px=4)
         if start is None or wall is None or end is None:
             return None
         left, width = wall.box[0], wall.box[2]
@@ -151,11 +157,11 @@ def past_far_edge(thing: str, screen: str, ahead: float | None = None) -> Observ
 
 
 def rests_over(thing: str, goal: str, find: Finder = compact, ahead: float | None = None) -> Observer:
-    """Return 'yes' if the thing rests within the goal from left to right (2 px more to either side), else 'no'."""
+    """Return an observer of whether the thing rests within the goal's width + 2 px."""
 
-    def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-        path = [find(frame, named[thing]) for frame in frames]
-        box, end = largest(frames[-1], named[goal], 60), end_of(path, ahead)
+    def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+        path = [find(frame, slots[thing]) for frame in frames]
+        box, end = largest(frames[-1], slots[goal], 60), end_of(path, ahead)
         if box is None or end is None:
             return None
         left, width = box.box[0], box.box[2]
@@ -174,12 +180,14 @@ def nearer_side(
     tolerance_px: float = 1.5,
     ahead: float | None = None,
 ) -> Observer:
-    """Return 'left' or 'right': which of two marks the resting thing is nearer to. left, right: what the question
-    names, or colours; least: of the marks (pixels)."""
+    """Return an observer of which of two marks the resting thing is nearer to.
 
-    def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-        path = [find(frame, named[thing]) for frame in frames[-3:]]
-        marks = [largest(frames[-1], named.get(mark, mark), least) for mark in (left, right)]
+    left, right: slots, or colours. least: smallest area of a mark (pixels).
+    """
+
+    def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+        path = [find(frame, slots[thing]) for frame in frames[-3:]]
+        marks = [largest(frames[-1], slots.get(mark, mark), least) for mark in (left, right)]
         end = end_of(path, ahead, tolerance_px)
         if end is None or marks[0] is None or marks[1] is None:
             return None
@@ -189,7 +197,7 @@ def nearer_side(
 
 
 def reaches(thing: str, goal: str, foot: float | None = None, ahead: float | None = None) -> Observer:
-    """Return 'yes' if the thing rests nearer to the middle of the goal than to where it was first, else 'no'.
+    """Return an observer of whether the thing rests nearer the goal than the start.
 
     foot: which share of the thing's height, from its top, stands for its place; None takes its middle.
     """
@@ -197,8 +205,8 @@ def reaches(thing: str, goal: str, foot: float | None = None, ahead: float | Non
     def place(blob: Blob) -> np.ndarray:
         return np.array([blob.x, blob.y if foot is None else blob.box[1] + foot * blob.box[3]])
 
-    def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-        path, box = track(frames, named[thing], 60), largest(frames[0], named[goal], 60)
+    def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+        path, box = track(frames, slots[thing], 60), largest(frames[0], slots[goal], 60)
         first, last = path[0], end_of(path, ahead)
         if first is None or last is None or box is None or is_occluder(last) or is_occluder(box):
             return None
@@ -209,61 +217,58 @@ def reaches(thing: str, goal: str, foot: float | None = None, ahead: float | Non
 
 
 def has_fallen(thing: str) -> Observer:
-    """Return 'yes' if the thing, once at rest, no longer stands where it stood at first, else 'no'."""
+    """Return an observer of whether the resting thing has left its first stand."""
 
-    def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-        path = track(frames, named[thing], 60)
-        if path[0] is None or is_occluder(path[0]) or path[0].box[3] < path[0].box[2] or not at_rest(path):
+    def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+        path = track(frames, slots[thing], 60)
+        if path[0] is None or is_occluder(path[0]) or path[0].box[3] < path[0].box[2] or not is_at_rest(path):
             return None  # neither an occluder nor a flag stands like a domino
-        return "no" if upper_half_stays(frames, named[thing], path[0]) else "yes"
+        return "no" if is_upper_half_in_place(frames, slots[thing], path[0]) else "yes"
 
     return observe
 
 
 def has_begun(thing: str, reach: float) -> Observer:
-    """Return 'yes' if the thing has left the place where it was first, or is about to: what moves is so near it (in its
-    longer sides), else 'no'."""
+    """Return an observer of whether the thing has left its place or is struck next."""
 
-    def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-        first, last = largest(frames[0], named[thing], 60), largest(frames[-1], named[thing], 60)
+    def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+        first, last = largest(frames[0], slots[thing], 60), largest(frames[-1], slots[thing], 60)
         if first is None or last is None or is_occluder(first):
             return None
-        left = np.hypot(last.x - first.x, last.y - first.y) > BEGUN_PX or not upper_half_stays(
-            frames, named[thing], first
+        has_left = np.hypot(last.x - first.x, last.y - first.y) > BEGUN_PX or not is_upper_half_in_place(
+            frames, slots[thing], first
         )
-        return "yes" if left or struck(frames, last, reach) else "no"
+        return "yes" if has_left or is_struck(frames, last, reach) else "no"
 
     return foresee
 
 
 def will_clear(thing: str, mark: str) -> Observer:
-    """Return 'yes' if the thing is beyond the mark, or flies over its upper edge when it goes on as it does, else
-    'no'.
-    """
+    """Return an observer of whether the thing is beyond the mark or will fly over it."""
 
-    def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-        path, wall = track(frames, named[thing], 60), largest(frames[-1], named[mark], 60)
-        start, now, then = next((blob for blob in path if blob), None), carried_on(path, 0.0), carried_on(path, 1.0)
-        if wall is None or start is None or now is None or then is None:
+    def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+        path, wall = track(frames, slots[thing], 60), largest(frames[-1], slots[mark], 60)
+        start, now, soon = next((blob for blob in path if blob), None), carried_on(path, 0.0), carried_on(path, 1.0)
+        if wall is None or start is None or now is None or soon is None:
             return None
         side = 1.0 if wall.x > start.x else -1.0
-        lead, speed = side * (now.x - wall.x), side * (then.x - now.x)
+        lead, speed = side * (now.x - wall.x), side * (soon.x - now.x)
         if lead > 0:
             return "yes"
         if speed <= 0 or lead + FLIGHT * speed < 0:
             return "no"  # it comes back, or does not get there
-        height = now.y - lead / speed * (then.y - now.y)
+        height = now.y - lead / speed * (soon.y - now.y)
         return "yes" if height < wall.box[1] else "no"
 
     return foresee
 
 
 def lies_on(thing: str, goal: str) -> Observer:
-    """Return 'yes' if the thing rests between the left and the right end of all that is seen of the goal, else 'no'."""
+    """Return an observer of whether the thing rests between the goal's ends."""
 
-    def look(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-        end = end_of(track(frames, named[thing], 60))
-        boxes = [blob.box for blob in blobs(colour_mask(frames[-1], named[goal]), 30)]
+    def look(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+        end = end_of(track(frames, slots[thing], 60))
+        boxes = [blob.box for blob in blobs(colour_mask(frames[-1], slots[goal]), 30)]
         if end is None or not boxes:
             return None
         left, right = min(box[0] for box in boxes), max(box[0] + box[2] for box in boxes)
@@ -273,10 +278,10 @@ def lies_on(thing: str, goal: str) -> Observer:
 
 
 def lies_flat(thing: str) -> Observer:
-    """Return 'yes' if the thing that should stand rests and is wider than high, 'no' if it is higher."""
+    """Return an observer of whether the resting thing is wider than high."""
 
-    def look(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-        end = end_of(track(frames, named[thing], 60))
+    def look(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+        end = end_of(track(frames, slots[thing], 60))
         return None if end is None else "yes" if end.box[2] > end.box[3] else "no"
 
     return look

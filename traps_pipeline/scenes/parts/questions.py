@@ -1,4 +1,4 @@
-"""What is asked of a scene, as values: templates that are filled and read back, their labels and other forms of these.
+"""Questions of a scene as values: templates, labels and other forms of these.
 
 A template names parts in braces: '{ball}' is the value of the field `ball_colour`, and `fills` adds others. A family
 has one `Question` and some answerable asides, of which each scenario has one; even the void answers those.
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from traps_pipeline.scenes.parts.course import coloured
-from traps_pipeline.scenes.parts.wording import asked
+from traps_pipeline.scenes.parts.wording import match_slots
 from traps_pipeline.scenes.physics.kit import AnswerableQuestion, AnswerType, Wording, listed
 
 Forms = Sequence[str]  # ways to say a label; '{}' stands for it
@@ -23,8 +23,7 @@ Aside = Callable[[Any, np.random.Generator], AnswerableQuestion]
 
 @dataclass(frozen=True)
 class Filled:
-    """What a question becomes for one scenario. labels: its choices. aliases: other wordings of a label -> the label.
-    fills: placeholder -> text, besides the parts' colours."""
+    """A question for one scenario. aliases: form -> label, fills: placeholder -> text."""
 
     labels: tuple[str, ...]
     aliases: Mapping[str, str]
@@ -33,24 +32,21 @@ class Filled:
 
 @dataclass(frozen=True)
 class Question:
-    """A question in some wordings. fill(p, rng): its choices and placeholders for the parameters of a scenario; what it
-    draws is drawn before the wording is."""
+    """A question in some wordings. fill(p, rng): its choices and slots, drawn first."""
 
     answer_type: AnswerType
     templates: tuple[str, ...]
     fill: Callable[[Any, np.random.Generator], Filled]
 
     def word(self, p: Any, rng: np.random.Generator, asides: Sequence[Aside]) -> Wording:
-        """Return the words of a scenario: one wording of the question, one of the asides; a sole aside costs no
-        draw.
-        """
+        """Word the question and one of the asides; a sole aside costs no draw."""
         filled = self.fill(p, rng)
         text = str(rng.choice(self.templates)).format_map({**coloured(p), **filled.fills})
         return Wording(text, filled.labels, filled.aliases, _one_of(asides, rng)(p, rng))
 
-    def named_in(self, question: str) -> dict[str, str] | None:
-        """Return what a question, read back, has in its placeholders; None if it is not this question."""
-        return asked(self.templates, question)
+    def slots_in(self, question: str) -> dict[str, str] | None:
+        """Return what fills this question's placeholders; None if it is another one."""
+        return match_slots(self.templates, question)
 
 
 def _one_of(asides: Sequence[Aside], rng: np.random.Generator) -> Aside:
@@ -66,15 +62,17 @@ def yes_no(
     no: Forms,
     fills: Callable[[Any, np.random.Generator], Mapping[str, str]] = lambda p, rng: {},
 ) -> Question:
-    """Return a question that is answered by yes or no, and other ways to say either. fills: what its placeholders that
-    are no part become."""
+    """Return a question answered by yes or no. fills: placeholders that are no part."""
     aliases = dict.fromkeys(yes, "yes") | dict.fromkeys(no, "no")
     return Question("binary", templates, lambda p, rng: Filled(("yes", "no"), aliases, fills(p, rng)))
 
 
 def left_or_right(*templates: str, forms: Forms, colours: Callable[[Any], tuple[str, str]] | None = None) -> Question:
-    """Return a question that is answered by left or right. forms: other ways to say a side; '{0}' is the side and '{1}'
-    its colour, which `colours(p)` gives for left and right."""
+    """Return a question answered by a side.
+
+    forms: other ways to say a side; '{0}' is the side and '{1}' its colour, which `colours(p)` gives for left and
+    right.
+    """
 
     def fill(p: Any, rng: np.random.Generator) -> Filled:
         of_sides = ("", "") if colours is None else colours(p)
@@ -90,8 +88,10 @@ def which_colour(
     forms: Forms,
     also: Mapping[str, str] = MappingProxyType({}),
 ) -> Question:
-    """Return a question that is answered by one of some colours, '{choices}' in random order. forms: ways to say a
-    colour. also: other names of colours -> the colour."""
+    """Return a question answered by a colour of '{choices}', in random order.
+
+    forms: ways to say a colour. also: other names of colours -> the colour.
+    """
 
     def fill(p: Any, rng: np.random.Generator) -> Filled:
         choices = tuple(str(c) for c in rng.permutation(colours(p)))
@@ -105,7 +105,7 @@ NUMBERS = ("zero", "one", "two", "three", "four", "five", "six", "seven")
 
 
 def range_of(ranges: Sequence[Sequence[int]], count: int) -> str | None:
-    """Return the choice '<lowest>-<highest>' that a count belongs to, None if it belongs to none."""
+    """Return the choice '<lowest>-<highest>' that holds a count; None if none does."""
     return next((f"{low}-{high}" for low, high in ranges if low <= count <= high), None)
 
 
@@ -114,8 +114,7 @@ def how_many(
     ranges: Callable[[Any], Sequence[tuple[int, int]]],
     fills: Callable[[Any, np.random.Generator], Mapping[str, str]] = lambda p, rng: {},
 ) -> Question:
-    """Return a question that is answered by a range of numbers; its '{choices}' are all ranges, lowest first. fills: as
-    in `yes_no`."""
+    """Return a question answered by a range; '{choices}' are all, lowest first."""
 
     def fill(p: Any, rng: np.random.Generator) -> Filled:
         aliases: dict[str, str] = {}
@@ -132,7 +131,7 @@ def how_many(
 
 
 def either(question: str, labels: Sequence[str], answer: Callable[[Any], str]) -> Aside:
-    """Return a question that names its choices in a fixed order: 'Are the pegs round or square?'. It may name parts."""
+    """Return a question that names its choices in a fixed order, and may name parts."""
 
     def ask(p: Any, rng: np.random.Generator) -> AnswerableQuestion:
         return AnswerableQuestion(question.format_map(coloured(p)), tuple(labels), answer(p))
@@ -141,12 +140,12 @@ def either(question: str, labels: Sequence[str], answer: Callable[[Any], str]) -
 
 
 def comes_from(question: str) -> Aside:
-    """Return a question after the side, left or right, that things come from."""
+    """Return a question for the side, left or right, that things come from."""
     return either(question, ("left", "right"), lambda p: "left" if p.direction > 0 else "right")
 
 
 def goes_to(question: str) -> Aside:
-    """Return a question after the side, left or right, that things go to."""
+    """Return a question for the side, left or right, that things go to."""
     return either(question, ("left", "right"), lambda p: "right" if p.direction > 0 else "left")
 
 
@@ -154,25 +153,23 @@ def choice_of(question: str, choices: Callable[[Any], Sequence[str]], answer: Ca
     """Return a question whose '{choices}' are in random order."""
 
     def ask(p: Any, rng: np.random.Generator) -> AnswerableQuestion:
-        shown = tuple(str(c) for c in rng.permutation(choices(p)))
-        return AnswerableQuestion(question.format_map({**coloured(p), "choices": listed(shown)}), shown, answer(p))
+        order = tuple(str(c) for c in rng.permutation(choices(p)))
+        return AnswerableQuestion(question.format_map({**coloured(p), "choices": listed(order)}), order, answer(p))
 
     return ask
 
 
 def colour_of(part: str, question: str, among: Sequence[str]) -> Aside:
-    """Return a question after the colour of a part; its '{choices}' are the colours of the parts `among`, itself
-    included."""
-    return choice_of(question, lambda p: [coloured(p)[one] for one in among], lambda p: coloured(p)[part])
+    """Return a question for a part's colour among those of the parts `among`."""
+    return choice_of(question, lambda p: [coloured(p)[name] for name in among], lambda p: coloured(p)[part])
 
 
 def colour_from(part: str, question: str, pool: Sequence[str], unlike: Sequence[str]) -> Aside:
-    """Return a question after the colour of a part; its '{choices}' are that and two of the pool that no part of
-    `unlike` has."""
+    """Return a question for a part's colour, with two that no `unlike` part has."""
 
     def ask(p: Any, rng: np.random.Generator) -> AnswerableQuestion:
         colours = coloured(p)
-        excluded = [colours[one] for one in unlike]
+        excluded = [colours[name] for name in unlike]
         others = [str(c) for c in rng.permutation([c for c in pool if c not in excluded])[:2]]
         return choice_of(question, lambda p: [colours[part], *others], lambda p: colours[part])(p, rng)
 
@@ -183,7 +180,5 @@ _IN_WORDS = {"wood": "brown", "grey": "grey", "black": "black"}
 
 
 def material_of(part: str, question: str) -> Aside:
-    """Return a question after the colour of a part of wood, grey or black; its '{choices}' are brown, grey and
-    black.
-    """
+    """Return a question for the colour of a part: brown (wood), grey or black."""
     return choice_of(question, lambda p: list(_IN_WORDS.values()), lambda p: _IN_WORDS[coloured(p)[part]])

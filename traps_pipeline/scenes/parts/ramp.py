@@ -1,4 +1,4 @@
-"""Ramps, and places on them: a board that leads down along the way or towards the camera, with rails and a support."""
+"""Ramps along the way or towards the camera, and places on them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Ramp:
-    """A slope, measured from its foot: `up` the slope, `over` its surface, `aside` of its middle (m).
+    """A slope, from its foot: `up` it, `over` its surface, `aside` of its middle (m).
 
     foot_m: where the foot is; along the way that is 0 for most, towards the camera it is how far away in y. height_m:
     of the surface at the foot. towards_camera: the ramp falls towards the camera and its middle is at `middle_m` in x;
@@ -51,8 +51,7 @@ class Ramp:
         *,
         aside: float = 0.0,
     ) -> mujoco.MjsGeom:
-        """Return a box that lies on the slope, its middle at a place. half: half sizes up the slope, across it, out of
-        it."""
+        """Return a box on the slope. half: half sizes up the slope, across it, out of it."""
         centre = self.at(up, over, aside)
         if not self.towards_camera:
             return course.slab(name, centre, half, colour, falls_rad=self.slope_rad)
@@ -61,7 +60,7 @@ class Ramp:
         return geom
 
     def support(self, course: Course, name: str, up: float, under: float, half_width: float, colour: str) -> None:
-        """Add a post from the ground to so far under the surface."""
+        """Add a post from the ground to a depth under the surface."""
         x, y, z = self.at(up, -under)
         half = (half_width, 0.02, z / 2) if self.towards_camera else (0.02, half_width, z / 2)
         course.slab(name, (x, y, z / 2), half, colour)
@@ -69,7 +68,7 @@ class Ramp:
 
 @dataclass(frozen=True)
 class SteppedRamp:
-    """A ramp from the beginning of the way that ends in a step above the deck, so that nothing comes back up.
+    """A ramp that ends in a step above the deck: nothing comes back up.
 
     length_m: along the ground. height_m: of its lower end.
     """
@@ -79,13 +78,13 @@ class SteppedRamp:
     height_m: float
 
     def at(self, along: float, over: float = 0.0) -> Vec3:
-        """Return the place so far along the way, and from the surface there so far out of it."""
+        """Return the place so far along the way and out of the surface there."""
         slope = np.radians(self.slope_deg)
         high = self.height_m + (self.length_m - along) * np.tan(slope)
         return (float(along + over * np.sin(slope)), 0.0, float(high + over * np.cos(slope)))
 
     def add(self, course: Course, half_width: float, colour: str) -> mujoco.MjsGeom:
-        """Return the board `ramp`, which is returned, and the `prop` under its upper end."""
+        """Add the board `ramp` and the `prop` under its upper end; return the board."""
         slope, half_thick = np.radians(self.slope_deg), 0.012
         half = (self.length_m / 2 / float(np.cos(slope)), half_width, half_thick)
         ramp = course.slab("ramp", self.at(self.length_m / 2, -half_thick), half, colour, falls_rad=float(slope))

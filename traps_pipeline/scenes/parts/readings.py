@@ -1,4 +1,4 @@
-"""What a run comes to: for every frame the label that holds, and by how much the end is clear of any other outcome.
+"""Readings of a run: the label of every frame, and the margin of the end.
 
 A family's `outcome(motion, p)` gives a `kit.Reading`, mostly from one of the functions here. Arrays over the frames are
 (F,), lengths in metres.
@@ -19,13 +19,13 @@ Labels = list[str | None]
 
 
 def lasting_from(holds: np.ndarray) -> int:
-    """Return the first frame from which `holds` (F,) is true to the end; F if it is not true at the end."""
+    """Return the first frame from which `holds` (F,) stays true; F if none."""
     broken = np.flatnonzero(~holds)
     return int(broken[-1]) + 1 if broken.size else 0
 
 
 def still_from(*paths: np.ndarray, within_m: float) -> int:
-    """Return the first frame from which all paths stay within so many metres of where they end.
+    """Return the first frame from which all paths stay near their ends.
 
     A path is (F,), a place along a line, or (F, ..., 3), places in space.
     """
@@ -35,8 +35,7 @@ def still_from(*paths: np.ndarray, within_m: float) -> int:
 
 
 def clear_m(past: np.ndarray, before_m: float = 0.0) -> float:
-    """Return how far (m) a thing ends past a line, `past` (F,) m above 0, or how far its front, so much ahead of its
-    middle, ends before the line."""
+    """Return how far (m) a thing ends past a line, or its front ends before it."""
     return float(past[-1] if past[-1] > 0 else -past[-1] - before_m)
 
 
@@ -44,19 +43,17 @@ def clear_m(past: np.ndarray, before_m: float = 0.0) -> float:
 
 
 def undecided(motion: Motion) -> Labels:
-    """Return no label for any frame: a run that has no valid outcome."""
+    """Return no label for any frame: a run without a valid outcome."""
     return [None] * len(motion.times)
 
 
-def held_from(first: int, label: str, motion: Motion) -> Labels:
-    """Return one label, from a frame on."""
+def label_from(first: int, label: str, motion: Motion) -> Labels:
+    """Return a label from a frame on."""
     return [label if i >= first else None for i in range(len(motion.times))]
 
 
 def yes_while(holds: np.ndarray, no_from: int, no_where: np.ndarray | bool = True) -> Labels:
-    """Return 'yes' while `holds` (F,); 'no' while it does not, from frame `no_from` on and only where `no_where`
-    (F,).
-    """
+    """Return 'yes' where `holds` (F,), 'no' elsewhere from a frame on if `no_where`."""
     no_where = np.broadcast_to(no_where, holds.shape)
     return [
         "yes" if yes else "no" if i >= no_from and no else None
@@ -65,23 +62,19 @@ def yes_while(holds: np.ndarray, no_from: int, no_where: np.ndarray | bool = Tru
 
 
 def side_while(valid: np.ndarray, past: np.ndarray, over: str = "yes", under: str = "no") -> Labels:
-    """Return `over` where `past` (F,) is above 0 and `under` elsewhere, in the frames where `valid` (F,)."""
+    """Return `over` where `past` > 0, else `under`, in the frames that are `valid`."""
     return [(over if x > 0 else under) if counts else None for x, counts in zip(past, valid, strict=True)]
 
 
-def crossed(past: np.ndarray, valid: np.ndarray | bool = True) -> Reading:
-    """Return 'yes' if `past` (F,) m ends above 0, else 'no': from when it is `valid` and on that side to the end.
-
-    The margin is how far from 0 it ends.
-    """
+def read_crossing(past: np.ndarray, valid: np.ndarray | bool = True) -> Reading:
+    """Read 'yes' if `past` (F,) m ends above 0, else 'no', and its end as the margin."""
     first = lasting_from(valid & (np.sign(past) == np.sign(past[-1])))
     answer = "yes" if past[-1] > 0 else "no"
     return Reading([answer if i >= first else None for i in range(len(past))], float(abs(past[-1])))
 
 
-def came_through(rear_past: np.ndarray, radius_m: float) -> Reading:
-    """Return 'yes' from when the rear of a ball is out, `rear_past` (F,) m above 0; 'no' from when it stays where it
-    ends.
+def read_passage(rear_past: np.ndarray, radius_m: float) -> Reading:
+    """Read 'yes' once a ball's rear is out, `rear_past` (F,) > 0, 'no' if it stays in.
 
     The margin is how far the ball ends out, or how far its front is from coming out.
     """
@@ -93,7 +86,7 @@ def came_through(rear_past: np.ndarray, radius_m: float) -> Reading:
 
 
 def first_past(motion: Motion, ahead: np.ndarray, names: Sequence[str], min_lead_s: float) -> Reading:
-    """Return who is first past the line: `ahead` (F, N) m above 0, one column a name.
+    """Read which name is first past the line: `ahead` (F, N) m above 0.
 
     No reading at all if somebody never gets past or the lead is below `min_lead_s`. The margin is how far the second
     still is from the line when the first is past it.
@@ -110,12 +103,11 @@ def first_past(motion: Motion, ahead: np.ndarray, names: Sequence[str], min_lead
 
 
 def top_m(motion: Motion, body: str, height_m: float, floor_m: float = 0.0) -> np.ndarray:
-    """Return height over a floor of the middle of a standing or fallen body's top (m), shape (F,)."""
+    """Return the height over a floor of the middle of a body's top (m), shape (F,)."""
     return motion.pos(body)[:, 2] - floor_m + motion.rot(body)[:, 2, 2] * height_m / 2
 
 
 def turns_deg(rotations: np.ndarray) -> float:
-    """Return how far (degrees) a body is turned, in the frame where it is most, from how it stands at first. rotations:
-    its matrices, (F, 3, 3)."""
+    """Return the largest turn (degrees) from the first frame; rotations (F, 3, 3)."""
     traces = np.einsum("fij,ij->f", rotations, rotations[0])
     return float(np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1)).max()))

@@ -33,7 +33,7 @@ def rope(
     sliding: float = 0.6,
     drag: float = 0.1,
 ) -> mujoco.MjsFlex:
-    """Return a rope that lies straight along the way at the start and does not stretch.
+    """Return a rope that lies straight along the way at first and does not stretch.
 
     thrown: speeds along and up (m/s). links: of which it is made, each longer than the rope is thick. sliding:
     friction, no unit. drag: viscosity of the air (Pa s).
@@ -60,7 +60,7 @@ def hammock(
     sliding: float = 0.6,
     drag: float = 0.1,
 ) -> mujoco.MjsFlex:
-    """Return a cloth that hangs through between its ends and does not stretch; its corners are where it is tied.
+    """Return a cloth that sags between its ends; its corners are where it is tied.
 
     middle: between its four corners. size, cells: along and across, in metres and in pieces. sag: how far (m) its
     middle hangs below. tied: at which ends: -1 is the near one along the way, 1 the far one. thick: half of its
@@ -94,8 +94,7 @@ def soft_ball(
     sliding: float = 0.3,
     pieces: int = 6,
 ) -> mujoco.MjsFlex:
-    """Return a ball that can be squeezed. young: its stiffness (Pa). pieces: of a diameter. It bends as one
-    (quadratic)."""
+    """Return a soft ball. young: stiffness (Pa). pieces: cells of a diameter."""
     _settle(pieces)
     skin = 0.004
     spacing = (2 * (radius - skin) / pieces,) * 3
@@ -121,8 +120,10 @@ def soft_ball(
 
 @cache
 def _settle(pieces: int) -> None:
-    """Make one ball that is always the same before a process makes its first: MuJoCo 4.0 takes the last bits of the
-    masses and stiffness of all later balls from the first one (docs/engineering-notes.md, "Physics")."""
+    """Make a fixed ball before a process's first: it sets later balls' last bits.
+
+    MuJoCo 4.0 takes masses and stiffness from the first one (docs/engineering-notes.md, "Physics").
+    """
     import mujoco
 
     ball: dict[str, Any] = {"type": "ellipsoid", "dim": 3, "dof": "quadratic", "count": [pieces + 1] * 3}

@@ -1,4 +1,4 @@
-"""What varies in a family: a field of its `Params` and the range that the field is drawn from are one line.
+"""Fields of a family's `Params`, each with the range that it is drawn from.
 
     @dataclass(frozen=True)
     class Params:
@@ -10,8 +10,8 @@
 
     PLAY = apart("red", "green", "blue")  # before the class: colours that differ from each other
 
-`drawn(Params, rng)` draws the fields in the order in which they stand; a field may depend on those before it only. So a
-hidden element that depends on nothing is as likely whatever is seen. `twins(p)` changes the hidden element.
+`draw_params(Params, rng)` draws the fields in their order; a field may depend on those before it only. So a hidden
+element that depends on nothing is as likely whatever is seen. `twins(p)` changes the hidden element.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ _RANGE, _VALUES = "range", "values"  # what is drawn: bounds of a number, or all
 # --- one field --------------------------------------------------------------------------------------------------------
 
 
-def drawn_by(draw: Draw, **what: Any) -> Any:
-    """Return a field that `draw(rng, so_far)` draws, for what no other function here says.
+def drawn_by(draw: Draw, **metadata: Any) -> Any:
+    """Return a field that `draw(rng, so_far)` draws, where no other function does.
 
     `so_far` holds the fields above by name. `draw` may put further values into it for fields below: those are not
-    stored with the parameters. what: for `check`, the bounds (`range`) or the possible values (`values`).
+    stored with the parameters. metadata: for `check`, the bounds (`range`) or the possible values (`values`).
     """
-    return field(metadata={_HOW: draw, **what})
+    return field(metadata={_HOW: draw, **metadata})
 
 
 def between(low: float, high: float) -> Any:
@@ -53,16 +53,14 @@ def between(low: float, high: float) -> Any:
 
 
 def several_between(count: Count, low: float, high: float) -> Any:
-    """Return a tuple of floats between two bounds. count: how many, or the name of the drawn value that says how
-    many.
-    """
+    """Return a tuple of floats between two bounds. count: a number or a drawn field."""
     return drawn_by(
         lambda rng, so_far: tuple(uniform(rng, low, high) for _ in range(_number(count, so_far))), range=(low, high)
     )
 
 
 def one_of(*values: Any) -> Any:
-    """Return one of these values, each as often. Names of colours, -1 and 1, counts: `one_of(4, 5, 6)`."""
+    """Return one of these values, each as often: colours, -1 and 1, counts."""
     return drawn_by(lambda rng, so_far: values[int(rng.integers(len(values)))], values=values)
 
 
@@ -72,13 +70,15 @@ def chance(share: float) -> Any:
 
 
 def facing(low: float, high: float) -> Any:
-    """Return azimuth (degrees) of a camera in front of the scene that stands by so many degrees, between two bounds,
-    towards the side that things come from. Needs a field `direction` above it."""
+    """Return the azimuth of a camera, off the front towards where things come from.
+
+    Needs a field `direction` above it.
+    """
     return drawn_by(lambda rng, so_far: 90 - so_far["direction"] * uniform(rng, low, high))
 
 
 def in_front(low: float, high: float) -> Any:
-    """Return azimuth (degrees) of a camera in front of the scene, turned by so many degrees whatever the direction."""
+    """Return the azimuth (degrees) of a camera, off the front whatever the direction."""
     return drawn_by(lambda rng, so_far: 90 + uniform(rng, low, high))
 
 
@@ -87,7 +87,7 @@ def in_front(low: float, high: float) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Fields that are drawn together, at the place of the first of them. Calling the group gives one of its fields.
+    """Fields that are drawn together, in place of the first. A call gives one field.
 
     draw(rng, so_far, count): as many values as the group's fields take, in the order of the fields.
     """
@@ -96,13 +96,12 @@ class Group:
     values: tuple[Any, ...] | None = None  # all that it draws from, where that can be said
 
     def __call__(self, count: Count | None = None) -> Any:
-        """Return a field with one value of the group, or with a tuple of `count` of them: a number, the name of the
-        drawn value that says how many, or a function of the fields above."""
+        """Return a field with a value of the group, or a tuple of `count` of them."""
         return field(metadata={_HOW: self, _COUNT: count, _VALUES: self.values})
 
 
 def apart(*pool: str, fits: Callable[..., bool] | None = None) -> Group:
-    """Return colours of a pool that are not easily taken for each other; drawn again until `fits(*colours)`."""
+    """Return distinct colours of a pool, drawn again until `fits(*colours)`."""
 
     def draw(rng: np.random.Generator, so_far: Drawn, count: int) -> Sequence[str]:
         while True:
@@ -114,8 +113,7 @@ def apart(*pool: str, fits: Callable[..., bool] | None = None) -> Group:
 
 
 def shuffled(*values: Any, without: str | None = None) -> Group:
-    """Return a group that draws different ones of these values, in random order; not the one that the field named
-    `without` has."""
+    """Return a group of different values in random order, without that of a field."""
 
     def draw(rng: np.random.Generator, so_far: Drawn, count: int) -> Sequence[Any]:
         pool = [value for value in values if without is None or value != so_far[without]]
@@ -125,7 +123,7 @@ def shuffled(*values: Any, without: str | None = None) -> Group:
 
 
 def together(draw: Callable[[np.random.Generator, Drawn], Sequence[Any]]) -> Group:
-    """Return fields whose values `draw(rng, so_far)` gives all at once, in the order of the fields."""
+    """Return a group of fields whose values `draw(rng, so_far)` gives in order."""
     return Group(lambda rng, so_far, count: draw(rng, so_far))
 
 
@@ -133,12 +131,12 @@ def together(draw: Callable[[np.random.Generator, Drawn], Sequence[Any]]) -> Gro
 
 
 def hidden(*values: Any) -> Any:
-    """Return the hidden element: one of these values, each as often, whatever else is drawn. Twins have the others."""
+    """Return the hidden element: one of these values, whatever else is drawn."""
     return _hidden(lambda so_far: values)
 
 
 def hidden_index(of: str) -> Any:
-    """Return the hidden element as a place in the tuple that the field `of` has (which lane, which sector)."""
+    """Return the hidden element as an index of the tuple in the field `of`."""
     return _hidden(lambda so_far: range(len(so_far[of])))
 
 
@@ -151,7 +149,7 @@ def _hidden(values: Callable[[Mapping[str, Any]], Sequence[Any]]) -> Any:
 
 
 def hidden_field(params: type) -> str | None:
-    """Name of the field that is the hidden element; None if there is none. Raises TypeError if there are several."""
+    """Return the hidden element's name, None if none. Raises TypeError if several."""
     names = [each.name for each in fields(params) if _HIDDEN in each.metadata]
     if len(names) > 1:
         raise TypeError(f"{params.__module__}: several hidden elements {names}; a scene has one")
@@ -159,7 +157,7 @@ def hidden_field(params: type) -> str | None:
 
 
 def twins(p: Any) -> list[Any]:
-    """Return the same scene with every other value of its hidden element. Raises TypeError if it has none."""
+    """Return the scene with every other value of its hidden element. Raises TypeError."""
     name = hidden_field(type(p))
     if name is None:
         raise TypeError(f"{type(p).__module__}: no field of Params is `hidden(...)`, so there are no twins")
@@ -171,19 +169,21 @@ def twins(p: Any) -> list[Any]:
 
 
 def check(p: Any) -> None:
-    """Raise ValueError naming the first parameter whose value is not of its type or is far from all that is drawn. A
-    number may lie outside of its range by the width of the range: a correction may move what a draw would not."""
+    """Raise ValueError naming the first parameter of a wrong type or far out of range.
+
+    A number may lie outside of its range by the width of the range, as a correction may need.
+    """
     types = _types(type(p))
     for each in fields(p):
         value = getattr(p, each.name)
         try:
             types[each.name].validate_python(value, strict=True)
         except ValidationError as error:
-            raise ValueError(f"parameter {each.name} is {_shown(value)}: {error.errors()[0]['msg']}") from None
-        for one in _members(value):
-            if isinstance(one, float) and not np.isfinite(one):
-                raise ValueError(f"parameter {each.name} is {_shown(value)}; it must be finite")
-            _check_member(p, each, one)
+            raise ValueError(f"parameter {each.name} is {_short_repr(value)}: {error.errors()[0]['msg']}") from None
+        for member in _members(value):
+            if isinstance(member, float) and not np.isfinite(member):
+                raise ValueError(f"parameter {each.name} is {_short_repr(value)}; it must be finite")
+            _check_member(p, each, member)
 
 
 @cache
@@ -195,19 +195,19 @@ def _check_member(p: Any, each: Field[Any], value: Any) -> None:
     if bounds := each.metadata.get(_RANGE):
         low, high = bounds
         if not low - (high - low) <= value <= high + (high - low):
-            raise ValueError(f"parameter {each.name} is {_shown(value)}; it is drawn from {low} to {high}")
+            raise ValueError(f"parameter {each.name} is {_short_repr(value)}; it is drawn from {low} to {high}")
     hides = each.metadata.get(_HIDDEN)
     values = tuple(hides(vars(p))) if hides else each.metadata.get(_VALUES)
     if values is not None and value not in values:
-        raise ValueError(f"parameter {each.name} is {_shown(value)}; it is one of {', '.join(map(str, values))}")
+        raise ValueError(f"parameter {each.name} is {_short_repr(value)}; it is one of {', '.join(map(str, values))}")
 
 
 def _members(value: Any) -> list[Any]:
-    """Return the values in a tuple of tuples, or the value itself."""
-    return [one for each in value for one in _members(each)] if isinstance(value, tuple) else [value]
+    """Return the values in nested tuples, or the value itself."""
+    return [member for item in value for member in _members(item)] if isinstance(value, tuple) else [value]
 
 
-def _shown(value: Any) -> str:
+def _short_repr(value: Any) -> str:
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:60]}..."
 
@@ -215,34 +215,33 @@ def _shown(value: Any) -> str:
 # --- all fields -------------------------------------------------------------------------------------------------------
 
 
-def drawn(params: type[Params], rng: np.random.Generator) -> Params:
-    """Return parameters of one scenario; a field that has a default keeps it. Raises TypeError naming a field that has
-    neither a range nor a default."""
+def draw_params(params: type[Params], rng: np.random.Generator) -> Params:
+    """Draw a scenario's parameters; defaults stay. Raises TypeError without a range."""
     so_far: Drawn = {}
     members = fields(params)  # type: ignore[arg-type]
     for each in members:
         if each.name in so_far or each.default is not MISSING:
             continue
-        how = each.metadata.get(_HOW)
-        if how is None:
+        draw = each.metadata.get(_HOW)
+        if draw is None:
             raise TypeError(f"{params.__module__}: Params.{each.name} has no range; write it as `= between(low, high)`")
-        if isinstance(how, Group):
-            so_far |= _of_group(how, members, rng, so_far)
+        if isinstance(draw, Group):
+            so_far |= _of_group(draw, members, rng, so_far)
         else:
-            so_far[each.name] = how(rng, so_far)
+            so_far[each.name] = draw(rng, so_far)
     return params(**{each.name: so_far[each.name] for each in members if each.name in so_far})
 
 
 def _of_group(group: Group, members: Sequence[Field[Any]], rng: np.random.Generator, so_far: Drawn) -> Drawn:
-    """Return values of all fields of a group."""
+    """Return the values of all fields of a group."""
     counts = {each.name: each.metadata[_COUNT] for each in members if each.metadata.get(_HOW) is group}
     numbers = {name: 1 if count is None else _number(count, so_far) for name, count in counts.items()}
     values = list(group.draw(rng, so_far, sum(numbers.values())))
-    values_drawn: Drawn = {}
+    field_values: Drawn = {}
     for name, number in numbers.items():
         chosen, values = values[:number], values[number:]
-        values_drawn[name] = chosen[0] if counts[name] is None else tuple(chosen)
-    return values_drawn
+        field_values[name] = chosen[0] if counts[name] is None else tuple(chosen)
+    return field_values
 
 
 def _number(count: Count, so_far: Mapping[str, Any]) -> int:

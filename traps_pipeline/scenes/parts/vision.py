@@ -1,4 +1,4 @@
-"""Classical vision for observers: where a colour is in a frame, and how it moves (OpenCV, no knowledge of the scene).
+"""Classical vision for observers: where a colour is in a frame, how it moves.
 
 Frames are RGB uint8, shape (360, 480, 3); pixel coordinates are x to the right, y down. Colours are named as in
 `kit.COLOURS`. A colour that is none of them (most occluders') belongs to no mask.
@@ -36,7 +36,7 @@ _HUES: Mapping[str, tuple[float, float, float, float]] = {
 
 @dataclass(frozen=True)
 class Blob:
-    """A connected region: centroid, bounding box (x, y, width, height) and area, all in pixels."""
+    """A connected region: centroid, box (x, y, width, height) and area, in pixels."""
 
     x: float
     y: float
@@ -45,12 +45,12 @@ class Blob:
 
     @property
     def fill(self) -> float:
-        """Share of the bounding box that the region covers: 1 for an upright rectangle, 0.79 for a disc."""
+        """Share of the bounding box that the region covers; 0.79 for a disc."""
         return self.area / (self.box[2] * self.box[3])
 
 
 def colour_mask(frame: np.ndarray, colour: str) -> np.ndarray:
-    """Return where a frame has a colour, bool (360, 480), tolerant of shade and of compression."""
+    """Return where a frame has a colour, bool (H, W), tolerant of shade."""
     hsv = cv2.cvtColor(frame.astype(np.float32) / 255, cv2.COLOR_RGB2HSV)
     hue, saturation, value = hsv[..., 0], hsv[..., 1], hsv[..., 2]
     if colour in _HUES:
@@ -93,10 +93,10 @@ def largest(frame: np.ndarray, colour: str, min_area: int = 12) -> Blob | None:
 
 
 def largest_board(frame: np.ndarray, min_area: int = 12) -> Blob | None:
-    """Return the largest region of a colour that occluders have, in light or shade, with the lines on it."""
+    """Return the largest region of an occluder's colour, with the lines on it."""
     pixels, mask = frame.astype(np.float32) / 255, np.zeros(frame.shape[:2], bool)
-    for named in OCCLUDERS.values():
-        colour = np.array(named, np.float32)
+    for rgb in OCCLUDERS.values():
+        colour = np.array(rgb, np.float32)
         bright = pixels @ colour / (colour @ colour)
         off = np.linalg.norm(pixels - bright[..., None] * colour, axis=2) / np.linalg.norm(colour)
         mask |= (bright > 0.5) & (bright < 1.1) & (off < 0.06 * bright)
@@ -107,10 +107,9 @@ def largest_board(frame: np.ndarray, min_area: int = 12) -> Blob | None:
 def slanting_edges(
     frame: np.ndarray, part: tuple[slice, slice], slants: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return where edges in a part of a frame fall to the left and where they fall to the right, bool of the part's
-    shape.
+    """Return where edges of a part fall to the left, and to the right, bool masks.
 
-    slants: between how many rows a column they fall.
+    slants: least and greatest slope, in rows a column.
     """
     grey = cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY).astype(np.float32)
     across, down = (cv2.Sobel(grey, cv2.CV_32F, x, 1 - x)[part] for x in (1, 0))
@@ -125,101 +124,91 @@ def track(frames: Sequence[np.ndarray] | np.ndarray, colour: str, min_area: int 
 
 
 def before_occluder(frames: np.ndarray) -> np.ndarray:
-    """Return the frames before an occluder comes that stands to the end of the clip; all of them if none comes.
+    """Return the frames before an occluder comes and stays; all of them if none does.
 
     An occluder comes in large steps: a large region turns to one colour (but for its shadow), which is not that of what
     is around it, and soon a large region has that colour and keeps it. What stands from the first frame on does not
     come; where an occluder goes, the scene goes on.
     """
     for at in range(1, len(frames)):
-        changed = _apart(frames[at], frames[at - 1]) > CHANGED
-        if changed.sum() < STEP_PX:
+        is_new = _levels(frames[at], frames[at - 1]) > CHANGED
+        if is_new.sum() < STEP_PX:
             continue
-        count, names = cv2.connectedComponents(changed.astype(np.uint8), connectivity=4)
+        count, names = cv2.connectedComponents(is_new.astype(np.uint8), connectivity=4)
         sizes = np.bincount(names.ravel(), minlength=count)
         sizes[0] = 0
         region = names == sizes.argmax()
         around = cv2.dilate(region.astype(np.uint8), np.ones((17, 17), np.uint8)).astype(bool) & ~region
         before, colour = (np.median(frame[region], axis=0).astype(np.uint8) for frame in (frames[at - 1], frames[at]))
-        even, beside = ((_apart(frames[at][part], colour) <= ALIKE).mean() for part in (region, around))
-        was_even = (_apart(frames[at - 1][region], before) <= ALIKE).mean()
+        even, beside = ((_levels(frames[at][part], colour) <= ALIKE).mean() for part in (region, around))
+        was_even = (_levels(frames[at - 1][region], before) <= ALIKE).mean()
         stands_out = beside < 0.4 or (beside < 0.75 and was_even < even)  # some of what is around it may be as dark
-        if sizes.max() >= STEP_PX and even > 0.5 and stands_out and _stands_later(frames, at, colour):
-            return frames[: _sets_off(frames, at, colour)]
+        if sizes.max() >= STEP_PX and even > 0.5 and stands_out and _is_standing_later(frames, at, colour):
+            return frames[: _first_on_its_way(frames, at, colour)]
     return frames
 
 
-def _stands_later(frames: np.ndarray, comes: int, colour: np.ndarray) -> bool:
-    """Return whether a large region has this colour soon after frame `comes`, and at the end, that had another one
-    before: in the last frame, and some frames ago, when nothing that goes again had covered it."""
-    ago, soon = max(0, comes - 1 - COMES_FRAMES), min(comes + COMES_FRAMES, len(frames) - 1)
-    before, was, soon_after, stays = (_apart(frames[at], colour) <= ALIKE for at in (comes - 1, ago, soon, -1))
-    stands = stays & ~before & ~was
-    closed = cv2.morphologyEx(
-        stands.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8)
+def _is_standing_later(frames: np.ndarray, comes: int, colour: np.ndarray) -> bool:
+    """Return whether a region that turned to a colour has it soon and at the end."""
+    early, soon = max(0, comes - 1 - COMES_FRAMES), min(comes + COMES_FRAMES, len(frames) - 1)
+    before, was, soon_after, at_end = (_levels(frames[at], colour) <= ALIKE for at in (comes - 1, early, soon, -1))
+    new_region = at_end & ~before & ~was
+    filled = cv2.morphologyEx(
+        new_region.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8)
     )  # lines between slats
-    return bool(closed.sum() >= OCCLUDER_PX and (soon_after & stands).sum() > 0.9 * stands.sum())
+    return bool(filled.sum() >= OCCLUDER_PX and (soon_after & new_region).sum() > 0.9 * new_region.sum())
 
 
-def _sets_off(frames: np.ndarray, comes: int, colour: np.ndarray) -> int:
-    """Return the first frame in which an occluder of a colour is seen on its way, a large part of which comes in frame
-    `comes`."""
+def _first_on_its_way(frames: np.ndarray, comes: int, colour: np.ndarray) -> int:
+    """Return the first frame in which an occluder that comes is seen on its way."""
     first = comes
     while first > max(1, comes - COMES_FRAMES):
-        now, before = (_apart(frame, colour) <= ALIKE for frame in (frames[first - 1], frames[first - 2]))
-        if (now & ~before).sum() < COMING_PX:
+        current, before = (_levels(frame, colour) <= ALIKE for frame in (frames[first - 1], frames[first - 2]))
+        if (current & ~before).sum() < COMING_PX:
             break
         first -= 1
     return first
 
 
 def after_occluder(frames: np.ndarray) -> np.ndarray:
-    """Return the frames after an occluder goes that stands from the first one on; all of them if none goes."""
+    """Return the frames after an occluder that stood from the first on has gone."""
     return before_occluder(frames[::-1])[::-1]
 
 
-def moved(frames: np.ndarray) -> np.ndarray:
-    """Return where the last frame differs from the one before, bool (360, 480)."""
-    return _apart(frames[-1], frames[-2]) > CHANGED if len(frames) > 1 else np.zeros(frames.shape[1:3], bool)
+def motion_mask(frames: np.ndarray) -> np.ndarray:
+    """Return where the last frame differs from the one before, bool (H, W)."""
+    return _levels(frames[-1], frames[-2]) > CHANGED if len(frames) > 1 else np.zeros(frames.shape[1:3], bool)
 
 
-def before_hold(frames: np.ndarray) -> np.ndarray:
-    """Return the frames without those at the end in which nothing moves any more; at least one."""
-    count = len(frames)
-    while count > 1 and moved(frames[:count]).sum() < MOVED_PX:
-        count -= 1
-    return frames[:count]
+def is_still(frames: np.ndarray) -> bool:
+    """Return whether nothing moves in the last two steps."""
+    return motion_mask(frames).sum() < MOVED_PX and motion_mask(frames[:-1]).sum() < MOVED_PX
 
 
-def still(frames: np.ndarray) -> bool:
-    """Return whether nothing moves in the last two steps that are shown."""
-    return moved(frames).sum() < MOVED_PX and moved(frames[:-1]).sum() < MOVED_PX
-
-
-def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return by how many levels two pictures of bytes differ, pixel by pixel, in the channel where they differ most."""
-    apart = np.maximum(a, b) - np.minimum(a, b)
-    return np.maximum(np.maximum(apart[..., 0], apart[..., 1]), apart[..., 2])  # 20 times as fast as max(axis=-1)
+def _levels(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return by how many levels two pictures differ at most in a channel, by pixel."""
+    levels = np.maximum(a, b) - np.minimum(a, b)
+    return np.maximum(np.maximum(levels[..., 0], levels[..., 1]), levels[..., 2])  # 20 times as fast as max(axis=-1)
 
 
 def without_flags(frames: np.ndarray) -> np.ndarray:
-    """Return the frames with every flag painted over by what is beside it: a flag stands for a thing and is none.
+    """Return the frames with every flag painted over by what is beside it.
 
     A flag is a small upright patch of one colour at the top of a thin dark mast, to its right; both stand still. Of a
     black flag the mast is told apart only below.
     """
-    still = np.median(frames, axis=0).astype(np.uint8)
+    background = np.median(frames, axis=0).astype(np.uint8)
     painted = frames.copy()
-    for left, top, width in _masts(still):
+    for left, top, width in _mast_tops(background):
         for seed in ((left + width + 3, top + 5), (left + width + 3, top - 4)):
-            patch = _patch(still, seed)
+            patch = _flag_patch(background, seed)
             if patch is None or patch[0] > left + width + 3:
                 continue
             x, y, wide, high = patch
             box = np.s_[y : y + high, x : x + wide]
-            changes = np.abs(np.stack([frames[0][box], frames[-1][box]]).astype(int) - still[box])
-            rests = (changes[1] > 40).any(axis=-1).mean()  # a thing that lies before the patch is smaller than it
-            if min(abs(y - top), abs(y + high - top)) > 6 or changes.mean() > 12 or rests > 0.03:
+            changes = np.abs(np.stack([frames[0][box], frames[-1][box]]).astype(int) - background[box])
+            rest_share = (changes[1] > 40).any(axis=-1).mean()  # a thing that lies before the patch is smaller than it
+            if min(abs(y - top), abs(y + high - top)) > 6 or changes.mean() > 12 or rest_share > 0.03:
                 continue  # neither flies at the end of the mast, or it moves
             above = max(0, min(top, y) - 4)
             beside = painted[:, above, max(0, left - 4)]
@@ -228,24 +217,24 @@ def without_flags(frames: np.ndarray) -> np.ndarray:
     return painted
 
 
-def _patch(still: np.ndarray, seed: tuple[int, int]) -> tuple[int, int, int, int] | None:
-    """Return box (x, y, width, height) of the patch of one colour around a pixel (x, y), if it may be a flag."""
-    height, width = still.shape[:2]
+def _flag_patch(background: np.ndarray, seed: tuple[int, int]) -> tuple[int, int, int, int] | None:
+    """Return the box of the patch of one colour around a pixel, if it may be a flag."""
+    height, width = background.shape[:2]
     if not (0 <= seed[0] < width and 0 <= seed[1] < height):
         return None
     region = np.zeros((height + 2, width + 2), np.uint8)
     flags = 4 | cv2.FLOODFILL_MASK_ONLY | cv2.FLOODFILL_FIXED_RANGE | (1 << 8)
-    _, _, _, (x, y, wide, high) = cv2.floodFill(still.copy(), region, seed, (0, 0, 0), (22,) * 3, (22,) * 3, flags)
+    _, _, _, (x, y, wide, high) = cv2.floodFill(background.copy(), region, seed, (0, 0, 0), (22,) * 3, (22,) * 3, flags)
     filled = region[1:-1, 1:-1][y : y + high, x : x + wide].mean()
     fits = 8 <= wide <= FLAG_PX[0] and 6 <= high <= FLAG_PX[1] and filled > 0.6
     return (x, y, wide, high) if fits else None
 
 
-def _masts(still: np.ndarray) -> list[tuple[int, int, int]]:
-    """Return upper ends (left, top, width) of thin, dark, colourless lines that stand upright, or nearly."""
-    light = still.max(axis=2)
+def _mast_tops(background: np.ndarray) -> list[tuple[int, int, int]]:
+    """Return upper ends (left, top, width) of thin, dark, upright lines."""
+    light = background.max(axis=2)
     beside = cv2.morphologyEx(light, cv2.MORPH_CLOSE, np.ones((1, 7), np.uint8))
-    thin = ((light < 125) & (np.ptp(still, axis=2) < 30) & (cv2.subtract(beside, light) > 30)).astype(np.uint8)
+    thin = ((light < 125) & (np.ptp(background, axis=2) < 30) & (cv2.subtract(beside, light) > 30)).astype(np.uint8)
     tall = cv2.morphologyEx(cv2.dilate(thin, np.ones((1, 3), np.uint8)), cv2.MORPH_OPEN, np.ones((6, 1), np.uint8))
     count, names = cv2.connectedComponents(tall, connectivity=8)
     masts = []
@@ -257,8 +246,8 @@ def _masts(still: np.ndarray) -> list[tuple[int, int, int]]:
     return masts
 
 
-def at_rest(path: Sequence[Blob | None], last: int = 3, tolerance_px: float = 1.5) -> bool:
-    """Return whether the tracked thing is seen in each of the last frames and stays where it is."""
+def is_at_rest(path: Sequence[Blob | None], last: int = 3, tolerance_px: float = 1.5) -> bool:
+    """Return whether the thing is seen in each of the last frames and stays in place."""
     tail = path[-last:]
     visible = [blob for blob in tail if blob is not None]
     if len(visible) < last:
@@ -268,6 +257,5 @@ def at_rest(path: Sequence[Blob | None], last: int = 3, tolerance_px: float = 1.
 
 
 def is_occluder(blob: Blob, longest_px: int = 130) -> bool:
-    """Return whether a region is too long for a thing of a tabletop scene, or so thin that only an occluder's edge
-    is."""
+    """Return whether a region is too long or too thin for a thing of a scene."""
     return max(blob.box[2:]) > longest_px or min(blob.box[2:]) < 5

@@ -1,4 +1,4 @@
-"""The words of a scenario: question templates that can be read back, and ill-posed questions with their proof.
+"""Words of a scenario: templates that can be read back, and ill-posed questions.
 
 An ill-posed question is drawn from shared templates over the scene's inventory, and checked by vocabulary alone, so
 that a question which a reviewer wrote is checked in the same way (docs/spec.md 2.4).
@@ -20,19 +20,19 @@ from traps_pipeline.scenes.physics.kit import COLOURS, Inventory, Taxonomy
 @cache
 def _pattern(template: str) -> re.Pattern[str]:
     parts = re.split(r"\{(\w+)\}", template)
-    named: set[str] = set()
+    slots: set[str] = set()
     pattern = ""
     for i, part in enumerate(parts):
         if i % 2 == 0:
             pattern += re.escape(part)
         else:
-            pattern += f"(?P={part})" if part in named else f"(?P<{part}>.+?)"
-            named.add(part)
+            pattern += f"(?P={part})" if part in slots else f"(?P<{part}>.+?)"
+            slots.add(part)
     return re.compile(pattern)
 
 
-def asked(templates: Sequence[str], question: str) -> dict[str, str] | None:
-    """Return the values that fill a template's placeholders in a question; None if it fits none of the templates."""
+def match_slots(templates: Sequence[str], question: str) -> dict[str, str] | None:
+    """Return what a question has in a template's placeholders; None if none fits."""
     for template in templates:
         match = _pattern(template).fullmatch(question)
         if match:
@@ -41,7 +41,7 @@ def asked(templates: Sequence[str], question: str) -> dict[str, str] | None:
 
 
 def choices_in(text: str) -> tuple[str, ...]:
-    """Return the choices that `kit.listed` reads out: 'red, blue or green' -> red, blue, green."""
+    """Return the choices in the text of `kit.listed`: 'red, blue or green'."""
     return tuple(re.split(r", | or ", text))
 
 
@@ -100,7 +100,7 @@ BEYOND_VIDEO: Mapping[str, tuple[str, tuple[str, ...]]] = {
 
 
 def beyond_video(question: str) -> str | None:
-    """Return the property that no video shows and that the question asks for; None if it asks for none of them."""
+    """Return the property asked for that no video shows; None if there is none."""
     text = question.lower()
     return next((name for name, (words, _) in BEYOND_VIDEO.items() if re.search(words, text)), None)
 
@@ -169,8 +169,11 @@ _COLOUR_WORDS = frozenset(COLOURS) - {"wood"} | frozenset(ABSENT_COLOURS)
 
 
 def false_premises(question: str, inventory: Inventory, *, near: bool = False) -> list[str]:
-    """Return all that the question presumes and the scene's inventory refutes. near: and colours that it does not have,
-    but has others like them: a viewer may take these for a second false premise, though they refute nothing."""
+    """Return what a question presumes and the inventory refutes.
+
+    near: include colours like those in view, which a viewer may take for another false premise, though they refute
+    nothing.
+    """
     text, premises = question.lower(), []
     for thing in (*ABSENT_OBJECTS, "arrow", "stripe"):
         if re.search(rf"\b{thing}(s|es)?\b", text) and thing not in inventory.objects:
@@ -187,30 +190,30 @@ def false_premises(question: str, inventory: Inventory, *, near: bool = False) -
 
 
 def false_premise(question: str, inventory: Inventory) -> str | None:
-    """Return what the question presumes and the scene's inventory refutes; None if it presumes nothing of the kind."""
+    """Return the first false premise of a question; None if there is none."""
     return next(iter(false_premises(question, inventory)), None)
 
 
 def none_as_answer(question: str) -> str | None:
-    """Return the answer (zero, never, nobody, nothing, no) that denies a false premise and is true; None if there is
-    none. "How many windmills does the ball touch?" is answered by zero, "What colour is the windmill?" by nothing."""
+    """Return the true answer that denies a false premise: zero, never, no ..; or None.
+
+    "How many windmills does the ball touch?" has one (zero), "What colour is the windmill?" has none.
+    """
     text = question.lower()
     return next((answer for words, answer in _TRULY_NONE if re.search(words, text)), None)
 
 
 def is_far(colour: str, present: Sequence[str]) -> bool:
-    """Return whether a colour is none of some others and is not easily taken for one of them: at least `FAR_COLOUR`
-    away."""
-    return colour not in present and all(colour_distance(colour, other) >= FAR_COLOUR for other in present)
+    """Return whether a colour is at least `FAR_COLOUR` from all that are present."""
+    return colour not in present and all(colour_distance(colour, neighbour) >= FAR_COLOUR for neighbour in present)
 
 
 @cache
-def colour_distance(one: str, other: str) -> float:
-    """Return least Euclidean distance in CIELAB (D65) of a named colour from another one, in shade and in bright light
-    too."""
-    known = {**COLOURS, **_ELSEWHERE}
-    lit = (tuple(min(1.0, light * part) for part in known[other]) for light in LIGHTS)
-    return min(float(np.linalg.norm(_lab(known[one]) - _lab(as_lit))) for as_lit in lit)
+def colour_distance(colour: str, neighbour: str) -> float:
+    """Return the least CIELAB (D65) distance of two colours, in shade and light too."""
+    srgb_of = {**COLOURS, **_ELSEWHERE}
+    lit = (tuple(min(1.0, light * part) for part in srgb_of[neighbour]) for light in LIGHTS)
+    return min(float(np.linalg.norm(_lab(srgb_of[colour]) - _lab(shade))) for shade in lit)
 
 
 def _lab(srgb: Sequence[float]) -> np.ndarray:
@@ -224,14 +227,14 @@ def _lab(srgb: Sequence[float]) -> np.ndarray:
 
 
 def refutation(taxonomy: Taxonomy, question: str, inventory: Inventory) -> str | None:
-    """Return why the question cannot be answered from the control; None if nothing says so."""
+    """Return why a control cannot answer the question; None if nothing says so."""
     return beyond_video(question) if taxonomy == "occlusion" else false_premise(question, inventory)
 
 
 def draw_ill_posed(
     taxonomy: Taxonomy, inventory: Inventory, rng: np.random.Generator, free: Callable[[str], bool] = lambda _: True
 ) -> str:
-    """Return an ill-posed question about a scene that is still free to use. Raises ValueError when all are taken."""
+    """Return an ill-posed question that is free. Raises ValueError if all are taken."""
     questions = list(_beyond_video(inventory) if taxonomy == "occlusion" else _false_premises(inventory, rng))
     for i in rng.permutation(len(questions)):
         question = questions[i]

@@ -1,1 +1,1 @@
-"""MuJoCo models: the builders that families share, soft bodies, and simulation to a trajectory."""
+"""MuJoCo models: shared builders, soft bodies, and simulation to a trajectory."""

@@ -1,4 +1,4 @@
-"""Soft bodies (MuJoCo's flexes) of a compiled model: their names, what carries them, where they are.
+"""Soft bodies (MuJoCo's flexes) of a compiled model.
 
 A soft body is named in the roles of a scene as any other body is. It has no pose: it is where its vertices are, which
 follow from the poses of the bodies that carry it, and it is drawn as a whole.
@@ -15,14 +15,14 @@ if TYPE_CHECKING:
 
 
 def flexes(model: mujoco.MjModel) -> dict[str, int]:
-    """Return the number of each soft body, by its name, in the order of the model."""
+    """Return the id of each soft body, by name, in the order of the model."""
     import mujoco
 
     return {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_FLEX, i): i for i in range(model.nflex)}
 
 
 def carriers(model: mujoco.MjModel, flex: int) -> np.ndarray:
-    """Return numbers of the bodies that carry a soft body: one a vertex, or the nodes of the cage around it."""
+    """Return ids of the bodies that carry a soft body: a vertex or a cage node each."""
     if model.flex_interp[flex]:
         first, count, bodies = model.flex_nodeadr[flex], model.flex_nodenum[flex], model.flex_nodebodyid
     else:
@@ -31,7 +31,7 @@ def carriers(model: mujoco.MjModel, flex: int) -> np.ndarray:
 
 
 def is_carrier(model: mujoco.MjModel) -> np.ndarray:
-    """Return whether each body is no thing of its own but carries a soft body, (nbody,) bool."""
+    """Return whether each body only carries a soft body, (nbody,) bool."""
     mask = np.zeros(model.nbody, bool)
     for flex in range(model.nflex):
         mask[carriers(model, flex)] = True
@@ -39,7 +39,7 @@ def is_carrier(model: mujoco.MjModel) -> np.ndarray:
 
 
 def vertices(model: mujoco.MjModel, data: mujoco.MjData, flex: int) -> np.ndarray:
-    """Return where the vertices of a soft body are (m), (V, 3), once the bodies' poses are computed."""
+    """Return the vertices of a soft body (m), (V, 3), at the computed poses."""
     import mujoco
 
     mujoco.mj_flex(model, data)
@@ -48,7 +48,6 @@ def vertices(model: mujoco.MjModel, data: mujoco.MjData, flex: int) -> np.ndarra
 
 
 def elements(model: mujoco.MjModel, flex: int) -> np.ndarray:
-    """Return the vertices of each element of a soft body (two of a rope, three of a cloth, four of a solid), (E, 2 to
-    4)."""
+    """Return the vertices of a soft body's elements, (E, 2 to 4)."""
     corners, first = int(model.flex_dim[flex]) + 1, int(model.flex_elemdataadr[flex])
     return model.flex_elem[first : first + corners * int(model.flex_elemnum[flex])].reshape(-1, corners)

@@ -1,4 +1,4 @@
-"""What a scene family is made of: its values, and the few builders that every family shares.
+"""Values that a scene family is made of, and builders that all families share.
 
 A family file defines one `FAMILY`, put together by `parts.family`. Its functions are pure: `draw` and `word` take the
 generator they draw from, `build` and `outcome` draw nothing, so that a stored spec always gives the same scene.
@@ -52,7 +52,7 @@ def rgba(colour: str) -> list[float]:
 
 @dataclass(frozen=True)
 class Physics:
-    """Solver settings and clip timing, stored with every spec (docs/engineering-notes.md, "Physics")."""
+    """Solver settings and clip timing (docs/engineering-notes.md, "Physics")."""
 
     timestep_s: float = 0.002
     duration_s: float = 5.0
@@ -64,7 +64,7 @@ class Physics:
 
     @property
     def n_frames(self) -> int:
-        """Frames of the control clip; frame i shows time i / fps, frame 0 the initial state."""
+        """Frames of the control; frame i shows time i / fps, frame 0 the initial state."""
         return round(self.duration_s * self.fps)
 
     @property
@@ -103,7 +103,7 @@ class View:
 
 @dataclass(frozen=True)
 class Inventory:
-    """What a viewer can name, which ill-posed questions are made from and checked against (`wording.py`).
+    """What a viewer can name; ill-posed questions are made from it (`wording.py`).
 
     colours: every colour in view. objects: every noun, singular ('ball', 'ramp'). things: phrases that single one out
     ('red ball', 'wooden ramp'), which occlusion scenes are asked about; at least three of them.
@@ -144,7 +144,7 @@ class Scene:
 
 
 def flag_of(phrase: str) -> str:
-    """Name of the geom of a flag."""
+    """Return the name of a flag's geom."""
     return f"flag {phrase}"
 
 
@@ -162,7 +162,7 @@ class Motion:
     vertices: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def pos(self, body: str) -> np.ndarray:
-        """Return world position of a body's frame, or of the middle of a soft body's vertices, shape (F, 3)."""
+        """Return the position of a body, or the mean of a soft body's vertices, (F, 3)."""
         return self.vertices[body].mean(axis=1) if body in self.vertices else self.positions[body]
 
     def rot(self, body: str) -> np.ndarray:
@@ -170,8 +170,7 @@ class Motion:
         return self.rotations[body]
 
     def places(self, body: str, beside_m: float) -> np.ndarray:
-        """Return the points by which a body is seen to move, (F, N, 3) m: its middle and points beside it, or a soft
-        body's vertices."""
+        """Return points of a body, its middle and three beside it, or vertices, (F, N, 3)."""
         if body in self.vertices:
             return self.vertices[body]
         beside = np.pad(self.rot(body).swapaxes(1, 2), ((0, 0), (1, 0), (0, 0)))
@@ -180,10 +179,12 @@ class Motion:
 
 @dataclass(frozen=True)
 class Reading:
-    """What a run comes to. labels: for every frame the label that holds then, None while undecided. margin_m: distance
-    (m) of the end state from the nearest other outcome. in_order: of a question after the order of two events, the
-    frames from which the first one and the second one have happened: in between, the order is seen. turns_deg: how far
-    the thing turns that the scene is about, where there is one: a seesaw that nothing strikes sorts nothing."""
+    """A run's label in every frame, None while undecided, and its margin.
+
+    margin_m: distance (m) of the end state from the nearest other outcome. in_order: of a question for the order of two
+    events, the frames from which the first one and the second one have happened. turns_deg: how far the thing turns
+    that the scene is about, where there is one.
+    """
 
     labels: Sequence[str | None]
     margin_m: float
@@ -193,7 +194,7 @@ class Reading:
 
 @dataclass(frozen=True)
 class AnswerableQuestion:
-    """A question that even the void video answers (a mechanism control: `occlusion_answerable`)."""
+    """A question that even the void answers (`occlusion_answerable`)."""
 
     question: str
     labels: tuple[str, ...]
@@ -202,7 +203,7 @@ class AnswerableQuestion:
 
 @dataclass(frozen=True)
 class Wording:
-    """The words of a scenario. The question words its choices; aliases map other wordings to a label."""
+    """Words of a scenario. aliases: other wording -> label."""
 
     question: str
     labels: tuple[str, ...]
@@ -212,7 +213,7 @@ class Wording:
 
 @dataclass(frozen=True)
 class Family:
-    """A scene family: how it varies, how it is built, what decides its outcome (docs/spec.md 2.2).
+    """A scene family: its variation, construction and outcome (docs/spec.md 2.2).
 
     params: a frozen dataclass of plain values with units in the names.
     draw(rng): parameters of one scenario.
@@ -250,24 +251,23 @@ class Family:
     )  # raises ValueError where parameters from a file are not plausible
 
     def params_from(self, values: Mapping[str, Any]) -> Any:
-        """Return parameters from a stored mapping (lists become tuples). Raises ValueError naming the first that is
-        unknown, missing, of another type or not plausible."""
-        known = {f.name: f for f in fields(self.params)}
-        needed = {name for name, f in known.items() if f.default is MISSING}
-        unknown, missing = sorted(set(values) - set(known)), sorted(needed - set(values))
+        """Return parameters from a stored mapping. Raises ValueError naming a wrong one."""
+        field_of = {f.name: f for f in fields(self.params)}
+        required = {name for name, f in field_of.items() if f.default is MISSING}
+        unknown, missing = sorted(set(values) - set(field_of)), sorted(required - set(values))
         if unknown or missing:
             raise ValueError(
                 f"family {self.name}: unknown parameters {unknown}, missing parameters {missing}; "
-                f"known: {sorted(known)}"
+                f"known: {sorted(field_of)}"
             )
-        read = {name: known[name].metadata.get(READ, _as_tuple) for name in values}
+        read = {name: field_of[name].metadata.get(READ, _as_tuple) for name in values}
         params = self.params(**{name: read[name](value) for name, value in values.items()})
         self.check(params)
         return params
 
 
 def params_to_dict(params: Any) -> dict[str, Any]:
-    """Return plain JSON-able mapping of a family's parameters, without a look that is not there."""
+    """Return a family's parameters as a plain mapping, without a missing look."""
     absent = {each.name for each in fields(params) if each.default is None and getattr(params, each.name) is None}
     return {name: value for name, value in asdict(params).items() if name not in absent}
 
@@ -280,7 +280,7 @@ def _as_tuple(value: Any) -> Any:
 
 
 def new_spec(physics: Physics) -> mujoco.MjSpec:
-    """Return an empty world: sky, warm-grey floor, one key light with shadow, robust contact settings."""
+    """Return an empty world: sky, floor, key light, robust contact settings."""
     import mujoco
 
     spec = mujoco.MjSpec()
@@ -338,7 +338,7 @@ def add_box(
     euler_y: float = 0.0,
     **attributes: Any,
 ) -> mujoco.MjsGeom:
-    """Return a box geom on a body (`spec.worldbody` for a static one), optionally tilted about y (rad)."""
+    """Return a box geom on a body, or on `spec.worldbody`, tilted about y (rad)."""
     import mujoco
 
     geom = parent.add_geom(
@@ -354,7 +354,7 @@ def add_box(
 def add_ball(
     spec: mujoco.MjSpec, name: str, centre: Sequence[float], radius: float, colour: str, *, density: float = 1000.0
 ) -> mujoco.MjsGeom:
-    """Return a free ball (body `name`, geom `name`) with rolling friction, so that it comes to rest."""
+    """Return a free ball, body and geom `name`, that friction brings to rest."""
     import mujoco
 
     body = spec.worldbody.add_body(name=name, pos=list(centre))
@@ -370,7 +370,7 @@ def add_ball(
 
 
 def uniform(rng: np.random.Generator, low: float, high: float) -> float:
-    """Return a plain float between two bounds, rounded to 0.0001 so that stored parameters stay readable."""
+    """Return a plain float between two bounds, rounded to 0.0001."""
     return round(float(rng.uniform(low, high)), 4)
 
 
@@ -387,7 +387,7 @@ _LOOK_ALIKE = (
 
 
 def distinct_colours(rng: np.random.Generator, count: int, pool: Sequence[str]) -> tuple[str, ...]:
-    """Return `count` colours of the pool in random order, no two of which are easily taken for each other."""
+    """Return `count` colours of the pool, no two of which look alike."""
     for _ in range(1000):
         chosen = tuple(str(c) for c in rng.permutation(list(pool))[:count])
         if len(chosen) == count and not any(pair <= set(chosen) for pair in _LOOK_ALIKE):

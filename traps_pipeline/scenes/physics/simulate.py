@@ -1,4 +1,4 @@
-"""A built scene to its trajectory (qpos at frame times), and a trajectory to the poses of its bodies."""
+"""Simulation of a built scene to a trajectory, and replay of it to poses."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ if TYPE_CHECKING:
 
 
 def initial_velocity(model: mujoco.MjModel, velocity: Mapping[str, Sequence[float]]) -> np.ndarray:
-    """Return qvel at the start: each named free body gets its six numbers, each named soft body the first three, by
-    which all of it moves. Shape (nv,)."""
+    """Return qvel at the start, (nv,): six numbers a free body, three a soft one."""
     qvel, soft = np.zeros(model.nv), flexes(model)
     for body, values in velocity.items():
         if body in soft:
@@ -29,8 +28,7 @@ def initial_velocity(model: mujoco.MjModel, velocity: Mapping[str, Sequence[floa
 
 
 def simulate(model: mujoco.MjModel, scene: Scene, physics: Physics) -> np.ndarray:
-    """Return qpos at every frame time, shape (F, nq), float32: what is frozen and replayed. Raises if the solver
-    diverges."""
+    """Return qpos at every frame time, (F, nq) float32. Raises FloatingPointError."""
     import mujoco
 
     data = mujoco.MjData(model)
@@ -46,31 +44,30 @@ def simulate(model: mujoco.MjModel, scene: Scene, physics: Physics) -> np.ndarra
 
 
 def replay(model: mujoco.MjModel, qpos: np.ndarray, physics: Physics) -> Motion:
-    """Return body poses of a trajectory, and where its soft bodies are; no dynamics."""
+    """Return the poses of a trajectory's bodies, without dynamics."""
     import mujoco
 
     data, soft = mujoco.MjData(model), flexes(model)
     names = [model.body(i).name for i in range(1, model.nbody)]
     positions = np.empty((len(qpos), model.nbody, 3))
     rotations = np.empty((len(qpos), model.nbody, 9))
-    bent = {name: np.empty((len(qpos), int(model.flex_vertnum[i]), 3)) for name, i in soft.items()}
+    soft_vertices = {name: np.empty((len(qpos), int(model.flex_vertnum[i]), 3)) for name, i in soft.items()}
     for i, row in enumerate(qpos):
         data.qpos[:] = row
         mujoco.mj_kinematics(model, data)
         positions[i], rotations[i] = data.xpos, data.xmat
-        for name, places in bent.items():
+        for name, places in soft_vertices.items():
             places[i] = vertices(model, data, soft[name])
     return Motion(
         times=np.arange(len(qpos)) / physics.fps,
         positions={name: positions[:, i + 1] for i, name in enumerate(names)},
         rotations={name: rotations[:, i + 1].reshape(-1, 3, 3) for i, name in enumerate(names)},
-        vertices=bent,
+        vertices=soft_vertices,
     )
 
 
 def swept_points(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
-    """Return corners of the bounding boxes of all moving geoms, and of the elements of soft bodies, over a trajectory,
-    eight by eight, shape (N, 3)."""
+    """Return corners of boxes of all that moves, over a trajectory, (N, 3), by eights."""
     import mujoco
 
     data = mujoco.MjData(model)

@@ -1,4 +1,4 @@
-"""Where the camera stands and where the occluder stands: both fitted, neither placed by hand."""
+"""Camera and occluder, both fitted, neither placed by hand."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ OCCLUDER_HALF_THICKNESS = 0.006
 
 @dataclass(frozen=True)
 class Camera:
-    """A resolved free camera. extent and centre fix MuJoCo's `stat`, hence clipping planes and the shadow map."""
+    """A resolved free camera. extent and centre fix MuJoCo's clipping and shadow map."""
 
     lookat: Vec3
     distance: float
@@ -36,28 +36,28 @@ class Camera:
         return Camera(**_tuples(record))
 
     def axes(self) -> np.ndarray:
-        """Return rows: right, up, forward unit vectors in the world, shape (3, 3)."""
+        """Return unit vectors right, up and forward in the world, rows of (3, 3)."""
         return _axes(self.azimuth_deg, self.elevation_deg)
 
     def position(self) -> np.ndarray:
-        """Return world position of the eye, shape (3,)."""
+        """Return the world position of the eye, shape (3,)."""
         return np.array(self.lookat) - self.distance * self.axes()[2]
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Return pixel coordinates (x right, y down) of world points at 480x360, shape (N, 2)."""
+        """Return pixel coordinates (x right, y down) at 480x360 of points, (N, 2)."""
         right, up, depth = self.axes() @ (np.atleast_2d(points) - self.position()).T
         focal = HEIGHT / 2 / np.tan(np.radians(self.fovy_deg) / 2)
         return np.stack([WIDTH / 2 + focal * right / depth, HEIGHT / 2 - focal * up / depth], axis=1)
 
     def metres_a_pixel(self, point: np.ndarray) -> float:
-        """Return how long a pixel of 480x360 is at the depth of a point (3,)."""
+        """Return the length of a pixel of 480x360 at the depth of a point (3,)."""
         depth = float(self.axes()[2] @ (point - self.position()))
         return depth * float(np.tan(np.radians(self.fovy_deg) / 2)) / (HEIGHT / 2)
 
 
 @dataclass(frozen=True)
 class Occluder:
-    """The occluder: an opaque upright box facing the camera. half: across, thickness, up (m)."""
+    """An opaque upright box facing the camera. half: across, thickness, up (m)."""
 
     centre: Vec3
     half: Vec3
@@ -77,8 +77,7 @@ class Occluder:
 
 @dataclass(frozen=True)
 class Closing:
-    """How a control ends: from this frame on an occluder stands before its outcome, in an occlusion scene that of its
-    void, where the void has it."""
+    """How a control ends: from this frame on an occluder stands before its outcome."""
 
     frame: int
     occluder: Occluder
@@ -99,7 +98,7 @@ def _axes(azimuth_deg: float, elevation_deg: float) -> np.ndarray:
 
 
 def fit_camera(view: View, points: np.ndarray) -> Camera:
-    """Return the nearest camera in the view's direction that has all points (N, 3) within FRAME_FILL of the frame.
+    """Return the nearest camera along the view with all points (N, 3) in FRAME_FILL.
 
     With the orientation given, each frame edge is a half-space for the eye: the two pairs of edges give the largest
     admissible forward position, and the eye is centred between the edges that have slack.
@@ -126,9 +125,7 @@ def fit_camera(view: View, points: np.ndarray) -> Camera:
 
 
 def fit_occluder(camera: Camera, cover: Box) -> Occluder:
-    """Return the smallest upright occluder on the floor, just in front of `cover`, that hides all of it from the
-    camera.
-    """
+    """Return the smallest upright occluder just in front of `cover` that hides it."""
     eye = camera.position()
     azimuth = np.radians(camera.azimuth_deg)
     ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
@@ -149,9 +146,7 @@ def fit_occluder(camera: Camera, cover: Box) -> Occluder:
 
 
 def fit_shot(view: View, points: np.ndarray, cover: Box | None) -> tuple[Camera, Occluder | None]:
-    """Return camera and occluder together: the occluder is placed by the camera, and the camera must have the occluder
-    in frame.
-    """
+    """Return a camera, and an occluder placed by it that it has in frame."""
     camera, occluder = fit_camera(view, points), None
     if cover is None:
         return camera, None
@@ -161,7 +156,7 @@ def fit_shot(view: View, points: np.ndarray, cover: Box | None) -> tuple[Camera,
     return camera, fit_occluder(camera, cover)
 
 
-def in_frame(camera: Camera, points: np.ndarray) -> bool:
+def is_in_frame(camera: Camera, points: np.ndarray) -> bool:
     """Return whether all points (N, 3) are inside the frame."""
     pixels = camera.project(points)
     return bool((pixels > 0).all() and (pixels < (WIDTH, HEIGHT)).all())

@@ -1,4 +1,4 @@
-"""Pixel evidence: what is seen of a geom, what is seen past an occluder, whether two worlds give one video."""
+"""Pixel evidence: of a geom, past an occluder, between two worlds."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ SAMPLED_FPS = 5  # models are shown this rate (docs/spec.md 3.1)
 
 
 def last_sampled(n_frames: int, fps: int, count: int = 3) -> list[int]:
-    """Return indices of the last frames that the 5 FPS sample shows of a clip."""
+    """Return indices of the last frames that a 5 FPS sample has."""
     return list(range(0, n_frames, fps // SAMPLED_FPS))[-count:]
 
 
 def least_visible(renderer: Renderer, qpos: np.ndarray, groups: Sequence[tuple[tuple[str, ...], float]]) -> list[float]:
-    """Return the least number of pixels that each group of geoms has in any of the given frames of the control."""
+    """Return the least pixels of each group of geoms in any of some control frames."""
     geoms = sorted({name for names, _ in groups for name in names})
     counts = renderer.visible_pixels(qpos, geoms)
     return [float(counts[:, [geoms.index(n) for n in names]].sum(axis=1).min()) for names, _ in groups]
@@ -28,34 +28,29 @@ def least_visible(renderer: Renderer, qpos: np.ndarray, groups: Sequence[tuple[t
 
 @dataclass(frozen=True)
 class PastOccluder:
-    """What is seen past the occluder in frames of a void: pixels (F,) of the decisive bodies, and of the hidden
-    element."""
+    """Pixels (F,) of decisive bodies and of the hidden element in a void's frames."""
 
     decisive: np.ndarray
     hidden: np.ndarray
 
     def hidden_from(self) -> int:
-        """Return first frame from which no decisive body has a pixel until the end; the number of frames if none is."""
+        """Return the first frame from which no decisive pixel is seen; F if none."""
         showing = np.flatnonzero(self.decisive)
         return int(showing[-1]) + 1 if showing.size else 0
 
     def leaked(self, first: int) -> float:
-        """Return pixels of decisive bodies from a frame on, and of the hidden element in any frame. 0: the occluder
-        hides.
-        """
+        """Return decisive pixels from a frame on, and all of the hidden element."""
         return float(self.decisive[first:].sum() + self.hidden.sum())
 
 
 def past_occluder(renderer: Renderer, qpos: np.ndarray, decisive: Sequence[str], hidden: Sequence[str]) -> PastOccluder:
-    """Return what is seen past the occluder of the geoms of decisive bodies and of the hidden element, by
-    segmentation."""
+    """Return what is seen past the occluder of some geoms, by segmentation."""
     counts = renderer.visible_pixels(qpos, [*decisive, *hidden], occluder=True)
     return PastOccluder(counts[:, : len(decisive)].sum(axis=1), counts[:, len(decisive) :].sum(axis=1))
 
 
 def seen_moving(pixels: np.ndarray, places: np.ndarray, *, least_px: float, step_px: float) -> int:
-    """Count the steps between frames in which a body is seen to move: it has at least so many pixels in both and goes
-    so far.
+    """Count the steps in which a body is visible in both frames and moves so far.
 
     pixels (F,), places (F, 2) in pixels.
     """
@@ -65,8 +60,10 @@ def seen_moving(pixels: np.ndarray, places: np.ndarray, *, least_px: float, step
 
 
 def swept_behind(camera: Camera, swept: Sequence[np.ndarray], occluder: Occluder) -> float:
-    """Return share of the picture's pixels over which anything moves that the occluder covers. swept: corners (8, 3) of
-    every moving geom's box in every frame."""
+    """Return the share of the pixels of motion that an occluder covers.
+
+    swept: corners (8, 3) of every moving geom's box in every frame.
+    """
     import cv2
 
     moving, board = (np.zeros((HEIGHT, WIDTH), np.uint8) for _ in range(2))
@@ -78,16 +75,16 @@ def swept_behind(camera: Camera, swept: Sequence[np.ndarray], occluder: Occluder
 
 
 def void_frames(renderer: Renderer, qpos: np.ndarray, without: Sequence[str] = ()) -> Iterator[np.ndarray]:
-    """Yield the void that a trajectory makes, without the geoms that are named."""
+    """Yield the void of a trajectory, without some geoms."""
     yield from renderer.frames(qpos, occluder=True, without=without)
 
 
 def closing_frames(
     renderer: Renderer, qpos: np.ndarray, board: Coming, *, occluder: bool = False
 ) -> Iterator[np.ndarray]:
-    """Draw what a trajectory (F, nq) makes of a control, or of a void, whose occluder stands from the start.
+    """Yield a trajectory (F, nq) with its closing board, and the void's if `occluder`.
 
-    board: of each row, where the board is that closes it; once it stands it is drawn in the place of the void's own.
+    board: of each row, where the board is; once it stands it is drawn in place of the void's own.
     """
     for row, offset in zip(qpos, board, strict=True):
         stands = offset == LANDED
@@ -97,17 +94,18 @@ def closing_frames(
 def ablation_pixels(
     renderer: Renderer, qpos: np.ndarray, geoms: Sequence[str], void: Iterable[np.ndarray] | None = None
 ) -> int:
-    """Return how many void pixels change, over the given frames, when the geoms are taken away. 0 proves that nothing
-    of them, shadow included, reaches the eye. void: the frames with them, if they are drawn already."""
-    with_them = void_frames(renderer, qpos) if void is None else void
-    return differing_pixels(with_them, void_frames(renderer, qpos, without=geoms))[0]
+    """Return how many void pixels change when geoms are taken away; 0: no trace shows.
+
+    void: the frames with them, if they are drawn already.
+    """
+    complete = void_frames(renderer, qpos) if void is None else void
+    return differing_pixels(complete, void_frames(renderer, qpos, without=geoms))[0]
 
 
-def differing_pixels(frames: Iterable[np.ndarray], others: Iterable[np.ndarray]) -> tuple[int, int]:
-    """Return, over all frames of two worlds, how many pixels differ, and the largest difference of a channel
-    (0-255)."""
+def differing_pixels(frames: Iterable[np.ndarray], counterparts: Iterable[np.ndarray]) -> tuple[int, int]:
+    """Return how many pixels of two videos differ, and the largest difference (0-255)."""
     pixels, largest = 0, 0
-    for a, b in zip(frames, others, strict=True):
+    for a, b in zip(frames, counterparts, strict=True):
         if not np.array_equal(a, b):
             difference = np.abs(a.astype(np.int16) - b)
             pixels += int(difference.any(axis=2).sum())

@@ -1,4 +1,4 @@
-"""How the board that closes a control comes: it falls from above the picture and stands where it lands.
+"""The board that closes a control: it falls into the picture and stands.
 
 A camera that looks down on the scene sees it slide in from the side instead. It comes just in front of where a void's
 own board stands, in control and void alike: neither that a board comes nor when tells the sides of an occlusion pair
@@ -25,7 +25,7 @@ Coming = list[Offset | None]  # of each frame: how far from its place (m) the bo
 
 
 def coming_board(closing: Closing | None, camera: Camera, n_frames: int, fps: float) -> Coming:
-    """Return where the board is in every frame of a control or void that it closes."""
+    """Return where the board is in every frame of a clip that it closes."""
     if closing is None:
         return [None] * n_frames
     way = _way(closing.occluder, camera)
@@ -42,13 +42,13 @@ def coming_board(closing: Closing | None, camera: Camera, n_frames: int, fps: fl
 
 
 def before_board(occluder: Occluder) -> np.ndarray:
-    """Return where a coming board is beside a standing one: just in front of it, towards the camera (m)."""
+    """Return the offset of a coming board to a standing one, towards the camera (m)."""
     azimuth = math.radians(occluder.yaw_deg + 90.0)
     return -(2 * occluder.half[1] + IN_FRONT_M) * np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
 
 
 def _way(occluder: Occluder, camera: Camera) -> np.ndarray:
-    """Return the unit vector from a board's place towards where it comes from: up, or to its side of the picture."""
+    """Return the unit vector to where a board comes from: up, or its side."""
     if camera.elevation_deg >= -STEEP_DEG:
         return np.array([0.0, 0.0, 1.0])
     right = camera.axes()[0]
@@ -56,7 +56,7 @@ def _way(occluder: Occluder, camera: Camera) -> np.ndarray:
 
 
 def _out_of_picture_m(occluder: Occluder, camera: Camera, way: np.ndarray) -> float:
-    """Return how far along its way a board is wholly out of the picture."""
+    """Return how far along its way a board is out of the picture."""
     corners = occluder.corners() + before_board(occluder)
     for distance in np.arange(0.0, FURTHEST_M, STEP_M):
         x, y = camera.project(corners + distance * way).T

@@ -1,4 +1,4 @@
-"""Frames of a trajectory: MuJoCo's classic renderer at twice the size, averaged 2x2 (sharper and faster than MSAA).
+"""Frames of a trajectory, drawn by MuJoCo at twice the size and averaged 2x2.
 
 One off-screen GL context lives as long as the process; each `Renderer` owns one `MjrContext` for its model.
 """
@@ -46,15 +46,14 @@ def _make_current(width: int, height: int) -> None:
 
 
 def gl_version() -> str:
-    """Return what draws here, in its own words, e.g. "4.5 (Compatibility Profile) Mesa 22.3.6": the scene drawn by
-    another version may differ in single pixels. Only while a Renderer is open."""
+    """Return OpenGL's version, on which single pixels depend; needs an open Renderer."""
     from OpenGL.GL import GL_VERSION
 
     return _gl_text(GL_VERSION)
 
 
-def drawn_by() -> str:
-    """Return OpenGL's version and renderer, e.g. "llvmpipe (LLVM 15.0.6, 256 bits)": both decide pixels.
+def renderer_version() -> str:
+    """Return OpenGL's version and renderer, which decide pixels.
 
     Raises RenderingUnavailable.
     """
@@ -72,10 +71,12 @@ def _gl_text(name: int) -> str:
 
 
 def _make_floors_finite(model: mujoco.MjModel, camera: Camera) -> None:
-    """Give each plane a size that reaches beyond what the camera sees. An infinite one is drawn as a grid of 200 x 200
-    cells in each pass, a third of a frame's time in some scenes; a finite one as 2 x 2. Collisions know no difference.
-    Its texture lies where that of the infinite one does: by its centre where the half size is an odd number of repeats
-    (`settexture` and `makePlane` of MuJoCo)."""
+    """Give each plane a finite size that reaches beyond what the camera sees.
+
+    An infinite one is drawn as a grid of 200 x 200 cells in each pass, a third of a frame's time in some scenes; a
+    finite one as 2 x 2. Collisions know no difference. Its texture lies where that of the infinite one does: by its
+    centre where the half size is an odd number of repeats (`settexture` and `makePlane` of MuJoCo).
+    """
     import mujoco
 
     reach = 1.05 * model.vis.map.zfar * camera.extent
@@ -88,9 +89,11 @@ def _make_floors_finite(model: mujoco.MjModel, camera: Camera) -> None:
 
 
 class Renderer:
-    """Draws one model from one camera. Use as a context manager; every frame is (360, 480, 3) uint8 RGB, or
-    (720, 960, 3) of a model whose look is as fine as that. supersample: by how much the drawing is larger; 1 takes a
-    quarter of the time, where edges need not be smooth."""
+    """Context manager that draws a model from a camera: uint8 RGB, (360, 480, 3).
+
+    Frames are (720, 960, 3) of a model whose look is as fine as that. supersample: by how much the drawing is larger; 1
+    takes a quarter of the time, where edges need not be smooth.
+    """
 
     def __init__(self, model: mujoco.MjModel, camera: Camera, *, supersample: int = SUPERSAMPLE) -> None:
         global _renderer_open
@@ -142,8 +145,10 @@ class Renderer:
         without: Sequence[str] = (),
         board: Offset | None = None,
     ) -> Iterator[np.ndarray]:
-        """Yield RGB frames of a trajectory (F, nq); `without` names geoms that are taken away (an ablation). board: how
-        far from its place (m) a board is that comes before the scene; None if none does."""
+        """Yield RGB frames of a trajectory (F, nq).
+
+        without: geoms that are taken away (an ablation). board: offset (m) of a board that comes.
+        """
         import cv2
 
         for row in qpos:
@@ -155,8 +160,7 @@ class Renderer:
     def visible_pixels(
         self, qpos: Sequence[np.ndarray] | np.ndarray, geoms: Sequence[str], *, occluder: bool = False
     ) -> np.ndarray:
-        """Return how many pixels (of the 480x360 frame, so quarters occur) each geom or soft body has in each frame,
-        shape (F, G)."""
+        """Return pixels of each geom or soft body at 480x360, quarters included, (F, G)."""
         import mujoco
 
         kinds = (int(mujoco.mjtObj.mjOBJ_GEOM), int(mujoco.mjtObj.mjOBJ_FLEX))
@@ -170,23 +174,25 @@ class Renderer:
                 rgba = self._draw(row, occluder=occluder, without=())
                 pixels = np.bincount((rgba.view("<u4") & 0xFFFFFF).ravel())  # a segment's id is its colour
                 shapes = self._scene.geoms[: self._scene.ngeom]
-                drawn = {g.segid + 1: (g.objtype, g.objid) for g in shapes if g.objtype in kinds}
-                counted = {thing: pixels[id_] for id_, thing in drawn.items() if id_ < len(pixels)}
-                counts[i] = [counted.get(thing, 0) / self._scale**2 for thing in things]
+                shape_of = {g.segid + 1: (g.objtype, g.objid) for g in shapes if g.objtype in kinds}
+                pixels_of = {thing: pixels[id_] for id_, thing in shape_of.items() if id_ < len(pixels)}
+                counts[i] = [pixels_of.get(thing, 0) / self._scale**2 for thing in things]
         finally:
             flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = False
         return counts
 
     def _put_board(self, offset: Offset | None) -> None:
-        """Put the board that comes so far from its place, where it is kept; None: there is none."""
+        """Move the coming board to an offset; None: there is none."""
         self._comes = offset is not None
         if self._boards.size:
             self._model.geom_pos[self._boards] = self._board_places + np.array(offset or (0.0, 0.0, 0.0))
 
     def _draw(self, qpos: np.ndarray, *, occluder: bool, without: Sequence[str]) -> np.ndarray:
-        """Return the picture of a pose, RGBA, bottom row first, until the next one is drawn. What is shown is not drawn
-        again while all of it stays where it is: things come to rest, in some families for half of a clip, or what moves
-        is taken away. (The model does not change while it is drawn, but for the board that comes.)"""
+        """Return the picture of a pose, RGBA, bottom row first, until the next draw.
+
+        What is shown is not drawn again while all of it stays in place: things come to rest, in some families for half
+        of a clip, or what moves is taken away. (Only the coming board changes the model.)
+        """
         import mujoco
 
         self._data.qpos[:] = qpos
@@ -203,13 +209,13 @@ class Renderer:
         groups, soft_groups = self._model.geom_group.copy(), self._model.flex_group.copy()
         self._model.geom_group[self._model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE] = FLOOR_GROUP
         for name in without:
-            of = self._model.flex_group if self._is_soft(name) else self._model.geom_group
-            of[self._number(name)] = REMOVED_GROUP
+            target = self._model.flex_group if self._is_soft(name) else self._model.geom_group
+            target[self._number(name)] = REMOVED_GROUP
         try:
             mujoco.mjv_updateScene(self._model, self._data, option, unmoved, self._camera, everything, self._scene)
             # The floor last: what stands before it is not painted over. The same picture, up to a fifth sooner.
-            for of in (option.geomgroup, option.flexgroup, option.sitegroup, option.tendongroup, option.skingroup):
-                of[:] = 0
+            for target in (option.geomgroup, option.flexgroup, option.sitegroup, option.tendongroup, option.skingroup):
+                target[:] = 0
             option.geomgroup[FLOOR_GROUP] = 1
             mujoco.mjv_addGeoms(self._model, self._data, option, unmoved, everything, self._scene)
             self._add_haze()
@@ -222,8 +228,10 @@ class Renderer:
         return self._pixels
 
     def _add_haze(self) -> None:
-        """Let the far end of the floor fade: MuJoCo draws that haze where it finds an infinite plane, for which it
-        takes this one, which has no area."""
+        """Let the far end of the floor fade, by a plane without area.
+
+        MuJoCo draws that haze where it finds an infinite plane.
+        """
         import mujoco
 
         for plane in np.flatnonzero(self._model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)[:1]:
@@ -236,33 +244,33 @@ class Renderer:
         return name in self._soft
 
     def _number(self, name: str) -> int:
-        """Return of a geom, or of a soft body."""
+        """Return the id of a geom or a soft body."""
         return self._soft[name] if self._is_soft(name) else self._model.geom(name).id
 
     def _places(self, occluder: bool, without: Sequence[str]) -> tuple[bytes, ...]:
-        """Return where everything is that is shown, to the last bit, and the lights. In a model with other things than
-        geoms the whole pose stands for them."""
+        """Return poses of all that is shown, and the lights, to the last bit.
+
+        In a model with other things than geoms the whole pose stands for them.
+        """
         model, data = self._model, self._data
-        gone = [self._number(name) for name in without if not self._is_soft(name)]
+        removed = [self._number(name) for name in without if not self._is_soft(name)]
         groups = model.geom_group
-        drawn = (groups != REMOVED_GROUP) & ((groups != OCCLUDER_GROUP) | occluder)
-        drawn &= (groups != COMING_GROUP) | self._comes
-        drawn[gone] = False
-        places = (data.geom_xpos[drawn], data.geom_xmat[drawn], data.light_xpos, data.light_xdir)
-        more = data.qpos if model.nflex or model.nsite or model.ntendon or model.nskin else np.empty(0)
-        return (*(values.tobytes() for values in places), more.tobytes())
+        shown = (groups != REMOVED_GROUP) & ((groups != OCCLUDER_GROUP) | occluder)
+        shown &= (groups != COMING_GROUP) | self._comes
+        shown[removed] = False
+        places = (data.geom_xpos[shown], data.geom_xmat[shown], data.light_xpos, data.light_xdir)
+        pose = data.qpos if model.nflex or model.nsite or model.ntendon or model.nskin else np.empty(0)
+        return (*(values.tobytes() for values in places), pose.tobytes())
 
     def _place(self) -> None:
-        """Compute where everything is at the present qpos: all that drawing needs of mj_forward (no contacts, no
-        dynamics)."""
+        """Compute all poses that drawing needs at the present qpos, without dynamics."""
         import mujoco
 
         for step in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight, mujoco.mj_flex, mujoco.mj_tendon):
             step(self._model, self._data)
 
     def _read(self) -> None:
-        """Fetch the off-screen buffer. Read directly: 30 times faster than mjr_readPixels, and cheaper to turn and to
-        strip of alpha once it is small."""
+        """Fetch the off-screen buffer, 30 times faster than mjr_readPixels."""
         from OpenGL import GL
 
         GL.glReadBuffer(GL.GL_COLOR_ATTACHMENT0)

@@ -1,4 +1,4 @@
-"""Draw a frame and encode a clip, to see whether this machine can."""
+"""Trial of this machine: draw a frame and encode a clip."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _OPENGL = re.compile(r"MUJOCO_|PYOPENGL_|MESA_|GALLIUM_|LIBGL_|LP_NATIVE|EGL_|__
 
 
 def draw_frame() -> str:
-    """Draw a red ball; return what drew it. Raises TrapsError, which names the variables that choose OpenGL."""
+    """Draw a red ball; return what drew it. Raises TrapsError with the remedy."""
     import numpy as np
 
     try:
@@ -38,17 +38,17 @@ def draw_frame() -> str:
 
 
 def opengl_variables() -> dict[str, str]:
-    """Return the environment's variables that choose what draws, and how: of MuJoCo, PyOpenGL, Mesa and the loader."""
-    chosen = {name: value for name, value in sorted(os.environ.items()) if _OPENGL.match(name)}
+    """Return the environment's variables that choose what draws, and how."""
+    variables = {name: value for name, value in sorted(os.environ.items()) if _OPENGL.match(name)}
     # OpenCV adds a folder of its own to the loader's when it is imported: nobody chose that.
-    folders = [folder for folder in chosen.pop("LD_LIBRARY_PATH", "").split(":") if folder and "/cv2/" not in folder]
-    return chosen | ({"LD_LIBRARY_PATH": ":".join(folders)} if folders else {})
+    folders = [folder for folder in variables.pop("LD_LIBRARY_PATH", "").split(":") if folder and "/cv2/" not in folder]
+    return variables | ({"LD_LIBRARY_PATH": ":".join(folders)} if folders else {})
 
 
 def _unusable(reason: str) -> str:
-    chosen = ", ".join(f"{name}={value[:60]}" for name, value in opengl_variables().items())
+    variables = ", ".join(f"{name}={value[:60]}" for name, value in opengl_variables().items())
     return (
-        f"this machine cannot render clips with {chosen} ({' '.join(reason.split())[:300]}): unset these variables "
+        f"this machine cannot render clips with {variables} ({' '.join(reason.split())[:300]}): unset these variables "
         "and, on Debian, apt-get install libosmesa6"
     )
 
@@ -72,7 +72,7 @@ def encode_clip() -> str:
 
 
 def check_rendering() -> None:
-    """Draw and encode in a process of its own, as a run does: a driver that fails may end it. Raises TrapsError."""
+    """Draw and encode in a process of its own. Raises TrapsError."""
     try:
         ((_, problem),) = run_in_order(_problem, [None], workers=1)
     except BrokenProcessPool:

@@ -1,4 +1,4 @@
-"""Solid things that are not drawn, and by which drawn edges a viewer knows of them.
+"""Walls that are not drawn, and the drawn edges by which a viewer knows of them.
 
 A thing that turns round where nothing is to be seen breaks the physics that a viewer can reckon with. So a wall that
 is not drawn (a pane that would tint what is behind it) must have edges that are. A pane before the scene that lies
@@ -22,22 +22,22 @@ TOUCHES_M = 0.01  # an edge is no further from its wall
 
 
 def outlines(model: mujoco.MjModel, camera: Camera, qpos: np.ndarray) -> Mapping[str, tuple[str, ...]]:
-    """Return each solid geom that is not drawn and does not lie parallel to the picture, by name, with the names of
-    what shows it: things that do not move, are drawn, touch it, and stop nothing themselves.
+    """Return undrawn solid geoms by name, with the drawn, contactless edges at each.
 
-    qpos: a pose, (nq,); what is returned is at rest in all poses."""
+    Panes that face the eye are left out. qpos: any pose, (nq,).
+    """
     import mujoco
 
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_kinematics(model, data)
     solid = (model.geom_contype | model.geom_conaffinity) != 0
-    still = model.body_weldid[model.geom_bodyid] == 0
-    drawn = model.geom_rgba[:, 3] > 0
-    edges = np.flatnonzero(still & drawn & ~solid)
+    static = model.body_weldid[model.geom_bodyid] == 0
+    visible = model.geom_rgba[:, 3] > 0
+    edges = np.flatnonzero(static & visible & ~solid)
     names: dict[str, tuple[str, ...]] = {}
-    for wall in np.flatnonzero(solid & ~drawn):
-        if _faces_the_eye(model, data, camera, int(wall)):
+    for wall in np.flatnonzero(solid & ~visible):
+        if _is_facing_eye(model, data, camera, int(wall)):
             continue
         near = [
             int(edge)
@@ -48,8 +48,8 @@ def outlines(model: mujoco.MjModel, camera: Camera, qpos: np.ndarray) -> Mapping
     return names
 
 
-def _faces_the_eye(model: mujoco.MjModel, data: mujoco.MjData, camera: Camera, geom: int) -> bool:
-    """Return whether a geom is a pane, parallel to the picture, that is nearer to the eye than the scene's middle."""
+def _is_facing_eye(model: mujoco.MjModel, data: mujoco.MjData, camera: Camera, geom: int) -> bool:
+    """Return whether a geom is a pane before the scene, parallel to the picture."""
     normal = data.geom_xmat[geom].reshape(3, 3)[:, int(np.argmin(model.geom_size[geom]))]
     forward = camera.axes()[2]
     is_parallel = abs(normal @ forward) > np.cos(np.radians(FACES_THE_EYE_DEG))

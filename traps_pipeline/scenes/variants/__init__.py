@@ -1,1 +1,1 @@
-"""Further clips and questions of a scenario: arms and variations."""
+"""Variants of a scenario, its further clips and questions: arms and variations."""

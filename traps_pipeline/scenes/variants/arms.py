@@ -1,4 +1,4 @@
-"""Arms: further clips and questions of a scenario, each of which takes one shortcut away (docs/arms.md).
+"""Arms: further clips and questions that take one shortcut away (docs/arms.md).
 
 A shortcut tells control from void without looking at what happens: an occluder in the first frame, a short clip, the
 words of a question. In an arm the shortcut points the wrong way, and a certificate says that it may: what must be
@@ -48,7 +48,7 @@ BEHIND_M = 0.05  # a decoy stands so far behind all that is shown
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """A record with its two worlds, and the frames that several arms need."""
+    """A record with its two worlds, and frames that several arms need."""
 
     spec: SceneSpec
     control: World
@@ -56,7 +56,7 @@ class Scenario:
 
     @staticmethod
     def of_record(spec: SceneSpec, qpos: np.ndarray, twin: np.ndarray) -> Scenario:
-        """Return the scenario of a record and its trajectories, each (F, nq)."""
+        """Return the scenario of a record and its trajectories, (F, nq) each."""
         return Scenario(spec, World.of_record(spec, qpos), World.of_record(spec, twin, twin=True))
 
     @property
@@ -66,13 +66,13 @@ class Scenario:
 
     @cached_property
     def control_frames(self) -> list[np.ndarray]:
-        """The control as it is drawn without the occluder that may close it."""
+        """The control without the occluder that may close it."""
         with self.control.renderer() as renderer:
             return list(renderer.frames(self.control.qpos))
 
     @cached_property
     def twin_frames(self) -> list[np.ndarray]:
-        """The other world, as it is drawn when nothing hides it."""
+        """The other world without any occluder."""
         with self.twin.renderer() as renderer:
             return list(renderer.frames(self.twin.qpos))
 
@@ -99,10 +99,9 @@ class Take:
 
 @dataclass(frozen=True)
 class Question:
-    """What an arm asks. side: `control` if it must be answered, `void` if it must be abstained on.
+    """A question of an arm: `control` must be answered, `void` abstained on.
 
-    clip: that of the pair (`control`, `void` or `twin`) which is shown; None where it is the arm's own. labels: the
-    answers to choose from; None where they are the record's.
+    clip: the pair's clip that is shown, None for the arm's own. labels: choices, None for the record's.
     """
 
     side: str
@@ -114,7 +113,7 @@ class Question:
 
 @dataclass(frozen=True)
 class Arm:
-    """One arm; `protocol.datasets.arms_of` says which scenarios may have it, `protocol.datasets.sides_of` what it asks.
+    """An arm of some scenarios; `protocol.datasets` says of which, and what it asks.
 
     takes_away: the shortcut that it turns against its user. promises: its certificate in words.
 
@@ -129,7 +128,7 @@ class Arm:
 
 
 def must_answer(spec: SceneSpec) -> list[Question]:
-    """Return the record's question of the arm's own clip, to be answered."""
+    """Return the record's question for the arm's clip, to be answered."""
     return [Question("control", spec.question, spec.ground_truth)]
 
 
@@ -137,7 +136,7 @@ def must_answer(spec: SceneSpec) -> list[Question]:
 
 
 def _decoys(scenario: Scenario, points: np.ndarray) -> Iterator[Occluder]:
-    """Yield places for the void's own occluder where it may hide nothing: behind everything, then beside it."""
+    """Yield places of the void's occluder behind everything, then beside it."""
     occluder, control = scenario.control.occluder, scenario.control
     assert occluder is not None, "an occlusion scenario has an occluder"
     azimuth = np.radians(control.camera.azimuth_deg)
@@ -171,7 +170,7 @@ def _decoy(scenario: Scenario) -> Take:
         sampled = control.qpos[scenario.sampled]
         with Renderer(model, camera) as renderer:
             shown = float(renderer.visible_pixels(sampled[:1], ["occluder"], occluder=True)[0, 0])
-            without, beside = (renderer.visible_pixels(sampled, geoms, occluder=there) for there in (False, True))
+            without, beside = (renderer.visible_pixels(sampled, geoms, occluder=drawn) for drawn in (False, True))
             hidden = float(np.abs(without - beside).sum())
             least = checks.least_visible(renderer, sampled[-3:], groups)
             small = [f"{px:.0f} of {want:.0f} pixels" for px, (_, want) in zip(least, groups, strict=True) if px < want]
@@ -199,7 +198,7 @@ def _removed(scenario: Scenario) -> Take:
 
 
 def _late_occluder(scenario: Scenario) -> Take:
-    """Return a control whose occluder comes just before the outcome is settled."""
+    """Return a control whose occluder comes just before the outcome settles."""
     at = scenario.control.outcome.commit_frame - 1
     if at < EARLIEST_COVER_S * scenario.fps:
         raise Rejected(f"the outcome is settled at {(at + 1) / scenario.fps:.1f} s: nothing can be seen before it")
@@ -218,21 +217,21 @@ def _late_occluder(scenario: Scenario) -> Take:
 
 
 def _length_matched(scenario: Scenario) -> Take:
-    """Return the control's last open frames, as many as the void has; the observer answers from them."""
+    """Return as many of the control's last open frames as the void has."""
     spec, family, end = scenario.spec, scenario.control.family, scenario.control.open_frames
     begin, order = end - spec.void["cut_frame"], scenario.control.outcome.in_order
     if order is not None and order[0] < begin:
         raise Rejected("the first of the two events that are asked about happens before these frames")
     frames = scenario.control_frames[begin:end]
     assert family.observe is not None, f"{family.name}: has no observer"
-    seen = family.observe(np.stack(frames[scenario.sampled]), spec.question)
-    if seen != spec.ground_truth:
-        raise Rejected(f"the observer sees {seen!r} in the last {len(frames)} frames, the answer is not")
-    return Take(frames, {"frames": len(frames), "observed": seen})
+    answer = family.observe(np.stack(frames[scenario.sampled]), spec.question)
+    if answer != spec.ground_truth:
+        raise Rejected(f"the observer sees {answer!r} in the last {len(frames)} frames, the answer is not")
+    return Take(frames, {"frames": len(frames), "observed": answer})
 
 
 def _predictable_cut(scenario: Scenario) -> Take:
-    """Return a cut before the outcome is settled at which nearly all futures agree."""
+    """Return a cut before the outcome settles at which nearly all futures agree."""
     control, commit = scenario.control, scenario.control.outcome.commit_frame
     if not control.same_physics:
         raise Rejected("simulating here does not give the frozen trajectory, so that its futures are not known")
@@ -249,10 +248,10 @@ def _agreeing(scenario: Scenario, frame: int) -> int | None:
     import mujoco
 
     control, spec = scenario.control, scenario.spec
-    built = control.family.build(control.params, control.physics)
-    model, substeps = built.spec.compile(), control.physics.substeps
+    scene = control.family.build(control.params, control.physics)
+    model, substeps = scene.spec.compile(), control.physics.substeps
     data = mujoco.MjData(model)
-    data.qvel[:] = initial_velocity(model, built.velocity)
+    data.qvel[:] = initial_velocity(model, scene.velocity)
     mujoco.mj_step(model, data, frame * substeps)
     kind = mujoco.mjtState.mjSTATE_INTEGRATION
     state = np.empty(mujoco.mj_stateSize(model, kind))
@@ -287,7 +286,7 @@ def _twin(scenario: Scenario) -> Take:
 
 
 def crossed(partner: SceneSpec | None) -> Arm:
-    """Return the arm that asks the void what it answers, and the control the question of the scenario's partner."""
+    """Return the arm that asks the void its aside, the control a partner's question."""
 
     def ask(spec: SceneSpec) -> list[Question]:
         if partner is None:
@@ -316,7 +315,7 @@ def crossed(partner: SceneSpec | None) -> Arm:
 
 
 def _presumed(spec: SceneSpec) -> str:
-    """Return the question without its choices, which it offers and does not presume: one of them may be right."""
+    """Return the question without its choices, which it does not presume."""
     text = re.sub(r"\([^)]*\)", "", spec.question.lower())
     matches = [re.search(rf"\b{re.escape(label.lower())}\b", text) for label in spec.labels]
     spans = [match.span() for match in matches if match]
@@ -330,17 +329,17 @@ def partners(specs: Iterable[SceneSpec]) -> dict[str, str]:
     Scenarios with the fewest candidates choose first, which leaves few without a partner.
     """
     by_id = {spec.scenario_id: spec for spec in sorted(specs, key=lambda spec: spec.scenario_id)}
-    seen = {id_: World.of_record(spec, np.empty((0, 0))).inventory for id_, spec in by_id.items()}
+    inventories = {id_: World.of_record(spec, np.empty((0, 0))).inventory for id_, spec in by_id.items()}
     presumed = {id_: _presumed(spec) for id_, spec in by_id.items()}
-    refuted = {(a, b) for a in by_id for b in by_id if false_premise(presumed[b], seen[a]) is not None}
+    refuted = {(a, b) for a in by_id for b in by_id if false_premise(presumed[b], inventories[a]) is not None}
     free = {a: {b for b in by_id if (a, b) in refuted and (b, a) in refuted} for a in by_id}
-    chosen: dict[str, str] = {}
+    partner_of: dict[str, str] = {}
     while candidates := [a for a in free if free[a]]:
-        a = min(candidates, key=lambda one: len(free[one]))
-        b = min(sorted(free[a]), key=lambda one: len(free[one]))
-        chosen |= {a: b, b: a}
-        free = {one: others - {a, b} for one, others in free.items() if one not in (a, b)}
-    return chosen
+        a = min(candidates, key=lambda name: len(free[name]))
+        b = min(sorted(free[a]), key=lambda name: len(free[name]))
+        partner_of |= {a: b, b: a}
+        free = {name: candidates_left - {a, b} for name, candidates_left in free.items() if name not in (a, b)}
+    return partner_of
 
 
 # --- all of them ------------------------------------------------------------------------------------------------------

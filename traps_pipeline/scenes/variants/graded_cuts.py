@@ -1,5 +1,4 @@
-"""Graded cuts: a control that ends where its futures leave one answer as likely as is wanted (docs/arms.md, "Graded
-cuts").
+"""Graded cuts of controls, where one answer is as likely as wanted.
 
 The void of a pair is cut where nobody can know, an arm where everybody should. Here the cuts of a family spread over
 all that is between, and the certificate is the distribution over answers itself.
@@ -21,29 +20,28 @@ from traps_pipeline.scenes.worlds.spec import SceneSpec
 from traps_pipeline.scenes.worlds.world import World
 
 LEAST = 0.4  # the probability of the commonest answer that is wanted is spread evenly from here to 1
-SOUGHT = 16  # futures by which a cut is sought
+SEARCH_FUTURES = 16  # futures by which a cut is sought
 FUTURES = 72  # others, from which probabilities are measured at the cut: none is chosen by its own noise
 BEYOND_S = 2.0  # after the clip, in which what is undecided at its end may settle
 DECIDED = 0.9  # the share of these that must end in an answer
 _GOLDEN = (5**0.5 - 1) / 2  # multiples of it, modulo 1, fill [0, 1) evenly however many there are
 
 
-def wanted(spec: SceneSpec) -> float:
-    """Return the probability of the commonest answer at which a scenario is to be cut."""
+def target_probability(spec: SceneSpec) -> float:
+    """Return the commonest answer's probability at which a scenario is to be cut."""
     number = int(spec.scenario_id.rpartition("-")[2])
     start = int(digest(spec.family)[:13], 16) / 16**13  # or the first scenarios of all families would want the same
     return LEAST + (1 - LEAST) * ((start + number * _GOLDEN) % 1)
 
 
 def probabilities(counts: Counter[str | None]) -> dict[str, float]:
-    """Return the share of each answer among the futures that end in one, the commonest first."""
+    """Return the share of each answer among decided futures, the commonest first."""
     answers = {label: n for label, n in counts.most_common() if label is not None}
     return {label: n / sum(answers.values()) for label, n in answers.items()}
 
 
 def graded_cut(spec: SceneSpec, control: World) -> tuple[int, dict[str, Any]]:
-    """Return the cut at which the commonest answer is most nearly as probable as is wanted, and its evidence. Raises
-    Rejected.
+    """Return the cut nearest to the target probability. Raises Rejected.
 
     A cut ends with a frame that 5 frames a second show, not after the outcome is settled. The later it is, the more
     futures agree, so it is sought by halving.
@@ -59,15 +57,15 @@ def graded_cut(spec: SceneSpec, control: World) -> tuple[int, dict[str, Any]]:
         raise Rejected(f"the outcome is settled at {commit / fps:.1f} s, before the earliest cut")
     while cuts:
         middle = cuts[len(cuts) // 2]
-        shares[middle] = max(probabilities(futures.after(middle, SOUGHT, beyond=beyond)).values(), default=0.0)
-        is_early = shares[middle] < wanted(spec)
+        shares[middle] = max(probabilities(futures.after(middle, SEARCH_FUTURES, beyond=beyond)).values(), default=0.0)
+        is_early = shares[middle] < target_probability(spec)
         cuts = [frame for frame in cuts if (frame > middle if is_early else frame < middle)]
-    frame = min(shares, key=lambda one: (abs(shares[one] - wanted(spec)), one))
+    frame = min(shares, key=lambda cut: (abs(shares[cut] - target_probability(spec)), cut))
     counts = futures.after(frame, FUTURES, beyond=beyond)
     decided = FUTURES - counts[None]
     if decided < DECIDED * FUTURES:
         raise Rejected(f"{decided} of {FUTURES} futures end in an answer, {DECIDED:.0%} are wanted")
-    evidence = {"cut_s": frame / fps, "settled_s": commit / fps, "wanted": wanted(spec), "futures": FUTURES}
+    evidence = {"cut_s": frame / fps, "settled_s": commit / fps, "wanted": target_probability(spec), "futures": FUTURES}
     return frame, evidence | {"decided": decided, "posterior": probabilities(counts)}
 
 

@@ -1,4 +1,4 @@
-"""Variations: the pairs with one thing changed, step by step, for what the paper supposes and did not measure.
+"""Variations of how a scenario is asked and shown, one thing changed in each.
 
 docs/hypotheses.md says what each is for. What varies the question or the way it is put shows the pair's own clips; what
 varies the occluder is drawn and certified here. An occluder that lets the outcome through makes no void, and is not
@@ -17,7 +17,7 @@ from traps_pipeline.base.digests import digest
 from traps_pipeline.protocol.datasets import FRAMINGS, OCCLUDER_DOSES, OCCLUDER_LOOKS, SCHEMAS
 from traps_pipeline.scenes.certification.certificates import legible_groups
 from traps_pipeline.scenes.family_registry import get_family
-from traps_pipeline.scenes.parts.wording import asked, choices_in
+from traps_pipeline.scenes.parts.wording import choices_in, match_slots
 from traps_pipeline.scenes.physics.kit import listed
 from traps_pipeline.scenes.picture import checks
 from traps_pipeline.scenes.picture.render import Renderer
@@ -39,7 +39,7 @@ PALETTE = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")  # colo
 
 
 def with_labels(spec: SceneSpec, count: int) -> tuple[str, tuple[str, ...]]:
-    """Return the scenario's question with so many choices, and these.
+    """Return the scenario's question with `count` choices, and these. Raises Rejected.
 
     The answer and that of the twin, the other world behind the same void, are always among them, so that the void stays
     open; then come the question's own choices, and then colours that it does not name. Raises Rejected where the
@@ -47,26 +47,26 @@ def with_labels(spec: SceneSpec, count: int) -> tuple[str, tuple[str, ...]]:
     """
     if spec.answer_type != "colour":
         raise Rejected(f"the answers {listed(spec.labels)} are no colours, so that no others can be offered")
-    named = asked(get_family(spec.family).questions, spec.question)
-    if named is None or set(choices_in(named.get("choices", ""))) != set(spec.labels):
+    slots = match_slots(get_family(spec.family).questions, spec.question)
+    if slots is None or set(choices_in(slots.get("choices", ""))) != set(spec.labels):
         raise Rejected(f"the choices of {spec.question!r} are part of its sentence")
-    others = [colour for colour in PALETTE if colour not in named.values()]
-    pool = [spec.ground_truth, spec.twin.ground_truth, *_mixed(spec, spec.labels), *_mixed(spec, others)]
+    more_colours = [colour for colour in PALETTE if colour not in slots.values()]
+    pool = [spec.ground_truth, spec.twin.ground_truth, *_mixed(spec, spec.labels), *_mixed(spec, more_colours)]
     labels = _mixed(spec, [*dict.fromkeys(pool)][:count])
     if len(labels) < count:
         raise Rejected(f"there are {len(labels)} answers to choose from, {count} are wanted")
-    return spec.question.replace(named["choices"], listed(labels)), tuple(labels)
+    return spec.question.replace(slots["choices"], listed(labels)), tuple(labels)
 
 
 def _mixed(spec: SceneSpec, labels: Sequence[str]) -> list[str]:
-    """Return the labels in an order that the scenario and nothing else decides."""
+    """Return the labels in an order that the scenario alone decides."""
     return sorted(labels, key=lambda label: digest([spec.scenario_id, label]))
 
 
 def _labels(count: int) -> Callable[[SceneSpec], list[Question]]:
     def ask(spec: SceneSpec) -> list[Question]:
-        for wanted in (2, 3, 6):  # asked with all numbers of choices or with none, so that doses compare
-            with_labels(spec, wanted)
+        for choices in (2, 3, 6):  # asked with all numbers of choices or with none, so that doses compare
+            with_labels(spec, choices)
         question, labels = with_labels(spec, count)
         return _both(question, spec.ground_truth, labels)
 
@@ -74,7 +74,7 @@ def _labels(count: int) -> Callable[[SceneSpec], list[Question]]:
 
 
 def _both(question: str, answer: str, labels: tuple[str, ...] | None = None) -> list[Question]:
-    """Return a question of both clips of the pair."""
+    """Return a question for both clips of the pair."""
     return [
         Question("control", question, answer, "control", labels),
         Question("void", question, None, "void", labels),
@@ -94,7 +94,7 @@ def _nothing(scenario: Scenario) -> Take:
 
 
 def _offered(scenario: Scenario) -> Take:
-    """Return two worlds behind one void have different answers, and both are offered."""
+    """Record that both worlds' answers are offered."""
     return Take([], {"offered": [scenario.spec.ground_truth, scenario.spec.twin.ground_truth]})
 
 
@@ -103,8 +103,7 @@ def _offered(scenario: Scenario) -> Take:
 
 @dataclass(frozen=True)
 class Look:
-    """How an occluder looks. colour: RGB in [0, 1], None for the occluder's own; alpha: 1 is opaque; wide: in terms of
-    its own width."""
+    """Look of an occluder. colour: RGB or None, alpha: 1 is opaque, wide: factor."""
 
     colour: tuple[float, float, float] | None = None
     alpha: float = 1.0
@@ -112,7 +111,7 @@ class Look:
 
 
 def _renderer(world: World, look: Look) -> Renderer:
-    """Return a renderer of a world whose occluder has another look, from the pair's camera."""
+    """Return a renderer of a world, from the pair's camera, with another occluder."""
     assert world.occluder is not None, "an occlusion scenario has an occluder"
     across, thickness, up = world.occluder.half
     occluder = replace(world.occluder, half=(round(across * look.wide, 6), thickness, up))
@@ -125,13 +124,12 @@ def _renderer(world: World, look: Look) -> Renderer:
 
 
 def _void_with(scenario: Scenario, look: Look) -> Take:
-    """Return the void with another occluder, if the other world gives the same frames byte for byte. Raises
-    Rejected."""
+    """Return the void with another occluder, alike in both worlds. Raises Rejected."""
     control, twin = scenario.control, scenario.twin
     moving = moving_geoms(control.model)
     with _renderer(control, look) as renderer:
         frames = list(checks.void_frames(renderer, control.qpos))
-        shown = float(renderer.visible_pixels(control.qpos[:1], ["occluder"], occluder=True)[0, 0])
+        shown_px = float(renderer.visible_pixels(control.qpos[:1], ["occluder"], occluder=True)[0, 0])
         cause = float(renderer.visible_pixels(control.qpos[scenario.sampled], moving, occluder=True).sum(axis=1).max())
     with _renderer(twin, look) as renderer:
         differing, levels = checks.differing_pixels(frames, checks.void_frames(renderer, twin.qpos))
@@ -141,15 +139,13 @@ def _void_with(scenario: Scenario, look: Look) -> Take:
         raise Rejected(
             f"past this occluder at most {cause:.0f} pixels of what moves are seen, {SEEN_PX:.0f} are wanted"
         )
-    evidence = {"panel_px": shown, "cause_px": cause, "twin_px": differing}
+    evidence = {"panel_px": shown_px, "cause_px": cause, "twin_px": differing}
     looks = {"wide": look.wide, "contrast": _contrast(frames[0], scenario.control_frames[0])}
     return Take(frames, evidence | looks)
 
 
 def _contrast(void: np.ndarray, control: np.ndarray) -> float:
-    """Return how far, in CIELAB, an occluder is from what it covers: the mean over the pixels of a frame that it
-    changes.
-    """
+    """Return the mean CIELAB distance of an occluder from what it covers."""
     import cv2
 
     lab = [cv2.cvtColor((frame / 255).astype(np.float32), cv2.COLOR_RGB2LAB) for frame in (void, control)]
@@ -167,15 +163,14 @@ def _large(scenario: Scenario) -> Take:
 
 def _sheer(alpha: float) -> Callable[[Scenario], Take]:
     def film(scenario: Scenario) -> Take:
-        """Return an occluder that lets light through, where it lets the outcome through: what tells the two worlds
-        apart is seen in the last sampled frames. Raises Rejected where it is not."""
+        """Return a clip whose sheer occluder shows the outcome. Raises Rejected."""
         look, last = Look(alpha=alpha), checks.last_sampled(len(scenario.control.qpos), scenario.fps)
         with _renderer(scenario.control, look) as renderer:
             frames = list(checks.void_frames(renderer, scenario.control.qpos))
         with _renderer(scenario.twin, look) as renderer:
-            others = list(checks.void_frames(renderer, scenario.twin.qpos))
-        far = [np.abs(frames[k].astype(np.int16) - others[k]).max(axis=2) for k in last]
-        noticed, levels = max(int((one >= NOTICED).sum()) for one in far), max(int(one.max()) for one in far)
+            twin_frames = list(checks.void_frames(renderer, scenario.twin.qpos))
+        gaps = [np.abs(frames[k].astype(np.int16) - twin_frames[k]).max(axis=2) for k in last]
+        noticed, levels = max(int((gap >= NOTICED).sum()) for gap in gaps), max(int(gap.max()) for gap in gaps)
         evidence = {"alpha": alpha, "seen_through_px": noticed, "levels": levels}
         if noticed < SEEN_PX:
             raise Rejected(
@@ -191,20 +186,19 @@ def _sheer(alpha: float) -> Callable[[Scenario], Take]:
 
 
 def _later(scenario: Scenario) -> Take:
-    """Return the frames after those that models are shown at the end show the outcome too, but for those that an
-    occluder closes; a void hides it in every frame."""
+    """Return no clip, if the frames after those shown at the end show the outcome too."""
     control = scenario.control
     at_end = shown_at_end(len(control.qpos), scenario.fps, END_S, control.open_frames - 1)
-    shown = [frame + 1 for frame in at_end]
-    if shown[0] < control.outcome.commit_frame:
-        raise Rejected(f"the outcome is settled at frame {control.outcome.commit_frame}, frame {shown[0]} is shown")
+    late = [frame + 1 for frame in at_end]
+    if late[0] < control.outcome.commit_frame:
+        raise Rejected(f"the outcome is settled at frame {control.outcome.commit_frame}, frame {late[0]} is shown")
     groups = legible_groups(control.family, control.model, control.scene, control.motion, control.params)
     with control.renderer() as renderer:
-        least = checks.least_visible(renderer, control.qpos[shown], groups)
+        least = checks.least_visible(renderer, control.qpos[late], groups)
     small = [f"{px:.0f} of {want:.0f} pixels" for px, (_, want) in zip(least, groups, strict=True) if px < want]
     if small:
         raise Rejected(f"the frames that are shown later show {', '.join(small)} of the outcome")
-    return Take([], {"late_frames": shown, "least_visible_px": min(least)})
+    return Take([], {"late_frames": late, "least_visible_px": min(least)})
 
 
 # --- all of them ------------------------------------------------------------------------------------------------------
@@ -263,6 +257,6 @@ VARIATIONS: Mapping[str, Arm] = {
 
 def table() -> str:
     """Return the variations as the Markdown table of `docs/hypotheses.md`."""
-    groups = itertools.groupby(VARIATIONS.values(), key=lambda one: one.promises)
-    rows = [("; ".join(f"`{one.name}`: {one.takes_away}" for one in same), promises) for promises, same in groups]
+    groups = itertools.groupby(VARIATIONS.values(), key=lambda arm: arm.promises)
+    rows = [("; ".join(f"`{arm.name}`: {arm.takes_away}" for arm in arms), promises) for promises, arms in groups]
     return "\n".join(["| variation: change | certificate |", "| --- | --- |", *(f"| {a} | {b} |" for a, b in rows)])

@@ -1,1 +1,1 @@
-"""A scenario as data and as a simulated world: outcome, length of the clip, and its two clips."""
+"""Scenarios as data and as simulated worlds: outcome, length, and clips."""

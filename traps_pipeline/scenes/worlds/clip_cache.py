@@ -1,7 +1,7 @@
-"""Clips that this machine has rendered, by content: another study with the same scene copies them.
+"""Cache of rendered clips by content, shared by this machine's studies.
 
 An entry is a clip with its note, under a digest of all that decides its bytes. Entries are copied, so that a study
-never changes with the cache; the one that was used longest ago goes first.
+never changes with the cache; the least recently used one goes first.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
 from traps_pipeline.base.paths import PACKAGE, user_cache
-from traps_pipeline.scenes.picture.render import RenderingUnavailable, drawn_by
+from traps_pipeline.scenes.picture.render import RenderingUnavailable, renderer_version
 from traps_pipeline.scenes.worlds.clips import note_of, read_clip, read_note
 from traps_pipeline.video.encode import DamagedClip
 
@@ -27,9 +27,9 @@ DEFAULT_GB = 4.0
 
 @dataclass(frozen=True)
 class ClipCache:
-    """Rendered clips in a folder of at most `most_bytes` bytes. Threads and processes may share it.
+    """Rendered clips in a folder of at most `most_bytes` bytes.
 
-    What cannot be read or written there is as if it were not there: a study is made without it.
+    Threads and processes may share it. A study is made without whatever cannot be read or written here.
     """
 
     folder: Path
@@ -37,7 +37,7 @@ class ClipCache:
 
     @classmethod
     def of_user(cls) -> ClipCache | None:
-        """Return the cache that the environment chooses; None where it is off, or there is no folder for this user.
+        """Return the cache that the environment chooses, or None.
 
         Raises TrapsError for a wrong size.
         """
@@ -56,7 +56,7 @@ class ClipCache:
             return None
 
     def bring(self, clip: Path, scene_hash: str) -> bool:
-        """Copy a clip and its note to where a study has it; return whether it was there. A damaged entry is removed."""
+        """Copy a clip with its note to a study, if it is cached; return whether it is."""
         entry = self._entry(clip, scene_hash)
         if entry is None:
             return False
@@ -64,7 +64,7 @@ class ClipCache:
             if not entry.is_file():
                 return False
             note = read_note(entry)
-            content, beside = entry.read_bytes(), note_of(entry).read_bytes()
+            content, note_content = entry.read_bytes(), note_of(entry).read_bytes()
             if note is None or sha256(content).hexdigest() != note.file_sha256:
                 raise DamagedClip(f"{entry}: is not what was rendered")
             os.utime(entry)  # used last
@@ -72,11 +72,11 @@ class ClipCache:
             _remove(entry)
             return False
         write_bytes(clip, content)
-        write_bytes(note_of(clip), beside)
+        write_bytes(note_of(clip), note_content)
         return True
 
     def keep(self, clips: Iterable[Path], scene_hash: str) -> None:
-        """Copy clips of a study, with their notes, into the cache."""
+        """Copy a study's clips with their notes into the cache."""
         for clip in clips:
             entry = self._entry(clip, scene_hash)
             if entry is None:
@@ -89,7 +89,7 @@ class ClipCache:
                 _remove(entry)
 
     def trim(self) -> None:
-        """Remove the entries that were used longest ago until the rest takes nine tenths of what is allowed."""
+        """Remove least recently used entries until nine tenths of the bound are left."""
         entries = self._entries()
         size = sum(each for _, each, _ in entries)
         if size <= self.most_bytes:
@@ -106,15 +106,15 @@ class ClipCache:
         return f"{self.folder}: {len(sizes):,} clips, {sum(sizes) / 1e9:.2f} of {self.most_bytes / 1e9:g} GB"
 
     def _entry(self, clip: Path, scene_hash: str) -> Path | None:
-        """Return the place of a clip; None where nothing can be drawn, so that nobody knows what would draw it."""
+        """Return the cached path of a clip; None where nothing can be drawn."""
         try:
-            key = digest([scene_hash, clip.name, _renderer()])
+            key = digest([scene_hash, clip.name, _renderer_digest()])
         except RenderingUnavailable:
             return None
         return self.folder / key[:2] / f"{key}.mp4"
 
     def _entries(self) -> list[tuple[float, int, Path]]:
-        """Return of each clip when it was used last, its bytes with its note, and its path."""
+        """Return time of last use, bytes with its note, and path of each clip."""
         entries = []
         for path in self.folder.glob("??/*.mp4"):
             try:
@@ -134,8 +134,8 @@ def _remove(entry: Path) -> None:
 
 
 @cache
-def _renderer() -> str:
-    """Return a digest of what turns a scene into bytes: code of `scenes` and `video`, OpenGL, MuJoCo, OpenCV, encoder.
+def _renderer_digest() -> str:
+    """Return a digest of all code and versions that turn a scene into bytes.
 
     Raises RenderingUnavailable.
     """
@@ -146,4 +146,4 @@ def _renderer() -> str:
     files = sorted(path for room in ("scenes", "video") for path in (PACKAGE / room).rglob("*.py"))
     code = {path.relative_to(PACKAGE).as_posix(): file_digest(path) for path in files}
     versions = (mujoco.__version__, cv2.__version__, av.__version__, sorted(av.library_versions.items()))
-    return digest([code, drawn_by(), versions])
+    return digest([code, renderer_version(), versions])

@@ -1,4 +1,4 @@
-"""The two clips of a scenario, replayed from its frozen trajectory: nothing is simulated here.
+"""Clips of a scenario, replayed from its frozen trajectory without simulation.
 
 Occluder: the void is the same replay with the occluder drawn. Truncation: the void is a prefix of the control. A
 board comes before a control that closes, and before its void if an occluder makes it; the twin's clip never has one.
@@ -31,8 +31,7 @@ ABLATION_FRAMES = 5  # evenly spaced void frames that are drawn once more withou
 
 @dataclass(frozen=True)
 class Clip:
-    """What is known of an encoded clip. leaked_pixels: void pixels that anything decisive still has (0, or the occluder
-    does not hide): from segmentation of every sampled frame and from ablation; None where there is no occluder."""
+    """An encoded clip. leaked_pixels: of what a void must hide, None without occluder."""
 
     file_sha256: str
     frames_sha256: str
@@ -56,7 +55,7 @@ def _seal_of(clip: Clip) -> str:
 
 @dataclass(frozen=True)
 class Job:
-    """A pair and its twin to render: record, trajectories (F, nq), and where the clips go."""
+    """A pair and its twin to render: record, trajectories (F, nq), and clips' paths."""
 
     spec: SceneSpec
     qpos: np.ndarray
@@ -72,12 +71,12 @@ class Job:
 
 
 def note_of(clip: Path) -> Path:
-    """Return the small JSON beside a clip that says what it is; written after it, so that it vouches for it."""
+    """Return the path of a clip's note, JSON that is written last and vouches for it."""
     return clip.with_suffix(".json")
 
 
 def read_clip(path: Path) -> Clip | None:
-    """Return the clip if it is rendered; None if not. Raises DamagedClip when the file is not what its note says."""
+    """Return a rendered clip, None if missing. Raises DamagedClip if it was altered."""
     clip = read_note(path) if path.is_file() else None
     if clip is not None:
         check_clip(path, clip.file_sha256, clip.size_bytes)
@@ -85,7 +84,7 @@ def read_clip(path: Path) -> Clip | None:
 
 
 def read_note(path: Path) -> Clip | None:
-    """Return what the note of a clip says, wherever the clip is; None where there is none. Raises DamagedClip."""
+    """Return what a clip's note says, None if there is none. Raises DamagedClip."""
     if not note_of(path).is_file():
         return None
     try:
@@ -100,7 +99,7 @@ def read_note(path: Path) -> Clip | None:
 
 
 def check_clip(path: Path, sha256: str, size_bytes: int) -> None:
-    """Raise DamagedClip, naming the file and the remedy, unless it has that size and digest."""
+    """Raise DamagedClip, with the remedy, unless a file has that size and digest."""
     size = path.stat().st_size if path.is_file() else 0
     if size != size_bytes or file_digest(path) != sha256:
         raise DamagedClip(
@@ -110,26 +109,26 @@ def check_clip(path: Path, sha256: str, size_bytes: int) -> None:
 
 
 def render_pair(job: Job) -> int:
-    """Render and encode what is missing of a pair and its twin; returns how many frames are new in clips.
+    """Render missing clips of a pair and its twin; return the number of new frames.
 
     The twin's clip is its control: the other world as it is when nothing hides it.
     """
     missing = [path for path in job.clips if read_clip(path) is None]
     if not missing:
         return 0
-    family, physics, other = get_family(job.spec.family), Physics(**job.spec.physics), job.spec.twin.params
-    drawn = 0
-    if missing != [job.twin] or other is None:
-        drawn += _render_scene(job, family, physics, missing)
-    if job.twin in missing and other is not None:
-        model, _ = compile_scene(family, family.params_from(other), physics)
+    family, physics, twin_params = get_family(job.spec.family), Physics(**job.spec.physics), job.spec.twin.params
+    n_frames = 0
+    if missing != [job.twin] or twin_params is None:
+        n_frames += _render_scene(job, family, physics, missing)
+    if job.twin in missing and twin_params is not None:
+        model, _ = compile_scene(family, family.params_from(twin_params), physics)
         with Renderer(model, Camera.from_record(job.spec.camera)) as renderer:
-            drawn += save_clip(job.twin, list(renderer.frames(job.twin_qpos)), physics.fps)
-    return drawn
+            n_frames += save_clip(job.twin, list(renderer.frames(job.twin_qpos)), physics.fps)
+    return n_frames
 
 
 def _render_scene(job: Job, family: Family, physics: Physics, missing: Sequence[Path]) -> int:
-    """Return what is missing of control and void, and of a twin that is the same scene from another start."""
+    """Render what is missing of control, void, and a twin that is another start."""
     spec = job.spec
     occluder, closing = (
         Occluder.from_record(spec.void["panel"]) if spec.void_kind == "occluder" else None,
@@ -138,29 +137,29 @@ def _render_scene(job: Job, family: Family, physics: Physics, missing: Sequence[
     behind = occluder if closing is None else closing.occluder
     model, scene = compile_scene(family, family.params_from(spec.params), physics, behind)
     camera = Camera.from_record(spec.camera)
-    drawn, open_frames = 0, len(job.qpos) if closing is None else closing.frame
+    n_frames, open_frames = 0, len(job.qpos) if closing is None else closing.frame
     board = coming_board(closing, camera, len(job.qpos), physics.fps)
     with Renderer(model, camera) as renderer:
         control: list[np.ndarray] = []
         if job.control in missing or (occluder is None and job.void in missing):
             control = list(checks.closing_frames(renderer, job.qpos, board))
-            drawn += len(control)
+            n_frames += len(control)
         if job.control in missing:
             save_clip(job.control, control, physics.fps)
         if job.void in missing and occluder is not None:
             decisive = decisive_geoms(model, scene.decisive)
-            closed = control[open_frames:]  # behind the same occluder: these are not drawn again
-            open_to = len(job.qpos) - len(closed)
+            closed_frames = control[open_frames:]  # behind the same occluder: these are not drawn again
+            open_to = len(job.qpos) - len(closed_frames)
             before = checks.closing_frames(renderer, job.qpos[:open_to], board[:open_to], occluder=True)
-            void = [*before, *closed]
+            void = [*before, *closed_frames]
             still = [frame for frame, offset in enumerate(board) if offset in (None, LANDED)]
             leaked = _leaked_pixels(renderer, scene, decisive, job, void, still)
-            drawn += save_clip(job.void, void, physics.fps, leaked)
+            n_frames += save_clip(job.void, void, physics.fps, leaked)
         elif job.void in missing:
             save_clip(job.void, control[: spec.void["cut_frame"]], physics.fps)
         if job.twin in missing and spec.twin.params is None:
-            drawn += save_clip(job.twin, list(renderer.frames(job.twin_qpos)), physics.fps)
-    return drawn
+            n_frames += save_clip(job.twin, list(renderer.frames(job.twin_qpos)), physics.fps)
+    return n_frames
 
 
 def _leaked_pixels(
@@ -171,22 +170,24 @@ def _leaked_pixels(
     void: Sequence[np.ndarray],
     still: Sequence[int],
 ) -> float:
-    """Return what the certificates `hidden` and `ablation` measure, on the sampled frames and on a few: 0 if the
-    occluder hides decisive bodies from hiding on, and the hidden element, without a trace. still: frames in which no
-    board comes."""
+    """Return the pixels of the certificates `hidden` and `ablation` on some frames.
+
+    0: the occluder hides decisive bodies from hiding on, and the hidden element, without a trace. still: frames in
+    which no board comes.
+    """
     step = job.spec.physics["fps"] // checks.SAMPLED_FPS
     first = job.spec.void["hidden_from_frame"]
     past_occluder_px = checks.past_occluder(renderer, job.qpos[::step], decisive, scene.hidden).leaked(
         -(-first // step)
     )
-    hiding = [frame for frame in still if frame >= first]
-    ablated = [hiding[i] for i in np.unique(np.linspace(0, len(hiding) - 1, ABLATION_FRAMES).astype(int))]
-    complete = [void[frame] for frame in ablated]
-    return past_occluder_px + checks.ablation_pixels(renderer, job.qpos[ablated], [*decisive, *scene.hidden], complete)
+    hiding_frames = [frame for frame in still if frame >= first]
+    sampled = [hiding_frames[i] for i in np.unique(np.linspace(0, len(hiding_frames) - 1, ABLATION_FRAMES).astype(int))]
+    complete = [void[frame] for frame in sampled]
+    return past_occluder_px + checks.ablation_pixels(renderer, job.qpos[sampled], [*decisive, *scene.hidden], complete)
 
 
 def save_clip(path: Path, frames: Sequence[np.ndarray], fps: int, leaked_pixels: float | None = None) -> int:
-    """Encode frames and write the note that vouches for them; returns how many there are."""
+    """Encode frames, write the note that vouches for them, and return their number."""
     encode(frames, path, fps)
     clip = Clip(file_digest(path), frames_digest(frames), len(frames), fps, path.stat().st_size, leaked_pixels)
     write_text(note_of(path), json.dumps(asdict(clip) | {_SEAL: _seal_of(clip)}))

@@ -1,4 +1,4 @@
-"""A compiled scene, what a run of it comes to, and which of its geoms decide that."""
+"""Outcomes: a compiled scene, what its run comes to, and the geoms that decide it."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 
 class Rejected(ValueError):
-    """This makes no valid pair; the message says why."""
+    """These parameters make no valid pair; the message says why."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a run comes to, held against nothing yet.
+    """What a run comes to, before it is certified.
 
     label: None if it is undecided at the end. commit_frame: first frame from which the label holds to the end (the
     number of frames if it is undecided). margin_m: distance (m) of the end from the nearest other outcome. in_order,
@@ -47,8 +47,7 @@ class Outcome:
 
 
 def read_outcome(family: Family, motion: Motion, params: Any) -> Outcome:
-    """Return the outcome of a trajectory as the family reads it; `certificates.settled_outcome` also holds it to
-    account."""
+    """Return a trajectory's outcome, which `settled_outcome` also certifies."""
     reading = family.outcome(motion, params)
     commit = last_run(reading.labels)
     label = reading.labels[-1]
@@ -64,9 +63,11 @@ def last_run(labels: Sequence[str | None]) -> int:
 def compile_scene(
     family: Family, params: Any, physics: Physics, occluder: Occluder | None = None
 ) -> tuple[mujoco.MjModel, Scene]:
-    """Return the compiled model of a scene, with the occluder if one is given, and another one like it, just in
-    front, that comes before the scene where a control closes; each has a geom group of its own and collides with
-    nothing."""
+    """Return the compiled model of a scene, and the scene.
+
+    An occluder is added twice, each in its own geom group and without contact: where it stands, and just in front, to
+    come before the scene where a control closes.
+    """
     scene = family.build(params, physics)
     if occluder is not None:
         occluders = []
@@ -83,7 +84,7 @@ def compile_scene(
 
 
 def simulated(model: mujoco.MjModel, scene: Scene, physics: Physics) -> np.ndarray:
-    """Return the trajectory of a compiled scene, (F, nq). Raises Rejected if the solver diverges."""
+    """Return the trajectory of a compiled scene, (F, nq). Raises Rejected."""
     try:
         return simulate(model, scene, physics)
     except FloatingPointError as error:

@@ -1,9 +1,9 @@
-"""How long a clip is, and when it closes: its outcome settles neither at its beginning, so that watching on were idle,
-nor at its very end.
+"""Pace: how long a clip is, and when it closes.
 
-A scene is simulated for as long as its family says. Where the outcome settles early the clip ends earlier, void and
-control alike, so that its length tells nothing of the side. A clip is never longer than its family's: 25 frames of five
-a second are what models are shown. So where the outcome settles too late the scene is drawn anew.
+An outcome settles neither at a clip's beginning nor at its very end. A scene is simulated for as long as its family
+says. Where the outcome settles early the clip ends earlier, void and control alike, so that its length tells nothing of
+the side. A clip is never longer than its family's: models are shown 25 frames of five a second. So where the outcome
+settles too late the scene is drawn anew.
 
 Of an occlusion pair both worlds count, and which of them is the control makes no difference: neither length nor closing
 tells which world the occluder hides.
@@ -48,19 +48,24 @@ def out_of_pace(share: float) -> str | None:
     return None
 
 
-def exchangeable(family: Family) -> bool:
-    """Return whether both worlds of a family's pairs count. Of soft bodies the control alone does: they settle in one
-    world at twice the time of the other, so that no length suits both."""
+def is_exchangeable(family: Family) -> bool:
+    """Return whether both worlds of a family's pairs count.
+
+    Of soft bodies the control alone does: one world settles in twice the other's time.
+    """
     return family.category not in EXTENSION_CATEGORIES
 
 
 def _counted(worlds: Sequence[World]) -> Sequence[World]:
-    return worlds if exchangeable(worlds[0].family) else worlds[:1]
+    return worlds if is_exchangeable(worlds[0].family) else worlds[:1]
 
 
 def lengths(worlds: Sequence[World], seed: int) -> list[int]:
-    """Return numbers of frames to try for a clip of simulated worlds, best first: all that there are, or, where the
-    outcome of one is early, an even number that follows from the seed, and then the most."""
+    """Return numbers of frames to try for a clip of simulated worlds, best first.
+
+    Those are all that there are, or, where the outcome of one world is early, an even number drawn by seed, and then
+    the most.
+    """
     worlds = _counted(worlds)
     n_frames, fps = len(worlds[0].qpos), worlds[0].physics.fps
     first, last = (of(world.outcome.commit_frame for world in worlds) for of in (min, max))
@@ -69,39 +74,40 @@ def lengths(worlds: Sequence[World], seed: int) -> list[int]:
     most = _even(first / EARLIEST_SHARE)
     least = min(most, _even(max(last / DRAWN_SHARE, last + FRAMES_AFTER * fps / 10)))
     rng = np.random.default_rng([seed, *worlds[0].family.name.encode(), *b"pace"])
-    drawn = least + 2 * int(rng.integers((most - least) // 2 + 1))
-    return list(dict.fromkeys((drawn, most)))
+    length = least + 2 * int(rng.integers((most - least) // 2 + 1))
+    return list(dict.fromkeys((length, most)))
 
 
 def moments(worlds: Sequence[World], seed: int) -> Iterator[int]:
-    """Yield frames at which a control may close: when the outcome of every world has been in view, and at rest, for
-    long enough; where there is no time for that, and after all others, the last frame that is possible. None where no
-    frame is."""
+    """Yield frames at which a control may close; none if it cannot.
+
+    All outcomes have been in view and at rest for long enough; after those, or where there is no time for that, comes
+    the last possible frame.
+    """
     worlds = _counted(worlds)
     fps, commit = worlds[0].physics.fps, max(world.outcome.commit_frame for world in worlds)
     last = last_of_all(len(worlds[0].qpos), fps)
     if last - commit < round(READ_S * fps):
         return
-    rests = max(map(_at_rest_from, worlds)) + round(REST_BY_DRAW_S * fps)
-    first = min(max(commit + round(READ_BY_DRAW_S * fps), rests), last)
+    rest_frame = max(map(_at_rest_from, worlds)) + round(REST_BY_DRAW_S * fps)
+    first = min(max(commit + round(READ_BY_DRAW_S * fps), rest_frame), last)
     rng = np.random.default_rng([seed, *worlds[0].family.name.encode(), *b"closing"])
-    drawn = [int(frame) for frame in rng.permutation(np.arange(first, last + 1))]
-    yield from dict.fromkeys([*drawn[: TRIES - 1], last])
+    frames = [int(frame) for frame in rng.permutation(np.arange(first, last + 1))]
+    yield from dict.fromkeys([*frames[: TRIES - 1], last])
 
 
 def _at_rest_from(world: World) -> int:
-    """Return the frame from which every decisive body stays as it lies at the end: its middle, and three points around
-    it."""
+    """Return the frame from which all decisive bodies stay in place, and unturned."""
     paths = [world.motion.places(body, BESIDE_M) for body in world.scene.decisive]
     return still_from(*paths, within_m=STILL_M)
 
 
 def _even(frames: float) -> int:
-    """Return the largest even number of frames that is not more than so many."""
+    """Return the largest even number of frames up to a number."""
     return 2 * int(frames / 2 + 1e-9)
 
 
-def cut_to(world: World, n_frames: int) -> World:
+def shortened(world: World, n_frames: int) -> World:
     """Return the world's first frames, as a clip of its own."""
     if n_frames == len(world.qpos):
         return world

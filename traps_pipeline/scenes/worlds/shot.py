@@ -1,5 +1,4 @@
-"""The camera of a pair and its occluder, fitted to the worlds that it shows: which of two is the control makes no
-difference."""
+"""Camera and occluder of a pair, fitted to both worlds, whichever is the control."""
 
 from __future__ import annotations
 
@@ -18,15 +17,15 @@ if TYPE_CHECKING:
 
 
 def shown_points(model: mujoco.MjModel, scene: Scene, qpos: np.ndarray) -> np.ndarray:
-    """Return what a picture of a scene must hold: everything that moves over a trajectory, and the stage. Shape (N,
-    3).
-    """
+    """Return the points that a picture must hold: what moves, and the stage, (N, 3)."""
     return np.concatenate([swept_points(model, qpos), *(box.corners() for box in scene.framed)])
 
 
 def shot_of(worlds: Sequence[World]) -> tuple[Camera, Occluder | None]:
-    """Return the nearest camera that has all worlds in its frame, and the smallest occluder that covers what any of
-    them says; no occluder if some of them has nothing to cover."""
+    """Return the nearest camera with all worlds in frame, and the least occluder.
+
+    It covers what any world must hide; None if some world has nothing to cover.
+    """
     points = np.concatenate([shown_points(world.model, world.scene, world.qpos) for world in worlds])
     covers = [world.scene.cover for world in worlds if world.scene.cover is not None]
     cover = box_around([box.corners() for box in covers]) if len(covers) == len(worlds) else None
@@ -35,8 +34,8 @@ def shot_of(worlds: Sequence[World]) -> tuple[Camera, Occluder | None]:
 
 def box_around(points: Sequence[np.ndarray]) -> Box:
     """Return the smallest box with all points, each (N, 3)."""
-    every = np.concatenate(points)
-    return Box(_corner(every.min(axis=0)), _corner(every.max(axis=0)))
+    all_points = np.concatenate(points)
+    return Box(_corner(all_points.min(axis=0)), _corner(all_points.max(axis=0)))
 
 
 def _corner(values: np.ndarray) -> tuple[float, float, float]:

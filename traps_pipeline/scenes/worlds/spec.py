@@ -1,4 +1,4 @@
-"""A scenario as data: the fully resolved record that is frozen under `scene_specs/`, and its trajectory beside it."""
+"""Scenarios as data: resolved records of `scene_specs/`, and their trajectories."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class _Closing(_Strict):
 
 
 class _ClosingOccluder(_Closing):
-    """When an occluder comes in the control, and which (truncation: the void has none)."""
+    """When an occluder comes in the control, and which (truncation)."""
 
     panel: _Box
 
@@ -88,7 +88,7 @@ class Answerable(BaseModel):
 
 
 class Twin(BaseModel):
-    """Another world behind the same void: what is changed, its outcome, the digest of its trajectory.
+    """Another world behind the same void: what differs, outcome, trajectory's digest.
 
     params: the whole scene with another hidden element (occlusion), or none: the same scene from another start
     (chaotic). rollout: which of the perturbed starts that follow from the record's seed and from the first row of its
@@ -104,7 +104,7 @@ class Twin(BaseModel):
 
 
 class SceneSpec(BaseModel):
-    """One scenario, resolved: nothing about it is left to chance or to the code's defaults.
+    """One scenario, resolved: nothing is left to chance or to the code's defaults.
 
     control: how the control closes: from which frame an occluder stands before its outcome, and which occluder where
     the void has none; None if no occluder comes.
@@ -172,7 +172,7 @@ class SceneSpec(BaseModel):
 
     @property
     def closes_frame(self) -> int | None:
-        """The frame from which an occluder stands before the control's outcome; None if none comes."""
+        """The frame from which an occluder stands before the outcome; None if none."""
         return None if self.control is None else self.control["closes_frame"]
 
     @property
@@ -192,7 +192,7 @@ _Part = TypeVar("_Part", bound=_Strict)
 
 
 def _checked(kind: type[_Part], name: str, values: dict[str, Any]) -> _Part:
-    """Return a part of a record. Raises ValueError naming the field."""
+    """Return a validated part of a record. Raises ValueError naming the field."""
     try:
         return kind.model_validate(values)
     except ValidationError as error:
@@ -201,13 +201,13 @@ def _checked(kind: type[_Part], name: str, values: dict[str, Any]) -> _Part:
 
 
 def trajectory_digest(qpos: np.ndarray) -> str:
-    """Return SHA-256 over shape and little-endian float32 values."""
+    """Return the SHA-256 over shape and little-endian float32 values."""
     values = np.ascontiguousarray(qpos, dtype="<f4")
     return hashlib.sha256(repr(values.shape).encode() + values.tobytes()).hexdigest()
 
 
 def save_trajectory(folder: Path, scenario_id: str, qpos: np.ndarray, twin: np.ndarray) -> None:
-    """Write `<folder>/<scenario_id>.npz` (no pickle): the trajectory of a scenario and of its twin."""
+    """Write `<folder>/<scenario_id>.npz`: trajectories of a scenario and its twin."""
     arrays = {"qpos": qpos, "twin": twin}
     plain = {name: np.ascontiguousarray(values, dtype="<f4") for name, values in arrays.items()}
     with replacing(folder / f"{scenario_id}.npz") as part, part.open("wb") as stream:
@@ -215,8 +215,10 @@ def save_trajectory(folder: Path, scenario_id: str, qpos: np.ndarray, twin: np.n
 
 
 def load_trajectory(path: Path, sha256: str, world: Literal["qpos", "twin"] = "qpos") -> np.ndarray:
-    """Return qpos at frame times (F, nq) float32 of the scenario or its twin. Raises ValueError naming a missing or
-    altered file."""
+    """Return qpos (F, nq) float32 of a scenario or its twin.
+
+    Raises ValueError naming a missing or altered file.
+    """
     try:
         with np.load(path, allow_pickle=False) as archive:
             qpos = archive[world]

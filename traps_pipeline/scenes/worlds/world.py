@@ -1,4 +1,4 @@
-"""One simulated world as the camera of its pair sees it; what several certificates need of it is computed once."""
+"""A simulated world in its pair's shot, with cached values for certificates."""
 
 from __future__ import annotations
 
@@ -52,9 +52,7 @@ class World:
 
     @staticmethod
     def of_record(spec: SceneSpec, qpos: np.ndarray, *, twin: bool = False, frame_step: int = 1) -> World:
-        """Return the control of a record, or its twin, with its trajectory. Raises ValueError for unknown
-        parameters.
-        """
+        """Return the control or the twin of a record. Raises ValueError."""
         family = get_family(spec.family)
         params = spec.twin.params if twin and spec.twin.params is not None else spec.params
         return World(
@@ -89,25 +87,20 @@ class World:
 
     @cached_property
     def closed_model(self) -> mujoco.MjModel:
-        """The compiled model with the occluder that closes the control: that of the void, or its own."""
+        """The compiled model with the occluder that closes the control."""
         if self.closing is None or self.occluder is not None:
             return self.model
         return compile_scene(self.family, self.params, self.physics, self.closing.occluder)[0]
 
     @property
     def open_frames(self) -> int:
-        """How many frames the control shows before an occluder comes: all of them if none does."""
+        """Number of frames of the control before an occluder comes; all if none does."""
         return len(self.qpos) if self.closing is None else self.closing.frame
 
     @cached_property
     def board(self) -> Coming:
-        """Where the board is that closes the control, in every frame."""
+        """Offsets of the board that closes the control, by frame."""
         return coming_board(self.closing, self.camera, len(self.qpos), self.physics.fps)
-
-    @property
-    def clear_frames(self) -> int:
-        """Number of frames before the board that closes the control comes into the picture; all if none does."""
-        return next((n for n, offset in enumerate(self.board) if offset is not None), len(self.qpos))
 
     @cached_property
     def motion(self) -> Motion:
@@ -121,7 +114,7 @@ class World:
 
     @property
     def outcome_read(self) -> Outcome:
-        """What the frames before the closing come to, by themselves: what there is to be read."""
+        """What the frames before the closing come to, by themselves."""
         open_frames, motion = slice(0, self.open_frames), self.motion
         parts = (
             {k: v[open_frames] for k, v in each.items()}
@@ -131,7 +124,7 @@ class World:
 
     @cached_property
     def resimulated(self) -> np.ndarray:
-        """The trajectory that simulating the scene gives here, (F, nq). Raises Rejected if the solver diverges."""
+        """The trajectory that simulating gives here, (F, nq). Raises Rejected."""
         if self.simulated is not None:
             return self.simulated
         return simulated(*compile_scene(self.family, self.params, self.physics), self.physics)
@@ -142,77 +135,75 @@ class World:
         return np.array_equal(self.resimulated, self.qpos)
 
     @property
-    def looked_at(self) -> range:
+    def evidence_frames(self) -> range:
         """The frames that pixel evidence looks at."""
         return range(0, len(self.qpos), self.frame_step)
 
     def renderer(self, *, supersample: int = SUPERSAMPLE) -> Renderer:
-        """Return a renderer of this world; close it before another one is opened."""
+        """Return a renderer of this world; close it before you open another one."""
         return Renderer(self.model, self.camera, supersample=supersample)
 
     @property
-    def concealed(self) -> tuple[str, ...]:
-        """Names of all geoms that the void must not show: those of decisive bodies and of the hidden element."""
+    def concealed_geoms(self) -> tuple[str, ...]:
+        """Geoms that the void must not show: of decisive bodies and the hidden element."""
         return (*decisive_geoms(self.model, self.scene.decisive), *self.scene.hidden)
 
     @property
-    def closed_off(self) -> tuple[str, ...]:
-        """Names of all geoms that nothing may be seen of once the control is closed: what is concealed in the void; of
-        a cut scene everything that moves."""
-        return moving_geoms(self.model) if self.occluder is None else self.concealed
+    def closed_geoms(self) -> tuple[str, ...]:
+        """Geoms hidden by closing: the concealed ones, or all that move (cut scene)."""
+        return moving_geoms(self.model) if self.occluder is None else self.concealed_geoms
 
     @cached_property
     def geoms(self) -> tuple[str, ...]:
-        """Names of all geoms, in the order of the model, and of all soft bodies, which are drawn like one."""
+        """Names of all geoms and soft bodies, in the order of the model."""
         model = self.closed_model
         return (*(model.geom(i).name for i in range(model.ngeom)), *flexes(model))
 
     @property
-    def closed_at(self) -> list[int]:
-        """The frames that pixel evidence of the closed control looks at, the last one always among them."""
+    def closed_frames(self) -> list[int]:
+        """The closed control's frames that pixel evidence looks at, the last included."""
         return sorted(range(len(self.qpos) - 1, self.open_frames - 1, -self.frame_step))
 
     # What is drawn behind the occluder, that of the void or the one that closes the control, is needed by several
     # certificates; each frame is drawn once.
 
-    def behind_occluder(self, which: Sequence[int]) -> list[np.ndarray]:
-        """Return some frames of the world behind its occluder, as they are drawn."""
-        missing = [frame for frame in which if frame not in self._behind]
+    def behind_occluder(self, frames: Sequence[int]) -> list[np.ndarray]:
+        """Return some frames of the world behind its occluder."""
+        missing = [frame for frame in frames if frame not in self._behind]
         if missing:
             with self.closed_renderer() as renderer:
                 self._behind.update(zip(missing, void_frames(renderer, self.qpos[missing]), strict=True))
-        return [self._behind[frame] for frame in which]
+        return [self._behind[frame] for frame in frames]
 
     @cached_property
     def _behind(self) -> dict[int, np.ndarray]:
         return {}
 
-    def pixels_of(self, names: Sequence[str], which: Sequence[int] | None = None) -> np.ndarray:
-        """Return how many pixels some geoms have together behind the occluder, by segmentation, in some frames, or in
-        those that are looked at, (F,)."""
-        which = self.looked_at if which is None else which
-        missing = [frame for frame in which if frame not in self._segmented]
+    def pixels_of(self, names: Sequence[str], frames: Sequence[int] | None = None) -> np.ndarray:
+        """Return the pixels that geoms have together behind the occluder, by frame, (F,)."""
+        frames = self.evidence_frames if frames is None else frames
+        missing = [frame for frame in frames if frame not in self._segmented]
         if missing:
             with self.closed_renderer() as renderer:
                 counts = renderer.visible_pixels(self.qpos[missing], self.geoms, occluder=True)
             self._segmented.update(zip(missing, counts, strict=True))
         columns = [self.geoms.index(name) for name in names]
-        return np.array([self._segmented[frame][columns].sum() for frame in which])
+        return np.array([self._segmented[frame][columns].sum() for frame in frames])
 
     @cached_property
     def _segmented(self) -> dict[int, np.ndarray]:
         return {}
 
-    def ablation_px(self, which: Sequence[int], geoms: tuple[str, ...]) -> int:
-        """Return how many pixels change behind the occluder, over some frames, when geoms are taken away."""
-        missing = [frame for frame in which if (frame, geoms) not in self._ablated]
+    def ablation_px(self, frames: Sequence[int], geoms: tuple[str, ...]) -> int:
+        """Return how many pixels of some frames change when geoms are taken away."""
+        missing = [frame for frame in frames if (frame, geoms) not in self._ablated]
         if missing:
             complete = self.behind_occluder(missing)
             with self.closed_renderer() as renderer:
                 without = void_frames(renderer, self.qpos[missing], without=geoms)
-                for frame, one, other in zip(missing, complete, without, strict=True):
-                    self._ablated[frame, geoms] = differing_pixels([one], [other])[0]
-        return sum(self._ablated[frame, geoms] for frame in which)
+                for frame, ablated, unablated in zip(missing, complete, without, strict=True):
+                    self._ablated[frame, geoms] = differing_pixels([ablated], [unablated])[0]
+        return sum(self._ablated[frame, geoms] for frame in frames)
 
     @cached_property
     def _ablated(self) -> dict[tuple[int, tuple[str, ...]], int]:
@@ -226,12 +217,11 @@ class World:
 
     @property
     def void_frames(self) -> list[np.ndarray]:
-        """The world with the occluder of its void, as it is drawn."""
-        return self.behind_occluder(self.looked_at)
+        """The frames of the world behind the occluder of its void."""
+        return self.behind_occluder(self.evidence_frames)
 
     def closed_renderer(self) -> Renderer:
-        """Return a renderer of this world with the occluder that closes the control; close it before another one is
-        opened."""
+        """Return a renderer with the occluder that closes the control; close it first."""
         return Renderer(self.closed_model, self.camera)
 
 
