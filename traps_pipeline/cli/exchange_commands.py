@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.wording import counted
 from traps_pipeline.cli.command import OK, Commands, add_experiment, experiment_of, integer, open_workspace
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ def export_calls(arguments: argparse.Namespace) -> int:
     if arguments.media_at:
         raise TrapsError("--media-at: only batch files refer to media by an address; say --batch, too")
     count = export_requests(open_workspace(arguments), experiment, arguments.out.absolute())
-    print(f"{count} requests in {arguments.out / REQUESTS}")
+    print(f"{counted(count, 'request')} in {arguments.out / REQUESTS}")
     print(f"next: have them answered, then traps study import-answers {arguments.experiment} ANSWERS.jsonl")
     return OK
 
@@ -72,7 +73,7 @@ def import_given(arguments: argparse.Namespace) -> int:
     experiment = experiment_of(arguments)
     context = AnswerContext(arguments.model, arguments.run, arguments.key and held_out_key(arguments.key))
     imported = import_answers(open_workspace(arguments), experiment, arguments.file, context, arguments.errors)
-    return _imported(imported, arguments, "answers")
+    return _imported(imported, arguments, "answer")
 
 
 def export_votes(arguments: argparse.Namespace) -> int:
@@ -89,20 +90,21 @@ def import_cast(arguments: argparse.Namespace) -> int:
     from traps_pipeline.exchange.answer_exchange import import_votes
 
     experiment = experiment_of(arguments)
-    return _imported(import_votes(open_workspace(arguments), experiment, arguments.file), arguments, "votes")
+    return _imported(import_votes(open_workspace(arguments), experiment, arguments.file), arguments, "vote")
 
 
 def _exported(files: Sequence[Path], count: int, command: str) -> int:
     for file in files:
         print(file)
-    print(f"{count} calls in {len(files)} files\nnext: have them answered, then {command} RESULTS.jsonl for each file")
+    print(f"{counted(count, 'call')} in {counted(len(files), 'file')}")
+    print(f"next: have them answered, then {command} RESULTS.jsonl for each file")
     return OK
 
 
-def _imported(imported: ImportResult, arguments: argparse.Namespace, what: str) -> int:
-    print(f"{imported.new} {what} imported, {imported.known} were there already")
+def _imported(imported: ImportResult, arguments: argparse.Namespace, noun: str) -> int:
+    print(f"{counted(imported.new, noun)} imported; already known: {imported.known:,}")
     if imported.dropped:
-        print(f"{imported.dropped} error messages were left out; what they stand for is still missing")
+        print(f"{counted(imported.dropped, 'error message')} left out; their answers are still missing")
     if imported.failed:
         print(f"failed and still missing: {imported.failed}")
     print(f"next: traps run {arguments.experiment}")

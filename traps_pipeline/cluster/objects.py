@@ -248,7 +248,7 @@ class ObjectStore(Store):
         named = {*self.names.naming().values()}
         if objects and not objects.keys() & named:
             raise TrapsError(
-                f"{self.bucket.address}: holds {len(objects)} objects, and the database names none of them for the "
+                f"{self.bucket.address}: holds objects ({len(objects):,}), and the database names none for the "
                 f"study {self._study}; see that its variable has the address of the study's own database: nothing was "
                 "removed"
             )

@@ -20,6 +20,7 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import replacing, write_bytes
 from traps_pipeline.base.terminal import plain
+from traps_pipeline.base.wording import counted
 from traps_pipeline.base.yamlfile import explain, read_lines
 from traps_pipeline.benchmark.held_out import opaque
 from traps_pipeline.exchange.harness_logs import LOG, OUTCOMES, LoggedAnswer, reader_of
@@ -238,7 +239,7 @@ def import_answers(
         for key, answer in answers.items()
     ]
     new = asyncio.run(_store(workspace, workspace.answers, outcomes))
-    failed = f"{n_failed} samples of the log" if n_failed else ""
+    failed = f"{counted(n_failed, 'sample')} of the log" if n_failed else ""
     return ImportResult(new, len(answers) - new, failed, dropped=len(like_errors) if errors == "drop" else 0)
 
 
@@ -248,7 +249,7 @@ def _said_of_errors(path: Path, answers: Mapping[str, Answer], requested: Mappin
         :MOST_LINES
     ]
     return (
-        f"{path}: {len(answers)} of its texts look like error messages and no answers ({'; '.join(examples)}): say "
+        f"{path}: {counted(len(answers), 'text')} may be an error message, not an answer ({'; '.join(examples)}): say "
         "--errors drop to leave them missing, or --errors keep if they are answers; nothing was imported"
     )
 

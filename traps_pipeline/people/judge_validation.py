@@ -19,6 +19,7 @@ from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.sheets import no_formula
 from traps_pipeline.base.terminal import text_table
+from traps_pipeline.base.wording import counted
 from traps_pipeline.judging.agreement import cohen_kappa
 from traps_pipeline.judging.confabulation import draw_sample, sample_id
 from traps_pipeline.judging.confabulation_protocol import TRACE_AND_OUTPUT, VOID_KINDS, load_protocol
@@ -158,7 +159,7 @@ def _paired(path: Path, by_sample: Mapping[tuple[str, str], tuple[int, list[bool
     names = sorted({annotator for annotator, _ in by_sample})
     if len(names) != 2:
         raise TrapsError(
-            f"{path}: has {len(names)} annotators ({', '.join(names)[:80] or 'none'}); it needs exactly two"
+            f"{path}: has {counted(len(names), 'annotator')} ({', '.join(names)[:80] or 'none'}); it needs exactly two"
         )
     first, second = names
     samples = sorted({sample for _, sample in by_sample})
@@ -279,7 +280,8 @@ def _share(part: int, total: int) -> float:
 def validation_text(rows: pd.DataFrame) -> str:
     """Return JUDGE_VALIDATION rows as text for people."""
     first = rows.iloc[0]
-    title = f"judge against {first['annotator_a']} (A) and {first['annotator_b']} (B), {first['n_failures']} failures"
+    failures = counted(first["n_failures"], "failure")
+    title = f"judge against {first['annotator_a']} (A) and {first['annotator_b']} (B), {failures}"
     headings = ["axis", "labels", "acc", "prec", "recall", "F1", "vs A", "vs B", "A = B", "kappa", "95 %"]
     shares = ("accuracy", "precision", "recall", "f1", "accuracy_a", "accuracy_b", "human_agreement")
     cells = [

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from traps_pipeline.base.wording import counted
 from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, REGIMES, STANDARD
 from traps_pipeline.report.catalogue import FIGURE_REPORTS
 from traps_pipeline.report.result_frames import Results
@@ -135,7 +136,7 @@ def _separable(results: Results, rows: pd.DataFrame) -> Iterator[StudyFinding]:
         if len(tested):
             count = int(tested["separable"].eq(True).sum())
             yield StudyFinding(
-                f"Of {len(tested)} differences of PECS between models under one regime, {count} "
+                f"Of {counted(len(tested), 'difference')} of PECS between models under one regime, {count} "
                 f"{'is' if count == 1 else 'are'} significant after Holm’s correction.",
                 "table-contrasts",
             )
@@ -147,8 +148,8 @@ def _missing_answers(rows: pd.DataFrame) -> Iterator[StudyFinding]:
         answers = 2 * int((rows["n_pairs"].to_numpy(int) * rows["n_runs"].to_numpy(int)).sum())
         most = rows.sort_values(["n_missing", "model"], ascending=[False, True]).to_dict("records")[0]
         yield StudyFinding(
-            f"{missing} of {answers} answers have no text or no majority; {most['model']} under {most['regime']} lacks "
-            f"most, {int(most['n_missing'])}.",
+            f"Without text or majority: {missing:,} of {counted(answers, 'answer')}; {most['model']} under "
+            f"{most['regime']} lacks most, {int(most['n_missing'])}.",
             "leaderboard",
         )
 

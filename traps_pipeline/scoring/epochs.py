@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.wording import counted
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.metrics import joined_epochs
 
@@ -88,4 +89,4 @@ def refusal(left: Answered, right: Answered) -> str | None:
 def _named(items: list[str]) -> str:
     """Return the first item with its dataset, and the number of others, in words."""
     dataset, more = items[0].partition(":")[0], len(items) - 1
-    return f"{dataset}: {items[0]}" + (f" and {more} more items are" if more else " is")
+    return f"{dataset}: {items[0]}" + (f" and {counted(more, 'more item')} are" if more else " is")

@@ -13,6 +13,7 @@ import numpy as np
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.wording import counted
 from traps_pipeline.models.local.capture import Pooling, capturing
 from traps_pipeline.models.local.checkpoint import Checkpoint, free_bytes
 from traps_pipeline.models.local.decoding import Steers, decode, steering_context
@@ -266,7 +267,9 @@ class LocalModel:
                     "or use a larger device"
                 ) from None
         torch.cuda.empty_cache()  # outside the handler, where the failed pass has been freed
-        progress.current().note(f"{self.checkpoint.name}: {len(rows)} rows do not fit into memory, trying half of them")
+        progress.current().note(
+            f"{self.checkpoint.name}: {counted(len(rows), 'row')} need more than the memory, trying half of them"
+        )
         return None
 
     def _answer(self, prompt: Prompt, tokens: list[int], first: Mapping[int, float]) -> GeneratedAnswer:
