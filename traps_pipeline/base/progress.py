@@ -157,10 +157,10 @@ class Progress:
         """Count this run's share of a partition that another run finished."""
         self.totals.setdefault(stage, Tally()).add(tally)
 
-    def tick(self, stage: str, what: str, done: int, total: int) -> None:
+    def tick(self, stage: str, unit: str, done: int, total: int) -> None:
         """Count units (clips, layers) of the partition in progress."""
         if (now := self.current_stage) is not None:
-            now.detail, now.share = f"{what}: {done:,} of {total:,}", done / max(total, 1)
+            now.detail, now.share = f"{unit}: {done:,} of {total:,}", done / max(total, 1)
         self.changed()
 
     def asking(self, stage: str, calls: Mapping[str, tuple[int, int]]) -> None:

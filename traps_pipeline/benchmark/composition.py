@@ -109,12 +109,12 @@ def _constant_margin(family: str, members: Sequence[SceneSpec]) -> list[str]:
     return [f"{family}: every scenario has the margin {margins.pop()} m"] if len(margins) == 1 < len(members) else []
 
 
-def _repeated(families: Mapping[str, Iterable[SceneSpec]], what: str, key: Callable[[SceneSpec], str]) -> list[str]:
+def _repeated(families: Mapping[str, Iterable[SceneSpec]], noun: str, key: Callable[[SceneSpec], str]) -> list[str]:
     owners: defaultdict[str, list[str]] = defaultdict(list)
     for members in families.values():
         for spec in members:
             owners[key(spec)].append(spec.scenario_id)
-    return [f"{', '.join(ids)}: the same {what}" for ids in owners.values() if len(ids) > 1]
+    return [f"{', '.join(ids)}: the same {noun}" for ids in owners.values() if len(ids) > 1]
 
 
 def _predictable(specs: Sequence[SceneSpec]) -> list[str]:

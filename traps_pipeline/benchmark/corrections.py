@@ -134,9 +134,9 @@ def fold(released: Mapping[str, SceneSpec], corrections: Sequence[tuple[str, Cor
         id_: Scenario(id_, spec.family, spec.category, spec, where="released") for id_, spec in released.items()
     }
     for where, correction in corrections:
-        known = scenarios.get(correction.scenario_id)
+        current = scenarios.get(correction.scenario_id)
         if correction.action == "add":
-            if known is not None or correction.scenario_id in released:
+            if current is not None or correction.scenario_id in released:
                 raise TrapsError(
                     f"{where}: cannot add {correction.scenario_id!r}: the id is taken; choose a free number"
                 )
@@ -150,13 +150,13 @@ def fold(released: Mapping[str, SceneSpec], corrections: Sequence[tuple[str, Cor
         if correction.action == "restore":
             scenarios[correction.scenario_id] = _restored(where, correction.scenario_id, released)
             continue
-        if known is None:
+        if current is None:
             state = "was discarded" if correction.scenario_id in released else "is unknown"
             raise TrapsError(f"{where}: scenario {correction.scenario_id!r} {state}; name a scenario of the benchmark")
         if correction.action == "discard":
             del scenarios[correction.scenario_id]
         elif correction.action == "correct":
-            scenarios[correction.scenario_id] = _corrected(where, known, correction)
+            scenarios[correction.scenario_id] = _corrected(where, current, correction)
     return dict(sorted(scenarios.items()))
 
 
@@ -167,21 +167,23 @@ def _restored(where: str, scenario_id: str, released: Mapping[str, SceneSpec]) -
     return Scenario(scenario_id, spec.family, spec.category, spec, where="released")
 
 
-def _corrected(where: str, known: Scenario, correction: Correction) -> Scenario:
+def _corrected(where: str, current: Scenario, correction: Correction) -> Scenario:
     changes = correction.changes()
-    if correction.family not in (None, known.family):
-        raise TrapsError(f"{where}: {known.scenario_id} is of the family {known.family}; a correction cannot change it")
+    if correction.family not in (None, current.family):
+        raise TrapsError(
+            f"{where}: {current.scenario_id} has the family {current.family}; a correction cannot change it"
+        )
     if not changes:
         raise TrapsError(f"{where}: `correct` gives no change; give words, answer or params, or use `keep`")
-    params = known.params
+    params = current.params
     if "params" in changes:
-        base = params if params is not None else (known.released.params if known.released else {})
+        base = params if params is not None else (current.released.params if current.released else {})
         unknown = sorted(set(changes["params"]) - set(base))
         if unknown:
-            raise TrapsError(f"{where}: family {known.family} has no parameters {unknown}; it has {sorted(base)}")
+            raise TrapsError(f"{where}: family {current.family} has no parameters {unknown}; it has {sorted(base)}")
         params = dict(base) | changes.pop("params")
-    words = dict(known.words) | changes
-    scenario = Scenario(known.scenario_id, known.family, known.category, known.released, words, params, where)
+    words = dict(current.words) | changes
+    scenario = Scenario(current.scenario_id, current.family, current.category, current.released, words, params, where)
     if scenario.released is not None and params is None:
         scenario.changed_words()  # an unknown label is an error of this line, found before anything runs
     return scenario

@@ -57,18 +57,18 @@ def undo(scenario_id: str, seen: int, *, who: str, why: str, folder: Path = CORR
     Raises DecidedMeanwhile as `decide` does, and TrapsError if there is no decision to take back.
     """
     with _appending(folder) as append:
-        own = _require_known(scenario_id, seen, folder)
-        if not is_reviewed(own):
+        decisions = _require_known(scenario_id, seen, folder)
+        if not is_reviewed(decisions):
             raise TrapsError(f"{scenario_id}: no decision stands that could be taken back")
         released = load_released()
         other_decisions = [(where, each) for where, each in read_corrections(folder) if each.scenario_id != scenario_id]
-        before = fold(released, [*other_decisions, *(("before", each) for each in own[:-1])]).get(scenario_id)
+        before = fold(released, [*other_decisions, *(("before", each) for each in decisions[:-1])]).get(scenario_id)
 
         def signed(action: str, **changes: Any) -> Correction:
             about = {"who": who, "when": date.today(), "why": why}
             return Correction.model_validate({"scenario_id": scenario_id, "action": action, **changes, **about})
 
-        append(_bring_back(scenario_id in released, before, was_reviewed=is_reviewed(own[:-1]), signed=signed))
+        append(_bring_back(scenario_id in released, before, was_reviewed=is_reviewed(decisions[:-1]), signed=signed))
 
 
 def _bring_back(is_released: bool, before: Scenario | None, *, was_reviewed: bool, signed: Signed) -> list[Correction]:
@@ -88,12 +88,12 @@ def _bring_back(is_released: bool, before: Scenario | None, *, was_reviewed: boo
 
 
 def _require_known(scenario_id: str, seen: int, folder: Path) -> list[Correction]:
-    own = decisions_on(scenario_id, folder)
-    if len(own) != seen:
+    decisions = decisions_on(scenario_id, folder)
+    if len(decisions) != seen:
         raise DecidedMeanwhile(
-            f"{scenario_id}: {own[-1].who if own else 'somebody'} decided meanwhile; look at the pair again"
+            f"{scenario_id}: {decisions[-1].who if decisions else 'somebody'} decided meanwhile; look at the pair again"
         )
-    return own
+    return decisions
 
 
 @contextmanager

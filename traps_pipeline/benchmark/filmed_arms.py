@@ -119,7 +119,7 @@ def build_arms(workspace: Workspace, category: str) -> list[ArmRow]:
     films = [clip for row in specs for clip in _clips(workspace, row, arms).values()]
     workspace.store.bring(map(_finding_of, films))
     try:
-        known = known_clips(workspace.store, films)
+        existing = known_clips(workspace.store, films)
     except DamagedClip as error:
         raise TrapsError(str(error)) from error
     version = version_of(
@@ -127,7 +127,7 @@ def build_arms(workspace: Workspace, category: str) -> list[ArmRow]:
         (clip_content(row["scenario_id"], row["scene_hash"]) for row in specs),
     )
     return [
-        arm_row for row in specs for arm in arms for arm_row in _rows(workspace, row, arm, of_pairs, known, version)
+        arm_row for row in specs for arm in arms for arm_row in _rows(workspace, row, arm, of_pairs, existing, version)
     ]
 
 
@@ -218,12 +218,12 @@ def _rows(
     row: Row,
     arm: str,
     of_pairs: Mapping[tuple[str, str], Row],
-    known: Mapping[Path, Clip],
+    existing: Mapping[Path, Clip],
     version: str,
 ) -> Iterator[ArmRow]:
     spec = spec_of(row)
     path = workspace.clip(spec.scenario_id, arm, row["scene_hash"])
-    finding, clip = ArmResult.read(_finding_of(path), _record_digest(spec, arm)), known.get(path)
+    finding, clip = ArmResult.read(_finding_of(path), _record_digest(spec, arm)), existing.get(path)
     if finding is None or (finding.frames and clip is None):
         raise TrapsError(f"{path}: was not filmed; run again")
     empty = ArmRow(

@@ -113,9 +113,9 @@ def known_clips(store: Store, clips: Iterable[Path]) -> dict[Path, Clip]:
     paths = [*clips]
     store.bring(map(note_of, paths))
     digests = store.digests(paths)
-    known = {path: note for path in digests if (note := read_note(path)) is not None}
-    for path, note in known.items():
+    notes = {path: note for path in digests if (note := read_note(path)) is not None}
+    for path, note in notes.items():
         if digests[path] != note.file_sha256:
             store.bring([path])
             check_clip(path, note.file_sha256, note.size_bytes)
-    return known
+    return notes

@@ -34,7 +34,7 @@ class _Cue(NamedTuple):
 
 
 def shortcuts(
-    items: pd.DataFrame, videos: pd.DataFrame, root: Path, known: MutableMapping[str, list[float]] | None = None
+    items: pd.DataFrame, videos: pd.DataFrame, root: Path, cache: MutableMapping[str, list[float]] | None = None
 ) -> pd.DataFrame:
     """Return how accurately each cue predicts the side, per dataset; 0.5 is chance.
 
@@ -52,11 +52,11 @@ def shortcuts(
         of_items: list[Any] = here[["scenario_id", "pair_id", "side"]].to_numpy().tolist()
         for name, cue in cues.items():
             key = digest([*code, dataset, name, of_items, cue.seen(here).tolist()])
-            used[key] = (known or {}).get(key) or _accuracy(_hits(here, cue.features(here), cue.model()))
+            used[key] = (cache or {}).get(key) or _accuracy(_hits(here, cue.features(here), cue.model()))
             rows.append((dataset, name, here["pair_id"].nunique(), *used[key]))
-    if known is not None:
-        known.clear()
-        known.update(used)
+    if cache is not None:
+        cache.clear()
+        cache.update(used)
     return pd.DataFrame(rows, columns=list(COLUMNS))
 
 

@@ -57,8 +57,8 @@ def resolve_scenario(workspace: Workspace, scenario: Scenario) -> ResolvedScenar
 def _resolved_anew(workspace: Workspace, scenario: Scenario) -> tuple[SceneSpec, Path]:
     """Return the scene of corrected parameters, with its family's words; stored once."""
     name = _resolved_name(scenario)
-    own = [workspace.trajectories / f"{name}{ending}" for ending in (".npz", ".json")]
-    workspace.store.bring(own)
+    files = [workspace.trajectories / f"{name}{ending}" for ending in (".npz", ".json")]
+    workspace.store.bring(files)
     for folder in (CORRECTIONS / "trajectories", workspace.trajectories):
         if (folder / f"{name}.json").is_file():
             record = (folder / f"{name}.json").read_text(encoding="utf-8")
@@ -70,7 +70,7 @@ def _resolved_anew(workspace: Workspace, scenario: Scenario) -> tuple[SceneSpec,
         raise TrapsError(f"{workspace.trajectories / name}.npz: cannot be written ({error.strerror})") from error
     record = json.dumps(spec.model_dump(mode="json"))
     write_text(workspace.trajectories / f"{name}.json", record)  # last, so that it vouches for the trajectory
-    workspace.store.keep(own)
+    workspace.store.keep(files)
     progress.current().note(
         f"{scenario.scenario_id}: simulated here after {scenario.where}; to freeze it for other machines copy "
         f"trajectories/{name}.* of the workspace to {CORRECTIONS / 'trajectories'}"

@@ -71,15 +71,15 @@ def build_videos(workspace: Workspace, category: str) -> tuple[list[VideoRow], d
     """Return clips, and occluded voids' leaked pixels. Raises TrapsError if missing."""
     specs = _specs(workspace, category)
     try:
-        known = known_clips(workspace.store, (clip for row in specs for clip in _clips(workspace, row)))
+        existing = known_clips(workspace.store, (clip for row in specs for clip in _clips(workspace, row)))
     except DamagedClip as error:
         raise TrapsError(str(error)) from error
     version = version_of(
         (clip_content(id_, spec.scene_hash) for id_, spec in released_in_study(workspace, category).items()),
         (clip_content(row["scenario_id"], row["scene_hash"]) for row in specs),
     )
-    rows = [row for spec in specs for row in _rows(workspace, spec, known, version)]
-    voids = {row["scenario_id"]: known[_clips(workspace, row)[1]].leaked_pixels for row in specs}
+    rows = [row for spec in specs for row in _rows(workspace, spec, existing, version)]
+    voids = {row["scenario_id"]: existing[_clips(workspace, row)[1]].leaked_pixels for row in specs}
     return rows, {id_: pixels for id_, pixels in voids.items() if pixels is not None}
 
 
@@ -105,10 +105,10 @@ def _job(workspace: Workspace, row: Row) -> Job:
     return Job(spec_of(row), *trajectories, *_clips(workspace, row))
 
 
-def _rows(workspace: Workspace, spec: Row, known: Mapping[Path, Clip], version: str) -> list[VideoRow]:
+def _rows(workspace: Workspace, spec: Row, existing: Mapping[Path, Clip], version: str) -> list[VideoRow]:
     rows, (width, height) = [], frame_size(json.loads(spec["params"]))
     for side, path in zip(CLIPS, _clips(workspace, spec), strict=True):
-        clip = known.get(path)
+        clip = existing.get(path)
         if clip is None:
             raise TrapsError(f"{path}: was not rendered; run again")
         rows.append(

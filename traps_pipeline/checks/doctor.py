@@ -206,11 +206,11 @@ def _remove_unfinished(root: Path) -> str:
     )
 
 
-def _finding(what: str, look: Callable[[], str]) -> Finding:
+def _finding(topic: str, look: Callable[[], str]) -> Finding:
     try:
-        return Finding(True, what, look())
+        return Finding(True, topic, look())
     except Exception as error:  # noqa: BLE001 - every failure of an examination becomes a finding
-        return Finding(False, what, f"{error}")
+        return Finding(False, topic, f"{error}")
 
 
 def _checkout() -> str:

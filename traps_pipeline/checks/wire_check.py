@@ -282,9 +282,9 @@ def participants() -> dict[str, Entry]:
 
 def check_named(names: Sequence[str]) -> Iterator[CheckedEntry]:
     """Check these entries (default: all). Raises TrapsError for an unknown id."""
-    known = participants()
-    if unknown := [name for name in names if name not in known]:
-        raise TrapsError(f"unknown model or judge {', '.join(unknown)}; known: {', '.join(known)}")
-    for name, entry in known.items():
+    entries = participants()
+    if unknown := [name for name in names if name not in entries]:
+        raise TrapsError(f"unknown model or judge {', '.join(unknown)}; known: {', '.join(entries)}")
+    for name, entry in entries.items():
         if name in names or (not names and entry.backend in (NETWORK, "local")):
             yield examine(entry)

@@ -89,10 +89,10 @@ def _check_live(names: list[str], *, is_json: bool) -> int:
     from traps_pipeline.checks.wire_check import participants
     from traps_pipeline.models.registry import NETWORK
 
-    known = participants()
-    if unknown := [name for name in names if name not in known]:
-        raise TrapsError(f"unknown model or judge {', '.join(unknown)}; known: {', '.join(known)}")
-    entries = [known[name] for name in names if known[name].backend == NETWORK]
+    entry_of = participants()
+    if unknown := [name for name in names if name not in entry_of]:
+        raise TrapsError(f"unknown model or judge {', '.join(unknown)}; known: {', '.join(entry_of)}")
+    entries = [entry_of[name] for name in names if entry_of[name].backend == NETWORK]
     if not entries:
         raise TrapsError("--live asks over the network: name a model or judge with an address, or an experiment")
     checks = check_live(entries)

@@ -108,8 +108,8 @@ def _difference(least: float | None) -> str:
 
 def _print_forecasts(forecasts: Sequence[Forecast], minutes: float) -> None:
     """Print tokens, dollars and minutes of new calls; sums omit unknown prices."""
-    known = [row.dollars for row in forecasts if row.dollars is not None]
-    total = (sum(d[0] for d in known), sum(d[1] for d in known), sum(d[2] for d in known))
+    priced = [row.dollars for row in forecasts if row.dollars is not None]
+    total = (sum(d[0] for d in priced), sum(d[1] for d in priced), sum(d[2] for d in priced))
     calls = sum(row.calls for row in forecasts)
     rows = [
         (
@@ -129,7 +129,7 @@ def _print_forecasts(forecasts: Sequence[Forecast], minutes: float) -> None:
     if in_batches < total[1]:
         heading = "expected if all calls are made in batches (traps study export-requests --batch)"
         print(wrapped(f"{heading}: USD {in_batches:,.2f}"))
-    if len(known) < len(forecasts):
+    if len(priced) < len(forecasts):
         unknown = ", ".join(row.participant for row in forecasts if row.dollars is None)
         print(wrapped(f"price unknown, not in the sum: {unknown}"))
 

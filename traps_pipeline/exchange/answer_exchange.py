@@ -157,13 +157,13 @@ def _cells(workspace: Workspace, experiment: Experiment) -> list[Cell]:
 
 
 def _missing_requests(workspace: Workspace, experiment: Experiment) -> Iterator[Request]:
-    known: dict[Evaluation, set[str]] = {}
+    settled: dict[Evaluation, set[str]] = {}
     for cell in _cells(workspace, experiment):
         evaluation = cell.evaluation
-        if evaluation not in known:
-            known[evaluation] = {*workspace.answers.read(evaluation.key).settled}
+        if evaluation not in settled:
+            settled[evaluation] = {*workspace.answers.read(evaluation.key).settled}
         requests = (question.request for question in wanted_questions(workspace, cell))
-        yield from (request for request in requests if request.key not in known[evaluation])
+        yield from (request for request in requests if request.key not in settled[evaluation])
 
 
 def _line(request: Request, out: Path) -> dict[str, Any]:
@@ -271,11 +271,11 @@ def export_vote_batches(workspace: Workspace, experiment: Experiment, out: Path)
     Return the files, and the number of calls. Raises TrapsError if answers are missing.
     """
     missing: dict[str, list[Request]] = {}
-    known: dict[Evaluation, set[str]] = {}
+    settled: dict[Evaluation, set[str]] = {}
     for cell, request in _wanted_votes(workspace, experiment):
-        if cell.evaluation not in known:
-            known[cell.evaluation] = {*workspace.votes.read(cell.evaluation.key).settled}
-        if request.key not in known[cell.evaluation]:
+        if cell.evaluation not in settled:
+            settled[cell.evaluation] = {*workspace.votes.read(cell.evaluation.key).settled}
+        if request.key not in settled[cell.evaluation]:
             missing.setdefault(request.participant, []).append(request)
     judges = load_judges()
     return export_batches({name: (judges[name], requests) for name, requests in missing.items()}, out)

@@ -163,11 +163,11 @@ class Experiment(BaseModel):
         return cells
 
 
-def _known_names(values: list[str], known: tuple[str, ...]) -> list[str]:
-    unknown = [value for value in values if value not in known]
+def _known_names(values: list[str], names: tuple[str, ...]) -> list[str]:
+    unknown = [value for value in values if value not in names]
     if unknown or not values:
-        near = did_you_mean(unknown[0], known) if unknown else ""
-        raise ValueError(f"{unknown or 'nothing'} given; choose from {', '.join(known)}{near}")
+        near = did_you_mean(unknown[0], names) if unknown else ""
+        raise ValueError(f"{unknown or 'nothing'} given; choose from {', '.join(names)}{near}")
     return values
 
 
@@ -175,10 +175,10 @@ def load_experiment(name: str) -> Experiment:
     """Return an experiment by name or YAML path. Raises TrapsError with known names."""
     path = Path(name) if name.endswith((".yaml", ".yml")) else EXPERIMENTS / f"{name}.yaml"
     if not path.is_file():
-        known = sorted(p.stem for p in EXPERIMENTS.glob("*.yaml"))
+        names = sorted(p.stem for p in EXPERIMENTS.glob("*.yaml"))
         raise TrapsError(
-            f"no experiment {name[:80]!r}: {str(path)[:200]} is not there; known: {', '.join(known)}, or give the path "
-            f"of a YAML file{did_you_mean(name, known)}"
+            f"no experiment {name[:80]!r}: {str(path)[:200]} is not there; known: {', '.join(names)}, or give the path "
+            f"of a YAML file{did_you_mean(name, names)}"
         )
     experiment = parse_yaml_model(Experiment, read_yaml(path), path)
     add_entries(experiment.own, path)

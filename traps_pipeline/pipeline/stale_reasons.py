@@ -82,11 +82,11 @@ def lines_of(explanation: Mapping[str, Any]) -> Iterator[str]:
 
 def _unknown(workspace: Workspace, item_id: str) -> str:
     """Return why an item is unknown, with the nearest one."""
-    known = workspace.tables.read_all(ITEMS, ["item_id"])["item_id"]
-    if known.empty:
+    item_ids = workspace.tables.read_all(ITEMS, ["item_id"])["item_id"]
+    if item_ids.empty:
         return f"item {item_id!r} is unknown: this study has no items yet; `traps run EXPERIMENT` makes them"
     form = "; an item is dataset:scenario:side, e.g. occlusion:domino_chain-0001:void"
-    return f"item {item_id!r} is unknown{did_you_mean(item_id, known) or form}"
+    return f"item {item_id!r} is unknown{did_you_mean(item_id, item_ids) or form}"
 
 
 def _rows_of(

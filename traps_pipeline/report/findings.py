@@ -103,13 +103,13 @@ def gate_arrows(results: Results) -> Iterator[str]:
     for model, group in _models(rows.loc[rows["pecs"].notna()]):
         for regime, part in group.groupby("regime", sort=False, observed=True):
             gates = {row["features"]: row for row in part.to_dict("records")}
-            own = gates.pop("states", None)
-            if own is None or not gates:
+            by_states = gates.pop("states", None)
+            if by_states is None or not gates:
                 continue
             best = max(gates.values(), key=lambda row: row["pecs"])
             yield (
-                f"{model} under {regime}: a gate on states takes PECS from {own['plain_pecs']:.2f} to "
-                f"{own['pecs']:.2f}, the best other gate ({best['features']}) to {best['pecs']:.2f}."
+                f"{model} under {regime}: a gate on states takes PECS from {by_states['plain_pecs']:.2f} to "
+                f"{by_states['pecs']:.2f}, the best other gate ({best['features']}) to {best['pecs']:.2f}."
             )
 
 

@@ -40,12 +40,12 @@ def study_findings(results: Results) -> list[StudyFinding]:
     if not len(rows):
         return []
     references = models_of(group="reference")
-    own = rows.loc[[model not in references for model in rows["model"]]]
-    own = own if len(own) else rows
+    shown = rows.loc[[model not in references for model in rows["model"]]]
+    shown = shown if len(shown) else rows
     inside = [(report.name, report.finding(results)) for report in FIGURE_REPORTS] if results.mechanism else []
     return [
-        *_best(own), *_abstention(own), *_accuracy(own), *_gaps(results, own), *_separable(results, own),
-        *_missing_answers(own), *(StudyFinding(text, f"figure-{name}") for name, text in inside if text),
+        *_best(shown), *_abstention(shown), *_accuracy(shown), *_gaps(results, shown), *_separable(results, shown),
+        *_missing_answers(shown), *(StudyFinding(text, f"figure-{name}") for name, text in inside if text),
     ]  # fmt: skip
 
 

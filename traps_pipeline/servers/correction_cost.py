@@ -42,10 +42,10 @@ class CorrectionEffect:
 
     def plus(self, other: CorrectionEffect) -> CorrectionEffect:
         """Return the sum of both."""
-        known = self.dollars is not None and other.dollars is not None
+        is_priced = self.dollars is not None and other.dollars is not None
         return CorrectionEffect(
             self.items + other.items, self.answers + other.answers, self.votes + other.votes,
-            (self.dollars or 0) + (other.dollars or 0) if known else None,
+            (self.dollars or 0) + (other.dollars or 0) if is_priced else None,
             self.rendered + other.rendered, self.gone + other.gone, self.added + other.added,
         )  # fmt: skip
 
