@@ -65,7 +65,7 @@ def add(commands: Commands) -> None:
 
     text = "prove that a revealed benchmark is the one that was committed"
     example = "commitment.json reveal.json --specs private"
-    parser = commands.add("benchmark prove", verify_commitment, text, example=example, workspace=False)
+    parser = commands.add("benchmark prove", verify_commitment, text, example=example, workspace=False, json=True)
     parser.add_argument("commitment", type=Path, help="a file of `traps benchmark commit --out`")
     parser.add_argument("reveal", type=Path, help="a file of `traps benchmark commit --reveal`")
     parser.add_argument("--specs", type=Path, metavar="FOLDER", help="the revealed benchmark, sampled or released")
@@ -157,17 +157,20 @@ def verify_commitment(arguments: argparse.Namespace) -> int:
     published, reveal = sealed.read_commitment(arguments.commitment), sealed.read_reveal(arguments.reveal)
     if arguments.without_drawing and not arguments.specs:
         raise TrapsError("--without-drawing: leaves nothing to look at; name the revealed benchmark with --specs")
-    problems, proven = [], []
+    problems, proven, output = [], [], sys.stderr if arguments.json else sys.stdout
     specs = sealed.revealed_specs(arguments.specs.absolute()) if arguments.specs else None
     if specs is not None:
         problems += sealed.broken_seals(published, reveal, specs)
         proven.append(f"the records of {arguments.specs} are the committed ones")
     if not arguments.without_drawing and not problems:
         sample = sealed.drawn_again(
-            published, reveal, workers=arguments.workers, report=lambda line: print(line, flush=True)
+            published, reveal, workers=arguments.workers, report=lambda line: print(line, file=output, flush=True)
         )
         problems += _not_drawn(published, sealed.broken_seals(published, reveal, sample), specs, sample)
         proven.append("the revealed seed draws them")
+    if arguments.json:
+        print_json({"benchmark": published.name, "version": published.version, "problems": problems, "proven": proven})
+        return FAILED if problems else OK
     for problem in problems:
         print(problem)
     if problems:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.wording import counted
-from traps_pipeline.cli.command import OK, Commands, add_experiment, experiment_of, integer, open_workspace
+from traps_pipeline.cli.command import OK, Commands, add_experiment, experiment_of, integer, open_workspace, print_json
 
 if TYPE_CHECKING:
     from traps_pipeline.exchange.answer_exchange import ImportResult
@@ -32,12 +32,13 @@ def add(commands: Commands) -> None:
     add_experiment(parser)
     parser.add_argument("--out", type=Path, required=True, help="folder of batches/")
     text = "import a provider's batch of votes into the ledger"
-    parser = commands.add("study import-votes", import_cast, text, example="paper results.jsonl")
+    parser = commands.add("study import-votes", import_cast, text, example="paper results.jsonl", json=True)
     add_experiment(parser)
     parser.add_argument("file", type=Path, help="the returned file")
 
     text = "import answers into the ledger: by key, a provider's batch, an inspect_ai log, or lmms-eval's samples"
-    parser = commands.add("study import-answers", import_given, text, example="demo answers.jsonl --model oracle")
+    example = "demo answers.jsonl --model oracle"
+    parser = commands.add("study import-answers", import_given, text, example=example, json=True)
     add_experiment(parser)
     parser.add_argument("file", type=Path, help="the returned file")
     parser.add_argument("--model", help="the model, for a file by item (default: the experiment's only model)")
@@ -102,6 +103,9 @@ def _exported(files: Sequence[Path], count: int, command: str) -> int:
 
 
 def _imported(imported: ImportResult, arguments: argparse.Namespace, noun: str) -> int:
+    if arguments.json:
+        print_json(imported)
+        return OK
     print(f"{counted(imported.new, noun)} imported; already known: {imported.known:,}")
     if imported.dropped:
         print(f"{counted(imported.dropped, 'error message')} left out; their answers are still missing")

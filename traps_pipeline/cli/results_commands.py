@@ -15,7 +15,7 @@ from traps_pipeline.cli.command import OK, Commands, open_workspace, place_of, p
 def add(commands: Commands) -> None:
     """Add the `traps results` commands, and `traps site`."""
     text = "write a folder to explore all answers and clips in; it opens from disk"
-    parser = commands.add("results site", site, text, example="site --without-clips")
+    parser = commands.add("results site", site, text, example="site --without-clips", json=True)
     parser.add_argument("folder", nargs="?", type=Path, help="default: `site` in the study's folder")
     parser.add_argument("--without-clips", action="store_true", help="leave the clips out, for a small folder")
 
@@ -41,6 +41,9 @@ def site(arguments: argparse.Namespace) -> int:
     workspace = open_workspace(arguments)
     folder = (arguments.folder or workspace.root / "site").absolute()
     summary = write_site(workspace, folder, clips=not arguments.without_clips)
+    if arguments.json:
+        print_json({"folder": folder, **vars(summary)})
+        return OK
     clips = f"{counted(summary.clips, 'clip')}, {_megabytes(summary.clip_bytes)}"
     files = f"{counted(summary.files, 'file')}, {_megabytes(summary.bytes)}"
     content = f"{counted(summary.answers, 'answer')} with {counted(summary.votes, 'vote')}"
