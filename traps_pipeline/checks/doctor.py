@@ -243,7 +243,7 @@ def _workspace(place: Place) -> str:
     if not Workspace.is_there(place):
         return f"{place} not made yet (`traps init` or `traps run demo` makes it)"
     study = Workspace.open(place).study
-    return f"{place}: benchmark {study.benchmark}, panel {study.panel}, budget {study.budget_usd} dollars"
+    return f"{place}: benchmark {study.benchmark}, panel {study.panel}, budget ${study.budget_usd:,.2f}"
 
 
 def _keys() -> str:
