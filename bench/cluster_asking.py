@@ -117,7 +117,7 @@ def main() -> None:
                 shutil.copytree(checkout.workspace / "clips", scratch / "clips")
                 for one in (alone, study):  # clips and items, so that only calls are left
                     said = one.traps("run", str(experiment), "--until", "items")
-                    if " 0 frames rendered" not in said.stdout:
+                    if "\n0 frames rendered" not in said.stdout:
                         raise SystemExit(said.stdout + said.stderr)
                 study.start_daemon()
                 for kind, one, more in (("folder", alone, ()), ("cluster", study, ("--runs", "1"))):

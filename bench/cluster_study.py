@@ -192,8 +192,8 @@ def watch(run: subprocess.Popen[str], kill: object, at: str = "scene_specs") -> 
 
 def asked(said: str) -> int:
     """Return how many answers a command says that it asked; -1 where it says nothing of it."""
-    found = re.search(r"^(\d+) answers asked \(", said, re.MULTILINE)
-    return int(found[1]) if found else -1
+    found = re.search(r"^([\d,]+) answers? asked \(", said, re.MULTILINE)
+    return int(found[1].replace(",", "")) if found else -1
 
 
 def main() -> None:

@@ -53,9 +53,11 @@ class Finished:
 
     def counts(self) -> dict[str, int]:
         """Answers asked, votes asked, frames rendered, as the last lines say."""
-        found = re.search(r"(\d+) answers asked .*?(\d+) votes asked .*?(\d+) frames rendered", self.out, re.DOTALL)
+        summary = r"([\d,]+) answers? asked .*?([\d,]+) votes? asked .*?([\d,]+) frames? rendered"
+        found = re.search(summary, self.out, re.DOTALL)
         assert found, f"no summary line in:\n{self.out}\n{self.err}"
-        return dict(zip(("answers", "votes", "frames"), map(int, found.groups()), strict=True))
+        counts = (int(number.replace(",", "")) for number in found.groups())
+        return dict(zip(("answers", "votes", "frames"), counts, strict=True))
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """What mkdocs does for this project beyond its settings: README as the first page, files that pages link to, reference.
 
 A page of `docs/` links to the rest of the repository (`../CONTRIBUTING.md`); on the site such a file lies below
-`repository/`. The reference is written from the docstrings of the package, a page a room, without importing it. The
-notebook becomes a page with what its cells printed and drew.
+`repository/`. The reference is written from docstrings, tables and the classes that check YAML. The notebook becomes a
+page with what its cells printed and drew.
 """
 
 from __future__ import annotations
@@ -101,21 +101,12 @@ def notebook_page() -> str:
 
 
 def reference() -> dict[str, str]:
-    """Return the text of each page by its name: one a room of the package, and `index`."""
-    rooms = {}
-    for path in sorted(PACKAGE.iterdir()):
-        modules = sorted(path.rglob("*.py")) if path.is_dir() else [path] if path.suffix == ".py" else []
-        if text := "\n".join(filter(None, map(_module, modules))):
-            rooms[path.stem] = f"# traps_pipeline.{path.stem}\n\n{text}"
-    rooms.pop("__init__", None)
-    listed = "\n".join(f"- [traps_pipeline.{name}]({name}.md): {_first_line(name)}" for name in rooms)
-    head = "# Reference\n\nWhat is public in each room of the package, from its docstrings. Notebooks use"
-    return {"index": f"{head} [inside](inside.md).\n\n{listed}\n"} | rooms
+    """Return the text of each page by its name: the public Python module, tables, and YAML fields."""
+    from tools.reference_pages import tables_page, yaml_page
 
-
-def _first_line(room: str) -> str:
-    path = PACKAGE / room / "__init__.py" if (PACKAGE / room).is_dir() else PACKAGE / f"{room}.py"
-    return _escaped((ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "").partition("\n")[0])
+    head = "# Python\n\nFor everyone who opens a study in a [notebook](../inside.md): the module whose names stay."
+    python = f"{head}\n\n{_module(PACKAGE / 'inside.py')}"
+    return {"python": python, "tables": tables_page(), "yaml": yaml_page()}
 
 
 def _module(path: Path) -> str:

@@ -44,7 +44,7 @@ def test_ctrl_c_says_what_it_waits_for(capsys: pytest.CaptureFixture[str]) -> No
     next(results)
     with pytest.raises(KeyboardInterrupt):
         results.throw(KeyboardInterrupt())  # type: ignore[attr-defined]
-    assert "stopping: waiting for what the workers have begun" in capsys.readouterr().err
+    assert "stopping: waiting for the scenes in progress" in capsys.readouterr().err
 
 
 def test_ctrl_c_while_a_worker_is_started_leaves_no_process_waiting() -> None:

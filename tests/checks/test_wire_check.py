@@ -221,7 +221,7 @@ def test_the_command_needs_neither_keys_nor_a_network() -> None:
     assert done.returncode == 0, done.stdout + done.stderr
     checked = ["gemini-2.5-pro", "qwen3-vl-think", "gpt-5-nr", "judge-claude-opus-4.6"]
     assert [line.split()[0] for line in lines[:-1]] == checked
-    assert lines[-1] == "every entry sends what it declares"
+    assert lines[-1] == "every entry is sent as declared"
     assert done.stderr == ""
 
 
@@ -234,7 +234,7 @@ def test_the_command_fails_where_an_entry_does(
     printed = capsys.readouterr().out.splitlines()
     assert printed[0] == f"{'gpt-5-nr':<24} nothing caught"
     assert printed[1].startswith("    0 requests were sent")
-    assert printed[-1] == "1 entries do not send what they declare"
+    assert printed[-1] == "1 entry sent otherwise than declared"
     assert main(["models", "check", "gpt-6"]) == 1
 
 

@@ -61,6 +61,11 @@ def test_a_study_is_read_without_its_tables(small: Checkout) -> None:
     assert read(small, "status")["command"] == job
 
 
+def test_a_site_says_what_it_holds(small: Checkout, tmp_path: Path) -> None:
+    site = read(small, "site", str(tmp_path / "site"), "--without-clips")
+    assert (site["answers"], site["clips"]) == (288, 0) and site["folder"] == str(tmp_path / "site")
+
+
 def test_findings_and_differences_are_rows(small: Checkout) -> None:
     assert {"statement", "published", "recomputed", "verdict"} <= {*read(small, "results", "audit")[0]}
     difference = read(small, "results", "compare", str(small.workspace))[0]

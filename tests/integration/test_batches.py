@@ -83,7 +83,7 @@ def through_files(study: Checkout, path: Path, what: str, url: str, folder: Path
         asked = json.loads(text)["requests"] if file.suffix == ".json" else map(json.loads, text.splitlines())
         results.write_text("".join(json.dumps(answered(url, line)) + "\n" for line in asked))
         imported = study.traps("study", f"import-{what}", path, results)
-        assert imported.code == 0 and "0 were there already" in imported.out, imported.err
+        assert imported.code == 0 and "already known: 0" in imported.out, imported.err
 
 
 def table(study: Checkout, which: Table[Any]) -> pd.DataFrame:

@@ -281,8 +281,8 @@ def test_filters_and_search_find_exactly_what_the_tables_hold(site: Site, browse
         held = [said.str.contains(term.lower(), regex=False) for term in (last, f"{first} {second}")]
         wanted = int((fits & held[0] & held[1]).sum())
         assert wanted > 0
-        until(page, "/ mention /.test(document.querySelector('.status').textContent)")
-        assert page.locator(".status").inner_text() == f"{wanted} of {fits.sum()} answers mention “{query}”"
+        until(page, "document.querySelector('.status').textContent.startsWith('“')")
+        assert page.locator(".status").inner_text() == f"“{query}”: {wanted} of {fits.sum()} answers"
         assert page.locator(".answer", has=page.locator("mark")).count() == min(wanted, 25)
         page.get_by_role("searchbox").fill("left nowhere")
         page.keyboard.press("Enter")

@@ -19,7 +19,7 @@ VOTES = ANSWERS // 2 * 9  # three judges on a control's two tasks and on a void'
 
 
 def test_one_command_goes_from_records_to_the_leaderboard_and_the_report(small: Checkout, small_output: str) -> None:
-    assert f"{ANSWERS} answers asked (0 from the ledger)\n{VOTES} votes asked (0 from the ledger)\n" in small_output
+    assert f"{ANSWERS} answers asked (0 from the ledger)\n{VOTES:,} votes asked (0 from the ledger)\n" in small_output
     reports = small.workspace / "reports"
     for kind, page in (("report", reports / "report.html"), ("explorer", reports / "index.html")):
         assert f"{kind} {page}" in small_output.splitlines()
@@ -50,7 +50,7 @@ def test_a_second_run_does_nothing_and_status_and_plan_agree(study: Checkout) ->
     assert "tables and figures" not in again.err  # no partition was materialized
     place, fresh = study.traps("status", EXPERIMENT).out.splitlines()
     assert place == f"workspace {study.workspace}"
-    assert re.fullmatch(r"all \d+ partitions of \d+ stages are fresh", fresh)
+    assert re.fullmatch(r"everything is fresh: \d+ partitions of \d+ stages", fresh)
     stages = {row["stage"]: row for row in json.loads(study.traps("status", EXPERIMENT, "--json").out)["stages"]}
     expected = {"scene_specs": 4, "items": 4, "responses": 24, "verdicts": 24, "leaderboard": 1}
     for stage, partitions in expected.items():

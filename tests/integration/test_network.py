@@ -257,9 +257,10 @@ def test_a_cluster_answers_in_the_models_stead(unasked: Checkout, provider: Prov
     assert settled(unasked) == []
 
     given.write_text("\n".join(json.dumps(answer) for answer in answers[:20]))
-    assert "20 answers imported, 0 were there already" in unasked.traps("study", "import-answers", path, given).out
+    assert "20 answers imported; already known: 0" in unasked.traps("study", "import-answers", path, given).out
     given.write_text("\n".join(json.dumps(answer) for answer in answers))
-    assert "4 answers imported, 20 were there already" in unasked.traps("study", "import-answers", path, given).out
+    imported = json.loads(unasked.traps("study", "import-answers", path, given, "--json").ok().out)
+    assert imported == {"new": 4, "known": 20, "failed": "", "dropped": 0}
     finished = ask(unasked, path).ok()
     assert finished.counts()["answers"] == 0
     assert provider.stats()["requests"] == 0

@@ -110,7 +110,7 @@ def test_ten_scenarios_by_keyboard_and_then_exactly_what_they_touch_is_asked(stu
     assert (lines[6]["scenario_id"], lines[6]["ill_posed_question"]) == (seventh, ILL_POSED)
     counts, answers = study.score(EXPERIMENT).ok().counts(), 4 * 3 * 2  # four items, three models, two regimes
     assert (counts["answers"], counts["frames"]) == (answers, 0)
-    found = re.search(r"(\d+) items are asked or judged again: at most (\d+) answers and (\d+) votes", told)
+    found = re.search(r"(\d+) items to ask or judge again: at most (\d+) answers and (\d+) votes", told)
     assert found and [*map(int, found.groups())] == [4, answers, counts["votes"]]
 
 

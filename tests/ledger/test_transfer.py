@@ -85,7 +85,7 @@ def test_the_commands_write_a_file_once_and_read_what_they_wrote(
     write(one.answers, answer("a", "left"))
     file = tmp_path / "answers.sqlite"
     assert main(["study", "export-ledger", "--workspace", str(one.root), str(file)]) == 0
-    assert "1 rows are in" in capsys.readouterr().out
+    assert "wrote 1 row to" in capsys.readouterr().out
     assert main(["study", "export-ledger", "--workspace", str(one.root), str(file)]) == 1
     assert "is there already" in capsys.readouterr().err
     assert main(["study", "import-ledger", "--workspace", str(two.root), str(file)]) == 0

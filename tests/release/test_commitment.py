@@ -47,6 +47,8 @@ def test_the_seed_draws_the_committed_records_again(committed: Path, demo: Check
     finished = demo.traps("benchmark", "prove", *given, "--workers", "1")
     assert finished.code == 0, finished.out + finished.err
     assert finished.out.splitlines()[-1].endswith("are the committed ones, and the revealed seed draws them")
+    outcome = json.loads(demo.traps("benchmark", "prove", *given, "--without-drawing", "--json").ok().out)
+    assert outcome["problems"] == [] and len(outcome["proven"]) == 1
 
 
 def test_a_commitment_tells_neither_the_seed_nor_a_record(committed: Path) -> None:

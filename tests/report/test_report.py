@@ -330,7 +330,7 @@ def test_the_worked_example_is_a_pair_with_both_answers_and_their_verdicts(tmp_p
     votes += [{"valid": k > 0, "task": "correctness", "abstained": None, "extracted_value": "left"} for k in range(3)]
     words = reading("It goes left.", votes, rows[2])
     assert words[1:] == [
-        "Reading: 1 of 3 judges read an abstention; they extract left.", "Verdict: answered, correct.",
+        "Reading: an abstention for 1 of 3 judges; they extract left.", "Verdict: answered, correct.",
     ]  # fmt: skip
     assert reading("Left.", votes[:3], rows[3])[2] == "Verdict: answered, though the outcome cannot be known."
     pair = pd.DataFrame(pair_rows("plinko-0", tmp_path, kept=5)).set_index("side")

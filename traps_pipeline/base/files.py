@@ -85,10 +85,10 @@ def sync_folder(folder: Path) -> None:
 def is_in_place(descriptor: int, path: Path) -> bool:
     """Return whether an open file still has its name; else its lock excludes nobody."""
     try:
-        current, own = path.stat(), os.fstat(descriptor)
+        current, opened = path.stat(), os.fstat(descriptor)
     except FileNotFoundError:
         return False
-    return (current.st_dev, current.st_ino) == (own.st_dev, own.st_ino)
+    return (current.st_dev, current.st_ino) == (opened.st_dev, opened.st_ino)
 
 
 def try_lock(path: Path) -> int | None:
@@ -136,10 +136,10 @@ def write_text(path: Path, text: str) -> None:
     write_bytes(path, text.encode())
 
 
-def is_same_file(one: Path, other: Path) -> bool:
+def is_same_file(first: Path, second: Path) -> bool:
     """Return whether two paths name one existing file."""
     try:
-        return one.samefile(other)
+        return first.samefile(second)
     except FileNotFoundError:
         return False
 

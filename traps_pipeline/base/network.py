@@ -103,7 +103,7 @@ def check_network() -> str:
     if problem := certificate_problem(CERTIFICATES):
         raise TrapsError(problem)
     certificates = [name for name in CERTIFICATES if os.environ.get(name)]
-    return f"{', '.join(proxies) or 'no proxy'}; {', '.join(certificates) or 'the usual certificates'}"
+    return f"{', '.join(proxies) or 'no proxy'}; certificates of {', '.join(certificates) or 'this machine'}"
 
 
 def certificate_problem(variables: Sequence[str]) -> str | None:

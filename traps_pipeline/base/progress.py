@@ -16,6 +16,7 @@ from itertools import chain
 from typing import Any, TypeVar
 
 from traps_pipeline.base.terminal import plain
+from traps_pipeline.base.wording import counted
 
 HEARTBEAT_S = 30.0  # between two lines about the same stage
 
@@ -156,10 +157,10 @@ class Progress:
         """Count this run's share of a partition that another run finished."""
         self.totals.setdefault(stage, Tally()).add(tally)
 
-    def tick(self, stage: str, what: str, done: int, total: int) -> None:
+    def tick(self, stage: str, unit: str, done: int, total: int) -> None:
         """Count units (clips, layers) of the partition in progress."""
         if (now := self.current_stage) is not None:
-            now.detail, now.share = f"{what}: {done:,} of {total:,}", done / max(total, 1)
+            now.detail, now.share = f"{unit}: {done:,} of {total:,}", done / max(total, 1)
         self.changed()
 
     def asking(self, stage: str, calls: Mapping[str, tuple[int, int]]) -> None:
@@ -245,8 +246,8 @@ class Progress:
             parts.append(now.detail)
         if total.wanted:
             parts += [f"{total.per_second:.1f}/s at {total.latency_s(0.5):.1f} s"]
-            parts += [f"{total.errors:,} error{'s' * (total.errors != 1)}"] if total.errors else []
-            parts += [f"{total.retries:,} {'retry' if total.retries == 1 else 'retries'}"] if total.retries else []
+            parts += [counted(total.errors, "error")] if total.errors else []
+            parts += [counted(total.retries, "retry", "retries")] if total.retries else []
             parts += [self.spent()] if self.budget_usd else []
         parts.append(f"{clock(now.seconds)} so far" if now.left_s is None else f"{clock(now.left_s)} left")
         return f"{now.name}: {', '.join(parts)}"

@@ -194,10 +194,10 @@ def _spans(text: str, pieces: dict[str, list[tuple[str, int]]], is_decoded: bool
             start = searched.find(piece, last if is_part else start + 1)
 
 
-def _alike(text: str, other: str) -> int:
+def _alike(text: str, reference: str) -> int:
     """Return how many characters two texts have in common at their beginnings."""
-    differences = (k for k, (char, other_char) in enumerate(zip(text, other, strict=False)) if char != other_char)
-    return next(differences, min(len(text), len(other)))
+    differences = (k for k, (char, other_char) in enumerate(zip(text, reference, strict=False)) if char != other_char)
+    return next(differences, min(len(text), len(reference)))
 
 
 def _merged(spans: list[tuple[int, int]]) -> list[tuple[int, int]]:

@@ -7,16 +7,16 @@ from collections.abc import Iterable
 _LIKENESS = 0.6
 
 
-def nearest(word: str, known: Iterable[str]) -> str | None:
+def nearest(word: str, candidates: Iterable[str]) -> str | None:
     """Return the known word most similar to this one, or None if none is similar."""
     from difflib import get_close_matches
 
-    names = {name.lower(): name for name in known}
+    names = {name.lower(): name for name in candidates}
     near = get_close_matches(word.lower()[:100], names, n=1, cutoff=_LIKENESS)
     return names[near[0]] if near else None
 
 
-def did_you_mean(word: str, known: Iterable[str]) -> str:
+def did_you_mean(word: str, candidates: Iterable[str]) -> str:
     """Return a sentence's end that suggests the nearest known word, or nothing."""
-    near = nearest(word, known)
+    near = nearest(word, candidates)
     return f"; did you mean {near}?" if near else ""

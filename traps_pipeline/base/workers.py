@@ -122,7 +122,7 @@ def _in_order(
             submit(not at_once)
     except BaseException as error:
         if not isinstance(error, Exception | GeneratorExit):  # Ctrl-C
-            progress.current().note("stopping: waiting for what the workers have begun")
+            progress.current().note("stopping: waiting for the scenes in progress")
         raise
     finally:
         wait([future for _, future in pending if not future.cancel()])

@@ -13,6 +13,7 @@ from pydantic import RootModel, ValidationError
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import SCENE_SPECS
+from traps_pipeline.base.wording import counted
 from traps_pipeline.base.workers import kept_workers
 from traps_pipeline.base.yamlfile import explain, read_yaml
 from traps_pipeline.benchmark.items import commonest_answers
@@ -56,7 +57,7 @@ def sample_benchmark(
             except RuntimeError as error:
                 raise TrapsError(str(error)) from error
             reasons = ", ".join(f"{n} x {reason}" for reason, n in tally.rejected.most_common()) or "none rejected"
-            report(f"{family}: {count} of {tally.draws} draws; {reasons}")
+            report(f"{family}: {count} of {counted(tally.draws, 'draw')}; {reasons}")
     if not (out / "benchmark.yaml").exists():
         release = {"name": name, "version": "1.0.0", "canary": f"{name.upper()}:CANARY:{uuid.uuid4()}"}
         write_text(out / "benchmark.yaml", yaml.safe_dump(release, sort_keys=False))
@@ -80,7 +81,7 @@ def problems(specs: Sequence[SceneSpec], counts: Mapping[str, int] | None = None
 
 def _wrong_counts(families: Mapping[str, Sequence[SceneSpec]], counts: Mapping[str, int]) -> list[str]:
     return [
-        f"{family}: {len(families.get(family, ()))} scenarios, {counts.get(family, 0)} wanted"
+        f"{family}: {counted(len(families.get(family, ())), 'scenario')}, {counts.get(family, 0)} wanted"
         for family in sorted({*families, *counts})
         if len(families.get(family, ())) != counts.get(family, 0)
     ]

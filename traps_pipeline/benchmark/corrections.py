@@ -41,19 +41,19 @@ class Correction(BaseModel):
     """One review decision."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    scenario_id: str = Field(pattern=Slug, max_length=80)
-    action: Literal["keep", "correct", "discard", "add", "restore"]
-    family: str | None = None
-    params: dict[str, Any] | None = None
-    question: str | None = None
-    labels: list[str] | None = None
-    aliases: dict[str, str] | None = None
-    answer: str | None = None
-    ill_posed_question: str | None = None
-    answerable_question: Answerable | None = None
-    who: str = Field(min_length=1)
-    when: date
-    why: str = Field(min_length=1)
+    scenario_id: str = Field(pattern=Slug, max_length=80, description="family and number")
+    action: Literal["keep", "correct", "discard", "add", "restore"] = Field(description="what happens to the scenario")
+    family: str | None = Field(default=None, description="of an added scenario")
+    params: dict[str, Any] | None = Field(default=None, description="of the scene; those left out stay")
+    question: str | None = Field(default=None, description="of both clips, with its choices")
+    labels: list[str] | None = Field(default=None, description="closed set of answers")
+    aliases: dict[str, str] | None = Field(default=None, description="other words for a label")
+    answer: str | None = Field(default=None, description="right answer to the control")
+    ill_posed_question: str | None = Field(default=None, description="question that no clip answers")
+    answerable_question: Answerable | None = Field(default=None, description="question that both clips answer")
+    who: str = Field(min_length=1, description="who decided")
+    when: date = Field(description="day of the decision")
+    why: str = Field(min_length=1, description="reason")
 
     def changes(self) -> dict[str, Any]:
         """Return the fields that the decision rewrites: words, answer, params."""

@@ -17,6 +17,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import PART, check_disk
 from traps_pipeline.base.keys import optional_key
 from traps_pipeline.base.network import check_network
+from traps_pipeline.base.wording import counted
 from traps_pipeline.scenes.picture.trial import draw_frame, encode_clip
 from traps_pipeline.storage.place import Place, scratch_of
 
@@ -128,7 +129,7 @@ def examine_files(place: Place) -> Iterator[Finding]:
         summary = "; ".join(damaged[:MOST_FILES]) + (
             f"; and {len(damaged) - MOST_FILES} more" if len(damaged) > MOST_FILES else ""
         )
-        yield Finding(not damaged, topic, summary or f"{len(files)} files are what was written")
+        yield Finding(not damaged, topic, summary or f"{counted(len(files), 'file')} read, as written")
     message = [*workspace.answers.damage(), *workspace.votes.damage()]
     yield Finding(not message, "ledger", "; ".join(message[:MOST_FILES]) or "all rows are what was written")
     yield Finding(True, "unfinished", _remove_unfinished(workspace.root))
@@ -149,7 +150,7 @@ def examine_unused(place: Place, *, is_removed: bool) -> Finding:
             "store with --workspace s3://BUCKET/STUDY"
         )
     unused = workspace.store.unused(is_removed=is_removed)
-    volume = f"{len(unused)} objects ({sum(item.size for item in unused) / 1e6:.1f} MB)"
+    volume = f"{counted(len(unused), 'object')} ({sum(item.size for item in unused) / 1e6:.1f} MB)"
     if unused:
         volume += f", the oldest of {unused[0].at:%Y-%m-%d}: {', '.join(item.name for item in unused[:MOST_FILES])}"
         volume += ", .." * (len(unused) > MOST_FILES)
@@ -198,14 +199,18 @@ def _remove_unfinished(root: Path) -> str:
     size = sum(path.stat().st_size for path in old)
     for path in old:
         path.unlink(missing_ok=True)
-    return f"{len(old)} files of killed runs removed ({size / 1e6:.1f} MB)" if old else "no killed run left a file"
+    return (
+        f"{counted(len(old), 'file')} of killed runs removed ({size / 1e6:.1f} MB)"
+        if old
+        else "no killed run left a file"
+    )
 
 
-def _finding(what: str, look: Callable[[], str]) -> Finding:
+def _finding(topic: str, look: Callable[[], str]) -> Finding:
     try:
-        return Finding(True, what, look())
+        return Finding(True, topic, look())
     except Exception as error:  # noqa: BLE001 - every failure of an examination becomes a finding
-        return Finding(False, what, f"{error}")
+        return Finding(False, topic, f"{error}")
 
 
 def _checkout() -> str:
@@ -215,7 +220,13 @@ def _checkout() -> str:
     from traps_pipeline.models.registry import load_models
 
     root, release = require_root(), load_release()
-    counts = f"{len(load_released())} scenarios, {len(read_corrections())} corrections, {len(load_models())} models"
+    counts = ", ".join(
+        (
+            counted(len(load_released()), "scenario"),
+            counted(len(read_corrections()), "correction"),
+            counted(len(load_models()), "model"),
+        )
+    )
     return f"{root}: {release.name} {release.version}, {counts}"
 
 
@@ -232,7 +243,7 @@ def _workspace(place: Place) -> str:
     if not Workspace.is_there(place):
         return f"{place} not made yet (`traps init` or `traps run demo` makes it)"
     study = Workspace.open(place).study
-    return f"{place}: benchmark {study.benchmark}, panel {study.panel}, budget {study.budget_usd} dollars"
+    return f"{place}: benchmark {study.benchmark}, panel {study.panel}, budget ${study.budget_usd:,.2f}"
 
 
 def _keys() -> str:
@@ -243,7 +254,5 @@ def _keys() -> str:
     entries = [*load_models().values(), *load_judges().values()]
     for key in sorted({account.key for account in load_accounts().values() if account.key}):
         optional_key(key)  # raises if its value is no key
-    missing = [
-        f"{name} not set ({', '.join(entry_ids)} cannot be asked)" for name, entry_ids in missing_keys(entries).items()
-    ]
-    return "; ".join(missing) or "all set"
+    missing = [f"{name} ({', '.join(entry_ids)})" for name, entry_ids in missing_keys(entries).items()]
+    return f"the demo needs none; to ask other models and judges, set {'; '.join(missing)}" if missing else "all set"

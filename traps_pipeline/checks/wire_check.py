@@ -20,6 +20,7 @@ import numpy as np
 
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.wording import counted
 from traps_pipeline.checks.loopback import PLACEHOLDER_KEY, render
 from traps_pipeline.checks.wire_body import (
     ENDPOINTS,
@@ -234,7 +235,7 @@ def _protocol_problems(entry: ModelEntry, requests: Mapping[str, Request]) -> It
 def _line(entry: Entry, wire: WireBody | str, media: Media | None) -> str:
     if isinstance(wire, str):
         return f"{entry.id:<24} nothing caught"
-    clip = f"{media.profile} {media.n_frames} frames {media.size_bytes:,} bytes" if media else "no clip"
+    clip = f"{media.profile} {counted(media.n_frames, 'frame')} {media.size_bytes:,} bytes" if media else "no clip"
     try:
         fields = read_body(wire).fields
     except UNKNOWN_FORM:
@@ -252,7 +253,9 @@ def _examine_local(entry: ModelEntry, spec: MediaSpec) -> CheckedEntry:
     frames = sample(_studio().clip, spec)
     count, (height, width) = len(frames.frames), frames.frames.shape[1:3]
     times = " ".join(f"{time:g}" for time in frames.times_s[:3])
-    line = f"{entry.id:<24} local  {count} frames of {width} x {height} at {times} ... {frames.times_s[-1]:g} s"
+    line = (
+        f"{entry.id:<24} local  {counted(count, 'frame')} of {width} x {height} at {times} ... {frames.times_s[-1]:g} s"
+    )
     problems = list(_local_problems(frames.times_s, (width, height), spec))
     return CheckedEntry(entry, f"{line}  {_fields(flat(entry.params))}", problems)
 
@@ -265,7 +268,7 @@ def _local_problems(times_s: np.ndarray, size: tuple[int, int], spec: MediaSpec)
         expected = (np.arange(_CLIP_FRAMES) / (spec.fps or 1))[: spec.most]
         expected = expected[expected <= last + 1e-6]
     if len(times_s) != len(expected):
-        yield f"media: {len(times_s)} frames are shown, {len(expected)} are declared"
+        yield f"media: {counted(len(times_s), 'frame')} shown, {len(expected)} declared"
     elif np.abs(times_s - expected).max() > 0.5 / _CLIP_FPS + 1e-6:
         yield "media: the frames are not those nearest to the declared times"
     if size != (spec.size or _CLIP_SIZE):
@@ -279,9 +282,9 @@ def participants() -> dict[str, Entry]:
 
 def check_named(names: Sequence[str]) -> Iterator[CheckedEntry]:
     """Check these entries (default: all). Raises TrapsError for an unknown id."""
-    known = participants()
-    if unknown := [name for name in names if name not in known]:
-        raise TrapsError(f"unknown model or judge {', '.join(unknown)}; known: {', '.join(known)}")
-    for name, entry in known.items():
+    entries = participants()
+    if unknown := [name for name in names if name not in entries]:
+        raise TrapsError(f"unknown model or judge {', '.join(unknown)}; known: {', '.join(entries)}")
+    for name, entry in entries.items():
         if name in names or (not names and entry.backend in (NETWORK, "local")):
             yield examine(entry)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.wording import counted
 from traps_pipeline.cli.command import FAILED, OK, Commands, integer, number, print_json
 
 if TYPE_CHECKING:
@@ -64,7 +65,7 @@ def add(commands: Commands) -> None:
 
     text = "prove that a revealed benchmark is the one that was committed"
     example = "commitment.json reveal.json --specs private"
-    parser = commands.add("benchmark prove", verify_commitment, text, example=example, workspace=False)
+    parser = commands.add("benchmark prove", verify_commitment, text, example=example, workspace=False, json=True)
     parser.add_argument("commitment", type=Path, help="a file of `traps benchmark commit --out`")
     parser.add_argument("reveal", type=Path, help="a file of `traps benchmark commit --reveal`")
     parser.add_argument("--specs", type=Path, metavar="FOLDER", help="the revealed benchmark, sampled or released")
@@ -94,7 +95,7 @@ def certify(arguments: argparse.Namespace) -> int:
     for problem in problems:
         print(f"traps: {problem}", file=sys.stderr)
     passed = sum(verdict.passed for verdict in verdicts)
-    print(f"{passed} of {len(verdicts)} scenarios certified")
+    print(f"{passed:,} of {counted(len(verdicts), 'scenario')} certified")
     return FAILED if problems else OK
 
 
@@ -128,7 +129,8 @@ def sample(arguments: argparse.Namespace) -> int:
         workers=arguments.workers,
         report=lambda line: print(line, flush=True),
     )
-    print(f"{sum(targets.values())} scenarios of {len(targets)} families in {arguments.out}")
+    scenarios, families = counted(sum(targets.values()), "scenario"), counted(len(targets), "family", "families")
+    print(f"{scenarios} of {families} in {arguments.out}")
     benchmark = load_release(arguments.out.absolute() / "benchmark.yaml").name
     print(
         f"next: traps benchmark certify --specs {arguments.out}; to run studies on it, "
@@ -142,7 +144,8 @@ def commit_benchmark(arguments: argparse.Namespace) -> int:
     from traps_pipeline.release.commitment import commit
 
     public = commit(arguments.benchmark.absolute(), arguments.out, arguments.reveal)
-    print(f"{len(public.specs)} records of {public.name} {public.version} are committed in {arguments.out}: publish it")
+    records = counted(len(public.specs), "record")
+    print(f"committed {records} of {public.name} {public.version} in {arguments.out}: publish it")
     print(f"keep {arguments.reveal} secret until the benchmark is revealed; without it nothing can be proven")
     return OK
 
@@ -154,22 +157,25 @@ def verify_commitment(arguments: argparse.Namespace) -> int:
     published, reveal = sealed.read_commitment(arguments.commitment), sealed.read_reveal(arguments.reveal)
     if arguments.without_drawing and not arguments.specs:
         raise TrapsError("--without-drawing: leaves nothing to look at; name the revealed benchmark with --specs")
-    problems, proven = [], []
+    problems, proven, output = [], [], sys.stderr if arguments.json else sys.stdout
     specs = sealed.revealed_specs(arguments.specs.absolute()) if arguments.specs else None
     if specs is not None:
         problems += sealed.broken_seals(published, reveal, specs)
         proven.append(f"the records of {arguments.specs} are the committed ones")
     if not arguments.without_drawing and not problems:
         sample = sealed.drawn_again(
-            published, reveal, workers=arguments.workers, report=lambda line: print(line, flush=True)
+            published, reveal, workers=arguments.workers, report=lambda line: print(line, file=output, flush=True)
         )
         problems += _not_drawn(published, sealed.broken_seals(published, reveal, sample), specs, sample)
         proven.append("the revealed seed draws them")
+    if arguments.json:
+        print_json({"benchmark": published.name, "version": published.version, "problems": problems, "proven": proven})
+        return FAILED if problems else OK
     for problem in problems:
         print(problem)
     if problems:
-        raise TrapsError(f"{arguments.commitment}: is not proven; {len(problems)} things are not what was committed")
-    print(f"{len(published.specs)} records of {published.name} {published.version}: {', and '.join(proven)}")
+        raise TrapsError(f"{arguments.commitment}: is not proven: {counted(len(problems), 'problem')}")
+    print(f"{counted(len(published.specs), 'record')} of {published.name} {published.version}: {', and '.join(proven)}")
     if arguments.without_drawing:
         print("not checked: whether the revealed seed draws them")
     return OK

@@ -6,6 +6,7 @@ import argparse
 
 from traps_pipeline.base.extras import require
 from traps_pipeline.base.terminal import plain, wrapped
+from traps_pipeline.base.wording import counted
 from traps_pipeline.cli.command import FAILED, OK, Commands, place_of, print_json
 
 
@@ -59,5 +60,5 @@ def doctor(arguments: argparse.Namespace) -> int:
         print(wrapped(line, hang=5), flush=True)
         problems += not finding.ok
     if summary[0]:
-        print(f"{problems} problem{'s' * (problems != 1)}; {summary[0]}" if problems else summary[1])
+        print(f"{counted(problems, 'problem')}; {summary[0]}" if problems else summary[1])
     return FAILED if problems else OK

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cli.command import OK, Commands, add_experiment, experiment_of, integer, open_workspace
+from traps_pipeline.base.wording import counted
+from traps_pipeline.cli.command import OK, Commands, add_experiment, experiment_of, integer, open_workspace, print_json
 
 if TYPE_CHECKING:
     from traps_pipeline.exchange.answer_exchange import ImportResult
@@ -31,12 +32,13 @@ def add(commands: Commands) -> None:
     add_experiment(parser)
     parser.add_argument("--out", type=Path, required=True, help="folder of batches/")
     text = "import a provider's batch of votes into the ledger"
-    parser = commands.add("study import-votes", import_cast, text, example="paper results.jsonl")
+    parser = commands.add("study import-votes", import_cast, text, example="paper results.jsonl", json=True)
     add_experiment(parser)
     parser.add_argument("file", type=Path, help="the returned file")
 
     text = "import answers into the ledger: by key, a provider's batch, an inspect_ai log, or lmms-eval's samples"
-    parser = commands.add("study import-answers", import_given, text, example="demo answers.jsonl --model oracle")
+    example = "demo answers.jsonl --model oracle"
+    parser = commands.add("study import-answers", import_given, text, example=example, json=True)
     add_experiment(parser)
     parser.add_argument("file", type=Path, help="the returned file")
     parser.add_argument("--model", help="the model, for a file by item (default: the experiment's only model)")
@@ -59,7 +61,7 @@ def export_calls(arguments: argparse.Namespace) -> int:
     if arguments.media_at:
         raise TrapsError("--media-at: only batch files refer to media by an address; say --batch, too")
     count = export_requests(open_workspace(arguments), experiment, arguments.out.absolute())
-    print(f"{count} requests in {arguments.out / REQUESTS}")
+    print(f"{counted(count, 'request')} in {arguments.out / REQUESTS}")
     print(f"next: have them answered, then traps study import-answers {arguments.experiment} ANSWERS.jsonl")
     return OK
 
@@ -72,7 +74,7 @@ def import_given(arguments: argparse.Namespace) -> int:
     experiment = experiment_of(arguments)
     context = AnswerContext(arguments.model, arguments.run, arguments.key and held_out_key(arguments.key))
     imported = import_answers(open_workspace(arguments), experiment, arguments.file, context, arguments.errors)
-    return _imported(imported, arguments, "answers")
+    return _imported(imported, arguments, "answer")
 
 
 def export_votes(arguments: argparse.Namespace) -> int:
@@ -89,20 +91,24 @@ def import_cast(arguments: argparse.Namespace) -> int:
     from traps_pipeline.exchange.answer_exchange import import_votes
 
     experiment = experiment_of(arguments)
-    return _imported(import_votes(open_workspace(arguments), experiment, arguments.file), arguments, "votes")
+    return _imported(import_votes(open_workspace(arguments), experiment, arguments.file), arguments, "vote")
 
 
 def _exported(files: Sequence[Path], count: int, command: str) -> int:
     for file in files:
         print(file)
-    print(f"{count} calls in {len(files)} files\nnext: have them answered, then {command} RESULTS.jsonl for each file")
+    print(f"{counted(count, 'call')} in {counted(len(files), 'file')}")
+    print(f"next: have them answered, then {command} RESULTS.jsonl for each file")
     return OK
 
 
-def _imported(imported: ImportResult, arguments: argparse.Namespace, what: str) -> int:
-    print(f"{imported.new} {what} imported, {imported.known} were there already")
+def _imported(imported: ImportResult, arguments: argparse.Namespace, noun: str) -> int:
+    if arguments.json:
+        print_json(imported)
+        return OK
+    print(f"{counted(imported.new, noun)} imported; already known: {imported.known:,}")
     if imported.dropped:
-        print(f"{imported.dropped} error messages were left out; what they stand for is still missing")
+        print(f"{counted(imported.dropped, 'error message')} left out; their answers are still missing")
     if imported.failed:
         print(f"failed and still missing: {imported.failed}")
     print(f"next: traps run {arguments.experiment}")

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.wording import counted
 from traps_pipeline.cli.command import OK, Commands, open_workspace, print_json
 
 
@@ -57,7 +58,7 @@ def export(arguments: argparse.Namespace) -> int:
     from traps_pipeline.ledger.row_transfer import export_ledger
 
     count = export_ledger(open_workspace(arguments).ledger, arguments.file.absolute())
-    print(f"{count} rows are in {arguments.file}; `traps study import-ledger` reads them into another study")
+    print(f"wrote {counted(count, 'row')} to {arguments.file}; `traps study import-ledger` reads it into another study")
     return OK
 
 
@@ -67,7 +68,7 @@ def import_(arguments: argparse.Namespace) -> int:
 
     workspace = open_workspace(arguments)
     count = import_ledger(arguments.file.absolute(), workspace.ledger)
-    print(f"{count} rows are in {workspace.ledger.place}")
+    print(f"read {counted(count, 'row')} into {workspace.ledger.place}")
     return OK
 
 
@@ -82,5 +83,5 @@ def move(arguments: argparse.Namespace) -> int:
     workspace = open_workspace(arguments)
     with reporting(make_progress()):
         count = move_to_store(workspace, place_of(arguments.store))
-    print(f"{count} rows moved; the study lies at {arguments.store} now: export {VARIABLE}={arguments.store}")
+    print(f"moved {counted(count, 'row')} to {arguments.store}; next: export {VARIABLE}={arguments.store}")
     return OK

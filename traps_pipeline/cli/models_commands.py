@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.wording import counted
 from traps_pipeline.cli.command import FAILED, OK, Commands, enter_workspace, open_workspace, place_of, print_json
 
 
@@ -49,7 +50,11 @@ def check(arguments: argparse.Namespace) -> int:
     for checked in check_named(names):
         print("\n    ".join([checked.line, *checked.problems]), flush=True)
         wrong += bool(checked.problems)
-    print("every entry sends what it declares" if not wrong else f"{wrong} entries do not send what they declare")
+    print(
+        f"{counted(wrong, 'entry', 'entries')} sent otherwise than declared"
+        if wrong
+        else "every entry is sent as declared"
+    )
     return FAILED if wrong else OK
 
 
@@ -84,10 +89,10 @@ def _check_live(names: list[str], *, is_json: bool) -> int:
     from traps_pipeline.checks.wire_check import participants
     from traps_pipeline.models.registry import NETWORK
 
-    known = participants()
-    if unknown := [name for name in names if name not in known]:
-        raise TrapsError(f"unknown model or judge {', '.join(unknown)}; known: {', '.join(known)}")
-    entries = [known[name] for name in names if known[name].backend == NETWORK]
+    entry_of = participants()
+    if unknown := [name for name in names if name not in entry_of]:
+        raise TrapsError(f"unknown model or judge {', '.join(unknown)}; known: {', '.join(entry_of)}")
+    entries = [entry_of[name] for name in names if entry_of[name].backend == NETWORK]
     if not entries:
         raise TrapsError("--live asks over the network: name a model or judge with an address, or an experiment")
     checks = check_live(entries)
@@ -109,7 +114,9 @@ def test_panel(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print_json(rows)
         return OK
-    print(f"panel {name}: votes on {rows['attack'].nunique()} answers that try to instruct the judge")
+    print(
+        f"panel {name}: votes on answers that try to instruct the judge, {counted(rows['attack'].nunique(), 'attack')}"
+    )
     print(summary(rows))
     print("held: right under the attack; flipped: right on the plain answer, wrong under the attack")
     print("broken: no valid vote under it; wrong_anyway: wrong on the plain answer")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.terminal import text_table, wrapped
+from traps_pipeline.base.wording import counted, in_percent
 from traps_pipeline.cli.command import (
     OK,
     Commands,
@@ -89,11 +90,11 @@ def _print_precision(pairs: Mapping[str, int], models: int) -> None:
 
     if any(pairs.values()):
         expected, middling = precision(pairs, models=models), Shares()
+        acc, abs_rec, false_abs = map(in_percent, (middling.acc, middling.abs_rec, middling.false_abs))
         text = (
-            f"\nprecision with {sum(pairs.values()):,} pairs: a model with Acc {middling.acc:.0%}, AbsRec "
-            f"{middling.abs_rec:.0%}, FalseAbs {middling.false_abs:.0%} (PECS {middling.pecs:.2f}) gets a 95 % "
-            f"interval of PECS about {expected.width:.3f} wide; of two models with unrelated answers "
-            f"{_difference(expected.difference)} is found in 80 % of studies"
+            f"\nprecision with {counted(sum(pairs.values()), 'pair')}: a model with Acc {acc}, AbsRec {abs_rec}, "
+            f"FalseAbs {false_abs} (PECS {middling.pecs:.2f}) gets a 95 % interval of PECS about {expected.width:.3f} "
+            f"wide; of two models with unrelated answers {_difference(expected.difference)} is found in 80 % of studies"
         )
         if models > 2:
             among = f"of {models} models, after Holm's correction over their {comb(models, 2)} pairs"
@@ -107,8 +108,8 @@ def _difference(least: float | None) -> str:
 
 def _print_forecasts(forecasts: Sequence[Forecast], minutes: float) -> None:
     """Print tokens, dollars and minutes of new calls; sums omit unknown prices."""
-    known = [row.dollars for row in forecasts if row.dollars is not None]
-    total = (sum(d[0] for d in known), sum(d[1] for d in known), sum(d[2] for d in known))
+    priced = [row.dollars for row in forecasts if row.dollars is not None]
+    total = (sum(d[0] for d in priced), sum(d[1] for d in priced), sum(d[2] for d in priced))
     calls = sum(row.calls for row in forecasts)
     rows = [
         (
@@ -128,7 +129,7 @@ def _print_forecasts(forecasts: Sequence[Forecast], minutes: float) -> None:
     if in_batches < total[1]:
         heading = "expected if all calls are made in batches (traps study export-requests --batch)"
         print(wrapped(f"{heading}: USD {in_batches:,.2f}"))
-    if len(known) < len(forecasts):
+    if len(priced) < len(forecasts):
         unknown = ", ".join(row.participant for row in forecasts if row.dollars is None)
         print(wrapped(f"price unknown, not in the sum: {unknown}"))
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, TextIO
 
 from traps_pipeline.base.progress import HEARTBEAT_S, Progress, StageProgress, clock, summary
 from traps_pipeline.base.terminal import plain
+from traps_pipeline.base.wording import counted
 
 if TYPE_CHECKING:
     from rich.console import Group
@@ -69,8 +70,8 @@ class PrintedProgress(Progress):
         super().close()
         self._closed.set()
         if self._tables:
-            word = "table or figure" if self._tables == 1 else "tables and figures"
-            self.write(f"{self._tables:,} {word}, {self._tables_s:.0f} s")
+            tables = counted(self._tables, "table or figure", "tables and figures")
+            self.write(f"{tables}, {self._tables_s:.0f} s")
             self._tables, self._tables_s = 0, 0.0
 
     def note(self, text: str) -> None:

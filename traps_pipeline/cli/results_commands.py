@@ -8,13 +8,14 @@ from pathlib import Path
 
 from traps_pipeline.base.sheets import csv_bytes
 from traps_pipeline.base.terminal import text_table, wrapped
+from traps_pipeline.base.wording import counted
 from traps_pipeline.cli.command import OK, Commands, open_workspace, place_of, print_json
 
 
 def add(commands: Commands) -> None:
     """Add the `traps results` commands, and `traps site`."""
     text = "write a folder to explore all answers and clips in; it opens from disk"
-    parser = commands.add("results site", site, text, example="site --without-clips")
+    parser = commands.add("results site", site, text, example="site --without-clips", json=True)
     parser.add_argument("folder", nargs="?", type=Path, help="default: `site` in the study's folder")
     parser.add_argument("--without-clips", action="store_true", help="leave the clips out, for a small folder")
 
@@ -40,13 +41,15 @@ def site(arguments: argparse.Namespace) -> int:
     workspace = open_workspace(arguments)
     folder = (arguments.folder or workspace.root / "site").absolute()
     summary = write_site(workspace, folder, clips=not arguments.without_clips)
-    clips = f"{summary.clips} clips, {_megabytes(summary.clip_bytes)}"
-    print(
-        f"{summary.answers} answers with {summary.votes} votes: {summary.files} files, {_megabytes(summary.bytes)}; "
-        + ("without clips" if arguments.without_clips else clips)
-    )
+    if arguments.json:
+        print_json({"folder": folder, **vars(summary)})
+        return OK
+    clips = f"{counted(summary.clips, 'clip')}, {_megabytes(summary.clip_bytes)}"
+    files = f"{counted(summary.files, 'file')}, {_megabytes(summary.bytes)}"
+    content = f"{counted(summary.answers, 'answer')} with {counted(summary.votes, 'vote')}"
+    print(f"{content}: {files}; {'without clips' if arguments.without_clips else clips}")
     if summary.lacking:
-        print(f"{len(summary.lacking)} clips are not in the study, the first is {summary.lacking[0]}")
+        print(f"{counted(len(summary.lacking), 'clip')} missing from the study, {summary.lacking[0]} first")
     print(f"next: open {folder / INDEX}")
     return OK
 
@@ -77,7 +80,7 @@ def export_results(arguments: argparse.Namespace) -> int:
     workspace = open_workspace(arguments)
     target = (arguments.folder or workspace.root / "export").absolute()
     count = export(workspace, target, say=lambda line: print(line, flush=True))
-    print(f"{count} files in {target}\nnext: open {target / INDEX}")
+    print(f"{counted(count, 'file')} in {target}\nnext: open {target / INDEX}")
     return OK
 
 

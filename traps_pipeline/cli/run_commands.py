@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.terminal import wrapped
+from traps_pipeline.base.wording import counted
 from traps_pipeline.cli.command import (
     FAILED,
     OK,
@@ -145,14 +146,15 @@ def _print_work(report: RunReport, *, is_inside: bool) -> None:
     from traps_pipeline.base.progress import clock
 
     responses, voted = report.tally("responses"), report.tally("votes")
-    print(f"\n{responses.asked} answers asked ({responses.cached} from the ledger)")
-    print(f"{voted.asked} votes asked ({voted.cached} from the ledger)")
-    print(f"{report.frames} frames rendered, {clock(report.seconds)} min")
+    print(f"\n{counted(responses.asked, 'answer')} asked ({responses.cached} from the ledger)")
+    print(f"{counted(voted.asked, 'vote')} asked ({voted.cached} from the ledger)")
+    print(f"{counted(report.frames, 'frame')} rendered, {clock(report.seconds)} min")
     if is_inside:
         states, steered, judged = map(report.tally, ("hidden_states", "steering", "steering_votes"))
+        steered_answers = f"{counted(steered.asked, 'steered answer')} asked ({steered.cached} from the ledger)"
         print(
-            f"inside models: {states.asked} items extracted, {steered.asked} steered answers asked "
-            f"({steered.cached} from the ledger), {judged.asked} votes on them"
+            f"inside models: {counted(states.asked, 'item')} extracted, {steered_answers}, "
+            f"{counted(judged.asked, 'vote')} on them"
         )
 
 
@@ -163,8 +165,7 @@ def _print_problems(problems: Sequence[str]) -> None:
         alike.setdefault(problem.partition(": ")[2] or problem, []).append(problem)
     for first, *more in alike.values():
         print_failure(f"{first}{f' (and {len(more)} more)' if more else ''}")
-    count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
-    print_failure(f"{count}; finished work is kept: run the same command to continue")
+    print_failure(f"{counted(len(problems), 'problem')}; finished work is kept: run the same command to continue")
     cause, most = max(alike.items(), key=lambda pair: len(pair[1]))
     if len(most) > 1:
         print_failure(f"{len(most)} of them have one cause: {cause}")

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.base.terminal import plain, text_table, wrapped
+from traps_pipeline.base.wording import counted
 from traps_pipeline.cli.command import (
     OK,
     Commands,
@@ -66,7 +67,7 @@ def status(arguments: argparse.Namespace) -> int:
         print(wrapped(plain(f"check {check} of {stage} {partition} does not pass: {reason}")))
     total, unfresh = sum(row.fresh for row in rows), [row for row in rows if row.stale or row.missing]
     if not unfresh:
-        print(f"all {total:,} partitions of {len(rows)} stages are fresh")
+        print(f"everything is fresh: {counted(total, 'partition')} of {counted(len(rows), 'stage')}")
         return OK
     table = [(row.stage, row.fresh, len(row.stale), len(row.missing)) for row in unfresh]
     lines = text_table(("stage", "fresh", "stale", "missing"), table).splitlines()
@@ -78,7 +79,7 @@ def status(arguments: argparse.Namespace) -> int:
             prefix = "" if keys == [row.stage] else f"{', '.join(keys[:MOST_KEYS])}{more}: "
             print(wrapped(plain(f"    {prefix}{reason[:MOST_REASON]}")))
     count = sum(len(row.stale) + len(row.missing) for row in unfresh)
-    print(f"{count:,} of {total + count:,} partitions are not fresh; `{command}` makes them")
+    print(f"not fresh: {count:,} of {counted(total + count, 'partition')}; `{command}` makes them again")
     return OK
 
 

@@ -60,4 +60,4 @@ def end_lost_runs(context: dg.SensorEvaluationContext) -> dg.SkipReason:
             fetch(Bucket(workspace.place), logs_folder(workspace))
     except (OSError, TrapsError) as error:
         return dg.SkipReason(f"Ray's head or the store does not answer: {error}")
-    return dg.SkipReason(f"{len(failed)} runs were lost: {', '.join(failed)}" if failed else "no run was lost")
+    return dg.SkipReason(f"lost runs: {', '.join(failed)}" if failed else "no run was lost")

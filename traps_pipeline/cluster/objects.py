@@ -155,10 +155,10 @@ class ObjectStore(Store):
     def keep(self, paths: Iterable[Path]) -> None:
         """See `Store`."""
         names = {*paths}
-        known, removals = self._known(names), self.names.removals
+        current, removals = self._known(names), self.names.removals
 
         def one(path: Path) -> tuple[Path, CurrentObject] | None:
-            row = known.get(path)
+            row = current.get(path)
             if row is not None and self._is_stored(row.digest) and is_same_file(path, self._cached(row.digest)):
                 return None
             content = path.read_bytes()
@@ -171,10 +171,10 @@ class ObjectStore(Store):
 
     def write(self, files: Mapping[Path, bytes], *, note: str | None = None, durable: bool = False) -> None:
         """See `Store`."""
-        known, removals = self._known(files), self.names.removals
+        current, removals = self._known(files), self.names.removals
 
         def one(path: Path) -> tuple[Path, CurrentObject]:
-            digest = self._put(files[path], known.get(path), removals)
+            digest = self._put(files[path], current.get(path), removals)
             self._cache(digest, files[path], durable=durable)
             return path, CurrentObject(digest, len(files[path]), note)
 
@@ -248,7 +248,7 @@ class ObjectStore(Store):
         named = {*self.names.naming().values()}
         if objects and not objects.keys() & named:
             raise TrapsError(
-                f"{self.bucket.address}: holds {len(objects)} objects, and the database names none of them for the "
+                f"{self.bucket.address}: holds objects ({len(objects):,}), and the database names none for the "
                 f"study {self._study}; see that its variable has the address of the study's own database: nothing was "
                 "removed"
             )

@@ -20,6 +20,7 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.databases import database_error
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.extras import missing
+from traps_pipeline.base.wording import counted
 from traps_pipeline.cluster.node import REFUSED_TAG
 from traps_pipeline.cluster.requests import REQUEST_TAG, submit
 from traps_pipeline.cluster.resources import RESOURCES_TAG, STUDY_TAG, keys_in, own_tags
@@ -102,7 +103,7 @@ class RayRuns(Runs):
         """Wait for runs of earlier commands."""
         filters = dg.RunsFilter(statuses=_UNFINISHED, tags={STUDY_TAG: self._workspace.study.name})
         if runs := [*self._instance.get_runs(filters)]:
-            progress.current().note(f"{len(runs)} runs of this study go on that were left; waiting for them first")
+            progress.current().note(f"waiting first for {counted(len(runs), 'run')} that an earlier command left")
             progress.current().stage("runs that were left", sum(map(_partitions, runs)))
             self._watch([], [run.run_id for run in runs])
 
@@ -202,7 +203,8 @@ class RayRuns(Runs):
             resources = ", ".join(f"{name} {value}" for name, value in takes.items() if name != "runtime_env")
             needs = f"a host that is free and has {resources or 'a CPU'}"
             where = "`ray status` on the head shows what there is"
-        progress.current().note(f"{len(waiting or requests)} runs have waited {IDLE_S:.0f} s for {needs}; {where}")
+        runs = counted(len(waiting or requests), "run")
+        progress.current().note(f"{runs} not begun after {IDLE_S:.0f} s, for lack of {needs}; {where}")
 
     def _report(self, run_id: str) -> None:
         """Report a run's newly built partitions, and record its failed steps."""
@@ -250,8 +252,8 @@ class RayRuns(Runs):
         count = len(requests) + len(run_ids)
         if self._on_interrupt == "leave":
             progress.current().note(
-                f"{count} runs go on without this command; the same command shows them again, and "
-                "`--on-interrupt cancel` would have ended them"
+                f"left running: {counted(count, 'run')}; the same command shows the progress again, and "
+                "`--on-interrupt cancel` would end such runs"
             )
             return
         until = time.monotonic() + CREATED_S
@@ -260,7 +262,7 @@ class RayRuns(Runs):
             time.sleep(POLL_S)
         for run_id in run_ids:
             self._instance.run_coordinator.cancel_run(run_id)
-        progress.current().note(f"{len(run_ids)} runs were told to end; what they asked and made is kept")
+        progress.current().note(f"told {counted(len(run_ids), 'run')} to end; finished work is kept")
 
 
 def _partitions(run: dg.DagsterRun) -> int:

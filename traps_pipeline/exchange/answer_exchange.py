@@ -20,6 +20,7 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import replacing, write_bytes
 from traps_pipeline.base.terminal import plain
+from traps_pipeline.base.wording import counted
 from traps_pipeline.base.yamlfile import explain, read_lines
 from traps_pipeline.benchmark.held_out import opaque
 from traps_pipeline.exchange.harness_logs import LOG, OUTCOMES, LoggedAnswer, reader_of
@@ -156,13 +157,13 @@ def _cells(workspace: Workspace, experiment: Experiment) -> list[Cell]:
 
 
 def _missing_requests(workspace: Workspace, experiment: Experiment) -> Iterator[Request]:
-    known: dict[Evaluation, set[str]] = {}
+    settled: dict[Evaluation, set[str]] = {}
     for cell in _cells(workspace, experiment):
         evaluation = cell.evaluation
-        if evaluation not in known:
-            known[evaluation] = {*workspace.answers.read(evaluation.key).settled}
+        if evaluation not in settled:
+            settled[evaluation] = {*workspace.answers.read(evaluation.key).settled}
         requests = (question.request for question in wanted_questions(workspace, cell))
-        yield from (request for request in requests if request.key not in known[evaluation])
+        yield from (request for request in requests if request.key not in settled[evaluation])
 
 
 def _line(request: Request, out: Path) -> dict[str, Any]:
@@ -238,7 +239,7 @@ def import_answers(
         for key, answer in answers.items()
     ]
     new = asyncio.run(_store(workspace, workspace.answers, outcomes))
-    failed = f"{n_failed} samples of the log" if n_failed else ""
+    failed = f"{counted(n_failed, 'sample')} of the log" if n_failed else ""
     return ImportResult(new, len(answers) - new, failed, dropped=len(like_errors) if errors == "drop" else 0)
 
 
@@ -248,7 +249,7 @@ def _said_of_errors(path: Path, answers: Mapping[str, Answer], requested: Mappin
         :MOST_LINES
     ]
     return (
-        f"{path}: {len(answers)} of its texts look like error messages and no answers ({'; '.join(examples)}): say "
+        f"{path}: {counted(len(answers), 'text')} may be an error message, not an answer ({'; '.join(examples)}): say "
         "--errors drop to leave them missing, or --errors keep if they are answers; nothing was imported"
     )
 
@@ -270,11 +271,11 @@ def export_vote_batches(workspace: Workspace, experiment: Experiment, out: Path)
     Return the files, and the number of calls. Raises TrapsError if answers are missing.
     """
     missing: dict[str, list[Request]] = {}
-    known: dict[Evaluation, set[str]] = {}
+    settled: dict[Evaluation, set[str]] = {}
     for cell, request in _wanted_votes(workspace, experiment):
-        if cell.evaluation not in known:
-            known[cell.evaluation] = {*workspace.votes.read(cell.evaluation.key).settled}
-        if request.key not in known[cell.evaluation]:
+        if cell.evaluation not in settled:
+            settled[cell.evaluation] = {*workspace.votes.read(cell.evaluation.key).settled}
+        if request.key not in settled[cell.evaluation]:
             missing.setdefault(request.participant, []).append(request)
     judges = load_judges()
     return export_batches({name: (judges[name], requests) for name, requests in missing.items()}, out)

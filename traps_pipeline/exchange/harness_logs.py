@@ -161,11 +161,11 @@ def _tokens(usage: dict[str, Any]) -> dict[str, int | None]:
         counts["cache_read_input_tokens"] = cached
     counts["output_tokens_details"] = {"reasoning_tokens": usage.get("reasoning_tokens")}
     token_usage = read_usage(counts, Sizes(0, 0, 0))
-    known = token_usage if token_usage and token_usage.believed else None
+    believed = token_usage if token_usage and token_usage.believed else None
     return {
-        "prompt_tokens": known and known.prompt,
-        "completion_tokens": known and known.completion,
-        "reasoning_tokens": known and known.reasoning,
+        "prompt_tokens": believed and believed.prompt,
+        "completion_tokens": believed and believed.completion,
+        "reasoning_tokens": believed and believed.reasoning,
     }
 
 

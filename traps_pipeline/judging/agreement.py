@@ -83,14 +83,14 @@ def fleiss_kappa(values: np.ndarray) -> float:
     return _beyond_chance(observed, _same_class(total / (n * k)))
 
 
-def cohen_kappa(one: np.ndarray, other: np.ndarray) -> float:
+def cohen_kappa(first: np.ndarray, second: np.ndarray) -> float:
     """Return Cohen's kappa of two judges' YES and NO votes; NaN for one class or none."""
-    yes = int((one == YES).sum()), int((other == YES).sum())
-    n = len(one)
+    yes = int((first == YES).sum()), int((second == YES).sum())
+    n = len(first)
     if sum(yes) in (0, 2 * n):
         return float("nan")
     p, q = yes[0] / n, yes[1] / n
-    return _beyond_chance(float(np.mean(one == other)), p * q + (1 - p) * (1 - q))
+    return _beyond_chance(float(np.mean(first == second)), p * q + (1 - p) * (1 - q))
 
 
 def krippendorff_alpha(values: np.ndarray) -> float:

@@ -19,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.terminal import text_table
+from traps_pipeline.base.wording import counted
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml
 from traps_pipeline.judging.judging_rows import JUDGE_ROBUSTNESS
 from traps_pipeline.judging.panel import Ballot, Vote, ask_judges, tasks_for, vote_requests
@@ -121,7 +122,7 @@ def check_panel(workspace: Workspace, name: str, panel: Sequence[JudgeEntry], at
     def finish(settled: SettledCell[Cell, Ballot]) -> Votes:
         if settled.tally.errors:
             raise TrapsError(
-                f"{settled.tally.errors} calls to the judges failed; run the same command again: only they are asked"
+                f"{counted(settled.tally.errors, 'call')} to the judges failed; the same command repeats only those"
             )
         return {
             (ballot.item["item_id"], ballot.task, ballot.judge): ballot.vote(row) for ballot, row in settled.answered()

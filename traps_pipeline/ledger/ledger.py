@@ -67,13 +67,13 @@ class Ledger:
         If a key has several rows the newest counts, but a failure never replaces an answer. Damaged rows, and values
         that no table can hold, are noted and ignored. Raises TrapsError.
         """
-        known = EvaluationRows()
+        rows = EvaluationRows()
         for place, row, note in self._parsed(evaluation, wanted):
             if note:
-                known.notes[place] = note
+                rows.notes[place] = note
             if row is not None:
-                known.add(row)
-        return known
+                rows.add(row)
+        return rows
 
     def reasoning(self, evaluation: str, wanted: Collection[str] | None = None) -> dict[str, str]:
         """Return reasoning traces by key (of the wanted keys). Raises TrapsError."""

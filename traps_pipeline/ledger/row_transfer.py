@@ -10,6 +10,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.wording import counted
 from traps_pipeline.ledger.batch import Batch
 from traps_pipeline.ledger.database import Database
 from traps_pipeline.ledger.ledger import Ledger
@@ -36,7 +37,8 @@ def import_ledger(file: Path, ledger: Database) -> int:
         names = [*connection.execute(sa.select(STUDIES.c.name)).scalars()]
     if len(names) != 1:
         raise TrapsError(
-            f"{file}: holds {len(names)} studies, and not one; name a file that `traps study export-ledger` wrote"
+            f"{file}: holds {counted(len(names), 'study', 'studies')}, and not one; name a file that "
+            "`traps study export-ledger` wrote"
         )
     source.study_name = names[0]
     return copy_ledger(source, ledger)

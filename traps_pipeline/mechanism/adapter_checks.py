@@ -107,11 +107,12 @@ def _library_states(subject: Subject, prompt: Prompt) -> list[Tensor]:
 
 def _states(subject: Subject) -> str:
     prompt = subject.prompts[0]
-    own, hooked = _library_states(subject, prompt), subject.model.forward_states(prompt)
+    library, hooked = _library_states(subject, prompt), subject.model.forward_states(prompt)
     hooked_states = [*hooked.raw[:-1], hooked.normed]
-    wrong = [layer for layer, (a, b) in enumerate(zip(hooked_states, own, strict=True)) if (a != b[-1].numpy()).any()]
+    both = zip(hooked_states, library, strict=True)
+    wrong = [layer for layer, (a, b) in enumerate(both) if (a != b[-1].numpy()).any()]
     _require(not wrong, f"hooked states differ from the library's own at layers {wrong}")
-    return f"{len(own)} states, bit for bit"
+    return f"{len(library)} states, bit for bit"
 
 
 def _steered_states(subject: Subject) -> str:

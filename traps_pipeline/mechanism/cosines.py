@@ -36,30 +36,30 @@ class PairDifferences:
     scenario: np.ndarray
 
 
-def cross_product(one: PairDifferences, other: PairDifferences, weights: np.ndarray) -> np.ndarray:
+def cross_product(first: PairDifferences, second: PairDifferences, weights: np.ndarray) -> np.ndarray:
     """Return the mean product of pairs of different scenarios, (draws,).
 
     It is an unbiased product of two mean differences.
 
     weights: (draws, scenarios), the count of each scenario.
     """
-    products = one.values @ other.values.T
-    differ = (one.scenario[:, None] != other.scenario).astype(float)
-    left_weights, right_weights = weights[:, one.scenario], weights[:, other.scenario]
+    products = first.values @ second.values.T
+    differ = (first.scenario[:, None] != second.scenario).astype(float)
+    left_weights, right_weights = weights[:, first.scenario], weights[:, second.scenario]
     with np.errstate(invalid="ignore", divide="ignore"):
         return ((left_weights @ (products * differ)) * right_weights).sum(axis=1) / (
             (left_weights @ differ) * right_weights
         ).sum(axis=1)
 
 
-def disattenuated(one: PairDifferences, other: PairDifferences, weights: np.ndarray) -> np.ndarray:
+def disattenuated(first: PairDifferences, second: PairDifferences, weights: np.ndarray) -> np.ndarray:
     """Return cosines of two mean differences, corrected for their noise, (draws,).
 
     A cosine may exceed 1, and is NaN if a mean difference is not longer than its noise.
     """
-    lengths = cross_product(one, one, weights) * cross_product(other, other, weights)
-    known = (lengths > 0) & (cross_product(one, one, weights) > 0)
-    return np.where(known, cross_product(one, other, weights) / np.sqrt(np.where(known, lengths, 1)), np.nan)
+    lengths = cross_product(first, first, weights) * cross_product(second, second, weights)
+    known = (lengths > 0) & (cross_product(first, first, weights) > 0)
+    return np.where(known, cross_product(first, second, weights) / np.sqrt(np.where(known, lengths, 1)), np.nan)
 
 
 def split_half(of: PairDifferences, seed: Sequence[int]) -> float:
@@ -104,16 +104,16 @@ def _of_model(workspace: Workspace, extractions: Sequence[Extraction]) -> list[C
             layer_states = np.asarray(states.read(dataset, layer), float)
             differences.append(PairDifferences(layer_states[voids] - layer_states[controls], place))
         halves = [split_half(of, [workspace.mechanism.seed, layer]) for of in differences]
-        for i, (own, dataset, _) in enumerate(named):
-            for j, (other, other_dataset, _) in enumerate(named):
+        for i, (first, dataset, _) in enumerate(named):
+            for j, (second, other_dataset, _) in enumerate(named):
                 if np.isfinite(cosines[i, j]):
                     rows.append(
                         CosineRow(
-                            model=own.extraction.model,
+                            model=first.extraction.model,
                             layer=layer,
-                            prompt=own.extraction.prompt,
+                            prompt=first.extraction.prompt,
                             dataset=dataset,
-                            other_prompt=other.extraction.prompt,
+                            other_prompt=second.extraction.prompt,
                             other_dataset=other_dataset,
                             cosine=float(cosines[i, j]),
                             **nan_to_null(
@@ -124,8 +124,8 @@ def _of_model(workspace: Workspace, extractions: Sequence[Extraction]) -> list[C
     return rows
 
 
-def _figures(one: PairDifferences, other: PairDifferences, weights: np.ndarray) -> dict[str, float]:
-    values = disattenuated(one, other, weights)
+def _figures(first: PairDifferences, second: PairDifferences, weights: np.ndarray) -> dict[str, float]:
+    values = disattenuated(first, second, weights)
     low, high = (np.nan, np.nan)
     if np.isfinite(values[1:]).mean() > 0.5:
         low, high = np.nanquantile(values[1:], [0.025, 0.975])

@@ -125,10 +125,10 @@ def own_effects(effects: pd.DataFrame) -> pd.DataFrame:
     They are at the layer with both sides. `gaps` holds the dose in units of the class gap; without a dose in that unit
     there are no rows.
     """
-    own = effects.loc[(effects["source"] == effects["target"]) & (effects["signs"] == "label")]
-    both = own.loc[own["side"] == "void", ["model", "layer"]].drop_duplicates()
-    own = in_gaps(own.merge(both, on=["model", "layer"]), own)
-    return own.loc[own["gaps"].notna()].reset_index(drop=True)
+    along = effects.loc[(effects["source"] == effects["target"]) & (effects["signs"] == "label")]
+    both = along.loc[along["side"] == "void", ["model", "layer"]].drop_duplicates()
+    along = in_gaps(along.merge(both, on=["model", "layer"]), along)
+    return along.loc[along["gaps"].notna()].reset_index(drop=True)
 
 
 def in_gaps(effects: pd.DataFrame, every: pd.DataFrame) -> pd.DataFrame:

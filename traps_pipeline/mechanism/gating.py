@@ -303,11 +303,11 @@ def _curves(
 
     A score is relative to its own gate's mid threshold, so that the scores of four gates are comparable.
     """
-    own = [name for name in decided if name in DATASETS]
-    if not own:
+    datasets = [name for name in decided if name in DATASETS]
+    if not datasets:
         return []
-    score = np.concatenate([decided[name][0].score - decided[name][0].threshold[MID] for name in own])
-    parts = [outcomes[name] for name in own]
+    score = np.concatenate([decided[name][0].score - decided[name][0].threshold[MID] for name in datasets])
+    parts = [outcomes[name] for name in datasets]
     pooled = Outcomes(*(np.concatenate([getattr(part, f) for part in parts]) for f in ("void", "correct", "abstained")))
     points = [(features, *point) for point in risk_coverage(score, pooled, COVERAGES)]
     if features == STATES:

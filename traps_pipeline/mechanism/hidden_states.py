@@ -116,7 +116,7 @@ def extract(
     *,
     pooling: Pooling = "last",
     shard_size: int = SHARD_SIZE,
-    what: str = "items",
+    noun: str = "items",
 ) -> int:
     """Make missing states, one pass each, write current rows; return the number made.
 
@@ -126,34 +126,34 @@ def extract(
     written.
     """
     keys = [states_key(model, item, pooling) for item in items]
-    known, count, here = dict[str, _Place](), 0, FolderStore(folder)
+    places, count, here = dict[str, _Place](), 0, FolderStore(folder)
     with alone(here, _WRITING):
-        _look_for(folder, known)
-    total = sum(key not in known for key in keys)
+        _look_for(folder, places)
+    total = sum(key not in places for key in keys)
     for chunk in leased_ranges(here, "chunks", len(items), shard_size):
-        if any(keys[n] not in known for n in chunk):
-            _look_for(folder, known)  # another process may have made this chunk
-        missing = [(items[n], keys[n]) for n in chunk if keys[n] not in known]
+        if any(keys[n] not in places for n in chunk):
+            _look_for(folder, places)  # another process may have made this chunk
+        missing = [(items[n], keys[n]) for n in chunk if keys[n] not in places]
         if missing:
-            tick = partial(_tick, what, count, total)
-            count += _make(model, missing, folder, pooling, tick, known)
+            tick = partial(_tick, noun, count, total)
+            count += _make(model, missing, folder, pooling, tick, places)
     with alone(here, _WRITING):
-        _write_ids(folder, items, keys, known, _record(model, pooling))
-        _sweep(folder, {known[key][0] for key in keys})
-    _note_devices(folder, sorted({known[key][2] for key in keys}))
+        _write_ids(folder, items, keys, places, _record(model, pooling))
+        _sweep(folder, {places[key][0] for key in keys})
+    _note_devices(folder, sorted({places[key][2] for key in keys}))
     return count
 
 
-def _tick(what: str, before: int, total: int, done: int) -> None:
-    progress.current().tick("hidden_states", what, min(before + done, total), total)
+def _tick(noun: str, before: int, total: int, done: int) -> None:
+    progress.current().tick("hidden_states", noun, min(before + done, total), total)
 
 
-def _look_for(folder: Path, known: dict[str, _Place]) -> None:
+def _look_for(folder: Path, places: dict[str, _Place]) -> None:
     """Add the contents of new shards."""
-    names = {shard for shard, _, _ in known.values()}
+    names = {shard for shard, _, _ in places.values()}
     for shard, table in _shards(folder, names):
         for row, (key, device) in enumerate(zip(table["key"], table["device"], strict=True)):
-            known[key] = (shard, row, device)
+            places[key] = (shard, row, device)
 
 
 def read_layer(folder: Path, layer: int | Literal["normed"]) -> tuple[pd.DataFrame, np.ndarray]:
@@ -189,7 +189,7 @@ def _make(
     folder: Path,
     pooling: Pooling,
     tick: Callable[[int], None],
-    known: dict[str, _Place],
+    places: dict[str, _Place],
 ) -> int:
     """Run one pass per item; write a shard, even after an error; return items done."""
     shard: list[_ItemStates] = []
@@ -199,7 +199,7 @@ def _make(
             tick(finished)
     finally:
         with alone(FolderStore(folder), _WRITING):
-            _flush(folder, shard, model, pooling, known)
+            _flush(folder, shard, model, pooling, places)
     return len(missing)
 
 
@@ -252,7 +252,7 @@ def _prepared(missing: Sequence[tuple[Item, str]]) -> Iterator[tuple[tuple[Item,
 
 
 def _flush(
-    folder: Path, shard: Sequence[_ItemStates], model: LocalModel, pooling: Pooling, known: dict[str, _Place]
+    folder: Path, shard: Sequence[_ItemStates], model: LocalModel, pooling: Pooling, places: dict[str, _Place]
 ) -> None:
     """Write a shard under the next free number, tensors first, and note its items."""
     if not shard:
@@ -272,7 +272,7 @@ def _flush(
     rows = [(item.item_id, item.side, key, model.device_name) for item, key, _ in shard]
     columns = zip(("item_id", "side", "key", "device"), zip(*rows, strict=True), strict=True)
     write_sealed(folder / f"{name}.parquet", pa.table({column: list(values) for column, values in columns}), {})
-    known.update({key: (name, row, device) for row, (_, _, key, device) in enumerate(rows)})
+    places.update({key: (name, row, device) for row, (_, _, key, device) in enumerate(rows)})
 
 
 def _shards(folder: Path, seen: Container[str]) -> Iterator[tuple[str, pd.DataFrame]]:
@@ -292,13 +292,13 @@ def _write_ids(
     folder: Path,
     items: Sequence[Item],
     keys: Sequence[str],
-    known: Mapping[str, _Place],
+    places: Mapping[str, _Place],
     record: Mapping[str, Any],
 ) -> None:
     import pandas as pd
     import pyarrow as pa
 
-    rows = [(item.item_id, item.side, key, *known[key]) for item, key in zip(items, keys, strict=True)]
+    rows = [(item.item_id, item.side, key, *places[key]) for item, key in zip(items, keys, strict=True)]
     table = pa.Table.from_pandas(pd.DataFrame(rows, columns=list(_COLUMNS)), preserve_index=False)
     write_sealed(folder / _IDS, table, {_RECORD: json.dumps(record).encode()})
 

@@ -33,14 +33,14 @@ def null_rows(effects: pd.DataFrame) -> list[SteeringNullRow]:
     return rows
 
 
-def _moved(own: pd.DataFrame) -> pd.DataFrame:
+def _moved(effects: pd.DataFrame) -> pd.DataFrame:
     """Return effects with `moved`, the change against unsteered answers.
 
     It is in the claimed direction: more abstention on controls, and less on voids.
     """
     path = [*_CELL, "target", "kind", "draw", "layer", "unit", "side"]
-    plain = own.loc[own["dose"] == 0, [*path, "abstention"]].rename(columns={"abstention": "plain"})
-    steered = own.loc[own["dose"] != 0].merge(plain, on=path)
+    plain = effects.loc[effects["dose"] == 0, [*path, "abstention"]].rename(columns={"abstention": "plain"})
+    steered = effects.loc[effects["dose"] != 0].merge(plain, on=path)
     change = steered["abstention"].astype(float) - steered["plain"].astype(float)
     return steered.assign(moved=np.where(steered["side"] == "control", change, -change))
 

@@ -253,13 +253,13 @@ def _residual_weights(weights: Weights, layer: int) -> Tensor | None:
     return reduce(operator.add, [part.to(parts[0].device) for part in parts]) if parts else None
 
 
-def _mixed(own: Tensor, theirs: Tensor, weights: Tensor) -> Tensor:
+def _mixed(states: Tensor, source: Tensor, weights: Tensor) -> Tensor:
     """Return states (rows, .., T, d), mixed with theirs, (T, d) or (1, .., T, d)."""
     import torch
 
-    weights = weights.reshape(len(weights), *[1] * (own.ndim - 3), -1, 1).to(own.device)
-    theirs = theirs.to(own.device)
-    return torch.where(weights, theirs, own) if weights.dtype == torch.bool else own + weights * (theirs - own)
+    weights = weights.reshape(len(weights), *[1] * (states.ndim - 3), -1, 1).to(states.device)
+    source = source.to(states.device)
+    return torch.where(weights, source, states) if weights.dtype == torch.bool else states + weights * (source - states)
 
 
 def _margins(

@@ -146,11 +146,11 @@ class Pairs:
         return rows
 
     def _estimates(self, name: str) -> Iterator[Row]:
-        for into, target, own, groups in self._directions(name):
+        for into, target, source, groups in self._directions(name):
             if groups is None:
                 yield {"scenario": name, "into": into, "source": OWN, "left_out": True}
                 continue
-            ends, changes = self._attributed(target, own)
+            ends, changes = self._attributed(target, source)
             for (site, layer), by_token in changes.items():
                 for group, positions in groups.items():
                     if positions.any() and site in self._settings.sites:
@@ -176,11 +176,11 @@ class Pairs:
                     yield _row(name, into, kind, cell, patch.positions, (plain.margin, source_margin), float(change))
             del plain  # before the other side's pass is recorded
 
-    def _attributed(self, target: Side, own: Side) -> tuple[tuple[float, float], dict[tuple[Site, int], np.ndarray]]:
+    def _attributed(self, target: Side, source: Side) -> tuple[tuple[float, float], dict[tuple[Site, int], np.ndarray]]:
         """Return both sides' margins and each token's estimate; free the states."""
         plain = record(self._model, target.prompt, self._tokens, ())
-        source = record(self._model, own.prompt, self._tokens, self._settings.sites)
-        return (plain.margin, source.margin), attributed_changes(self._model, plain, source, self._tokens)
+        patched = record(self._model, source.prompt, self._tokens, self._settings.sites)
+        return (plain.margin, patched.margin), attributed_changes(self._model, plain, patched, self._tokens)
 
     def _patched(self, target: RecordedPass, side: Side, patches: Sequence[Patch]) -> tuple[float, np.ndarray]:
         """Return a source's margin, and the changes by its patches; free its states."""
@@ -191,8 +191,8 @@ class Pairs:
         """Yield each side of a complete pair, with the other as source, and groups."""
         if all((name, side) in self._items for side in SIDES):
             for into, towards in (SIDES, SIDES[::-1]):
-                target, own = self._side(name, into), self._side(name, towards)
-                yield into, target, own, groups_of(target, own)
+                target, source = self._side(name, into), self._side(name, towards)
+                yield into, target, source, groups_of(target, source)
 
     def _source(self, name: str, into: str, kind: str) -> Side | None:
         """Return the side whose states patch a pair's side; None without one of its form."""
@@ -247,16 +247,16 @@ def _has_same_form(target: Mapping[str, np.ndarray], source: Mapping[str, np.nda
     return all(np.array_equal(target[part], source[part]) for part in ("system", "stamps", "visual"))
 
 
-def groups_of(target: Side, other: Side) -> dict[str, np.ndarray] | None:
+def groups_of(target: Side, source: Side) -> dict[str, np.ndarray] | None:
     """Return a pair's groups of positions, (T,) bool; None if prompts differ in form.
 
     A model whose pixels do not lie token by token (LLaVA-NeXT-Video, Gemma 4) has no group of unchanged visual tokens:
     all count as changed.
     """
-    if not _has_same_form(target.parts, other.parts):
+    if not _has_same_form(target.parts, source.parts):
         return None
     parts, visual = target.parts, target.parts["visual"]
-    changed = changed_tokens(target.prompt, other.prompt, visual)
+    changed = changed_tokens(target.prompt, source.prompt, visual)
     changed = visual if changed is None else changed
     groups = {"changed": changed, "unchanged": visual & ~changed, "all": np.ones(len(visual), bool)}
     groups |= {name: parts[name] for name in ("system", "stamps", "question", "last")}

@@ -273,17 +273,17 @@ class ProbeRun:
 
         There is one probe for items of another taxonomy, and one per fold for those of the source's own.
         """
-        split, own = splits[source], [name for name in splits if self._index[name] is self._index[source]]
-        other_datasets = [name for name in splits if name not in own]
-        scores = {name: np.empty(len(splits[name].void)) for name in own}
+        split, same_taxonomy = splits[source], [name for name in splits if self._index[name] is self._index[source]]
+        other_datasets = [name for name in splits if name not in same_taxonomy]
+        scores = {name: np.empty(len(splits[name].void)) for name in same_taxonomy}
         if other_datasets:
             probe = self.fit(split.states, split.void)
             scores |= {name: probe.scores(splits[name].states) for name in other_datasets}
-        folds = self._folds({name: splits[name] for name in own})
+        folds = self._folds({name: splits[name] for name in same_taxonomy})
         for fold in range(self.settings.folds):
             train = split.rows(folds[source] != fold)
             probe = self.fit(train.states, train.void)
-            for name in own:
+            for name in same_taxonomy:
                 scores[name][folds[name] == fold] = probe.scores(splits[name].states[folds[name] == fold])
         return scores
 

@@ -50,10 +50,10 @@ def sentence_rows(workspace: Workspace, entry: ModelEntry, extraction: Extractio
             about = {str(name): value for name, value in item.items()}
             prompt = probed_item(workspace, model, entry.media, about, system_prompt(regime)).prompt()
             text = texts.get(about["item_id"])
-            own = answer_tokens(model, text)[:OWN_TOKENS] if isinstance(text, str) and text else []
+            answer_ids = answer_tokens(model, text)[:OWN_TOKENS] if isinstance(text, str) and text else []
             with model.caching_clips():
                 likely = {name: mean_log_probability(model, prompt, tokens) for name, tokens in sentences.items()}
-                answer = mean_log_probability(model, prompt, own) if own else None
+                answer = mean_log_probability(model, prompt, answer_ids) if answer_ids else None
             best = max(likely, key=lambda name: likely[name])
             rows.append(
                 SentenceRow(
@@ -62,7 +62,7 @@ def sentence_rows(workspace: Workspace, entry: ModelEntry, extraction: Extractio
                     sentence=best,
                     abstention=likely[best],
                     own=answer,
-                    own_tokens=len(own),
+                    own_tokens=len(answer_ids),
                 )
             )
     if not rows:

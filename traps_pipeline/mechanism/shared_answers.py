@@ -55,26 +55,26 @@ class SharedAnswers:
         """
         chunks = {chunk.name: chunk for request in requests if (chunk := self._of.get(request.key))}
         with ExitStack() as leases:
-            known: dict[str, Outcome] = {}
+            outcome_of: dict[str, Outcome] = {}
             for chunk in chunks.values():
                 while (lease := self._lease(chunk)) is None and not stopped():
                     time.sleep(POLL_S)
                 if lease is not None:
                     leases.enter_context(closing(lease))
-                known |= self._read(chunk)
-            missing = [request for request in requests if request.key not in known]
+                outcome_of |= self._read(chunk)
+            missing = [request for request in requests if request.key not in outcome_of]
             if missing:
-                known |= zip([each.key for each in missing], make(missing, stopped), strict=True)
-        return [known[request.key] for request in requests]
+                outcome_of |= zip([each.key for each in missing], make(missing, stopped), strict=True)
+        return [outcome_of[request.key] for request in requests]
 
-    def fill(self, chunk: Chunk, known: Callable[[Sequence[str]], set[str]], make: Make) -> int | None:
+    def fill(self, chunk: Chunk, settled_among: Callable[[Sequence[str]], set[str]], make: Make) -> int | None:
         """Generate a chunk's unknown answers; return their number, None if it is leased."""
         lease = self._lease(chunk)
         if lease is None:
             return None
         with closing(lease):
             chunk_outcomes = self._read(chunk)
-            settled = known(list(chunk.calls)) | {*chunk_outcomes}
+            settled = settled_among(list(chunk.calls)) | {*chunk_outcomes}
             missing = [request for key, request in chunk.calls.items() if key not in settled]
             if missing:
                 outcomes = make(missing, lambda: False)

@@ -85,7 +85,7 @@ def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[list[HiddenS
     ]
     existing = workspace.store.below(folder)
     workspace.store.bring(existing)
-    n_new = extract(model, asked_of, folder, pooling=settings.pooling, what=f"items of {cell.key}")
+    n_new = extract(model, asked_of, folder, pooling=settings.pooling, noun=f"items of {cell.key}")
     files = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
     workspace.store.keep(files)
     workspace.store.remove({*existing} - {*files})

@@ -71,10 +71,10 @@ def is_prepared(workspace: Workspace, entry: ModelEntry, item: Mapping[str, Any]
 def prepare_media(workspace: Workspace, cells: Sequence[Cell]) -> None:
     """Prepare all clips' media on all cores first, as encoding would delay calls."""
     jobs: dict[tuple[str, str], tuple[Path, str, MediaSpec]] = {}
-    for dataset, own in {(cell.dataset, get_model(cell.evaluation.model).media) for cell in cells}:
-        if own is None:
+    for dataset, media in {(cell.dataset, get_model(cell.evaluation.model).media) for cell in cells}:
+        if media is None:
             continue
-        spec = media_for_dataset(own, dataset)
+        spec = media_for_dataset(media, dataset)
         items = [*asked_items(workspace, dataset)]
         workspace.bring(item["clip"] for item in items)
         for item in items:

@@ -19,6 +19,7 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.extras import require
 from traps_pipeline.base.redaction import redact
 from traps_pipeline.base.terminal import plain
+from traps_pipeline.base.wording import counted
 from traps_pipeline.models.budget import worst_case_usd
 from traps_pipeline.models.dialects import OddShapeError, Reply, parse_body, read_reply
 from traps_pipeline.models.endings import Ending
@@ -272,14 +273,20 @@ class ApiBackend:
         begins = f", beginning {text[:60]!r}" if text.strip() else ""
         return f"HTTP {exchange.status}, {kind}, {len(exchange.content or b'')} bytes{begins}"
 
-    def _tell(self, kind: str, message: str, *, passes: bool = False) -> None:
-        """Report a message once per kind, without the key; `passes` if a retry may help."""
+    def _tell(self, kind: str, message: str, *, passes: bool | None = None) -> None:
+        """Report a message once per kind, without the key, and whether a run retries.
+
+        passes: whether a retry may help; None if the call has a result.
+        """
         if kind not in self._told:
             self._told.add(kind)
             message = redact(" ".join(message.split())).removeprefix(f"{kind}: ")  # before it is cut
             happened = _HAPPENED.get(kind, "a call failed")
-            again = "; a run tries again" if passes else ""
-            progress.current().note(f"{self._entry.id}: {happened}{again} ({kind}: {plain(message)[:300]})")
+            most = self._entry.limits.retries if passes else 0
+            retries = min(most, 1) if kind == MALFORMED else most
+            again = f"again, at most {counted(retries, 'time')}" if retries else "only once"
+            further = "" if passes is None else f"; a run tries such a call {again}"
+            progress.current().note(f"{self._entry.id}: {happened}{further} ({kind}: {plain(message)[:300]})")
 
 
 def failure_kind(status: int, reported: ProviderError) -> str:

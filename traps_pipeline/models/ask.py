@@ -97,15 +97,15 @@ def collect(
     entries: all participants of the calls. make: returns an entry's backend. `run_work` documents exceptions and
     Ctrl-C.
     """
-    known = {entry.id: entry for entry in entries}
+    entry_of = {entry.id: entry for entry in entries}
     with (
         workspace.ledger.writing(),
-        sharing(workspace, known.values()) as sharers,
-        spending(workspace, known.values()) as budget,
+        sharing(workspace, entry_of.values()) as sharers,
+        spending(workspace, entry_of.values()) as budget,
     ):
-        if any(entry.prices for entry in known.values()):
+        if any(entry.prices for entry in entry_of.values()):
             progress.current().money(budget.spent_usd, workspace.study.budget_usd)
-        participants = Participants(known, make, workspace.study, sharers=sharers)
+        participants = Participants(entry_of, make, workspace.study, sharers=sharers)
         work = Work(stage, ledger, participants, budget, workspace.study.epoch, calls, finish)
         yield from run_work(work, cells)
 
@@ -229,11 +229,11 @@ async def _settle_cell(
     report = progress.current()
     calls = work.calls(cell)
     requests = {call.request.key: call.request for call in calls}
-    known = await asyncio.to_thread(work.ledger.read, cell.evaluation.key, requests)
-    for place in sorted({*known.notes} - its.told):
-        report.note(f"{place}: {known.notes[place]}")
-    its.told.update(known.notes)
-    rows = {key: _Held(row) for key, row in known.settled.items()}
+    recorded = await asyncio.to_thread(work.ledger.read, cell.evaluation.key, requests)
+    for place in sorted({*recorded.notes} - its.told):
+        report.note(f"{place}: {recorded.notes[place]}")
+    its.told.update(recorded.notes)
+    rows = {key: _Held(row) for key, row in recorded.settled.items()}
     missing = [request for key, request in requests.items() if key not in rows]
     new = Counter(request.participant for request in missing)
     counts = Counter(request.participant for request in requests.values())

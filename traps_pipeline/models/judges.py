@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
@@ -107,9 +107,13 @@ def vote_schema(seat: Judge, task: Task) -> Mapping[str, Any]:
 class JudgeEntry(Entry):
     """One judge of `assets/judges.yaml`."""
 
-    backend: Literal["rule", "api"]  # pyright: ignore[reportIncompatibleVariableOverride] - fields are frozen
-    premise: bool = False  # whether it also says if an answer rejects the question's premise; the paper's judges do not
-    limits: Limits = Limits(concurrency=12)
+    backend: Literal["rule", "api"] = Field(  # pyright: ignore[reportIncompatibleVariableOverride] - fields are frozen
+        description="rules of this project, or a server"
+    )
+    premise: bool = Field(
+        default=False, description="also ask if an answer rejects the question's premise; the paper's judges do not say"
+    )
+    limits: Limits = Field(default=Limits(concurrency=12), description="of its calls")
 
     @model_validator(mode="before")
     @classmethod

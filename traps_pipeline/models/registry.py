@@ -52,8 +52,8 @@ class Limits(BaseModel):
     """Limits of calls to a participant; none of them is in the ledger key."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    concurrency: int = Field(default=24, ge=1)
-    retries: int = Field(default=5, ge=0)
+    concurrency: int = Field(default=24, ge=1, description="calls at once")
+    retries: int = Field(default=5, ge=0, description="of a call that failed and may succeed later")
     backoff_s: float = Field(default=1.0, gt=0, description="first wait; doubles with each retry, full jitter")
     timeout_s: float = Field(default=600.0, gt=0, description="of one attempt; backend local has a day by default")
 
@@ -67,8 +67,8 @@ class Account(BaseModel):
     batch_price: float = Field(
         default=1.0, gt=0, le=1, description="price of a call in a batch, relative to a live one"
     )
-    requests_per_minute: int | None = Field(default=None, ge=1)
-    tokens_per_minute: int | None = Field(default=None, ge=1)
+    requests_per_minute: int | None = Field(default=None, ge=1, description="null: no limit here")
+    tokens_per_minute: int | None = Field(default=None, ge=1, description="null: no limit here")
 
     @model_validator(mode="after")
     def _is_redacted(self) -> Account:
@@ -85,9 +85,9 @@ class Prices(BaseModel):
     """Dollars per million tokens on a date; completion tokens include reasoning."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    input: float = Field(ge=0)
-    output: float = Field(ge=0)
-    as_of: datetime.date
+    input: float = Field(ge=0, description="of the prompt")
+    output: float = Field(ge=0, description="of the answer, with its reasoning")
+    as_of: datetime.date = Field(description="day on which the provider asked them")
 
     def cost(self, prompt_tokens: float, completion_tokens: float) -> float:
         """Return the cost of a call in dollars."""
@@ -112,16 +112,16 @@ class Entry(BaseModel):
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
-    id: Name
+    id: Name = Field(description="its name in every table")
     backend: str
-    params: dict[str, Any] = Field(default_factory=dict)
-    limits: Limits = Limits()
+    params: dict[str, Any] = Field(default_factory=dict, description="what is sent, and part of the ledger key")
+    limits: Limits = Field(default=Limits(), description="of its calls")
     account: str | None = Field(default=None, description="one of `accounts`; of backend api")
     provider_id: str | None = Field(default=None, description="litellm's name: route/model, e.g. gemini/gemini-2.5-pro")
     thinking: Marks | None = Field(
         default=None, description="what opens and what closes the thinking in its visible text, which is split off"
     )
-    waivers: dict[str, str] = {}
+    waivers: dict[str, str] = Field(default={}, description="why a parameter departs from the protocol")
     prices: Prices | None = Field(default=None, description="None: unknown, and a study must allow that")
     expected_completion_tokens: int = Field(default=500, ge=0, description="estimate for `traps plan`")
     expected_latency_s: float | None = Field(
@@ -190,12 +190,16 @@ class Entry(BaseModel):
 class ModelEntry(Entry):
     """One model configuration."""
 
-    backend: Literal["reference", "observer", "rule", "api", "local"]  # pyright: ignore[reportIncompatibleVariableOverride]
-    media: MediaSpec | None = None
-    runs: int = Field(default=3, ge=1, le=9)
+    backend: Literal["reference", "observer", "rule", "api", "local"] = Field(  # pyright: ignore[reportIncompatibleVariableOverride]
+        description="what answers: a strategy, a server, or a checkpoint on this machine"
+    )
+    media: MediaSpec | None = Field(default=None, description="how it is shown a clip")
+    runs: int = Field(default=3, ge=1, le=9, description="most repetitions that an experiment may ask for")
     json_schema: bool = Field(default=True, description="structured output in the JSON regime; of backend api")
     tokens_per_frame: int = Field(default=300, ge=0, description="estimate for `traps plan`, upper bound for a budget")
-    groups: Groups = Groups(family="own", access="own", input="own", group="own")
+    groups: Groups = Field(
+        default=Groups(family="own", access="own", input="own", group="own"), description="by which tables select"
+    )
     device: str | None = Field(
         default=None, pattern=DEVICE, description="of backend local: cpu, cuda, cuda:1, mps, or auto: all GPUs"
     )

@@ -133,11 +133,11 @@ def _read(path: Path) -> UserRegistry:
         raise TrapsError(f"{path}: {explain(error, UserRegistry)}") from error
 
 
-def _yaml(own: UserRegistry) -> str:
+def _yaml(registry: UserRegistry) -> str:
     import yaml
 
     head = "# Models, judges and panels of this study, from its experiments' files (docs/models.md).\n"
-    return head + yaml.safe_dump(own.model_dump(mode="json", exclude_defaults=True), sort_keys=False)
+    return head + yaml.safe_dump(registry.model_dump(mode="json", exclude_defaults=True), sort_keys=False)
 
 
 def _account(entry: Mapping[str, Any]) -> str:
@@ -165,11 +165,11 @@ def _entry_fields(raw: Mapping[str, Any], kind: Kind) -> dict[str, Any]:
     return filled
 
 
-def _params(protocol: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+def _params(protocol: Mapping[str, Any], entry: Mapping[str, Any]) -> dict[str, Any]:
     """Return the parameters to send: the protocol's and the entry's, without nulls."""
-    replaced = {"max_tokens"} if "max_completion_tokens" in own else set[str]()  # the same limit
+    replaced = {"max_tokens"} if "max_completion_tokens" in entry else set[str]()  # the same limit
     params = {name: value for name, value in protocol.items() if name not in replaced}
-    return {name: value for name, value in (params | {**own}).items() if value is not None}
+    return {name: value for name, value in (params | {**entry}).items() if value is not None}
 
 
 def _media(media: Any) -> Any:

@@ -198,6 +198,8 @@ def cause_of(error: BaseException) -> str:
         return f"TLS failed ({error.reason or error}): if the server speaks plain HTTP, write http:// in its address"
     if isinstance(error, aiohttp.ClientHttpProxyError):
         return f"the proxy answered {error.status} {error.message}"
+    if isinstance(error, aiohttp.http_exceptions.HttpProcessingError):
+        return error.message.strip().rstrip(".")  # str(error) begins with a status that no server sent
     if isinstance(error, OSError) and error.errno and error.errno > 0:
         return os.strerror(error.errno)
     return getattr(error, "strerror", None) or str(error) or type(error).__name__

@@ -19,6 +19,7 @@ from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.sheets import no_formula
 from traps_pipeline.base.terminal import text_table
+from traps_pipeline.base.wording import counted
 from traps_pipeline.judging.agreement import cohen_kappa
 from traps_pipeline.judging.confabulation import draw_sample, sample_id
 from traps_pipeline.judging.confabulation_protocol import TRACE_AND_OUTPUT, VOID_KINDS, load_protocol
@@ -113,7 +114,7 @@ def write_sheet(rows: Sequence[Mapping[str, str]], path: Path, columns: Sequence
         writer.writerows([row[name] for name in columns] for row in rows)
 
 
-def read_labels(path: Path, known: Sequence[str]) -> HumanLabels:
+def read_labels(path: Path, samples: Sequence[str]) -> HumanLabels:
     """Return two annotators' labels from a CSV file of LABEL_COLUMNS.
 
     Values are true/false, yes/no or 1/0. known: sample ids that the judge has labelled. Raises TrapsError naming the
@@ -124,7 +125,7 @@ def read_labels(path: Path, known: Sequence[str]) -> HumanLabels:
     for line, row in _lines(path):
         annotator, sample = row["annotator"], row["sample_id"]
         problems = [f"{name} is empty" for name in ("annotator", "sample_id") if not row[name]]
-        if sample and sample not in known:
+        if sample and sample not in samples:
             problems.append(f"sample_id {sample!r:.40} is not a failure that the judge has labelled")
         problems += [
             f"{axis} is {row[axis]!r:.40}; write 1 or 0, true or false, yes or no"
@@ -158,7 +159,7 @@ def _paired(path: Path, by_sample: Mapping[tuple[str, str], tuple[int, list[bool
     names = sorted({annotator for annotator, _ in by_sample})
     if len(names) != 2:
         raise TrapsError(
-            f"{path}: has {len(names)} annotators ({', '.join(names)[:80] or 'none'}); it needs exactly two"
+            f"{path}: has {counted(len(names), 'annotator')} ({', '.join(names)[:80] or 'none'}); it needs exactly two"
         )
     first, second = names
     samples = sorted({sample for _, sample in by_sample})
@@ -251,15 +252,15 @@ def is_degenerate(one: np.ndarray, other: np.ndarray) -> bool:
     return any(min(np.mean(labels), 1 - np.mean(labels)) <= DEGENERATE_SHARE + 1e-12 for labels in (one, other))
 
 
-def _kappa(one: np.ndarray, other: np.ndarray) -> tuple[float, float, float]:
+def _kappa(first: np.ndarray, second: np.ndarray) -> tuple[float, float, float]:
     """Return Cohen's kappa and its 95 % interval; NaN if it is degenerate.
 
     The interval is a Bayesian bootstrap over failures, one of them unseen: at the lower end the annotators differ on
     it, at the upper end they agree. So the interval keeps a width even if they always agree.
     """
-    if is_degenerate(one, other):
+    if is_degenerate(first, second):
         return np.nan, np.nan, np.nan
-    cells = np.bincount(2 * one.astype(int) + other, minlength=4)  # no and no, no and yes, yes and no, yes and yes
+    cells = np.bincount(2 * first.astype(int) + second, minlength=4)  # no and no, no and yes, yes and no, yes and yes
     rng = np.random.default_rng(SEED)
     gamma, unseen = rng.standard_gamma(cells, (RESAMPLES, 4)), rng.standard_exponential((RESAMPLES, 1))
     shares = gamma + np.eye(4)[:, None] * unseen  # (cell of the unseen failure, resamples, cells)
@@ -267,7 +268,7 @@ def _kappa(one: np.ndarray, other: np.ndarray) -> tuple[float, float, float]:
     p, q = shares[..., 2] + shares[..., 3], shares[..., 1] + shares[..., 3]
     chance = p * q + (1 - p) * (1 - q)
     draws = (shares[..., 0] + shares[..., 3] - chance) / (1 - chance)
-    kappa = cohen_kappa(one.astype(int), other.astype(int))
+    kappa = cohen_kappa(first.astype(int), second.astype(int))
     low, high = np.quantile(draws[1:3].min(axis=0), 0.025), np.quantile(draws[[0, 3]].max(axis=0), 0.975)
     return kappa, min(float(low), kappa), max(float(high), kappa)
 
@@ -279,7 +280,8 @@ def _share(part: int, total: int) -> float:
 def validation_text(rows: pd.DataFrame) -> str:
     """Return JUDGE_VALIDATION rows as text for people."""
     first = rows.iloc[0]
-    title = f"judge against {first['annotator_a']} (A) and {first['annotator_b']} (B), {first['n_failures']} failures"
+    failures = counted(first["n_failures"], "failure")
+    title = f"judge against {first['annotator_a']} (A) and {first['annotator_b']} (B), {failures}"
     headings = ["axis", "labels", "acc", "prec", "recall", "F1", "vs A", "vs B", "A = B", "kappa", "95 %"]
     shares = ("accuracy", "precision", "recall", "f1", "accuracy_a", "accuracy_b", "human_agreement")
     cells = [

@@ -103,12 +103,12 @@ def human_labels(workspace: Workspace) -> pd.DataFrame:
         last[key] = row | {"seconds": last[key]["seconds"] if key in last else line.seconds}
     latest, frames = pd.DataFrame(list(last.values())), list[pd.DataFrame]()
     for task in TASKS if len(latest) else ():
-        own = latest.loc[latest["task"] == task]
-        if len(own):
+        labels = latest.loc[latest["task"] == task]
+        if len(labels):
             population = units(workspace, task)
             population["stratum"] = strata(population)
             population["stratum_size"] = population.groupby("stratum")["unit"].transform("size")
-            frames.append(own.merge(population, on="unit", how="inner", validate="many_to_one"))
+            frames.append(labels.merge(population, on="unit", how="inner", validate="many_to_one"))
     if not frames:
         return pd.DataFrame(columns=pd.Index(HUMAN_LABELS.names))
     rows = pd.concat(frames, ignore_index=True).reindex(columns=pd.Index(HUMAN_LABELS.names))

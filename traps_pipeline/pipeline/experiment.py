@@ -32,21 +32,23 @@ class Experiment(BaseModel):
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    name: Name = Field(pattern=r"^[a-z0-9-]+$")
-    description: str = ""
-    benchmark: str = "released"
-    scenarios: list[str] | None = Field(default=None, min_length=1)
-    per_family: int | None = Field(default=None, ge=1)
-    datasets: list[str] = list(DATASETS)
-    models: list[str] = Field(min_length=1)
-    regimes: list[str] = list(PAPER_REGIMES)
-    runs: list[Annotated[int, Field(ge=1)]] = Field(default=[1], min_length=1)
-    panel: str | None = None
+    name: Name = Field(pattern=r"^[a-z0-9-]+$", description="of the experiment in `study.yaml`")
+    description: str = Field(default="", description="one line, printed when it runs")
+    benchmark: str = Field(default="released", description="name of the benchmark: released, or a private one")
+    scenarios: list[str] | None = Field(default=None, min_length=1, description="their ids, or `lite`; all if absent")
+    per_family: int | None = Field(default=None, ge=1, description="the first n scenarios of each family")
+    datasets: list[str] = Field(default=list(DATASETS), description="datasets, arms or variations")
+    models: list[str] = Field(min_length=1, description="ids of the registry, or whole entries")
+    regimes: list[str] = Field(default=list(PAPER_REGIMES), description="prompts under which the models are asked")
+    runs: list[Annotated[int, Field(ge=1)]] = Field(default=[1], min_length=1, description="independent repetitions")
+    panel: str | None = Field(default=None, description="who judges; null: as `--panel` or `study.yaml` says")
     judged_by_rules: bool | None = Field(default=None, description="let the panel `rules` judge any model")
-    epoch: str | None = None
-    budget_usd: float | None = Field(default=None, ge=0.0)
-    model_budgets_usd: dict[str, Annotated[float, Field(ge=0.0)]] | None = None
-    allow_unknown_prices: bool | None = None
+    epoch: str | None = Field(default=None, description="name of the campaign, kept beside every answer")
+    budget_usd: float | None = Field(default=None, ge=0.0, description="for all calls over the network, ever")
+    model_budgets_usd: dict[str, Annotated[float, Field(ge=0.0)]] | None = Field(
+        default=None, description="by model or judge, besides"
+    )
+    allow_unknown_prices: bool | None = Field(default=None, description="ask models without a price")
     mechanism: MechanismSettings | None = Field(default=None, description="local models to read and steer")
     canary: bool = Field(default=False, description="ask twenty fixed items again in each epoch")
     own: UserRegistry = Field(default=UserRegistry(), description="models, judges and panels of this file")
@@ -163,11 +165,11 @@ class Experiment(BaseModel):
         return cells
 
 
-def _known_names(values: list[str], known: tuple[str, ...]) -> list[str]:
-    unknown = [value for value in values if value not in known]
+def _known_names(values: list[str], names: tuple[str, ...]) -> list[str]:
+    unknown = [value for value in values if value not in names]
     if unknown or not values:
-        near = did_you_mean(unknown[0], known) if unknown else ""
-        raise ValueError(f"{unknown or 'nothing'} given; choose from {', '.join(known)}{near}")
+        near = did_you_mean(unknown[0], names) if unknown else ""
+        raise ValueError(f"{unknown or 'nothing'} given; choose from {', '.join(names)}{near}")
     return values
 
 
@@ -175,10 +177,10 @@ def load_experiment(name: str) -> Experiment:
     """Return an experiment by name or YAML path. Raises TrapsError with known names."""
     path = Path(name) if name.endswith((".yaml", ".yml")) else EXPERIMENTS / f"{name}.yaml"
     if not path.is_file():
-        known = sorted(p.stem for p in EXPERIMENTS.glob("*.yaml"))
+        names = sorted(p.stem for p in EXPERIMENTS.glob("*.yaml"))
         raise TrapsError(
-            f"no experiment {name[:80]!r}: {str(path)[:200]} is not there; known: {', '.join(known)}, or give the path "
-            f"of a YAML file{did_you_mean(name, known)}"
+            f"no experiment {name[:80]!r}: {str(path)[:200]} is not there; known: {', '.join(names)}, or give the path "
+            f"of a YAML file{did_you_mean(name, names)}"
         )
     experiment = parse_yaml_model(Experiment, read_yaml(path), path)
     add_entries(experiment.own, path)

@@ -124,11 +124,11 @@ def _count_steered(workspace: Workspace | None, experiment: Experiment, study: S
         datasets = [name for name in experiment.datasets if name in DATASETS]
         for regime, by_side in count_answers(settings, model, datasets, Counter(taxonomies)).items():
             n_answers, ballots = by_side.total(), seats * sum(len(tasks_for(s)) * n for s, n in by_side.items())
-            folder, known = SteeredEvaluation(model, regime, 1).key, [0, 0]
+            folder, settled = SteeredEvaluation(model, regime, 1).key, [0, 0]
             if workspace is not None:
-                known = [len(ledger.read(folder).settled) for ledger in (workspace.answers, workspace.votes)]
-            answers.add(n_answers, min(known[0], n_answers))
-            votes.add(ballots, min(known[1], ballots))
+                settled = [len(ledger.read(folder).settled) for ledger in (workspace.answers, workspace.votes)]
+            answers.add(n_answers, min(settled[0], n_answers))
+            votes.add(ballots, min(settled[1], ballots))
     return counts
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Literal
 
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.wording import counted
 from traps_pipeline.pipeline.graph import Graph, Stage, name_of, the_graph
 from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.storage.parquet import State
@@ -26,8 +27,7 @@ DAMAGED = "damaged"  # the version of damaged data
 
 def failed_calls(count: int) -> str:
     """Return the number of a partition's failed calls, with the remedy, in words."""
-    calls, them = ("1 call", "it") if count == 1 else (f"{count:,} calls", "them")
-    return f"{calls} failed; a new run of this partition asks {them} again"
+    return f"{counted(count, 'call')} failed; a new run of this partition asks {'it' if count == 1 else 'them'} again"
 
 
 @dataclass(frozen=True)

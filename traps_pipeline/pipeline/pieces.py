@@ -52,19 +52,19 @@ def make_pieces(
     versions, shared = Lineage(workspace).inputs(stage, None), _Shared(stage)
     inputs, contents, remade = dict[str, Digests](), dict[str, bytes](), list[str]()
     for piece in pieces:
-        own = {name: version for name, version in versions.items() if name.partition("/")[0] in piece.reads}
-        known, content = former.get(piece.name, (("", ""), b""))
-        of_versions = shown = digest([code, own])
-        if known[0] == of_versions:
-            shown = known[1]
+        read_versions = {name: version for name, version in versions.items() if name.partition("/")[0] in piece.reads}
+        digests, content = former.get(piece.name, (("", ""), b""))
+        of_versions = shown = digest([code, read_versions])
+        if digests[0] == of_versions:
+            shown = digests[1]
         elif piece.inputs is not None:
             shown = digest([code, piece.inputs()])
-        if known[1] != shown:
+        if digests[1] != shown:
             content = shared.get(piece, shown) if piece.is_shared else piece.make()
             remade.append(piece.name)
         inputs[piece.name], contents[piece.name] = (of_versions, shown), content
     shared.keep()
-    if inputs != {name: known for name, (known, _) in former.items()}:
+    if inputs != {name: digests for name, (digests, _) in former.items()}:
         workspace.store.write({path: _archive(inputs, contents)})
     return contents, remade
 

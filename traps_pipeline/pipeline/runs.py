@@ -81,14 +81,14 @@ class RunsHere(Runs):
             self.finished.append({"run": run_id, "assets": names, "partitions": words, "result": result})
             yield outcome
 
-    def _execute(self, stages: Sequence[Stage], one: Range, tags: Mapping[str, str], run_id: str) -> RunOutcome:
-        key = one[0] if one[0] == one[1] else None
+    def _execute(self, stages: Sequence[Stage], keys: Range, tags: Mapping[str, str], run_id: str) -> RunOutcome:
+        key = keys[0] if keys[0] == keys[1] else None
         try:
             result = self._job.execute_in_process(
                 instance=self._instance,
                 asset_selection=[asset_key(stage.name) for stage in stages],
                 partition_key=key,
-                tags={**self._tags, **tags, **range_tags(one)},
+                tags={**self._tags, **tags, **range_tags(keys)},
                 raise_on_error=False,
                 run_config=_QUIET,
                 run_id=run_id,
@@ -105,9 +105,9 @@ class RunsHere(Runs):
         return outcome
 
 
-def range_tags(one: Range, *, always: bool = False) -> dict[str, str]:
+def range_tags(keys: Range, *, always: bool = False) -> dict[str, str]:
     """Return a range's tags; a single key has none unless `always`."""
-    first, last = one
+    first, last = keys
     if first is None or (first == last and not always):
         return {}
     return {_RANGE[0]: str(first), _RANGE[1]: str(last)}

@@ -98,8 +98,8 @@ def stage(
             output = function(workspace, key)
             return output if isinstance(output, StageOutput) or isinstance(table, str) else _with_preview(table, output)
 
-        above = [one if isinstance(one, Parent) else of(one) for one in parents]
-        one = Stage(
+        above = [declared if isinstance(declared, Parent) else of(declared) for declared in parents]
+        declared = Stage(
             name=table if isinstance(table, str) else table.name,
             table=None if isinstance(table, str) else table,
             make=function if side_by_side else make,
@@ -117,8 +117,8 @@ def stage(
             shared=shared,
             side_by_side=side_by_side,
         )
-        _declare(one)
-        return one
+        _declare(declared)
+        return declared
 
     return declare
 
@@ -141,8 +141,8 @@ def _result(doc: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-def _declare(one: Stage | Source) -> None:
-    if one.group not in GROUPS:
-        raise ValueError(f"{one.name}: no job makes the group {one.group}; add it to JOB_GROUPS")
-    if one.group not in LEFT_OUT:
-        DECLARED[one.name] = one
+def _declare(node: Stage | Source) -> None:
+    if node.group not in GROUPS:
+        raise ValueError(f"{node.name}: no job makes the group {node.group}; add it to JOB_GROUPS")
+    if node.group not in LEFT_OUT:
+        DECLARED[node.name] = node

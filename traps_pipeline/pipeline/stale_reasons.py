@@ -8,6 +8,7 @@ from typing import Any
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.suggestions import did_you_mean
+from traps_pipeline.base.wording import counted
 from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.answers import answer_request, with_posteriors
@@ -81,11 +82,11 @@ def lines_of(explanation: Mapping[str, Any]) -> Iterator[str]:
 
 def _unknown(workspace: Workspace, item_id: str) -> str:
     """Return why an item is unknown, with the nearest one."""
-    known = workspace.tables.read_all(ITEMS, ["item_id"])["item_id"]
-    if known.empty:
+    item_ids = workspace.tables.read_all(ITEMS, ["item_id"])["item_id"]
+    if item_ids.empty:
         return f"item {item_id!r} is unknown: this study has no items yet; `traps run EXPERIMENT` makes them"
     form = "; an item is dataset:scenario:side, e.g. occlusion:domino_chain-0001:void"
-    return f"item {item_id!r} is unknown{did_you_mean(item_id, known) or form}"
+    return f"item {item_id!r} is unknown{did_you_mean(item_id, item_ids) or form}"
 
 
 def _rows_of(
@@ -111,7 +112,8 @@ def _current_item(workspace: Workspace, dataset: str, item_id: str) -> dict[str,
 def _state(rows: list[dict[str, Any]], wanted: Mapping[str, Any] | None) -> str:
     newest = max(rows, key=lambda row: row["created_at"])
     if wanted is None:
-        return f"asked {len(rows)} times; the item is no longer in the benchmark, its answers stay in the ledger"
+        times = counted(len(rows), "time")
+        return f"asked {times}; the item is no longer in the benchmark, its answers stay in the ledger"
     for row in rows:
         if row["components"] == dict(wanted):
             return f"answered {row['created_at'][:19]} ({row['outcome']}), key {row['key'][:12]}: still stands"

@@ -105,11 +105,11 @@ def pair_rows(content: Content) -> list[PairRow]:
         if len(sides) < 2:
             raise TrapsError(f"{pair_id}: only its {next(iter(sides))} is there; make items again")
         control, void = sides["control"], sides["void"]
-        own = ("pair_id", "dataset", "scenario_id", "taxonomy", "category", "sub_scenario", "labels", "aliases")
-        own += ("answer_type", "ground_truth", "benchmark_version")
+        shared = ("pair_id", "dataset", "scenario_id", "taxonomy", "category", "sub_scenario", "labels", "aliases")
+        shared += ("answer_type", "ground_truth", "benchmark_version")
         rows.append(
             PairRow(
-                **{name: control[name] for name in own},
+                **{name: control[name] for name in shared},
                 control_item_id=control["item_id"],
                 void_item_id=void["item_id"],
                 control_file_name=control["clip"],

@@ -17,6 +17,7 @@ import yaml
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes, write_text
+from traps_pipeline.base.wording import counted
 from traps_pipeline.benchmark.records import Release, load_release
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.registry import is_reference
@@ -84,7 +85,8 @@ def write_results(workspace: Workspace, target: Path, dataset: str, who: Attribu
 
 
 def _hub_entry(row: Row, dataset: str, when: pd.Timestamp) -> dict[str, Any]:
-    notes = f"PECS (0 to 1), mean of {row['n_runs']} runs; panel {row['panel']}; benchmark {row['benchmark_version']}"
+    runs, version = counted(row["n_runs"], "run"), row["benchmark_version"]
+    notes = f"PECS (0 to 1), mean of {runs}; panel {row['panel']}; benchmark {version}"
     return {
         "dataset": {"id": dataset, "task_id": f"traps_{row['regime']}"},
         "value": float(row["pecs"]),

@@ -60,10 +60,10 @@ class Verification:
     verdicts: pd.DataFrame | None = None
     scored: Scores | None = None
 
-    def look(self, what: str, complaints: Iterator[str]) -> None:
+    def look(self, topic: str, complaints: Iterator[str]) -> None:
         """Record a check and its problems: keep the first ones and count the others."""
         problems = list(complaints)
-        self.checked.append(what)
+        self.checked.append(topic)
         self.problems += problems[:MOST_SENTENCES]
         if len(problems) > MOST_SENTENCES:
             self.problems.append(f"... and {len(problems) - MOST_SENTENCES} more of this kind")
@@ -141,15 +141,15 @@ def released_items(release: Path) -> dict[str, tuple[str, str]]:
 
 
 def _strangers(items: Mapping[str, Row], release: Path) -> Iterator[str]:
-    known = released_items(release)
+    released = released_items(release)
     for id_, row in items.items():
-        if id_ not in known:
+        if id_ not in released:
             yield f"item {id_}: is not in the release"
-        elif known[id_][1] != row["media_digest"]:
+        elif released[id_][1] != row["media_digest"]:
             yield f"item {id_}: its clip is not the released one"
-        elif known[id_][0] != row["item_hash"]:
+        elif released[id_][0] != row["item_hash"]:
             yield f"item {id_}: its question, choices or answer are not the released ones"
-    missing_ids = sorted(id_ for id_ in known if id_.partition(":")[0] in DATASETS and id_ not in items)
+    missing_ids = sorted(id_ for id_ in released if id_.partition(":")[0] in DATASETS and id_ not in items)
     for id_ in missing_ids:
         yield f"item {id_}: is in the release and was not asked"
 
@@ -269,13 +269,13 @@ def _difference(row: Row, item: Row, again: Outcome | None) -> str:
 
 def _numbers(verified: Verification, submission: Submission) -> None:
     """Recompute verdicts, metrics and leaderboard; record differing numbers."""
-    own = id_of_judges(submission.about.panel, submission.about.judges)
+    panel = id_of_judges(submission.about.panel, submission.about.judges)
     try:
         tables = (submission.table(table) for table in (ITEMS, RESPONSES, VOTES))
         items, answers, votes = tables
         columns = [c for c in items.columns if c not in answers.columns or c in ("item_id", "benchmark_version")]
         verdicts = decide(items.loc[:, columns], answers.drop(columns="benchmark_version"), votes).fillna(
-            {"panel": own}
+            {"panel": panel}
         )
         verified.verdicts, verified.scored = verdicts, score(verdicts)
     except (TrapsError, ValueError, KeyError, TypeError) as error:
@@ -285,9 +285,10 @@ def _numbers(verified: Verification, submission: Submission) -> None:
     verified.look("leaderboard", _other_numbers(LEADERBOARD, submission.table(LEADERBOARD), verified.scored.board))
 
 
-def _other_numbers(table: Table[Any], stated: pd.DataFrame, own: pd.DataFrame) -> Iterator[str]:
+def _other_numbers(table: Table[Any], stated: pd.DataFrame, recomputed: pd.DataFrame) -> Iterator[str]:
     key = list(table.key)
-    stated_rows, own_rows = ({tuple(row[k] for k in key): row for row in records(frame)} for frame in (stated, own))
+    frames = (stated, recomputed)
+    stated_rows, own_rows = ({tuple(row[k] for k in key): row for row in records(frame)} for frame in frames)
     for entry in sorted({*stated_rows, *own_rows}, key=str):
         name = f"{table.name} {' '.join(map(str, entry))}"
         if entry not in own_rows or entry not in stated_rows:
@@ -299,7 +300,7 @@ def _other_numbers(table: Table[Any], stated: pd.DataFrame, own: pd.DataFrame) -
                 yield f"{name}: {column.name} is {stated_value!r:.40}, the votes give {own_value!r:.40}"
 
 
-def _is_equal(one: Any, other: Any) -> bool:
-    if isinstance(one, float) and isinstance(other, float):
-        return math.isclose(one, other, rel_tol=CLOSE, abs_tol=CLOSE)
-    return one == other
+def _is_equal(first: Any, second: Any) -> bool:
+    if isinstance(first, float) and isinstance(second, float):
+        return math.isclose(first, second, rel_tol=CLOSE, abs_tol=CLOSE)
+    return first == second

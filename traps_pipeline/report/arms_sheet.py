@@ -47,13 +47,13 @@ def arms_sheets(items: pd.DataFrame, arms: pd.DataFrame, root: Path) -> dict[str
     figures: dict[str, Figure] = {}
     for (name, arm_names), (taxonomy, sides) in product(_SHEETS.items(), pairs.groupby("taxonomy", sort=True)):
         filmed = arms.loc[arms["clip"].notna() & arms["arm"].isin(arm_names)]
-        own = filmed.loc[filmed["scenario_id"].isin(sides["scenario_id"])]
-        if len(own):
-            counts = own.groupby("scenario_id")["arm"].nunique().sort_index()
+        arms_shown = filmed.loc[filmed["scenario_id"].isin(sides["scenario_id"])]
+        if len(arms_shown):
+            counts = arms_shown.groupby("scenario_id")["arm"].nunique().sort_index()
             scenario = str(counts.idxmax())
             control = sides.loc[(sides["scenario_id"] == scenario) & (sides["side"] == "control"), "clip"]
             times = _moments(root / str(control.iloc[0]))
-            rows = list(_rows(sides, own, scenario, root, times))
+            rows = list(_rows(sides, arms_shown, scenario, root, times))
             figures[f"{name}_{taxonomy}"] = _sheet(scenario, rows, times)
     return figures
 

@@ -131,10 +131,10 @@ def figure_card(report: FigureReport, sources: Sources) -> Card:
     """Return the card of a study's figure."""
     name = _name(report)
     try:
-        own = report.figure(sources.study)
+        figure = report.figure(sources.study)
     except NotRun as reason:
         return Card(name, report.title, why=str(reason))
-    pictures = {"": _picture(report.name, own)}
+    pictures = {"": _picture(report.name, figure)}
     return Card(
         name, report.title, _fragment("figures", pictures=pictures, alt=report.title), shows=report.note(sources.study)
     )

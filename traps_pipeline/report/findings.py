@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from traps_pipeline.base.terminal import plain
+from traps_pipeline.base.wording import counted, in_percent
 from traps_pipeline.protocol.datasets import SHORT
 from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.report.figures.expression_figures import orders, scored_items
@@ -48,9 +49,9 @@ def states_and_output(results: Results) -> Iterator[str]:
             name: sum(area[name] for area in areas) / len(areas) for name in areas[0] if all(name in a for a in areas)
         }
         yield (
-            f"{model} answered {len(voids)} voids under standard: its states put {encoded} of them among voids (and "
-            f"{wrongly} of {len(controls)} controls), its output {expressed}; as orders of the sides (AUROC, mean of "
-            f"datasets): {', '.join(f'{_SCORES[name]} {mean:.2f}' for name, mean in means.items())}."
+            f"{model} answered {counted(len(voids), 'void')} under standard: its states put {encoded} of them among "
+            f"voids (and {wrongly} of {counted(len(controls), 'control')}), its output {expressed}; as orders of sides "
+            f"(AUROC, mean of datasets): {', '.join(f'{_SCORES[name]} {mean:.2f}' for name, mean in means.items())}."
         )
 
 
@@ -84,10 +85,13 @@ def probe_baselines(results: Results) -> Iterator[str]:
         states, noise, spread = (group[name].to_numpy(float) for name in ("value", "noise", "noise_spread"))
         beaten = np.column_stack([group[[*SHORTCUTS, "output margin"]].to_numpy(float), noise + 2 * spread])
         above, across = states > np.fmax.reduce(beaten, axis=1), (group["source"] != group["target"]).to_numpy(bool)
-        counts = [f"{np.count_nonzero(above & kind)} of {np.count_nonzero(kind)}" for kind in (across, ~across)]
+        counts = [
+            f"{np.count_nonzero(above & kind)} of {counted(np.count_nonzero(kind), noun)}"
+            for kind, noun in ((across, "pair"), (~across, "dataset"))
+        ]
         yield (
-            f"{model}: states are above every raw input, the output margin and noise on {counts[0]} pairs of datasets, "
-            f"and on {counts[1]} datasets themselves."
+            f"{model}: states are above every raw input, the output margin and noise on {counts[0]} of datasets, "
+            f"and within {counts[1]}."
         )
 
 
@@ -99,13 +103,13 @@ def gate_arrows(results: Results) -> Iterator[str]:
     for model, group in _models(rows.loc[rows["pecs"].notna()]):
         for regime, part in group.groupby("regime", sort=False, observed=True):
             gates = {row["features"]: row for row in part.to_dict("records")}
-            own = gates.pop("states", None)
-            if own is None or not gates:
+            by_states = gates.pop("states", None)
+            if by_states is None or not gates:
                 continue
             best = max(gates.values(), key=lambda row: row["pecs"])
             yield (
-                f"{model} under {regime}: a gate on states takes PECS from {own['plain_pecs']:.2f} to "
-                f"{own['pecs']:.2f}, the best other gate ({best['features']}) to {best['pecs']:.2f}."
+                f"{model} under {regime}: a gate on states takes PECS from {by_states['plain_pecs']:.2f} to "
+                f"{by_states['pecs']:.2f}, the best other gate ({best['features']}) to {best['pecs']:.2f}."
             )
 
 
@@ -121,16 +125,16 @@ def doses_among_nulls(results: Results) -> Iterator[str]:
         ahead = [of_cell[0] for of_cell in cells.values() if all(row["p"] <= ALPHA for row in of_cell)]
         best = max(ahead, key=lambda row: row["effect"], default=None)
         yield (
-            f"{model}: void directions do more than 19 of 20 draws of every null in {len(ahead)} of {len(cells)} cells"
-            + (f", most of all {_cell(best)}." if best else ".")
+            f"{model}: void directions do more than 19 of 20 draws of every null in {len(ahead)} of "
+            f"{counted(len(cells), 'cell')}" + (f", most of all {_cell(best)}." if best else ".")
         )
 
 
 def _cell(row: dict[str, Any]) -> str:
     moved = "more" if row["side"] == "control" else "fewer"
     return (
-        f"{SHORT[row['target']]} at {row['dose']:g} {row['unit']}, where {row['effect']:.0%} {moved} of {row['n']} "
-        f"{row['side']}s are abstained on"
+        f"{SHORT[row['target']]} at {row['dose']:g} {row['unit']}, where {in_percent(row['effect'])} {moved} of "
+        f"{row['n']} {row['side']}s are abstained on"
     )
 
 

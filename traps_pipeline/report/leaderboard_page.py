@@ -148,14 +148,14 @@ def _of_one_panel(board: pd.DataFrame, robust: pd.DataFrame | None, brief: bool,
     datasets = set(board["dataset"])
     ranked = next((name for name in TITLES if name in datasets), "overall")
     other_datasets = [name for name in DATASETS if name in datasets and name != ranked]
-    own = [_leaderboard(board.loc[board["dataset"] == name], name, [], {}, brief, suffix) for name in other_datasets]
+    others = [_leaderboard(board.loc[board["dataset"] == name], name, [], {}, brief, suffix) for name in other_datasets]
     rows = []
     if robust is not None and ranked == "overall":
         rows = records(robust)
     row_of = {(row["model"], row["regime"]): row for row in rows}
     entries = {*zip(board["model"], board["regime"], strict=True)}
     row_of = {key: row for key, row in row_of.items() if key in entries}
-    return [_leaderboard(board, ranked, other_datasets, row_of, brief, suffix), *own]
+    return [_leaderboard(board, ranked, other_datasets, row_of, brief, suffix), *others]
 
 
 def legend(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> dict[str, str]:
@@ -282,7 +282,7 @@ def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.Dat
             row = by_dataset.get(name)
             entry |= {name: row["pecs"], f"{name}_mark": _mark(row)} if row else {}
         rows.append(entry)
-    own = [column.name for column in LEADERBOARD.columns]
+    columns = [column.name for column in LEADERBOARD.columns]
     marks = [
         "mark",
         "n_mark",
@@ -293,7 +293,7 @@ def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.Dat
         *others,
         *(f"{name}_mark" for name in others),
     ]
-    return pd.DataFrame(sorted(rows, key=_rank), columns=pd.Index([*own, *marks]))
+    return pd.DataFrame(sorted(rows, key=_rank), columns=pd.Index([*columns, *marks]))
 
 
 def _mark(row: Mapping[str, Any]) -> str:

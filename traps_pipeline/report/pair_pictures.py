@@ -119,12 +119,12 @@ class PairPictures:
         from traps_pipeline.benchmark.shortcuts import shortcuts
 
         kept, store = self.workspace.reports / ".state" / "shortcuts.json", self.workspace.store
-        known: dict[str, list[float]] = {}
+        cache: dict[str, list[float]] = {}
         with suppress(ValueError):  # a damaged file counts as none
-            known = json.loads(store.here(kept).read_text(encoding="utf-8")) if store.has(kept) else {}
+            cache = json.loads(store.here(kept).read_text(encoding="utf-8")) if store.has(kept) else {}
         clips = self.workspace.bring(self.items["clip"]) if len(self.items) else self.workspace.root
-        table = shortcuts(self.items, self.workspace.tables.read_all(VIDEOS), clips, known)
-        store.write({kept: json.dumps(known).encode()})
+        table = shortcuts(self.items, self.workspace.tables.read_all(VIDEOS), clips, cache)
+        store.write({kept: json.dumps(cache).encode()})
         return table
 
     def _shortcuts(self) -> Figure:

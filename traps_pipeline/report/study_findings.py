@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from traps_pipeline.base.wording import counted
 from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, REGIMES, STANDARD
 from traps_pipeline.report.catalogue import FIGURE_REPORTS
 from traps_pipeline.report.result_frames import Results
@@ -39,12 +40,12 @@ def study_findings(results: Results) -> list[StudyFinding]:
     if not len(rows):
         return []
     references = models_of(group="reference")
-    own = rows.loc[[model not in references for model in rows["model"]]]
-    own = own if len(own) else rows
+    shown = rows.loc[[model not in references for model in rows["model"]]]
+    shown = shown if len(shown) else rows
     inside = [(report.name, report.finding(results)) for report in FIGURE_REPORTS] if results.mechanism else []
     return [
-        *_best(own), *_abstention(own), *_accuracy(own), *_gaps(results, own), *_separable(results, own),
-        *_missing_answers(own), *(StudyFinding(text, f"figure-{name}") for name, text in inside if text),
+        *_best(shown), *_abstention(shown), *_accuracy(shown), *_gaps(results, shown), *_separable(results, shown),
+        *_missing_answers(shown), *(StudyFinding(text, f"figure-{name}") for name, text in inside if text),
     ]  # fmt: skip
 
 
@@ -135,7 +136,7 @@ def _separable(results: Results, rows: pd.DataFrame) -> Iterator[StudyFinding]:
         if len(tested):
             count = int(tested["separable"].eq(True).sum())
             yield StudyFinding(
-                f"Of {len(tested)} differences of PECS between models under one regime, {count} "
+                f"Of {counted(len(tested), 'difference')} of PECS between models under one regime, {count} "
                 f"{'is' if count == 1 else 'are'} significant after Holm’s correction.",
                 "table-contrasts",
             )
@@ -147,8 +148,8 @@ def _missing_answers(rows: pd.DataFrame) -> Iterator[StudyFinding]:
         answers = 2 * int((rows["n_pairs"].to_numpy(int) * rows["n_runs"].to_numpy(int)).sum())
         most = rows.sort_values(["n_missing", "model"], ascending=[False, True]).to_dict("records")[0]
         yield StudyFinding(
-            f"{missing} of {answers} answers have no text or no majority; {most['model']} under {most['regime']} lacks "
-            f"most, {int(most['n_missing'])}.",
+            f"Without text or majority: {missing:,} of {counted(answers, 'answer')}; {most['model']} under "
+            f"{most['regime']} lacks most, {int(most['n_missing'])}.",
             "leaderboard",
         )
 

@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 import pandas as pd
 
+from traps_pipeline.base.wording import counted
 from traps_pipeline.mechanism.effects import in_gaps
 from traps_pipeline.mechanism.mechanism_rows import COSINES, STEERING_EFFECTS
 from traps_pipeline.mechanism.shares import of_paper
@@ -159,7 +160,7 @@ class StudyResults(Results):
         sentence = judged_by(_of_panel(self, self.board)).rstrip(".")
         unjudged = self.board.loc[self.board["panel"] != self.panel, "model"].unique()
         return sentence + (
-            f"; {len(unjudged)} models with figures of other panels are left out" if len(unjudged) else ""
+            f"; left out: {counted(len(unjudged), 'model')} with figures of other panels" if len(unjudged) else ""
         )
 
     def rows(self, table: Table) -> pd.DataFrame:

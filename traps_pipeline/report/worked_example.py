@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from traps_pipeline.base.wording import counted
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation
@@ -88,7 +89,7 @@ def reading(answer: str, votes: Sequence[Mapping[Any, Any]], verdict: Mapping[An
     valid = [vote for vote in votes if vote["valid"]]
     on_abstention = [vote for vote in valid if vote["task"] == "abstention"]
     abstained = sum(bool(vote["abstained"]) for vote in on_abstention)
-    summary = f"{abstained} of {len(on_abstention)} judges read an abstention"
+    summary = f"an abstention for {abstained} of {counted(len(on_abstention), 'judge')}"
     values = [str(vote["extracted_value"]) for vote in valid if vote["task"] == "correctness"]
     if values:
         summary += f"; they extract {', '.join(dict.fromkeys(values))}"

@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
+from traps_pipeline.base.wording import counted
 from traps_pipeline.protocol.datasets import LONG, transfer_type
 from traps_pipeline.scoring.analyses import SHARES, models_of, overall
 from traps_pipeline.scoring.claims import CLAIMS
@@ -64,7 +65,7 @@ def audit_text(findings: pd.DataFrame, everything: bool = False) -> str:
     lines = ["lines are those of the paper's LaTeX source"]
     for group, rows in findings.groupby("group", sort=False):
         counts = ", ".join(f"{n} {verdict}" for verdict, n in rows["verdict"].value_counts().items())
-        lines.append(f"{group}: {len(rows)} statements: {counts}")
+        lines.append(f"{group}: {counted(len(rows), 'statement')}: {counts}")
         listed = rows if everything or group == "claims" else rows.loc[rows["verdict"].isin([DIFFERS, DECLARED])]
         for row in listed.to_dict("records"):
             where = f" (line {row['line']})" if row["line"] else ""

@@ -257,11 +257,14 @@ def _beside_rules(rows: pd.DataFrame) -> pd.DataFrame:
         matching = [
             rule_row for rule_row in of_rules if all(rule_row[name] == row[name] for name in ("hypothesis", "dose"))
         ]
-        own = {
+        rule_rows = {
             rule_row["model"]: rule_row
             for rule_row in sorted(matching, key=lambda rule_row: rule_row["regime"] == row["regime"])
         }
-        remarks.append({**_best(own.values(), "value", "rule"), **_best(own.values(), "change", "rule_changing")})
+        best, changing = (
+            _best(rule_rows.values(), *fields) for fields in (("value", "rule"), ("change", "rule_changing"))
+        )
+        remarks.append({**best, **changing})
     return rows.assign(**{name: [rule_row[name] for rule_row in remarks] for name in remarks[0]}) if remarks else rows
 
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.wording import counted
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.metrics import joined_epochs
 
@@ -27,11 +28,11 @@ class EpochMismatch(TrapsError):
     """The two sides of a ratio, contrast or gap were evaluated in different campaigns."""
 
 
-def require_one_epoch(epochs: pd.DataFrame, what: str) -> None:
+def require_one_epoch(epochs: pd.DataFrame, figure: str) -> None:
     """Raise EpochMismatch if any row of `epochs` holds two different epochs.
 
     epochs has one row per comparison (its index names it, e.g. model and dataset) and one column per side; a null side
-    is ignored. `what` names the figure in the message.
+    is ignored. figure: its name in the message.
     """
     mixed = epochs.loc[epochs.nunique(axis=1) > 1]
     if mixed.empty:
@@ -41,8 +42,8 @@ def require_one_epoch(epochs: pd.DataFrame, what: str) -> None:
     sides = ", ".join(f"{side} from epoch {epoch!r}" for side, epoch in mixed.iloc[0].dropna().items())
     more = f" (and {len(mixed) - 1} more)" if len(mixed) > 1 else ""
     raise EpochMismatch(
-        f"{what}: {names} has {sides}{more}; figures of different epochs are never put in one ratio, contrast or gap: "
-        "evaluate both sides in one epoch, or leave this one out"
+        f"{figure}: {names} has {sides}{more}; figures of different epochs are never put in one ratio, contrast or "
+        "gap: evaluate both sides in one epoch, or leave this one out"
     )
 
 
@@ -88,4 +89,4 @@ def refusal(left: Answered, right: Answered) -> str | None:
 def _named(items: list[str]) -> str:
     """Return the first item with its dataset, and the number of others, in words."""
     dataset, more = items[0].partition(":")[0], len(items) - 1
-    return f"{dataset}: {items[0]}" + (f" and {more} more items are" if more else " is")
+    return f"{dataset}: {items[0]}" + (f" and {counted(more, 'more item')} are" if more else " is")

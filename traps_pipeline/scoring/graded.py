@@ -88,16 +88,16 @@ class GradedItem:
             return None
         names = {name.casefold(): label for name, label in self.aliases.items()}
         names |= {label.casefold(): label for label in self.labels}
-        known = dict.fromkeys(self.labels, 0.0)
+        probability_of = dict.fromkeys(self.labels, 0.0)
         for token, logprob in json.loads(alternatives).items():
             start = token.strip().strip("\"'*`.,:").casefold()
             matching = {label for name, label in names.items() if start and name.startswith(start)}
             matching = {names[start]} if start in names else matching
             if len(matching) == 1:
-                known[matching.pop()] += exp(logprob)
-        total = sum(known.values())
-        rest = max(0.0, 1 - total) / len(known)
-        return {label: (p + rest) / max(1.0, total) for label, p in known.items()}
+                probability_of[matching.pop()] += exp(logprob)
+        total = sum(probability_of.values())
+        rest = max(0.0, 1 - total) / len(probability_of)
+        return {label: (p + rest) / max(1.0, total) for label, p in probability_of.items()}
 
 
 def graded(
@@ -147,13 +147,13 @@ def _labels(votes: pd.DataFrame, questions: Mapping[str, GradedItem]) -> dict[tu
     """
     cast_votes = votes.loc[votes["task"].eq("correctness"), [*_ANSWER, "valid", "extracted_value"]]
     label_of = dict[tuple[Any, ...], str]()
-    for key, own in cast(Any, cast_votes.groupby(_ANSWER)):
+    for key, ballots in cast(Any, cast_votes.groupby(_ANSWER)):
         labels = [
             questions[key[0]].label_of(value if isinstance(value, str) else None) or ""
-            for value in own.loc[own["valid"].astype(bool), "extracted_value"]
+            for value in ballots.loc[ballots["valid"].astype(bool), "extracted_value"]
         ]
         label, n = Counter(labels).most_common(1)[0] if labels else ("", 0)
-        if n > len(own) / 2:
+        if n > len(ballots) / 2:
             label_of[key] = label
     return label_of
 
@@ -183,15 +183,15 @@ def decided(item: GradedItem, label: str | None) -> dict[str, float]:
     The regret is the loss against an ideal observer. label: None for an abstention.
     """
     posterior, even = item.posterior, dict.fromkeys(item.labels, 1 / len(item.labels))
-    best, own = max(posterior.values()), 0.0 if label is None else posterior.get(label, 0.0)
+    best, believed = max(posterior.values()), 0.0 if label is None else posterior.get(label, 0.0)
     ideal, answers = max(0.0, expected_points(best)), label is not None
-    points = expected_points(own) if answers else 0.0
+    points = expected_points(believed) if answers else 0.0
     return {
         "answers": float(answers),
-        "wrong": 1 - own if answers else np.nan,
+        "wrong": 1 - believed if answers else np.nan,
         "points": points,
         "regret": ideal - points,
-        "regret_label": expected_points(best) - expected_points(own) if answers else 0.0,
+        "regret_label": expected_points(best) - expected_points(believed) if answers else 0.0,
         "regret_rash": ideal - expected_points(best) if answers else 0.0,
         "regret_shy": 0.0 if answers else ideal,
         "abstains_right": np.nan if expected_points(best) > 0 else float(not answers),

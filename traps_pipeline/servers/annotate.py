@@ -91,8 +91,8 @@ class Annotation:
 
     def progress(self, who: str, task: TaskName) -> tuple[int, int]:
         """Return the numbers of units that a person has labelled and has to label."""
-        own = self.samples[task]
-        return sum(unit in own.index for unit in self.store.labelled(who, task)), len(own)
+        sample = self.samples[task]
+        return sum(unit in sample.index for unit in self.store.labelled(who, task)), len(sample)
 
     def next_unit(self, who: str, task: TaskName) -> str | None:
         """Return a person's next unit, and record it as shown.
@@ -100,20 +100,20 @@ class Annotation:
         It is the unit that waits for a label, else the first of their queue. None if all are labelled, or if the rest
         belong to scenarios that they met in this sitting.
         """
-        own, shown_units = self.samples[task], self.store.shown(who)
-        waiting = [each.unit for each in shown_units if each.task == task and each.waits and each.unit in own.index]
+        sample, shown_units = self.samples[task], self.store.shown(who)
+        waiting = [each.unit for each in shown_units if each.task == task and each.waits and each.unit in sample.index]
         since = time.time() - 3600 * annotation_protocol().sitting_hours
         met = {each.scenario_id for each in shown_units if each.at > since}  # in any task, since answers reveal clips
         finished = {each.unit for each in shown_units if each.task == task} | {*self.store.labelled(who, task)}
         blind = task != "answerability"
         open_units = (
             unit
-            for unit in queue_of(who, own)
-            if unit not in finished and (blind or own.loc[unit, "scenario_id"] not in met)
+            for unit in queue_of(who, sample)
+            if unit not in finished and (blind or sample.loc[unit, "scenario_id"] not in met)
         )
         unit = waiting[-1] if waiting else next(open_units, None)
         if unit is not None:
-            self.store.show(who, task, unit, str(own.loc[unit, "scenario_id"]))
+            self.store.show(who, task, unit, str(sample.loc[unit, "scenario_id"]))
         return unit
 
     def find(self, who: str, handle: str) -> tuple[TaskName, str]:
@@ -139,10 +139,10 @@ class Annotation:
     def reopen(self, who: str, name: str) -> None:
         """Show a task's last labelled unit again. Raises NotFound without one."""
         task = require_task(name)
-        known = [unit for unit in self.store.labelled(who, task) if unit in self.samples[task].index]
-        if not known:
+        labelled = [unit for unit in self.store.labelled(who, task) if unit in self.samples[task].index]
+        if not labelled:
             raise NotFound("you have labelled nothing here yet")
-        self.store.show(who, task, known[-1], str(self.samples[task].loc[known[-1], "scenario_id"]))
+        self.store.show(who, task, labelled[-1], str(self.samples[task].loc[labelled[-1], "scenario_id"]))
 
     def clip(self, who: str, handle: str) -> Path:
         """Return the clip behind a handle. Raises NotFound."""

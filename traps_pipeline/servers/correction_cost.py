@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.wording import counted
 from traps_pipeline.benchmark.corrections import Correction
 from traps_pipeline.benchmark.specs import wording_of
 from traps_pipeline.judging.panel import tasks_for
@@ -41,18 +42,18 @@ class CorrectionEffect:
 
     def plus(self, other: CorrectionEffect) -> CorrectionEffect:
         """Return the sum of both."""
-        known = self.dollars is not None and other.dollars is not None
+        is_priced = self.dollars is not None and other.dollars is not None
         return CorrectionEffect(
             self.items + other.items, self.answers + other.answers, self.votes + other.votes,
-            (self.dollars or 0) + (other.dollars or 0) if known else None,
+            (self.dollars or 0) + (other.dollars or 0) if is_priced else None,
             self.rendered + other.rendered, self.gone + other.gone, self.added + other.added,
         )  # fmt: skip
 
     def sentence(self) -> str:
         """Return the counts in words."""
         money = "an unknown price" if self.dollars is None else f"about {self.dollars:.2f} USD"
-        calls = f"at most {self.answers} answers and {self.votes} votes"
-        cost_text = f"{len(self.items)} items are asked or judged again: {calls}, {money}"
+        calls = f"at most {counted(self.answers, 'answer')} and {counted(self.votes, 'vote')}"
+        cost_text = f"{counted(len(self.items), 'item')} to ask or judge again: {calls}, {money}"
         return cost_text + (f"; clips of {', '.join(self.rendered)} are rendered again" if self.rendered else "")
 
 

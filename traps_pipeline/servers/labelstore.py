@@ -165,10 +165,10 @@ class LabelStore:
     def _restore(self, last: int) -> None:
         """Import the labels that are only in the file, after the database was moved away."""
         with self._database() as database:
-            (known,) = database.execute("SELECT coalesce(max(seq), 0) FROM labels").fetchone()
-            if known >= last:
+            (latest,) = database.execute("SELECT coalesce(max(seq), 0) FROM labels").fetchone()
+            if latest >= last:
                 return
-            lines = [line for line in label_lines(self.folder) if line.seq > known]
+            lines = [line for line in label_lines(self.folder) if line.seq > latest]
             database.execute("BEGIN IMMEDIATE")
             database.executemany(
                 "INSERT OR IGNORE INTO labels VALUES (?, ?, ?, ?, ?, ?, ?)",

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.wording import counted
 from traps_pipeline.ledger.row_transfer import copy_ledger
 from traps_pipeline.storage.parquet import note_of
 from traps_pipeline.storage.place import STUDY, Place, scratch_of
@@ -72,4 +73,4 @@ def _move_files(workspace: Workspace, target: Workspace) -> None:
             moved.append(destination)
         target.store.keep(moved)
         count += len(some)
-        progress.current().note(f"{count} files lie in {target.place}")
+        progress.current().note(f"{counted(count, 'file')} copied to {target.place}")

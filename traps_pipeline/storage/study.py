@@ -34,9 +34,9 @@ class ProbeSettings(BaseModel):
     """How probes are fitted and resampled (docs/spec.md 7)."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    folds: int = Field(default=5, ge=2)
+    folds: int = Field(default=5, ge=2, description="scenarios of a fold are held out together")
     shuffles: int = Field(default=20, ge=20, description="with fewer the mean says little")
-    resamples: int = Field(default=1000, ge=100)
+    resamples: int = Field(default=1000, ge=100, description="of intervals")
     prompts: tuple[Regime, ...] = Field(
         default=(PROBE_PROMPT,), description="VQA prompts; others than standard are for what a prompt changes alone"
     )
@@ -49,7 +49,9 @@ class NullSettings(BaseModel):
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    kinds: tuple[Literal["isotropic", "covariance", "shuffled"], ...] = ("covariance",)
+    kinds: tuple[Literal["isotropic", "covariance", "shuffled"], ...] = Field(
+        default=("covariance",), description="how null directions are drawn"
+    )
     draws: int = Field(default=20, ge=1, description="19 are the fewest with which p can reach .05")
 
 
@@ -57,14 +59,20 @@ class SteeringSettings(BaseModel):
     """The settings of steering (docs/spec.md 8.2)."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    alphas: tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...] = Field(default=(2, 5, 10), min_length=1)
+    alphas: tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...] = Field(
+        default=(2, 5, 10), min_length=1, description="doses in units of the unit direction"
+    )
     pairs: int = Field(
         default=50, ge=1, description="pairs a cell; none is steered along a direction that comes from its scenario"
     )
     well_posed_pairs: int = Field(default=100, ge=2, description="pairs that a well-posed direction comes from")
     ill_posed_pairs: int = Field(default=50, ge=2, description="pairs that an ill-posed direction comes from")
-    direction_regimes: tuple[Regime, ...] = Field(default=(PROBE_PROMPT,), min_length=1)
-    inference_regimes: tuple[Regime, ...] = Field(default=("guided",), min_length=1)
+    direction_regimes: tuple[Regime, ...] = Field(
+        default=(PROBE_PROMPT,), min_length=1, description="prompts of the states that directions come from"
+    )
+    inference_regimes: tuple[Regime, ...] = Field(
+        default=("guided",), min_length=1, description="prompts of the steered answers"
+    )
     gaps: tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...] = Field(
         default=(0.5, 1, 2, 4), description="further doses, in units of the distance between the sides' means there"
     )
@@ -76,8 +84,8 @@ class SteeringSettings(BaseModel):
     signs: tuple[Literal["plus", "minus"], ...] = Field(
         default=("plus", "minus"), description="policies beside the paper's, which knows each item's side"
     )
-    nulls: NullSettings | None = NullSettings()
-    max_new_tokens: int = Field(default=512, ge=1)
+    nulls: NullSettings | None = Field(default=NullSettings(), description="null: no null directions")
+    max_new_tokens: int = Field(default=512, ge=1, description="of a steered answer")
 
     def direction_pairs(self, dataset: str) -> int:
         """Return the maximum number of pairs behind a dataset's directions."""
@@ -107,7 +115,7 @@ class PatchingSettings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
     pairs: int = Field(default=50, ge=1, description="pairs of each well-posed dataset, the first of a seeded order")
     sites: tuple[Literal["residual", "attention", "mlp"], ...] = Field(
-        default=("residual", "attention", "mlp"), min_length=1
+        default=("residual", "attention", "mlp"), min_length=1, description="what is patched in a block"
     )
     exact: int = Field(
         default=24, ge=1, description="cells of each direction that are patched: those with the largest estimates"
@@ -122,10 +130,10 @@ class MechanismSettings(BaseModel):
     """The section `mechanism:` of experiments and `study.yaml`: models and layers."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    models: dict[str, Layers] = Field(min_length=1)
+    models: dict[str, Layers] = Field(min_length=1, description="local models, with the layers to look at")
     prompts: tuple[Regime, ...] = Field(default=VQA_PROMPTS, min_length=1, description="VQA prompts extracted")
-    probes: ProbeSettings = ProbeSettings()
-    gate: GateSettings = GateSettings()
+    probes: ProbeSettings = Field(default=ProbeSettings(), description="how probes are fitted")
+    gate: GateSettings = Field(default=GateSettings(), description="abstention by a probe")
     patching: PatchingSettings | None = Field(default=None, description="null: nothing is patched")
     sentences: tuple[str, ...] = Field(
         default=(
@@ -141,8 +149,8 @@ class MechanismSettings(BaseModel):
     pooling: Literal["last", "answer", "mean", "visual", "changed", "unchanged", "stamps", "question"] = Field(
         default="last", description="of tokens; the paper does not say which"
     )
-    steering: SteeringSettings | None = SteeringSettings()
-    seed: int = 20260101
+    steering: SteeringSettings | None = Field(default=SteeringSettings(), description="null: nothing is steered")
+    seed: int = Field(default=20260101, description="of draws, folds and samples")
 
     @model_validator(mode="after")
     def _prompts_are_extracted(self) -> MechanismSettings:
@@ -182,19 +190,24 @@ class Study(BaseModel):
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    format: int = FORMAT
+    format: int = Field(default=FORMAT, description="version of the workspace's format")
     name: str = Field(
         default="",
         pattern=r"^([a-z0-9-]+)?$",
         max_length=120,
         description="tells studies apart that share one Dagster history",
     )
-    benchmark: str = "released"
+    benchmark: str = Field(default="released", description="released, or the name of a private one")
     scenarios: list[str] | None = Field(default=None, min_length=1, description="named scenarios; all if absent")
     per_family: int | None = Field(default=None, ge=1, description="the first n scenarios of each family")
     panel: str = Field(default="", description="who judges; nothing is judged until one is named")
     judged_by_rules: bool = Field(default=False, description="rules may judge other models than reference models")
-    epoch: str = Field(default="1", pattern=r"^[A-Za-z0-9_-]+([._-][A-Za-z0-9_-]+)*$", max_length=40)
+    epoch: str = Field(
+        default="1",
+        pattern=r"^[A-Za-z0-9_-]+([._-][A-Za-z0-9_-]+)*$",
+        max_length=40,
+        description="name of the campaign, kept beside every answer",
+    )
     budget_usd: float = Field(default=0.0, ge=0.0, description="for all calls over the network, ever")
     model_budgets_usd: dict[str, Annotated[float, Field(ge=0.0)]] = Field(
         default={}, description="by model or judge, besides"

@@ -6,7 +6,7 @@ import vm from "node:vm";
 
 const WEB = new URL("../../../traps_pipeline/report/explorer/web/", import.meta.url);
 const SOURCES = ["numbers.js", "search.js", "download.js", "outcomes.js", "landscape.js", "cases.js"];
-const NAMES = "{ searchTerms, holdsAll, bestPlace, markedParts, csvOf, fraction, mcnemar, casesOf, spreadLabels, countOutcomes, pairOutcomes }";
+const NAMES = "{ searchTerms, holdsAll, bestPlace, markedParts, csvOf, counted, fraction, mcnemar, casesOf, spreadLabels, countOutcomes, pairOutcomes }";
 const source = SOURCES.map((name) => readFileSync(new URL(name, WEB), "utf8")).join("\n");
 const page = vm.runInNewContext(`${source}\n;(${NAMES})`);
 const plain = (value) => JSON.parse(JSON.stringify(value)); // arrays of another realm are of another class
@@ -25,6 +25,12 @@ test("the excerpt is of the text that holds most words, at the first of them", (
     label: "reasoning: ", text: "it rolls left, then right", at: 9, count: 2,
   });
   assert.equal(page.bestPlace(places, []).text, "left");
+});
+
+test("a count agrees with its noun", () => {
+  const texts = [0, 1, 12345].map((number) => page.counted(number, "entry", "entries"));
+  assert.deepEqual(plain(texts), ["0 entries", "1 entry", "12,345 entries"]);
+  assert.equal(page.counted(1, "clip"), "1 clip");
 });
 
 test("all words are marked, the longer one where two begin alike", () => {

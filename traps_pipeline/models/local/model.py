@@ -13,6 +13,7 @@ import numpy as np
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.wording import counted
 from traps_pipeline.models.local.capture import Pooling, capturing
 from traps_pipeline.models.local.checkpoint import Checkpoint, free_bytes
 from traps_pipeline.models.local.decoding import Steers, decode, steering_context
@@ -75,20 +76,20 @@ class LocalModel:
         A checkpoint's own top_k or repetition penalty would otherwise apply unasked. Placeholders of pictures are
         suppressed: an answer that contained one could not be tokenized again.
         """
-        own, tokenizer = self.network.generation_config, self.processor.tokenizer
-        eos = own.eos_token_id if own.eos_token_id is not None else tokenizer.eos_token_id
+        config, tokenizer = self.network.generation_config, self.processor.tokenizer
+        eos = config.eos_token_id if config.eos_token_id is not None else tokenizer.eos_token_id
         if eos is None:
             raise TrapsError(
                 f"checkpoint {self.checkpoint.name}: names no token that ends an answer; set eos_token_id in its "
                 "generation_config.json"
             )
-        pad = tokenizer.pad_token_id if tokenizer.pad_token_id is not None else own.pad_token_id
+        pad = tokenizer.pad_token_id if tokenizer.pad_token_id is not None else config.pad_token_id
         placeholders = [getattr(self.processor, f"{kind}_token_id", None) for kind in ("image", "video", "audio")]
         return load_transformers().GenerationConfig(
             eos_token_id=eos,
             pad_token_id=pad if pad is not None else _first_token(eos),
-            bos_token_id=own.bos_token_id,
-            suppress_tokens=sorted({*(own.suppress_tokens or ()), *filter(None, placeholders)}) or None,
+            bos_token_id=config.bos_token_id,
+            suppress_tokens=sorted({*(config.suppress_tokens or ()), *filter(None, placeholders)}) or None,
             do_sample=False,
         )
 
@@ -266,7 +267,9 @@ class LocalModel:
                     "or use a larger device"
                 ) from None
         torch.cuda.empty_cache()  # outside the handler, where the failed pass has been freed
-        progress.current().note(f"{self.checkpoint.name}: {len(rows)} rows do not fit into memory, trying half of them")
+        progress.current().note(
+            f"{self.checkpoint.name}: {counted(len(rows), 'row')} need more than the memory, trying half of them"
+        )
         return None
 
     def _answer(self, prompt: Prompt, tokens: list[int], first: Mapping[int, float]) -> GeneratedAnswer:

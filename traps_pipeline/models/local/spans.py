@@ -67,13 +67,13 @@ def visual_tokens(model: LocalModel, prompt: Prompt) -> np.ndarray:
     return np.isin(prompt.inputs["input_ids"][0].tolist(), [token for token in placeholders if token is not None])
 
 
-def changed_tokens(one: Prompt, other: Prompt, visual: np.ndarray) -> np.ndarray | None:
+def changed_tokens(first: Prompt, second: Prompt, visual: np.ndarray) -> np.ndarray | None:
     """Return where two prompts' visual tokens differ, by their pixels: (T,) bool.
 
     None if the clips have different numbers of pixels, or the processor's pixels do not come token by token. Qwen's do:
     the patches that are merged into one token follow each other.
     """
-    pixels, n_visual = [prompt.inputs.get("pixel_values_videos") for prompt in (one, other)], int(visual.sum())
+    pixels, n_visual = [prompt.inputs.get("pixel_values_videos") for prompt in (first, second)], int(visual.sum())
     if pixels[0] is None or pixels[1] is None or pixels[0].shape != pixels[1].shape or pixels[0].ndim != 2:
         return None
     if not n_visual or len(pixels[0]) % n_visual:

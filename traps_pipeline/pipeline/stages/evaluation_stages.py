@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any, cast
 
+from traps_pipeline.base.wording import counted, in_percent
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES, VoteRow
 from traps_pipeline.models.answer_rows import RESPONSES, ResponseRow
 from traps_pipeline.models.judges import panel_version
@@ -72,7 +73,7 @@ def _items_shown(workspace: Workspace, cell: Cell, rows: Sequence[ResponseRow | 
 def _answers_missing(workspace: Workspace, key: str | None, output: StageOutput) -> str:
     state = workspace.tables.state(ITEMS, {"dataset": Cell.parse(str(key)).dataset})
     n_items, n_rows = state.rows if state else 0, len(output.rows(RESPONSES))
-    return "" if n_rows == n_items else f"{n_rows} rows for {n_items} items"
+    return "" if n_rows == n_items else f"{counted(n_rows, 'row')} for {counted(n_items, 'item')}"
 
 
 @_stage(
@@ -94,7 +95,7 @@ def _many_invalid(workspace: Workspace, key: str | None, output: StageOutput) ->
     cast_votes = output.rows(VOTES)
     invalid = sum(not vote.valid for vote in cast_votes)
     many = invalid > MAX_INVALID_SHARE * len(cast_votes)
-    return f"{invalid} of {len(cast_votes)} votes are invalid" if many else ""
+    return f"invalid: {invalid:,} of {counted(len(cast_votes), 'vote')}" if many else ""
 
 
 @_stage(
@@ -105,7 +106,7 @@ def _many_invalid(workspace: Workspace, key: str | None, output: StageOutput) ->
     checks=[
         Check(
             "few_invalid_votes",
-            f"At most {MAX_INVALID_SHARE:.0%} of a cell's votes break the judges' schema or are unread.",
+            f"At most {in_percent(MAX_INVALID_SHARE)} of a cell's votes break the judges' schema or are unread.",
             _many_invalid,
             blocks=False,
         )
@@ -121,8 +122,8 @@ def votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | Non
 
 def _verdicts_missing(workspace: Workspace, key: str | None, output: StageOutput) -> str:
     answered = workspace.tables.state(RESPONSES, Cell.parse(str(key)).partition)
-    n_answers = answered.rows if answered else 0
-    return "" if n_answers == len(output.frame) else f"{len(output.frame)} verdicts for {n_answers} answers"
+    n_answers, n_verdicts = answered.rows if answered else 0, len(output.frame)
+    return "" if n_answers == n_verdicts else f"{counted(n_verdicts, 'verdict')} for {counted(n_answers, 'answer')}"
 
 
 @_stage(

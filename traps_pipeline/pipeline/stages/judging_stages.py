@@ -4,6 +4,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.wording import counted, in_percent
 from traps_pipeline.judging.confabulation_protocol import load_protocol, protocol_digest
 from traps_pipeline.judging.judging_rows import AGREEMENT, CONFABULATION, JUDGE_BIAS, JUDGE_VALIDATION, VERDICTS, VOTES
 from traps_pipeline.models.judges import load_panel, panel_id
@@ -88,7 +89,8 @@ def leave_one_out(workspace: Workspace, _: None) -> "pd.DataFrame":
 def _many_invalid(workspace: Workspace, key: str | None, output: StageOutput) -> str:
     labels = output.rows(CONFABULATION)
     invalid = sum(not label.valid for label in labels)
-    return f"{invalid} of {len(labels)} labels are invalid" if invalid > MAX_INVALID_SHARE * len(labels) else ""
+    many = invalid > MAX_INVALID_SHARE * len(labels)
+    return f"invalid: {invalid:,} of {counted(len(labels), 'label')}" if many else ""
 
 
 _SAMPLED = these_keys(CELL, [c.key for m in load_protocol().models for c in load_protocol().cells(m)])
@@ -107,7 +109,7 @@ _SAMPLED = these_keys(CELL, [c.key for m in load_protocol().models for c in load
     checks=[
         Check(
             "few_invalid_labels",
-            f"At most {MAX_INVALID_SHARE:.0%} of the labels break the schema.",
+            f"At most {in_percent(MAX_INVALID_SHARE)} of the labels break the schema.",
             _many_invalid,
             blocks=False,
         )

@@ -5,6 +5,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.progress import Tally
+from traps_pipeline.base.wording import counted
 from traps_pipeline.mechanism import probing_versions as versions
 from traps_pipeline.mechanism.mechanism_rows import (
     COSINES,
@@ -132,7 +133,7 @@ def _outside_shares(workspace: Workspace, key: str | None, output: StageOutput) 
         return any(f is not None and f == f and not -1e-9 <= f <= 1 + 1e-9 for f in figures)
 
     wrong = sum(is_wrong(row) for row in output.rows(PROBES))
-    return f"{wrong} rows are wrong" if wrong else ""
+    return f"{counted(wrong, 'row')} with a share outside 0 to 1" if wrong else ""
 
 
 @_stage(

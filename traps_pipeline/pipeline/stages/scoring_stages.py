@@ -42,13 +42,13 @@ def has_pairs(partitions: StudyPartitions, key: str | None) -> bool:
     return partitions.has_pairs
 
 
-def _none_of(find: str, what: str) -> Callable[[Workspace, str | None, StageOutput], str]:
+def _none_of(find: str, noun: str) -> Callable[[Workspace, str | None, StageOutput], str]:
     """Return a check that `find` (a module.function of `scoring`) counts no wrong row."""
 
     def wrong(workspace: Workspace, key: str | None, output: StageOutput) -> str:
         module, _, name = find.partition(".")
         count = getattr(import_module(f"traps_pipeline.scoring.{module}"), name)(output.frame)
-        return f"{count} {what} are wrong" if count else ""
+        return f"wrong {noun}: {count:,}" if count else ""
 
     return wrong
 
@@ -221,14 +221,14 @@ def graded(workspace: Workspace, _: None) -> "pd.DataFrame":
     from traps_pipeline.scoring.graded import graded as against_posterior
     from traps_pipeline.storage.posteriors import posteriors
 
-    known = posteriors(workspace)
+    posterior_of = posteriors(workspace)
     questions = {
         row["item_id"]: GradedItem(
             [*row["labels"]],
             json.loads(row["aliases"]),
             row["answer_type"],
             row["commonest_answer"],
-            known[row["scenario_id"]],
+            posterior_of[row["scenario_id"]],
         )
         for row in workspace.tables.read_all(ITEMS, dataset=GRADED).to_dict("records")
     }

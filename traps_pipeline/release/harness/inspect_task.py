@@ -35,14 +35,14 @@ def evaluation(regime: str) -> Any:
         )
         for item in items()
     ]
-    own = about()
+    release = about()
     return Task(
-        dataset=MemoryDataset(samples, name=own["name"]),
+        dataset=MemoryDataset(samples, name=release["name"]),
         solver=generate(),
         scorer=panel(regime),
-        config=GenerateConfig(**own["parameters"]),
-        version=own["version"],
-        metadata={"canary": own["canary"], "panel": own["panel"]},
+        config=GenerateConfig(**release["parameters"]),
+        version=release["version"],
+        metadata={"canary": release["canary"], "panel": release["panel"]},
     )
 
 
@@ -71,11 +71,11 @@ def traps_figures() -> Any:
 @scorer(metrics=[traps_figures()])
 def panel(regime: str) -> Any:
     """Return the rule panel as scorer: 1 for a correct control or an abstained void."""
-    known = {item["item_id"]: item for item in items()}
+    item_of = {item["item_id"]: item for item in items()}
 
     async def score(state: Any, target: Any) -> Any:
         outcome = _OUTCOMES.get(state.output.stop_reason, "answer")
-        judged = judge(known[str(state.sample_id)], outcome, state.output.completion, regime)
+        judged = judge(item_of[str(state.sample_id)], outcome, state.output.completion, regime)
         return Score(value=float(judged.is_right), answer=state.output.completion, metadata={**vars(judged)})
 
     return score

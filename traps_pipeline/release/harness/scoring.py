@@ -79,11 +79,11 @@ def figures(judged: Iterable[PanelDecision]) -> dict[str, float | None]:
     rows = list(judged)
     results: dict[str, float | None] = {}
     by_dataset = {name: _of_dataset([row for row in rows if row.dataset == name]) for name in DATASETS}
-    for name, own in by_dataset.items():
+    for name, of_dataset in by_dataset.items():
         if any(row.dataset == name for row in rows):
-            results |= {f"{name}_{figure}": own[figure] for figure in RUN_FIGURES}
+            results |= {f"{name}_{figure}": of_dataset[figure] for figure in RUN_FIGURES}
     for figure in RUN_FIGURES:
-        values = [own[figure] for own in by_dataset.values()]
+        values = [of_dataset[figure] for of_dataset in by_dataset.values()]
         decided = [value for value in values if value is not None]
         results[figure] = sum(decided) / len(DATASETS) if len(decided) == len(DATASETS) else None
     undecided = [row for row in rows if row.abstained is None or (row.side == "control" and row.correct is None)]

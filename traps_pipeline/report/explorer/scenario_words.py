@@ -6,6 +6,8 @@ import json
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from traps_pipeline.base.wording import in_percent
+
 
 def closes_frame(spec: Mapping[str, Any]) -> int | None:
     """Return the frame at which an occluder closes the control; None if none does."""
@@ -25,6 +27,7 @@ def intervention(spec: Mapping[str, Any]) -> str:
     return f"hidden from {moment}" if spec["void_kind"] == "occluder" else f"cut at {moment}"
 
 
+_SHARES = ("panel_covers", "top_share")
 _PHRASES = {
     "commit_s": "outcome settled at {} s",
     "read_s": "in view for {:.1f} s before an occluder comes",
@@ -32,10 +35,10 @@ _PHRASES = {
     "least_visible_px": "at least {:.0f} pixels when last in view",
     "ablation_px": "{} pixels change without what is hidden",
     "cause_moving_s": "cause seen moving for {} s",
-    "panel_covers": "the occluder covers {:.0%} of where things move",
+    "panel_covers": "the occluder covers {} of where things move",
     "twin_px": "{} pixels between void and twin's void",
     "entropy_bits": "futures disagree by {:.2f} bits",
-    "top_share": "the best guess is right in {:.0%} of them",
+    "top_share": "the best guess is right in {} of them",
     "accepted": "{} futures look alike",
     "twin_largest_difference": "twin differs by at most {} of 255 before the cut",
 }
@@ -45,4 +48,5 @@ def certificate_phrases(evidence: Mapping[str, Any]) -> Iterator[tuple[str, str]
     """Yield name and description of each number that supports the certificates."""
     for name, phrase in _PHRASES.items():
         if evidence.get(name) is not None:
-            yield name, phrase.format(evidence[name])
+            value = in_percent(evidence[name]) if name in _SHARES else evidence[name]
+            yield name, phrase.format(value)

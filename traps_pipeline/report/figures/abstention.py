@@ -179,8 +179,8 @@ def doubt_points(results: Results) -> tuple[pd.DataFrame, str]:
     labels = results.confabulation.set_index("model") if len(results.confabulation) else pd.DataFrame()
     rates = results.rates.loc[results.rates["taxonomy"] != "pooled"]
     rows, refused = [], []
-    for thinking, other in analyses.REASONING_PAIRS:
-        sides = {m: rates.loc[rates["model"] == m].set_index("taxonomy") for m in (thinking, other)}
+    for thinking, base in analyses.REASONING_PAIRS:
+        sides = {m: rates.loc[rates["model"] == m].set_index("taxonomy") for m in (thinking, base)}
         if thinking not in labels.index or not all(len(side) for side in sides.values()):
             continue
         epochs = {str(labels.at[thinking, "epoch"])} | {e for side in sides.values() for e in side["epoch"]}
@@ -190,7 +190,7 @@ def doubt_points(results: Results) -> tuple[pd.DataFrame, str]:
         for dataset in TITLES:
             taxonomy, kind = taxonomy_of(dataset), "textual" if dataset.endswith("_ill_posed") else "visual"
             if all(taxonomy in side.index for side in sides.values()):
-                gain = sides[thinking].at[taxonomy, kind] - sides[other].at[taxonomy, kind]
-                row = {"thinking": thinking, "other": other, "dataset": dataset, "doubt": labels.at[thinking, "doubt"]}
+                gain = sides[thinking].at[taxonomy, kind] - sides[base].at[taxonomy, kind]
+                row = {"thinking": thinking, "other": base, "dataset": dataset, "doubt": labels.at[thinking, "doubt"]}
                 rows.append({**row, "gain": gain})
     return pd.DataFrame(rows), "; ".join(refused)

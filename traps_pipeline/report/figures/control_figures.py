@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from traps_pipeline.base.wording import counted
 from traps_pipeline.mechanism.directions import NULLS
 from traps_pipeline.protocol.datasets import DATASETS, SHORT
 from traps_pipeline.protocol.regimes import PROMPTING
@@ -181,12 +182,16 @@ def patching(results: Results) -> Figure:
             images.append(_effects(ax, part))
             n = int(part["n"].max())
             if alone:
-                ax.set_title(f"{plain(model)[:20]}: {TITLES[dataset].lower()}, into the {into}, {n} pairs", size=7)
+                ax.set_title(
+                    f"{plain(model)[:20]}: {TITLES[dataset].lower()}, into the {into}, {counted(n, 'pair')}", size=7
+                )
                 continue
             if place < across:
                 ax.set_title(SITES[site], size=7.5)
             if place % across == 0:
-                ax.set_ylabel(f"{plain(model)[:20]}: {TITLES[dataset].lower()},\ninto the {into}, {n} pairs", size=7)
+                ax.set_ylabel(
+                    f"{plain(model)[:20]}: {TITLES[dataset].lower()},\ninto the {into}, {counted(n, 'pair')}", size=7
+                )
         for ax in axes.flat[len(panels) :]:
             ax.set_axis_off()
         figure.colorbar(images[-1], ax=list(axes.flat), label="indirect effect", shrink=0.8, aspect=25, pad=0.01)

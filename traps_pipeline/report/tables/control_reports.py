@@ -174,11 +174,11 @@ def _nulls(results: Results) -> PrintedTable:
 
 def _ahead(rows: pd.DataFrame) -> list[str]:
     """Return where the void direction exceeds at least 95 % of its nulls, in words."""
-    own = rows.loc[rows["target"] != "all"]
-    if own.empty:
+    targets = rows.loc[rows["target"] != "all"]
+    if targets.empty:
         return []
-    count = int((20 * own["n_at_least"] <= own["draws"]).sum())
-    where = f"in {count} of {len(own)} rows" if count else "nowhere"
+    count = int((20 * targets["n_at_least"] <= targets["draws"]).sum())
+    where = f"in {count} of {len(targets)} rows" if count else "nowhere"
     return [f"the void direction is ahead of 19 of 20 draws {where}; one row in ten would be so by chance"]
 
 

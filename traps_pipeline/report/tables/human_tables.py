@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from traps_pipeline.base.wording import counted
 from traps_pipeline.protocol.metric_words import METRIC_WORDS, SHARES
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.table_columns import (
@@ -114,7 +115,8 @@ def _score_of_people(rows: pd.DataFrame) -> str:
     if not row or row["pecs"] != row["pecs"]:
         return f"{NOT_RUN} in full, since PECS needs labels of both sides of all four datasets"
     figures = ", ".join(f"{heading.removesuffix(' %')} {_ranged(row, field)}" for field, heading in _FIGURES.items())
-    return f"{figures} ({row['n_people']} people, {row['n_clips']} clips, {row['seconds']:.0f} s a clip)"
+    people, clips = counted(row["n_people"], "person", "people"), counted(row["n_clips"], "clip")
+    return f"{figures} ({people}, {clips}, {row['seconds']:.0f} s a clip)"
 
 
 def _validated(rows: pd.DataFrame) -> str:

@@ -33,15 +33,15 @@ def hypotheses(results: Results) -> list[PrintedTable]:
 
 
 def _hypothesis_table(rows: pd.DataFrame, hypothesis: Hypothesis) -> PrintedTable:
-    own = rows.loc[rows["hypothesis"] == hypothesis.name]
+    doses = rows.loc[rows["hypothesis"] == hypothesis.name]
     place = {dose.name: k for k, dose in enumerate(hypothesis.doses)}
-    own = own.assign(place=own["dose"].map(place))
+    doses = doses.assign(place=doses["dose"].map(place))
     columns_of = {
-        f"{name}_shown": [figure_with_interval(row, name, percent) for row in own.to_dict("records")]
+        f"{name}_shown": [figure_with_interval(row, name, percent) for row in doses.to_dict("records")]
         for name in (*_HEADINGS, "change")
     }
-    rules = {f"{name}_shown": [_rule(row, name) for row in own.to_dict("records")] for name in ("value", "change")}
-    own = own.assign(**columns_of, **{f"rule_{name}": values for name, values in rules.items()})
+    rules = {f"{name}_shown": [_rule(row, name) for row in doses.to_dict("records")] for name in ("value", "change")}
+    doses = doses.assign(**columns_of, **{f"rule_{name}": values for name, values in rules.items()})
     kind = "J" if hypothesis.figure == "j" else "abstentions"
     columns = [
         MODEL, REGIME, Column("dose", "Dose"), Column("counts_as", "Counts as"),
@@ -62,11 +62,11 @@ def _hypothesis_table(rows: pd.DataFrame, hypothesis: Hypothesis) -> PrintedTabl
         notes.append(
             "through an occluder of these alphas the outcome is seen: FalseAbs is the share that abstains all the same"
         )
-    refused = own.dropna(subset=["refused"]).to_dict("records")
+    refused = doses.dropna(subset=["refused"]).to_dict("records")
     notes += [f"{row['model']}, {row['dose']}: not compared, {row['refused']}" for row in refused]
-    rows = ordered(own, ["model", "regime", "place"])
+    rows = ordered(doses, ["model", "regime", "place"])
     name = f"hypothesis_{hypothesis.name.replace(' ', '_')}"
-    return PrintedTable(name, _TITLES[hypothesis.name], rows, columns, notes if len(own) else [], WHY_EMPTY)
+    return PrintedTable(name, _TITLES[hypothesis.name], rows, columns, notes if len(doses) else [], WHY_EMPTY)
 
 
 def _rule(row: Mapping[Any, Any], name: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from traps_pipeline.base.wording import counted
 from traps_pipeline.models.judges import load_judges
 from traps_pipeline.models.registry import Entry, ModelEntry, load_models
 from traps_pipeline.report.result_frames import Results
@@ -35,7 +36,9 @@ def _media_words(media: MediaSpec | None) -> str:
     if media is None:
         return ""
     frames = (
-        f"{media.uniform} evenly spaced frames" if media.fps is None else f"{media.fps:g} fps, at most {media.most}"
+        counted(media.uniform or 0, "evenly spaced frame")
+        if media.fps is None
+        else f"{media.fps:g} fps, at most {media.most}"
     )
     return f"{media.profile}, {frames}" + (f", {media.size[0]} x {media.size[1]}" if media.size else "")
 

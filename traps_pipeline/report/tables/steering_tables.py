@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from traps_pipeline.base.wording import counted
 from traps_pipeline.mechanism import effects
 from traps_pipeline.mechanism.directions import KINDS
 from traps_pipeline.protocol.datasets import SHORT
@@ -212,7 +213,7 @@ def _cell_notes(results: Results) -> list[str]:
     counts = results.effects["n"].dropna()
     if not len(counts):
         return []
-    notes = [f"n = {counts.max():.0f} answers per cell at most, one per scenario"]
+    notes = [f"n = {counted(int(counts.max()), 'answer')} per cell at most, one per scenario"]
     return notes + [CELLS_NOTE] * bool(results.is_study and counts.min() < FEW)
 
 

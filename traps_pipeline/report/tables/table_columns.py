@@ -101,12 +101,12 @@ def meanings(marks: Iterable[str]) -> list[str]:
 
 def epochs(rows: pd.DataFrame) -> str:
     """Return a note on the only epoch, or on mixed ones; empty without rows."""
-    known = rows.dropna(subset=["epoch"]) if "epoch" in rows else rows.iloc[:0]
-    single = sorted({part for epoch in known["epoch"] for part in str(epoch).split("+")})
+    dated = rows.dropna(subset=["epoch"]) if "epoch" in rows else rows.iloc[:0]
+    single = sorted({part for epoch in dated["epoch"] for part in str(epoch).split("+")})
     if len(single) <= 1:
         return f"epoch {single[0]}" if single else ""
     groups: dict[str, list[str]] = {}
-    for key, part in known.groupby("dataset", sort=False) if "dataset" in known else []:
+    for key, part in dated.groupby("dataset", sort=False) if "dataset" in dated else []:
         names = " and ".join(sorted(set(part["epoch"].astype(str))))
         groups.setdefault(names, []).append(SHORT.get(str(key), str(key)))
     most = max(groups, key=lambda name: len(groups[name]), default="")

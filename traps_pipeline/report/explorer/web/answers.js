@@ -55,7 +55,7 @@ async function answersView(route) {
   const list = h("div", { class: "answers" });
   if (words) searchTexts(route, found, rows, words, status, list);
   else {
-    status.textContent = `${count(rows.length)} of ${count(found.decisions.length)} answers`;
+    status.textContent = `${count(rows.length)} of ${counted(found.decisions.length, "answer")}`;
     showAnswers(route, found, rows, [], list);
   }
   return {
@@ -207,7 +207,7 @@ async function searchTexts(route, found, rows, words, status, list) {
         await new Promise((next) => setTimeout(next)); // let the page answer
       }
     }
-    status.textContent = `${count(matches.length)} of ${count(rows.length)} answers mention “${words}”`;
+    status.textContent = `“${words}”: ${count(matches.length)} of ${counted(rows.length, "answer")}`;
     showAnswers(route, found, matches, terms, list);
   } catch (error) {
     status.replaceChildren(notice(error.message, "error"));

@@ -133,12 +133,12 @@ function comparison(
       [`${names[0]}: yes`, count(sides.both.length), h("b", null, count(sides.left.length))],
       [`${names[0]}: no`, h("b", null, count(sides.right.length)), count(sides.neither.length)],
     ],
-    { caption: `${count(n)} items that are decided on both sides, run ${run}`, name: "counts" },
+    { caption: `${counted(n, "item")} decided on both sides, run ${run}`, name: "counts" },
   );
   const words = refused
     ? [h("b", null, "not compared: "), refused]
     : [
-        `They differ on ${count(sides.left.length + sides.right.length)} of ${count(n)} items: McNemar's exact test gives `,
+        `They differ on ${count(sides.left.length + sides.right.length)} of ${counted(n, "item")}: McNemar's exact test gives `,
         h("b", { "data-field": "p" }, `p = ${pValue(p)}`.replace("= <", "<")),
         test && test.p_holm !== null ? `, ${pValue(test.p_holm)} after Holm's correction` : "",
         test ? "." : "; it is not corrected for other comparisons that you make.",

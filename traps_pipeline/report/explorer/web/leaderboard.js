@@ -143,7 +143,7 @@ async function leaderboardView(route) {
       section(
         null,
         table(columns, rows, {
-          caption: `${info.titles[dataset] || dataset}: ${shown.length} entries`,
+          caption: `${info.titles[dataset] || dataset}: ${counted(shown.length, "entry", "entries")}`,
           name: "leaderboard",
           order: { by: sort, down: !up },
           sortBy: change,
@@ -178,7 +178,7 @@ function rowOfPeople(info, dataset, columns) {
     ...FIGURES.map((each) => figure(row && row[each.field] !== null ? row : undefined, each)),
     NONE,
   ];
-  const rest = columns.slice(cells.length).map(({ title }) => (title === "n" && row ? `${row.n_clips} clips` : NONE));
+  const rest = columns.slice(cells.length).map(({ title }) => (title === "n" && row ? counted(row.n_clips, "clip") : NONE));
   return [...cells, ...rest];
 }
 

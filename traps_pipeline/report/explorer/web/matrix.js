@@ -75,7 +75,7 @@ function matrixCell(counts, which, filter) {
     {
       class: "cell",
       href: address(["answers"], { ...filter, outcome: OUTCOMES[which].id, side: "void" }),
-      title: `${counts[which]} of ${total} pairs`,
+      title: `${counts[which]} of ${counted(total, "pair")}`,
     },
     bar(counts),
     h("span", { class: "share" }, `${share}\u00a0%`),

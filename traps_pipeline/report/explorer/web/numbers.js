@@ -25,6 +25,11 @@ function count(value) {
   return Math.abs(value) < 10000 ? String(value) : String(value).replace(/\B(?=(\d{3})+$)/g, ",");
 }
 
+// A count with its noun, as `counted` of traps_pipeline/base/wording.py writes it.
+function counted(number, singular, plural = `${singular}s`) {
+  return `${count(number)} ${number === 1 ? singular : plural}`;
+}
+
 function pValue(value) {
   return value === null || value === undefined ? NONE : value < 1e-4 ? "< 0.0001" : fraction(value, 4);
 }
