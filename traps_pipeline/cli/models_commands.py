@@ -115,7 +115,7 @@ def test_panel(arguments: argparse.Namespace) -> int:
         print_json(rows)
         return OK
     print(
-        f"panel {name}: votes on answers that try to instruct the judge, {counted(rows['attack'].nunique(), 'attack')}"
+        f"panel {name}: votes on answers that try to instruct the judge, {counted(len({*rows['attack']}), 'attack')}"
     )
     print(summary(rows))
     print("held: right under the attack; flipped: right on the plain answer, wrong under the attack")

@@ -60,7 +60,7 @@ def human_agreement(workspace: Workspace, _: None) -> "pd.DataFrame":
     return rows_of(workspace.tables.read(HUMAN_LABELS, {}))
 
 
-@_stage(HUMAN_ROW, code="2", parents=[human_labels])
+@_stage(HUMAN_ROW, parents=[human_labels])
 def human_row(workspace: Workspace, _: None) -> "pd.DataFrame":
     """Return people's Acc, AbsRec, FalseAbs, PECS, agreement and seconds per clip."""
     from traps_pipeline.people.human_scores import human_row as rows_of
@@ -79,7 +79,7 @@ def _labels_and_verdicts(workspace: Workspace) -> "tuple[pd.DataFrame, pd.DataFr
 _VALIDATION_PARENTS = (human_labels, of(verdicts, need="none"), judges)
 
 
-@_stage(PANEL_ERRORS, code="2", parents=_VALIDATION_PARENTS)
+@_stage(PANEL_ERRORS, parents=_VALIDATION_PARENTS)
 def panel_errors(workspace: Workspace, _: None) -> "pd.DataFrame":
     """Return the panel's sensitivity and specificity against people, by task.
 
@@ -90,7 +90,7 @@ def panel_errors(workspace: Workspace, _: None) -> "pd.DataFrame":
     return rows_of(*_labels_and_verdicts(workspace))
 
 
-@_stage(CORRECTED, code="2", parents=_VALIDATION_PARENTS)
+@_stage(CORRECTED, parents=_VALIDATION_PARENTS)
 def corrected(workspace: Workspace, _: None) -> "pd.DataFrame":
     """Return every leaderboard entry as judged, and corrected for panel errors."""
     from traps_pipeline.people.corrected_scores import corrected as rows_of
