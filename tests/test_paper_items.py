@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 from functools import cache
 
-from tests.paper_items import PAGE, ROOT, STATUSES, items, page
+from tools.paper_items import PAGE, ROOT, STATUSES, items, page
 
 ITEMS = items()
 

@@ -9,8 +9,8 @@ import sys
 
 import pytest
 
-from tests.commands_page import PAGE, page
 from tests.conftest import ROOT
+from tools.commands_page import PAGE, page
 from traps_pipeline.cli import GROUPS, START, build_parser, main
 from traps_pipeline.cli.command import SHORT
 
@@ -86,7 +86,7 @@ def test_a_shell_completes_commands_options_and_experiments() -> None:
 
 def test_the_page_of_commands_is_what_the_parser_says_and_every_argument_has_a_meaning() -> None:
     text = page()
-    assert PAGE.read_text(encoding="utf-8") == text  # `python -m tests.commands_page` writes it
+    assert PAGE.read_text(encoding="utf-8") == text  # `python -m tools.commands_page` writes it
     arguments = [line for line in text.partition("## Common")[2].splitlines() if line.startswith("- `")]
     assert len(arguments) > 100 and not [line for line in arguments if not re.search(r"`(?: \(required\))?: \w", line)]
 

@@ -1,4 +1,4 @@
-"""Writes `docs/paper.md` from `docs/paper.csv`: `python -m tests.paper_items`."""
+"""Writes `docs/paper.md` from `docs/paper.csv`: `python -m tools.paper_items`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ STATUSES = ("there", "departs", "missing")
 HEAD = """# The paper, item by item
 
 For readers of the paper: what differs here. [paper.csv](paper.csv) lists all items: line in the paper's LaTeX source,
-file, test, status, note. A test fails where a named file or test does not exist; `python -m tests.paper_items` writes
+file, test, status, note. A test fails where a named file or test does not exist; `python -m tools.paper_items` writes
 this page.
 
 """

@@ -1,6 +1,6 @@
 """The page of all commands, docs/commands.md, written from the parser.
 
-`python -m tests.commands_page` writes it; a test holds the page against it.
+`python -m tools.commands_page` writes it; a test holds the page against it.
 """
 
 from __future__ import annotations
@@ -8,16 +8,16 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from collections.abc import Iterator
+from pathlib import Path
 
-from tests.conftest import ROOT
 from traps_pipeline.cli import GROUPS, build_parser
 from traps_pipeline.cli.command import SHORT, Parser
 
-PAGE = ROOT / "docs" / "commands.md"
+PAGE = Path(__file__).parents[1] / "docs" / "commands.md"
 HEAD = """# Commands
 
 For everyone who types `traps`: every command and option. `--help` shows the same, with an example; `python -m
-tests.commands_page` writes this page from the parser.
+tools.commands_page` writes this page from the parser.
 
 - `--workspace` names the study's folder or s3:// address (default: `$TRAPS_WORKSPACE`, else `.workspaces/default`).
 - Results go to standard output, progress and errors to standard error, [exit codes](ci.md#exit-codes) to scripts.
