@@ -29,7 +29,7 @@ from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.filmed_arms import arm_of
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.models.shortcut_rules import CUT_FRAMES, has_no_choices
-from traps_pipeline.protocol.datasets import CROSSED, DATASETS, TWIN
+from traps_pipeline.protocol.datasets import CROSSED, DATASETS, INFERENCE_ARMS, TWIN
 from traps_pipeline.scenes.picture.camera import Camera, Occluder
 from traps_pipeline.scenes.variants.arms import SHOWN_AGAIN_S
 from traps_pipeline.scenes.worlds.outcome import Rejected
@@ -53,7 +53,7 @@ def main() -> None:
     items = pd.DataFrame([row for spec in chosen for row in rows_of(spec)])
     print(f"{len(items)} items of {len(chosen)} scenarios, {items['family'].nunique()} families")
     for held_out, folds in FOLDS.items():
-        print(f"\n{held_out} held out: PECS, robust, conjunction; J of {', '.join((*DATASETS, CROSSED))}")
+        print(f"\n{held_out} held out: PECS, robust, conjunction, inference; J of {', '.join((*DATASETS, CROSSED))}")
         for rule, abstains in (one_line(items) | decisions(items, held_out, folds)).items():
             print_figures(rule, items.assign(abstained=abstains))
 
@@ -102,7 +102,7 @@ def rows_of(spec: SceneSpec) -> Iterator[dict[str, Any]]:
 
 
 def asked_of(spec: SceneSpec) -> Iterator[tuple[str, str, str, Clip]]:
-    """Yield the pairs and the robust arms, as far as records tell which scenarios admit these."""
+    """Yield the pairs and the arms, as far as records tell which scenarios admit these."""
     trajectory = RELEASED / "trajectories" / f"{spec.scenario_id}.npz"
     camera, closing = Camera.from_record(spec.camera), closing_of(spec)
     shown = Clip(camera, load_trajectory(trajectory, spec.trajectory_sha256))
@@ -119,9 +119,12 @@ def asked_of(spec: SceneSpec) -> Iterator[tuple[str, str, str, Clip]]:
     yield ill_posed, "control", spec.question, control
     yield ill_posed, "void", spec.ill_posed_question, control
     yield TWIN, "control", spec.question, twin
+    settled = round(spec.evidence["commit_s"] * spec.physics["fps"])
     if board is None:
+        yield "predictable_cut", "control", spec.question, replace(shown, qpos=shown.qpos[: settled - 1])
         yield "length_matched", "control", spec.question, replace(shown, qpos=shown.qpos[end - cut : end])
     else:
+        yield "late_occluder", "control", spec.question, replace(shown, board=board, start=settled - 1, stop=n)
         forward = camera.axes()[2]
         x, y, z = (float(value) for value in np.array(board.centre) + BEHIND_M * forward)
         yield "decoy", "control", spec.question, replace(shown, board=replace(board, centre=(x, y, z)), stop=n)
@@ -150,7 +153,11 @@ def one_line(items: pd.DataFrame) -> Decisions:
 
 
 def decisions(items: pd.DataFrame, held_out: str, folds: int) -> Decisions:
-    """Return whether each rule abstains on each item, fitted on items of other groups (`held_out`)."""
+    """Return whether each rule abstains on each item, fitted on items of other groups (`held_out`).
+
+    None is fitted on arms that ask for inference.
+    """
+    inferred = items["dataset"].isin(INFERENCE_ARMS).to_numpy()
     void, crossed = (items["side"] == "void").to_numpy(), (items["dataset"] == CROSSED).to_numpy()
     ill_posed = void & items["dataset"].str.endswith("_ill_posed").to_numpy()
     clip, groups = items.filter(regex=r"^f\d+$").to_numpy(float), items[held_out].to_numpy()
@@ -158,6 +165,7 @@ def decisions(items: pd.DataFrame, held_out: str, folds: int) -> Decisions:
     text = cast(Any, words.fit_transform(items["question"])).toarray().astype(float)
     abstains = {rule: np.zeros(len(items), bool) for rule in RULES}
     for train, test in GroupKFold(min(folds, len(set(groups)))).split(clip, groups=groups):
+        train = train[~inferred[train]]
         # Crossed items contradict either classifier alone; each learns its own reason to abstain.
         of_clip, of_text = train[~(ill_posed | crossed)[train]], train[~((void & ~ill_posed) | crossed)[train]]
         by_clip = trees(clip[of_clip], void[of_clip]).predict(clip[test])
@@ -205,7 +213,7 @@ def print_figures(rule: str, items: pd.DataFrame) -> None:
     shares = items.pivot_table(values="abstained", index="dataset", columns="side", aggfunc="mean")
     control, j = shares["control"], shares["void"] - shares["control"]
     pecs = pecs_of((1 - control).to_numpy(float), j.to_numpy(float))[j.index.isin(DATASETS)].mean()
-    figures = " ".join(f"{value:6.3f}" for value in (pecs, row["robust"], row["conjunction"]))
+    figures = " ".join(f"{value:6.3f}" for value in (pecs, row["robust"], row["conjunction"], row["inference_acc"]))
     print(f"  {rule:7} {figures}  ", *(f"{j[dataset]:5.2f}" for dataset in (*DATASETS, CROSSED)))
 
 
