@@ -11,6 +11,7 @@ import pytest
 
 from tests.terminals import Screen, read_all, terminal
 from traps_pipeline.base.progress import HEARTBEAT_S, Progress, Tally
+from traps_pipeline.cli import main
 from traps_pipeline.cli.printed_progress import LiveProgress, make_progress
 
 WORDS = "a provider's words that are longer than the eighty columns of a terminal, so that they stand on two lines"
@@ -106,7 +107,7 @@ def test_lines_of_json_have_the_same_figures(clock: Clock) -> None:
     report.note("slow")
     report.tell("ok   gpt")
     report.close()
-    begin, progress, note, result, end = map(json.loads, out.getvalue().splitlines())
+    begin, progress, note, result, end, finish = map(json.loads, out.getvalue().splitlines())
     assert (begin["event"], begin["stage"], begin["done"], begin["partitions"]) == ("begin", "responses", 0, 4)
     assert (progress["event"], progress["spent_usd"], progress["budget_usd"]) == ("progress", 11.0, 50.0)
     assert progress["left_s"] == 40.0
@@ -114,6 +115,13 @@ def test_lines_of_json_have_the_same_figures(clock: Clock) -> None:
     assert progress["calls"] == {"gpt": gpt | {"per_second": 1.0, "p50_s": 2.1, "p95_s": 3.9, "usd": 10.0}}
     assert (note["event"], note["text"], result["text"]) == ("note", "slow", "ok   gpt")
     assert (end["event"], end["asked"], end["errors"]) == ("end", 20, 1)
+    assert (finish["event"], finish["asked"], finish["spent_usd"]) == ("finish", 20, 11.0) and "stage" not in finish
+
+
+def test_a_failure_among_lines_of_json_is_one_of_them(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "no-such-experiment", "--progress", "json"]) == 1
+    (failure,) = map(json.loads, capsys.readouterr().err.splitlines())
+    assert failure["event"] == "failure" and failure["text"].startswith("no experiment 'no-such-experiment'")
 
 
 @pytest.mark.parametrize(("columns", "rows"), [(80, 24), (160, 50)])

@@ -90,7 +90,7 @@ def test_ten_scenarios_by_keyboard_and_then_exactly_what_they_touch_is_asked(stu
             rewrite(page, "w", text="unclear")
             press(page, "c")
             seventh = page.locator("h1").inner_text()
-            rewrite(page, "e", "Tab", text=ILL_POSED, shown="1 items")
+            rewrite(page, "e", "Tab", text=ILL_POSED, shown="1 item")
             press(page, "c")
             eighth = page.locator("h1").inner_text()
             for key in "dkk":

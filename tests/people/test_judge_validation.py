@@ -116,7 +116,7 @@ def test_labels_are_read_whatever_their_words_their_order_and_the_other_columns(
         ([HEAD, *GOOD[:3], ",s2,1,0,1,1"], "labels.csv:5: annotator is empty"),
         ([HEAD, *GOOD, "bob,s2,0,0,0,0"], "labels.csv:6: bob has already labelled s2 on line 5"),
         ([HEAD, *GOOD[:3]], "labels.csv:3: only ann has labelled s2; both annotators must"),
-        ([HEAD, *GOOD[:2]], "has 1 annotators (ann); it needs exactly two"),
+        ([HEAD, *GOOD[:2]], "has 1 annotator (ann); it needs exactly two"),
         ([HEAD, *GOOD, "cy,s1,1,1,1,1"], "has 3 annotators (ann, bob, cy)"),
         ([HEAD], "has 0 annotators (none)"),
     ],

@@ -80,28 +80,32 @@ def main(argv: Sequence[str] | None = None, parser: argparse.ArgumentParser | No
 
 def _run(argv: Sequence[str] | None, parser: argparse.ArgumentParser) -> int:
     """Run a subcommand. Raises BrokenPipeError if the reader of its output has gone."""
+    as_json = False
     try:
         arguments = parser.parse_args(argv)
+        as_json = getattr(arguments, "progress", None) == "json"
         command: Run = arguments.command
         with _stopped_alike():
             return command(arguments)
     except BrokenPipeError:
         raise
     except TrapsError as error:
-        print_failure(str(error))
+        print_failure(str(error), as_json=as_json)
         return FAILED
     except ModuleNotFoundError as error:
         if (sentence := sentence_of(error)) is None:
             raise
-        print_failure(sentence)
+        print_failure(sentence, as_json=as_json)
         return FAILED
     except OSError as error:
         where = f"{plain(error.filename)[:200]}: " if error.filename else ""
-        print_failure(f"{where}{error.strerror}; {remedy(error)} and run the same command again")
+        failure = f"{where}{error.strerror}; {remedy(error)} and run the same command again"
+        print_failure(failure, as_json=as_json)
         return FAILED
     except KeyboardInterrupt:
-        print(file=sys.stderr)
-        print_failure("interrupted; every finished answer and clip is kept. Run the same command to continue.")
+        print(end="" if as_json else "\n", file=sys.stderr)
+        failure = "interrupted; every finished answer and clip is kept. Run the same command to continue."
+        print_failure(failure, as_json=as_json)
         return INTERRUPTED
     finally:
         for stream in (sys.stdout, sys.stderr):

@@ -170,8 +170,14 @@ class Commands:
         return parser
 
 
-def print_failure(text: str) -> None:
-    """Print an error to standard error by line, on a terminal wrapped between words."""
+def print_failure(text: str, *, as_json: bool = False) -> None:
+    """Print an error to standard error: lines wrapped between words, or a line of JSON."""
+    if as_json:
+        from datetime import UTC, datetime
+
+        at, lines = datetime.now(UTC).isoformat(timespec="seconds"), "\n".join(map(plain, text.splitlines()))
+        print(json.dumps({"event": "failure", "at": at, "text": lines}, ensure_ascii=False), file=sys.stderr)
+        return
     for line in f"traps: {text}".splitlines():
         print(wrapped(plain(line), sys.stderr), file=sys.stderr)
 

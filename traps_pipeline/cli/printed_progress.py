@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TextIO
 
-from traps_pipeline.base.progress import HEARTBEAT_S, Progress, StageProgress, clock, summary
+from traps_pipeline.base.progress import HEARTBEAT_S, Progress, StageProgress, Tally, clock, summary
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.wording import counted
 
@@ -111,7 +111,11 @@ class PrintedProgress(Progress):
 
 
 class JsonProgress(PrintedProgress):
-    """Progress as JSON lines: `begin` and `end` of stages, `progress`, `note`."""
+    """Progress as JSON lines: `begin` and `end` of stages, `progress`, `note`, `finish`."""
+
+    def __init__(self, stream: TextIO) -> None:
+        super().__init__(stream)
+        self._began = time.monotonic()
 
     def stage(self, name: str, partitions: int) -> None:
         """See `Progress`."""
@@ -129,6 +133,14 @@ class JsonProgress(PrintedProgress):
         self._event("note", {"text": plain(text)})
 
     tell = note
+
+    def close(self) -> None:
+        """See `Progress`."""
+        super().close()
+        total = Tally()
+        for tally in self.totals.values():
+            total.add(tally)
+        self._event("finish", {"seconds": round(time.monotonic() - self._began, 1), **self.figures(), **vars(total)})
 
     def beat(self) -> None:
         """See `PrintedProgress`."""

@@ -127,7 +127,7 @@ def run(arguments: argparse.Namespace) -> int:
         board = workspace.tables.read_all(LEADERBOARD)
         print_json({"workspace": str(workspace.place), "run": report, "leaderboard": board})
     if report.problems:
-        _print_problems(report.problems)
+        _print_problems(report.problems, as_json=arguments.progress == "json")
         return OVER_BUDGET if report.over_budget else FAILED
     if arguments.json:
         return OK
@@ -158,17 +158,18 @@ def _print_work(report: RunReport, *, is_inside: bool) -> None:
         )
 
 
-def _print_problems(problems: Sequence[str]) -> None:
+def _print_problems(problems: Sequence[str], *, as_json: bool) -> None:
     """Print each cause once, last the one behind most problems, to fix first."""
+    show = partial(print_failure, as_json=as_json)
     alike = dict[str, list[str]]()
     for problem in problems:
         alike.setdefault(problem.partition(": ")[2] or problem, []).append(problem)
     for first, *more in alike.values():
-        print_failure(f"{first}{f' (and {len(more)} more)' if more else ''}")
-    print_failure(f"{counted(len(problems), 'problem')}; finished work is kept: run the same command to continue")
+        show(f"{first}{f' (and {len(more)} more)' if more else ''}")
+    show(f"{counted(len(problems), 'problem')}; finished work is kept: run the same command to continue")
     cause, most = max(alike.items(), key=lambda pair: len(pair[1]))
     if len(most) > 1:
-        print_failure(f"{len(most)} of them have one cause: {cause}")
+        show(f"{len(most)} of them have one cause: {cause}")
 
 
 @contextmanager

@@ -16,6 +16,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from traps_pipeline.base import progress
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.files import write_bytes
 from traps_pipeline.base.paths import user_cache
@@ -51,7 +52,8 @@ def make_pieces(
     former = _read(workspace.store.here(path).read_bytes()) if workspace.store.has(path) else {}
     versions, shared = Lineage(workspace).inputs(stage, None), _Shared(stage)
     inputs, contents, remade = dict[str, Digests](), dict[str, bytes](), list[str]()
-    for piece in pieces:
+    for number, piece in enumerate(pieces):
+        progress.current().tick(stage, "parts", number, len(pieces))
         read_versions = {name: version for name, version in versions.items() if name.partition("/")[0] in piece.reads}
         digests, content = former.get(piece.name, (("", ""), b""))
         of_versions = shown = digest([code, read_versions])
