@@ -115,7 +115,7 @@ def test_a_released_control_is_closed_and_one_that_closes_too_early_or_too_late_
     late = altered(spec, closes_frame=46)
     assert "a model is shown no frame after 4.5 s" in str(failure(scenario_id, late))
     # The table of records finds it too, without a trajectory.
-    assert [said.partition(": closing: ")[2][:26] for said in answerable_voids([late])] == [
+    assert [said.partition(": closing: ")[2][:29] for said in answerable_voids([late])] == [
         "the occluder comes at 4.6 s; "
     ]
 

@@ -189,7 +189,7 @@ def test_what_moves_is_carried_on_as_it_moved_last() -> None:
     assert foresee(moving("red", (40, 170, 180)), named) == "no"
     lost = moving("red", (40, 110, 180, 200))
     lost[3, 150:170, 200:220] = 200  # behind something: where it was last is where it goes on from
-    path = [observers.compact(frame, "red") for frame in lost]
+    path = [observers.compact_blob(frame, "red") for frame in lost]
     end = observers.carried_on(path, 1.0)
     assert path[-1] is None and end is not None and abs(end.x - (189.5 + 2 * 70)) < 1
     assert observers.carried_on([*path, None, None], 1.0) is None  # for too long

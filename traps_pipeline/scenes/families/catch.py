@@ -15,7 +15,7 @@ import numpy as np
 
 from traps_pipeline.scenes.parts.course import SHADOW_BACK, SHADOW_RIGHT, SOFT, Course, Span, Surface
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import end_of, rounded
+from traps_pipeline.scenes.parts.observers import end_of, round_blob
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
 from traps_pipeline.scenes.parts.readings import Reading, side_while
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, facing, hidden, one_of
@@ -139,7 +139,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return whether the resting ball is between the basket's sides in the picture."""
-    path = [rounded(frame, slots["ball"]) for frame in frames[-3:]]
+    path = [round_blob(frame, slots["ball"]) for frame in frames[-3:]]
     sides, ball = _sides(frames[-1], slots["basket"]), end_of(path)
     if ball is None or sides is None:
         return None
@@ -148,7 +148,7 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
 
 def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Predict whether the ball is in the basket when it has fallen to half its height."""
-    path = [rounded(frame, slots["ball"]) for frame in frames[-3:]]
+    path = [round_blob(frame, slots["ball"]) for frame in frames[-3:]]
     sides, flight = _sides(frames[-1], slots["basket"]), [ball for ball in path if ball is not None]
     if sides is None or len(flight) < 3:
         return None

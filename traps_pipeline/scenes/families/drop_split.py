@@ -13,9 +13,9 @@ from math import atan2, hypot
 
 import numpy as np
 
-from traps_pipeline.scenes.parts.course import SOFT, Course, Surface, coloured
+from traps_pipeline.scenes.parts.course import SOFT, Course, Surface, part_colours
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import carried_on, rounded
+from traps_pipeline.scenes.parts.observers import carried_on, round_blob
 from traps_pipeline.scenes.parts.questions import Aside, choice_of, either, left_or_right
 from traps_pipeline.scenes.parts.readings import Reading, side_while
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, in_front, one_of, shuffled
@@ -125,7 +125,7 @@ def _ask_colour(part: str, question: str) -> Aside:
     def ask(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
         colours = [p.ball_colour, p.cube_colour]
         third = next(str(c) for c in rng.permutation(FREE) if c not in colours)
-        return choice_of(question, lambda p: [*colours, third], lambda p: coloured(p)[part])(p, rng)
+        return choice_of(question, lambda p: [*colours, third], lambda p: part_colours(p)[part])(p, rng)
 
     return ask
 
@@ -138,7 +138,7 @@ def _middle_x(frame: np.ndarray, colour: str) -> float | None:
 
 def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return whether the resting ball is nearer to the red or the blue bin's middle."""
-    path = [rounded(frame, slots["ball"]) for frame in frames[-3:]]
+    path = [round_blob(frame, slots["ball"]) for frame in frames[-3:]]
     ball, red, blue = path[-1], _middle_x(frames[-1], "red"), _middle_x(frames[-1], "blue")
     if ball is None or not is_at_rest(path) or red is None or blue is None:
         return None
@@ -147,7 +147,7 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
 
 def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Predict the side of the ridge's top, seen by its edges, on which the ball lands."""
-    ball = carried_on([rounded(frame, slots["ball"]) for frame in frames], 0.5)
+    ball = carried_on([round_blob(frame, slots["ball"]) for frame in frames], 0.5)
     red, blue = (colour_mask(frames[0], colour) for colour in ("red", "blue"))
     bins = [largest(frames[0], colour) for colour in ("red", "blue")]
     if ball is None or bins[0] is None or bins[1] is None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from traps_pipeline.scenes.parts.course import SOFT, Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import rounded
+from traps_pipeline.scenes.parts.observers import round_blob
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
 from traps_pipeline.scenes.parts.readings import Reading
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, facing, one_of, shuffled, together
@@ -137,7 +137,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return whether the resting ball is below the upper edge of the cup."""
-    path = [rounded(frame, slots["ball"], fill=0.92, longer=2.5) for frame in frames[-3:]]
+    path = [round_blob(frame, slots["ball"], fill=0.92, longer=2.5) for frame in frames[-3:]]
     ball, cup = path[-1], largest(frames[-1], slots["cup"], 150)
     if ball is None or not is_at_rest(path) or cup is None:
         return None

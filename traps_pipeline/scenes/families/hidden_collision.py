@@ -14,7 +14,7 @@ import numpy as np
 
 from traps_pipeline.scenes.parts.course import SHADOW_BACK, SHADOW_RIGHT, Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import carried_on, small
+from traps_pipeline.scenes.parts.observers import carried_on, small_blob
 from traps_pipeline.scenes.parts.questions import yes_no
 from traps_pipeline.scenes.parts.readings import Reading
 from traps_pipeline.scenes.parts.vary import apart, between, drawn_by, hidden, in_front, one_of, shuffled
@@ -136,7 +136,7 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return 'no' once the balls have changed their order, 'yes' if they rest before."""
     starts, ends, all_rest = [], [], True
     for name in ("first", "second"):
-        path = [small(frame, slots[name]) for frame in frames]
+        path = [small_blob(frame, slots[name]) for frame in frames]
         start, end = next((blob for blob in path if blob), None), path[-1]
         if start is None or end is None:
             return None
@@ -150,7 +150,7 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
 
 def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Predict a collision: the balls are in one lane when they are side by side."""
-    paths = [[small(frame, slots[name]) for frame in frames] for name in ("first", "second")]
+    paths = [[small_blob(frame, slots[name]) for frame in frames] for name in ("first", "second")]
     a, b = (carried_on(path, 0.0) for path in paths)
     a_next, b_next = (carried_on(path, 1.0) for path in paths)
     if a is None or b is None or a_next is None or b_next is None:

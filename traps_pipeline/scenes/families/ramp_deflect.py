@@ -12,7 +12,7 @@ import numpy as np
 
 from traps_pipeline.scenes.parts.course import Course
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import AHEAD, compact, nearer_side
+from traps_pipeline.scenes.parts.observers import AHEAD, compact_blob, nearer_side
 from traps_pipeline.scenes.parts.questions import colour_from, left_or_right, material_of
 from traps_pipeline.scenes.parts.ramp import Ramp
 from traps_pipeline.scenes.parts.readings import Reading, side_while
@@ -131,7 +131,7 @@ FAMILY = scene_family(
         material_of("ramp", "What colour is the ramp that the ball rolls down: {choices}?"),
         colour_from("ball", "What colour is the ball on the ramp: {choices}?", BALLS, unlike=("ball",)),
     ],
-    observe=nearer_side("ball", "red", "blue", find=compact, least=100),
-    foresee=nearer_side("ball", "red", "blue", find=compact, least=100, ahead=AHEAD),
+    observe=nearer_side("ball", "red", "blue", find=compact_blob, least=100),
+    foresee=nearer_side("ball", "red", "blue", find=compact_blob, least=100, ahead=AHEAD),
     min_margin_m=0.03,
 )

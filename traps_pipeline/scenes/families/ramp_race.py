@@ -14,7 +14,7 @@ import numpy as np
 
 from traps_pipeline.scenes.parts.course import Course, brake
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import colours_of_balls, compact
+from traps_pipeline.scenes.parts.observers import colours_of_balls, compact_blob
 from traps_pipeline.scenes.parts.questions import which_colour
 from traps_pipeline.scenes.parts.ramp import Ramp
 from traps_pipeline.scenes.parts.readings import Reading, first_past
@@ -157,7 +157,7 @@ SETTLING_PX = 8.0  # so far a ball may still roll in the tray when an occluder c
 def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return which ball is first near its place of rest, the same part of the tray."""
     choices = colours_of_balls(frames, slots, BALL_COLOURS)
-    paths = [[compact(frame, colour) for frame in frames] for colour in choices]
+    paths = [[compact_blob(frame, colour) for frame in frames] for colour in choices]
     if len(choices) != 2 or not all(is_at_rest(path, tolerance_px=SETTLING_PX) for path in paths):
         return None
     rates = [_progress(path) for path in paths]
@@ -169,7 +169,7 @@ def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Predict which ball will be lower in the picture if both gain speed as they do."""
     lower: dict[str, float] = {}
     for colour in colours_of_balls(frames, slots, BALL_COLOURS):
-        path = [compact(frame, colour) for frame in frames[-3:]]
+        path = [compact_blob(frame, colour) for frame in frames[-3:]]
         ys = [ball.y + ball.box[3] / 2 for ball in path if ball is not None]
         if len(ys) == len(path) == 3:
             step, gain = ys[2] - ys[1], ys[2] - 2 * ys[1] + ys[0]

@@ -15,7 +15,7 @@ import numpy as np
 
 from traps_pipeline.scenes.parts.course import SHADOW_RIGHT, Course, brake
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import AHEAD, compact, end_of
+from traps_pipeline.scenes.parts.observers import AHEAD, compact_blob, end_of
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
 from traps_pipeline.scenes.parts.readings import Reading, clear_m, still_from, yes_while
 from traps_pipeline.scenes.parts.vary import apart, between, drawn_by, facing, hidden, one_of, shuffled
@@ -103,7 +103,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 def observe(frames: np.ndarray, slots: Mapping[str, str], ahead: float | None = None) -> str | None:
     """Return whether the ball rests on the other side of the line than it came from."""
-    path = [compact(frame, slots["ball"], shape=(0.5, 2.0)) for frame in frames]
+    path = [compact_blob(frame, slots["ball"], shape=(0.5, 2.0)) for frame in frames]
     first, last = next((ball for ball in path if ball is not None), None), end_of(path, ahead)
     if first is None or last is None:
         return None

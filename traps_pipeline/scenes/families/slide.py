@@ -14,7 +14,7 @@ import numpy as np
 
 from traps_pipeline.scenes.parts.course import SHADOW_RIGHT, Course, Span
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import AHEAD, compact, rests_over
+from traps_pipeline.scenes.parts.observers import AHEAD, compact_blob, rests_over
 from traps_pipeline.scenes.parts.questions import colour_from, comes_from, material_of, yes_no
 from traps_pipeline.scenes.parts.ramp import Ramp
 from traps_pipeline.scenes.parts.readings import Reading, still_from, yes_while
@@ -134,7 +134,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading(yes_while(is_off, still_from(block, within_m=STILL_M)), float(abs(past[-1])))
 
 
-BLOCK = partial(compact, area=4500, shape=(0.3, 3.5), fill=0.4)
+BLOCK = partial(compact_blob, area=4500, shape=(0.3, 3.5), fill=0.4)
 FAMILY = scene_family(
     "slide",
     category="ramps_rolling",

@@ -14,7 +14,7 @@ import numpy as np
 
 from traps_pipeline.scenes.parts.course import SOFT, Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import rounded
+from traps_pipeline.scenes.parts.observers import round_blob
 from traps_pipeline.scenes.parts.questions import colour_from, either, which_colour
 from traps_pipeline.scenes.parts.readings import Reading, still_from
 from traps_pipeline.scenes.parts.soft_bodies import soft_ball
@@ -134,7 +134,7 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return the offered colour nearest to the resting ball's underside, None if none."""
     if "choices" not in slots:
         return None
-    path = [rounded(frame, slots["ball"]) for frame in frames[-3:]]
+    path = [round_blob(frame, slots["ball"]) for frame in frames[-3:]]
     end = path[-1]
     heights = {colour: _height(frames[-1], colour) for colour in choices_in(slots["choices"])}
     if end is None or not is_at_rest(path, tolerance_px=4) or None in heights.values():

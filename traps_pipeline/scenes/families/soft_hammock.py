@@ -15,7 +15,7 @@ import numpy as np
 
 from traps_pipeline.scenes.parts.course import SHADOW_RIGHT, SOFT, Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import rounded
+from traps_pipeline.scenes.parts.observers import round_blob
 from traps_pipeline.scenes.parts.questions import colour_of, either, yes_no
 from traps_pipeline.scenes.parts.readings import Reading, lasting_from, still_from
 from traps_pipeline.scenes.parts.soft_bodies import hammock
@@ -104,7 +104,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return whether the cloth is wider than high once the ball rests, None if unseen."""
-    path = [rounded(frame, slots["ball"]) for frame in frames[-3:]]
+    path = [round_blob(frame, slots["ball"]) for frame in frames[-3:]]
     rows, columns = np.nonzero(colour_mask(frames[-1], slots["cloth"]))
     if len(rows) < CLOTH_PX or not is_at_rest(path, tolerance_px=4):
         return None

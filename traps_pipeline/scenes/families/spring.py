@@ -15,7 +15,7 @@ import numpy as np
 
 from traps_pipeline.scenes.parts.course import SHADOW_BACK, SHADOW_RIGHT, SOFT, Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import AHEAD, end_of, rounded
+from traps_pipeline.scenes.parts.observers import AHEAD, end_of, round_blob
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
 from traps_pipeline.scenes.parts.readings import Reading, side_while
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, facing, one_of, together
@@ -141,8 +141,8 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 def observe(frames: np.ndarray, slots: Mapping[str, str], ahead: float | None = None) -> str | None:
     """Return whether the resting ball is on the side of the line that it came from."""
-    path = [rounded(frame, slots["ball"]) for frame in frames[-3:]]
-    start, end = rounded(frames[0], slots["ball"]), end_of(path, ahead)
+    path = [round_blob(frame, slots["ball"]) for frame in frames[-3:]]
+    start, end = round_blob(frames[0], slots["ball"]), end_of(path, ahead)
     parts = [blob for blob in blobs(colour_mask(frames[-1], slots["line"]), 15) if blob.area < 4000]
     if start is None or end is None or not parts:
         return None

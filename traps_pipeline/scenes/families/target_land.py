@@ -15,7 +15,7 @@ import numpy as np
 
 from traps_pipeline.scenes.parts.course import SOFT, Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import offered, rounded
+from traps_pipeline.scenes.parts.observers import offered, round_blob
 from traps_pipeline.scenes.parts.questions import choice_of, comes_from, which_colour
 from traps_pipeline.scenes.parts.readings import Reading
 from traps_pipeline.scenes.parts.vary import apart, between, facing, hidden, one_of, shuffled
@@ -127,7 +127,7 @@ def _colours(slots: Mapping[str, str]) -> Sequence[str]:
 
 def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return the tray colour that most of the picture around the resting ball has."""
-    path = [rounded(frame, slots["ball"]) for frame in frames[-3:]]
+    path = [round_blob(frame, slots["ball"]) for frame in frames[-3:]]
     ball = path[-1]
     if ball is None or not is_at_rest(path):
         return None

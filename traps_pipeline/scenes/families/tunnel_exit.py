@@ -15,7 +15,7 @@ import numpy as np
 
 from traps_pipeline.scenes.parts.course import SHADOW_RIGHT, Course, Span, Surface
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import AHEAD, end_of, small
+from traps_pipeline.scenes.parts.observers import AHEAD, end_of, small_blob
 from traps_pipeline.scenes.parts.questions import colour_from, left_or_right
 from traps_pipeline.scenes.parts.ramp import Ramp
 from traps_pipeline.scenes.parts.readings import Reading, side_while
@@ -127,7 +127,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 def observe(frames: np.ndarray, slots: Mapping[str, str], ahead: float | None = None) -> str | None:
     """Return the side of the tunnel on which the ball lies at the end."""
-    path = [small(frame, slots["ball"]) for frame in frames[-3:]]
+    path = [small_blob(frame, slots["ball"]) for frame in frames[-3:]]
     tunnel, ball = largest(frames[-1], slots["tunnel"], 200), end_of(path, ahead, tolerance_px=4)
     if ball is None or tunnel is None:
         return None

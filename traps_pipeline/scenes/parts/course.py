@@ -447,14 +447,14 @@ class Course:
             shown_by=dict(shown_by),
             velocity=self._velocity,
             inventory=Inventory(
-                tuple(dict.fromkeys([*coloured(p).values(), *colours])),
+                tuple(dict.fromkeys([*part_colours(p).values(), *colours])),
                 tuple(dict.fromkeys([*nouns, *also])),
                 tuple(things),
             ),
         )
 
 
-def coloured(p: Any) -> dict[str, str]:
+def part_colours(p: Any) -> dict[str, str]:
     """Return part -> colour, from the fields `<part>_colour` of the parameters."""
     names = [each.name for each in fields(p) if each.name.endswith("_colour")]
     return {name.removesuffix("_colour"): getattr(p, name) for name in names}

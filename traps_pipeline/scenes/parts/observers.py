@@ -40,12 +40,12 @@ LOST = 2  # for so many frames a moving thing may be out of sight
 # --- one thing in one frame -------------------------------------------------------------------------------------------
 
 
-def small(frame: np.ndarray, colour: str) -> Blob | None:
+def small_blob(frame: np.ndarray, colour: str) -> Blob | None:
     """Return the largest region of a colour that is no longer than a ball (80 px)."""
     return next((blob for blob in blobs(colour_mask(frame, colour), 60) if max(blob.box[2:]) < 80), None)
 
 
-def compact(
+def compact_blob(
     frame: np.ndarray, colour: str, *, area: int = 4000, shape: tuple[float, float] = (0.4, 2.5), fill: float = 0.5
 ) -> Blob | None:
     """Return the largest region of a colour that may be a ball: filled, about round.
@@ -65,11 +65,11 @@ def offered(slots: Mapping[str, str], otherwise: Sequence[str]) -> Sequence[str]
 
 def colours_of_balls(frames: np.ndarray, slots: Mapping[str, str], pool: Sequence[str]) -> Sequence[str]:
     """Return the offered colours, or else those of the pool that a ball has at first."""
-    at_first = [colour for colour in pool if sum(compact(frame, colour) is not None for frame in frames[:3]) >= 2]
+    at_first = [colour for colour in pool if sum(compact_blob(frame, colour) is not None for frame in frames[:3]) >= 2]
     return offered(slots, at_first)
 
 
-def rounded(frame: np.ndarray, colour: str, *, fill: float = 0.9, longer: float = 1.9) -> Blob | None:
+def round_blob(frame: np.ndarray, colour: str, *, fill: float = 0.9, longer: float = 1.9) -> Blob | None:
     """Return the largest region of a colour that may be a ball, and no occluder.
 
     fill: greatest share of its bounding box. longer: how many times as long as it is wide, at most.
@@ -145,7 +145,7 @@ def past_far_edge(thing: str, screen: str, ahead: float | None = None) -> Observ
     """Return an observer of whether the thing rests past the screen's farther edge."""
 
     def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
-        path = [small(frame, slots[thing]) for frame in frames]
+        path = [small_blob(frame, slots[thing]) for frame in frames]
         start = next((blob.x for blob in path if blob), None)
         wall, end = largest(frames[-1], slots[screen], 200), end_of(path, ahead, tolerance_px=4)
         if start is None or wall is None or end is None:
@@ -156,7 +156,7 @@ def past_far_edge(thing: str, screen: str, ahead: float | None = None) -> Observ
     return observe
 
 
-def rests_over(thing: str, goal: str, find: Finder = compact, ahead: float | None = None) -> Observer:
+def rests_over(thing: str, goal: str, find: Finder = compact_blob, ahead: float | None = None) -> Observer:
     """Return an observer of whether the thing rests within the goal's width + 2 px."""
 
     def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
@@ -175,7 +175,7 @@ def nearer_side(
     left: str,
     right: str,
     *,
-    find: Finder = small,
+    find: Finder = small_blob,
     least: int = 60,
     tolerance_px: float = 1.5,
     ahead: float | None = None,

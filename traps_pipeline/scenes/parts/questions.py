@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from traps_pipeline.scenes.parts.course import coloured
+from traps_pipeline.scenes.parts.course import part_colours
 from traps_pipeline.scenes.parts.wording import match_slots
 from traps_pipeline.scenes.physics.kit import AnswerableQuestion, AnswerType, Wording, listed
 
@@ -41,7 +41,7 @@ class Question:
     def word(self, p: Any, rng: np.random.Generator, asides: Sequence[Aside]) -> Wording:
         """Word the question and one of the asides; a sole aside costs no draw."""
         filled = self.fill(p, rng)
-        text = str(rng.choice(self.templates)).format_map({**coloured(p), **filled.fills})
+        text = str(rng.choice(self.templates)).format_map({**part_colours(p), **filled.fills})
         return Wording(text, filled.labels, filled.aliases, _one_of(asides, rng)(p, rng))
 
     def slots_in(self, question: str) -> dict[str, str] | None:
@@ -134,7 +134,7 @@ def either(question: str, labels: Sequence[str], answer: Callable[[Any], str]) -
     """Return a question that names its choices in a fixed order, and may name parts."""
 
     def ask(p: Any, rng: np.random.Generator) -> AnswerableQuestion:
-        return AnswerableQuestion(question.format_map(coloured(p)), tuple(labels), answer(p))
+        return AnswerableQuestion(question.format_map(part_colours(p)), tuple(labels), answer(p))
 
     return ask
 
@@ -154,21 +154,21 @@ def choice_of(question: str, choices: Callable[[Any], Sequence[str]], answer: Ca
 
     def ask(p: Any, rng: np.random.Generator) -> AnswerableQuestion:
         order = tuple(str(c) for c in rng.permutation(choices(p)))
-        return AnswerableQuestion(question.format_map({**coloured(p), "choices": listed(order)}), order, answer(p))
+        return AnswerableQuestion(question.format_map({**part_colours(p), "choices": listed(order)}), order, answer(p))
 
     return ask
 
 
 def colour_of(part: str, question: str, among: Sequence[str]) -> Aside:
     """Return a question for a part's colour among those of the parts `among`."""
-    return choice_of(question, lambda p: [coloured(p)[name] for name in among], lambda p: coloured(p)[part])
+    return choice_of(question, lambda p: [part_colours(p)[name] for name in among], lambda p: part_colours(p)[part])
 
 
 def colour_from(part: str, question: str, pool: Sequence[str], unlike: Sequence[str]) -> Aside:
     """Return a question for a part's colour, with two that no `unlike` part has."""
 
     def ask(p: Any, rng: np.random.Generator) -> AnswerableQuestion:
-        colours = coloured(p)
+        colours = part_colours(p)
         excluded = [colours[name] for name in unlike]
         others = [str(c) for c in rng.permutation([c for c in pool if c not in excluded])[:2]]
         return choice_of(question, lambda p: [colours[part], *others], lambda p: colours[part])(p, rng)
@@ -181,4 +181,4 @@ _IN_WORDS = {"wood": "brown", "grey": "grey", "black": "black"}
 
 def material_of(part: str, question: str) -> Aside:
     """Return a question for the colour of a part: brown (wood), grey or black."""
-    return choice_of(question, lambda p: list(_IN_WORDS.values()), lambda p: _IN_WORDS[coloured(p)[part]])
+    return choice_of(question, lambda p: list(_IN_WORDS.values()), lambda p: _IN_WORDS[part_colours(p)[part]])
