@@ -41,6 +41,7 @@ bench: setup ## ratios against what one would otherwise use; each script has --q
 	$(BIN)/python bench/probes.py
 	$(BIN)/python bench/scoring.py
 	$(BIN)/python bench/shortcuts.py
+	$(BIN)/python bench/difficulty.py
 	$(BIN)/python bench/explorer.py
 
 bench-cluster: cluster-setup ## what a cluster costs and gains, against one machine; half an hour to an hour

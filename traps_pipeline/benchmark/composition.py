@@ -17,7 +17,8 @@ from traps_pipeline.base.wording import counted
 from traps_pipeline.base.workers import kept_workers
 from traps_pipeline.base.yamlfile import explain, read_yaml
 from traps_pipeline.benchmark.items import commonest_answers
-from traps_pipeline.scenes.draw.sample import answer_quota, ill_posed_quota, sample_family
+from traps_pipeline.scenes.draw.sample import answer_quota, ill_posed_quota, require_difficulty, sample_family
+from traps_pipeline.scenes.parts.difficulty import USUAL, Difficulty
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 
 PRIOR_AT_MOST = 0.55  # accuracy of the commonest answer, occlusion and chaotic weighted equally
@@ -42,18 +43,29 @@ def sample_benchmark(
     name: str,
     *,
     look: Collection[str] = (),
+    difficulty: Difficulty = USUAL,
     workers: int | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> None:
     """Sample a benchmark into `out`: records, trajectories, and `benchmark.yaml`.
 
     It has a canary of its own. Existing records of the same seed and numbers stay: an interrupted sampling resumes.
-    Raises TrapsError if a family cannot be filled.
+    Raises TrapsError if a family cannot be filled, or not with a difficulty.
     """
+    require_difficulty(counts, difficulty)
     with kept_workers():
         for family, count in counts.items():
             try:
-                tally = sample_family(family, count, seed, out / "released", look=look, workers=workers, report=report)
+                tally = sample_family(
+                    family,
+                    count,
+                    seed,
+                    out / "released",
+                    look=look,
+                    difficulty=difficulty,
+                    workers=workers,
+                    report=report,
+                )
             except RuntimeError as error:
                 raise TrapsError(str(error)) from error
             reasons = ", ".join(f"{n} x {reason}" for reason, n in tally.rejected.most_common()) or "none rejected"

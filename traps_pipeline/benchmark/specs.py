@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,7 +20,7 @@ from traps_pipeline.benchmark.records import load_released, parse_record
 from traps_pipeline.benchmark.versions import version_of
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.physics.kit import Physics, Wording
-from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory, save_trajectory
+from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory, physics_record, save_trajectory
 from traps_pipeline.storage.benchmark_tables import SCENE_SPECS, SceneSpecRow
 from traps_pipeline.storage.workspace import Workspace
 
@@ -88,7 +88,7 @@ def _seed(scenario: Scenario) -> int:
 
 
 def _physics(scenario: Scenario) -> dict[str, Any]:
-    return scenario.released.physics if scenario.released else asdict(get_family(scenario.family).physics)
+    return scenario.released.physics if scenario.released else physics_record(get_family(scenario.family).physics)
 
 
 def _wording(scenario: Scenario, params: Mapping[str, Any]) -> Wording:

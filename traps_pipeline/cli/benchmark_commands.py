@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from traps_pipeline.release.commitment import Commitment
     from traps_pipeline.scenes.worlds.spec import SceneSpec
 
-# Copied from `scenes.parts.look.PARTS`, which takes long to import.
+# Copied from `scenes.parts.look.PARTS` and from `scenes.parts.difficulty`, which take long to import.
+SPEEDS, MOST_DISTRACTORS = (1.0, 1.5, 2.0), 3
 LOOKS = ("floor", "pale-floor", "light", "panel", "bystanders", "camera", "material", "size")
 
 
@@ -54,6 +55,21 @@ def add(commands: Commands) -> None:
         metavar="PART",
         help=f"vary how scenes look, too: {', '.join(LOOKS)} (default: what varies in the released benchmark)",
     )
+    parser.add_argument(
+        "--distractors",
+        type=integer(0, MOST_DISTRACTORS),
+        default=0,
+        metavar="N",
+        help="things like the named ones that cross before each scene (default: none)",
+    )
+    parser.add_argument(
+        "--speed",
+        type=float,
+        choices=SPEEDS,
+        default=1.0,
+        help="how many times as fast all happens (default: 1.0)",
+    )
+    parser.add_argument("--longer", action="store_true", help="longer rows, more lanes, greater counts")
     parser.add_argument("--workers", type=integer(1, 1024), help="processes (default: one per core)")
 
     text = "fix a sampled benchmark before anybody sees it: write a commitment to publish, and a reveal to keep"
@@ -105,6 +121,7 @@ def sample(arguments: argparse.Namespace) -> int:
     from traps_pipeline.benchmark.composition import load_composition, sample_benchmark
     from traps_pipeline.benchmark.records import load_release
     from traps_pipeline.scenes.family_registry import family_names
+    from traps_pipeline.scenes.parts.difficulty import Difficulty
 
     counts = load_composition()
     names = arguments.families or list(counts)
@@ -126,6 +143,7 @@ def sample(arguments: argparse.Namespace) -> int:
         arguments.seed,
         name,
         look=arguments.look,
+        difficulty=Difficulty(arguments.distractors, arguments.speed, arguments.longer),
         workers=arguments.workers,
         report=lambda line: print(line, flush=True),
     )

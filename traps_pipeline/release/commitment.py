@@ -25,6 +25,7 @@ from traps_pipeline.base.workers import kept_workers
 from traps_pipeline.base.yamlfile import explain, read_lines
 from traps_pipeline.benchmark.records import load_release, load_released, parse_record
 from traps_pipeline.scenes.draw.sample import load_tallies, sample_family
+from traps_pipeline.scenes.parts.difficulty import USUAL, Difficulty
 from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory
 
 _HEX = r"^[0-9a-f]{64}$"
@@ -40,8 +41,9 @@ class _Strict(BaseModel):
 class Commitment(_Strict):
     """The public file.
 
-    draws: scenarios by family. look: the varied parts of the look, by family. seed: digest of the seed. specs: digest
-    of each record. made_with: machine and libraries, which may affect the arithmetic of a draw.
+    draws: scenarios by family. look: the varied parts of the look, by family. difficulty: of every scene. seed: digest
+    of the seed. specs: digest of each record. made_with: machine and libraries, which may affect the arithmetic of a
+    draw.
     """
 
     format: Literal[1] = 1
@@ -50,6 +52,7 @@ class Commitment(_Strict):
     canary: str
     draws: dict[str, int]
     look: dict[str, list[str]] = {}
+    difficulty: Difficulty = USUAL
     seed: str = Field(pattern=_HEX)
     specs: dict[str, str] = Field(min_length=1)
     made_with: dict[str, str]
@@ -81,17 +84,20 @@ def commit(benchmark: Path, commitment: Path, reveal: Path) -> Commitment:
         if path.exists():
             raise TrapsError(f"{path}: is there already, and a commitment is made once; name another file")
     specs, tallies = load_released(benchmark / "released"), load_tallies(benchmark / "released")
-    seeds = {tally.seed for tally in tallies.values()}
-    if len(seeds) != 1 or {spec.family for spec in specs.values()} != {*tallies}:
+    draws_of = {(tally.seed, tally.difficulty) for tally in tallies.values()}
+    if len(draws_of) != 1 or {spec.family for spec in specs.values()} != {*tallies}:
         raise TrapsError(
-            f"{benchmark}: is not one draw of one seed; draw one with `traps benchmark sample` into a new folder"
+            f"{benchmark}: is not one draw of one seed and difficulty; draw one with `traps benchmark sample` into a "
+            "new folder"
         )
-    secret = Reveal(seed=seeds.pop(), nonce=secrets.token_hex(32))
+    ((seed, difficulty),) = draws_of
+    secret = Reveal(seed=seed, nonce=secrets.token_hex(32))
     release, draws = load_release(benchmark / "benchmark.yaml"), {n: t.wanted for n, t in sorted(tallies.items())}
     published = Commitment(
         **release.model_dump(include={"name", "version", "canary"}),
         draws=draws,
         look={name: tally.look for name, tally in sorted(tallies.items())},
+        difficulty=difficulty,
         seed=_sealed_seed(secret, draws),
         specs={id_: _sealed_spec(secret, spec) for id_, spec in sorted(specs.items())},
         made_with=_made_with(),
@@ -188,6 +194,7 @@ def drawn_again(
                         reveal.seed,
                         Path(folder) / "released",
                         look=commitment.look.get(family, ()),
+                        difficulty=commitment.difficulty,
                         workers=workers,
                         report=report,
                     )

@@ -27,6 +27,7 @@ from traps_pipeline.scenes.certification.evidence import (
     Pair,
     VoidKind,
 )
+from traps_pipeline.scenes.parts.difficulty import DISTRACTOR
 from traps_pipeline.scenes.parts.look import fineness
 from traps_pipeline.scenes.parts.wording import FAR_COLOUR, false_premises, none_as_answer, refutation
 from traps_pipeline.scenes.physics.flexes import flexes, is_carrier
@@ -507,7 +508,8 @@ def _referents(pair: Pair) -> Evidence:
     assert control.occluder is not None, "a pair with an occluder has an occluder"
     scene, model, fps = control.scene, control.model, control.physics.fps / control.frame_step
     rigid = np.flatnonzero((model.body_weldid > 0) & ~is_carrier(model))
-    moving = {*(model.body(int(i)).name for i in rigid), *flexes(model)}
+    bodies = {*(model.body(int(i)).name for i in rigid), *flexes(model)}
+    moving = {body for body in bodies if not body.startswith(DISTRACTOR)}  # which are neither named nor the cause
     moves: dict[str, float] = {}
     for body in sorted(moving):
         pixels = control.pixels_of(decisive_geoms(model, [body]))
@@ -518,13 +520,13 @@ def _referents(pair: Pair) -> Evidence:
     for noun in named_nouns(pair.claim.question, scene):
         nouns = (noun, *scene.shown_by.get(noun, ()))
         has_flag = any(phrase.split()[-1] in nouns for phrase in scene.marks)
-        bodies = [moves[body] for body in moves if _is_called(body, nouns)]
+        moving_s = [moves[body] for body in moves if _is_called(body, nouns)]
         static = [name for name in control.geoms if _is_called(name, nouns) and not _is_of(model, name, moving)]
         if has_flag:
             visibility[noun] = "marked"
-        elif bodies:
-            visibility[noun] = "seen moving" if min(bodies) >= MOVING_S - _NOISE_S else "hidden"
-            least_s.append(min(bodies))
+        elif moving_s:
+            visibility[noun] = "seen moving" if min(moving_s) >= MOVING_S - _NOISE_S else "hidden"
+            least_s.append(min(moving_s))
         else:
             least_px.append(float(control.pixels_of(static).min()))
             visibility[noun] = "in view" if least_px[-1] >= REFERENT_PIXELS else "hidden"

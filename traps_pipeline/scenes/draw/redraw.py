@@ -21,6 +21,7 @@ from traps_pipeline.scenes.certification.certificates import WORDS, certificates
 from traps_pipeline.scenes.draw.resolve import Resolved, plain
 from traps_pipeline.scenes.draw.sample import (
     Draw,
+    Tally,
     ill_posed_for,
     load_tallies,
     record_line,
@@ -38,7 +39,7 @@ from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory, save_t
 # Parts of a look that move neither camera nor occluder.
 STILL = ("floor", "pale-floor", "light", "panel", "material", "bystanders")
 
-_Job = tuple[SceneSpec, Path, int]  # a record, the folder of trajectories and the seed of its family
+_Job = tuple[SceneSpec, Path, Tally]  # a record, the folder of trajectories and how its family was drawn
 
 
 def draw_again(
@@ -95,11 +96,11 @@ def _rewrite(
     only: Collection[str] | None = None,
 ) -> dict[str, str]:
     """Change records of a family, take out those rejected, and return reasons by id."""
-    seed, rejected = load_tallies(released)[name].seed, dict[str, str]()
+    tally, rejected = load_tallies(released)[name], dict[str, str]()
     lines = (released / f"{name}.jsonl").read_text(encoding="utf-8").splitlines()
     records = {spec.scenario_id: spec for spec in map(SceneSpec.model_validate_json, lines)}
     chosen = [id_ for id_ in records if only is None or id_ in only]
-    jobs = [(records[id_], released / "trajectories", seed) for id_ in chosen]
+    jobs = [(records[id_], released / "trajectories", tally) for id_ in chosen]
     for finished, ((spec, folder, _), result) in enumerate(run_in_order(change, jobs, workers), start=1):
         if isinstance(result, str):
             rejected[spec.scenario_id] = result
@@ -117,8 +118,9 @@ def _rewrite(
 
 def _draw_record_again(job: _Job) -> Resolved | str:
     """Return today's result of a record's draw under its old names, or a rejection."""
-    spec, _, seed = job
-    result = try_draw(Draw(spec.family, seed, spec.seed, frozenset(), tuple(sorted(get_family(spec.family).looks))))
+    spec, _, tally = job
+    looks = tuple(sorted(get_family(spec.family).looks))
+    result = try_draw(Draw(spec.family, tally.seed, spec.seed, frozenset(), looks, tally.difficulty))
     if isinstance(result, str):
         return result
     worlds = [{field: value for field, value in each.params.items() if field != "look"} for each in (spec, result.spec)]
@@ -130,9 +132,9 @@ def _draw_record_again(job: _Job) -> Resolved | str:
 
 def _relook_record(job: _Job) -> Resolved | str:
     """Return a record with the look of its draw, or the certificate it then loses."""
-    spec, folder, seed = job
+    spec, folder, tally = job
     family, path = get_family(spec.family), folder / f"{spec.scenario_id}.npz"
-    look = look_of_draw(seed, spec.family, spec.seed, sorted(family.looks))
+    look = look_of_draw(tally.seed, spec.family, spec.seed, sorted(family.looks))
     qpos = load_trajectory(path, spec.trajectory_sha256)
     twin = load_trajectory(path, spec.twin.trajectory_sha256, "twin")
     result = with_look(spec, look, qpos, twin)

@@ -30,7 +30,7 @@ from traps_pipeline.scenes.picture.camera import fit_shot
 from traps_pipeline.scenes.worlds.outcome import Rejected, compile_scene, simulated
 from traps_pipeline.scenes.worlds.pace import lengths, shortened
 from traps_pipeline.scenes.worlds.shot import shot_of, shown_points
-from traps_pipeline.scenes.worlds.spec import SceneSpec, Twin, trajectory_digest
+from traps_pipeline.scenes.worlds.spec import SceneSpec, Twin, physics_record, trajectory_digest
 from traps_pipeline.scenes.worlds.world import World
 
 HOPELESS_SHARE = 0.9  # of the scouts; a scene whose true top share is 65 % looks like that less than once in 300 times
@@ -74,7 +74,7 @@ def resolve(
         family=family.name,
         seed=seed,
         params=plain(params_to_dict(params)),
-        physics=asdict(physics),
+        physics=physics_record(physics),
         camera=plain(asdict(control.camera)),
         void_kind=void_kind,
         void=plain({"cut_frame": frame} if occluder is None else {"panel": occluder, "hidden_from_frame": frame}),

@@ -10,7 +10,7 @@ import json
 import math
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -18,18 +18,21 @@ from typing import Any
 
 import numpy as np
 
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
 from traps_pipeline.base.workers import run_in_order
 from traps_pipeline.scenes.certification.certificates import settled_outcome
 from traps_pipeline.scenes.draw.likeness import excess_lookalike, frame_hash
 from traps_pipeline.scenes.draw.resolve import Resolved, resolve
-from traps_pipeline.scenes.family_registry import family_digest, fit_to_sample, get_family
+from traps_pipeline.scenes.family_registry import family_digest, family_names, fit_to_sample, get_family
+from traps_pipeline.scenes.parts.difficulty import USUAL, Difficulty, SceneDifficulty, draw_distractors, untakeable
 from traps_pipeline.scenes.parts.look import look_of_draw
 from traps_pipeline.scenes.parts.wording import draw_ill_posed
-from traps_pipeline.scenes.physics.kit import Family
+from traps_pipeline.scenes.physics.kit import Family, Physics, Scene, Wording
 from traps_pipeline.scenes.physics.simulate import replay
 from traps_pipeline.scenes.worlds.outcome import Rejected, compile_scene, simulated
 from traps_pipeline.scenes.worlds.pace import LATEST_SHARE, out_of_pace, settles_share
+from traps_pipeline.scenes.worlds.shot import shown_points
 from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory, save_trajectory
 
 MOST_DRAWS = 40  # for each scenario wanted; a family that needs more is not worth its time
@@ -49,6 +52,7 @@ class Tally:
     rejected: Counter[str] = field(default_factory=Counter)
     file: str = ""
     look: list[str] = field(default_factory=list)
+    difficulty: Difficulty = USUAL
 
 
 def load_tallies(released: Path) -> dict[str, Tally]:
@@ -57,7 +61,24 @@ def load_tallies(released: Path) -> dict[str, Tally]:
     if not path.is_file():
         return {}
     notes = json.loads(path.read_text(encoding="utf-8"))
-    return {name: Tally(**note | {"rejected": Counter(note["rejected"])}) for name, note in notes.items()}
+    return {
+        name: Tally(
+            **note | {"rejected": Counter(note["rejected"]), "difficulty": Difficulty(**note.get("difficulty", {}))}
+        )
+        for name, note in notes.items()
+    }
+
+
+def require_difficulty(names: Iterable[str], difficulty: Difficulty) -> None:
+    """Raise TrapsError naming families that cannot be drawn with the settings."""
+    lacking = {name: untakeable(get_family(name), difficulty) for name in names}
+    lacking = {name: settings for name, settings in lacking.items() if settings}
+    if lacking:
+        told = "; ".join(f"{name}: no --{', no --'.join(settings)}" for name, settings in sorted(lacking.items()))
+        able = [name for name in family_names() if not untakeable(get_family(name), difficulty)]
+        raise TrapsError(
+            f"some families cannot be drawn like this ({told}): name others with --families: {', '.join(able)}"
+        )
 
 
 def answer_quota(count: int, n_labels: float) -> int:
@@ -84,6 +105,7 @@ class Draw:
     number: int
     closed: frozenset[str]
     look: tuple[str, ...] = ()
+    difficulty: Difficulty = USUAL
 
 
 def sample_family(
@@ -93,6 +115,7 @@ def sample_family(
     released: Path,
     *,
     look: Collection[str] = (),
+    difficulty: Difficulty = USUAL,
     workers: int | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> Tally:
@@ -102,17 +125,20 @@ def sample_family(
     the places of records that were taken out (`take_out`); anything else of the family is replaced, as are records of
     another version of its file.
 
-    look: parts of the look (`look.PARTS`) that vary besides those that always do in the family. report: gets a line for
-    each record and for the first rejection of each kind. Raises RuntimeError with the tally of rejections when 40 draws
-    a scenario are not enough, TrapsError for an unfit family.
+    look: parts of the look (`look.PARTS`) that vary besides those that always do in the family. difficulty: of every
+    scene. report: gets a line for each record and for the first rejection of each kind. Raises RuntimeError with the
+    tally of rejections when 40 draws a scenario are not enough, TrapsError for a family that is unfit or cannot be
+    drawn with the difficulty.
     """
     family, records = fit_to_sample(name), Records(released, name)
+    require_difficulty([name], difficulty)
     tally, file, parts = load_tallies(released).get(name), family_digest(name), sorted({*family.looks, *look})
     if tally is not None and (tally.seed, tally.wanted) == (seed, count) and tally.file not in ("", file):
         report(f"{name}: its file was changed since its scenarios were drawn; all are drawn again")
         tally = None
-    if tally is None or (tally.seed, tally.wanted, tally.look) != (seed, count, parts):
-        tally = Tally(seed, count, file=file, look=parts)
+    drawn_as = (seed, count, parts, difficulty)
+    if tally is None or (tally.seed, tally.wanted, tally.look, tally.difficulty) != drawn_as:
+        tally = Tally(seed, count, file=file, look=parts, difficulty=difficulty)
         records.clear()
     specs = records.read(tally)
     answers = Counter(spec.ground_truth for spec in specs)
@@ -123,9 +149,12 @@ def sample_family(
     if not places:
         return tally
 
+    def full_answers() -> frozenset[str]:
+        return _full_answers(answers, count, family, difficulty.longer)
+
     def jobs() -> Iterator[Draw]:
         for number in range(tally.draws, MOST_DRAWS * count):
-            yield Draw(name, seed, number, _full_answers(answers, count, family), tuple(parts))
+            yield Draw(name, seed, number, full_answers(), tuple(parts), difficulty)
 
     reported: set[str] = set()  # kinds of rejections that the report has
     # A draw takes seconds, and those that were begun are waited for: no more than could all be wanted.
@@ -133,7 +162,7 @@ def sample_family(
     try:
         for draw, result in results:
             tally.draws += 1
-            if isinstance(result, Resolved) and result.spec.ground_truth in _full_answers(answers, count, family):
+            if isinstance(result, Resolved) and result.spec.ground_truth in full_answers():
                 result = f"answer {result.spec.ground_truth!r} has its quota"
             picture_hash = frame_hash(result.spec, result.qpos) if isinstance(result, Resolved) else 0
             if isinstance(result, Resolved) and (lookalike := excess_lookalike(hashes, picture_hash, count)):
@@ -228,7 +257,11 @@ def take_out(released: Path, reasons: Mapping[str, str]) -> None:
 
 def save_tallies(released: Path, tallies: Mapping[str, Tally]) -> None:
     """Write `draws.json`."""
-    notes = {name: vars(each) | {"rejected": dict(each.rejected)} for name, each in tallies.items()}
+    notes = dict[str, dict[str, Any]]()
+    for name, each in tallies.items():
+        notes[name] = {**vars(each), "rejected": dict(each.rejected), "difficulty": each.difficulty.settings()}
+        if each.difficulty == USUAL:
+            del notes[name]["difficulty"]
     write_text(released / DRAWS, json.dumps(notes, indent=1, sort_keys=True) + "\n")
 
 
@@ -237,16 +270,16 @@ def record_line(spec: SceneSpec) -> str:
     return json.dumps(spec.model_dump(mode="json"), ensure_ascii=False) + "\n"
 
 
-def _full_answers(answers: Counter[str], count: int, family: Family) -> frozenset[str]:
-    choices = _choices(family)
+def _full_answers(answers: Counter[str], count: int, family: Family, longer: bool = False) -> frozenset[str]:
+    choices = _choices(family, longer)
     return frozenset(answer for answer, n in answers.items() if n >= answer_quota(count, choices[answer]))
 
 
 @cache
-def _choices(family: Family) -> Mapping[str, float]:
+def _choices(family: Family, longer: bool = False) -> Mapping[str, float]:
     """Return how many choices each answer competes with, on average over many draws."""
     rng = np.random.default_rng(0)
-    choices_by_draw = [family.word(family.draw(rng), rng).labels for _ in range(_WORDED_DRAWS)]
+    choices_by_draw = [family.word(family.draw(rng, longer), rng).labels for _ in range(_WORDED_DRAWS)]
     shares = defaultdict[str, float](float)
     for labels in choices_by_draw:
         for label in labels:
@@ -257,18 +290,52 @@ def _choices(family: Family) -> Mapping[str, float]:
 
 def try_draw(draw: Draw) -> Resolved | str:
     """Return a draw, resolved, or the reason why it is rejected."""
-    family = get_family(draw.family)
-    rng = np.random.default_rng([draw.seed, *draw.family.encode(), draw.number])
-    params = family.draw(rng)
-    wording = family.word(params, rng)
-    params = replace(params, look=look_of_draw(draw.seed, draw.family, draw.number, draw.look))
     try:
-        answer = simulated_answer(family, params)
-        if answer in draw.closed:
-            return f"answer {answer!r} has its quota"
-        return resolve(family, params, wording, _NO_QUESTION, scenario_id=f"{family.name}-0000", seed=draw.number)
+        drawn = scene_of_draw(draw)
+        return resolve(
+            get_family(draw.family),
+            drawn.params,
+            drawn.wording,
+            _NO_QUESTION,
+            scenario_id=f"{draw.family}-0000",
+            seed=draw.number,
+            physics=drawn.physics,
+        )
     except Rejected as rejected:
         return str(rejected)
+
+
+@dataclass(frozen=True)
+class DrawnScene:
+    """What a draw gives before any pixel is looked at."""
+
+    params: Any
+    wording: Wording
+    physics: Physics
+
+
+def scene_of_draw(draw: Draw) -> DrawnScene:
+    """Return the scene of a numbered draw.
+
+    Raises Rejected where its answer has its quota or cannot be certified.
+    """
+    family = get_family(draw.family)
+    rng = np.random.default_rng([draw.seed, *draw.family.encode(), draw.number])
+    params = family.draw(rng, draw.difficulty.longer)
+    wording = family.word(params, rng)
+    params = replace(params, look=look_of_draw(draw.seed, draw.family, draw.number, draw.look))
+    physics = replace(family.physics, speed=draw.difficulty.speed)
+    if draw.difficulty.longer:
+        params = replace(params, difficulty=SceneDifficulty(longer=True))
+    answer, scene, points = simulated_scene(family, params, physics)
+    if answer in draw.closed:
+        raise Rejected(f"answer {answer!r} has its quota")
+    if draw.difficulty.distractors:
+        own = np.random.default_rng([draw.seed, *draw.family.encode(), draw.number, *b"distractors"])
+        duration_s = physics.duration_s * physics.speed
+        things = draw_distractors(own, draw.difficulty.distractors, scene, points, wording, params, duration_s)
+        params = replace(params, difficulty=SceneDifficulty(things, draw.difficulty.longer))
+    return DrawnScene(params, wording, physics)
 
 
 def _with_id(family: Family, resolved: Resolved, draw: Draw, place: int, texts: Counter[str], count: int) -> Resolved:
@@ -291,11 +358,20 @@ def ill_posed_for(spec: SceneSpec, seed: int, texts: Counter[str], count: int) -
 
 
 def simulated_answer(family: Family, params: Any) -> str:
-    """Return what a draw's control shows, in a second, before certificates cost more."""
-    model, scene = compile_scene(family, params, family.physics)
-    qpos = simulated(model, scene, family.physics)
-    outcome = settled_outcome(family, replay(model, qpos, family.physics), params)
+    """Return what the control of a draw shows."""
+    return simulated_scene(family, params, family.physics)[0]
+
+
+def simulated_scene(family: Family, params: Any, physics: Physics) -> tuple[str, Scene, np.ndarray]:
+    """Return what a draw's control shows, in a second, before certificates cost more.
+
+    Also return the scene, and points around all that it shows or covers, (N, 3).
+    """
+    model, scene = compile_scene(family, params, physics)
+    qpos = simulated(model, scene, physics)
+    outcome = settled_outcome(family, replay(model, qpos, physics), params)
     settled_at = settles_share(outcome.commit_frame, len(qpos))
     if settled_at > LATEST_SHARE:  # where it settles too early the clip will end earlier
         raise Rejected(str(out_of_pace(settled_at)))
-    return outcome.answer
+    covered = () if scene.cover is None else (scene.cover.corners(),)
+    return outcome.answer, scene, np.concatenate([shown_points(model, scene, qpos), *covered])

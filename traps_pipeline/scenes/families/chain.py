@@ -39,7 +39,7 @@ class Params:
     box_colour: str = PLAY()
     deck_colour: str = PLAIN()
     ramp_colour: str = PLAIN()
-    row: int = one_of(3, 4)  # balls in the row, the last one included
+    row: int = one_of(3, 4, longer=(5, 6))  # balls in the row, the last one included
     radius_m: float = between(0.046, 0.054)
     gap_m: float = between(0.030, 0.038)  # between two balls of the row
     start_m: float = between(0.06, 0.12)

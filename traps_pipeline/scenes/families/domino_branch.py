@@ -38,12 +38,12 @@ class Params:
     ball_colour: str = PLAY()
     left_colour: str = PLAY()
     right_colour: str = PLAY()
-    branch: int = one_of(3, 4)  # dominoes of either branch, the last one included
+    branch: int = one_of(3, 4, longer=(5, 6))  # dominoes of either branch, the last one included
     height_m: float = between(0.17, 0.21)
     width: float = between(0.46, 0.52)
     thickness: float = between(0.16, 0.19)
     spacing: float = between(0.68, 0.74)
-    visible: int = one_of(2, 3)  # dominoes before the hand-off
+    visible: int = one_of(2, 3, longer=(4, 5))  # dominoes before the hand-off
     angles_deg: tuple[float, float] = several_between(2, 55, 63)  # left and right branch
     gap_index: int = drawn_by(lambda rng, so_far: int(rng.integers(1, so_far["branch"] - 1)))  # what is hidden
     gap_side: str = hidden("left", "right")  # in which branch that domino lies beside

@@ -35,7 +35,7 @@ class Params:
     """Parameters; lengths without a unit in domino heights, direction +1: right."""
 
     direction: int = one_of(-1, 1)
-    concealed: int = one_of(3, 4)  # dominoes after the hand-off, the last one included
+    concealed: int = one_of(3, 4, longer=(5, 6))  # dominoes after the hand-off, the last one included
     first_colour: str = PLAY()
     row_colour: str = PLAY()
     last_colour: str = PLAY()
@@ -44,7 +44,7 @@ class Params:
     width: float = between(0.54, 0.66)
     thickness: float = between(0.16, 0.20)
     spacing: float = between(0.68, 0.74)
-    visible: int = one_of(3, 4)  # dominoes before the hand-off
+    visible: int = one_of(3, 4, longer=(5, 6))  # dominoes before the hand-off
     gap_index: int = drawn_by(lambda rng, so_far: int(rng.integers(1, so_far["concealed"] - 1)))  # what is hidden
     gap_open: bool = hidden(False, True)  # whether that domino lies beside the row
     starter_speed_m_s: float = between(0.50, 0.70)

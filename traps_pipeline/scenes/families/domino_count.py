@@ -20,13 +20,14 @@ from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import around, is_upper_half_in_place
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, either, how_many, range_of
 from traps_pipeline.scenes.parts.readings import Reading, still_from, top_m
-from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, facing, one_of
+from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, facing, is_longer, one_of
 from traps_pipeline.scenes.parts.vision import blobs, colour_mask, motion_mask
 from traps_pipeline.scenes.parts.wording import choices_in
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
 Ranges = tuple[tuple[int, int], ...]  # the choices: least and most dominoes of each
 RANGES: tuple[Ranges, ...] = (((1, 2), (3, 4), (5, 6)), ((1, 2), (3, 5), (6, 7)))
+LONGER_RANGES: tuple[Ranges, ...] = (((1, 3), (4, 6), (7, 9)), ((2, 4), (5, 7), (8, 9)))
 UPRIGHT = 1.8  # times as high as wide is a domino that stands
 GIVES = 0.2  # of a domino's picture: so much of one changes that falls
 FALLEN = 0.6  # of a domino's height: a top below it belongs to a fallen domino
@@ -35,7 +36,8 @@ PLAY = apart("red", "green", "blue", "yellow", "cyan", "purple")
 
 def _ranges(rng: np.random.Generator, so_far: Drawn) -> Ranges:
     """Draw the choices, then the right one of them, each as often."""
-    ranges = RANGES[int(rng.integers(len(RANGES)))]
+    pool = LONGER_RANGES if is_longer(so_far) else RANGES
+    ranges = pool[int(rng.integers(len(pool)))]
     so_far["right"] = ranges[int(rng.integers(len(ranges)))]
     return ranges
 
@@ -54,7 +56,7 @@ class Params:
     first_colour: str = PLAY()
     second_colour: str = PLAY()
     ball_colour: str = PLAY()
-    ranges: tuple[tuple[int, int], ...] = drawn_by(_ranges)
+    ranges: tuple[tuple[int, int], ...] = drawn_by(_ranges, longer=True)
     height_m: float = between(0.17, 0.21)
     width: float = between(0.54, 0.66)
     thickness: float = between(0.16, 0.20)

@@ -15,7 +15,7 @@ import numpy as np
 from traps_pipeline.scenes.parts.course import SHADOW_BACK, SHADOW_RIGHT, Course, Surface, brake
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import colours_of_balls
-from traps_pipeline.scenes.parts.questions import choice_of, comes_from, either, which_colour
+from traps_pipeline.scenes.parts.questions import choice_of, comes_from, which_colour
 from traps_pipeline.scenes.parts.readings import Reading, first_past
 from traps_pipeline.scenes.parts.vary import (
     Drawn,
@@ -24,11 +24,12 @@ from traps_pipeline.scenes.parts.vary import (
     drawn_by,
     facing,
     hidden_index,
+    is_longer,
     several_between,
     shuffled,
 )
 from traps_pipeline.scenes.parts.vision import blobs, colour_mask
-from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
+from traps_pipeline.scenes.physics.kit import AnswerableQuestion, Motion, Physics, Scene, listed
 
 DECK_M = 0.045  # height of the lanes; the tray lies lower, so that no ball rolls back into the tunnel
 TRAY_M = 0.015
@@ -42,7 +43,7 @@ PLAIN = shuffled("wood", "grey", "white")
 
 def _direction(rng: np.random.Generator, so_far: Drawn) -> int:
     """Draw the direction, and before it the number of lanes, which no field stores."""
-    so_far["lanes"] = int(rng.choice([2, 3, 3]))
+    so_far["lanes"] = 4 if is_longer(so_far) else int(rng.choice([2, 3, 3]))
     return int(rng.choice([-1, 1]))
 
 
@@ -50,7 +51,7 @@ def _direction(rng: np.random.Generator, so_far: Drawn) -> int:
 class Params:
     """Parameters by lane, front lane first; direction +1: to the right."""
 
-    direction: int = drawn_by(_direction)
+    direction: int = drawn_by(_direction, longer=True)
     tunnel_colour: str = PLAIN()
     deck_colour: str = PLAIN()
     tray_colour: str = PLAIN()
@@ -168,6 +169,12 @@ def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     return first[0] if len(first) == 1 else None
 
 
+def _how_many(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
+    numbers = ("2", "3") if len(p.colours) < 4 else ("3", "4")
+    question = f"How many balls roll into the tunnel, {listed(numbers)}?"
+    return AnswerableQuestion(question, numbers, str(len(p.colours)))
+
+
 FAMILY = scene_family(
     "hidden_race",
     category="hidden",
@@ -183,7 +190,7 @@ FAMILY = scene_family(
     ),
     asides=[
         comes_from("From which side do the balls roll in, left or right?"),
-        either("How many balls roll into the tunnel, 2 or 3?", ("2", "3"), lambda p: str(len(p.colours))),
+        _how_many,
         choice_of(
             "Which ball rolls in the lane nearest to the camera, {choices}?",
             choices=lambda p: p.colours,

@@ -36,7 +36,7 @@ class Params:
     """Parameters; direction +1: to the right. Only the top block's colour is unique."""
 
     direction: int = one_of(-1, 1)
-    blocks: int = one_of(3, 4)
+    blocks: int = one_of(3, 4, longer=(5,))
     top_colour: str = PLAY()
     ball_colour: str = PLAY()
     block_colours: tuple[str, ...] = PLAY(2)

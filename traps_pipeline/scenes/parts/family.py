@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from traps_pipeline.scenes.parts import vary
+from traps_pipeline.scenes.parts.difficulty import add_distractors, with_difficulty
 from traps_pipeline.scenes.parts.look import OF_OCCLUSION, apply_look, look_of, with_look
 from traps_pipeline.scenes.parts.observers import Observer
 from traps_pipeline.scenes.parts.questions import Aside, Question
@@ -67,7 +68,7 @@ def scene_family(
             return look(end, slots)
         return answer
 
-    params = with_look(params)
+    params = with_difficulty(with_look(params))
     return Family(
         name=name,
         taxonomy="chaotic" if twins is None else "occlusion",
@@ -75,8 +76,8 @@ def scene_family(
         sub_scenario=sub_scenario or name,
         answer_type=question.answer_type,
         params=params,
-        draw=lambda rng: vary.draw_params(params, rng),
-        build=lambda p, physics: apply_look(build(p, physics), look_of(p)),
+        draw=lambda rng, longer=False: vary.draw_params(params, rng, longer),
+        build=lambda p, physics: add_distractors(apply_look(build(p, physics), look_of(p)), p),
         outcome=outcome,
         word=lambda p, rng: question.word(p, rng, asides),
         questions=question.templates,

@@ -101,7 +101,7 @@ def which_colour(
     return Question("colour", templates, fill)
 
 
-NUMBERS = ("zero", "one", "two", "three", "four", "five", "six", "seven")
+NUMBERS = ("zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
 
 
 def range_of(ranges: Sequence[Sequence[int]], count: int) -> str | None:

@@ -33,6 +33,7 @@ Params = TypeVar("Params")
 
 _HOW, _COUNT, _HIDDEN = "how", "count", "hidden"  # keys of a field's metadata
 _RANGE, _VALUES = "range", "values"  # what is drawn: bounds of a number, or all values
+_LONGER = "longer"  # the values, where a draw asks for longer rows; key of what is drawn so far if it does
 
 
 # --- one field --------------------------------------------------------------------------------------------------------
@@ -42,7 +43,8 @@ def drawn_by(draw: Draw, **metadata: Any) -> Any:
     """Return a field that `draw(rng, so_far)` draws, where no other function does.
 
     `so_far` holds the fields above by name. `draw` may put further values into it for fields below: those are not
-    stored with the parameters. metadata: for `check`, the bounds (`range`) or the possible values (`values`).
+    stored with the parameters. metadata: for `check`, the bounds (`range`) or the possible values (`values`); `longer`,
+    those of a draw that asks for longer rows, or true if `draw` itself heeds `is_longer(so_far)`.
     """
     return field(metadata={_HOW: draw, **metadata})
 
@@ -59,9 +61,17 @@ def several_between(count: Count, low: float, high: float) -> Any:
     )
 
 
-def one_of(*values: Any) -> Any:
-    """Return one of these values, each as often: colours, -1 and 1, counts."""
-    return drawn_by(lambda rng, so_far: values[int(rng.integers(len(values)))], values=values)
+def one_of(*values: Any, longer: tuple[Any, ...] = ()) -> Any:
+    """Return one of these values, each as often: colours, -1 and 1, counts.
+
+    longer: the values instead, where a draw asks for longer rows.
+    """
+
+    def draw(rng: np.random.Generator, so_far: Drawn) -> Any:
+        pool = longer if longer and is_longer(so_far) else values
+        return pool[int(rng.integers(len(pool)))]
+
+    return drawn_by(draw, values=values, longer=longer)
 
 
 def chance(share: float) -> Any:
@@ -198,6 +208,9 @@ def _check_member(p: Any, each: Field[Any], value: Any) -> None:
             raise ValueError(f"parameter {each.name} is {_short_repr(value)}; it is drawn from {low} to {high}")
     hides = each.metadata.get(_HIDDEN)
     values = tuple(hides(vars(p))) if hides else each.metadata.get(_VALUES)
+    difficulty = getattr(p, "difficulty", None)
+    if difficulty is not None and difficulty.longer and isinstance(each.metadata.get(_LONGER), tuple):
+        values = each.metadata[_LONGER] or values
     if values is not None and value not in values:
         raise ValueError(f"parameter {each.name} is {_short_repr(value)}; it is one of {', '.join(map(str, values))}")
 
@@ -215,9 +228,22 @@ def _short_repr(value: Any) -> str:
 # --- all fields -------------------------------------------------------------------------------------------------------
 
 
-def draw_params(params: type[Params], rng: np.random.Generator) -> Params:
-    """Draw a scenario's parameters; defaults stay. Raises TypeError without a range."""
-    so_far: Drawn = {}
+def is_longer(so_far: Mapping[str, Any]) -> bool:
+    """Return whether the draw asks for longer rows."""
+    return _LONGER in so_far
+
+
+def can_be_longer(params: type) -> bool:
+    """Return whether some field has longer ranges."""
+    return any(each.metadata.get(_LONGER) for each in fields(params))
+
+
+def draw_params(params: type[Params], rng: np.random.Generator, longer: bool = False) -> Params:
+    """Draw a scenario's parameters; defaults stay. Raises TypeError without a range.
+
+    longer: draw from the longer ranges.
+    """
+    so_far: Drawn = {_LONGER: True} if longer else {}
     members = fields(params)  # type: ignore[arg-type]
     for each in members:
         if each.name in so_far or each.default is not MISSING:

@@ -61,6 +61,7 @@ class Physics:
     iterations: int = 100
     tolerance: float = 1e-10
     impratio: float = 10.0
+    speed: float = 1.0  # simulated seconds in a second of the clip: k times as fast is a scene of 1/k2 the size
 
     @property
     def n_frames(self) -> int:
@@ -70,9 +71,9 @@ class Physics:
     @property
     def substeps(self) -> int:
         """Simulation steps from one frame to the next."""
-        steps = 1.0 / (self.fps * self.timestep_s)
+        steps = self.speed / (self.fps * self.timestep_s)
         if abs(steps - round(steps)) > 1e-9:
-            raise ValueError(f"timestep {self.timestep_s} s does not divide a frame of {1 / self.fps} s")
+            raise ValueError(f"timestep {self.timestep_s} s does not divide a frame of {self.speed / self.fps} s")
         return round(steps)
 
 
@@ -216,7 +217,7 @@ class Family:
     """A scene family: its variation, construction and outcome (docs/spec.md 2.2).
 
     params: a frozen dataclass of plain values with units in the names.
-    draw(rng): parameters of one scenario.
+    draw(rng, longer=False): parameters of one scenario.
     build(params, physics): the scene. Draws nothing.
     outcome(motion, params): what a run comes to.
     word(params, rng): the question and its companions.
@@ -234,7 +235,7 @@ class Family:
     sub_scenario: str
     answer_type: AnswerType
     params: type
-    draw: Callable[[np.random.Generator], Any]
+    draw: Callable[..., Any]
     build: Callable[[Any, Physics], Scene]
     outcome: Callable[[Motion, Any], Reading]
     word: Callable[[Any, np.random.Generator], Wording]
@@ -246,9 +247,7 @@ class Family:
     twins: Callable[[Any], Sequence[Any]] | None = None
     looks: tuple[str, ...] = ()  # parts of the look (`look.PARTS`) that are drawn with every scenario
     perturbation: float = 1e-4  # chaotic: standard deviation of an initial-state perturbation (m, rad)
-    check: Callable[[Any], None] = lambda params: (
-        None
-    )  # raises ValueError where parameters from a file are not plausible
+    check: Callable[[Any], None] = lambda params: None  # raises ValueError where a file's parameters are not plausible
 
     def params_from(self, values: Mapping[str, Any]) -> Any:
         """Return parameters from a stored mapping. Raises ValueError naming a wrong one."""
@@ -375,7 +374,7 @@ def uniform(rng: np.random.Generator, low: float, high: float) -> float:
 
 
 # Pairs that a viewer may take for each other in shade, or that lean towards the navy of the occluder.
-_LOOK_ALIKE = (
+LOOK_ALIKE = (
     {"red", "orange"},
     {"orange", "yellow"},
     {"orange", "wood"},
@@ -390,7 +389,7 @@ def distinct_colours(rng: np.random.Generator, count: int, pool: Sequence[str]) 
     """Return `count` colours of the pool, no two of which look alike."""
     for _ in range(1000):
         chosen = tuple(str(c) for c in rng.permutation(list(pool))[:count])
-        if len(chosen) == count and not any(pair <= set(chosen) for pair in _LOOK_ALIKE):
+        if len(chosen) == count and not any(pair <= set(chosen) for pair in LOOK_ALIKE):
             return chosen
     raise ValueError(f"no {count} distinct colours among {list(pool)}; enlarge the pool")
 

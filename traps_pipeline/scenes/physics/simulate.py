@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def initial_velocity(model: mujoco.MjModel, velocity: Mapping[str, Sequence[float]]) -> np.ndarray:
-    """Return qvel at the start, (nv,): six numbers a free body, three a soft one."""
+    """Return qvel at the start, (nv,): a number for each freedom of a body, three a soft one."""
     qvel, soft = np.zeros(model.nv), flexes(model)
     for body, values in velocity.items():
         if body in soft:
@@ -23,7 +23,7 @@ def initial_velocity(model: mujoco.MjModel, velocity: Mapping[str, Sequence[floa
                 qvel[address : address + 3] = values[:3]
             continue
         address = model.body(body).dofadr[0]
-        qvel[address : address + 6] = values
+        qvel[address : address + len(values)] = values
     return qvel
 
 

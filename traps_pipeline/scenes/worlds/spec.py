@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -11,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.files import replacing
+from traps_pipeline.scenes.physics.kit import Physics
 
 Slug = r"^[a-z0-9_]+-[a-z0-9]+$"
 
@@ -35,6 +37,7 @@ class _Physics(_Strict):
     iterations: int = Field(ge=1, le=10_000)
     tolerance: float = Field(ge=0, le=1e-2)
     impratio: float = Field(ge=0.01, le=1000)
+    speed: float = Field(default=1.0, ge=1, le=10)
 
 
 class _Camera(_Strict):
@@ -186,6 +189,11 @@ class SceneSpec(BaseModel):
     def spec_hash(self) -> str:
         """Digest of the whole record."""
         return digest(self.model_dump(mode="json"))
+
+
+def physics_record(physics: Physics) -> dict[str, Any]:
+    """Return `kit.Physics` as a record has it: without a speed that is the usual one."""
+    return {name: value for name, value in asdict(physics).items() if name != "speed" or value != 1.0}
 
 
 _Part = TypeVar("_Part", bound=_Strict)

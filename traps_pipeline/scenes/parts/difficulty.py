@@ -1,0 +1,217 @@
+"""Make scenes harder to follow: distractors, faster events, longer rows.
+
+The settings belong to a draw (`traps benchmark sample`). What they come to in one scene is stored with its parameters,
+as `difficulty`, and its speed with its physics; a record without either is as scenes were before there were settings.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, make_dataclass, replace
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+
+import numpy as np
+from pydantic import ConfigDict, Field, StrictBool, TypeAdapter, ValidationError
+
+from traps_pipeline.protocol.datasets import EXTENSION_CATEGORIES
+from traps_pipeline.scenes.parts import vary
+from traps_pipeline.scenes.physics.kit import (
+    LOOK_ALIKE,
+    READ,
+    Family,
+    Inventory,
+    Scene,
+    Wording,
+    rgba,
+)
+
+if TYPE_CHECKING:
+    import mujoco
+
+Shape = Literal["ball", "puck"]
+Colour = Literal["red", "green", "blue", "yellow", "orange", "cyan", "purple"]
+DISTRACTOR = "distractor_"  # begins the name of a distractor's body and geom
+MOST_DISTRACTORS = 3
+SPEEDS = (1.0, 1.5, 2.0)  # each a whole number of simulation steps from frame to frame
+# The greatest speed of each family that takes one: most draws still show half a second of motion before the occluder
+# and settle after 0.8 s or more. In other families the certificates `referents` or `cut` would be lost.
+FASTEST: Mapping[str, float] = {
+    **dict.fromkeys(("balance", "behind_wall", "bounce", "chain", "domino_branch", "head_on", "hidden_collision"), 2.0),
+    **dict.fromkeys(("hidden_drop", "launch", "lever_gate", "roll_stop", "spinner", "under_bridge"), 2.0),
+    **dict.fromkeys(("pendulum", "slide", "stack", "topple", "tower", "transfer", "wedge_push"), 1.5),
+}
+RADIUS = 0.026, 0.030  # of a distractor, as a share of the scene's width
+LANE = 2.4  # radii from lane to lane: each distractor has one of its own, so that they pass each other
+PUCK_HALF = 0.45  # of its radius
+LEAST_DOWN_DEG = 8.0
+WAY = (0.5, 0.9)  # share of the scene's width that a distractor crosses
+BALL_COLOURS: tuple[Colour, ...] = get_args(Colour)
+
+
+@dataclass(frozen=True)
+class Difficulty:
+    """Settings of a draw.
+
+    distractors: how many. speed: how many times as fast everything happens. longer: rows, lanes and counts from the
+    longer ranges of their family.
+    """
+
+    distractors: int = 0
+    speed: float = 1.0
+    longer: bool = False
+
+    def settings(self) -> dict[str, Any]:
+        """Return the settings that are not the usual ones."""
+        return {name: value for name, value in asdict(self).items() if value != getattr(USUAL, name)}
+
+
+USUAL = Difficulty()
+
+
+def untakeable(family: Family, difficulty: Difficulty) -> list[str]:
+    """Return which of the settings a family cannot be drawn with.
+
+    Distractors move, and the board that closes a chaotic control must hide all that moves.
+    """
+    takes = {
+        "distractors": family.taxonomy == "occlusion" and family.category not in EXTENSION_CATEGORIES,
+        "speed": difficulty.speed <= FASTEST.get(family.name, 1.0),
+        "longer": vary.can_be_longer(family.params),
+    }
+    return [name for name in difficulty.settings() if not takes[name]]
+
+
+_PLAUSIBLE = ConfigDict(extra="forbid", allow_inf_nan=False)
+Metres = Annotated[float, Field(ge=-10, le=10)]
+
+
+@dataclass(frozen=True)
+class Distractor:
+    """A thing that crosses the floor before a scene and touches nothing.
+
+    It starts at `place_m` (right, away) and moves to the right at `speed_m_s` of simulated time.
+    """
+
+    __pydantic_config__ = _PLAUSIBLE
+    shape: Shape
+    colour: Colour
+    place_m: tuple[Metres, Metres]
+    radius_m: Annotated[float, Field(ge=0.01, le=0.2)]
+    speed_m_s: Metres
+
+
+@dataclass(frozen=True)
+class SceneDifficulty:
+    """What the settings of a draw come to in one scene."""
+
+    __pydantic_config__ = _PLAUSIBLE
+    distractors: Annotated[tuple[Distractor, ...], Field(max_length=MOST_DISTRACTORS)] = ()
+    longer: StrictBool = False
+
+    @staticmethod
+    def from_record(record: Mapping[str, Any]) -> SceneDifficulty:
+        """Read the difficulty in a record's parameters.
+
+        Raises ValueError for anything unknown or implausible.
+        """
+        try:
+            return TypeAdapter(SceneDifficulty).validate_python(record)
+        except ValidationError as error:
+            first = error.errors()[0]
+            raise ValueError(f"{'.'.join(map(str, ('difficulty', *first['loc'])))}: {first['msg']}") from None
+
+
+# --- drawing ----------------------------------------------------------------------------------------------------------
+
+
+def draw_distractors(
+    rng: np.random.Generator, count: int, scene: Scene, points: np.ndarray, wording: Wording, p: Any, duration_s: float
+) -> tuple[Distractor, ...]:
+    """Draw distractors for a simulated scene: pucks and balls in turn.
+
+    A puck has a named colour; a ball has a colour easily taken for a named one that no words of the scenario offer, and
+    rolls the scene's way from its beginning, so that whatever is asked of "the ball" has one answer. They hide nothing:
+    they are so far before the scene that the camera sees all of it over them, and so no shadow of it falls on them
+    either. points: (N, 3), around what the camera must show or the occluder hides. duration_s: simulated time of a
+    whole clip.
+    """
+    low, high, front = float(points[:, 0].min()), float(points[:, 0].max()), float(points[:, 1].min())
+    hides = 2 / np.tan(np.radians(max(-scene.view.elevation_deg, LEAST_DOWN_DEG)))  # so many radii behind a ball
+    most = RADIUS[1] * (high - low)
+    texts = (wording.question, wording.answerable_question.question)
+    words = {*re.findall(r"\w+", " ".join((*texts, *wording.answerable_question.labels, *wording.labels)).lower())}
+    asked = re.findall(r"\w+", wording.question)
+    coloured = dict.fromkeys((*asked, *scene.inventory.colours))
+    named = [colour for word in coloured for colour in BALL_COLOURS if colour == word]
+    taken = words | {*scene.inventory.colours}
+    things = list[Distractor]()
+    for number, lane in enumerate(rng.permutation(count)):
+        like = named[(number // 2) % len(named)]
+        near = [] if number % 2 == 0 else _like_and_free(like, taken | {thing.colour for thing in things})
+        shape: Shape = "ball" if near else "puck"
+        ahead = getattr(p, "direction", 0) if shape == "ball" else 0
+        radius, towards = rng.uniform(*RADIUS) * (high - low), ahead or int(rng.choice([-1, 1]))
+        way, begins = rng.uniform(*WAY), 0.0 if ahead else rng.uniform(0.0, 1.0)
+        room = high - low - 2 * radius
+        start = begins * (1 - way) * room
+        x = low + radius + start if towards > 0 else high - radius - start
+        y = front - most * (1 + hides + LANE * int(lane))
+        colour = near[int(rng.integers(len(near)))] if near else like
+        speed = towards * way * room / duration_s
+        things.append(Distractor(shape, colour, (round(x, 4), round(y, 4)), round(radius, 4), round(speed, 4)))
+    return tuple(things)
+
+
+def _like_and_free(colour: str, taken: Collection[str]) -> list[Colour]:
+    """Return free colours that are easily taken for a colour, else all free ones."""
+    free = [other for other in BALL_COLOURS if other not in taken]
+    return [other for other in free if {colour, other} in LOOK_ALIKE] or free
+
+
+# --- building ---------------------------------------------------------------------------------------------------------
+
+
+def with_difficulty(params: type) -> type:
+    """Return the same parameters with a last field `difficulty`, which no family draws."""
+    read = field(default=None, metadata={READ: lambda value: value and SceneDifficulty.from_record(value)})
+    named = make_dataclass(
+        params.__name__, [("difficulty", SceneDifficulty | None, read)], bases=(params,), frozen=True
+    )
+    named.__module__, named.__doc__ = params.__module__, params.__doc__
+    return named
+
+
+def add_distractors(scene: Scene, p: Any) -> Scene:
+    """Return a built scene with the distractors of its parameters.
+
+    Each slides along its lane at a constant speed, whatever happens in the scene.
+    """
+    difficulty: SceneDifficulty | None = getattr(p, "difficulty", None)
+    if difficulty is None or not difficulty.distractors:
+        return scene
+    velocity = dict(scene.velocity)
+    for number, thing in enumerate(difficulty.distractors):
+        name = f"{DISTRACTOR}{number}"
+        _add(scene.spec, name, thing)
+        velocity[name] = (thing.speed_m_s,)
+    inventory = _with_things(scene.inventory, difficulty.distractors)
+    return replace(scene, velocity=velocity, inventory=inventory)
+
+
+def _add(spec: mujoco.MjSpec, name: str, thing: Distractor) -> None:
+    import mujoco
+
+    ball = thing.shape == "ball"
+    half = thing.radius_m if ball else PUCK_HALF * thing.radius_m
+    body = spec.worldbody.add_body(name=name, pos=[*thing.place_m, half])
+    body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[1, 0, 0])
+    geom = body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_SPHERE if ball else mujoco.mjtGeom.mjGEOM_CYLINDER)
+    geom.size, geom.rgba = [thing.radius_m, 0 if ball else half, 0], rgba(thing.colour)
+    geom.contype = geom.conaffinity = 0
+
+
+def _with_things(inventory: Inventory, things: Sequence[Distractor]) -> Inventory:
+    colours = dict.fromkeys([*inventory.colours, *(thing.colour for thing in things)])
+    nouns = dict.fromkeys([*inventory.objects, *(thing.shape for thing in things)])
+    return replace(inventory, colours=tuple(colours), objects=tuple(nouns))
