@@ -145,7 +145,7 @@ def _print_local(costs: Sequence[Cost], card: str) -> None:
     hours = sum(cost.hours or 0.0 for cost in costs)
     rows.append(("all", "", f"{sum(cost.passes for cost in costs):,}", "", f"{hours:,.1f}", ""))
     print(f"\n{text_table(('on this machine', 'work', 'new', 'M tokens in, out', f'{card} hours', 'GB'), rows)}")
-    print("hours and GB are arithmetic, not measured: docs/mechanism.md#cost")
+    print("hours and GB are arithmetic, checked on one GPU: docs/mechanism.md#cost")
 
 
 def _dollars(amounts: tuple[float, float, float] | None) -> list[str]:

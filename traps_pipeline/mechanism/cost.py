@@ -1,7 +1,7 @@
 """Estimate passes, tokens, GPU-hours and memory of local models for `traps plan`.
 
-The estimate is arithmetic, not measurement: a pass takes 2 operations per parameter and token, and decoding steps are
-bound by the launch of each block's kernels or by reading the weights. docs/mechanism.md states the assumptions.
+The estimate is arithmetic: a pass takes 2 operations per parameter and token, and decoding steps are bound by the
+launch of each block's kernels or by reading the weights. Three constants were measured on one GPU (docs/mechanism.md).
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from traps_pipeline.models.local.vision_cache import MOST_BYTES
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.protocol.datasets import DATASETS, PROBED_ARMS, SIDES, sides_of, taxonomy_of
 from traps_pipeline.storage.media import MediaSpec
@@ -16,13 +17,13 @@ from traps_pipeline.storage.study import MechanismSettings
 
 TEXT_TOKENS = 220  # system prompt, question and chat template
 CLIP_S = 5.0
-REACHED = 0.4  # share of a card's operations that passes over prompts reach
-STEP_S = 0.7e-3  # per block and decoding step, for any number of rows
+REACHED = 0.28  # share of a card's operations that passes over prompts reach; measured
+STEP_S = 3.1e-3  # per block and decoding step, for any number of rows; measured
 NF4_TIMES = 2.0  # factor on time, since weights are unpacked at every use
 NF4_BYTES, BFLOAT16_BYTES = 0.6, 2.0  # per parameter
 ROWS = 64  # rows of a batch of answers
 WIDEST = 28  # numbers per token and unit of width at a block's peak
-GRAPH = 18  # numbers per token, block and unit of width that a backward pass keeps
+GRAPH = 22  # numbers per token, block and unit of width that a backward pass keeps; measured
 SOURCES = 4  # sources of patches: the other side, and three nulls
 
 
@@ -53,7 +54,10 @@ class Work:
 
 @dataclass(frozen=True)
 class Cost:
-    """The cost of work on a model; hours, gigabytes: None if its entry has no `size`."""
+    """The cost of work on a model; hours, gigabytes: None if its entry has no `size`.
+
+    gigabytes: what one prompt needs, with the features of cached clips; batches of answers take what else is free.
+    """
 
     model: str
     kind: str
@@ -103,5 +107,5 @@ def cost_of(entry: ModelEntry, media: MediaSpec, work: Work, card: Card, *, quan
     return Cost(
         entry.id, work.kind, passes, tokens_in, tokens_out,
         hours=seconds * (NF4_TIMES if quantised else 1.0) / 3600,
-        gigabytes=(weights + extra) / 1e9,
+        gigabytes=(weights + MOST_BYTES + extra) / 1e9,
     )  # fmt: skip
