@@ -12,10 +12,9 @@ docs/inside.ipynb walks through this; a test runs it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -24,7 +23,8 @@ import pandas as pd
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.mechanism.hook import Site, changing
-from traps_pipeline.mechanism.live_gate import Gate, Threshold, fitted_gate
+from traps_pipeline.mechanism.live_gate import Where, open_study
+from traps_pipeline.mechanism.live_gate import gate as gate
 from traps_pipeline.mechanism.other_probes import erased as erased
 from traps_pipeline.mechanism.other_probes import from_sklearn as from_sklearn
 from traps_pipeline.mechanism.other_probes import mean_difference as mean_difference
@@ -41,13 +41,6 @@ from traps_pipeline.storage.workspace import Workspace
 if TYPE_CHECKING:
     from torch import Tensor
     from torch.nn import Module
-
-Where = str | Path | Workspace
-
-
-def _workspace(where: Where) -> Workspace:
-    return where if isinstance(where, Workspace) else Workspace.open(Path(where))
-
 
 # --- states -----------------------------------------------------------------------------------------------------------
 
@@ -88,7 +81,7 @@ def load(
     layer: 0 for embeddings; `normed`: the last one after the final norm. datasets: some of those with states; all by
     default. Raises TrapsError if the study has no such states, model, layer or dataset.
     """
-    opened = _workspace(workspace)
+    opened = open_study(workspace)
     states = StoredStates.of(opened, Extraction(get_model(model).id, prompt))
     available = [*dict.fromkeys(states.items["dataset"])]
     unknown = sorted(set(datasets or ()) - set(available))
@@ -141,7 +134,7 @@ def protocol(
     datasets without features are left out. Columns: analysis, source, target, value (AUROC), low, high, n_voids,
     n_controls.
     """
-    opened = _workspace(workspace)
+    opened = open_study(workspace)
     states = StoredStates.of(opened, Extraction(get_model(model).id, prompt))
     mechanism = opened.study.mechanism
     settings = mechanism.probes if mechanism else ProbeSettings()
@@ -161,40 +154,6 @@ def protocol(
     run = ProbeRun(items, read, 1, 0, settings, seed, fit=fit)
     columns = ["analysis", "source", "target", "value", "low", "high", "n_voids", "n_controls"]
     return pd.DataFrame(run.comparable(0), columns=pd.Index(columns))
-
-
-# --- a gate -----------------------------------------------------------------------------------------------------------
-
-
-def gate(
-    workspace: Where,
-    model: str,
-    *,
-    source: str,
-    threshold: Threshold = "mid",
-    target: str = "",
-    layer: int | None = None,
-    prompt: str = "standard",
-    without: Collection[str] = (),
-) -> Gate:
-    """Return a gate for live use: `abstains(model, prompt)`, `answer(model, prompt)`.
-
-    model, prompt: a local model and its prompt. source: `one:DATASET`, `other datasets` (than the target) or `other
-    families`. threshold: mid, J or conformal. layer: default: that of the gate stage. without: scenarios, or families
-    as the gate stage names them (`occlusion:tunnel`), to hold out: without those of a fold, its decisions about that
-    fold equal the stage's. Raises TrapsError for a source without enough pairs, and for states that are means over a
-    part of the prompt.
-    """
-    extraction = Extraction(get_model(model).id, prompt)
-    return fitted_gate(
-        _workspace(workspace),
-        extraction,
-        source=source,
-        threshold=threshold,
-        target=target,
-        layer=layer,
-        without=without,
-    )
 
 
 # --- interventions ----------------------------------------------------------------------------------------------------
@@ -287,7 +246,7 @@ def direction(
 
     It has the class gap. Raises TrapsError if the study has no such direction.
     """
-    directions: Mapping[str, Any] = saved_directions(_workspace(workspace), Extraction(get_model(model).id, prompt))
+    directions: Mapping[str, Any] = saved_directions(open_study(workspace), Extraction(get_model(model).id, prompt))
     if dataset not in directions or kind not in directions[dataset].vectors:
         available = ", ".join(
             f"{name} ({', '.join(directions_of.vectors)})" for name, directions_of in directions.items()

@@ -114,9 +114,7 @@ def test_panel(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print_json(rows)
         return OK
-    print(
-        f"panel {name}: votes on answers that try to instruct the judge, {counted(len({*rows['attack']}), 'attack')}"
-    )
+    print(f"panel {name}: votes on answers that try to instruct the judge, {counted(len({*rows['attack']}), 'attack')}")
     print(summary(rows))
     print("held: right under the attack; flipped: right on the plain answer, wrong under the attack")
     print("broken: no valid vote under it; wrong_anyway: wrong on the plain answer")

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from traps_pipeline.models.local.vision_cache import MOST_BYTES
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.protocol.datasets import DATASETS, PROBED_ARMS, SIDES, sides_of, taxonomy_of
 from traps_pipeline.storage.media import MediaSpec
@@ -22,8 +23,8 @@ ATTENTION_S = 14e-9  # beside it, per block, step, row and token of its prompt
 NF4_TIMES = 2.0  # factor on time, since weights are unpacked at every use
 NF4_BYTES, BFLOAT16_BYTES = 0.6, 2.0  # per parameter
 ROWS = 64  # rows of a batch of answers
-WIDEST = 75  # numbers per token and unit of width at a block's peak
-GRAPH = 24  # numbers per token, block and unit of width that a backward pass keeps
+WIDEST = 28  # numbers per token and unit of width at a block's peak
+GRAPH = 22  # numbers per token, block and unit of width that a backward pass keeps
 SOURCES = 4  # sources of patches: the other side, and three nulls
 
 
@@ -54,7 +55,10 @@ class Work:
 
 @dataclass(frozen=True)
 class Cost:
-    """The cost of work on a model; hours, gigabytes: None if its entry has no `size`."""
+    """The cost of work on a model; hours, gigabytes: None if its entry has no `size`.
+
+    gigabytes: what one prompt needs, with the features of cached clips; batches of answers take what else is free.
+    """
 
     model: str
     kind: str
@@ -105,5 +109,5 @@ def cost_of(entry: ModelEntry, media: MediaSpec, work: Work, card: Card, *, quan
     return Cost(
         entry.id, work.kind, passes, tokens_in, tokens_out,
         hours=seconds * (NF4_TIMES if quantised else 1.0) / 3600,
-        gigabytes=(weights + extra) / 1e9,
+        gigabytes=(weights + MOST_BYTES + extra) / 1e9,
     )  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from traps_pipeline.base.errors import TrapsError
@@ -13,6 +14,7 @@ from traps_pipeline.mechanism.gating import chosen_layers, gate_items, gate_tabl
 from traps_pipeline.mechanism.probes import Scorer
 from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.models.local.capture import OF_PARTS, Pooling
+from traps_pipeline.models.registry import get_model
 from traps_pipeline.protocol.cells import Extraction
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.storage.workspace import Workspace
@@ -20,6 +22,7 @@ from traps_pipeline.storage.workspace import Workspace
 if TYPE_CHECKING:
     from traps_pipeline.models.local.adapter import LocalModel, Prompt
 
+Where = str | Path | Workspace
 ABSTENTION = "I don't know: this cannot be determined from the video."
 Threshold = Literal["mid", "J", "conformal"]
 
@@ -51,22 +54,31 @@ class Gate:
         return ABSTENTION if self.abstains(model, prompt) else model.generate([prompt], max_new_tokens)[0].text
 
 
-def fitted_gate(
-    workspace: Workspace,
-    extraction: Extraction,
+def open_study(where: Where) -> Workspace:
+    """Return the workspace at a place, or the one given."""
+    return where if isinstance(where, Workspace) else Workspace.open(Path(where))
+
+
+def gate(
+    workspace: Where,
+    model: str,
     *,
     source: str,
-    threshold: Threshold,
+    threshold: Threshold = "mid",
     target: str = "",
     layer: int | None = None,
+    prompt: str = "standard",
     without: Collection[str] = (),
 ) -> Gate:
-    """Return a gate of a source of `gate.SOURCES`, fitted on the study's states.
+    """Return a gate for live use: `abstains(model, prompt)`, `answer(model, prompt)`.
 
-    target: the dataset that `other datasets` leaves out. layer: default: that of the gate stage. without: scenarios, or
-    families as `gate.families` names them, to hold out. Raises TrapsError for another source or threshold, for a source
-    without both sides in as many scenarios as there are folds, and for states that are means over a part of the prompt.
+    model, prompt: a local model and its prompt. source: `one:DATASET`, `other datasets` (than the target) or `other
+    families`. threshold: mid, J or conformal. layer: default: that of the gate stage. without: scenarios, or families
+    as the gate stage names them (`occlusion:tunnel`), to hold out: without those of a fold, its decisions about that
+    fold equal the stage's. Raises TrapsError for another source or threshold, for a source without both sides in as
+    many scenarios as there are folds, and for states that are means over a part of the prompt.
     """
+    workspace, extraction = open_study(workspace), Extraction(get_model(model).id, prompt)
     states, settings = StoredStates.of(workspace, extraction), workspace.mechanism
     if threshold not in THRESHOLDS:
         raise TrapsError(f"no threshold {threshold!r}; there are {', '.join(THRESHOLDS)}")

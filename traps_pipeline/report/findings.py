@@ -133,8 +133,8 @@ def doses_among_nulls(results: Results) -> Iterator[str]:
 def _cell(row: dict[str, Any]) -> str:
     moved = "more" if row["side"] == "control" else "fewer"
     return (
-        f"{SHORT[row['target']]} at {row['dose']:g} {row['unit']}, where {in_percent(row['effect'])} {moved} of "
-        f"{row['n']} {row['side']}s are abstained on"
+        f"{SHORT[row['target']]} at {row['dose']:g} {row['unit']} along its direction of {row['directions']} states, "
+        f"where {in_percent(row['effect'])} {moved} of {row['n']} {row['side']}s are abstained on"
     )
 
 
