@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import AsyncIterator, Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 from functools import partial
 from itertools import islice
@@ -270,18 +270,6 @@ class Writer:
         content = _Content.of(row, beside)
         future = self._database.submit(lambda batch: self.add(batch, content, paid_by))
         await asyncio.shield(asyncio.wrap_future(future))  # store what was paid for even if the caller is cancelled
-        self._is_synced = False
-
-    async def write_all(self, rows: Iterable[Mapping[str, Any]]) -> None:
-        """Add many rows as `write` does, in one transaction."""
-        pending = iter(rows)
-        while some := [_Content.of(row, None) for row in islice(pending, _FETCHED)]:
-
-            def change(batch: Batch, some: Sequence[_Content] = some) -> None:
-                for content in some:
-                    self.add(batch, content, ())
-
-            await asyncio.wrap_future(self._database.submit(change))
         self._is_synced = False
 
     def add(self, batch: Batch, content: _Content, paid_by: Sequence[str]) -> None:
