@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.report.test_inside import Made
+from tests.build.controls import Made
 from tools.pocket.claims import CLAIMS, markdown
 from tools.pocket.commands import MECHANISM
 from tools.pocket.inside import read_figures

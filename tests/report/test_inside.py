@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from functools import cached_property
-from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
@@ -13,18 +10,7 @@ from typing import cast
 import pandas as pd
 import pytest
 
-from traps_pipeline.mechanism.control_rows import (
-    GATE,
-    ITEM_SCORES,
-    LENS,
-    PATCHING,
-    PROBE_BASELINES,
-    RISK_COVERAGE,
-    SENTENCES,
-    STEERING_NULLS,
-)
-from traps_pipeline.mechanism.effects import own_effects
-from traps_pipeline.mechanism.mechanism_rows import PROBES, STEERING_EFFECTS
+from tests.build.controls import Made, effects, gate, patching, probes
 from traps_pipeline.report import publish, study_results
 from traps_pipeline.report.cards import Sources
 from traps_pipeline.report.catalogue import FIGURE_REPORTS, INSIDE
@@ -36,117 +22,7 @@ from traps_pipeline.report.tables.patching_tables import patching as patching_ta
 from traps_pipeline.report.tables.steering_tables import steering as steering_tables
 from traps_pipeline.report.writing import PrintedTable
 from traps_pipeline.storage.study import Layers, MechanismSettings, Study
-from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
-
-ABOUT = {"model": "m", "prompt": "standard", "epoch": "e"}
-
-
-def frame(table: Table, *rows: Mapping[str, object]) -> pd.DataFrame:
-    return pd.DataFrame([{**ABOUT, **row} for row in rows]).reindex(columns=pd.Index(table.names))
-
-
-def probes() -> pd.DataFrame:
-    sides = {"n_voids": 16, "n_controls": 16, "layer": 3, "chosen": True, "own_best": True}
-    rows = [
-        {"analysis": a, "source": s, "target": t, "value": 0.98, "low": 0.79, "high": 1.0} | sides
-        for s, t, a in (("chaotic", "chaotic", "held_out"), ("chaotic", "occlusion", "transfer"),
-                        ("chaotic", "chaotic_time_swapped", "time_swapped"))
-    ]  # fmt: skip
-    guided = rows[0] | {"prompt": "guided", "value": 0.96}
-    return frame(PROBES, *rows, rows[0] | {"layer": 1, "chosen": False, "value": 0.2}, guided)
-
-
-def baselines() -> pd.DataFrame:
-    rows = []
-    for analysis, target in (("held_out", "chaotic"), ("time_swapped", "chaotic_time_swapped")):
-        for features, value in (("time stamps", 1.0), ("output margin", 0.9), ("noise", 0.5)):
-            row = {"analysis": analysis, "source": "chaotic", "target": target, "features": features, "value": value}
-            rows.append(row | {"spread": 0.1 if features == "noise" else None})
-    return frame(PROBE_BASELINES, *rows)
-
-
-def gate() -> pd.DataFrame:
-    figures = {"acc": 0.8, "false_abs": 0.1, "abs_rec": 0.9, "pecs": 0.64, "pecs_low": 0.5, "pecs_high": 0.7}
-    plain = {"plain_acc": 0.9, "plain_false_abs": 0.0, "plain_abs_rec": 0.5, "plain_pecs": 0.45}
-    at = {"regime": "guided", "source": "other datasets", "threshold": "mid", "layer": 3, "expected_false_abs": 0.05}
-    row = at | figures | plain | {"n_controls": 64, "n_voids": 64}
-    kinds = product(("states", "question words"), ("all", "chaotic"))
-    rows = [row | {"features": features, "target": target} for features, target in kinds]
-    decoys = at | {"features": "states", "target": "decoy", "false_abs": 0.4, "n_controls": 8, "n_voids": 0}
-    return frame(GATE, *rows, decoys)
-
-
-def curves() -> pd.DataFrame:
-    point = {"regime": "guided", "coverage": 0.5, "risk": 0.2, "n": 5}
-    return frame(RISK_COVERAGE, *(point | {"features": name} for name in ("states", "no gate")))
-
-
-def patching() -> pd.DataFrame:
-    row = {"dataset": "chaotic", "into": "control", "site": "residual", "layer": 0, "group": "stamps"}
-    row |= {"low": 0.9, "high": 1.1, "n": 6, "n_left_out": 1, "tokens": 6.0}
-    estimated = row | {"source": "pair", "group": "last", "attributed": 0.4, "effect": None}
-    own = row | {"source": "pair", "attributed": 0.8, "effect": 0.99}
-    return frame(PATCHING, own, estimated, row | {"source": "same side", "effect": 0.01})
-
-
-def item_scores() -> pd.DataFrame:
-    """Two voids, both answered: states rank them above both controls, the output between them."""
-    scored = (("void", 2.0, -3.0), ("void", 1.0, -1.0), ("control", -1.0, -2.0), ("control", -4.0, -4.0))
-    about = {"dataset": "chaotic", "abstained_standard": False}
-    rows = [about | {"item_id": str(n), "side": s, "own": own, "margin": m} for n, (s, own, m) in enumerate(scored)]
-    return frame(ITEM_SCORES, *rows)
-
-
-def sentences() -> pd.DataFrame:
-    """Of the same items, how likely abstentions are: of the first void least, of the second as of the first control."""
-    scored = (-3.0, -1.0, -1.0, -2.0)
-    rows = [{"item_id": str(n), "abstention": abstention, "own": -0.5} for n, abstention in enumerate(scored)]
-    return frame(SENTENCES, *rows)
-
-
-def lens() -> pd.DataFrame:
-    at = {("standard", 1): (-4, -5), ("guided", 1): (-4, -5), ("standard", 2): (-6, -9), ("guided", 2): (1, -8)}
-    rows = [
-        {"dataset": "chaotic", "prompt": prompt, "layer": layer, "voids": float(voids), "controls": float(controls)}
-        for (prompt, layer), (voids, controls) in at.items()
-    ]
-    return frame(LENS, *rows)
-
-
-def nulls() -> pd.DataFrame:
-    row = {"directions": "standard", "regime": "guided", "target": "chaotic", "layer": 3, "unit": "gap", "dose": 1.0}
-    row |= {"side": "control", "null": "isotropic", "effect": 0.8, "null_mean": 0.1, "null_lowest": 0.0}
-    return frame(STEERING_NULLS, row | {"null_highest": 0.3, "draws": 20, "n_at_least": 0, "p": 1 / 21, "n": 5})
-
-
-def effects() -> pd.DataFrame:
-    along = {"directions": "standard", "regime": "guided", "source": "chaotic", "target": "chaotic", "layer": 3}
-    doses = (("alpha", 0.0, 0.0), ("alpha", 10.0, 10.0), ("gap", 0.0, 0.0), ("gap", 1.0, 200.0))
-    kinds = (("void", 0), ("isotropic", 0), ("isotropic", 1))
-    rows = [
-        along
-        | {"kind": kind, "draw": draw, "side": side, "unit": unit, "dose": dose, "alpha": alpha}
-        | {"signs": "label", "abstention": dose / 10, "n": 5}
-        for (kind, draw), side, (unit, dose, alpha) in product(kinds, ("control", "void"), doses)
-    ]
-    return frame(STEERING_EFFECTS, *rows)
-
-
-class Made(Results):
-    """Results with rows of every control."""
-
-    source, is_study = "made up", True
-    prompted_probes = cached_property(lambda _: probes())
-    prompted_baselines = cached_property(lambda _: baselines())
-    gate = cached_property(lambda _: gate())
-    risk_coverage = cached_property(lambda _: curves())
-    patching = cached_property(lambda _: patching())
-    item_scores = cached_property(lambda _: item_scores())
-    lens = cached_property(lambda _: lens())
-    sentences = cached_property(lambda _: sentences())
-    nulls = cached_property(lambda _: nulls())
-    own_effects = cached_property(lambda _: own_effects(effects()))
 
 
 def cells(table: PrintedTable) -> list[dict[str, str]]:
