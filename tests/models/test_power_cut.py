@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import shutil
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from tests.build.asking import LEFT, TEN, Answering, ask, kept
+from tests.build.asking import TEN, Answering, ask, kept
 from traps_pipeline.models import ask as asking
 from traps_pipeline.models.request import Outcome, Request
+
+OnDisk = Callable[[], list[str]]
 
 
 @pytest.fixture
@@ -19,34 +24,40 @@ def study(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def disk(study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The study as the last sync of its ledger's log left it."""
-    fsync, left = os.fsync, tmp_path / "disk"
+def on_disk(study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> OnDisk:
+    """The items whose answers the ledger has in a copy made as its log was last synced."""
+    fsync, copies = os.fsync, list[Path]()
 
     def syncing(descriptor: int) -> None:
         fsync(descriptor)
         if Path(f"/proc/self/fd/{descriptor}").readlink().name.endswith("-wal"):
-            shutil.copytree(study, left, ignore=shutil.ignore_patterns("*-shm"), dirs_exist_ok=True)
+            copy = tmp_path / f"disk-{len(copies)}"
+            shutil.copytree(study, copy, ignore=shutil.ignore_patterns("*-shm"))
+            copies.append(copy)
 
     monkeypatch.setattr(os, "fsync", syncing)
-    return left
+    return lambda: kept(copies[-1]) if copies else []
 
 
-def test_no_answer_of_a_finished_cell_is_lost(study: Path, disk: Path) -> None:
+def test_no_answer_of_a_finished_cell_is_lost(study: Path, on_disk: OnDisk) -> None:
     ask(study, Answering(), TEN)
-    assert len(kept(disk)) == len(TEN)
+    assert len(on_disk()) == len(TEN)
 
 
-def test_a_run_that_goes_on_loses_only_its_last_moments(
-    study: Path, disk: Path, monkeypatch: pytest.MonkeyPatch
+def test_while_a_call_is_out_the_answers_that_came_before_are_safe(
+    study: Path, on_disk: OnDisk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(asking, "SYNC_S", 0.01)
-    left: list[int] = []
+    safe = list[int]()
 
-    def says(request: Request, _: int) -> Outcome:
-        if request.about["item_id"] == "item-9":
-            left.append(len(kept(disk)))
-        return LEFT
+    class LastIsOut(Answering):
+        async def ask(self, request: Request) -> Outcome:
+            if request.about["item_id"] == "item-9":
+                until = time.monotonic() + 30
+                while len(on_disk()) < 9 and time.monotonic() < until:
+                    await asyncio.sleep(0.02)
+                safe.append(len(on_disk()))
+            return await super().ask(request)
 
-    ask(study, Answering(says, after_s=0.2), TEN)
-    assert left[0] >= 4  # the first four had come back long before
+    ask(study, LastIsOut(), TEN)
+    assert safe == [9]
