@@ -94,16 +94,18 @@ def _print_precision(pairs: Mapping[str, int], models: int) -> None:
         text = (
             f"\nprecision with {counted(sum(pairs.values()), 'pair')}: a model with Acc {acc}, AbsRec {abs_rec}, "
             f"FalseAbs {false_abs} (PECS {middling.pecs:.2f}) gets a 95 % interval of PECS about {expected.width:.3f} "
-            f"wide; of two models with unrelated answers {_difference(expected.difference)} is found in 80 % of studies"
+            f"wide; {_power(expected.difference, 'two models with unrelated answers')}"
         )
         if models > 2:
-            among = f"of {models} models, after Holm's correction over their {comb(models, 2)} pairs"
-            text += f"\n{among}: {_difference(expected.among_all)}"
+            all_models = f"two of {models} models, after Holm's correction over their {comb(models, 2)} comparisons"
+            text += f"\n{_power(expected.among_all, all_models)}"
         print(wrapped(text))
 
 
-def _difference(least: float | None) -> str:
-    return "no difference (too few pairs)" if least is None else f"a difference of {least:.3f}"
+def _power(least: float | None, models: str) -> str:
+    if least is None:
+        return f"the pairs are too few for 80 % of studies to find a difference between {models}"
+    return f"80 % of studies find a difference of {least:.3f} between {models}"
 
 
 def _print_forecasts(forecasts: Sequence[Forecast], minutes: float) -> None:

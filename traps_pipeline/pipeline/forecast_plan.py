@@ -107,8 +107,9 @@ def make_plan(workspace: Workspace | None, experiment: Experiment, study: Study,
     if judge is None:
         return Plan(calls, uncertain, forecasts, None, steered, pairs, local)
     labels = _count_labels(workspace, experiment, judge)
-    cost = forecast(judge, labels.new, Experience(prompt_tokens=LABEL_TOKENS))
-    forecasts.append(replace(cost, participant="confabulation labels"))
+    if labels.new:
+        cost = forecast(judge, labels.new, Experience(prompt_tokens=LABEL_TOKENS))
+        forecasts.append(replace(cost, participant="confabulation labels"))
     return Plan(calls, uncertain, forecasts, labels, steered, pairs, local)
 
 
