@@ -1,0 +1,6 @@
+# The names that this project uses, with their types: to infer them from the source takes pyright minutes.
+import numpy as np
+from numpy.typing import ArrayLike
+
+def expit(x: ArrayLike, /) -> np.ndarray: ...
+def chdtrc(v: ArrayLike, x: ArrayLike, /) -> np.ndarray: ...
