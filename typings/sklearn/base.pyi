@@ -1,4 +1,4 @@
-# The names that this project uses, with their types: to infer them from the source takes pyright minutes.
+# What this project imports, since pyright would take minutes to infer it from the source: add what you need.
 from typing import Self
 
 import numpy as np

@@ -1,1 +1,1 @@
-# The names that this project uses, with their types: to infer them from the source takes pyright minutes.
+# What this project imports, since pyright would take minutes to infer it from the source: add what you need.
