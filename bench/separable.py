@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -162,7 +162,7 @@ def decisions(items: pd.DataFrame, held_out: str, folds: int) -> Decisions:
     ill_posed = void & items["dataset"].str.endswith("_ill_posed").to_numpy()
     clip, groups = items.filter(regex=r"^f\d+$").to_numpy(float), items[held_out].to_numpy()
     words = CountVectorizer(ngram_range=(1, 2), binary=True, max_features=WORDS)
-    text = cast(Any, words.fit_transform(items["question"])).toarray().astype(float)
+    text = words.fit_transform(items["question"]).toarray().astype(float)
     abstains = {rule: np.zeros(len(items), bool) for rule in RULES}
     for train, test in GroupKFold(min(folds, len(set(groups)))).split(clip, groups=groups):
         train = train[~inferred[train]]

@@ -86,6 +86,7 @@ def commit(message: str, folder: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, input=message, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.slow
 def test_a_message_in_the_form_of_the_page_is_committed(tmp_path: Path) -> None:
     for message in (
         "Add a column for retries",
@@ -99,6 +100,7 @@ def test_a_message_in_the_form_of_the_page_is_committed(tmp_path: Path) -> None:
         assert (finished.returncode, finished.stderr) == (0, ""), message
 
 
+@pytest.mark.slow
 def test_another_message_is_refused_by_the_rule_that_it_breaks(tmp_path: Path) -> None:
     for message, rule in {
         **dict.fromkeys(("Added a column", "Adds a column", "Adding a column"), "imperative"),

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -27,6 +28,7 @@ SCENES = (
 )  # fmt: skip
 
 
+@cache
 def files() -> dict[str, Path]:
     """Every file of the package by its module's name."""
     named = {}
@@ -36,18 +38,23 @@ def files() -> dict[str, Path]:
     return named
 
 
-def imported(source: str, known: Mapping[str, Path]) -> Iterator[tuple[int, str]]:
-    """Line and module of each import of ours in a file, wherever in the file it stands."""
+@cache
+def imports() -> dict[str, list[tuple[int, str]]]:
+    """Line and module of each import of ours, wherever in a file it stands, by the name of the module that imports."""
+    return {module: [*_imported(path.read_text(encoding="utf-8"))] for module, path in files().items()}
+
+
+def _imported(source: str) -> Iterator[tuple[int, str]]:
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0 and node.module, f"line {node.lineno}: name the package in an import"
             whole = [f"{node.module}.{alias.name}" for alias in node.names]
-            names = [name if name in known else node.module for name in whole]
+            names = [name if name in files() else node.module for name in whole]
         else:
             continue
-        yield from ((node.lineno, name) for name in names if name in known)
+        yield from ((node.lineno, name) for name in names if name in files())
 
 
 def room_of(module: str) -> str:
@@ -70,12 +77,12 @@ def test_contributing_lists_the_rooms_from_top_to_bottom() -> None:
 
 def upwards(below: str, order: Sequence[str]) -> list[str]:
     """Imports of a folder above one's own, of all modules below a package whose folders lie in this order."""
-    known = {module: path for module, path in files().items() if module.startswith(f"{below}.")}
     height, deep = {folder: number for number, folder in enumerate(order)}, below.count(".") + 1
     return [
-        f"{path.relative_to(PACKAGE)}:{line} imports {name}"
-        for module, path in known.items()
-        for line, name in imported(path.read_text(encoding="utf-8"), known)
+        f"{files()[module].relative_to(PACKAGE)}:{line} imports {name}"
+        for module, found in imports().items()
+        for line, name in found
+        if module.startswith(f"{below}.") and name.startswith(f"{below}.")
         if height[name.split(".")[deep]] > height[module.split(".")[deep]]
     ]
 
@@ -90,11 +97,7 @@ def test_no_folder_of_the_scenes_imports_one_above_it() -> None:
 
 
 def test_no_files_import_each_other_in_a_circle() -> None:
-    known = files()
-    graph = {
-        module: {name for _, name in imported(path.read_text(encoding="utf-8"), known)}
-        for module, path in known.items()
-    }
+    graph = {module: {name for _, name in found} for module, found in imports().items()}
     try:
         TopologicalSorter(graph).prepare()
     except CycleError as error:

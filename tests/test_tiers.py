@@ -60,20 +60,23 @@ def test_a_shard_that_there_is_not_is_refused(shard: str) -> None:
 @pytest.mark.parametrize(
     ("selection", "complete", "passed", "failed"),
     [
-        ("promise or not slow", False, {"test_quick", "test_promise"}, {"test_dear"}),
+        (tiers.PROMISED, False, {"test_quick", "test_promise"}, {"test_dear"}),
         ("slow and not promise", False, {"test_slow"}, set()),
-        ("not slow and not promise", True, {"test_quick"}, {"test_dear", "test_lacking"}),
+        (tiers.FAST, True, {"test_quick"}, {"test_dear", "test_lacking"}),
     ],
 )
 def test_a_tier_has_its_tests_and_fails_those_that_are_too_dear_or_lack_something(
     selection: str, complete: bool, passed: set[str], failed: set[str], tmp_path: Path
 ) -> None:
     (tmp_path / "test_tier.py").write_text(TESTS)
+    if selection in (tiers.FAST, tiers.PROMISED):
+        (tmp_path / "test_heavy.py").write_text("import pytest\npytestmark = pytest.mark.slow\nassert not 'imported'\n")
     (tmp_path / "pytest.ini").write_text("[pytest]\nmarkers =\n  slow: x\n  promise: x\n")
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("PYTEST", "TRAPS"))}
     environment |= {"PYTHONPATH": str(ROOT)} | ({tiers.COMPLETE: "1"} if complete else {})
     command = [sys.executable, "-c", RUN, tmp_path, "-m", selection]
     finished = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert "imported" not in finished.stdout
     lines = [line.split() for line in finished.stdout.splitlines() if line.startswith(("PASSED ", "FAILED "))]
     assert {words[1].partition("::")[2] for words in lines if words[0] == "PASSED"} == passed, finished.stdout
     assert {words[1].partition("::")[2] for words in lines if words[0] == "FAILED"} == failed, finished.stdout

@@ -6,6 +6,7 @@ marked `slow`. A test that uses one of the `SERVICES` is slow by itself.
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import re
@@ -23,6 +24,7 @@ UNKNOWN_S = 5.0  # CPU seconds that a file without a measurement is taken to nee
 SERVICES = {"demo", "small", "shared_provider", "page", "stored", "whole", "postgres", "s3", "tiny_disk"}
 FAST_S = 5.0  # CPU seconds of a test of `make check`, on the machine on which `LOOP_S` was measured
 LOOP_S = 0.011  # CPU seconds of `_loop` there
+FAST, PROMISED = "not slow and not promise", "promise or not slow"  # what `make check` and `make test` choose
 COMPLETE = "TRAPS_TEST_ALL"  # set by `make test` and `make campaign`: only skips that are listed here are accepted
 ACCEPTED_SKIPS = {
     r"needs Node": "the explorer's unit tests are for machines that have it; continuous integration does",
@@ -91,6 +93,17 @@ def of_shard(items: list[pytest.Item], shard: str) -> list[pytest.Item]:
         costs[unit] += known.get(file, UNKNOWN_S)
     chosen = {*shards(costs, int(match[2]))[int(match[1]) - 1]}
     return [item for item in items if units[file_of(item)] in chosen]
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Import no file of which `make check` or `make test` runs nothing: many import torch, which takes seconds."""
+    chosen = config.option.markexpr
+    if chosen not in (FAST, PROMISED) or not collection_path.match("test_*.py"):
+        return None
+    text = collection_path.read_text(encoding="utf-8")
+    if "pytest.mark.slow" not in text or (chosen == PROMISED and "pytest.mark.promise" in text):
+        return None
+    return any(ast.unparse(line) == "pytestmark = pytest.mark.slow" for line in ast.parse(text).body) or None
 
 
 @pytest.hookimpl(wrapper=True)

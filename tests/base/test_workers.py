@@ -22,6 +22,7 @@ def who(job: int) -> int:
     return os.getpid()
 
 
+@pytest.mark.slow
 def test_a_worker_gives_way_after_so_many_jobs_also_where_it_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(workers, "JOBS_A_WORKER", 3)
     with kept_workers():

@@ -78,6 +78,7 @@ def test_only_the_planted_cue_tells_control_from_void(
     assert (rows.loc[sorted(silent), "accuracy"] == 0.5).all(), rows
 
 
+@pytest.mark.slow
 def test_no_interval_of_the_figure_goes_beyond_what_a_share_can_be(table: pd.DataFrame) -> None:
     figure = shortcut_figure(table.assign(half_width=0.4))
     ends = [x for bars in figure.axes[0].collections for segment in bars.get_segments() for x, _ in segment]  # type: ignore[attr-defined]

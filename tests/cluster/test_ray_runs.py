@@ -241,6 +241,7 @@ def test_a_run_that_says_why_it_failed_did_not_break_off(error: Exception) -> No
         assert is_broken_off(run, failures) == isinstance(error, ConnectionError)
 
 
+@pytest.mark.slow
 def test_a_process_whose_run_was_resumed_elsewhere_ends_without_a_word(tmp_path: Path) -> None:
     with dg.DagsterInstance.local_temp(str(tmp_path)) as instance:
         run = instance.create_run_for_job(_nothing)

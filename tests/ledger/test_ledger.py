@@ -203,6 +203,7 @@ def test_an_import_whose_second_evaluation_is_taken_over_midway_stores_nothing(
     assert ledger.evaluations() == []
 
 
+@pytest.mark.slow
 def test_what_was_kept_survives_the_kill_of_its_writer_and_another_one_goes_on(place: Place) -> None:
     with place.process(WRITE) as process:
         told = [line_of(process) for _ in range(200)]
@@ -217,6 +218,7 @@ def test_what_was_kept_survives_the_kill_of_its_writer_and_another_one_goes_on(p
     assert len(ledger.read("m").rows) == len(kept) + 1
 
 
+@pytest.mark.slow
 def test_rows_kept_after_another_process_has_ended_survive_a_kill(tmp_path: Path) -> None:
     place = Place(("sqlite", str(tmp_path)))
     with place.process(KEEP) as keeping:
@@ -308,6 +310,7 @@ def test_a_row_that_cannot_be_written_is_told_and_the_others_are_kept(tmp_path: 
     assert len(ledger.read("m").rows) == stored + 1
 
 
+@pytest.mark.slow
 def test_a_ledger_in_a_folder_that_cannot_be_written_is_read() -> None:
     folder = Path(tempfile.mkdtemp(dir="/tmp"))  # others may enter it, as they may not enter pytest's
     write(local(folder), answer("a", "left"))
@@ -342,6 +345,7 @@ def test_the_lock_of_a_run_whose_file_is_removed_lets_no_call_go(tmp_path: Path)
         asyncio.run(scenario())
 
 
+@pytest.mark.slow
 def test_two_evaluations_are_written_by_two_processes_at_the_same_time(place: Place) -> None:
     with place.process(WRITE) as other:
         assert line_of(other) == "k0"

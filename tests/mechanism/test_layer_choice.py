@@ -50,6 +50,8 @@ def test_a_layer_is_chosen_where_probes_carry_over_although_all_layers_separate_
     assert transfer[transfer["layer"] == 1]["value"].mean() < 0.7  # where the maximum within a dataset is first reached
 
 
+@pytest.mark.slow
+@pytest.mark.promise
 def test_the_curve_and_its_ties_are_printed(saturated: pd.DataFrame) -> None:
     table, notes = layer_curves(saturated)
     assert table["layer"].tolist() == [*range(LAYERS)] and table["n_at_top"].tolist() == [0, 4, 4, 4, 4, 4]

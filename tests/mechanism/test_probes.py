@@ -268,6 +268,7 @@ def test_a_target_label_never_influences_a_fit() -> None:
     assert (of_target["chosen"] == of_target["chosen_after"]).all()  # the source's choice saw no target label
 
 
+@pytest.mark.slow
 def test_shared_controls_flatter_pairs_of_one_taxonomy_unless_their_scenario_is_held_out() -> None:
     """Pure noise, the same control items in both datasets of a taxonomy, fewer rows than columns."""
     items, states = study(pairs=15)

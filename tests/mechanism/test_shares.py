@@ -64,6 +64,7 @@ def test_its_interval_is_as_wide_as_the_scenarios_are_few() -> None:
     assert control["low"] == 0.0 and 0.4 < control["high"] < 0.9
 
 
+@pytest.mark.slow
 def test_of_64_answers_without_an_abstention_the_interval_keeps_a_width() -> None:
     scenarios = tuple(f"s{k}" for k in range(1, 65))  # none of them is s0, which abstains
     rows = pd.DataFrame(share_rows(*study(scenarios), resamples=2000))

@@ -48,6 +48,7 @@ def spender(folder: Path, *arguments: str) -> subprocess.Popen[str]:
     return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
 
+@pytest.mark.slow
 def test_processes_that_spend_at_once_share_one_cap_to_the_cent(folder: Path) -> None:
     calls = [int(process.communicate()[0]) for process in [spender(folder, name) for name in "abc"]]
     # 7 cents a call until less than ten are left; calls in flight of the others may leave up to 20 cents more unused.

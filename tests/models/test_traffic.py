@@ -138,6 +138,7 @@ def test_more_than_ten_errors_in_a_hundred_calls_stop_a_model() -> None:
             breaker.watch(ERROR if n % 2 else ANSWER)
 
 
+@pytest.mark.slow
 def test_connections_that_a_shell_does_not_allow_are_refused_before_anything_is_sent() -> None:
     asking = """
 import resource

@@ -99,6 +99,7 @@ def test_a_damaged_table_waits_for_nothing_but_what_is_above_it(study: Workspace
     assert Lineage(study).waits("metrics", "chaotic")
 
 
+@pytest.mark.slow
 def test_damage_and_a_loss_are_reported_again_after_a_restart_of_the_daemon(study: Workspace, tmp_path: Path) -> None:
     path, cell, graph = study.tables.path(VERDICTS, CELL), NAME.partition("/")[2], the_graph()
     with dg.DagsterInstance.local_temp(str(tmp_path)) as instance:

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pandas as pd
+import pytest
 
 from tests.build.latex import latex_cells
 from traps_pipeline.report.writing import (
@@ -122,6 +123,7 @@ def test_a_table_without_rows_says_not_run_and_why_everywhere():
     assert len(pd.read_parquet(io.BytesIO(files["t.parquet"]))) == 0
 
 
+@pytest.mark.slow
 def test_files_have_the_same_bytes_on_a_second_build():
     assert table_files(table()) == table_files(table())
     with figure_style():

@@ -120,6 +120,7 @@ def test_a_released_control_is_closed_and_one_that_closes_too_early_or_too_late_
     ]
 
 
+@pytest.mark.slow
 def test_an_occluder_that_is_too_small_or_beside_the_outcome_closes_nothing() -> None:
     spec = load_released()[BOARD]
     assert spec.control is not None

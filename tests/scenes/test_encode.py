@@ -73,6 +73,7 @@ def test_a_clip_is_checked_by_size_and_digest(clip: Path) -> None:
         check_clip(clip, digest, size)
 
 
+@pytest.mark.slow
 def test_a_flipped_bit_in_a_clips_note_is_never_believed(tmp_path: Path) -> None:
     clip = tmp_path / "void.mp4"
     save_clip(clip, frames(3), 10, leaked_pixels=0.25)

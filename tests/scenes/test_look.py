@@ -127,6 +127,7 @@ def test_an_occluder_of_slats_or_tiles_has_thin_paler_lines_and_is_as_opaque() -
     assert 0 == paler["plain"] < paler["slats"] < paler["tiles"] < 0.3 * on_occluder
 
 
+@pytest.mark.slow
 def test_a_frame_of_720_lines_shows_the_same_scene_twice_as_fine_and_counts_the_same_pixels() -> None:
     case = load("bounce-0001")
     world = World.of_record(case.spec, case.qpos)

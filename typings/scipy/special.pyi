@@ -1,0 +1,6 @@
+# What this project imports, since pyright would take minutes to infer it from the source: add what you need.
+import numpy as np
+from numpy.typing import ArrayLike
+
+def expit(x: ArrayLike, /) -> np.ndarray: ...
+def chdtrc(v: ArrayLike, x: ArrayLike, /) -> np.ndarray: ...
