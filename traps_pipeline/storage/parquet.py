@@ -170,7 +170,7 @@ class TableStore:
                 state = State(**json.loads(footer))
             else:
                 state, names = _footer_of(self._store.here(path))
-            return state if names == table.arrow_schema().names else None
+            return state if names == table.names else None
         except (pa.ArrowException, OSError, KeyError, ValueError, TypeError) as error:
             raise _unreadable(path, table, error) from error
 
