@@ -9,6 +9,7 @@ import sys
 import textwrap
 import unicodedata
 from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any, TextIO
 
 from traps_pipeline.base.redaction import redact
@@ -106,3 +107,24 @@ def text_table(headings: Sequence[str], rows: Iterable[Sequence[object]], left: 
     lines = io.StringIO()
     Console(file=lines, width=_WIDE, force_terminal=styled).print(table)
     return redact("\n".join(line.rstrip() for line in lines.getvalue().splitlines()) + hidden)
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """A table with its title and notes before it is laid out; a JSON object holds it.
+
+    absence: is printed instead of rows, unless it is empty. left: the left-aligned columns, by index.
+    """
+
+    title: str
+    headings: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    left: Sequence[int]
+    absence: str
+    notes: Sequence[str]
+
+    def text(self) -> str:
+        """Return title, table and notes for standard output, like `text_table`."""
+        table = wrapped(plain(self.absence)) if self.absence else text_table(self.headings, self.rows, self.left)
+        notes = [wrapped(plain(note)) for note in self.notes]
+        return "\n".join([wrapped(plain(self.title)), "", table, *([""] if notes else []), *notes]) + "\n"

@@ -61,14 +61,16 @@ class Ledger:
 
     # --- reading ------------------------------------------------------------------------------------------------------
 
-    def read(self, evaluation: str, wanted: Collection[str] | None = None) -> EvaluationRows:
+    def read(self, evaluation: str, wanted: Collection[str] | None = None, *, naming: str = "") -> EvaluationRows:
         """Return the rows of an evaluation; with `wanted`, parse and hold only those keys.
+
+        naming: parse and hold only rows in which this text occurs, such as an item's id.
 
         If a key has several rows the newest counts, but a failure never replaces an answer. Damaged rows, and values
         that no table can hold, are noted and ignored. Raises TrapsError.
         """
         rows = EvaluationRows()
-        for place, row, note in self._parsed(evaluation, wanted):
+        for place, row, note in self._parsed(evaluation, wanted, naming.encode()):
             if note:
                 rows.notes[place] = note
             if row is not None:
@@ -148,10 +150,12 @@ class Ledger:
             yield from self._select(query.where(ROWS.c.key.in_(some)))
 
     def _parsed(
-        self, evaluation: str, keys: Collection[str] | None
+        self, evaluation: str, keys: Collection[str] | None, naming: bytes = b""
     ) -> Iterator[tuple[str, dict[str, Any] | None, str | None]]:
         """Yield each row's place, the row, and a note about it."""
         for entry in self._rows(evaluation, keys):
+            if naming not in entry.content:
+                continue
             if not _is_whole(entry):
                 yield self._place(entry), None, f"{NOT_WHOLE}: it is not believed; its answer is asked again"
                 continue
