@@ -18,7 +18,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging import panel as judging
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.judging.panel import collect_votes
-from traps_pipeline.judging.verdicts import decide, decide_cell
+from traps_pipeline.judging.verdicts import decide, decide_cells
 from traps_pipeline.models.judges import JudgeEntry
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.scoring.metrics import cell_metrics
@@ -140,7 +140,9 @@ def vote(workspace: Workspace) -> pd.DataFrame:
     ((cell, made),) = collect_votes(workspace, [CELL])
     assert cell == CELL and len(made.rows(VOTES)) == 2 * 3 * 27
     workspace.tables.write(VOTES, CELL.partition, made.rows(VOTES), {}, failed=made.tally.errors)
-    workspace.tables.write(VERDICTS, CELL.partition, decide_cell(workspace, CELL), {})
+    (rows,) = decide_cells(workspace, [CELL]).values()
+    assert isinstance(rows, pd.DataFrame)
+    workspace.tables.write(VERDICTS, CELL.partition, rows, {})
     return workspace.tables.read(VERDICTS, CELL.partition)
 
 

@@ -201,7 +201,11 @@ class TableStore:
 
     def read(self, table: Table, partition: Mapping[str, Any], columns: Sequence[str] | None = None) -> pd.DataFrame:
         """Return one partition. Raises TrapsError naming a missing file and its stage."""
-        return self._load(table, self.path(table, partition), columns).to_pandas()
+        return self.arrow(table, partition, columns).to_pandas()
+
+    def arrow(self, table: Table, partition: Mapping[str, Any], columns: Sequence[str] | None = None) -> pa.Table:
+        """Return `read` as an Arrow table."""
+        return self._load(table, self.path(table, partition), columns)
 
     def records(
         self, table: Table, partition: Mapping[str, Any], columns: Sequence[str] | None = None
