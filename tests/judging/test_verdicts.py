@@ -119,6 +119,22 @@ def test_a_response_to_an_item_that_is_gone_is_refused_by_name() -> None:
         decide(items.iloc[:0], responses, vote_rows(["yyy"]))
 
 
+def test_a_cell_whose_votes_lack_an_answer_is_named_and_the_others_are_decided(tmp_path: Path) -> None:
+    others = [Cell("occlusion", Evaluation("oracle", regime, 1)) for regime in ("guided", "json")]
+    answers = {(number, side): "It goes left." for number in range(2) for side in ("control", "void")}
+    workspace = answered_study(tmp_path, dict.fromkeys((CELL, *others), answers))
+    for cell, made in collect_votes(workspace, [CELL, *others]):
+        votes = made.rows(VOTES)
+        workspace.tables.write(VOTES, cell.partition, votes[1:] if cell == others[0] else votes, {})
+    decided = decide_cells(workspace, [CELL, *others])
+    assert isinstance(error := decided.pop(others[0]), TrapsError) and others[0].key in str(error)
+    assert {cell: {*rows["regime"]} for cell, rows in decided.items() if isinstance(rows, pd.DataFrame)} == {
+        CELL: {"standard"},
+        others[1]: {"json"},
+    }
+    assert [len(rows) for rows in decided.values()] == [4, 4]
+
+
 # --- over HTTP --------------------------------------------------------------------------------------------------------
 
 
