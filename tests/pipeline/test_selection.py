@@ -13,7 +13,7 @@ from traps_pipeline.pipeline.run import dagster_history
 from traps_pipeline.storage.workspace import Workspace
 
 # What takes longest to import, and what a command that reads footers and one item needs none of.
-HEAVY = {"dagster", "litellm", "matplotlib", "pandas", "scipy", "traps_pipeline.scenes.physics.kit"}
+HEAVY = {"dagster", "litellm", "matplotlib", "pandas", "rich.console", "scipy", "traps_pipeline.scenes.physics.kit"}
 PROGRAM = "import sys; from traps_pipeline.cli import main; code = main(sys.argv[1:]); "
 pytestmark = pytest.mark.slow
 
