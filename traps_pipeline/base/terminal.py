@@ -30,6 +30,8 @@ def visible(text: str) -> str:
     Line ends and tabs stay, and so do an emoji's variation selector and joiner. Every page and every value for Dagster
     passes through here; the type (`Markup`) is preserved.
     """
+    if text.isascii() and text.isprintable():  # most of a page's values, for which no expression need run
+        return text
     return type(text)(_HIDDEN.sub(_number, text)) if _HIDDEN.search(text) else text
 
 
@@ -54,6 +56,8 @@ def plain(text: object) -> str:
 
 
 def _printable(text: str) -> str:
+    if text.isprintable():
+        return text
     return "".join(c if c.isprintable() else " " if c in "\n\t" else "?" for c in text)
 
 
