@@ -337,13 +337,15 @@ def _verified(path: Path) -> bytes:
 def _footer_of(path: Path) -> tuple[State, list[str]]:
     """Return a file's footer and column names, cached until the file changes.
 
-    A run reads each of hundreds of footers dozens of times. Raises as `_verified`; KeyError, ValueError or TypeError
-    for a file without a footer.
+    A run reads each of hundreds of footers dozens of times. Raises as `_verified`, or KeyError without a footer.
     """
+    import pyarrow.parquet as pq
+
     stamp = _stamp(path.stat())
     if (cached := _FOOTERS.get(path)) is None or cached[0] != stamp:
         content = _verified(path)
-        names = _json_behind(content, _COLUMNS) if _COLUMNS in content else _names_in(content)
+        older = _COLUMNS not in content  # written before the names stood there
+        names = pq.ParquetFile(_sound_bytes(path)).schema_arrow.names if older else _json_behind(content, _COLUMNS)
         cached = _FOOTERS[path] = stamp, State(**_json_behind(content, _STATE, len(_STATE))), names
     return cached[1], cached[2]
 
@@ -354,14 +356,6 @@ def _json_behind(content: bytes, mark: bytes, within: int = 0) -> Any:
         raise KeyError(mark)
     text = content[place + len(mark) - within :].decode("latin-1")  # JSON is ASCII here, what follows is not
     return json.JSONDecoder().raw_decode(text)[0]
-
-
-def _names_in(content: bytes) -> list[str]:
-    """Return the names of the columns of a file that was written before they stood beside its footer."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    return pq.ParquetFile(pa.BufferReader(content)).schema_arrow.names
 
 
 def altered(path: Path) -> str:
