@@ -37,15 +37,14 @@ def explain(workspace: Workspace, item_id: str) -> dict[str, Any]:
         truth = current["ground_truth"] if current["side"] == "control" else "none, it is void"
         clip = str(workspace.resolve(current["clip"]))
         explanation |= {"question": current["question"], "ground_truth": truth, "clip": clip}
-    asked = {*workspace.answers.evaluations()}
+    answered = workspace.answers.naming(item_id)
     for model, entry in load_models().items():
         for regime in REGIMES:
             for run in range(1, entry.runs + 1):
                 evaluation = Evaluation(model, regime, run)
-                if evaluation.key not in asked:
+                if evaluation.key not in answered:
                     continue
-                named = workspace.answers.read(evaluation.key, naming=item_id).rows.values()
-                rows = [row for row in named if _about(row) == item_id]
+                rows = [row for row in answered[evaluation.key].rows.values() if _about(row) == item_id]
                 if not rows:
                     continue
                 request = answer_request(workspace, entry, current, evaluation) if current else None
