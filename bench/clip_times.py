@@ -65,7 +65,8 @@ def work() -> None:
     from traps_pipeline.benchmark.composition import load_composition
     from traps_pipeline.benchmark.records import load_released
     from traps_pipeline.scenes.certification.certify_record import certify
-    from traps_pipeline.scenes.worlds.clips import Job, read_clip, render_pair
+    from traps_pipeline.scenes.worlds.clip_notes import read_clip
+    from traps_pipeline.scenes.worlds.clips import Job, render_pair
     from traps_pipeline.scenes.worlds.spec import load_trajectory
 
     specs, package = load_released(), Path(str(traps_pipeline.__file__)).resolve().parent

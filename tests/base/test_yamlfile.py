@@ -100,7 +100,7 @@ def test_an_ambiguous_line_is_named(file: Path, line: str) -> None:
     file.write_text(f'{{"a": "\\ud83d\\ude00 [[[["}}\n{line}\n')
     lines = read_lines(file)
     assert next(lines)[0] == 1
-    with raises(TrapsError, "base.yamlfile._check_line", "file.yaml:2") as raised:
+    with raises(TrapsError, "base.yamlfile.check_line", "file.yaml:2") as raised:
         next(lines)
     assert len(str(raised.value)) < 400 + len(str(file))
 

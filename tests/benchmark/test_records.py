@@ -12,7 +12,7 @@ import pytest
 from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import RELEASED
-from traps_pipeline.benchmark.records import load_release, load_released
+from traps_pipeline.benchmark.records import load_release, load_released, released_lines
 from traps_pipeline.benchmark.versions import item_content, spec_record, version_of
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.worlds.spec import load_trajectory
@@ -36,6 +36,7 @@ def write(tmp_path: Path, *lines: dict[str, Any] | str) -> Path:
 def fresh_cache() -> Iterator[None]:
     yield
     load_released.cache_clear()
+    released_lines.cache_clear()
 
 
 def test_records_are_loaded_by_id_and_blank_lines_do_not_matter(tmp_path: Path) -> None:
@@ -80,12 +81,12 @@ def test_a_line_that_is_no_record_names_its_file_and_line(tmp_path: Path, line: 
 
 def test_an_id_that_occurs_twice_names_the_second_line(tmp_path: Path) -> None:
     one, two = records()
-    with raises(TrapsError, "benchmark.records.load_released", "some.jsonl"):
+    with raises(TrapsError, "benchmark.records.released_lines", "some.jsonl"):
         load_released(write(tmp_path, one, two, one))
 
 
 def test_a_folder_without_records_says_what_to_do(tmp_path: Path) -> None:
-    with raises(TrapsError, "benchmark.records.load_released"):
+    with raises(TrapsError, "benchmark.records.released_lines"):
         load_released(tmp_path)
 
 

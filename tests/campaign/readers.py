@@ -14,7 +14,7 @@ from tests.conftest import ROOT
 from tools.pocket.recipe import load_recipe
 from traps_pipeline.benchmark.composition import load_composition
 from traps_pipeline.benchmark.corrections import fold, read_corrections
-from traps_pipeline.benchmark.records import load_release, load_released
+from traps_pipeline.benchmark.records import load_release, load_released, released_lines
 from traps_pipeline.exchange.answer_exchange import checked_answers
 from traps_pipeline.judging.confabulation_protocol import load_protocol
 from traps_pipeline.judging.robustness import load_attacks
@@ -138,7 +138,9 @@ def readers(scratch: Path) -> dict[str, Reader]:
             lambda folder: load_recipe(folder / "recipe.yaml"),
         ),
         "records": Reader(
-            "bounce.jsonl", _few(SPECS / "released" / "bounce.jsonl"), lambda folder: load_released.__wrapped__(folder)
+            "bounce.jsonl",
+            _few(SPECS / "released" / "bounce.jsonl"),
+            lambda folder: [line.spec for line in released_lines.__wrapped__(folder).values()],
         ),
         "corrections": Reader("review.jsonl", CORRECTIONS, _corrected),
         "answers": Reader("answers.jsonl", ANSWERS, lambda folder: checked_answers(folder / "answers.jsonl", WANTED)),

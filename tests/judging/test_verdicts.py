@@ -18,7 +18,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging import panel as judging
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.judging.panel import collect_votes
-from traps_pipeline.judging.verdicts import decide, decide_cell
+from traps_pipeline.judging.verdicts import decide, decide_cells
 from traps_pipeline.models.judges import JudgeEntry
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.scoring.metrics import cell_metrics
@@ -119,6 +119,22 @@ def test_a_response_to_an_item_that_is_gone_is_refused_by_name() -> None:
         decide(items.iloc[:0], responses, vote_rows(["yyy"]))
 
 
+def test_a_cell_whose_votes_lack_an_answer_is_named_and_the_others_are_decided(tmp_path: Path) -> None:
+    others = [Cell("occlusion", Evaluation("oracle", regime, 1)) for regime in ("guided", "json")]
+    answers = {(number, side): "It goes left." for number in range(2) for side in ("control", "void")}
+    workspace = answered_study(tmp_path, dict.fromkeys((CELL, *others), answers))
+    for cell, made in collect_votes(workspace, [CELL, *others]):
+        votes = made.rows(VOTES)
+        workspace.tables.write(VOTES, cell.partition, votes[1:] if cell == others[0] else votes, {})
+    decided = decide_cells(workspace, [CELL, *others])
+    assert isinstance(error := decided.pop(others[0]), TrapsError) and others[0].key in str(error)
+    assert {cell: {*rows["regime"]} for cell, rows in decided.items() if isinstance(rows, pd.DataFrame)} == {
+        CELL: {"standard"},
+        others[1]: {"json"},
+    }
+    assert [len(rows) for rows in decided.values()] == [4, 4]
+
+
 # --- over HTTP --------------------------------------------------------------------------------------------------------
 
 
@@ -140,7 +156,9 @@ def vote(workspace: Workspace) -> pd.DataFrame:
     ((cell, made),) = collect_votes(workspace, [CELL])
     assert cell == CELL and len(made.rows(VOTES)) == 2 * 3 * 27
     workspace.tables.write(VOTES, CELL.partition, made.rows(VOTES), {}, failed=made.tally.errors)
-    workspace.tables.write(VERDICTS, CELL.partition, decide_cell(workspace, CELL), {})
+    (rows,) = decide_cells(workspace, [CELL]).values()
+    assert isinstance(rows, pd.DataFrame)
+    workspace.tables.write(VERDICTS, CELL.partition, rows, {})
     return workspace.tables.read(VERDICTS, CELL.partition)
 
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from traps_pipeline.cli.run_commands import _print_results
 from traps_pipeline.pipeline.graph import the_graph
 from traps_pipeline.pipeline.wanted import StudyPartitions
+from traps_pipeline.report.printed_board import printed_board
 from traps_pipeline.storage.study import Asked, Study
 from traps_pipeline.storage.workspace import Workspace
 
@@ -29,8 +29,6 @@ def test_a_study_without_pairs_wants_no_table_of_pairs(
     assert {"verdicts", "graded", "report_page"} <= wanted
 
 
-def test_a_run_without_pairs_ends_with_a_sentence_in_place_of_the_leaderboard(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    _print_results(Workspace.create(tmp_path / "study", Study(scenarios=["plinko-0001"])))
-    assert capsys.readouterr().out.startswith("no leaderboard: no pairs were asked")
+def test_a_run_without_pairs_ends_with_a_sentence_in_place_of_the_leaderboard(tmp_path: Path) -> None:
+    board = printed_board(Workspace.create(tmp_path / "study", Study(scenarios=["plinko-0001"])))
+    assert board.startswith("no leaderboard: no pairs were asked")

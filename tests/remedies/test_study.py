@@ -23,7 +23,7 @@ from traps_pipeline.pipeline.stages import judging_stages, scoring_stages
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.release.content import content_of
 from traps_pipeline.report.explorer.answer_shards import study_items
-from traps_pipeline.scenes.worlds.clips import read_clip
+from traps_pipeline.scenes.worlds.clip_notes import read_clip
 from traps_pipeline.servers.annotate import Annotation
 from traps_pipeline.servers.review import Review
 from traps_pipeline.storage.benchmark_tables import ITEMS
@@ -76,7 +76,7 @@ def damaged(workspace: Workspace, experiment: Experiment) -> list[Callable[[], A
         refused(lambda: list(answer_exchange._wanted_votes(workspace, experiment)), "exchange.answer_exchange"),
         refused(lambda: build_items(workspace, "occlusion"), "benchmark.items"),
         refused(lambda: content_of(workspace), "release.content.content_of"),
-        refused(lambda: read_clip(note.with_suffix(".mp4")), "scenes.worlds.clips.read_note", error=DamagedClip),
+        refused(lambda: read_clip(note.with_suffix(".mp4")), "scenes.worlds.clip_notes.read_note", error=DamagedClip),
     ]
     clip.unlink()
     note.unlink()

@@ -13,7 +13,7 @@ from tests.conftest import ROOT, Checkout
 from tests.remedies.remedied import remedied
 from traps_pipeline.scenes.worlds import clip_cache
 from traps_pipeline.scenes.worlds.clip_cache import VARIABLE, ClipCache
-from traps_pipeline.scenes.worlds.clips import note_of, read_clip, save_clip
+from traps_pipeline.scenes.worlds.clip_notes import note_of, read_clip, save_clip
 
 SCENE = "a" * 64
 ONE_SCENARIO = "name: one\npanel: rules\nmodels: [oracle]\nscenarios: [hidden_race-0001]\n"

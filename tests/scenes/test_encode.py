@@ -22,7 +22,7 @@ from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.physics.kit import Physics
 from traps_pipeline.scenes.picture.camera import Camera
 from traps_pipeline.scenes.picture.render import Renderer
-from traps_pipeline.scenes.worlds.clips import check_clip, note_of, read_clip, save_clip
+from traps_pipeline.scenes.worlds.clip_notes import check_clip, note_of, read_clip, save_clip
 from traps_pipeline.scenes.worlds.outcome import compile_scene
 from traps_pipeline.scenes.worlds.spec import load_trajectory
 from traps_pipeline.video.encode import DamagedClip, decode, encode, frames_digest
@@ -66,10 +66,10 @@ def test_a_clip_is_checked_by_size_and_digest(clip: Path) -> None:
     whole = clip.read_bytes()
     for damaged in (whole[:-1], whole[:-1] + bytes([whole[-1] ^ 1]), b""):
         clip.write_bytes(damaged)
-        with raises(DamagedClip, "scenes.worlds.clips.check_clip", "clip.mp4"):
+        with raises(DamagedClip, "scenes.worlds.clip_notes.check_clip", "clip.mp4"):
             check_clip(clip, digest, size)
     clip.unlink()
-    with raises(DamagedClip, "scenes.worlds.clips.check_clip", "clip.mp4"):
+    with raises(DamagedClip, "scenes.worlds.clip_notes.check_clip", "clip.mp4"):
         check_clip(clip, digest, size)
 
 
@@ -84,7 +84,7 @@ def test_a_flipped_bit_in_a_clips_note_is_never_believed(tmp_path: Path) -> None
         flipped = bytearray(written)
         flipped[place // 8] ^= 1 << place % 8
         note.write_bytes(flipped)
-        with raises(DamagedClip, "scenes.worlds.clips.read_note", "void.json"):
+        with raises(DamagedClip, "scenes.worlds.clip_notes.read_note", "void.json"):
             read_clip(clip)
     note.unlink()
     assert read_clip(clip) is None  # rendered anew

@@ -16,7 +16,7 @@ from tests.build.video_rows import PARTITION, clip
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.answer_rows import RESPONSES, ResponseRow
 from traps_pipeline.storage.benchmark_tables import VIDEOS, VideoRow
-from traps_pipeline.storage.parquet import TableStore, write_sealed
+from traps_pipeline.storage.parquet import State, TableStore, write_sealed
 
 CELL = {"dataset": "chaotic", "model": "m", "regime": "standard", "run": 1}
 
@@ -164,3 +164,19 @@ def test_no_bit_of_a_file_can_flip_unseen(store: TableStore) -> None:
             assert str(path) in str(error)
         silent += not same and str(path) not in named
     assert silent == 0
+
+
+@pytest.mark.parametrize("path", ["clips/a.mp4", 'traps-columns:["a"] {"version": "0"}'])
+def test_a_footer_is_read_whatever_a_row_says_and_of_an_earlier_version_without_names(
+    store: TableStore, path: str
+) -> None:
+    version = store.write(VIDEOS, PARTITION, [clip("plinko-0001", path=path)], {"scene_specs/plinko": "1"}, failed=2)
+    state, file = store.state(VIDEOS, PARTITION), store.path(VIDEOS, PARTITION)
+    assert state == State(version, {"scene_specs/plinko": "1"}, 1, 2)
+    data = pq.read_table(file)
+    footer = {b"traps": (data.schema.metadata or {})[b"traps"]}
+    if path == "clips/a.mp4":
+        write_sealed(file, data, footer)
+        assert store.state(VIDEOS, PARTITION) == state
+        write_sealed(file, data.drop_columns(["fps"]), footer)
+        assert store.state(VIDEOS, PARTITION) is None  # it is made again

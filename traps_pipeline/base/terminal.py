@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import io
 import re
 import shutil
 import sys
 import textwrap
 import unicodedata
 from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any, TextIO
 
 from traps_pipeline.base.redaction import redact
 
-_WIDE = 100_000  # columns: no table is wrapped or cut to the width of the screen
+_GAP = 2  # blanks between the columns of a table
 
 
 # Controls, and what Unicode calls default ignorable, with all marks of direction; as HIDDEN in the explorer's dom.js.
@@ -30,6 +30,8 @@ def visible(text: str) -> str:
     Line ends and tabs stay, and so do an emoji's variation selector and joiner. Every page and every value for Dagster
     passes through here; the type (`Markup`) is preserved.
     """
+    if text.isascii() and text.isprintable():  # most of a page's values, for which no expression need run
+        return text
     return type(text)(_HIDDEN.sub(_number, text)) if _HIDDEN.search(text) else text
 
 
@@ -54,6 +56,8 @@ def plain(text: object) -> str:
 
 
 def _printable(text: str) -> str:
+    if text.isprintable():
+        return text
     return "".join(c if c.isprintable() else " " if c in "\n\t" else "?" for c in text)
 
 
@@ -81,28 +85,44 @@ def text_table(headings: Sequence[str], rows: Iterable[Sequence[object]], left: 
     above a rule, and if it is too narrow the last columns are left out and named. Elsewhere lines are plain, with two
     or more spaces between columns. No cell is wrapped or cut.
     """
-    from rich.box import SIMPLE_HEAD
     from rich.cells import cell_len
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
 
     styled = sys.stdout.isatty()
-    box, gap = (SIMPLE_HEAD, 1) if styled else (None, 2)  # a box adds a blank of its own between columns
-    table = Table(box=box, padding=(0, gap, 0, 0), show_edge=False, pad_edge=False, header_style="bold")
     cells = [[plain(heading) for heading in headings], *([_printable(str(cell)) for cell in row] for row in rows)]
+    widths = [max(map(cell_len, column)) for column in zip(*cells, strict=True)]
     count, hidden = len(headings), ""
     if styled:
-        widths = [max(map(cell_len, column)) + 2 for column in zip(*cells, strict=True)]
         columns = shutil.get_terminal_size().columns
-        while count > 1 and sum(widths[:count]) - 2 > columns:
+        while count > 1 and sum(widths[:count]) + _GAP * (count - 1) > columns:
             count -= 1
         names = ", ".join(cells[0][count:])
         hidden = "\n" + wrapped(f"not shown in {columns} columns: {names}") if names else ""
-    for place, heading in enumerate(cells[0][:count]):
-        table.add_column(Text(heading), justify="left" if place in left else "right", no_wrap=True)
-    for row in cells[1:]:
-        table.add_row(*map(Text, row[:count]))
-    lines = io.StringIO()
-    Console(file=lines, width=_WIDE, force_terminal=styled).print(table)
-    return redact("\n".join(line.rstrip() for line in lines.getvalue().splitlines()) + hidden)
+    lines = list[str]()
+    for row in cells:
+        blanks = [" " * (width - cell_len(cell)) for width, cell in zip(widths, row, strict=True)]
+        aligned = [c + b if k in left else b + c for k, (c, b) in enumerate(zip(row, blanks, strict=True))]
+        lines.append((" " * _GAP).join(aligned[:count]).rstrip())
+    if styled:
+        lines[:1] = [f"\x1b[1m{lines[0]}\x1b[0m", "─" * (sum(widths[:count]) + _GAP * (count - 1))]
+    return redact("\n".join(lines) + hidden)
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """A table with its title and notes before it is laid out; a JSON object holds it.
+
+    absence: is printed instead of rows, unless it is empty. left: the left-aligned columns, by index.
+    """
+
+    title: str
+    headings: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    left: Sequence[int]
+    absence: str
+    notes: Sequence[str]
+
+    def text(self) -> str:
+        """Return title, table and notes for standard output, like `text_table`."""
+        table = wrapped(plain(self.absence)) if self.absence else text_table(self.headings, self.rows, self.left)
+        notes = [wrapped(plain(note)) for note in self.notes]
+        return "\n".join([wrapped(plain(self.title)), "", table, *([""] if notes else []), *notes]) + "\n"

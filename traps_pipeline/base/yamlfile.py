@@ -139,18 +139,24 @@ def _complaint(error: Exception) -> str:
 
 
 def read_lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield a JSON Lines file's numbered non-empty lines. Raises TrapsError."""
+    """Yield a JSON Lines file's numbered non-empty lines, checked. Raises TrapsError."""
+    for number, line in read_unchecked_lines(path):
+        check_line(line, f"{path}:{number}")
+        yield number, line
+
+
+def read_unchecked_lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Yield numbered non-empty lines, for a reader that passes those it uses to `check_line`. Raises TrapsError."""
     try:
         text = path.read_text(encoding="utf-8-sig")  # some editors and shells put a byte-order mark first
     except (OSError, UnicodeDecodeError) as error:
         raise TrapsError(f"{path}: cannot be read as lines of text ({plain(error)[:MOST_SAID]}); restore it") from error
     for number, line in enumerate(text.split("\n"), start=1):  # not splitlines: JSON may hold U+2028 as it is
         if line.strip():
-            _check_line(line, f"{path}:{number}")
             yield number, line
 
 
-def _check_line(line: str, where: str) -> None:
+def check_line(line: str, where: str) -> None:
     """Raise TrapsError for ambiguous or unbounded JSON; ignore invalid JSON."""
     try:
         if len(line) > MOST_LINE_BYTES or _depth(line) > MOST_DEPTH:

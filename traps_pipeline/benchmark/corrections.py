@@ -28,7 +28,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import CORRECTIONS, OWN_SPECS, SCENE_SPECS, SPECS_VARIABLE
 from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.base.yamlfile import explain, read_lines
-from traps_pipeline.benchmark.records import load_release, load_released
+from traps_pipeline.benchmark.records import ReleasedLine, load_release, released_lines
 from traps_pipeline.protocol.datasets import ALL_CATEGORIES
 from traps_pipeline.scenes.family_registry import family_names, get_family
 from traps_pipeline.scenes.worlds.spec import Answerable, SceneSpec, Slug
@@ -63,7 +63,7 @@ class Correction(BaseModel):
 
 @dataclass(frozen=True)
 class Scenario:
-    """A scenario after corrections: its changes, and its record (None if added).
+    """A scenario after corrections: its changes, and its record or the line of it (None if added).
 
     `params` is not None if the scene itself must be resolved again; the scene_specs stage does that.
     """
@@ -71,10 +71,15 @@ class Scenario:
     scenario_id: str
     family: str
     category: str
-    released: SceneSpec | None
+    record: SceneSpec | ReleasedLine | None
     words: Mapping[str, Any] = field(default_factory=dict)
     params: Mapping[str, Any] | None = None
     where: str = ""
+
+    @property
+    def released(self) -> SceneSpec | None:
+        """The released record, None if added. Raises TrapsError for a line that is none."""
+        return self.record.spec if isinstance(self.record, ReleasedLine) else self.record
 
     @property
     def version(self) -> str:
@@ -128,7 +133,9 @@ def read_corrections(folder: Path = CORRECTIONS) -> list[tuple[str, Correction]]
     return corrections
 
 
-def fold(released: Mapping[str, SceneSpec], corrections: Sequence[tuple[str, Correction]]) -> dict[str, Scenario]:
+def fold(
+    released: Mapping[str, SceneSpec | ReleasedLine], corrections: Sequence[tuple[str, Correction]]
+) -> dict[str, Scenario]:
     """Return scenarios by id after all decisions. Raises TrapsError with `file:line`."""
     scenarios = {
         id_: Scenario(id_, spec.family, spec.category, spec, where="released") for id_, spec in released.items()
@@ -160,7 +167,7 @@ def fold(released: Mapping[str, SceneSpec], corrections: Sequence[tuple[str, Cor
     return dict(sorted(scenarios.items()))
 
 
-def _restore(where: str, scenario_id: str, released: Mapping[str, SceneSpec]) -> Scenario:
+def _restore(where: str, scenario_id: str, released: Mapping[str, SceneSpec | ReleasedLine]) -> Scenario:
     spec = released.get(scenario_id)
     if spec is None:
         raise TrapsError(f"{where}: scenario {scenario_id!r} was never released; `discard` takes back an added one")
@@ -181,7 +188,7 @@ def _correct(where: str, prior: Scenario, correction: Correction) -> Scenario:
             raise TrapsError(f"{where}: family {prior.family} has no parameters {unknown}; it has {sorted(base)}")
         params = dict(base) | changes.pop("params")
     words = dict(prior.words) | changes
-    scenario = Scenario(prior.scenario_id, prior.family, prior.category, prior.released, words, params, where)
+    scenario = Scenario(prior.scenario_id, prior.family, prior.category, prior.record, words, params, where)
     if scenario.released is not None and params is None:
         scenario.changed_words()  # an unknown label is an error of this line, found before anything runs
     return scenario
@@ -228,7 +235,7 @@ def _elsewhere(benchmark: str) -> str:
 @cache
 def corrected_scenarios() -> dict[str, Scenario]:
     """Return the released records after all corrections."""
-    return fold(load_released(), read_corrections())
+    return fold(released_lines(), read_corrections())
 
 
 def subset(scenarios: Mapping[str, _OfFamily], study: Study) -> dict[str, _OfFamily]:
@@ -244,7 +251,7 @@ def subset(scenarios: Mapping[str, _OfFamily], study: Study) -> dict[str, _OfFam
         return {id_: scenarios[id_] for id_ in sorted(study.scenarios) if id_ in scenarios}
     if study.per_family is None:
         return dict(scenarios)
-    families = {id_: spec.family for id_, spec in load_released().items()}
+    families = {id_: spec.family for id_, spec in released_lines().items()}
     families |= {id_: scenario.family for id_, scenario in scenarios.items()}
     by_family: dict[str, list[str]] = {}
     for id_, family in sorted(families.items()):
@@ -255,7 +262,7 @@ def subset(scenarios: Mapping[str, _OfFamily], study: Study) -> dict[str, _OfFam
 
 def _all_ids() -> set[str]:
     """Return ids that are or were in the benchmark: released, added, discarded."""
-    return set(load_released()) | {correction.scenario_id for _, correction in read_corrections()}
+    return set(released_lines()) | {correction.scenario_id for _, correction in read_corrections()}
 
 
 def categories_of(scenarios: Mapping[str, Scenario]) -> list[str]:

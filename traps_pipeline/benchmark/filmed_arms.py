@@ -25,7 +25,7 @@ from traps_pipeline.scenes.variants.arms import ARMS as SHORTCUT_ARMS
 from traps_pipeline.scenes.variants.arms import Arm, Question, Scenario, crossed, partners
 from traps_pipeline.scenes.variants.graded_cuts import GRADED_CUT
 from traps_pipeline.scenes.variants.variations import VARIATIONS
-from traps_pipeline.scenes.worlds.clips import Clip, note_of, read_clip, save_clip
+from traps_pipeline.scenes.worlds.clip_notes import Clip, note_of, read_clip, save_clip
 from traps_pipeline.scenes.worlds.outcome import Rejected
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 from traps_pipeline.storage.benchmark_tables import ARMS, VIDEOS, ArmRow

@@ -21,7 +21,7 @@ from traps_pipeline.protocol.datasets import (
     all_datasets_of,
     is_ill_posed,
 )
-from traps_pipeline.scenes.worlds.clips import check_clip
+from traps_pipeline.scenes.worlds.clip_notes import check_clip
 from traps_pipeline.storage.benchmark_tables import ARMS as ARMS_TABLE
 from traps_pipeline.storage.benchmark_tables import ITEMS, SCENE_SPECS, VIDEOS, ItemRow
 from traps_pipeline.storage.tables import records

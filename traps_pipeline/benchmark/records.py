@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from functools import cache
+from dataclasses import dataclass
+from functools import cache, cached_property
 from pathlib import Path
+from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic_core import from_json
@@ -11,7 +13,7 @@ from pydantic_core import from_json
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.names import Name
 from traps_pipeline.base.paths import RELEASED, SCENE_SPECS
-from traps_pipeline.base.yamlfile import explain, parse_yaml_model, read_lines, read_yaml
+from traps_pipeline.base.yamlfile import check_line, explain, parse_yaml_model, read_unchecked_lines, read_yaml
 from traps_pipeline.protocol.datasets import ALL_CATEGORIES
 from traps_pipeline.scenes.family_registry import family_names
 from traps_pipeline.scenes.worlds.spec import SceneSpec
@@ -32,23 +34,63 @@ def load_release(path: Path = SCENE_SPECS / "benchmark.yaml") -> Release:
     return parse_yaml_model(Release, read_yaml(path), path)
 
 
+@dataclass(frozen=True)
+class ReleasedLine:
+    """A released record by its line, which is checked and parsed when `spec` is asked for.
+
+    A command of a small study asks for a few of hundreds, and parsing all takes longer than all else it does.
+    """
+
+    scenario_id: str
+    family: str
+    category: str
+    line: str
+    where: str
+
+    @cached_property
+    def spec(self) -> SceneSpec:
+        """The record. Raises TrapsError naming file, line and remedy."""
+        check_line(self.line, self.where)
+        return parse_record(self.line, self.where)
+
+
 @cache
 def load_released(folder: Path = RELEASED) -> dict[str, SceneSpec]:
     """Return released records by id. Raises TrapsError naming file, line and remedy."""
-    records: dict[str, SceneSpec] = {}
+    return {id_: line.spec for id_, line in released_lines(folder).items()}
+
+
+@cache
+def released_lines(folder: Path = RELEASED) -> dict[str, ReleasedLine]:
+    """Return the lines of released records by id. Raises TrapsError naming file, line and remedy."""
+    records: dict[str, ReleasedLine] = {}
     for path in sorted(folder.glob("*.jsonl")):
-        for number, line in read_lines(path):
-            spec = parse_record(line, f"{path}:{number}")
-            if spec.scenario_id in records:
+        for number, line in read_unchecked_lines(path):
+            released = _line(line, f"{path}:{number}")
+            if released.scenario_id in records:
                 raise TrapsError(
-                    f"{path}:{number}: scenario {spec.scenario_id!r} occurs twice; remove one of the lines"
+                    f"{path}:{number}: scenario {released.scenario_id!r} occurs twice; remove one of the lines"
                 )
-            records[spec.scenario_id] = spec
+            records[released.scenario_id] = released
     if not records:
         raise TrapsError(
             f"{folder}: holds no released records; restore it from git or draw some with `traps benchmark sample`"
         )
     return records
+
+
+def _line(line: str, where: str) -> ReleasedLine:
+    """Return a line that names a scenario, its family and category. Raises TrapsError for any other."""
+    try:
+        fields: Any = from_json(line)
+        names = [fields[name] for name in ("scenario_id", "family", "category")]
+    except (ValueError, KeyError, TypeError):
+        names = []
+    if not names or not all(isinstance(name, str) for name in names):
+        check_line(line, where)
+        spec = parse_record(line, where)
+        names = [spec.scenario_id, spec.family, spec.category]
+    return ReleasedLine(*names, line, where)
 
 
 def parse_record(line: str, where: str) -> SceneSpec:

@@ -16,7 +16,7 @@ from typing import Any, Generic, TypeVar
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.workers import run_in_order
-from traps_pipeline.scenes.worlds.clips import Clip, check_clip, note_of, read_note
+from traps_pipeline.scenes.worlds.clip_notes import Clip, check_clip, note_of, read_note
 from traps_pipeline.storage.leases import POLL_S
 from traps_pipeline.storage.store import Lease, Store
 from traps_pipeline.video.encode import DamagedClip

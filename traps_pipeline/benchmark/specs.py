@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -16,13 +16,15 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import CORRECTIONS, RELEASED, ROOT
 from traps_pipeline.benchmark.corrections import WORDS, Scenario, apply_words, load_scenarios, subset
-from traps_pipeline.benchmark.records import load_released, parse_record
+from traps_pipeline.benchmark.records import parse_record, released_lines
 from traps_pipeline.benchmark.versions import version_of
 from traps_pipeline.scenes.family_registry import get_family
-from traps_pipeline.scenes.physics.kit import Physics, Wording
 from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory, physics_record, save_trajectory
 from traps_pipeline.storage.benchmark_tables import SCENE_SPECS, SceneSpecRow
 from traps_pipeline.storage.workspace import Workspace
+
+if TYPE_CHECKING:
+    from traps_pipeline.scenes.physics.kit import Wording
 
 SECONDS_A_RECORD = 0.04  # measured on one core: read a scenario's trajectories, and recompute its evidence
 
@@ -115,6 +117,7 @@ def _simulate(scenario: Scenario) -> tuple[SceneSpec, np.ndarray, np.ndarray]:
     """Simulate a corrected scene. Raises TrapsError naming the correction."""
     from traps_pipeline.scenes.draw.resolve import resolve
     from traps_pipeline.scenes.parts.wording import draw_ill_posed
+    from traps_pipeline.scenes.physics.kit import Physics
     from traps_pipeline.scenes.worlds.outcome import Rejected
 
     family = get_family(scenario.family)
@@ -193,8 +196,8 @@ def expected_specs(workspace: Workspace, category: str) -> list[SceneSpecRow]:
 
 def released_in_study(workspace: Workspace, category: str) -> dict[str, SceneSpec]:
     """Return a category's released records in the study, as without corrections."""
-    records = subset(load_released(), workspace.study)
-    return {id_: spec for id_, spec in sorted(records.items()) if spec.category == category}
+    records = subset(released_lines(), workspace.study)
+    return {id_: record.spec for id_, record in sorted(records.items()) if record.category == category}
 
 
 def released_version(workspace: Workspace, category: str) -> str:

@@ -13,8 +13,9 @@ from traps_pipeline.benchmark.sharing import Filming, Row, existing_clips, share
 from traps_pipeline.benchmark.specs import clips_version, released_in_study, spec_of, spec_rows, trajectory_of
 from traps_pipeline.scenes.parts.look import frame_size
 from traps_pipeline.scenes.worlds.clip_cache import ClipCache
-from traps_pipeline.scenes.worlds.clips import Clip, Job, note_of, read_clip, render_pair
-from traps_pipeline.storage.benchmark_tables import VIDEOS, VideoRow
+from traps_pipeline.scenes.worlds.clip_notes import Clip, note_of, read_clip
+from traps_pipeline.scenes.worlds.clips import Job, render_pair
+from traps_pipeline.storage.benchmark_tables import VideoRow
 from traps_pipeline.storage.workspace import Workspace
 
 CLIPS = ("control", "void", "twin")
@@ -117,12 +118,3 @@ def _rows(workspace: Workspace, spec: Row, clips: Mapping[Path, Clip], version: 
             )
         )
     return rows
-
-
-def missing_clips(workspace: Workspace, category: str) -> Sequence[str]:
-    """Return a category's clips that are lost or of another size, for `traps status`."""
-    table = workspace.tables.read_arrow(VIDEOS, ["path", "size_bytes"], category=category)
-    expected = dict(zip(table["path"].to_pylist(), table["size_bytes"].to_pylist(), strict=True))
-    notes = {path: workspace.relative(note_of(workspace.root / path)) for path in expected}
-    sizes = workspace.sizes([*expected, *notes.values()])
-    return [path for path, size in expected.items() if sizes.get(path) != size or notes[path] not in sizes]

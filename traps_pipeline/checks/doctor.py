@@ -161,7 +161,7 @@ def examine_unused(place: Place, *, is_removed: bool) -> Finding:
 
 
 def _damaged_clip(path: Path) -> str:
-    from traps_pipeline.scenes.worlds.clips import DamagedClip, read_clip
+    from traps_pipeline.scenes.worlds.clip_notes import DamagedClip, read_clip
 
     try:
         read_clip(path)

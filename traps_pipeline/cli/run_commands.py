@@ -96,7 +96,6 @@ def run(arguments: argparse.Namespace) -> int:
     """See `traps run --help`."""
     from traps_pipeline.base.progress import reporting
     from traps_pipeline.cli.printed_progress import make_progress
-    from traps_pipeline.scoring.score_rows import LEADERBOARD
 
     experiment = experiment_of(arguments)
     workspace = _allow(create(arguments, experiment), experiment, arguments)
@@ -124,6 +123,8 @@ def run(arguments: argparse.Namespace) -> int:
             changes = ask_canary(workspace, experiment.models)
         print(changes_text(changes), file=about)
     if arguments.json:
+        from traps_pipeline.scoring.score_rows import LEADERBOARD
+
         board = workspace.tables.read_all(LEADERBOARD)
         print_json({"workspace": str(workspace.place), "run": report, "leaderboard": board})
     if report.problems:
@@ -134,7 +135,9 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.until is not None:
         print(f"next: traps run {arguments.experiment} for the stages after {arguments.until}")
         return OK
-    _print_results(workspace)
+    from traps_pipeline.report.printed_board import printed_board
+
+    print(printed_board(workspace))
     print(f"report {workspace.reports / 'report.html'}\nexplorer {workspace.reports / 'index.html'}")
     print(
         wrapped("next: open one of them; traps why ITEM examines an item's answers; traps site writes a folder to send")
@@ -219,17 +222,3 @@ def _check_participant(name: str) -> None:
 
     if name not in load_judges():
         get_model(name)
-
-
-def _print_results(workspace: Workspace) -> None:
-    from traps_pipeline.people.human_score_rows import HUMAN_ROW, PANEL_ERRORS
-    from traps_pipeline.report.leaderboard_page import leaderboard_text
-    from traps_pipeline.report.tables.human_tables import said_by_people
-    from traps_pipeline.scoring.score_rows import LEADERBOARD, ROBUST
-
-    board = workspace.tables.read_all(LEADERBOARD)
-    if board.empty:
-        print("no leaderboard: no pairs were asked; the report has the tables of what was")
-        return
-    notes = said_by_people(workspace.tables.read_all(HUMAN_ROW), workspace.tables.read_all(PANEL_ERRORS))
-    print(leaderboard_text(board, workspace.tables.read_all(ROBUST), notes))

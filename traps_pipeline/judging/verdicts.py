@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import groupby
+
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
@@ -30,13 +34,37 @@ ITEM_COLUMNS = ["item_id", "scenario_id", "category", "sub_scenario", "control_a
 RESPONSE_COLUMNS = [*ANSWER, "pair_id", "side", "outcome", "is_json", "epoch"]
 
 
-def decide_cell(workspace: Workspace, cell: Cell) -> pd.DataFrame:
-    """Return a cell's VERDICTS rows; raise TrapsError unless its inputs match."""
-    items = workspace.tables.read(ITEMS, {"dataset": cell.dataset}, ITEM_COLUMNS)
-    responses = workspace.tables.read(RESPONSES, cell.partition, RESPONSE_COLUMNS)
-    votes = workspace.tables.read(VOTES, cell.partition, [*VOTE_COLUMNS, "invalid_reason", "rejects_premise", "panel"])
-    # If no answer of the cell is judged, no vote names a panel, so the rows name the study's.
-    return decide(items, responses, votes).fillna({"panel": panel_id(workspace.study.panel)})
+def decide_cells(workspace: Workspace, cells: Sequence[Cell]) -> dict[Cell, pd.DataFrame | TrapsError]:
+    """Return each cell's VERDICTS rows, or why there are none: its inputs do not match.
+
+    All cells are decided at once, since a cell takes as long as hundreds; if that fails, each alone.
+    """
+    try:
+        return _decided(workspace, cells)
+    except TrapsError as error:
+        if len(cells) == 1:
+            return {cells[0]: error}
+        return {cell: rows for each in cells for cell, rows in decide_cells(workspace, [each]).items()}
+
+
+def _decided(workspace: Workspace, cells: Sequence[Cell]) -> dict[Cell, pd.DataFrame | TrapsError]:
+    tables, of_cell = workspace.tables, dict[Cell, pd.DataFrame | TrapsError]()
+    vote_columns = [*VOTE_COLUMNS, "invalid_reason", "rejects_premise", "panel"]
+    votes = {cell: tables.arrow(VOTES, cell.partition, vote_columns) for cell in cells}
+
+    def alike(cell: Cell) -> tuple[str, list[str]]:
+        """Return what cells must share to be decided together: the dataset, and the judges of their votes."""
+        return cell.dataset, sorted(votes[cell]["judge"].unique().to_pylist())
+
+    for (dataset, _), group in groupby(sorted(cells, key=alike), alike):
+        some = [*group]
+        items = tables.read(ITEMS, {"dataset": dataset}, ITEM_COLUMNS)
+        responses = pa.concat_tables([tables.arrow(RESPONSES, cell.partition, RESPONSE_COLUMNS) for cell in some])
+        rows = decide(items, responses.to_pandas(), pa.concat_tables([votes[cell] for cell in some]).to_pandas())
+        # If no answer of a cell is judged, no vote names a panel, so the rows name the study's.
+        by_cell = dict([*rows.fillna({"panel": panel_id(workspace.study.panel)}).groupby(CELL)])
+        of_cell |= {cell: by_cell.get(tuple(cell.partition.values()), rows.iloc[:0]) for cell in some}
+    return of_cell
 
 
 def decide(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:

@@ -68,11 +68,17 @@ class Ledger:
         that no table can hold, are noted and ignored. Raises TrapsError.
         """
         rows = EvaluationRows()
-        for place, row, note in self._parsed(evaluation, wanted):
-            if note:
-                rows.notes[place] = note
-            if row is not None:
-                rows.add(row)
+        for entry in self._rows(evaluation, wanted):
+            self._add(rows, entry)
+        return rows
+
+    def naming(self, text: str) -> dict[str, EvaluationRows]:
+        """Return what `read` does of the rows in which a text occurs, such as an item's id, by evaluation."""
+        query = sa.select(EVALUATIONS.c.name, ROWS).join(ROWS, ROWS.c.evaluation == EVALUATIONS.c.id)
+        rows = dict[str, EvaluationRows]()
+        for entry in self._select(query.where(self._is_own_kind(EVALUATIONS)).order_by(ROWS.c.id)):
+            if isinstance(entry.content, bytes) and text.encode() in entry.content:  # a flipped bit makes another kind
+                self._add(rows.setdefault(entry.name, EvaluationRows()), entry)
         return rows
 
     def reasoning(self, evaluation: str, wanted: Collection[str] | None = None) -> dict[str, str]:
@@ -147,21 +153,15 @@ class Ledger:
         while some := [*islice(keys, _KEYS)]:
             yield from self._select(query.where(ROWS.c.key.in_(some)))
 
-    def _parsed(
-        self, evaluation: str, keys: Collection[str] | None
-    ) -> Iterator[tuple[str, dict[str, Any] | None, str | None]]:
-        """Yield each row's place, the row, and a note about it."""
-        for entry in self._rows(evaluation, keys):
-            if not _is_whole(entry):
-                yield self._place(entry), None, f"{NOT_WHOLE}: it is not believed; its answer is asked again"
-                continue
-            row = json.loads(entry.content)
-            healed = heal(row)
-            yield (
-                self._place(entry),
-                row,
-                f"{', '.join(healed)}: no possible value, counted as unknown" if healed else None,
-            )
+    def _add(self, rows: EvaluationRows, entry: sa.Row[Any]) -> None:
+        """Add a row, or a note that it is damaged; and a note about values that no table can hold."""
+        if not _is_whole(entry):
+            rows.notes[self._place(entry)] = f"{NOT_WHOLE}: it is not believed; its answer is asked again"
+            return
+        row = json.loads(entry.content)
+        if healed := heal(row):
+            rows.notes[self._place(entry)] = f"{', '.join(healed)}: no possible value, counted as unknown"
+        rows.add(row)
 
     def _place(self, row: sa.Row[Any]) -> str:
         return f"{self.database.place}: row {row.id}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -94,20 +94,23 @@ def wanted_questions(workspace: Workspace, cell: Cell) -> list[Question]:
 
 
 def asked_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
-    """Return the columns of items that requests, responses and votes use, in order.
+    """Return the columns of items that requests, responses and votes use, in order."""
+    state = workspace.tables.state(ITEMS, {"dataset": dataset})
+    return with_posteriors(workspace, dataset, _item_rows(workspace, dataset, state.version if state else ""))
+
+
+@lru_cache(maxsize=1)  # a dataset's cells follow one another
+def _item_rows(workspace: Workspace, dataset: str, version: str) -> list[dict[str, Any]]:
+    """Return the items of one version of a dataset.
 
     Equal texts share one copy: a cell of 100,000 items may have a hundred questions.
     """
     copies: dict[str, str] = {}
     rows = workspace.tables.read_all(ITEMS, _ITEM_COLUMNS, dataset=dataset).to_dict("records")
-    return with_posteriors(
-        workspace,
-        dataset,
-        [
-            {name: copies.setdefault(value, value) if isinstance(value, str) else value for name, value in row.items()}
-            for row in rows
-        ],
-    )
+    return [
+        {name: copies.setdefault(value, value) if isinstance(value, str) else value for name, value in row.items()}
+        for row in rows
+    ]
 
 
 def with_posteriors(workspace: Workspace, dataset: str, items: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -267,9 +267,16 @@ class ModelEntry(Entry):
 _Entry = TypeVar("_Entry", bound=Entry)
 
 
+@user_registry.cached_registry
+@cache
+def _parsed(path: Path) -> Any:
+    """Return a registry's YAML, of which models and accounts are read one after another."""
+    return read_yaml(path)
+
+
 def read_entries(path: Path, key: str, kind: type[_Entry]) -> dict[str, _Entry]:
     """Return a file's entries by id, in order. Raises TrapsError naming entry, field."""
-    data = read_yaml(path)
+    data = _parsed(path)
     entries = data.get(key) if isinstance(data, dict) else None
     if not isinstance(entries, list):
         raise TrapsError(f"{path}: must hold a list `{key}:`")
@@ -316,7 +323,7 @@ def load_models(path: Path = MODELS_FILE) -> dict[str, ModelEntry]:
 @cache
 def load_accounts(path: Path = MODELS_FILE) -> dict[str, Account]:
     """Return accounts by name. Raises TrapsError naming account and field."""
-    data = read_yaml(path)
+    data = _parsed(path)
     accounts = data.get("accounts", {}) if isinstance(data, dict) else None
     if not isinstance(accounts, dict):
         raise TrapsError(f"{path}: `accounts:` must be a mapping of names")

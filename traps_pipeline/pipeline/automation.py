@@ -17,7 +17,7 @@ from sqlalchemy.exc import IntegrityError
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.corrections import corrected_scenarios
-from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.benchmark.records import load_released, released_lines
 from traps_pipeline.judging.confabulation_protocol import load_protocol
 from traps_pipeline.models.judges import load_judges, load_panel
 from traps_pipeline.models.prompts import prompt, system_prompt, vqa_prompt
@@ -61,7 +61,7 @@ def reread_sources() -> None:
     The set of evaluations stays: partition keys are built from it when the code location is loaded.
     """
     registries = (load_models, load_accounts, load_judges, load_panel, load_protocol)
-    for cached in (load_released, corrected_scenarios, prompt, system_prompt, vqa_prompt, *registries):
+    for cached in (load_released, released_lines, corrected_scenarios, prompt, system_prompt, vqa_prompt, *registries):
         cached.cache_clear()
 
 

@@ -8,8 +8,10 @@ touches the file. `dagster.yaml` names this class; a study may name another stor
 
 import contextlib
 import os
+import sqlite3
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any, cast
 
 import sqlalchemy as db
@@ -22,8 +24,10 @@ from sqlalchemy.event import listen
 from sqlalchemy.exc import DBAPIError, OperationalError
 
 from traps_pipeline.base.databases import reason_and_remedy
+from traps_pipeline.base.files import write_bytes
 
 OPEN_FILES = 32  # at most: each run has a file of its own, and a server sees many
+_INDEX = "index"  # the file of all runs' events of assets; each run has another
 _BUSY_S = 30  # wait for another process's lock, as long as Dagster itself
 
 
@@ -70,16 +74,17 @@ class _EventStorage(SqliteEventLogStorage):
     def __init__(self, base_dir: str) -> None:
         self._engines: dict[str, db.Engine] = {}
         self._engines_lock = threading.Lock()  # threads of a web server ask at once
+        self._blank = b""  # a run's file without events
         self._there: set[str] = set()  # tables, and columns of assets: what is there stays
         super().__init__(base_dir)
 
     @contextlib.contextmanager
     def _connect(self, shard: str) -> Iterator[db.Connection]:
         with self._db_lock:
-            engine = self._engine(shard)
             if shard not in self._initialized_dbs:
-                self._initdb(engine)
+                self._begin(shard)
                 self._initialized_dbs.add(shard)
+            engine = self._engine(shard)
             with _transaction(engine) as connection:
                 before = _changes(connection)
                 yield connection
@@ -87,6 +92,18 @@ class _EventStorage(SqliteEventLogStorage):
             if is_changed:
                 with contextlib.suppress(FileNotFoundError):
                     os.utime(self.path_for_shard(shard))
+
+    def _begin(self, shard: str) -> None:
+        """Make a run's file as a copy of the first one: Dagster reads all its migrations to make one."""
+        path = Path(self.path_for_shard(shard))
+        is_new = shard != _INDEX and not path.exists()
+        if is_new and self._blank:
+            write_bytes(path, self._blank)
+            return
+        self._initdb(self._engine(shard))
+        if is_new:
+            with contextlib.closing(sqlite3.connect(path)) as connection:
+                self._blank = connection.serialize()
 
     def _engine(self, shard: str) -> db.Engine:
         with self._engines_lock:

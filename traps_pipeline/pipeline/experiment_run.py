@@ -15,7 +15,6 @@ from traps_pipeline.models.judges import load_panel
 from traps_pipeline.models.registry import LOCAL, NETWORK, Entry, get_model
 from traps_pipeline.pipeline.experiment import Experiment
 from traps_pipeline.pipeline.lineage import Lineage
-from traps_pipeline.pipeline.machine import require_machine, wanted_parts
 from traps_pipeline.pipeline.selection import failed_checks, is_nothing_to_do, note_versions, require_work, stages_until
 from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.cells import Cell
@@ -67,6 +66,7 @@ def run_experiment(
     require_work(workspace, experiment.name, until)
     if is_nothing_to_do(workspace, stages, experiment.name):
         return RunReport(failed_checks(workspace, experiment.name))
+    from traps_pipeline.pipeline.machine import require_machine, wanted_parts
     from traps_pipeline.pipeline.run import dagster_history, materialize_stale
 
     with dagster_history(workspace) as instance:

@@ -105,11 +105,11 @@ class ConcurrentBuild:
 class Stage:
     """The declaration of an asset to build: a table, or files (table: None).
 
-    make: returns the StageOutput of a key; if `side_by_side`, takes several keys and yields each with its own. code:
-    the code version; raise it when the formula changes, so that existing partitions become stale. cost: the main
-    resource it uses besides time. wants: whether a study wants a key at all. lost: returns the missing files that a
-    partition names. takes: the resources of a run on a host. shared: how several runs build a partition together, if
-    they may.
+    make: returns the StageOutput of a key; if `side_by_side`, takes several keys and yields each with its own, or with
+    the TrapsError that says why it has none. code: the code version; raise it when the formula changes, so that
+    existing partitions become stale. cost: the main resource it uses besides time. wants: whether a study wants a key
+    at all. lost: returns the missing files that a partition names. takes: the resources of a run on a host. shared: how
+    several runs build a partition together, if they may.
     """
 
     name: str

@@ -46,7 +46,10 @@ class PartitionMaker:
         try:
             for key, output in self._stage.make(self._workspace, [str(key) for key in keys]) if keys else ():
                 pending.remove(key)
-                yield key, output
+                if isinstance(output, TrapsError):
+                    self.unmade[key] = output
+                else:
+                    yield key, output
         except TrapsError as error:
             self.unmade |= dict.fromkeys(pending, error)
 

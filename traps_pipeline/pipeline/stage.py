@@ -89,7 +89,7 @@ def stage(
 
     The description is the function's docstring, without its "Return"; the code is `code_of` the group, unless stated.
     It returns a StageOutput, or rows alone (figures and ids, never text that a model wrote), which are then shown.
-    side_by_side: it gets the keys of several partitions, and yields each with its StageOutput.
+    side_by_side: it gets the keys of several partitions, and yields each with its StageOutput or TrapsError.
     """
 
     def declare(function: Callable[[Workspace, Any], Any]) -> Stage:

@@ -37,14 +37,14 @@ def explain(workspace: Workspace, item_id: str) -> dict[str, Any]:
         truth = current["ground_truth"] if current["side"] == "control" else "none, it is void"
         clip = str(workspace.resolve(current["clip"]))
         explanation |= {"question": current["question"], "ground_truth": truth, "clip": clip}
-    asked = {*workspace.answers.evaluations()}
+    answered = workspace.answers.naming(item_id)
     for model, entry in load_models().items():
         for regime in REGIMES:
             for run in range(1, entry.runs + 1):
                 evaluation = Evaluation(model, regime, run)
-                if evaluation.key not in asked:
+                if evaluation.key not in answered:
                     continue
-                rows = [r for r in workspace.answers.read(evaluation.key).rows.values() if _about(r) == item_id]
+                rows = [row for row in answered[evaluation.key].rows.values() if _about(row) == item_id]
                 if not rows:
                     continue
                 request = answer_request(workspace, entry, current, evaluation) if current else None
@@ -94,7 +94,16 @@ def _rows_of(
 ) -> list[dict[str, Any]]:
     if workspace.tables.state(table, cell.partition) is None:
         return []
-    return [row for row in workspace.tables.records(table, cell.partition, columns) if row["item_id"] == item_id]
+    return _rows_about(workspace, table, cell.partition, item_id, columns)
+
+
+def _rows_about(
+    workspace: Workspace, table: Table, partition: Mapping[str, Any], item_id: str, columns: Sequence[str] | None = None
+) -> list[dict[str, Any]]:
+    """Return an item's rows; only these become Python values."""
+    data = workspace.tables.read_arrow(table, columns, **partition)
+    places = [place for place, name in enumerate(data["item_id"].to_pylist()) if name == item_id]
+    return [row for place in places for row in data.slice(place, 1).to_pylist()]
 
 
 def _about(row: Mapping[str, Any]) -> Any:
@@ -104,8 +113,7 @@ def _about(row: Mapping[str, Any]) -> Any:
 def _current_item(workspace: Workspace, dataset: str, item_id: str) -> dict[str, Any] | None:
     if workspace.tables.state(ITEMS, {"dataset": dataset}) is None:
         return None
-    items = workspace.tables.records(ITEMS, {"dataset": dataset})
-    named = [item for item in items if item["item_id"] == item_id]
+    named = _rows_about(workspace, ITEMS, {"dataset": dataset}, item_id)
     return next(iter(with_posteriors(workspace, dataset, named)), None)
 
 

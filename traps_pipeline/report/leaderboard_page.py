@@ -11,6 +11,7 @@ from typing import Any
 
 import pandas as pd
 
+from traps_pipeline.base.terminal import TextTable
 from traps_pipeline.models.judges import BY_RULES, ONE_JUDGE, is_judged_by_rules
 from traps_pipeline.protocol.datasets import ARMS, DATASETS
 from traps_pipeline.protocol.regimes import REGIMES
@@ -112,7 +113,14 @@ LEGEND = {
 
 def leaderboard_text(board: pd.DataFrame, robust: pd.DataFrame | None = None, notes: Sequence[str] = ()) -> str:
     """Return LEADERBOARD rows as text, a table per panel, with ROBUST and notes."""
-    return "\n".join(table_text(table) for table in leaderboards(board, robust, notes, brief=True))
+    return "\n".join(table.text() for table in leaderboard_tables(board, robust, notes))
+
+
+def leaderboard_tables(
+    board: pd.DataFrame, robust: pd.DataFrame | None = None, notes: Sequence[str] = ()
+) -> list[TextTable]:
+    """Return what `leaderboard_text` says, a table per panel."""
+    return [table_text(table) for table in leaderboards(board, robust, notes, brief=True)]
 
 
 def leaderboard_markdown(board: pd.DataFrame, robust: pd.DataFrame | None = None, notes: Sequence[str] = ()) -> str:

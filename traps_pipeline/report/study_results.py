@@ -50,22 +50,31 @@ def _overall(results: StudyResults) -> pd.DataFrame:
 
 def _rates(results: StudyResults) -> pd.DataFrame:
     standard = results.cells.loc[results.cells["regime"] == "standard"]
-    result = []
-    for _, rows in standard.groupby("model", sort=False):
-        for part in [rows[rows["dataset"].map(taxonomy_of) == t] for t in analyses.TAXONOMIES] + [rows]:
-            result.append(_gap(results, part))
-    return joined(result).reindex(columns=pd.Index(RATE_COLUMNS)).drop_duplicates(["model", "taxonomy"])
+    parts = [standard[standard["dataset"].map(taxonomy_of) == t] for t in analyses.TAXONOMIES] + [standard]
+    gaps = joined([gap for part in parts for gap in _gaps(results, part)]).reindex(columns=pd.Index(RATE_COLUMNS))
+    place = {model: number for number, model in enumerate(standard["model"].unique())}
+    gaps = gaps.drop_duplicates(["model", "taxonomy"])
+    return gaps.sort_values("model", key=lambda models: models.map(place), kind="stable", ignore_index=True)
 
 
-def _gap(results: StudyResults, rows: pd.DataFrame) -> pd.DataFrame:
+def _gaps(results: StudyResults, rows: pd.DataFrame) -> list[pd.DataFrame]:
+    """Return the gaps of all models; if epochs are mixed, of each model that has one."""
     try:
         gaps = analyses.visual_textual_gap(rows)
     except EpochMismatch as error:
+        models = [part for _, part in rows.groupby("model", sort=False)]
+        if len(models) > 1:
+            return [gap for part in models for gap in _gaps(results, part)]
         results.refused.setdefault("rates", []).append(str(error))
-        return pd.DataFrame()
-    counts = {name: rows[name].sum() for name in ("n_pairs", "n_missing")}
-    counts |= {"n_runs": rows["n_runs"].min(), "incomplete": bool(rows["incomplete"].any())}
-    return gaps.assign(epoch=joined_epochs(rows["epoch"]), **counts)
+        return []
+    of_model = rows.groupby("model").agg(
+        n_pairs=("n_pairs", "sum"),
+        n_missing=("n_missing", "sum"),
+        n_runs=("n_runs", "min"),
+        incomplete=("incomplete", "any"),
+        epoch=("epoch", joined_epochs),
+    )
+    return [gaps.merge(of_model, left_on="model", right_index=True, how="left", sort=False)]
 
 
 def _scoped(results: StudyResults, scope: str) -> pd.DataFrame:

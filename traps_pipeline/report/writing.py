@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.sheets import csv_bytes
-from traps_pipeline.base.terminal import finalized, plain, text_table, wrapped
+from traps_pipeline.base.terminal import TextTable, finalized, plain
 from traps_pipeline.report.numbers import NONE, as_numbers
 
 if TYPE_CHECKING:
@@ -231,18 +231,15 @@ def table_markdown(table: PrintedTable) -> str:
     return "\n".join([*lines, *([""] if notes else []), *(f"- {note}" for note in notes)]) + "\n"
 
 
-def table_text(table: PrintedTable) -> str:
-    """Return title, table and notes for standard output, like `text_table`."""
-    lines = [wrapped(plain(f"{table.title}. {table.lead}" if table.lead else table.title)), ""]
+def table_text(table: PrintedTable) -> TextTable:
+    """Return title, table and notes for standard output."""
+    title = f"{table.title}. {table.lead}" if table.lead else table.title
     if table.absence:
-        lines += [wrapped(plain(table.absence))]
-    else:
-        columns = [(_with_marks if c in table.marked else _without_marks)(c, table.records) for c in table.columns]
-        headings, *rows = zip(*columns, strict=True)
-        left = [k for k, c in enumerate(table.columns) if not c.is_number or c in table.marked]
-        lines += [text_table(headings, rows, left)]
-    notes = [wrapped(plain(note)) for note in table.remarks]
-    return "\n".join([*lines, *([""] if notes else []), *notes]) + "\n"
+        return TextTable(title, [], [], [], table.absence, table.remarks)
+    columns = [(_with_marks if c in table.marked else _without_marks)(c, table.records) for c in table.columns]
+    headings, *rows = zip(*columns, strict=True)
+    left = [k for k, c in enumerate(table.columns) if not c.is_number or c in table.marked]
+    return TextTable(title, headings, rows, left, "", table.remarks)
 
 
 def _without_marks(column: Column, records: Sequence[Mapping[str, Any]]) -> list[str]:

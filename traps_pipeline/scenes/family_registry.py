@@ -12,13 +12,15 @@ import pkgutil
 import re
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.protocol.datasets import CHAOTIC_CATEGORIES, EXTENSION_CATEGORIES, OCCLUSION_CATEGORIES
 from traps_pipeline.scenes import families as package
-from traps_pipeline.scenes.parts.independence import dependence
-from traps_pipeline.scenes.physics.kit import Family
+
+if TYPE_CHECKING:
+    from traps_pipeline.scenes.physics.kit import Family
 
 CATEGORIES = {"occlusion": OCCLUSION_CATEGORIES + EXTENSION_CATEGORIES, "chaotic": CHAOTIC_CATEGORIES}
 
@@ -35,6 +37,8 @@ def get_family(name: str) -> Family:
 
     Raises KeyError for an unknown name, TrapsError if its file defines none, another name or an unknown category.
     """
+    from traps_pipeline.scenes.physics.kit import Family
+
     if name not in family_names():
         raise KeyError(f"unknown family {name!r}; known: {', '.join(family_names())}")
     module = importlib.import_module(f"{package.__name__}.{name}")
@@ -84,6 +88,8 @@ def fit_to_sample(name: str) -> Family:
 
     Raises TrapsError if another family has its question, or its hidden element depends on what is seen.
     """
+    from traps_pipeline.scenes.parts.independence import dependence
+
     families()
     family = get_family(name)
     dependent = dependence(family)

@@ -26,8 +26,12 @@ if TYPE_CHECKING:
 
 
 _FOOTER, _SUFFIX = b"traps", ".parquet"
+# How a footer begins, and what stands before the names of the columns beside it: both are read from a file's bytes,
+# since Parquet's own reader takes longer for a footer than all else that `traps status` does with it.
+_STATE, _COLUMNS = b'{"version": "', b"traps-columns:"
 # Marks the digest of a file's own bytes in its footer, computed with zeros in the digest's place.
 _SUM, _MARK, _ZEROS = b"traps-sum", b"traps-sum:", b"0" * 8
+_SMALL_BYTES = 2**20  # handing a smaller file to threads takes twice as long as reading it
 _ROWS_AT_ONCE = 1000  # rows converted to Python values at a time
 _VERIFIED: dict[Path, str] = {}  # files whose digest this process has verified, with their stamp
 _FOOTERS: dict[Path, tuple[str, State, list[str]]] = {}  # footers by file, with its stamp
@@ -111,7 +115,9 @@ class TableStore:
         state = State(version, dict(inputs), len(data), failed, code)
         footer, path = json.dumps(asdict(state)), self.path(table, partition)
         note = _note(footer, data.schema.names)
-        self._store.write({path: sealed(data, {_FOOTER: footer.encode()})}, note=note, durable=True)
+        columns = _COLUMNS + json.dumps(data.schema.names).encode()
+        content = sealed(data, {_FOOTER: footer.encode(), _COLUMNS.rstrip(b":"): columns})
+        self._store.write({path: content}, note=note, durable=True)
         return version
 
     def _checked(self, table: Table[Row], partition: Mapping[str, Any], rows: Sequence[Row] | pd.DataFrame) -> pa.Table:
@@ -170,7 +176,7 @@ class TableStore:
                 state = State(**json.loads(footer))
             else:
                 state, names = _footer_of(self._store.here(path))
-            return state if names == table.arrow_schema().names else None
+            return state if names == table.names else None
         except (pa.ArrowException, OSError, KeyError, ValueError, TypeError) as error:
             raise _unreadable(path, table, error) from error
 
@@ -196,7 +202,11 @@ class TableStore:
 
     def read(self, table: Table, partition: Mapping[str, Any], columns: Sequence[str] | None = None) -> pd.DataFrame:
         """Return one partition. Raises TrapsError naming a missing file and its stage."""
-        return self._load(table, self.path(table, partition), columns).to_pandas()
+        return self.arrow(table, partition, columns).to_pandas()
+
+    def arrow(self, table: Table, partition: Mapping[str, Any], columns: Sequence[str] | None = None) -> pa.Table:
+        """Return `read` as an Arrow table."""
+        return self._load(table, self.path(table, partition), columns)
 
     def records(
         self, table: Table, partition: Mapping[str, Any], columns: Sequence[str] | None = None
@@ -237,7 +247,8 @@ class TableStore:
 
         try:
             names = _schema_of(table, columns)
-            data = pq.ParquetFile(_sound_bytes(self._store.here(path))).read(columns=names.names)
+            content = _sound_bytes(self._store.here(path))
+            data = pq.ParquetFile(content).read(columns=names.names, use_threads=content.size() > _SMALL_BYTES)
             if not data.schema.equals(names):
                 raise pa.ArrowInvalid("its columns are not those of this version")
             return data
@@ -301,13 +312,18 @@ def _sum_of(content: bytes) -> bytes:
 
 
 def _sound_bytes(path: Path) -> pa.BufferReader:
-    """Return a file's bytes, verified once per process until they change.
+    """Return a file's verified bytes for Arrow, whose threads read a buffer without Python.
 
-    Arrow's threads read a buffer without Python: with a file object of Python's they may meet an interpreter that is
-    ending, and abort or hang (https://github.com/apache/arrow/issues/50482). Raises TrapsError.
+    With a file object of Python's they may meet an interpreter that is ending, and abort or hang
+    (https://github.com/apache/arrow/issues/50482). Raises TrapsError.
     """
     import pyarrow as pa
 
+    return pa.BufferReader(_verified(path))
+
+
+def _verified(path: Path) -> bytes:
+    """Return a file's bytes, verified once per process until they change. Raises TrapsError."""
     with path.open("rb") as stream:
         content, stamp = stream.read(), _stamp(os.fstat(stream.fileno()))
     place = content.rfind(_MARK) + len(_MARK)
@@ -315,21 +331,31 @@ def _sound_bytes(path: Path) -> pa.BufferReader:
         if place < len(_MARK) or content[place : place + len(_ZEROS)] != _sum_of(content):
             raise TrapsError(f"{path}: is not what was written (it was altered); materialize it again")
         _VERIFIED[path] = stamp
-    return pa.BufferReader(content)
+    return content
 
 
 def _footer_of(path: Path) -> tuple[State, list[str]]:
     """Return a file's footer and column names, cached until the file changes.
 
-    A run reads each of hundreds of footers dozens of times. Raises as `_sound_bytes`, or ArrowException.
+    A run reads each of hundreds of footers dozens of times. Raises as `_verified`, or KeyError without a footer.
     """
     import pyarrow.parquet as pq
 
     stamp = _stamp(path.stat())
     if (cached := _FOOTERS.get(path)) is None or cached[0] != stamp:
-        schema = pq.ParquetFile(_sound_bytes(path)).schema_arrow
-        cached = _FOOTERS[path] = stamp, State(**json.loads((schema.metadata or {})[_FOOTER])), schema.names
+        content = _verified(path)
+        older = _COLUMNS not in content  # written before the names stood there
+        names = pq.ParquetFile(_sound_bytes(path)).schema_arrow.names if older else _json_behind(content, _COLUMNS)
+        cached = _FOOTERS[path] = stamp, State(**_json_behind(content, _STATE, len(_STATE))), names
     return cached[1], cached[2]
+
+
+def _json_behind(content: bytes, mark: bytes, within: int = 0) -> Any:
+    """Return the JSON value behind the last mark of a file's bytes, of which `within` bytes belong to it."""
+    if (place := content.rfind(mark)) < 0:
+        raise KeyError(mark)
+    text = content[place + len(mark) - within :].decode("latin-1")  # JSON is ASCII here, what follows is not
+    return json.JSONDecoder().raw_decode(text)[0]
 
 
 def altered(path: Path) -> str:

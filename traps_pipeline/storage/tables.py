@@ -107,8 +107,8 @@ class Table(Generic[Row]):
 
     @property
     def names(self) -> list[str]:
-        """The names of the columns."""
-        return [column.name for column in self.columns]
+        """The names of the columns, without evaluating their annotations."""
+        return [field.name for field in fields(self.row_type)]  # pyright: ignore[reportArgumentType] - a dataclass
 
     def arrow_schema(self) -> pa.Schema:
         """Return the schema of a written file."""

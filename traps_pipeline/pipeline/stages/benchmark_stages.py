@@ -122,7 +122,7 @@ def _seconds_of_rendering(workspace: Workspace, category: str) -> float:
 
 
 def _lost_clips(workspace: Workspace, category: str) -> list[str]:
-    from traps_pipeline.benchmark.videos import missing_clips
+    from traps_pipeline.benchmark.lost_clips import missing_clips
 
     return [f"clip {path} is gone or damaged" for path in missing_clips(workspace, category)]
 

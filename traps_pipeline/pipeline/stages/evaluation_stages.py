@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any, cast
 
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.wording import counted, in_percent
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES, VoteRow
 from traps_pipeline.models.answer_rows import RESPONSES, ResponseRow
@@ -24,6 +25,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 MAX_INVALID_SHARE = 0.05
 ITEMS_SHOWN = 40
+DECIDED_AT_ONCE = 50  # cells whose votes are in memory together
 _stage, _source = partial(stage, group="evaluation", scheme=CELL), partial(source, group="evaluation")
 
 
@@ -131,10 +133,16 @@ def _verdicts_missing(workspace: Workspace, key: str | None, output: StageOutput
     parents=[of(items, by_dataset), responses, votes, judges],
     code="3",
     checks=[Check("one_verdict_an_item", "Every answered item has exactly one verdict.", _verdicts_missing)],
+    side_by_side=True,
 )
-def verdicts(workspace: Workspace, key: str) -> StageOutput:
+def verdicts(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput | TrapsError]]:
     """Return the verdict of the panel's majority on each item of a cell."""
-    from traps_pipeline.judging.verdicts import decide_cell
+    from traps_pipeline.judging.verdicts import decide_cells
 
-    rows = decide_cell(workspace, Cell.parse(key))
-    return StageOutput(rows, shown={"undecided": int(rows["undecided"].to_numpy(bool).sum())})
+    for first in range(0, len(keys), DECIDED_AT_ONCE):
+        cells = [Cell.parse(key) for key in keys[first : first + DECIDED_AT_ONCE]]
+        for cell, rows in decide_cells(workspace, cells).items():
+            if isinstance(rows, TrapsError):
+                yield cell.key, rows
+            else:
+                yield cell.key, StageOutput(rows, shown={"undecided": int(rows["undecided"].to_numpy(bool).sum())})

@@ -42,6 +42,7 @@ def report_page(workspace: Workspace, _: None) -> StageOutput:
     reads changes.
     """
     from traps_pipeline.report.cards import Card, Sources
+    from traps_pipeline.report.printed_board import BOARD_FILE, board_bytes, board_tables
     from traps_pipeline.report.publish import MARKDOWN, PAPER, report_files, report_parts
 
     sources = Sources(workspace)
@@ -62,7 +63,7 @@ def report_page(workspace: Workspace, _: None) -> StageOutput:
         "made again": f"{len(remade)} of {len(pieces)}: {', '.join(remade[:NAMES]) or 'none'}",
         "leaderboard": Markdown(files[MARKDOWN].decode()),
     }
-    return StageOutput(files, shown=figures)
+    return StageOutput(files | {BOARD_FILE: board_bytes(board_tables(workspace))}, shown=figures)
 
 
 @_stage("site", parents=_parents(*ANSWERS, "scene_specs", *SCORES, "contrasts", "regime_tests"))

@@ -18,7 +18,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
 from traps_pipeline.base.paths import PACKAGE, user_cache
 from traps_pipeline.scenes.picture.render import RenderingUnavailable, renderer_version
-from traps_pipeline.scenes.worlds.clips import note_of, read_clip, read_note
+from traps_pipeline.scenes.worlds.clip_notes import note_of, read_clip, read_note
 from traps_pipeline.video.encode import DamagedClip
 
 VARIABLE = "TRAPS_CLIP_CACHE"  # at most so many GB, or "off"

@@ -6,51 +6,24 @@ board comes before a control that closes, and before its void if an occluder mak
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from traps_pipeline.base.digests import digest, file_digest
-from traps_pipeline.base.files import write_text
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.physics.kit import Family, Physics, Scene
 from traps_pipeline.scenes.picture import checks
 from traps_pipeline.scenes.picture.camera import Camera, Occluder
 from traps_pipeline.scenes.picture.coming_board import LANDED, coming_board
 from traps_pipeline.scenes.picture.render import Renderer
+from traps_pipeline.scenes.worlds.clip_notes import read_clip, save_clip
 from traps_pipeline.scenes.worlds.outcome import compile_scene, decisive_geoms
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 from traps_pipeline.scenes.worlds.world import closing_of
-from traps_pipeline.video.encode import DamagedClip, encode, frames_digest
 
 ABLATION_FRAMES = 5  # evenly spaced void frames that are drawn once more without what they must not show
-
-
-@dataclass(frozen=True)
-class Clip:
-    """An encoded clip. leaked_pixels: of what a void must hide, None without occluder."""
-
-    file_sha256: str
-    frames_sha256: str
-    n_frames: int
-    fps: int
-    size_bytes: int
-    leaked_pixels: float | None = None
-
-    @property
-    def duration_s(self) -> float:
-        """Seconds shown."""
-        return self.n_frames / self.fps
-
-
-_SEAL = "seal"  # of a note: the digest of what else it says
-
-
-def _seal_of(clip: Clip) -> str:
-    return digest(asdict(clip))[:16]
 
 
 @dataclass(frozen=True)
@@ -68,44 +41,6 @@ class Job:
     def clips(self) -> tuple[Path, Path, Path]:
         """All files of the job."""
         return self.control, self.void, self.twin
-
-
-def note_of(clip: Path) -> Path:
-    """Return the path of a clip's note, JSON that is written last and vouches for it."""
-    return clip.with_suffix(".json")
-
-
-def read_clip(path: Path) -> Clip | None:
-    """Return a rendered clip, None if missing. Raises DamagedClip if it was altered."""
-    clip = read_note(path) if path.is_file() else None
-    if clip is not None:
-        check_clip(path, clip.file_sha256, clip.size_bytes)
-    return clip
-
-
-def read_note(path: Path) -> Clip | None:
-    """Return what a clip's note says, None if there is none. Raises DamagedClip."""
-    if not note_of(path).is_file():
-        return None
-    try:
-        note = json.loads(note_of(path).read_text(encoding="utf-8"))
-        seal = note.pop(_SEAL, None)  # notes of version 0.1.0 have none
-        clip = Clip(**note)
-        if seal not in (None, _seal_of(clip)):
-            raise ValueError("it was altered")
-    except (ValueError, TypeError, AttributeError) as error:
-        raise DamagedClip(f"{note_of(path)}: is not what was written ({error}); delete it and run again") from error
-    return clip
-
-
-def check_clip(path: Path, sha256: str, size_bytes: int) -> None:
-    """Raise DamagedClip, with the remedy, unless a file has that size and digest."""
-    size = path.stat().st_size if path.is_file() else 0
-    if size != size_bytes or file_digest(path) != sha256:
-        raise DamagedClip(
-            f"{path}: is not the clip that was rendered ({size} of {size_bytes} bytes; truncated or altered); "
-            "delete it and run again: it is rendered anew"
-        )
 
 
 def render_pair(job: Job) -> int:
@@ -184,11 +119,3 @@ def _leaked_pixels(
     sampled = [hiding_frames[i] for i in np.unique(np.linspace(0, len(hiding_frames) - 1, ABLATION_FRAMES).astype(int))]
     complete = [void[frame] for frame in sampled]
     return past_occluder_px + checks.ablation_pixels(renderer, job.qpos[sampled], [*decisive, *scene.hidden], complete)
-
-
-def save_clip(path: Path, frames: Sequence[np.ndarray], fps: int, leaked_pixels: float | None = None) -> int:
-    """Encode frames, write the note that vouches for them, and return their number."""
-    encode(frames, path, fps)
-    clip = Clip(file_digest(path), frames_digest(frames), len(frames), fps, path.stat().st_size, leaked_pixels)
-    write_text(note_of(path), json.dumps(asdict(clip) | {_SEAL: _seal_of(clip)}))
-    return len(frames)

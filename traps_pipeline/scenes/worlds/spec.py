@@ -5,14 +5,16 @@ from __future__ import annotations
 import hashlib
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.files import replacing
-from traps_pipeline.scenes.physics.kit import Physics
+
+if TYPE_CHECKING:
+    from traps_pipeline.scenes.physics.kit import Physics
 
 Slug = r"^[a-z0-9_]+-[a-z0-9]+$"
 

@@ -1,0 +1,42 @@
+"""Keep the leaderboard as `traps run` prints it, so that a run with nothing to do need not make it again."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+
+from traps_pipeline.base.terminal import TextTable
+from traps_pipeline.storage.workspace import Workspace
+
+BOARD_FILE = ".state/leaderboard.json"  # in the folder `reports`, beside the report's versions
+NO_BOARD = "no leaderboard: no pairs were asked; the report has the tables of what was"
+
+
+def board_bytes(tables: Sequence[TextTable]) -> bytes:
+    """Return the content of BOARD_FILE."""
+    return json.dumps([asdict(table) for table in tables], ensure_ascii=False).encode()
+
+
+def printed_board(workspace: Workspace) -> str:
+    """Return a study's leaderboard for standard output, from a report that is fresh."""
+    path = workspace.reports / BOARD_FILE
+    if workspace.store.has(path):
+        tables = [TextTable(**table) for table in json.loads(workspace.store.here(path).read_bytes())]
+    else:  # somebody has cleared the folder
+        tables = board_tables(workspace)
+    return "\n".join(table.text() for table in tables) or NO_BOARD
+
+
+def board_tables(workspace: Workspace) -> list[TextTable]:
+    """Return the leaderboard from the study's tables, a table per panel; none without pairs."""
+    from traps_pipeline.people.human_score_rows import HUMAN_ROW, PANEL_ERRORS
+    from traps_pipeline.report.leaderboard_page import leaderboard_tables
+    from traps_pipeline.report.tables.human_tables import said_by_people
+    from traps_pipeline.scoring.score_rows import LEADERBOARD, ROBUST
+
+    board = workspace.tables.read_all(LEADERBOARD)
+    if board.empty:
+        return []
+    notes = said_by_people(workspace.tables.read_all(HUMAN_ROW), workspace.tables.read_all(PANEL_ERRORS))
+    return leaderboard_tables(board, workspace.tables.read_all(ROBUST), notes)
