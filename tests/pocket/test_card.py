@@ -6,12 +6,12 @@ import json
 from pathlib import Path
 
 import pytest
+from tools.pocket.planted import planted
 
 from tests.mechanism.study import filled
 from tools.pocket import inside
 from tools.pocket.commands import CARD, EVALUATION, FACTS, WEIGHTS, card_tables, marks, other_tables
 from tools.pocket.evaluate import read_cells
-from tools.pocket.planted import planted
 from tools.pocket.recipe import GAP, SHIPPED, load_recipe
 from tools.pocket.words import PROMPTS
 from traps_pipeline.judging.judging_rows import VERDICTS

@@ -9,8 +9,9 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from tools.pocket.claims import claimed
 from tools.pocket.planted import TRUTHS, planted
+
+from tools.pocket.claims import claimed
 from tools.pocket.recipe import SHIPPED
 from tools.pocket.seeds import Figure, write_seeds
 from traps_pipeline.base.errors import TrapsError
