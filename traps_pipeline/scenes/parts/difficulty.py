@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, make_dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import numpy as np
@@ -18,7 +18,6 @@ from traps_pipeline.protocol.datasets import EXTENSION_CATEGORIES
 from traps_pipeline.scenes.parts import vary
 from traps_pipeline.scenes.physics.kit import (
     LOOK_ALIKE,
-    READ,
     Family,
     Inventory,
     Scene,
@@ -170,16 +169,6 @@ def _like_and_free(colour: str, taken: Collection[str]) -> list[Colour]:
 
 
 # --- building ---------------------------------------------------------------------------------------------------------
-
-
-def with_difficulty(params: type) -> type:
-    """Return the same parameters with a last field `difficulty`, which no family draws."""
-    read = field(default=None, metadata={READ: lambda value: value and SceneDifficulty.from_record(value)})
-    named = make_dataclass(
-        params.__name__, [("difficulty", SceneDifficulty | None, read)], bases=(params,), frozen=True
-    )
-    named.__module__, named.__doc__ = params.__module__, params.__doc__
-    return named
 
 
 def add_distractors(scene: Scene, p: Any) -> Scene:

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 
 from traps_pipeline.scenes.parts import vary
-from traps_pipeline.scenes.parts.difficulty import add_distractors, with_difficulty
-from traps_pipeline.scenes.parts.look import OF_OCCLUSION, apply_look, look_of, with_look
+from traps_pipeline.scenes.parts.difficulty import SceneDifficulty, add_distractors
+from traps_pipeline.scenes.parts.look import OF_OCCLUSION, Look, apply_look, look_of
 from traps_pipeline.scenes.parts.observers import Observer
 from traps_pipeline.scenes.parts.questions import Aside, Question
 from traps_pipeline.scenes.parts.vision import after_occluder, before_occluder, is_still, without_flags
@@ -68,7 +68,7 @@ def scene_family(
             return look(end, slots)
         return answer
 
-    params = with_difficulty(with_look(params))
+    params = vary.with_field(vary.with_field(params, "look", Look), "difficulty", SceneDifficulty)
     return Family(
         name=name,
         taxonomy="chaotic" if twins is None else "occlusion",

@@ -8,14 +8,14 @@ certificates are computed under it like everything else.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, make_dataclass, replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from traps_pipeline.scenes.parts.floor import PALE, TEXELS, TONES, floors, lay_floor
-from traps_pipeline.scenes.physics.kit import COLOURS, READ, Scene, uniform
+from traps_pipeline.scenes.physics.kit import COLOURS, Scene, uniform
 from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH
 from traps_pipeline.scenes.picture.render import SUPERSAMPLE
 
@@ -121,14 +121,6 @@ def draw_look(rng: np.random.Generator, parts: Collection[str]) -> Look | None:
 
 
 # --- parameters that have one -----------------------------------------------------------------------------------------
-
-
-def with_look(params: type) -> type:
-    """Return the parameters' class with a last field `look`, which no family draws."""
-    look_field = field(default=None, metadata={READ: lambda value: None if value is None else Look.from_record(value)})
-    extended = make_dataclass(params.__name__, [("look", Look | None, look_field)], bases=(params,), frozen=True)
-    extended.__module__, extended.__doc__ = params.__module__, params.__doc__
-    return extended
 
 
 def look_of(params: Any) -> Look | None:

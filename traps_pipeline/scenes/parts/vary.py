@@ -17,14 +17,14 @@ element that depends on nothing is as likely whatever is seen. `twins(p)` change
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, Field, dataclass, field, fields, replace
+from dataclasses import MISSING, Field, dataclass, field, fields, make_dataclass, replace
 from functools import cache
 from typing import Any, TypeVar, get_type_hints
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from traps_pipeline.scenes.physics.kit import distinct_colours, uniform
+from traps_pipeline.scenes.physics.kit import READ, distinct_colours, uniform
 
 Drawn = dict[str, Any]  # name -> value: what is drawn so far
 Draw = Callable[[np.random.Generator, Drawn], Any]
@@ -173,6 +173,14 @@ def twins(p: Any) -> list[Any]:
         raise TypeError(f"{type(p).__module__}: no field of Params is `hidden(...)`, so there are no twins")
     values = {each.name: each for each in fields(p)}[name].metadata[_HIDDEN](vars(p))
     return [replace(p, **{name: value}) for value in values if value != getattr(p, name)]
+
+
+def with_field(params: type, name: str, kind: Any) -> type:
+    """Return the class with a last field of a kind, None by default, that is not drawn."""
+    read = field(default=None, metadata={READ: lambda value: None if value is None else kind.from_record(value)})
+    extended = make_dataclass(params.__name__, [(name, kind | None, read)], bases=(params,), frozen=True)
+    extended.__module__, extended.__doc__ = params.__module__, params.__doc__
+    return extended
 
 
 # --- values from a file -----------------------------------------------------------------------------------------------
