@@ -63,7 +63,7 @@ class Correction(BaseModel):
 
 @dataclass(frozen=True)
 class Scenario:
-    """A scenario after corrections: its changes, and its record or the line of it (None if added).
+    """A scenario after corrections: its changes, and its record (None if added).
 
     `params` is not None if the scene itself must be resolved again; the scene_specs stage does that.
     """

@@ -1,4 +1,4 @@
-"""Find the clips that a study has lost, for `traps status`, without what renders one."""
+"""Find the clips that a study has lost, without importing what renders one."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ def load_release(path: Path = SCENE_SPECS / "benchmark.yaml") -> Release:
 
 @dataclass(frozen=True)
 class ReleasedLine:
-    """A released record by its line, which is checked and parsed when `spec` is asked for.
+    """A line of a released record, checked and parsed when `spec` is asked for.
 
     A command of a small study asks for a few of hundreds, and parsing all takes longer than all else it does.
     """
@@ -62,7 +62,7 @@ def load_released(folder: Path = RELEASED) -> dict[str, SceneSpec]:
 
 @cache
 def released_lines(folder: Path = RELEASED) -> dict[str, ReleasedLine]:
-    """Return the lines of released records by id. Raises TrapsError naming file, line and remedy."""
+    """Return lines of released records by id. Raises TrapsError with file and remedy."""
     records: dict[str, ReleasedLine] = {}
     for path in sorted(folder.glob("*.jsonl")):
         for number, line in read_unchecked_lines(path):
@@ -80,7 +80,7 @@ def released_lines(folder: Path = RELEASED) -> dict[str, ReleasedLine]:
 
 
 def _line(line: str, where: str) -> ReleasedLine:
-    """Return a line that names a scenario, its family and category. Raises TrapsError for any other."""
+    """Return a line that names scenario, family and category, or raise TrapsError."""
     try:
         fields: Any = from_json(line)
         names = [fields[name] for name in ("scenario_id", "family", "category")]

@@ -35,7 +35,7 @@ RESPONSE_COLUMNS = [*ANSWER, "pair_id", "side", "outcome", "is_json", "epoch"]
 
 
 def decide_cells(workspace: Workspace, cells: Sequence[Cell]) -> dict[Cell, pd.DataFrame | TrapsError]:
-    """Return each cell's VERDICTS rows, or why there are none: its inputs do not match.
+    """Return each cell's VERDICTS rows, or the error where its inputs do not match.
 
     All cells are decided at once, since a cell takes as long as hundreds; if that fails, each alone.
     """
@@ -53,7 +53,7 @@ def _decided(workspace: Workspace, cells: Sequence[Cell]) -> dict[Cell, pd.DataF
     votes = {cell: tables.arrow(VOTES, cell.partition, vote_columns) for cell in cells}
 
     def alike(cell: Cell) -> tuple[str, list[str]]:
-        """Return what cells must share to be decided together: the dataset, and the judges of their votes."""
+        """Return what cells must share to be decided together: dataset and judges."""
         return cell.dataset, sorted(votes[cell]["judge"].unique().to_pylist())
 
     for (dataset, _), group in groupby(sorted(cells, key=alike), alike):

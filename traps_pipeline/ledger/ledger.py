@@ -73,7 +73,7 @@ class Ledger:
         return rows
 
     def naming(self, text: str) -> dict[str, EvaluationRows]:
-        """Return what `read` does of the rows in which a text occurs, such as an item's id, by evaluation."""
+        """Return the rows in which a text occurs, such as an item's id, by evaluation."""
         query = sa.select(EVALUATIONS.c.name, ROWS).join(ROWS, ROWS.c.evaluation == EVALUATIONS.c.id)
         rows = dict[str, EvaluationRows]()
         for entry in self._select(query.where(self._is_own_kind(EVALUATIONS)).order_by(ROWS.c.id)):
@@ -154,7 +154,7 @@ class Ledger:
             yield from self._select(query.where(ROWS.c.key.in_(some)))
 
     def _add(self, rows: EvaluationRows, entry: sa.Row[Any]) -> None:
-        """Add a row, or a note that it is damaged; and a note about values that no table can hold."""
+        """Add a row and a note about impossible values, or only a note if it is damaged."""
         if not _is_whole(entry):
             rows.notes[self._place(entry)] = f"{NOT_WHOLE}: it is not believed; its answer is asked again"
             return

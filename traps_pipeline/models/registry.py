@@ -270,7 +270,7 @@ _Entry = TypeVar("_Entry", bound=Entry)
 @user_registry.cached_registry
 @cache
 def _parsed(path: Path) -> Any:
-    """Return a registry's YAML, of which models and accounts are read one after another."""
+    """Return a registry's YAML, from which models and accounts are read in turn."""
     return read_yaml(path)
 
 

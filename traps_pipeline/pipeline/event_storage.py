@@ -94,7 +94,7 @@ class _EventStorage(SqliteEventLogStorage):
                     os.utime(self.path_for_shard(shard))
 
     def _begin(self, shard: str) -> None:
-        """Make a run's file as a copy of the first one: Dagster reads all its migrations to make one."""
+        """Make a run's file, a copy of the first: Dagster would read all its migrations."""
         path = Path(self.path_for_shard(shard))
         is_new = shard != _INDEX and not path.exists()
         if is_new and self._blank:

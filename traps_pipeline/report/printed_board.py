@@ -1,4 +1,4 @@
-"""Keep the leaderboard as `traps run` prints it, so that a run with nothing to do need not make it again."""
+"""Keep the leaderboard as `traps run` prints it, for a run with nothing to do."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def printed_board(workspace: Workspace) -> str:
 
 
 def board_tables(workspace: Workspace) -> list[TextTable]:
-    """Return the leaderboard from the study's tables, a table per panel; none without pairs."""
+    """Return the leaderboard from the tables, one per panel; none without pairs."""
     from traps_pipeline.people.human_score_rows import HUMAN_ROW, PANEL_ERRORS
     from traps_pipeline.report.leaderboard_page import leaderboard_tables
     from traps_pipeline.report.tables.human_tables import said_by_people

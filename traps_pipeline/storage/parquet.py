@@ -312,7 +312,7 @@ def _sum_of(content: bytes) -> bytes:
 
 
 def _sound_bytes(path: Path) -> pa.BufferReader:
-    """Return a file's verified bytes for Arrow, whose threads read a buffer without Python.
+    """Return a file's verified bytes for Arrow's threads, which need no Python then.
 
     With a file object of Python's they may meet an interpreter that is ending, and abort or hang
     (https://github.com/apache/arrow/issues/50482). Raises TrapsError.
@@ -323,7 +323,7 @@ def _sound_bytes(path: Path) -> pa.BufferReader:
 
 
 def _verified(path: Path) -> bytes:
-    """Return a file's bytes, verified once per process until they change. Raises TrapsError."""
+    """Return a file's bytes, verified once until they change. Raises TrapsError."""
     with path.open("rb") as stream:
         content, stamp = stream.read(), _stamp(os.fstat(stream.fileno()))
     place = content.rfind(_MARK) + len(_MARK)
@@ -351,7 +351,7 @@ def _footer_of(path: Path) -> tuple[State, list[str]]:
 
 
 def _json_behind(content: bytes, mark: bytes, within: int = 0) -> Any:
-    """Return the JSON value behind the last mark of a file's bytes, of which `within` bytes belong to it."""
+    """Return the JSON behind the last mark in a file, with `within` bytes of the mark."""
     if (place := content.rfind(mark)) < 0:
         raise KeyError(mark)
     text = content[place + len(mark) - within :].decode("latin-1")  # JSON is ASCII here, what follows is not

@@ -1,4 +1,4 @@
-"""A clip's file and the note beside it that vouches for it, without what renders one."""
+"""Read and write clips, each with the note beside it that vouches for it."""
 
 from __future__ import annotations
 
