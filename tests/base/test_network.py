@@ -57,4 +57,4 @@ def test_a_proxy_and_certificates_that_are_there_are_fine(
     monkeypatch.setenv("HTTP_PROXY", value)
     monkeypatch.setenv("SSL_CERT_FILE", certifi.where())
     monkeypatch.setenv("SSL_CERT_DIR", str(tmp_path))
-    assert check_network() == "HTTP_PROXY; SSL_CERT_FILE, SSL_CERT_DIR"
+    assert check_network() == "HTTP_PROXY; certificates of SSL_CERT_FILE, SSL_CERT_DIR"

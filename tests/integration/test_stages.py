@@ -141,12 +141,12 @@ def test_a_run_that_lives_elsewhere_is_left_alone(study: Checkout, monkeypatch: 
 def test_a_failing_step_exits_with_one_and_names_the_file(own_study: Checkout) -> None:
     path = own_study.root / "scene_specs" / "released" / "domino_chain.jsonl"
     lines = path.read_text().splitlines()
-    record = json.loads(lines[3])
+    record = json.loads(lines[0])
     record["ground_truth"] = "perhaps"
-    path.write_text("\n".join([*lines[:3], json.dumps(record), *lines[4:]]) + "\n")
+    path.write_text("\n".join([json.dumps(record), *lines[1:]]) + "\n")
     finished = materialize(own_study, "scene_specs", "--partition", "dominoes")
     assert finished.code == 1
-    assert f"{path}:4" in finished.out + finished.err
+    assert f"{path}:1" in finished.out + finished.err
 
 
 def test_the_code_location_validates_and_imports_nothing_heavy(study: Checkout) -> None:

@@ -106,14 +106,14 @@ FINDINGS = {
     "probe_baselines": "0 1 0 1",
     "gate_arrows": "0.45 0.64 0.64",
     "patching": "0.99 0.99",
-    "doses_among_nulls": "19 20 1 1 1 80% 5",
+    "doses_among_nulls": "19 20 1 1 1 80 % 5",
 }
 
 
 @pytest.mark.parametrize("name", INSIDE)
 def test_a_lead_figure_says_what_it_shows_of_the_study_and_nothing_of_an_empty_one(name: str) -> None:
     report = next(report for report in FIGURE_REPORTS if report.name == name)
-    assert re.findall(r"[+-]?\d+(?:\.\d+)?%?", report.finding(Made())) == FINDINGS[name].split()
+    assert re.findall(r"[+-]?\d+(?:\.\d+)?(?: %)?", report.finding(Made())) == re.split(r" (?!%)", FINDINGS[name])
     assert report.note(Results()) == report.doc
 
 

@@ -83,14 +83,12 @@ def _line(line: str, where: str) -> ReleasedLine:
     """Return a line that names scenario, family and category, or raise TrapsError."""
     try:
         fields: Any = from_json(line)
-        names = [fields[name] for name in ("scenario_id", "family", "category")]
+        scenario_id, family, category = (str(fields[name]) for name in ("scenario_id", "family", "category"))
     except (ValueError, KeyError, TypeError):
-        names = []
-    if not names or not all(isinstance(name, str) for name in names):
         check_line(line, where)
         spec = parse_record(line, where)
-        names = [spec.scenario_id, spec.family, spec.category]
-    return ReleasedLine(*names, line, where)
+        scenario_id, family, category = spec.scenario_id, spec.family, spec.category
+    return ReleasedLine(scenario_id, family, category, line, where)
 
 
 def parse_record(line: str, where: str) -> SceneSpec:

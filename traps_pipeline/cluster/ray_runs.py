@@ -203,8 +203,8 @@ class RayRuns(Runs):
             resources = ", ".join(f"{name} {value}" for name, value in takes.items() if name != "runtime_env")
             needs = f"a host that is free and has {resources or 'a CPU'}"
             where = "`ray status` on the head shows what there is"
-        runs = counted(len(waiting or requests), "run")
-        progress.current().note(f"{runs} not begun after {IDLE_S:.0f} s, for lack of {needs}; {where}")
+        unbegun = counted(len(waiting or requests), "run")
+        progress.current().note(f"{unbegun} not begun after {IDLE_S:.0f} s, for lack of {needs}; {where}")
 
     def _report(self, run_id: str) -> None:
         """Report a run's newly built partitions, and record its failed steps."""

@@ -63,7 +63,9 @@ def _decided(workspace: Workspace, cells: Sequence[Cell]) -> dict[Cell, pd.DataF
         rows = decide(items, responses.to_pandas(), pa.concat_tables([votes[cell] for cell in some]).to_pandas())
         # If no answer of a cell is judged, no vote names a panel, so the rows name the study's.
         by_cell = dict([*rows.fillna({"panel": panel_id(workspace.study.panel)}).groupby(CELL)])
-        of_cell |= {cell: by_cell.get(tuple(cell.partition.values()), rows.iloc[:0]) for cell in some}
+        for cell in some:
+            key = tuple(cell.partition.values())
+            of_cell[cell] = by_cell[key] if key in by_cell else rows.iloc[:0]
     return of_cell
 
 

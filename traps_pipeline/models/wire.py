@@ -18,6 +18,7 @@ from typing import Any
 import aiohttp
 import httpx
 from aiohttp.abc import AbstractStreamWriter
+from aiohttp.http_exceptions import HttpProcessingError
 from yarl import URL
 
 from traps_pipeline.base.errors import TrapsError
@@ -198,7 +199,7 @@ def cause_of(error: BaseException) -> str:
         return f"TLS failed ({error.reason or error}): if the server speaks plain HTTP, write http:// in its address"
     if isinstance(error, aiohttp.ClientHttpProxyError):
         return f"the proxy answered {error.status} {error.message}"
-    if isinstance(error, aiohttp.http_exceptions.HttpProcessingError):
+    if isinstance(error, HttpProcessingError):
         return error.message.strip().rstrip(".")  # str(error) begins with a status that no server sent
     if isinstance(error, OSError) and error.errno and error.errno > 0:
         return os.strerror(error.errno)

@@ -86,7 +86,7 @@ def probe_baselines(results: Results) -> Iterator[str]:
         beaten = np.column_stack([group[[*SHORTCUTS, "output margin"]].to_numpy(float), noise + 2 * spread])
         above, across = states > np.fmax.reduce(beaten, axis=1), (group["source"] != group["target"]).to_numpy(bool)
         counts = [
-            f"{np.count_nonzero(above & kind)} of {counted(np.count_nonzero(kind), noun)}"
+            f"{np.count_nonzero(above & kind)} of {counted(int(np.count_nonzero(kind)), noun)}"
             for kind, noun in ((across, "pair"), (~across, "dataset"))
         ]
         yield (

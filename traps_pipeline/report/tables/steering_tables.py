@@ -210,7 +210,7 @@ def _counts(results: Results) -> list[Column]:
 
 def _cell_notes(results: Results) -> list[str]:
     """Return notes on a cell's largest n, and what it means for scores of cells."""
-    counts = results.effects["n"].dropna()
+    counts = results.effects["n"].dropna().to_numpy(int)
     if not len(counts):
         return []
     notes = [f"n = {counted(int(counts.max()), 'answer')} per cell at most, one per scenario"]

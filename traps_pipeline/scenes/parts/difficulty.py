@@ -45,7 +45,7 @@ LANE = 2.4  # radii from lane to lane: each distractor has one of its own, so th
 PUCK_HALF = 0.45  # of its radius
 LEAST_DOWN_DEG = 8.0
 WAY = (0.5, 0.9)  # share of the scene's width that a distractor crosses
-BALL_COLOURS: tuple[Colour, ...] = get_args(Colour)
+BALL_COLOURS: dict[str, Colour] = {colour: colour for colour in get_args(Colour)}  # by their word
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def draw_distractors(
     words = {*re.findall(r"\w+", " ".join((*texts, *wording.answerable_question.labels, *wording.labels)).lower())}
     asked = re.findall(r"\w+", wording.question)
     coloured = dict.fromkeys((*asked, *scene.inventory.colours))
-    named = [colour for word in coloured for colour in BALL_COLOURS if colour == word]
+    named: list[Colour] = [BALL_COLOURS[word] for word in coloured if word in BALL_COLOURS]
     taken = words | {*scene.inventory.colours}
     things = list[Distractor]()
     for number, lane in enumerate(rng.permutation(count)):
@@ -164,8 +164,9 @@ def draw_distractors(
 
 def _like_and_free(colour: str, taken: Collection[str]) -> list[Colour]:
     """Return free colours that are easily taken for a colour, else all free ones."""
-    free = [other for other in BALL_COLOURS if other not in taken]
-    return [other for other in free if {colour, other} in LOOK_ALIKE] or free
+    free: list[Colour] = [other for word, other in BALL_COLOURS.items() if word not in taken]
+    alike: list[Colour] = [other for other in free if {colour, other} in LOOK_ALIKE]
+    return alike or free
 
 
 # --- building ---------------------------------------------------------------------------------------------------------
