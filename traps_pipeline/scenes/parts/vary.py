@@ -176,7 +176,7 @@ def twins(p: Any) -> list[Any]:
 
 
 def with_field(params: type, name: str, kind: Any) -> type:
-    """Return the class with a last field of a kind, None by default, that is not drawn."""
+    """Return the class with a last field, None by default, that is not drawn."""
     read = field(default=None, metadata={READ: lambda value: None if value is None else kind.from_record(value)})
     extended = make_dataclass(params.__name__, [(name, kind | None, read)], bases=(params,), frozen=True)
     extended.__module__, extended.__doc__ = params.__module__, params.__doc__

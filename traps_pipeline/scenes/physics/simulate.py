@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def initial_velocity(model: mujoco.MjModel, velocity: Mapping[str, Sequence[float]]) -> np.ndarray:
-    """Return qvel at the start, (nv,): a number for each freedom of a body, three a soft one."""
+    """Return qvel at the start, (nv,): a number a freedom, three a soft body."""
     qvel, soft = np.zeros(model.nv), flexes(model)
     for body, values in velocity.items():
         if body in soft:
