@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol, cast
+from typing import NamedTuple, Protocol, cast
 
 import numpy as np
 
@@ -103,27 +103,42 @@ def solve_gram(gram: np.ndarray, void: np.ndarray) -> tuple[np.ndarray, float]:
     if not np.isfinite(gram).all():
         raise _unfit(len(gram))
     label = np.asarray(void, float)
-    dual, intercept = np.zeros(len(label)), float(np.log(label.mean() / (1 - label.mean())))
-    logits = np.full(len(label), intercept)
-    value, newton, before = _objective(dual, intercept, logits, label), None, np.inf
+    odds = float(np.log(label.mean() / (1 - label.mean())))
+    at = _Point(np.zeros(len(label)), odds, np.full(len(label), odds))
+    newton, before = None, np.inf
     for _ in range(_MOST_STEPS):
-        chance = expit(logits)
-        missing = label - chance - dual
-        worst = max(np.abs(missing).max(), abs(dual.sum()) / len(label))
+        chance = expit(at.logits)
+        missing = label - chance - at.dual
+        worst = float(max(np.abs(missing).max(), abs(at.dual.sum()) / len(label)))
         if worst < _TOLERANCE:
-            return dual, intercept
+            return at.dual, at.intercept
         if newton is None or worst > 0.2 * before:
             newton = _NewtonStep(gram, chance * (1 - chance))
-        step, intercept_step = newton.solve(missing, dual.sum())
-        logit_step, size, before = gram @ step + intercept_step, 1.0, worst
-        while True:
-            moved = dual + size * step, intercept + size * intercept_step, logits + size * logit_step
-            new_value = _objective(*moved, label)
-            if new_value <= value + 1e-12 * abs(value) or size < 1e-6:
-                break
-            size /= 2
-        (dual, intercept, logits), value = moved, new_value
+        step, intercept_step = newton.solve(missing, at.dual.sum())
+        at, before = _descended(at, _Point(step, intercept_step, gram @ step + intercept_step), label), worst
     raise _unfit(len(label))
+
+
+class _Point(NamedTuple):
+    """A place in the search, or a step: dual (n,), intercept, and logits (n,), which follow from both."""
+
+    dual: np.ndarray
+    intercept: float
+    logits: np.ndarray
+
+    def objective(self, label: np.ndarray) -> float:
+        loss = np.logaddexp(0, self.logits).sum() - label @ self.logits
+        return float(0.5 * self.dual @ (self.logits - self.intercept) + loss)  # scikit-learn's, with C = 1
+
+
+def _descended(at: _Point, step: _Point, label: np.ndarray) -> _Point:
+    """Return the place after a step, halved until the objective falls."""
+    value, size = at.objective(label), 1.0
+    while True:
+        moved = _Point(at.dual + size * step.dual, at.intercept + size * step.intercept, at.logits + size * step.logits)
+        if moved.objective(label) <= value + 1e-12 * abs(value) or size < 1e-6:
+            return moved
+        size /= 2
 
 
 def _unfit(rows: int) -> TrapsError:
@@ -156,11 +171,6 @@ class _NewtonStep:
         free = self._inverse(missing)
         intercept_step = float((free.sum() + dual_sum) / self._by_intercept.sum())
         return free - intercept_step * self._by_intercept, intercept_step
-
-
-def _objective(dual: np.ndarray, intercept: float, logits: np.ndarray, label: np.ndarray) -> float:
-    loss = np.logaddexp(0, logits).sum() - label @ logits
-    return float(0.5 * dual @ (logits - intercept) + loss)  # scikit-learn's, with C = 1
 
 
 # --- scoring ----------------------------------------------------------------------------------------------------------
