@@ -14,7 +14,7 @@ import numpy as np
 
 from traps_pipeline.mechanism.probes import auroc
 from traps_pipeline.protocol.datasets import DATASETS
-from traps_pipeline.protocol.regimes import STANDARD
+from traps_pipeline.protocol.regimes import GUIDED, STANDARD
 from traps_pipeline.report.figures.expression_figures import orders, scored_items
 from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.report.tables.control_reports import prompts
@@ -86,7 +86,7 @@ def _moved(results: Results) -> float | None:
     rows = results.lens
     rows = rows.loc[rows["layer"] == rows["layer"].max()]
     apart = (rows["voids"] - rows["controls"]).groupby(rows["prompt"].astype(str)).mean()
-    return float(apart["guided"] - apart[STANDARD]) if {STANDARD, "guided"} <= {*apart.index} else None
+    return float(apart[GUIDED] - apart[STANDARD]) if {STANDARD, GUIDED} <= {*apart.index} else None
 
 
 def _prompt_alone(results: Results) -> float | None:
@@ -178,8 +178,8 @@ CLAIMS = (
           "AUROC against `removed`", 0.65, _removed),
     Claim("direction", "`cosines`", "the void has one direction under both prompts", "cosine standard, guided", 0.65,
           _same_direction),
-    Claim("ahead", "`steering_nulls`", "void directions do more than their nulls", "cells ahead of 19 of 20 draws of "
-          "every null", 1.0, _ahead),
+    Claim("ahead", "`steering_nulls`", "void directions do more than their nulls", "cells ahead of 19 of "
+          "20 draws of every null", 1.0, _ahead),
 )  # fmt: skip
 
 
@@ -191,17 +191,18 @@ def claimed(workspace: Workspace) -> dict[str, float]:
 
 
 def markdown(gap: Sequence[Figure], no_gap: Sequence[Figure]) -> str:
-    """Return the table of the card: each claim in both models, and whether its stage tells them apart: whether it
-    holds for every seed of the first, and for none of the second."""
-    lines = ["| stage | claim | figure | holds from | gap | no gap | told apart |", "|" + " --- |" * 7]
+    """Return the table of the card: each claim in both models, by training seed, and whether its stage tells them
+    apart: whether it holds for every seed of one, and for none of the other."""
+    seeds = [", ".join(str(seed) for seed in sorted({f.seed for f in of})) for of in (gap, no_gap)]
+    heads = ["stage", "claim", "figure", "holds from", f"gap, seed {seeds[0]}", f"no gap, seed {seeds[1]}"]
+    lines = [f"| {' | '.join(heads)} | told apart |", "|" + " --- |" * 7]
     for claim in CLAIMS:
-        values = [[f.value for f in of if (f.figure, f.kind) == ("claim", claim.name)] for of in (gap, no_gap)]
+        values = [[f.value for f in sorted(of, key=lambda f: f.seed) if f.claim == claim.name] for of in (gap, no_gap)]
         if not all(values):
             continue
-        first, second = values
-        told = "yes" if min(first) >= claim.bound > max(second) else "no"
-        cells = [f"{np.mean(of):.2f}" + (f" ({min(of):.2f}-{max(of):.2f})" if len(of) > 1 else "") for of in values]
+        every, some = ([pick(of) >= claim.bound for of in values] for pick in (min, max))  # of the seeds of a model
+        told = "yes" if every[0] and not some[1] else "the other way" if every[1] and not some[0] else "no"
+        cells = [", ".join(f"{value:.2f}" for value in of) for of in values]
         columns = [claim.stage, claim.says, claim.figure, f"{claim.bound:g}", *cells, told]
         lines.append(f"| {' | '.join(columns)} |")
-    seeds = [", ".join(map(str, sorted({f.seed for f in of}))) for of in (gap, no_gap)]
-    return "\n".join([*lines, "", f"Training seeds: {seeds[0]} of the model with the gap, {seeds[1]} of the other."])
+    return "\n".join(lines)

@@ -118,15 +118,8 @@ def card_tables() -> dict[str, str]:
 
 
 def other_tables() -> list[str]:
-    """Return the tables for which the card is too short: what each model answers, and what was found in it."""
-    return [
-        table
-        for folder in SHIPPED.values()
-        for table in (
-            evaluation.markdown(evaluation.read_cells(folder / EVALUATION)),
-            inside.markdown(inside.read_figures(folder / MECHANISM)),
-        )
-    ]
+    """Return the tables for which the card is too short: what each model answers under every prompt."""
+    return [evaluation.markdown(evaluation.read_cells(folder / EVALUATION)) for folder in SHIPPED.values()]
 
 
 def marks(table: str) -> tuple[str, str]:

@@ -13,29 +13,12 @@ from traps_pipeline.base.files import replacing
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure of one training seed; columns that do not apply to it are empty.
-
-    figure: transfer_best and transfer_chosen (AUROC of a pair at the layer that is best on the target, and at the
-    one chosen without it), held_out_best and held_out_chosen (the same, fitted without the scored scenario), shuffled,
-    answerable_void, answerable_control (at the chosen layer), abstention (over all paths and regimes), planted
-    (kind: its name in `planted.TRUTHS`), claim (kind: its name in `claims.CLAIMS`). low, high: 95 % interval from
-    resampled scenarios. answers: number of distinct answers.
-    """
+    """What a claim of `claims.CLAIMS` comes to in the model of one training seed."""
 
     seed: int
     weights: str
-    figure: str
-    source: str = ""
-    target: str = ""
-    kind: str = ""
-    layer: int | None = None
-    alpha: float | None = None
-    side: str = ""
-    value: float = 0.0
-    low: float | None = None
-    high: float | None = None
-    answers: int | None = None
-    scenarios: int | None = None
+    claim: str
+    value: float
 
 
 def write_seeds(path: Path, rows: Sequence[Any], read: Callable[[Path], Sequence[Any]]) -> None:
