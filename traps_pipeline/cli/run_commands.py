@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import shlex
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -133,7 +134,9 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         return OK
     if arguments.until is not None:
-        print(f"next: traps run {arguments.experiment} for the stages after {arguments.until}")
+        where = [] if arguments.workspace is None else ["--workspace", arguments.workspace]
+        command = shlex.join(["traps", "run", arguments.experiment, *where])
+        print(wrapped(f"next: `{command}` for the stages after {arguments.until}"))
         return OK
     from traps_pipeline.report.printed_board import printed_board
 
