@@ -1,4 +1,4 @@
-"""Three balls run off sloping shelves and stream down a tilted board of pegs; how many end up in the named zone?
+"""Three balls stream down a board of pegs: how many end up in the named zone?
 
 The balls start one behind the other, so that the first meets the pegs after about a second and the others follow.
 Control: the whole run, until all three lie in the coloured zones at the bottom. Void: the clip ends before that. Each
@@ -53,7 +53,7 @@ LABELS = ("0", "1", "2", "3")
 
 
 def _sides(rng: np.random.Generator, so_far: Drawn) -> tuple[int, ...]:
-    """Return all from one side, or one of them from the other; then how far each has to roll."""
+    """Draw the balls' sides, all or all but one the same, and their ways on the shelf."""
     side = int(rng.choice([-1, 1]))
     sides = (side,) * BALLS if rng.random() < 0.5 else (side, -side, side)
     ways, gap = {-1: uniform(rng, 0.21, 0.28), 1: uniform(rng, 0.21, 0.28)}, uniform(rng, 0.120, 0.150)
@@ -62,9 +62,7 @@ def _sides(rng: np.random.Generator, so_far: Drawn) -> tuple[int, ...]:
 
 
 def _zones(rng: np.random.Generator, so_far: Drawn) -> tuple[Any, ...]:
-    """Return widths of two or three zones that meet below where the balls fall, their colours, and which is asked
-    for.
-    """
+    """Draw widths and colours of two or three zones, and the one that is asked for."""
     zones, width = int(rng.integers(2, 4)), uniform(rng, 1.10, 1.25)
     sides = so_far["sides"]
     fall = sides[0] * (width / 2 - 0.52) if len(set(sides)) == 1 else 0.0  # about where the balls fall
@@ -83,7 +81,7 @@ ROWS, ZONES = peg_rows(5, 7), together(_zones)
 
 @dataclass(frozen=True)
 class Params:
-    """Per zone, left to right: width, colour. Per ball: colour, side it comes from (-1: left), way on the shelf."""
+    """Parameters; per zone: width, colour, per ball: colour, side (-1: left), way."""
 
     rows: int = ROWS()
     peg_gap_m: float = ROWS()  # from peg to peg in a row
@@ -136,7 +134,7 @@ class Params:
         return self.lip_m + rise + 3 * self.ball_radius_m
 
     def shelf_m(self, side: int) -> float:
-        """Return length of the shelf at a side."""
+        """Return the length of the shelf at a side."""
         return max(w for w, s in zip(self.ways_m, self.sides, strict=True) if s == side) + 1.4 * self.ball_radius_m
 
     def lip_x_m(self, side: int) -> float:
@@ -145,7 +143,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return plate, frame, zones with walls between them, pegs, shelves, balls."""
+    """Build plate, frame, zones with walls between them, pegs, shelves and balls."""
     board = Board(
         physics,
         tilt_deg=p.tilt_deg,
@@ -194,15 +192,14 @@ def _add_shelf(board: Board, p: Params, side: int) -> None:
 
 
 def _start(p: Params, ball: int) -> tuple[float, float]:
-    """Return where a ball's centre starts: across and up the board (m). It rests against its shelf."""
+    """Return a ball's place across and up the board (m), at rest against its shelf."""
     side, way, slope = p.sides[ball], p.ways_m[ball], p.slope_rad
     across = way * math.cos(slope) - p.ball_radius_m * math.sin(slope)
     return p.lip_x_m(side) + side * across, p.lip_m + way * math.sin(slope) + p.ball_radius_m * math.cos(slope)
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return how many balls' centres are in the asked zone, while all are in some zone; None before. The margin is how
-    far the nearest ball's centre ends from the walls of the asked zone or from the zones' rim."""
+    """Read how many balls are in the asked zone, while all are in some zone."""
     places = [place(motion, f"ball_{i}", p.tilt_deg) for i in range(BALLS)]
     across, up = (np.stack(values, axis=1) for values in zip(*places, strict=True))
     low, high = p.edges_m[p.asked : p.asked + 2]
@@ -213,7 +210,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 
 def _counts(p: Params, rng: np.random.Generator) -> Filled:
-    """Return the choices are all counts that three balls allow."""
+    """Return the choices: all counts that three balls allow."""
     aliases = {"all three": "3", "all three balls": "3"}
     for label, number in zip(LABELS, NUMBERS, strict=False):
         noun = "ball" if label == "1" else "balls"
@@ -224,9 +221,9 @@ def _counts(p: Params, rng: np.random.Generator) -> Filled:
 LAST_PEGS = 0.45  # of the board's width above the zones: so low a ball has the last rows of pegs before it
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Count the balls that are in the asked zone, or right above it on the last rows of pegs, if all are so low."""
-    if named["zone"] not in ZONE_COLOURS:
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Count the balls in the asked zone, or right above it, if all are that low."""
+    if slots["zone"] not in ZONE_COLOURS:
         return None
     grounds = {colour: _ground(frames[-1], colour) for colour in ZONE_COLOURS}
     colours = sorted({colour for pool in BALL_COLOURS.values() for colour in pool})
@@ -234,11 +231,11 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
     homes = [_home(ball, grounds) or _above(ball, grounds) for ball in balls if ball is not None]
     if len(homes) != BALLS or None in homes:
         return None
-    return str(homes.count(named["zone"]))
+    return str(homes.count(slots["zone"]))
 
 
 def _above(ball: Blob, grounds: Mapping[str, np.ndarray | None]) -> str | None:
-    """Return colour of the zone that a ball is above, seen along the board; None while it has many pegs before it."""
+    """Return the colour of the zone that a ball is above; None if far above."""
     outlines = {colour: ground[:, 0].astype(float) for colour, ground in grounds.items() if ground is not None}
     if len(outlines) < 2:
         return None
@@ -254,7 +251,7 @@ def _above(ball: Blob, grounds: Mapping[str, np.ndarray | None]) -> str | None:
 
 
 def _ground(frame: np.ndarray, colour: str) -> np.ndarray | None:
-    """Return convex outline of a zone's colour, which balls may part into regions; None if it has not a zone's size."""
+    """Return the convex outline of a zone's colour; None if it is no zone in size."""
     mask = colour_mask(frame, colour).astype(np.uint8)
     outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     regions = [outline for outline in outlines if cv2.contourArea(outline) > 40]
@@ -264,7 +261,7 @@ def _ground(frame: np.ndarray, colour: str) -> np.ndarray | None:
 
 
 def _home(ball: Blob, grounds: Mapping[str, np.ndarray | None]) -> str | None:
-    """Return colour of the zone that a ball's centre lies in."""
+    """Return the colour of the zone that a ball's centre lies in."""
     inside = (c for c, g in grounds.items() if g is not None and cv2.pointPolygonTest(g, (ball.x, ball.y), False) > 0)
     return next(inside, None)
 

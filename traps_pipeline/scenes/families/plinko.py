@@ -1,4 +1,4 @@
-"""A ball runs down a tilted board of pegs into numbered buckets; the question is into which.
+"""A ball runs down a tilted board of pegs: into which numbered bucket?
 
 The ball is thrown up the bare head of the board, curves back and meets the pegs after about a second. Control: the
 whole run. Void: the clip ends before the buckets. Each peg magnifies a difference in the ball's path about tenfold, so
@@ -41,14 +41,14 @@ ROWS = peg_rows(5, 7)
 
 
 def _tilt(rng: np.random.Generator, so_far: Drawn) -> float:
-    """Before it, how many balls there are and which side each comes from: their starts and pushes follow from that."""
+    """Draw the tilt, and before it the sides that one or two balls come from."""
     count = 2 if rng.random() < 0.4 else 1
     so_far["sides"] = rng.permutation([-1, 1])[:count]
     return uniform(rng, 22, 30)
 
 
 def _balls(rng: np.random.Generator, so_far: Drawn) -> tuple[Any, ...]:
-    """Return colours, starts, pushes towards the other side, rises."""
+    """Draw the balls' colours, starts, pushes towards the other side, and rises."""
     sides = so_far["sides"]
     colours = distinct_colours(rng, len(sides), SCHEMES[so_far["board_colour"]])
     starts = tuple(round(float(side * rng.uniform(0.12, 0.40)), 4) for side in sides)
@@ -61,7 +61,7 @@ BALLS = together(_balls)
 
 @dataclass(frozen=True)
 class Params:
-    """Per ball: colour, start and push; the first ball is the one asked for, a second one is company."""
+    """Parameters; per ball: colour, start and push; the first ball is asked for."""
 
     rows: int = ROWS()
     peg_gap_m: float = ROWS()  # from peg to peg in a row
@@ -93,12 +93,12 @@ class Params:
 
     @property
     def row_heights_m(self) -> list[float]:
-        """Where the rows of pegs are, up the board; one place more is where the balls start."""
+        """Heights of the rows of pegs up the board, and of the balls' starts."""
         return [self.rim_m + (row + 0.9) * self.row_gap_m for row in range(self.rows + 1)]
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return plate, numbered apron, frame, buckets, pegs, balls."""
+    """Build plate, numbered apron, frame, buckets, pegs and balls."""
     board = Board(
         physics,
         tilt_deg=p.tilt_deg,
@@ -152,8 +152,7 @@ def _add_digit(board: Board, digit: int, x: float) -> None:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return the number of the bucket that the asked ball's centre is in; None above the buckets. The margin is how far
-    that centre ends from where another bucket begins: its walls or their rim."""
+    """Read the number of the bucket that the asked ball's centre is in."""
     middle, up = place(motion, "ball_0", p.tilt_deg)
     across = middle + p.width_m / 2
     bucket = np.clip(across // p.pitch_m, 0, p.buckets - 1).astype(int) + 1
@@ -163,7 +162,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 
 def _numbers(p: Params, rng: np.random.Generator) -> Filled:
-    """Return the choices are the buckets' numbers."""
+    """Return the choices: the buckets' numbers."""
     labels = tuple(str(i + 1) for i in range(p.buckets))
     aliases: dict[str, str] = {}
     for n, word, ordinal in zip(labels, NUMBERS[1:], ORDINALS, strict=False):
@@ -179,13 +178,12 @@ INK = 0.025, 0.075  # where the middle of the digits is
 FRAME = 0.012  # share of that edge below the frame at either side
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Return the bucket that the ball is above by its share of the apron's lower edge, if it lies there or will soon:
-    of those that two rows of pegs leave to it, the one right below is the likeliest."""
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Return the bucket right below the ball, if only the last two rows are left."""
     last = frames[-1]
-    if not any(named["ball"] in pool for pool in SCHEMES.values()):
+    if not any(slots["ball"] in pool for pool in SCHEMES.values()):
         return None
-    ball, edge = round_ball(last, named["ball"]), _lower_edge(last)
+    ball, edge = round_ball(last, slots["ball"]), _lower_edge(last)
     if ball is None or edge is None:
         return None
     left, right = edge
@@ -194,12 +192,12 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
     height = float(along[1] * offset[0] - along[0] * offset[1]) / float(along @ along)
     if not (0 < share < 1 and 0 < height < LAST_PEGS):
         return None
-    buckets = len(choices_in(named["choices"])) if "choices" in named else _digits(last, edge)
+    buckets = len(choices_in(slots["choices"])) if "choices" in slots else _digits(last, edge)
     return str(int(share * buckets) + 1) if buckets else None
 
 
 def _digits(frame: np.ndarray, edge: tuple[np.ndarray, np.ndarray]) -> int:
-    """Return how many digits stand on the apron: one a bucket. Beside each there is a gap without ink."""
+    """Count the digits on the apron, one a bucket, by the gaps between their ink."""
     left, right = edge
     along = right - left
     up = np.array([along[1], -along[0]])
@@ -213,7 +211,7 @@ def _digits(frame: np.ndarray, edge: tuple[np.ndarray, np.ndarray]) -> int:
 
 
 def _lower_edge(frame: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the lower left and right corner of the white apron: no white is lower."""
+    """Return the lower left and right corner of the white apron."""
     outlines, _ = cv2.findContours((frame.min(axis=2) > 225).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     large = [outline[:, 0] for outline in outlines if cv2.contourArea(outline) > 1500]
     if not large:

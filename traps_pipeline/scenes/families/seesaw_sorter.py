@@ -1,4 +1,4 @@
-"""A ball runs down a tilted board of pegs towards a seesaw above two coloured bins; the question is where it ends up.
+"""A ball runs down a board of pegs to a seesaw above two bins: where does it end?
 
 The ball is thrown up the bare head of the board, curves back over the seesaw and meets the pegs after a second. A
 funnel below them leads it onto the seesaw, which tips under it and sheds it into the red bin on the left or the blue
@@ -69,35 +69,35 @@ CRATES = ("grey", "wood", "white", "black")
 
 
 def _tilt(rng: np.random.Generator, so_far: Drawn) -> float:
-    """Before it, the side on which the ball begins: start and push follow from that."""
+    """Draw the tilt, and before it the side on which the ball begins."""
     so_far["side"] = int(rng.choice([-1, 1]))
     return uniform(rng, 31, 35)
 
 
 def _beam_colour(rng: np.random.Generator, so_far: Drawn) -> str:
-    """Return one that stands out against the board and the ball."""
+    """Draw a colour that stands out against the board and the ball."""
     ball, beams = so_far["ball_colour"], BEAMS[so_far["board_colour"]]
     return str(rng.choice([beam for beam in beams if (ball, beam) not in CLASHES]))
 
 
 def _start(rng: np.random.Generator, so_far: Drawn) -> float:
-    """Well inside the frame, on the side that is drawn."""
+    """Draw the start, well inside the frame on the side drawn before."""
     return so_far["side"] * uniform(rng, 0.05, 0.35)
 
 
 def _push(rng: np.random.Generator, so_far: Drawn) -> float:
-    """So that the ball is over the seesaw after about a second, when it meets the pegs."""
+    """Draw a push that has the ball over the seesaw after about a second."""
     return round((so_far["trays_m"][0] - so_far["trays_m"][1]) / 2 + uniform(rng, -0.12, 0.12) - so_far["start_m"], 4)
 
 
 def _rise(rng: np.random.Generator, so_far: Drawn) -> float:
-    """So far that the ball is back where it began after a second: it has not met a peg when the void may end."""
+    """Draw a rise that has the ball back at its start after a second, before any peg."""
     slowing = 5 / 7 * 9.81 * math.sin(math.radians(so_far["tilt_deg"]))
     return round(slowing * uniform(rng, 1.0, 1.05) ** 2 / 8, 4)
 
 
 def _bands(rng: np.random.Generator, so_far: Drawn) -> tuple[float, ...]:
-    """Return two bands, or none."""
+    """Draw two bands, or none."""
     so_far["half_m"] = so_far["bin_m"] + sum(so_far["trays_m"]) / 2
     if so_far["bands"] == "none":
         return ()
@@ -107,8 +107,7 @@ def _bands(rng: np.random.Generator, so_far: Drawn) -> tuple[float, ...]:
 
 
 def _crates(rng: np.random.Generator, so_far: Drawn) -> tuple[tuple[float, ...], ...]:
-    """Return boxes that stand beside the board, at most one on either side: how far across and away, half width and
-    height."""
+    """Draw boxes beside the board: how far across and away, half width and height."""
     crates: list[tuple[float, ...]] = []
     for side in (-1, 1):
         if rng.random() < 0.6:
@@ -122,7 +121,7 @@ def _crates(rng: np.random.Generator, so_far: Drawn) -> tuple[tuple[float, ...],
 
 @dataclass(frozen=True)
 class Params:
-    """Lengths are measured on the board; sideways ones from its middle, those of bins and seesaw from the pivot."""
+    """Parameters; lengths on the board, bins' and seesaw's sideways from the pivot."""
 
     rows: int = ROWS()
     peg_gap_m: float = ROWS()  # from peg to peg in a row
@@ -175,7 +174,7 @@ class Params:
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return plate, frame, bins and trays with walls between them, seesaw, pegs, ball."""
+    """Build plate, frame, bins and trays with walls between them, seesaw, pegs, ball."""
     board = Board(
         physics,
         tilt_deg=p.tilt_deg,
@@ -218,8 +217,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _add_funnel(board: Board, p: Params, colour: str) -> Callable[[float, float], bool]:
-    """Return two slanted bars that lead a ball at a side onto the seesaw. Returns whether a ball passes between them
-    and a peg at a place (across, up)."""
+    """Add two slanted bars; return whether a ball passes them by a peg at a place."""
     tip = p.pivot_m + TIP_M
     feet = [p.bin_m - FUNNEL_IN_M + side * p.middle_m for side in (-1, 1)]
     for name, side, foot in zip(("funnel_left", "funnel_right"), (-1, 1), feet, strict=True):
@@ -231,16 +229,16 @@ def _add_funnel(board: Board, p: Params, colour: str) -> Callable[[float, float]
         bar.quat = turned(math.atan2(along[1], along[0]), 3)
         SLICK.on(bar)
 
-    def passed(across: float, up: float) -> bool:
+    def has_room(across: float, up: float) -> bool:
         foot = feet[0] if across < 0 else feet[1]
         high = tip + STEEP * (board.side - foot) + p.ball_radius_m
         return up > high or foot + (up - tip) / STEEP - abs(across) - p.peg_radius_m > 2.9 * p.ball_radius_m
 
-    return passed
+    return has_room
 
 
 def _paint_bands(board: Board, p: Params, top: float) -> None:
-    """Paint two bands of another shade on the plate, from frame to frame."""
+    """Paint two bands of another shade on the plate."""
     for i, (low, high) in enumerate(zip(p.bands_m[::2], p.bands_m[1::2], strict=True)):
         across, up = (
             ((low, min(high, board.side)), (SILL_M, top))
@@ -253,14 +251,14 @@ def _paint_bands(board: Board, p: Params, top: float) -> None:
 
 
 def _stand_crates(board: Board, p: Params) -> None:
-    """Stand boxes on the floor beside the board, which nothing touches."""
+    """Stand boxes without contact on the floor beside the board."""
     for i, (colour, (across, away, half, tall)) in enumerate(zip(p.crate_colours, p.crates_m, strict=True)):
         at = (across, away, tall)
         add_box(board.spec.worldbody, f"crate_{i}", at, (half, half, tall), colour, contype=0, conaffinity=0)
 
 
 def _add_seesaw(board: Board, p: Params) -> None:
-    """Add a beam on a pivot in its middle that touches nothing but the ball; a weak spring levels it."""
+    """Add a beam on a pivot that touches only the ball; a weak spring levels it."""
     import mujoco
 
     half_deep = board.deep / 2
@@ -275,8 +273,7 @@ def _add_seesaw(board: Board, p: Params) -> None:
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return the bin that the ball's centre is in, or elsewhere for a tray at the side; None above the bins. The margin
-    is how far that centre ends from where another place begins: a wall or the bins' rim."""
+    """Read the bin that the ball is in, or elsewhere for a tray; None above the bins."""
     across, up = place(motion, "ball", p.tilt_deg)
     across = across - p.middle_m
     names = np.where(np.abs(across) > p.bin_m, "elsewhere", np.where(across < 0, "left", "right"))
@@ -287,7 +284,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 
 def _places(p: Params, rng: np.random.Generator) -> Filled:
-    """Return the choices are the two bins, in either order, and the rest of the board."""
+    """Return the choices: the two bins, in either order, and the rest of the board."""
     order = (*rng.permutation(["left", "right"]), "elsewhere")
     forms = ("{0} bin", "{1}", "{1} bin", "in the {0} bin", "in the {1} bin", "the {0} bin", "{0} bin ({1})")
     aliases = {f.format(*side): side[0] for side in (("left", "red"), ("right", "blue")) for f in forms}
@@ -299,21 +296,19 @@ def _places(p: Params, rng: np.random.Generator) -> Filled:
 PAST_PEGS = 1.2  # bin widths above the bins: so low a ball has at most one row of pegs before it
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """In which painted bin or tray the ball lies at the end, by the middle line of the red and the blue one; None
-    while it is above that line."""
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Return the bin or tray of the resting ball, or where it falls; None above them."""
     red, blue = largest(frames[0], "red", 300), largest(frames[0], "blue", 300)
-    if red is None or blue is None or blue.x <= red.x or not any(named["ball"] in pool for pool in BALLS.values()):
+    if red is None or blue is None or blue.x <= red.x or not any(slots["ball"] in pool for pool in BALLS.values()):
         return None
-    path = [_ball(frame, frames[0], named["ball"]) for frame in frames[-3:]]
+    path = [_ball(frame, frames[0], slots["ball"]) for frame in frames[-3:]]
     places = {_lies(ball, red, blue) for ball in path}
-    seen = places.pop() if len(places) == 1 else None
-    return _falls(path, red, blue) if seen is None else seen
+    place_seen = places.pop() if len(places) == 1 else None
+    return _falls(path, red, blue) if place_seen is None else place_seen
 
 
 def _falls(path: Sequence[Blob | None], red: Blob, blue: Blob) -> str | None:
-    """Return where a ball that is past the pegs goes to: the side of the seesaw that it is on, if it goes on as it
-    does, or elsewhere if that is past its end; None before."""
+    """Return where a ball past the pegs goes by the seesaw's side; None before."""
     now, soon = carried_on(path, 0.0), carried_on(path, AHEAD)
     if now is None or soon is None:
         return None
@@ -328,7 +323,7 @@ def _falls(path: Sequence[Blob | None], red: Blob, blue: Blob) -> str | None:
 
 
 def _ball(frame: np.ndarray, first: np.ndarray, colour: str) -> Blob | None:
-    """Return the largest region of the ball's colour that was not of that colour in the first frame."""
+    """Return the largest region that got the ball's colour since the first frame."""
     before = cv2.dilate(colour_mask(first, colour).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     return next(iter(blobs(colour_mask(frame, colour) & ~before, 40)), None)
 

@@ -1,4 +1,4 @@
-"""Dice tumble down steps into a tray; the question is which colour lies on top of the first die to get there.
+"""Dice tumble down steps into a tray: which colour is on top of the first one?
 
 Control: until the dice lie still. Void: the clip ends while they tumble. Edges hitting steps magnify differences that
 no pixel shows; gravity is low, which nothing in view betrays, so that many tumbles come after a cut at one second.
@@ -37,25 +37,25 @@ STILL = 0.1  # share of its size by which a lying die may move from one frame to
 
 
 def _direction(rng: np.random.Generator, so_far: Drawn) -> int:
-    """Before it, how many dice there are."""
+    """Draw the direction, and before it the number of dice."""
     so_far["dice"] = int(rng.choice([2, 3, 3]))
     return int(rng.choice([-1, 1]))
 
 
 def _width(rng: np.random.Generator, so_far: Drawn) -> float:
-    """Return room for a turning die beside each wall."""
+    """Return the width, with room for a turning die beside each wall."""
     return round(max(0.46, (2.5 * so_far["dice"] + 1.4) * so_far["half_m"]), 4)
 
 
 def _turns(rng: np.random.Generator, so_far: Drawn) -> tuple[tuple[float, ...], ...]:
-    """Before them, which dice of the zigzag are ahead."""
+    """Draw the dice's turns, and before them which dice of the zigzag are ahead."""
     so_far["ahead"] = int(rng.integers(2))
     turns = rng.normal(size=(so_far["dice"], 4))
     return tuple(tuple(round(float(v), 5) for v in q / np.linalg.norm(q)) for q in turns)
 
 
 def _starts(rng: np.random.Generator, so_far: Drawn) -> tuple[tuple[float, ...], ...]:
-    """Return a zigzag, so that the dice do not touch before they land."""
+    """Draw the starts in a zigzag, so that dice do not touch before they land."""
     dice, half, ahead = so_far["dice"], so_far["half_m"], so_far["ahead"]
     lanes = [(i - (dice - 1) / 2) * 2.5 * half for i in range(dice)]
     return tuple(
@@ -65,7 +65,7 @@ def _starts(rng: np.random.Generator, so_far: Drawn) -> tuple[tuple[float, ...],
 
 
 def _each(*ranges: tuple[float, float]) -> tuple[tuple[float, ...], ...]:
-    """For every die one number of each range."""
+    """Return a field with a number of each range for every die."""
     return drawn_by(
         lambda rng, so_far: tuple(tuple(uniform(rng, *ends) for ends in ranges) for _ in range(so_far["dice"]))
     )
@@ -77,7 +77,7 @@ def _faces(rng: np.random.Generator, so_far: Drawn) -> tuple[tuple[str, ...], ..
 
 @dataclass(frozen=True)
 class Params:
-    """Per die: start, turn and throw. faces: the colours on +x, -x, +y, -y, +z, -z of every die."""
+    """Parameters; per die: start, turn and throw, faces on +x, -x, +y, -y, +z, -z."""
 
     direction: int = drawn_by(_direction)  # +1: the steps go down to the right
     half_m: float = between(0.060, 0.068)  # half a die's edge
@@ -103,12 +103,12 @@ class Params:
         return self.steps * self.step_m
 
     def floor_m(self, step: int) -> float:
-        """Return height of a step, the tray being one after the last."""
+        """Return the height of a step; the tray is one after the last."""
         return TRAY_M + (self.steps - step) * self.drop_m
 
 
 def build(p: Params, physics: Physics) -> Scene:
-    """Return steps and tray between two walls. Lengths run down the steps."""
+    """Build steps and tray between two walls; lengths run down the steps."""
     course = Course(physics, p.direction)
     # The edges keep their colour in shade.
     course.spec.add_material(name="bright", emission=0.5, specular=0.0, shininess=0.0)
@@ -150,8 +150,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _add_glass_edges(course: Course, along: tuple[float, float], side: float, up: tuple[float, float]) -> None:
-    """Add the edges of the glass box that dice bounce off: four upright ones from floor to top, and the rails around
-    it."""
+    """Add the edges of the glass box: four upright ones, and the rails around it."""
     bars = [((x, y, up[0]), (x, y, up[1])) for x in along for y in (-side, side)]
     bars += [((along[0], y, up[1]), (along[1], y, up[1])) for y in (-side, side)]
     bars += [((x, -side, up[1]), (x, side, up[1])) for x in along]
@@ -160,7 +159,7 @@ def _add_glass_edges(course: Course, along: tuple[float, float], side: float, up
 
 
 def _add_die(course: Course, p: Params, i: int) -> None:
-    """Add a cube in the edge colour with a thin plate, drawn only, on every face."""
+    """Add a cube in the edge colour with a thin plate, only drawn, on every face."""
     (along, across, above), h, edge = p.starts_m[i], p.half_m, p.edge_colours[i]
     body = course.free_box(f"die_{i}", (along, across, p.floor_m(0) + above), (h, h, h), edge, density=600.0)
     body.quat, cube = list(p.turns[i]), body.first_geom()
@@ -173,48 +172,51 @@ def _add_die(course: Course, p: Params, i: int) -> None:
 
 
 def _short_of_tray(motion: Motion, p: Params) -> tuple[np.ndarray, np.ndarray]:
-    """Return how far (m) each die is from being past the last step, and from being low enough to touch the tray, (F,
-    dice)."""
+    """Return how far (m) each die is before the tray and above it, (F, dice)."""
     places = np.stack([motion.pos(f"die_{i}") for i in range(len(p.faces))], axis=1)
     return p.run_m - p.direction * places[..., 0], places[..., 2] - TRAY_M - 2.1 * p.half_m
 
 
 def _first_die(motion: Motion, p: Params) -> tuple[int, int] | None:
-    """Return the first die in the tray and the frame it is there; None without one. By the look of it, a die may reach
-    the tray when it is past the steps or when it lands: the same die must be clearly the first by either."""
+    """Return the first die in the tray and its frame, if it is first by two rules.
+
+    By the look of it, a die may reach the tray when it is past the steps or when it lands.
+    """
     along, above = _short_of_tray(motion, p)
-    firsts = [_first(reached, motion.times) for reached in (along <= 0, np.maximum(along, above) <= 0)]
+    firsts = [_first(has_reached, motion.times) for has_reached in (along <= 0, np.maximum(along, above) <= 0)]
     return firsts[1] if firsts[0] and firsts[1] and firsts[0][0] == firsts[1][0] else None
 
 
-def _first(reached: np.ndarray, times: np.ndarray) -> tuple[int, int] | None:
-    """Return the die (column) that is first to reach something, and the frame; None if another comes too soon after."""
-    arrivals = np.where(reached.any(axis=0), times[reached.argmax(axis=0)], math.inf)
+def _first(has_reached: np.ndarray, times: np.ndarray) -> tuple[int, int] | None:
+    """Return the first die (column) to reach something, and the frame; None if close."""
+    arrivals = np.where(has_reached.any(axis=0), times[has_reached.argmax(axis=0)], math.inf)
     first, second = np.sort(arrivals)[:2]
     if math.isinf(first) or second - first < LEAD_S - 1e-9:
         return None
     die = int(arrivals.argmin())
-    return die, int(reached[:, die].argmax())
+    return die, int(has_reached[:, die].argmax())
 
 
 def _lean(motion: Motion, die: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return index of the uppermost face and its angle to the horizontal (rad), each (F,)."""
+    """Return the uppermost face's index and its angle to the horizontal (rad), (F,)."""
     heights = motion.rot(f"die_{die}").swapaxes(1, 2) @ np.array([0, 0, 1.0])
     faces = np.stack([heights, -heights], axis=2).reshape(len(heights), 6)
     return faces.argmax(axis=1), np.arccos(np.clip(faces.max(axis=1), -1, 1))
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Return the upper colour of the first die in the tray, while it lies flat and still (by displacement). The margin
-    is the smaller of two distances: how far the next die was from the tray when the first came, and how much an edge of
-    the lying die would have to rise for another face to come up."""
+    """Read the upper colour of the first die in the tray, while it lies still.
+
+    The margin is the smaller of two distances: how far the next die was from the tray when the first came, and how much
+    an edge of the lying die would have to rise for another face to come up.
+    """
     first = _first_die(motion, p)
     if first is None:
         return Reading(undecided(motion), 0.0)
     die, arrival = first
     top, lean = _lean(motion, die)
-    moved = np.linalg.norm(np.diff(motion.pos(f"die_{die}"), axis=0, prepend=math.inf), axis=1)
-    lies = (lean < FLAT_RAD) & (moved < STILL * 2 * p.half_m) & (np.arange(len(top)) > arrival)
+    steps = np.linalg.norm(np.diff(motion.pos(f"die_{die}"), axis=0, prepend=math.inf), axis=1)
+    lies = (lean < FLAT_RAD) & (steps < STILL * 2 * p.half_m) & (np.arange(len(top)) > arrival)
     lead = np.min(np.delete(np.maximum(*_short_of_tray(motion, p))[arrival], die))
     rise = 2 * p.half_m * math.sin(max(0.0, math.pi / 4 - lean[-1]))
     labels = [p.faces[die][face] if lying else None for face, lying in zip(top, lies, strict=True)]
@@ -222,8 +224,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 
 def _in_order(motion: Motion, p: Params, die: int) -> tuple[int, int]:
-    """Return the frames from which the first die and another one are past the steps: in between, one sees which is
-    first."""
+    """Return the frames from which the first die, and another, are past the steps."""
     past = _short_of_tray(motion, p)[0] <= 0
     others: np.ndarray = np.delete(past, die, axis=1).max(axis=1)
     return int(past[:, die].argmax()), int(others.argmax()) if others.any() else len(past)
@@ -252,7 +253,7 @@ LAST_STEP_PX = 5.0  # between two sampled frames, when a die slides to rest
 
 @dataclass(frozen=True)
 class _Sight:
-    """A die in one frame (pixels): the middle of its outline, the root of its area, and the outline as a mask."""
+    """A die in one frame (pixels): the middle, size and mask of its outline."""
 
     x: float
     y: float
@@ -260,20 +261,19 @@ class _Sight:
     outline: np.ndarray
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Follows the dice by the colours of their edges, and reads the upper face of the first one past the steps once it
-    has slid to a stop. A die that freezes in full motion has not come to rest."""
+def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
+    """Read the upper face of the first die past the steps, once it has slid to a stop."""
     paths = {colour: [_sight(frame, colour) for frame in frames] for colour in EDGES}
     dice = [path for path in paths.values() if sum(sight is not None for sight in path) >= len(frames) / 2]
     path = _first_over(_tray_edge(frames), dice)
-    if path is None or not _came_to_rest(frames, path):
+    if path is None or not _has_come_to_rest(frames, path):
         return None
     tops = {_upper_face(frame, sight) for frame, sight in zip(frames[-3:], path[-3:], strict=True) if sight is not None}
     return tops.pop() if len(tops) == 1 else None
 
 
 def _sight(frame: np.ndarray, edge: str) -> _Sight | None:
-    """Return the die with edges of a colour: the largest region of that colour whose outline holds much vivid face."""
+    """Return the die with edges of a colour, whose outline holds much vivid face."""
     high, low = frame.max(axis=2).astype(int), frame.min(axis=2)
     vivid = (high - low > 0.68 * high) & (high > 60)
     if edge == "white":
@@ -292,7 +292,7 @@ def _sight(frame: np.ndarray, edge: str) -> _Sight | None:
 
 
 def _tray_edge(frames: np.ndarray) -> tuple[int, float, float] | None:
-    """Return where the steps end: the line x = slope y + offset, and on which side of it the tray lies (+1: right)."""
+    """Return the steps' end, x = slope y + offset, and the tray's side (+1: right)."""
     still = np.median(frames, axis=0).astype(np.uint8)
     shade = still.mean(axis=2)
     grey = (np.ptp(still, axis=2) < 22) & (shade > 125) & (shade < 185)
@@ -323,7 +323,7 @@ def _tray_edge(frames: np.ndarray) -> tuple[int, float, float] | None:
 def _first_over(
     edge: tuple[int, float, float] | None, dice: Sequence[Sequence[_Sight | None]]
 ) -> Sequence[_Sight | None] | None:
-    """Return the path of the die that is first past the edge; of two in one frame, the one that is farther past it."""
+    """Return the path of the die that is first, or farther, past the edge."""
     if edge is None or not dice:
         return None
     side, slope, offset = edge
@@ -337,9 +337,8 @@ def _first_over(
     return None
 
 
-def _came_to_rest(frames: np.ndarray, path: Sequence[_Sight | None]) -> bool:
-    """Return whether a die lies still at the end and came there by itself: other things went on moving, or its last
-    steps were small. A clip that merely freezes stops everything at once, in full motion."""
+def _has_come_to_rest(frames: np.ndarray, path: Sequence[_Sight | None]) -> bool:
+    """Return whether a die lies still by itself; a frozen clip stops all at once."""
     places = np.array([(math.nan, math.nan) if sight is None else (sight.x, sight.y) for sight in path])
     lies = np.linalg.norm(places - np.median(places[-3:], axis=0), axis=1) <= NEAR_PX
     if lies.all() or not lies[-3:].all():
@@ -353,7 +352,7 @@ def _came_to_rest(frames: np.ndarray, path: Sequence[_Sight | None]) -> bool:
 
 
 def _upper_face(frame: np.ndarray, die: _Sight) -> str | None:
-    """Seen from above, the upper face is the highest in the picture."""
+    """Return the colour of the upper face, the highest in the picture."""
     faces = {colour: blobs(colour_mask(frame, colour) & die.outline, 60) for colour in FACES}
     heights = {colour: found[0].y for colour, found in faces.items() if found}
     return min(heights, key=lambda colour: heights[colour], default=None)
