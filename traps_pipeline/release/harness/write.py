@@ -58,7 +58,9 @@ def write_harness(release: Path, target: Path, media: MediaSpec = MEDIA_SETTINGS
     altered release or one without answers, and for a folder that holds other files.
     """
     if target.exists() and any(target.iterdir()):
-        raise TrapsError(f"{target}: holds other files; give an empty or a new folder")
+        raise TrapsError(
+            f"{target}: holds other files, or what a stopped harness left; give an empty or a new folder, or delete it"
+        )
     wrong = altered_files(release)
     if wrong:
         raise TrapsError(f"{release}: is not what was released: {wrong[0]}")
