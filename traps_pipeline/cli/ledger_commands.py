@@ -1,4 +1,4 @@
-"""Export, import and move a study's answers, votes and money."""
+"""Commands that export or import a study's ledger, move the study, or release money."""
 
 from __future__ import annotations
 

@@ -146,12 +146,12 @@ def response_row(cell: Cell, item: Mapping[str, Any], row: Row, reasoning: str |
     """Return one row of the responses table."""
     thinking = get_model(cell.evaluation.model).thinking
     reading = read_answer(row, reasoning, cell.evaluation.regime, thinking=thinking, dataset=cell.dataset)
-    copied = ("finish_reason", "served_model", "client", "prompt_tokens", "completion_tokens")
-    copied += ("reasoning_tokens", "cost_usd", "latency_s", "attempts")
+    row_fields = ("finish_reason", "served_model", "client", "prompt_tokens", "completion_tokens")
+    row_fields += ("reasoning_tokens", "cost_usd", "latency_s", "attempts")
     return ResponseRow(
         **{name: item[name] for name in ("item_id", "pair_id", "side", "benchmark_version")},
         **cell.partition,
-        **{name: row[name] for name in copied},
+        **{name: row[name] for name in row_fields},
         **when_asked(row),
         outcome=reading.outcome,
         text=reading.text,

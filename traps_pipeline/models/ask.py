@@ -201,7 +201,7 @@ class _Evaluation:
     """State that the cells of an evaluation share: writer, and ledger places reported."""
 
     writer: Writer
-    told: set[str]
+    reported: set[str]
 
 
 async def settle_evaluation(
@@ -230,9 +230,9 @@ async def _settle_cell(
     calls = work.calls(cell)
     requests = {call.request.key: call.request for call in calls}
     recorded = await asyncio.to_thread(work.ledger.read, cell.evaluation.key, requests)
-    for place in sorted({*recorded.notes} - its.told):
-        report.note(f"{place}: {recorded.notes[place]}")
-    its.told.update(recorded.notes)
+    for location in sorted({*recorded.notes} - its.reported):
+        report.note(f"{location}: {recorded.notes[location]}")
+    its.reported.update(recorded.notes)
     rows = {key: _Held(row) for key, row in recorded.settled.items()}
     missing = [request for key, request in requests.items() if key not in rows]
     new = Counter(request.participant for request in missing)

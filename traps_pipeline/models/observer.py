@@ -1,4 +1,4 @@
-"""Answer from a clip's frames and the question alone: a leaderboard's ceiling row."""
+"""Backend of the classical-vision observer, the leaderboard's upper-bound row."""
 
 from __future__ import annotations
 

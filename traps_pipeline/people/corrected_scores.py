@@ -82,7 +82,7 @@ def corrected(
 
 
 def rogan_gladen(share: np.ndarray, sensitivity: np.ndarray, specificity: np.ndarray) -> np.ndarray:
-    """Return the true share behind a judged one, elementwise, within [0, 1].
+    """Return the Rogan-Gladen estimate of the true share, clipped to [0, 1].
 
     NaN if sensitivity + specificity is 1 or less: then the judged share carries no information.
     """

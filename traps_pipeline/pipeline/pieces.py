@@ -50,7 +50,7 @@ def make_pieces(
     """Return all pieces' content, and names of those rebuilt for new inputs or code."""
     path = workspace.reports / ".state" / f"{stage}.pieces.zip"
     former = _read(workspace.store.here(path).read_bytes()) if workspace.store.has(path) else {}
-    versions, shared = Lineage(workspace).inputs(stage, None), _Shared(stage)
+    versions, shared = Lineage(workspace).inputs(stage, None), _SharedPieces(stage)
     inputs, contents, remade = dict[str, Digests](), dict[str, bytes](), list[str]()
     for number, piece in enumerate(pieces):
         progress.current().tick(stage, "parts", number, len(pieces))
@@ -65,13 +65,13 @@ def make_pieces(
             content = shared.get(piece, shown) if piece.is_shared else piece.make()
             remade.append(piece.name)
         inputs[piece.name], contents[piece.name] = (of_versions, shown), content
-    shared.keep()
+    shared.save()
     if inputs != {name: digests for name, (digests, _) in former.items()}:
         workspace.store.write({path: _archive(inputs, contents)})
     return contents, remade
 
 
-class _Shared:
+class _SharedPieces:
     """An archive in the user's cache folder of the pieces that all studies share.
 
     If it cannot be read or written, the pieces are built as if it did not exist.
@@ -96,7 +96,7 @@ class _Shared:
             self._pieces[piece.name], self._is_new = (inputs_digests, content), True
         return content
 
-    def keep(self) -> None:
+    def save(self) -> None:
         """Store the newly built pieces."""
         if self._pieces and self._is_new:
             inputs = {name: inputs_digest for name, (inputs_digest, _) in self._pieces.items()}

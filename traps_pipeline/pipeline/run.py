@@ -124,9 +124,9 @@ def _is_alive(pid: int) -> bool:
 def pending_in(
     block: Sequence[Stage], lineage: Lineage, history: History, partitions: StudyPartitions, *, existing: bool = False
 ) -> tuple[list[Stage], list[str | None]]:
-    """Return a block's stages with work, all downstream of them, and their keys.
+    """Return the block's pending stages, their dependents in it, and the pending keys.
 
-    existing: only what exists, is outdated, and waits for nothing upstream.
+    existing: only partitions that exist, are stale, and wait for nothing upstream.
     """
     pending: dict[str, list[str | None]] = {}
     for stage in block:

@@ -120,7 +120,7 @@ def range_of(tags: Mapping[str, str]) -> Range:
 
 
 def this_host() -> str:
-    """Return the scope of process ids: the machine and its namespace of processes."""
+    """Return the scope in which process ids are unique: host and PID namespace."""
     namespace = Path("/proc/self/ns/pid")
     return f"{socket.gethostname()} {namespace.readlink() if namespace.exists() else ''}".strip()
 

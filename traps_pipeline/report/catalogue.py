@@ -1,9 +1,8 @@
-"""List all tables and figures (docs/spec.md 10).
+"""Catalogue of all tables and figures (docs/spec.md 10).
 
-Each has its function of `Results`, and the stages that it reads.
-
-An entry decides its asset, staleness and place on the report page and in `traps results export`. It names functions,
-whose modules are imported when they are called: `traps status` reads the entries of all and calls none.
+An entry names the function that builds it from `Results` and the stages that it reads. It decides its asset, its
+staleness, and its place on the report page and in `traps results export`. A function's module is imported only when
+the function is called, so `traps status` can read all entries without importing them.
 """
 
 from __future__ import annotations

@@ -115,7 +115,7 @@ class PairPictures:
 
     @cached_property
     def shortcuts(self) -> pd.DataFrame:
-        """The table of `benchmark.shortcuts`, of which only what a correction changes is computed again."""
+        """The table of `benchmark.shortcuts`; unchanged results come from a cache."""
         from traps_pipeline.benchmark.shortcuts import shortcuts
 
         kept, store = self.workspace.reports / ".state" / "shortcuts.json", self.workspace.store

@@ -115,8 +115,8 @@ def _score_of_people(rows: pd.DataFrame) -> str:
     if not row or row["pecs"] != row["pecs"]:
         return f"{NOT_RUN} in full, since PECS needs labels of both sides of all four datasets"
     figures = ", ".join(f"{heading.removesuffix(' %')} {_ranged(row, field)}" for field, heading in _FIGURES.items())
-    people, clips = counted(row["n_people"], "person", "people"), counted(row["n_clips"], "clip")
-    return f"{figures} ({people}, {clips}, {row['seconds']:.0f} s a clip)"
+    readers, clips_seen = counted(row["n_people"], "person", "people"), counted(row["n_clips"], "clip")
+    return f"{figures} ({readers}, {clips_seen}, {row['seconds']:.0f} s a clip)"
 
 
 def _validated(rows: pd.DataFrame) -> str:

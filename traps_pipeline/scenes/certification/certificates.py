@@ -47,7 +47,7 @@ from traps_pipeline.scenes.worlds.outcome import (
 from traps_pipeline.scenes.worlds.pace import (
     EARLIEST_SHARE,
     LATEST_SHARE,
-    READ_S,
+    IN_VIEW_S,
     is_exchangeable,
     lengths,
     moments,
@@ -338,7 +338,7 @@ def _legible(pair: Pair) -> Evidence:
     if not groups:
         raise Rejected("nothing says what must be seen at the end of the control")
     with control.renderer() as renderer:
-        last_s = COMMITTED_BEFORE_END_S if control.closing is None else READ_S
+        last_s = COMMITTED_BEFORE_END_S if control.closing is None else IN_VIEW_S
         frames_shown = shown_at_end(len(control.qpos), control.physics.fps, last_s, control.open_frames)
         frames = control.qpos[frames_shown]
         pixels_by_group = checks.least_visible(renderer, frames, groups)
@@ -362,7 +362,7 @@ LEGIBLE = Certificate(
     name="legible",
     about="control",
     promises=f"each decisive body has {LEGIBLE_PIXELS:.0f} pixels in each frame of the last {COMMITTED_BEFORE_END_S} s "
-    f"({READ_S} s before a control closes) that a model is shown ({', '.join(map(str, POLICIES))}), or the family's "
+    f"({IN_VIEW_S} s before a control closes) that a model is shown ({', '.join(map(str, POLICIES))}), or the family's "
     "own groups of geoms (of a die, the top face) have what the family asks for",
     does_not_promise="that a model's own resizing keeps them",
     numbers=(Number("too_small", kept=False), Number("least_visible_px", compared=False)),
@@ -751,8 +751,8 @@ def _judge_closing(e: Evidence, claim: Claim) -> Failures:
         return
     if e.get("read_answer", claim.answer) != claim.answer:
         yield f"before the occluder comes the control shows {e['read_answer']!r}, the record says {claim.answer!r}"
-    if min(e["read_s"], e["closes_s"] - e["commit_s"]) < READ_S - _NOISE_S:
-        yield f"the occluder comes at {e['closes_s']:.1f} s, less than {READ_S} s after the outcome has settled"
+    if min(e["read_s"], e["closes_s"] - e["commit_s"]) < IN_VIEW_S - _NOISE_S:
+        yield f"the occluder comes at {e['closes_s']:.1f} s, less than {IN_VIEW_S} s after the outcome has settled"
     if e["closes_s"] > e["looks_until_s"] + _NOISE_S:
         yield f"the occluder comes at {e['closes_s']:.1f} s; a model is shown no frame after {e['looks_until_s']:.1f} s"
     if e["closed_px"]:
@@ -766,7 +766,7 @@ CLOSING = Certificate(
     about="twin",
     promises="where the control closes: the frames before the occluder comes show the ground truth by themselves, "
     "settled "
-    f"for {READ_S} s or more; the occluder stands to the end and in the last frame that a model is shown "
+    f"for {IN_VIEW_S} s or more; the occluder stands to the end and in the last frame that a model is shown "
     f"({', '.join(map(str, POLICIES))}); from its coming on no pixel shows a decisive body or the hidden element "
     "(chaotic: anything that moves), taking them away changes no pixel, and the twin, with its other answer, has the "
     "same frames byte for byte: nobody can answer from the last frame",
@@ -834,8 +834,8 @@ def _judge_exchange(e: Evidence, claim: Claim) -> Failures:
         return
     if e.get("twin_read_answer", claim.twin_answer) != claim.twin_answer:
         yield f"before the occluder comes the twin shows {e['twin_read_answer']!r}, it ends in {claim.twin_answer!r}"
-    if e["closes_s"] - e["twin_commit_s"] < READ_S - _NOISE_S:
-        yield f"the occluder comes at {e['closes_s']:.1f} s, less than {READ_S} s after the twin's outcome has settled"
+    if e["closes_s"] - e["twin_commit_s"] < IN_VIEW_S - _NOISE_S:
+        yield f"the occluder comes at {e['closes_s']:.1f} s, less than {IN_VIEW_S} s after the twin's outcome settles"
 
 
 EXCHANGE = Certificate(

@@ -161,8 +161,12 @@ def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Predict the ball of which any part is seen first after the tunnel."""
     returned_at: dict[str, int] = {}
     for colour in colours_of_balls(frames, slots, BALL_COLOURS):
-        gone = [i for i, frame in enumerate(frames) if _ball_pixels(frame, colour) == 0]
-        after_tunnel = [i for i in range(gone[0], len(frames)) if _ball_pixels(frames[i], colour)] if gone else []
+        hidden_frames = [i for i, frame in enumerate(frames) if _ball_pixels(frame, colour) == 0]
+        after_tunnel = (
+            [i for i in range(hidden_frames[0], len(frames)) if _ball_pixels(frames[i], colour)]
+            if hidden_frames
+            else []
+        )
         if after_tunnel:
             returned_at[colour] = after_tunnel[0]
     first = [colour for colour, i in returned_at.items() if i == min(returned_at.values())]

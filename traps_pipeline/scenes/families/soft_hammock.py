@@ -67,10 +67,10 @@ def build(p: Params, physics: Physics) -> Scene:
     course.tray("tray", (-end, end), (-side, side), (0, FLOOR_M), p.tray_colour, wall=WALL_M, near=0.10, far=0.10)
     course.block("tray_front", (-outer, outer), (-back, -side), (0, 0.06), p.tray_colour)
     course.block("board", (-outer, outer), (side, back), (0, high), p.board_colour)
-    for name, along in (("near", -1), ("far", 1)):
-        for where, across in (("front", -1), ("back", 1)):
-            at = (along * (p.span_m / 2 + POST_M), across * p.deep_m / 2, high / 2)
-            course.post(f"post_{name}_{where}", at, POST_M, high / 2, p.post_colour)
+    for end_name, along_sign in (("near", -1), ("far", 1)):
+        for side_name, across_sign in (("front", -1), ("back", 1)):
+            at = (along_sign * (p.span_m / 2 + POST_M), across_sign * p.deep_m / 2, high / 2)
+            course.post(f"post_{end_name}_{side_name}", at, POST_M, high / 2, p.post_colour)
     half, beside = p.cube_m / 2, outer + 0.12 + p.cube_m / 2 + course.ahead(0.22)
     course.block("cube", (beside - half, beside + half), (-half, half), (0, p.cube_m), p.cube_colour)
 

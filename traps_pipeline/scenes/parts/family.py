@@ -40,14 +40,14 @@ def scene_family(
     perturbation: float = 1e-4,
     looks: tuple[str, ...] | None = None,
 ) -> Family:
-    """Return a family put together from its parts; fields as in `kit.Family`.
+    """Build a family from its parts; fields as in `kit.Family`.
 
-    Parameters with a hidden element make an occlusion family, whose twins follow from it; parameters without one make a
-    chaotic family. observe: what is seen of the outcome. foresee: what follows from the frames before an occluder,
-    where one comes before the outcome. look: what the end alone tells, where an occluder hid the beginning and went.
-    twins: other worlds than those, for a hidden element that is more than one field. sub_scenario: the family's name
-    unless it is given. looks: parts of the look that vary; unless they are given, all but the size in an occlusion
-    family, and none in a chaotic one.
+    Parameters with a hidden element make an occlusion family, whose twins are derived from it; parameters without one
+    make a chaotic family. observe: reads the outcome from the frames. foresee: predicts the outcome from the frames
+    before an occluder, if one comes before the outcome. look: reads the outcome from the frames after an occluder has
+    left, if `observe` finds none. twins: replaces the derived twins if the hidden element spans several fields.
+    sub_scenario: defaults to the family's name. looks: the parts of the scene's look that vary; by default all but the
+    size in an occlusion family, none in a chaotic one.
     """
     if twins is None and vary.hidden_field(params) is not None:
         twins = vary.twins

@@ -1,4 +1,4 @@
-"""Readings of a run: the label of every frame, and the margin of the end.
+"""Readings of a simulation: each frame's outcome label and the end state's margin.
 
 A family's `outcome(motion, p)` gives a `kit.Reading`, mostly from one of the functions here. Arrays over the frames are
 (F,), lengths in metres.

@@ -180,7 +180,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class Reading:
-    """A run's label in every frame, None while undecided, and its margin.
+    """A simulation's label in every frame, None while undecided, and its margin.
 
     margin_m: distance (m) of the end state from the nearest other outcome. in_order: of a question for the order of two
     events, the frames from which the first one and the second one have happened. turns_deg: how far the thing turns

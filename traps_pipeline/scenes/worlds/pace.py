@@ -26,9 +26,9 @@ EARLIEST_SHARE = 0.3  # of the clip's frames, before the outcome settles
 LATEST_SHARE = 0.8
 DRAWN_SHARE = 0.5  # in a clip that ends earlier the outcome settles after a share between the earliest and this
 FRAMES_AFTER = 16  # to see the outcome for a second, and an occluder before it until the end
-READ_S = 0.8  # so long a settled outcome stands in view before a control closes
-READ_BY_DRAW_S = 1.0  # so long it is in view where there is time for it
-REST_BY_DRAW_S = 0.6  # so long it has been at rest by then: three frames of five a second
+IN_VIEW_S = 0.8  # least time that a settled outcome is visible before the control closes
+DRAWN_OUTCOME_VIEW_S = 1.0  # so long it is in view where there is time for it
+DRAWN_REST_S = 0.6  # so long it has been at rest by then: three frames of five a second
 STILL_M = 0.005  # a pixel or two
 BESIDE_M = 0.03  # from the middle of a body to the points by which it is seen to turn
 TRIES = 4  # moments at which it is tried to close a control
@@ -87,10 +87,10 @@ def moments(worlds: Sequence[World], seed: int) -> Iterator[int]:
     worlds = _counted(worlds)
     fps, commit = worlds[0].physics.fps, max(world.outcome.commit_frame for world in worlds)
     last = last_of_all(len(worlds[0].qpos), fps)
-    if last - commit < round(READ_S * fps):
+    if last - commit < round(IN_VIEW_S * fps):
         return
-    rest_frame = max(map(_at_rest_from, worlds)) + round(REST_BY_DRAW_S * fps)
-    first = min(max(commit + round(READ_BY_DRAW_S * fps), rest_frame), last)
+    rest_frame = max(map(_at_rest_from, worlds)) + round(DRAWN_REST_S * fps)
+    first = min(max(commit + round(DRAWN_OUTCOME_VIEW_S * fps), rest_frame), last)
     rng = np.random.default_rng([seed, *worlds[0].family.name.encode(), *b"closing"])
     frames = [int(frame) for frame in rng.permutation(np.arange(first, last + 1))]
     yield from dict.fromkeys([*frames[: TRIES - 1], last])

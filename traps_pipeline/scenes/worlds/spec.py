@@ -111,8 +111,8 @@ class Twin(BaseModel):
 class SceneSpec(BaseModel):
     """One scenario, resolved: nothing is left to chance or to the code's defaults.
 
-    control: how the control closes: from which frame an occluder stands before its outcome, and which occluder where
-    the void has none; None if no occluder comes.
+    control: the first frame in which an occluder covers the control's outcome, and that occluder unless it is the
+    void's; None if the control has no closing occluder.
 
     Hashes: `scene_hash` covers what decides the pixels (family, params, physics, camera, void, trajectory, twin),
     `spec_hash` covers everything. Both are derived, never read from the file.
