@@ -317,7 +317,7 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
     ("exchange", {"lost_exchanged": "pace: too late"}, "with the twin as the control: pace: too late"),
     ("exchange", {"hidden_from_s": 3.7}, "does not hide the outcome of the twin before it is settled"),
     ("exchange", {"twin_read_answer": "teal"}, "before the occluder comes the twin shows 'teal'"),
-    ("exchange", {"twin_commit_s": 3.8}, "less than 0.8 s after the twin's outcome has settled"),
+    ("exchange", {"twin_commit_s": 3.8}, "less than 0.8 s after the twin's outcome settles"),
     ("words", {"ill_posed_for": None}, "has no answer"),
     ("words", {"question_refuted": "mass"}, "reads as ill-posed: mass"),
     ("words", {"premises": 2}, "presumes 2 things that are not so"),

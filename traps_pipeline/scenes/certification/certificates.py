@@ -46,8 +46,8 @@ from traps_pipeline.scenes.worlds.outcome import (
 )
 from traps_pipeline.scenes.worlds.pace import (
     EARLIEST_SHARE,
-    LATEST_SHARE,
     IN_VIEW_S,
+    LATEST_SHARE,
     is_exchangeable,
     lengths,
     moments,
