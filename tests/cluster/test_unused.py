@@ -166,7 +166,7 @@ def test_the_command_shows_and_removes_what_is_old_enough(
     assert "0 objects" in capsys.readouterr().out  # it is younger than the grace period
     monkeypatch.setattr(objects, "GRACE_DAYS", 0.0)
     command("doctor", "--unused", "show", "--workspace", address)
-    assert "1 objects (0.0 MB), the oldest of" in capsys.readouterr().out
+    assert "1 object (0.0 MB), the oldest of" in capsys.readouterr().out
     command("doctor", "--unused", "remove", "--workspace", address)
     assert object_name(digest(LOST)) in capsys.readouterr().out
     assert store.bucket.get(object_name(digest(LOST))) is None

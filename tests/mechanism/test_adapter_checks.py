@@ -57,7 +57,7 @@ def rounded_features(patch: pytest.MonkeyPatch) -> None:
 
 
 def paths_beside_the_stream_forgotten(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(patching_effects, "_behind", lambda _, __: None)
+    patch.setattr(patching_effects, "_residual_weights", lambda _, __: None)
 
 
 @pytest.mark.parametrize(

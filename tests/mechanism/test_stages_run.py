@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow
 def counted(finished: Finished) -> tuple[int, ...]:
     """Items extracted, steered answers asked, votes on them."""
     assert finished.code == 0, finished.out + finished.err
-    found = re.search(r"inside models: (\d+) items .*? (\d+) steered .*? (\d+) votes on them", finished.out)
+    found = re.search(r"inside models: (\d+) items? .*? (\d+) steered .*? (\d+) votes? on them", finished.out)
     assert found, finished.out
     return tuple(map(int, found.groups()))
 

@@ -43,7 +43,7 @@ def test_stages_of_scoring_carry_it_and_stages_that_cost_money_state_their_own()
     assert not any(is_followed(one.code) for one in graph.stages if one.cost == "money")
 
 
-def test_who_changes_what_decides_a_dear_stage_says_whether_its_rows_change() -> None:
+def test_a_dear_stage_whose_formula_changed_has_a_reviewed_code() -> None:
     reviewed = json.loads(REVIEWED.read_text(encoding="utf-8"))
     changed = {name for name, found in codes().items() if found != reviewed.get(name)}
     assert not changed, (
