@@ -113,7 +113,7 @@ def first_calls(study: Checkout, provider: Provider, path: Path) -> None:
 
 
 def main() -> None:
-    from tests.build.network import entry, experiment, register
+    from tests.build.network import entry, experiment
     from tests.conftest import KEY, SECRET, make_checkout
     from tests.postgres import Postgres
 
@@ -129,8 +129,7 @@ def main() -> None:
         study = Checkout(make_checkout(Path(name) / "checkout"), Path(name) / "study")
         if arguments.store:
             study = in_store(opened, Path(name) / "shared")
-        register(study, provider, entry("image-model", "images"))
-        free = experiment(study, ["oracle"], regimes=["standard"])
+        free = experiment(study, provider, ["oracle"], regimes=["standard"])
         until = ("--until", "items") if arguments.store else ()
         made = study.traps("run", free, *until)  # clips, items and a Dagster history, as before any paid run
         assert made.code == 0, made.err
@@ -147,7 +146,7 @@ def main() -> None:
             moved = study.traps("study", "import-ledger", str(file))
             assert exported.code == moved.code == 0, exported.err + moved.err
             print(f"moved into PostgreSQL in {time.perf_counter() - began:.1f} s", flush=True)
-        path = experiment(study, ["image-model"], regimes=["standard"])
+        path = experiment(study, provider, [entry("image-model", "images")], regimes=["standard"])
         first_calls(study, provider, path)
 
 

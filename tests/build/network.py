@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,21 +28,29 @@ def entry(name: str, profile: str, more: str = "prices: {input: 1.0, output: 10.
 """
 
 
+def _account(provider: Provider) -> str:
+    return f"accounts:\n  here: {{key: {KEY}, base_url: {provider.url}/v1}}\n"
+
+
 def register(study: Checkout, provider: Provider, *entries: str) -> None:
-    """Put these models at the provider into the registry, in the place of what a test has put there before."""
-    registry = study.root / "assets" / "models.yaml"
+    """Put these models at the provider into the registry of a checkout of its own, for all experiments and hosts."""
+    assert study.root != ROOT, "this would change the checkout that is tested"
     shipped = (ROOT / "assets" / "models.yaml").read_text()
-    account = f"accounts:\n  here: {{key: {KEY}, base_url: {provider.url}/v1}}\n"
-    registry.write_text(shipped.replace("accounts:\n", account, 1) + "".join(entries))
+    registry = shipped.replace("accounts:\n", _account(provider), 1) + "".join(entries)
+    (study.root / "assets" / "models.yaml").write_text(registry)
 
 
-def experiment(study: Checkout, models: list[str], **more: Any) -> Path:
-    """An experiment on the small study's scenarios."""
+def experiment(study: Checkout, provider: Provider, models: Sequence[str], **more: Any) -> Path:
+    """An experiment on the small study's scenarios, in the place of an earlier one. models: entries at the provider,
+    or names of the registry's."""
     scenarios = SMALL.read_text()[SMALL.read_text().index("scenarios:") :]
-    settings = {"models": models, "regimes": ["standard", "json"], "runs": [1], **more}
+    settings = {"regimes": ["standard", "json"], "runs": [1], **more}
     head = "".join(f"{name}: {value!r}\n".replace("'", '"') for name, value in settings.items())
-    path = study.root / "network.yaml"
-    path.write_text(f"name: network\npanel: rules\njudged_by_rules: true\n{head}{scenarios}")
+    entries = "".join(model if "\n" in model else f"\n  - {model}\n" for model in models)
+    path = study.workspace.parent / "network.yaml"
+    path.write_text(
+        f"name: network\npanel: rules\njudged_by_rules: true\n{_account(provider)}models:{entries}{head}{scenarios}"
+    )
     return path
 
 

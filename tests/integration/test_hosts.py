@@ -14,19 +14,13 @@ from pathlib import Path
 import pytest
 
 from bench.equality import main as compare
-from tests.build.network import ITEMS, ask, entry, experiment, register, responses, settled
-from tests.conftest import Checkout, copy_workspace, forget_answers
+from tests.build.network import ITEMS, ask, entry, experiment, responses, settled
+from tests.conftest import Checkout, copy_workspace
 from tests.ledger.conftest import VARIABLE
 from tests.postgres import Postgres
 from tests.providers.server import Provider
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture
-def unasked(own_study: Checkout) -> Checkout:
-    """A study without answers whose registry the tests change."""
-    return forget_answers(own_study)
 
 
 WANTED = 2 * ITEMS
@@ -42,7 +36,6 @@ def hosts(
 ) -> tuple[Checkout, Checkout]:
     """Two checkouts of one study, whose clips and items each has made, and whose ledger lies in the database."""
     monkeypatch.setenv(VARIABLE, postgres.address())
-    register(unasked, provider, entry("image-model", "images"))
     file = unasked.workspace / "study.yaml"
     text = re.sub(r"(?m)^name: .*$", f"name: study-{secrets.token_hex(4)}", file.read_text())
     file.write_text(f"{text}database: {VARIABLE}\n")
@@ -60,7 +53,7 @@ def test_hosts_ask_each_call_once_and_one_goes_on_where_another_is_killed(
 ) -> None:
     one, two = hosts
     provider.configure(latency_s=0.2)
-    path = experiment(one, ["image-model"])
+    path = experiment(one, provider, [entry("image-model", "images")])
     killed, other = start(one, path, "100"), start(two, path, "100")
     while provider.stats()["answered_in_full"] < WANTED // 4:
         assert killed.poll() is None and other.poll() is None
@@ -88,7 +81,7 @@ def test_one_budget_holds_for_both_and_the_next_run_goes_on(
 ) -> None:
     one, two = hosts
     provider.configure(latency_s=0.05, usd_a_token=[1e-6, 1e-5])  # as the entry says
-    path = experiment(one, ["image-model"])
+    path = experiment(one, provider, [entry("image-model", "images")])
     running = [start(host, path, "0.4") for host in (one, two)]  # all answers cost about $0.70
     said = [process.communicate(timeout=600) for process in running]
     assert [process.returncode for process in running] == [4, 4], said

@@ -13,18 +13,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.build.network import ITEMS, ask, entry, experiment, register, responses, settled
+from tests.build.network import ITEMS, ask, entry, experiment, responses, settled
 from tests.conftest import SECRET, Checkout, forget_answers
 from tests.providers.server import Provider
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture
-def unasked(own_study: Checkout) -> Checkout:
-    """A study without answers whose registry the tests change."""
-    return forget_answers(own_study)
-
 
 MANY = "TRAPS_MANY_CALLS" in os.environ  # 864 calls in the place of 288 and of 192, and five kills: for a release
 TRANSIENT = {
@@ -46,9 +39,8 @@ def test_a_fifth_of_all_calls_fails_and_every_item_ends_rightly_without_a_trace_
     unasked: Checkout, provider: Provider
 ) -> None:
     provider.configure(faults=TRANSIENT | ENDINGS, only_first_attempts=3, latency_s=0.02, seed=1)
-    register(unasked, provider, entry("video-model", "video"), entry("image-model", "images"))
-    runs = [1, 2, 3] if MANY else [1]
-    path = experiment(unasked, ["video-model", "image-model"], regimes=["standard", "guided", "json"], runs=runs)
+    runs, both = [1, 2, 3] if MANY else [1], [entry("video-model", "video"), entry("image-model", "images")]
+    path = experiment(unasked, provider, both, regimes=["standard", "guided", "json"], runs=runs)
     finished = ask(unasked, path, "--budget-usd", "500").ok()
     rows, stats = responses(unasked), provider.stats()
     assert (
@@ -84,8 +76,8 @@ def test_a_fifth_of_all_calls_fails_and_every_item_ends_rightly_without_a_trace_
 @pytest.mark.promise
 def test_the_cap_holds_and_the_next_run_goes_on(unasked: Checkout, provider: Provider) -> None:
     provider.configure(latency_s=0.05)
-    register(unasked, provider, entry("image-model", "images").replace("limits: {", "limits: {concurrency: 200, "))
-    path = experiment(unasked, ["image-model"])
+    model = entry("image-model", "images").replace("limits: {", "limits: {concurrency: 200, ")
+    path = experiment(unasked, provider, [model])
     first = ask(unasked, path, "--budget-usd", "0.4")  # all answers cost about $0.70
     assert first.code == 4, first.err
     assert "the budget of the study is reached" in first.err
@@ -104,8 +96,7 @@ def test_money_of_calls_that_a_kill_cut_off_is_released_and_the_study_goes_on(
     unasked: Checkout, provider: Provider
 ) -> None:
     provider.configure(latency_s=600.0)
-    register(unasked, provider, entry("image-model", "images"))
-    path = experiment(unasked, ["image-model"])
+    path = experiment(unasked, provider, [entry("image-model", "images")])
     command = ("run", str(path), "--no-preflight", "--until", "responses", "--budget-usd", "0.4")
     process = unasked.start(sys.executable, "-m", "traps_pipeline.cli", *command)
     in_flight = 0
@@ -130,8 +121,7 @@ def test_money_of_calls_that_a_kill_cut_off_is_released_and_the_study_goes_on(
 
 
 def test_paid_stages_want_a_budget_and_a_price_whoever_starts_them(unasked: Checkout, provider: Provider) -> None:
-    register(unasked, provider, entry("image-model", "images"), entry("no-price", "images", "runs: 1"))
-    path = experiment(unasked, ["image-model", "no-price"])
+    path = experiment(unasked, provider, [entry("image-model", "images"), entry("no-price", "images", "runs: 1")])
     refused = ask(unasked, path)
     assert refused.code == 1
     assert "image-model costs money and the study has no budget" in refused.err
@@ -148,8 +138,7 @@ def test_paid_stages_want_a_budget_and_a_price_whoever_starts_them(unasked: Chec
 
 def test_a_model_that_only_fails_is_stopped_and_the_others_go_on(unasked: Checkout, provider: Provider) -> None:
     provider.configure(fault_by_model={"locked-out": "unauthorized"})
-    register(unasked, provider, entry("image-model", "images"), entry("locked-out", "images"))
-    path = experiment(unasked, ["image-model", "locked-out"])
+    path = experiment(unasked, provider, [entry("image-model", "images"), entry("locked-out", "images")])
     finished = ask(unasked, path, "--budget-usd", "10")
     assert finished.code == 1
     assert "locked-out is stopped: 20 refusals in a row (http_401)" in finished.err
@@ -162,28 +151,25 @@ def test_a_model_that_only_fails_is_stopped_and_the_others_go_on(unasked: Checko
     assert finished.err.count("locked-out is stopped") == 1
 
 
-def test_only_what_decides_an_answer_is_asked_again(unasked: Checkout, provider: Provider) -> None:
-    register(unasked, provider, entry("image-model", "images"))
-    path = experiment(unasked, ["image-model"], regimes=["standard"], datasets=["chaotic", "chaotic_ill_posed"])
-    assert ask(unasked, path, "--budget-usd", "10").counts()["answers"] == ITEMS / 2
+def test_only_what_decides_an_answer_is_asked_again(own_study: Checkout, provider: Provider) -> None:
+    study, of = forget_answers(own_study), {"regimes": ["standard"], "datasets": ["chaotic", "chaotic_ill_posed"]}
+    path = experiment(study, provider, [entry("image-model", "images")], **of)
+    assert ask(study, path, "--budget-usd", "10").counts()["answers"] == ITEMS / 2
     quick = entry("image-model", "images").replace("timeout_s: 36", "timeout_s: 40, concurrency: 3")
-    register(unasked, provider, quick.replace("input: 1.0", "input: 2.0"))
-    assert ask(unasked, path).counts()["answers"] == 0
-    unasked.correct("plinko-0001", question="In which numbered bucket, 1 to 7, does the ball end?")
-    assert ask(unasked, path).counts()["answers"] == 3  # control and void, and the ill-posed pair's control
-    register(
-        unasked,
-        provider,
-        quick.replace("temperature: 0.8", "temperature: 0.5") + "    waivers: {temperature: a test}\n",
-    )
-    assert ask(unasked, path).counts()["answers"] == ITEMS / 2
+    experiment(study, provider, [quick.replace("input: 1.0", "input: 2.0")], **of)
+    assert ask(study, path).counts()["answers"] == 0
+    study.correct("plinko-0001", question="In which numbered bucket, 1 to 7, does the ball end?")
+    assert ask(study, path).counts()["answers"] == 3  # control and void, and the ill-posed pair's control
+    other = quick.replace("temperature: 0.8", "temperature: 0.5") + "    waivers: {temperature: a test}\n"
+    experiment(study, provider, [other], **of)
+    assert ask(study, path).counts()["answers"] == ITEMS / 2
 
 
 def test_kills_cost_no_more_than_what_was_in_flight(unasked: Checkout, provider: Provider) -> None:
     provider.configure(latency_s=0.1)
-    register(unasked, provider, entry("video-model", "video"), entry("image-model", "images"))
-    models, regimes = ["video-model", "image-model"][: 1 + MANY], ["standard", "json", "guided"][: 2 + MANY]
-    path = experiment(unasked, models, regimes=regimes, runs=[1, 2, 3][: 2 + MANY])
+    both = [entry("video-model", "video"), entry("image-model", "images")]
+    models, regimes = both[: 1 + MANY], ["standard", "json", "guided"][: 2 + MANY]
+    path = experiment(unasked, provider, models, regimes=regimes, runs=[1, 2, 3][: 2 + MANY])
     wanted, kills = ITEMS * len(models) * len(regimes) * (2 + MANY), 5 if MANY else 3
     points = sorted(random.Random(1).sample(range(1, wanted * 7 // 8), kills))
     for point in points:
@@ -208,8 +194,8 @@ def test_kills_cost_no_more_than_what_was_in_flight(unasked: Checkout, provider:
 def test_a_stop_sends_nothing_more_and_keeps_what_comes_back(unasked: Checkout, provider: Provider) -> None:
     # Of a cell's 12 calls 8 go out at once. While the other four are out, for two seconds, the run is stopped.
     provider.configure(latency_s=2.0)
-    register(unasked, provider, entry("image-model", "images").replace("limits: {", "limits: {concurrency: 8, "))
-    command = ("run", str(experiment(unasked, ["image-model"])), "--no-preflight", "--budget-usd", "100")
+    model = entry("image-model", "images").replace("limits: {", "limits: {concurrency: 8, ")
+    command = ("run", str(experiment(unasked, provider, [model])), "--no-preflight", "--budget-usd", "100")
     for stop in (signal.SIGTERM, signal.SIGHUP):
         before = len(settled(unasked))
         process = unasked.start(sys.executable, "-m", "traps_pipeline.cli", *command)
@@ -236,8 +222,8 @@ def test_a_stop_sends_nothing_more_and_keeps_what_comes_back(unasked: Checkout, 
 
 
 def test_a_cluster_answers_in_the_models_stead(unasked: Checkout, provider: Provider, tmp_path: Path) -> None:
-    register(unasked, provider, entry("video-model", "video"), entry("image-model", "images"))
-    path = experiment(unasked, ["video-model", "image-model"], regimes=["standard"], datasets=["occlusion"])
+    both = [entry("video-model", "video"), entry("image-model", "images")]
+    path = experiment(unasked, provider, both, regimes=["standard"], datasets=["occlusion"])
     unasked.traps("study", "export-requests", path, "--out", tmp_path / "batch").ok()
     lines = [json.loads(line) for line in (tmp_path / "batch" / "requests.jsonl").read_text().splitlines()]
     assert len(lines) == len({line["key"] for line in lines}) == 24

@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
-from tests.build.network import ITEMS, entry, experiment, register
-from tests.conftest import Checkout, forget_answers
+from tests.build.network import ITEMS, entry, experiment
+from tests.conftest import Checkout
 from tests.providers.server import Provider
 from tests.terminals import run_in_terminal
 
@@ -15,11 +15,10 @@ pytestmark = pytest.mark.slow
 FAULTS = {"rate_limited": 0.1, "server_error": 0.1, "cut": 0.05}
 
 
-def test_calls_are_shown_below_all_else_while_they_are_made(own_study: Checkout, provider: Provider) -> None:
-    study, columns, rows = forget_answers(own_study), 80, 24
+def test_calls_are_shown_below_all_else_while_they_are_made(unasked: Checkout, provider: Provider) -> None:
+    study, columns, rows = unasked, 80, 24
     provider.configure(faults=FAULTS, only_first_attempts=2, latency_s=1.0)
-    register(study, provider, entry("image-model", "images"))
-    path = experiment(study, ["image-model"], regimes=["standard"], budget_usd=20.0)
+    path = experiment(study, provider, [entry("image-model", "images")], regimes=["standard"], budget_usd=20.0)
     command = [sys.executable, "-m", "traps_pipeline.cli", "run", str(path), "--no-preflight", "--until", "votes"]
     code, screen = run_in_terminal(command, columns, rows, study.root, study.environment)
     assert code == 0, screen.text
