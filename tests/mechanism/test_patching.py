@@ -4,6 +4,7 @@ What a patch does at every site is held against plain hooks in `test_independent
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
@@ -107,6 +108,15 @@ def test_a_pass_of_a_spread_model_begins_at_the_patched_block_and_leaves_its_hoo
             remove_hook_from_module(block)
             vars(block).pop("forward", None)
     assert patched_changes(of, target, source, whole, tokens) == pytest.approx(expected)
+
+
+def test_margins_are_read_off_a_head_whose_weights_are_offloaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    of, target, _, tokens, prompt, _ = pair("qwen3-vl")
+    head = deepcopy(of.network.lm_head)
+    add_hook_to_module(head, AlignDevicesHook(execution_device="cpu", offload=True))
+    assert head.weight.is_meta
+    monkeypatch.setattr(of.network, "lm_head", head)
+    assert record(of, prompt, tokens).margin == target.margin
 
 
 def test_an_attribution_is_the_gradient_of_the_outcome_along_the_difference_of_states() -> None:

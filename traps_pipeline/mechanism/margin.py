@@ -76,6 +76,7 @@ def head_logits(model: LocalModel, normed: Tensor) -> Tensor:
     import torch
 
     head, config = model.network.get_output_embeddings(), model.network.config.get_text_config()
-    logits = head(normed.to(head.weight.device, model.network.dtype)).float()
+    # Of a spread model accelerate moves the states on; an offloaded head has no device of its own (`meta`).
+    logits = head(normed.to(model.inputs_device, model.network.dtype)).float()
     cap = getattr(config, "final_logit_softcapping", None)
     return torch.tanh(logits / cap) * cap if cap else logits
