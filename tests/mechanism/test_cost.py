@@ -53,8 +53,8 @@ def test_hours_and_gigabytes_follow_from_parameters_tokens_and_the_card() -> Non
     steps = 640 * 100 / 64 * (0.010 + 10 * 64 * 1000 * 14e-9)  # reading 10 GB takes 10 ms, launching ten blocks 9 ms
     assert answers.hours == pytest.approx((2 * 5e9 * 640e3 / 0.25e15 + steps) / 3600)
     packed = cost_of(entry(), media, Work("patching", 720), CARD, quantised=True)
-    assert packed.hours == pytest.approx(2 * states.hours)
-    assert packed.gigabytes == pytest.approx(3 + CACHED_GB + (4 * 10 + 2 + 22 * 10) * 2e6 / 1e9)
+    assert packed.hours == pytest.approx(1.5 * states.hours)
+    assert packed.gigabytes == pytest.approx(0.77 * 5 + CACHED_GB + (4 * 10 + 2 + 22 * 10) * 2e6 / 1e9)
 
 
 def test_frames_are_those_that_a_clip_of_five_seconds_has() -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from traps_pipeline.models.local.checkpoint import NF4_BYTES
 from traps_pipeline.models.local.vision_cache import MOST_BYTES
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.protocol.datasets import DATASETS, PROBED_ARMS, SIDES, sides_of, taxonomy_of
@@ -20,8 +21,8 @@ CLIP_S = 5.0
 REACHED = 0.25  # share of a card's operations that passes over prompts reach
 STEP_S = 0.9e-3  # per block and decoding step
 ATTENTION_S = 14e-9  # beside it, per block, step, row and token of its prompt
-NF4_TIMES = 2.0  # factor on time, since weights are unpacked at every use
-NF4_BYTES, BFLOAT16_BYTES = 0.6, 2.0  # per parameter
+NF4_TIMES = 1.5  # factor on time, since weights are unpacked at every use
+BFLOAT16_BYTES = 2.0  # per parameter
 ROWS = 64  # rows of a batch of answers
 WIDEST = 28  # numbers per token and unit of width at a block's peak
 GRAPH = 22  # numbers per token, block and unit of width that a backward pass keeps
