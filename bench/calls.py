@@ -36,8 +36,8 @@ KEY, DATABASE = "BENCH_KEY", "BENCH_DATABASE"
 
 def ours(url: str, connections: int, answers: int) -> dict[str, float]:
     """Return requests through `ask`: backend, retries, pace, budget and the ledger, on disk or in a database."""
+    from traps_pipeline.cluster.postgres import open_ledger
     from traps_pipeline.ledger.ledger import Ledger
-    from traps_pipeline.ledger.postgres import postgres_of
     from traps_pipeline.ledger.sqlite import SqliteDatabase
     from traps_pipeline.models.api import ApiBackend, load_litellm
     from traps_pipeline.models.ask import Call, Work, run_work
@@ -69,7 +69,7 @@ def ours(url: str, connections: int, answers: int) -> dict[str, float]:
         free = Study(allow_unknown_prices=True)
         participants = Participants({"m": entry}, lambda e: ApiBackend(e, account), free, {"a": account})
         name = f"bench-{os.getpid()}"
-        database = postgres_of(DATABASE, name) if DATABASE in os.environ else SqliteDatabase(Path(folder), name)
+        database = open_ledger(DATABASE, name) if DATABASE in os.environ else SqliteDatabase(Path(folder), name)
         ledger = Ledger(database, "answers")
         work = Work("responses", ledger, participants, Budget(0, {}), "1", calls, lambda _: None)
         return _measured(lambda: list(run_work(work, cells)), answers)

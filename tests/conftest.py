@@ -335,7 +335,7 @@ def postgres() -> Iterator[Postgres]:
     if programs() is None:
         pytest.skip(LACKING)
     pytest.importorskip("psycopg", reason="psycopg is not installed; `pip install -e '.[dev]'` brings it")
-    from traps_pipeline.ledger.postgres import GRACE_S
+    from traps_pipeline.cluster.postgres import GRACE_S
 
     with Postgres.running() as server:
         time.sleep(GRACE_S)  # until then a lock is kept for sessions that had it before the server was started

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from traps_pipeline.cluster.objects import Bucket, ObjectStore
-from traps_pipeline.ledger.postgres import PostgresDatabase
+from traps_pipeline.cluster.postgres import PostgresDatabase
 from traps_pipeline.storage.store import FolderStore, Store
 
 
@@ -29,7 +29,7 @@ def opened(folder: str, *of_database: str) -> Store:
     if not where:
         return FolderStore(Path(folder) / "study")
     address, study = where
-    return ObjectStore(Path(folder) / host, Bucket(f"s3://lab/{study}"), database(address, study), study, b"anchor")
+    return ObjectStore(Path(folder) / host, Bucket(f"s3://lab/{study}"), database(address, study))
 
 
 def database(address: str, study: str) -> PostgresDatabase:

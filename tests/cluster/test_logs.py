@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from tests.objectstore import S3
-from traps_pipeline.cluster import logs
+from traps_pipeline.cluster import history
 from traps_pipeline.cluster.bucket import Bucket
-from traps_pipeline.cluster.logs import fetch, upload, uploading
+from traps_pipeline.cluster.history import fetch, upload, uploading
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 
@@ -43,7 +43,7 @@ def test_what_a_run_prints_is_read_elsewhere_while_it_goes_on_and_when_it_ended(
 def test_a_run_brings_what_it_prints_before_its_end_and_at_it(
     place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(logs, "UPLOAD_S", 0.05)
+    monkeypatch.setattr(history, "UPLOAD_S", 0.05)
     workspace, bucket, name = Workspace(tmp_path, Study(name="lab"), place), Bucket(place), f"logs/{LOG.as_posix()}"
     with uploading(workspace, "run-1"):
         printed(tmp_path / "cluster" / "logs", "begun\n")

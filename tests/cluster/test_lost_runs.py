@@ -21,10 +21,9 @@ from dagster._utils.error import serializable_error_info_from_exc_info
 
 from tests.remedies.remedied import remedied
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cluster.lost_runs import fail_lost_runs
-from traps_pipeline.cluster.ray_runs import RayRuns
-from traps_pipeline.cluster.resources import RESOURCES_TAG, STUDY_TAG
-from traps_pipeline.cluster.shared_history import dagster_yaml
+from traps_pipeline.cluster.history import dagster_yaml
+from traps_pipeline.cluster.ray_runs import RESOURCES_TAG, STUDY_TAG, RayRuns
+from traps_pipeline.cluster.sensors import fail_lost_runs
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import RAY, Workspace
 

@@ -13,9 +13,8 @@ import pytest
 
 from tests.conftest import ROOT
 from tests.postgres import Postgres
-from traps_pipeline.cluster.node import REFUSED_TAG
-from traps_pipeline.cluster.same_code import CODE, code_here
-from traps_pipeline.cluster.shared_history import HISTORY, LOGS
+from traps_pipeline.cluster.history import HISTORY, LOGS
+from traps_pipeline.cluster.node import CODE, REFUSED_TAG, code_here
 from traps_pipeline.pipeline.run import dagster_history
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import RAY, VARIABLE, Workspace

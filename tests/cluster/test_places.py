@@ -10,7 +10,7 @@ import yaml
 from tests.postgres import Postgres
 from tests.remedies.remedied import command
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cluster.places import SharedFolder
+from traps_pipeline.storage.store import LEASES
 from traps_pipeline.storage.workspace import RAY, Workspace
 
 pytestmark = pytest.mark.slow
@@ -32,7 +32,9 @@ def test_a_study_that_is_made_with_a_database_is_shared_by_all_hosts_of_its_fold
     command("init", "demo", "--workspace", folder, "--database", "LAB_DATABASE")
     workspace = Workspace.open(folder)
     assert yaml.safe_load((folder / "study.yaml").read_text())["database"] == "LAB_DATABASE"
-    assert isinstance(workspace.store, SharedFolder)
+    lease = workspace.store.lease("work")
+    assert lease is not None and not (folder / LEASES).exists()  # some file systems lock files for one host alone
+    lease.close()
     # SQLite on a network file system loses what two hosts write: each has a history of its own, or all have PostgreSQL.
     assert not workspace.dagster_home.is_relative_to(folder)
     monkeypatch.setenv(RAY, "http://head:8265")

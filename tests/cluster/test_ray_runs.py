@@ -8,6 +8,7 @@ import shlex
 import threading
 import time
 from collections.abc import Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +20,10 @@ from tests.postgres import Postgres
 from traps_pipeline.base.cores import cores
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.progress import Progress, reporting
-from traps_pipeline.cluster.ray_runs import RayRuns
-from traps_pipeline.cluster.requests import REQUEST_TAG, start_requested_runs, submit
-from traps_pipeline.cluster.resources import RESOURCES_TAG, STUDY_TAG, own_tags
-from traps_pipeline.cluster.same_code import code_here, installed_versions, require_same_code
-from traps_pipeline.cluster.shared_history import HISTORY, LOGS, dagster_yaml
+from traps_pipeline.cluster.history import HISTORY, LOGS, dagster_yaml
+from traps_pipeline.cluster.node import code_here, require_same_code
+from traps_pipeline.cluster.ray_runs import RESOURCES_TAG, STUDY_TAG, RayRuns, own_tags
+from traps_pipeline.cluster.sensors import REQUEST_TAG, start_requested_runs, submit
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.pipeline.graph import the_graph
 from traps_pipeline.pipeline.run import dagster_history
@@ -101,7 +101,7 @@ def test_a_host_with_other_code_refuses_a_run_and_names_both() -> None:
     del theirs["mujoco"]  # which it does not have: what only one of them has is not compared
     with pytest.raises(
         TrapsError, match=rf"^the host .* has other code .* of the study lab: files of assets \w+ here and 0123 there, "
-        rf"numpy {installed_versions()['numpy']} here and 1\.0 there\. Install",
+        rf"numpy {version('numpy')} here and 1\.0 there\. Install",
     ):  # fmt: skip
         require_same_code(json.dumps(theirs), "lab")
 

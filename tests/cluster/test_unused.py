@@ -16,7 +16,7 @@ from tests.remedies.remedied import command, remedied
 from traps_pipeline.cluster import objects
 from traps_pipeline.cluster.bucket import Bucket, object_name
 from traps_pipeline.cluster.objects import ObjectStore
-from traps_pipeline.ledger.postgres import PostgresDatabase
+from traps_pipeline.cluster.postgres import PostgresDatabase
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import DATABASE, Workspace
 
@@ -27,7 +27,7 @@ OLD, NEW, LOST = b"an older table", b"the table", b"written, and its host died b
 def opened_store(postgres: Postgres, root: Path, bucket: str, study: str) -> ObjectStore:
     """A host's store of a study, in the bucket of one that may be another."""
     database = PostgresDatabase(postgres.address(), "DB", study)
-    return ObjectStore(root, Bucket(f"s3://lab/{bucket}"), database, study, b"anchor")
+    return ObjectStore(root, Bucket(f"s3://lab/{bucket}"), database)
 
 
 @pytest.fixture

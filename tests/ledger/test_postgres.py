@@ -21,8 +21,8 @@ from tests.conftest import ROOT
 from tests.ledger.conftest import VARIABLE, WRITE_ONE, begin, in_database, line_of, opened
 from tests.postgres import Postgres
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.cluster.postgres import PostgresDatabase, open_ledger
 from traps_pipeline.ledger.ledger import Ledger
-from traps_pipeline.ledger.postgres import PostgresDatabase, postgres_of
 
 pytestmark = pytest.mark.slow
 # Asks as a run does: looks whether it may, makes the call (a byte in a file, which the provider counts), keeps the row.
@@ -169,7 +169,7 @@ def test_an_address_that_leads_nowhere_names_variable_host_study_and_remedy(
 ) -> None:
     monkeypatch.setenv(VARIABLE, address.format(port=postgres.port))
     with pytest.raises(TrapsError) as raised:
-        postgres_of(VARIABLE, "my-study")
+        open_ledger(VARIABLE, "my-study")
     told = str(raised.value)
     assert told.startswith(f"{VARIABLE}: ") and said in told and "study my-study" in told
     assert f"host {socket.gethostname()}" in told
@@ -182,13 +182,13 @@ def test_a_variable_that_is_not_set_and_a_package_that_is_not_there_are_named(mo
     with pytest.raises(
         TrapsError, match=rf"{VARIABLE} is not set on the host .*: study.yaml of my-study .* export {VARIABLE}=post"
     ):
-        postgres_of(VARIABLE, "my-study")
+        open_ledger(VARIABLE, "my-study")
     code = f"""
 import os, sys
 sys.modules["psycopg"] = None
-from traps_pipeline.ledger.postgres import postgres_of
+from traps_pipeline.cluster.postgres import open_ledger
 os.environ["{VARIABLE}"] = "postgresql://traps@127.0.0.1/postgres"
-postgres_of("{VARIABLE}", "my-study")
+open_ledger("{VARIABLE}", "my-study")
 """
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
     assert "a study that hosts share needs psycopg, which is not installed: `make setup`" in ran.stderr

@@ -19,7 +19,6 @@ from tests.postgres import Postgres
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cluster.bucket import object_name
 from traps_pipeline.cluster.objects import OBJECTS, ObjectStore
-from traps_pipeline.cluster.places import SharedFolder
 from traps_pipeline.storage.benchmark_tables import VIDEOS
 from traps_pipeline.storage.leases import alone, leased_ranges
 from traps_pipeline.storage.parquet import TableStore
@@ -43,7 +42,7 @@ def hosts(request: pytest.FixtureRequest, tmp_path: Path) -> Hosts:
         return Hosts(lambda name: FolderStore(tmp_path / "study"))
     if request.param == "shared":
         address, study = request.getfixturevalue("postgres").address(), f"study-{secrets.token_hex(4)}"
-        return Hosts(lambda name: SharedFolder(tmp_path / "study", database(address, study)))
+        return Hosts(lambda name: FolderStore(tmp_path / "study", database(address, study).lease))
     return Hosts(_hosts_of_bucket(request, tmp_path))
 
 
@@ -224,8 +223,7 @@ def test_an_object_that_was_altered_is_named_and_nothing_is_read_from_it(bucket_
     one, other = bucket_hosts.open("one"), bucket_hosts.open("other")
     assert isinstance(one, ObjectStore)
     path = put(one, "tables/t/part.parquet", b"whole")
-    row = one._current(path)
-    assert row is not None
+    (row,) = one._known([path]).values()
     for altered in (b"whale", b"who"):
         one.bucket.put(object_name(row.digest), altered)
         other.look()
@@ -268,6 +266,13 @@ def test_a_bucket_that_is_gone_is_no_reason_to_forget_its_files(bucket_hosts: Ho
         assert other.has(other.root / "clips/a.mp4") and one.has(path)
     finally:
         s3.make_bucket()
+
+
+def test_more_names_are_looked_up_at_once_than_a_statement_takes_values(bucket_hosts: Hosts) -> None:
+    store = bucket_hosts.open("one")
+    path = put(store, "clips/a.mp4", b"frames")
+    others = [store.root / "clips" / f"{number}.mp4" for number in range(70_000)]  # PostgreSQL takes 65,535
+    assert store.there([path, *others]) == {path}
 
 
 def test_changes_of_hosts_at_once_are_all_seen(bucket_hosts: Hosts) -> None:

@@ -19,7 +19,6 @@ KEYS = {
 }
 _SECRETS = {
     "s3": ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN"),
-    "gs": (),
     "az": ("AZURE_STORAGE_ACCOUNT_KEY",),
 }
 _NO_BUCKET = ("NoSuchBucket", "ContainerNotFound")  # the services' terms; Azure's is the latter
@@ -35,65 +34,55 @@ class Bucket:
 
     def __init__(self, address: str) -> None:
         require("cluster", "obstore")
-        import obstore
-        from obstore.exceptions import BaseError
         from obstore.store import from_url
 
-        self.address, self._client = address, obstore
-        for variable in _SECRETS[address.partition(":")[0]]:
+        self.address, self._kind = address, address.partition(":")[0]
+        for variable in _SECRETS.get(self._kind, ()):
             optional_key(variable)  # obstore reads it again
-        try:
+        with self._used():
             self._store = from_url(address, retry_config={"max_retries": 5})
-        except (BaseError, ValueError, TypeError) as error:
-            raise self.error(error) from None
 
     @contextmanager
     def _used(self) -> Iterator[None]:
         """Translate errors within the block to FileNotFoundError or TrapsError."""
-        from obstore.exceptions import BaseError, NotFoundError
+        from obstore.exceptions import BaseError
 
         try:
             yield
-        except (NotFoundError, FileNotFoundError) as error:
-            if any(code in str(error) for code in _NO_BUCKET):
-                raise self.error(error) from None
-            raise FileNotFoundError(str(error)) from None
-        except BaseError as error:
-            raise self.error(error) from None
+        except (BaseError, FileNotFoundError, ValueError, TypeError) as error:
+            if isinstance(error, FileNotFoundError) and not any(code in str(error) for code in _NO_BUCKET):
+                raise
+            reason = " ".join(str(error).split())[:300]
+            raise TrapsError(
+                f"{self.address}: cannot be used from the host {socket.gethostname()} ({reason}). See that the bucket "
+                f"exists, that its keys and its address are in the environment ({KEYS[self._kind]}), and that this "
+                "machine's clock is right; then run the same command again: what is finished is kept"
+            ) from None
 
     def get(self, name: str) -> bytes | None:
         """Return an object's content; None if it is missing. Raises TrapsError."""
         with suppress(FileNotFoundError), self._used():
-            return bytes(self._client.get(self._store, name).bytes())
+            return bytes(self._store.get(name).bytes())
         return None
 
     def size(self, name: str) -> int | None:
         """Return an object's size in bytes; None if it is missing. Raises TrapsError."""
         with suppress(FileNotFoundError), self._used():
-            return int(self._client.head(self._store, name)["size"])
+            return int(self._store.head(name)["size"])
         return None
 
     def put(self, name: str, content: bytes) -> None:
         """Write an object. Raises TrapsError."""
         with self._used():
-            self._client.put(self._store, name, content)
+            self._store.put(name, content)
 
     def delete(self, names: Sequence[str]) -> None:
         """Remove objects. Raises TrapsError."""
         with suppress(FileNotFoundError), self._used():
-            self._client.delete(self._store, names)
+            self._store.delete(names)
 
     def names(self, below: str = "") -> Iterator[tuple[str, int, datetime]]:
         """Yield objects' name, size (bytes) and time, below a name. Raises TrapsError."""
         with self._used():
-            for page in self._client.list(self._store, below or None):
+            for page in self._store.list(below or None):
                 yield from ((entry["path"], entry["size"], entry["last_modified"]) for entry in page)
-
-    def error(self, error: Exception) -> TrapsError:
-        """Return the sentence for people about a store that cannot be used."""
-        reason = " ".join(str(error).split())[:300]
-        return TrapsError(
-            f"{self.address}: cannot be used from the host {socket.gethostname()} ({reason}). See that the bucket "
-            f"exists, that its keys and its address are in the environment ({KEYS[self.address.partition(':')[0]]}), "
-            "and that this machine's clock is right; then run the same command again: what is finished is kept"
-        )

@@ -5,11 +5,12 @@ Modules above the storage are imported in functions: importing them opens the st
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from traps_pipeline.cluster.places import open_store
+from traps_pipeline.cluster.history import dagster_yaml
+from traps_pipeline.cluster.objects import open_store
+from traps_pipeline.cluster.postgres import open_ledger
 from traps_pipeline.storage.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -17,17 +18,10 @@ if TYPE_CHECKING:
 
     from traps_pipeline.pipeline.runs import Runs
 
-__all__ = ["dagster_yaml", "open_store", "runs", "sensors"]
+__all__ = ["dagster_yaml", "open_ledger", "open_store", "runs", "sensors"]
 
 
-def dagster_yaml(workspace: Workspace) -> dict[str, Any]:
-    """See `SeveralHosts`."""
-    from traps_pipeline.cluster import shared_history
-
-    return shared_history.dagster_yaml(workspace)
-
-
-def runs(workspace: Workspace, instance: dg.DagsterInstance, options: argparse.Namespace) -> Runs:
+def runs(workspace: Workspace, instance: dg.DagsterInstance, options: Any) -> Runs:
     """See `SeveralHosts`."""
     from traps_pipeline.cluster.ray_runs import RayRuns, require_cluster
 
@@ -39,7 +33,6 @@ def runs(workspace: Workspace, instance: dg.DagsterInstance, options: argparse.N
 
 def sensors() -> Sequence[dg.SensorDefinition]:
     """See `SeveralHosts`."""
-    from traps_pipeline.cluster.lost_runs import end_lost_runs
-    from traps_pipeline.cluster.requests import start_requested_runs
+    from traps_pipeline.cluster.sensors import end_lost_runs, start_requested_runs
 
     return [start_requested_runs, end_lost_runs]

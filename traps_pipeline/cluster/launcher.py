@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import socket
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
@@ -15,10 +14,10 @@ from dagster_ray import RayRunLauncher  # pyright: ignore[reportMissingImports] 
 from ray.job_submission import JobSubmissionClient  # pyright: ignore[reportMissingImports]
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cluster.resources import RESOURCES_TAG, STUDY_TAG, keys_in, own_tags
+from traps_pipeline.cluster.ray_runs import RESOURCES_TAG, STUDY_TAG, own_tags
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.pipeline.graph import Stage, the_graph
-from traps_pipeline.pipeline.runs import range_of
+from traps_pipeline.pipeline.runs import keys_of
 from traps_pipeline.storage.workspace import RAY, RUN_CPUS, RUN_GPUS, Workspace
 
 
@@ -38,23 +37,21 @@ class ClusterLauncher(RayRunLauncher):
             context.workspace.instance.add_run_tags(run.run_id, tags)
             run = run.with_tags({**run.tags, **tags})
             context = type(context)(run, context.workspace)
-        with self._answering(run):
-            super().launch_run(context)
+        self._submit(super().launch_run, context)
 
     def resume_run(self, context: Any) -> None:
         """Launch a run again after its host died."""
-        with self._answering(context.dagster_run):
-            super().resume_run(context)
+        self._submit(super().resume_run, context)
 
-    @contextmanager
-    def _answering(self, run: dg.DagsterRun) -> Iterator[None]:
+    def _submit(self, submit: Callable[[Any], None], context: Any) -> None:
         try:
-            yield
+            submit(context)
         except OSError as error:
+            study, reason = context.dagster_run.tags.get(STUDY_TAG, ""), " ".join(str(error).split())[:200]
             raise TrapsError(
                 f"{self.address}: Ray's head does not answer the host {socket.gethostname()}, which starts the runs of "
-                f"the study {run.tags.get(STUDY_TAG, '')} ({' '.join(str(error).split())[:200]}). See that the head "
-                f"runs (`ray status`) and that {RAY} is its address; then run the same command again"
+                f"the study {study} ({reason}). See that the head runs (`ray status`) and that {RAY} is its address; "
+                "then run the same command again"
             ) from error
 
 
@@ -66,9 +63,8 @@ class _NodeClient(JobSubmissionClient):
 
     def submit_job(self, *, entrypoint: str, metadata: dict[str, str] | None = None, **options: Any) -> str:
         """Submit a job; return its id."""
-        return super().submit_job(
-            entrypoint=node_command(entrypoint, (metadata or {})["dagster/run-id"]), metadata=metadata, **options
-        )
+        command = node_command(entrypoint, (metadata or {})["dagster/run-id"])
+        return super().submit_job(entrypoint=command, metadata=metadata, **options)
 
 
 def node_command(entrypoint: str, run_id: str) -> str:
@@ -82,9 +78,8 @@ def tags_of_page_run(run: dg.DagsterRun) -> dict[str, str]:
     """Return a page's or sensor's run tags, as `traps run --cluster` would set them."""
     import traps_pipeline.definitions  # noqa: F401 - declares the stages, which the daemon's process has not loaded
 
-    workspace, declared = Workspace.open(), the_graph().declared
-    names = [key.path[-1] for key in run.asset_selection or ()]
-    stages = [declaration for name in names if isinstance(declaration := declared.get(name), Stage)]
-    keys = keys_in([declaration for declaration in stages if declaration.name == RESPONSES.name], range_of(run.tags))
+    declared = [the_graph().declared.get(key.path[-1]) for key in run.asset_selection or ()]
+    stages = [each for each in declared if isinstance(each, Stage)]
+    keys = [key for stage in stages if stage.name == RESPONSES.name for key in keys_of(stage, run.tags)]
     cpus, gpus = int(os.environ.get(RUN_CPUS, "1")), float(os.environ.get(RUN_GPUS, "0"))
-    return own_tags(workspace, stages, keys, cpus, gpus)
+    return own_tags(Workspace.open(), stages, keys, cpus, gpus)

@@ -1,8 +1,8 @@
 """Request runs on other hosts (`traps run EXPERIMENT --cluster`).
 
 The head of the cluster runs Dagster's daemon (`traps ui`), which creates the requested runs, starts them as Ray jobs
-and resumes those whose host died. This module cuts the missing partitions into ranges, requests their runs, and reports
-their progress.
+and resumes those whose host died. This module cuts the missing partitions into ranges, requests their runs with tags of
+the study, the submitter's code and the resources for Ray, and reports their progress.
 """
 
 from __future__ import annotations
@@ -11,37 +11,62 @@ import json
 import os
 import socket
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from typing import Literal
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from functools import partial
+from typing import Any
 
 import dagster as dg
 
 from traps_pipeline.base import progress
+from traps_pipeline.base.cores import CORES
 from traps_pipeline.base.databases import database_error
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.extras import missing
 from traps_pipeline.base.wording import counted
-from traps_pipeline.cluster.node import REFUSED_TAG
-from traps_pipeline.cluster.requests import REQUEST_TAG, submit
-from traps_pipeline.cluster.resources import RESOURCES_TAG, STUDY_TAG, keys_in, own_tags
-from traps_pipeline.ledger.postgres import PATIENCE_S
+from traps_pipeline.cluster.node import CODE, REFUSED_TAG, code_here
+from traps_pipeline.cluster.postgres import PATIENCE_S
+from traps_pipeline.cluster.sensors import REQUEST_TAG, submit
+from traps_pipeline.models.answer_rows import RESPONSES
+from traps_pipeline.models.registry import LOCAL, get_model
 from traps_pipeline.pipeline.graph import Stage, the_graph
 from traps_pipeline.pipeline.metadata import tally_of
 from traps_pipeline.pipeline.ranges import Range, cut, shared_out
-from traps_pipeline.pipeline.runs import RunOutcome, Runs, is_broken_off, problems_of, range_of, range_tags, reason
+from traps_pipeline.pipeline.runs import RunOutcome, Runs, is_broken_off, keys_of, problems_of, range_tags, reason
 from traps_pipeline.pipeline.step import TAKEN, UNWANTED
+from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.storage.workspace import RAY, VARIABLE, Workspace
 
+STUDY_TAG = "traps/study"
+RESOURCES_TAG = "dagster-ray/config"  # dagster-ray's own name
 POLL_S = 1.0
-IDLE_S = 60.0  # waiting time before the user is told that runs wait for a host, or for the daemon
+IDLE_S = 60.0  # waiting time before the user is told that no run is at work
 ALIVE_S = 120  # a daemon silent for longer is presumed dead
 CREATED_S = 30.0  # when ending its runs, a command waits so long for the daemon to create the requested ones
 DAEMONS = ("QUEUED_RUN_COORDINATOR", "SENSOR")
 ENDS = 300  # characters of the beginning and of the end of a lost run's last message
-OnInterrupt = Literal["leave", "cancel"]
 _UNFINISHED = [status for status in dg.DagsterRunStatus if status.name not in ("SUCCESS", "FAILURE", "CANCELED")]
 _WRITTEN, _FAILED = dg.DagsterEventType.ASSET_MATERIALIZATION, dg.DagsterEventType.STEP_FAILURE
 _ENDED = {dg.DagsterEventType.RUN_FAILURE, dg.DagsterEventType.RUN_CANCELED, dg.DagsterEventType.ENGINE_EVENT}
+
+
+def own_tags(
+    workspace: Workspace, stages: Collection[Stage], keys: Iterable[str], cpus: int, gpus: float
+) -> dict[str, str]:
+    """Return the tags of a run on another host; they are public, so hold no secrets.
+
+    keys: the partitions to build; cpus: of a run that can use several cores; gpus: of a run that loads a model.
+    """
+    takes: dict[str, Any] = {"num_cpus": cpus if any(stage.takes.each_gb for stage in stages) else 1}
+    is_asking = RESPONSES.name in {stage.name for stage in stages}
+    asks_local = is_asking and any(get_model(Cell.parse(key).evaluation.model).backend == LOCAL for key in keys)
+    if gpus and (asks_local or any(stage.cost == "machine" for stage in stages)):
+        takes["num_gpus"] = gpus
+    memory_gb = [stage.takes.memory_gb + takes["num_cpus"] * stage.takes.each_gb for stage in stages]
+    if memory := max(memory_gb, default=0.0):
+        takes["memory"] = int(memory * 2**30)
+    exported = {VARIABLE: str(workspace.place), RAY: os.environ.get(RAY, ""), CODE: code_here()}
+    takes["runtime_env"] = {"env_vars": exported | {CORES: str(takes["num_cpus"])}}
+    return {STUDY_TAG: workspace.study.name, RESOURCES_TAG: json.dumps(takes)}
 
 
 def require_cluster(workspace: Workspace, instance: dg.DagsterInstance) -> None:
@@ -78,7 +103,7 @@ class RayRuns(Runs):
     """Runs of a study in Dagster's queue.
 
     most: maximum number of ranges per group of stages. gpus: of each run that loads a local model. cpus: of each run
-    that can use several.
+    that can use several. on_interrupt: whether Ctrl-C is to `leave` or to `cancel` them.
     """
 
     def __init__(
@@ -87,24 +112,25 @@ class RayRuns(Runs):
         workspace: Workspace,
         most: int,
         gpus: float,
-        on_interrupt: OnInterrupt,
+        on_interrupt: str,
         cpus: int = 1,
     ) -> None:
         self._instance, self._workspace, self._on_interrupt = instance, workspace, on_interrupt
         self._most, self._gpus, self._cpus = most, gpus, cpus
-        self._idle_since, self._is_reported_idle = float("inf"), False  # while all runs wait for a host
-        self._keys = frozenset[str | None]()
+        self._idle_since, self._is_reported_idle = 0.0, False  # when a run was last seen at work
+        self._submit, self._keys = partial(submit, instance, workspace.study.name), frozenset[str | None]()
         # Stages and tags by name, to request a run again if it breaks off.
         self._requests: dict[str, tuple[Sequence[str], Mapping[str, str]]] = {}
-        self._cursors: dict[str, str | None] = {}
-        self._failures: dict[str, list[dg.DagsterEvent]] = {}  # failed steps of runs
+        # By run: how far its events were read, and its failed steps.
+        self._cursors, self._failures = dict[str, str | None](), dict[str, list[dg.DagsterEvent]]()
 
     def wait_for_earlier(self) -> None:
         """Wait for runs of earlier commands."""
         filters = dg.RunsFilter(statuses=_UNFINISHED, tags={STUDY_TAG: self._workspace.study.name})
         if runs := [*self._instance.get_runs(filters)]:
             progress.current().note(f"waiting first for {counted(len(runs), 'run')} that an earlier command left")
-            progress.current().stage("runs that were left", sum(map(_partitions, runs)))
+            stages = [(the_graph()[key.path[-1]], run.tags) for run in runs for key in run.asset_selection or ()]
+            progress.current().stage("runs that were left", sum(len(keys_of(*each)) or 1 for each in stages))
             self._watch([], [run.run_id for run in runs])
 
     def ranges(self, stages: Sequence[Stage], keys: Sequence[str | None]) -> list[Range]:
@@ -118,45 +144,39 @@ class RayRuns(Runs):
         shared = [stage.shared for stage in stages if stage.shared is not None]
         if not shared:
             return cut(scheme, keys, self._most)
-        seconds = {
-            key: sum(costly_stage.seconds(self._workspace, key) for costly_stage in shared) / self._cpus for key in keys
-        }
+        seconds = {key: sum(each.seconds(self._workspace, key) for each in shared) / self._cpus for key in keys}
         return shared_out(scheme, keys, seconds, self._most)
 
     def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterator[RunOutcome]:
         """See `Runs`."""
-        if ranges:
-            progress.current().stage(", ".join(stage.name for stage in stages), len(self._keys) * len(stages))
-            names = [stage.name for stage in stages]
-            requests = [
-                (names, {**tags, **self._own_tags(stages, keys), **range_tags(keys, always=True)}) for keys in ranges
-            ]
-            self._requests = {self._submit(*request): request for request in requests}
-            yield from self._watch([*self._requests], [])
-
-    def _own_tags(self, stages: Sequence[Stage], of: Range) -> dict[str, str]:
-        keys = [key for key in keys_in(stages, of) if key in self._keys]
-        return own_tags(self._workspace, stages, keys, self._cpus, self._gpus)
-
-    def _submit(self, stages: Sequence[str], tags: Mapping[str, str]) -> str:
-        return submit(self._instance, self._workspace.study.name, stages, tags)
+        if not ranges:
+            return
+        names, requests = [stage.name for stage in stages], list[tuple[Sequence[str], Mapping[str, str]]]()
+        progress.current().stage(", ".join(names), len(self._keys) * len(stages))
+        for each in ranges:
+            of_range = range_tags(each, always=True)
+            keys = [key for stage in stages[:1] for key in keys_of(stage, of_range) if key in self._keys]
+            own = own_tags(self._workspace, stages, keys, self._cpus, self._gpus)
+            requests.append((names, {**tags, **own, **of_range}))
+        self._requests = {self._submit(*request): request for request in requests}
+        yield from self._watch([*self._requests], [])
 
     def _watch(self, requests: list[str], run_ids: list[str]) -> list[RunOutcome]:
         """Report the progress of requested and existing runs until all have ended.
 
         An unreachable database ends this only after runs themselves would give up on it.
         """
-        done, seen_at = list[RunOutcome](), time.monotonic()
+        done = list[RunOutcome]()
+        seen_at = self._idle_since = time.monotonic()
         try:
             while requests or run_ids:
+                time.sleep(POLL_S)
                 try:
                     self._look_at(requests, run_ids, done)
                     seen_at = time.monotonic()
                 except Exception as error:
                     if database_error(error) is None or time.monotonic() - seen_at > PATIENCE_S:
                         raise
-                if requests or run_ids:
-                    time.sleep(POLL_S)
         except KeyboardInterrupt:
             self._interrupted(requests, run_ids)
             raise
@@ -166,20 +186,20 @@ class RayRuns(Runs):
         """Report progress of runs; replace requests by runs, and add ended ones to `done`."""
         self._take_created(requests, run_ids)
         runs = {run.run_id: run for run in self._instance.get_runs(dg.RunsFilter(run_ids=run_ids))} if run_ids else {}
-        self._report_waiting(requests, [*runs.values()])
+        self._report_waiting(runs.values())
         for run_id in [*run_ids]:
             run = runs.get(run_id)
             self._report(run_id)
             if run is not None and not run.is_finished:
                 continue
-            run_ids.remove(run_id)
-            name, failures = "" if run is None else run.tags.get(REQUEST_TAG, ""), self._failures.get(run_id, [])
-            is_refused = run is not None and REFUSED_TAG in run.tags
-            if run is not None and name in self._requests and not is_refused and is_broken_off(run, failures):
-                requests.append(self._submit(*self._requests.pop(name)))
+            tags, failures = run.tags if run is not None else {}, self._failures.get(run_id, [])
+            request = self._requests.get(tags.get(REQUEST_TAG, ""))
+            if run is not None and request and REFUSED_TAG not in tags and is_broken_off(run, failures):
+                requests.append(self._submit(*request))
                 progress.current().note(f"run {run_id[:8]} broke off, and is made once more")
             else:
                 done.append(self._ended(run_id, run, failures))
+            run_ids.remove(run_id)  # last, since the database may be lost on the way
 
     def _take_created(self, requests: list[str], run_ids: list[str]) -> None:
         """Replace requests by the runs created from them."""
@@ -187,24 +207,16 @@ class RayRuns(Runs):
             requests.remove(run.tags[REQUEST_TAG])
             run_ids.append(run.run_id)
 
-    def _report_waiting(self, requests: Collection[str], runs: Sequence[dg.DagsterRun]) -> None:
+    def _report_waiting(self, runs: Iterable[dg.DagsterRun]) -> None:
         """Warn once if nothing begins: no host has the resources, or the daemon is idle."""
-        waiting = [run for run in runs if run.status == dg.DagsterRunStatus.STARTING]
-        if not (waiting or requests) or any(run.status == dg.DagsterRunStatus.STARTED for run in runs):
-            self._idle_since = float("inf")
-            return
-        self._idle_since = min(self._idle_since, time.monotonic())
-        if time.monotonic() - self._idle_since <= IDLE_S or self._is_reported_idle:
-            return
-        self._is_reported_idle = True
-        needs, where = "Dagster's daemon to create them", "the ticks of start_requested_runs in `traps ui` show why"
-        if waiting:
-            takes = json.loads(waiting[0].tags.get(RESOURCES_TAG, "{}"))
-            resources = ", ".join(f"{name} {value}" for name, value in takes.items() if name != "runtime_env")
-            needs = f"a host that is free and has {resources or 'a CPU'}"
-            where = "`ray status` on the head shows what there is"
-        unbegun = counted(len(waiting or requests), "run")
-        progress.current().note(f"{unbegun} not begun after {IDLE_S:.0f} s, for lack of {needs}; {where}")
+        if any(run.status == dg.DagsterRunStatus.STARTED for run in runs):
+            self._idle_since = time.monotonic()
+        elif time.monotonic() - self._idle_since > IDLE_S and not self._is_reported_idle:
+            self._is_reported_idle = True
+            progress.current().note(
+                f"no run has begun for {IDLE_S:.0f} s: `ray status` on the head shows what runs take and what is free, "
+                "and the ticks of start_requested_runs in `traps ui` whether Dagster's daemon creates them"
+            )
 
     def _report(self, run_id: str) -> None:
         """Report a run's newly built partitions, and record its failed steps."""
@@ -242,18 +254,16 @@ class RayRuns(Runs):
         """Return the launcher's error or last event's message, if no step says why."""
         logged = [entry.dagster_event for entry in self._instance.all_logs(run_id, of_type=_ENDED)]
         events = [event for event in logged if event is not None]
-        for event in events[-2:]:  # a failed start is recorded right before the run's end
-            if event.is_engine_event and event.engine_event_data.error:
-                return reason(event.engine_event_data.error)
+        # A failed start is recorded right before the run's end.
+        errors = [event.engine_event_data.error for event in events[-2:] if event.is_engine_event]
         messages = [event.message for event in events if not event.is_engine_event and event.message]
-        return messages[-1] if messages else "no reason is known"
+        return next(map(reason, filter(None, errors)), (messages or ["no reason is known"])[-1])
 
     def _interrupted(self, requests: list[str], run_ids: list[str]) -> None:
-        count = len(requests) + len(run_ids)
         if self._on_interrupt == "leave":
             progress.current().note(
-                f"left running: {counted(count, 'run')}; the same command shows the progress again, and "
-                "`--on-interrupt cancel` would end such runs"
+                f"left running: {counted(len(requests) + len(run_ids), 'run')}; the same command shows the progress "
+                "again, and `--on-interrupt cancel` would end such runs"
             )
             return
         until = time.monotonic() + CREATED_S
@@ -263,10 +273,3 @@ class RayRuns(Runs):
         for run_id in run_ids:
             self._instance.run_coordinator.cancel_run(run_id)
         progress.current().note(f"told {counted(len(run_ids), 'run')} to end; finished work is kept")
-
-
-def _partitions(run: dg.DagsterRun) -> int:
-    """Return the number of partitions that a run is to build, over all its stages."""
-    graph = the_graph()
-    selected = [graph[key.path[-1]] for key in run.asset_selection or ()]
-    return sum(len(keys_in([stage], range_of(run.tags))) or 1 for stage in selected)

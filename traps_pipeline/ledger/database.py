@@ -2,7 +2,7 @@
 
 Hundreds of calls are in flight at once, and each changes the database twice: before it is sent and when it is answered.
 So changes are queued, and one thread applies all waiting ones in one transaction. A change is done when its future is.
-The two modules beside this one hold the differences between SQLite and PostgreSQL.
+What differs between databases is in `sqlite.py` and `cluster/postgres.py`.
 """
 
 from __future__ import annotations
@@ -19,16 +19,12 @@ from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 
 import sqlalchemy as sa
+from sqlalchemy import exc
 
 from traps_pipeline.base.databases import reason_and_remedy
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.ledger.batch import Batch
-from traps_pipeline.ledger.schema import (
-    METADATA,
-    SESSIONS,
-    SHARERS,
-    STUDIES,
-)
+from traps_pipeline.ledger.schema import METADATA, SESSIONS, SHARERS, STUDIES
 
 T = TypeVar("T")
 BEAT_S = 0.5  # how often a process renews its locks and reservations
@@ -53,10 +49,13 @@ class Lock:
 
 
 class Database(ABC):
-    """The ledger's database of one study in this process; thread-safe."""
+    """The ledger's database of one study in this process; thread-safe.
 
-    def __init__(self, study: str) -> None:
-        self.study_name = study
+    place: its location for people, without a password.
+    """
+
+    def __init__(self, study: str, place: str) -> None:
+        self.study_name, self.place = study, place
         self.session = ""  # while this process writes: a unique id
         self.study = 0  # the study's number, once there is one
         self._queue: SimpleQueue[tuple[Change, Future[Any]] | None] = SimpleQueue()
@@ -64,17 +63,18 @@ class Database(ABC):
         self._thread: threading.Thread | None = None
         self._session_lock: Lock | None = None
         self.sharers: dict[str, int] = {}  # by account in use: the number of processes that use it now
+        self._connection: sa.Connection | None = None  # for writing; `end` closes it
+        self._transaction = threading.RLock()
 
     # --- what differs between databases -------------------------------------------------------------------------------
 
-    @property
-    @abstractmethod
-    def place(self) -> str:
-        """The ledger's location for people, without a password."""
-
-    @abstractmethod
     def exists(self) -> bool:
         """Return whether the database may exist."""
+        return True
+
+    @abstractmethod
+    def connect(self) -> sa.Connection:
+        """Return a new connection for writing. Raises SQLAlchemy's errors."""
 
     @abstractmethod
     def read(self) -> sa.Connection:
@@ -107,11 +107,22 @@ class Database(ABC):
     def beat(self) -> None:
         """Renew this process's locks if they could expire. Raises TrapsError."""
 
-    @abstractmethod
-    def end(self) -> None:
-        """Close the resources that writing needed."""
-
     # --- writing ------------------------------------------------------------------------------------------------------
+
+    def _attempt(self, work: Callable[[sa.Connection], T]) -> T:
+        """Run `work` in one transaction; for `run`, which holds `_transaction`."""
+        if self._connection is None:
+            self._connection = self.connect()
+        with self._connection.begin():
+            return work(self._connection)
+
+    def end(self) -> None:
+        """Close the connection for writing."""
+        with self._transaction:
+            connection, self._connection = self._connection, None
+            if connection is not None:
+                with suppress(exc.SQLAlchemyError):
+                    connection.invalidate()  # unlike `close`, it sends no rollback to a server that may be unreachable
 
     @contextmanager
     def writing(self) -> Iterator[None]:
@@ -272,6 +283,14 @@ class Database(ABC):
                 future.set_exception(result)
             else:
                 future.set_result(result)
+
+
+def taken_over(place: str) -> TrapsError:
+    """Return the error of a writer whose evaluation another process has taken over."""
+    return TrapsError(
+        f"{place}: another process has begun to ask the same calls, since this one was away; nothing more is sent. Run "
+        "the same command again when the other one has ended"
+    )
 
 
 def sentence(error: Exception, place: str) -> TrapsError:

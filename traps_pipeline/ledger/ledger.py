@@ -17,9 +17,8 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy import exc
 
-from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.ledger.batch import Batch, claim
-from traps_pipeline.ledger.database import Database, Lock, sentence
+from traps_pipeline.ledger.database import Database, Lock, sentence, taken_over
 from traps_pipeline.ledger.rows import (
     AVERAGED,
     NOT_WHOLE,
@@ -287,10 +286,7 @@ class Writer:
     def check(self, batch: Batch) -> None:
         """Raise TrapsError if another process now writes this evaluation."""
         if not batch.is_writer(self._evaluation):
-            raise TrapsError(
-                f"{self._database.place}: another process has begun to ask the same calls, since this one was away; "
-                "nothing more is sent. Run the same command again when the other one has ended"
-            )
+            raise taken_over(self._database.place)
 
     async def sync(self) -> None:
         """Sync the written rows to disk. Raises TrapsError."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import sqlite3
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -34,17 +33,10 @@ class SqliteDatabase(Database):
     """
 
     def __init__(self, folder: Path, study: str = "study", file: str = FILE) -> None:
-        super().__init__(study)
+        super().__init__(study, str(folder / file))
         self.folder, self.path = folder, folder / file
-        self._connection: sa.Connection | None = None
-        self._transaction = threading.RLock()
         self._engine = sa.create_engine("sqlite://", creator=self._open, poolclass=sa.NullPool)
         event.listen(self._engine, "begin", _begin)
-
-    @property
-    def place(self) -> str:
-        """See `Database.place`."""
-        return str(self.path)
 
     def exists(self) -> bool:
         """See `Database.exists`."""
@@ -69,15 +61,16 @@ class SqliteDatabase(Database):
         except exc.DBAPIError as error:
             raise sentence(error, self.place) from error
 
+    def connect(self) -> sa.Connection:
+        """See `Database.connect`."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        return self._engine.connect()
+
     def run(self, work: Callable[[sa.Connection], T]) -> T:
         """See `Database.run`."""
         with self._transaction:
             try:
-                if self._connection is None:
-                    self.folder.mkdir(parents=True, exist_ok=True)
-                    self._connection = self._engine.connect()
-                with self._connection.begin():
-                    return work(self._connection)
+                return self._attempt(work)
             except (exc.DBAPIError, sqlite3.Error) as error:
                 self.end()
                 raise sentence(error, self.place) from error
@@ -129,14 +122,6 @@ class SqliteDatabase(Database):
 
     def beat(self) -> None:
         """See `Database.beat`; the kernel keeps the locks."""
-
-    def end(self) -> None:
-        """See `Database.end`."""
-        with self._transaction:
-            if self._connection is not None:
-                with suppress(exc.SQLAlchemyError, sqlite3.Error):
-                    self._connection.close()
-                self._connection = None
 
 
 def _begin(connection: sa.Connection) -> None:

@@ -113,10 +113,10 @@ def range_tags(keys: Range, *, always: bool = False) -> dict[str, str]:
     return {_RANGE[0]: str(first), _RANGE[1]: str(last)}
 
 
-def range_of(tags: Mapping[str, str]) -> Range:
-    """Return a run's partitions from `range_tags`, or Dagster's tag of a single key."""
-    single = tags.get("dagster/partition")
-    return tags.get(_RANGE[0], single), tags.get(_RANGE[1], single)
+def keys_of(stage: Stage, tags: Mapping[str, str]) -> Sequence[str]:
+    """Return a stage's partitions by `range_tags`, or by Dagster's tag of a single key."""
+    first, last = (tags.get(name, tags.get("dagster/partition", "")) for name in _RANGE)
+    return stage.scheme.between(first, last) if stage.scheme and first else []
 
 
 def this_host() -> str:

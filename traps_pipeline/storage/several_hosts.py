@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 if TYPE_CHECKING:
     import dagster as dg
 
+    from traps_pipeline.ledger.database import Database
     from traps_pipeline.storage.place import Place
     from traps_pipeline.storage.store import Store
     from traps_pipeline.storage.study import Study
@@ -29,6 +30,13 @@ class SeveralHosts(Protocol):
         Files lie below `root` while they are used. study: the contents of `study.yaml`, if known; else they are read
         from the address, and None is returned if there is no study. Raises TrapsError if the store or its database
         cannot be used.
+        """
+        ...
+
+    def open_ledger(self, variable: str, study: str) -> Database:
+        """Return this process's ledger in the database at a variable's address.
+
+        Raises TrapsError.
         """
         ...
 

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 
 from traps_pipeline.base.digests import file_digest
@@ -42,11 +43,11 @@ class UnusedObject:
 class Store(ABC):
     """The files of one study.
 
-    root: the local folder below which every path lies.
+    root: the local folder below which every path lies. leases: who keeps them; by default, locks on files below it.
     """
 
-    def __init__(self, root: Path) -> None:
-        self.root = root
+    def __init__(self, root: Path, leases: Callable[[str], Lease | None] | None = None) -> None:
+        self.root, self._leases = root, leases or partial(_file_lease, root / LEASES)
 
     @abstractmethod
     def here(self, path: Path) -> Path:
@@ -74,9 +75,9 @@ class Store(ABC):
     def remove(self, paths: Iterable[Path]) -> None:
         """Remove the files of these paths."""
 
-    @abstractmethod
     def has(self, path: Path) -> bool:
         """Return whether a path has a file."""
+        return bool(self.there([path]))
 
     @abstractmethod
     def sizes(self, paths: Iterable[Path]) -> dict[Path, int]:
@@ -90,13 +91,13 @@ class Store(ABC):
     def digests(self, paths: Iterable[Path]) -> dict[Path, str]:
         """Return the hex SHA-256 of those files that exist, without fetching content."""
 
-    @abstractmethod
     def lease(self, name: str) -> Lease | None:
         """Take a lease on a piece of work; None if any process, also this one, holds it.
 
         It ends when it is closed, and soon after its process or host has died. A host that is cut off may lose it
         unknowingly, so work under a lease must be idempotent. Raises TrapsError.
         """
+        return self._leases(name)
 
     @abstractmethod
     def below(self, folder: Path, pattern: str = "**/*") -> list[Path]:
@@ -124,7 +125,10 @@ class Store(ABC):
 
 
 class FolderStore(Store):
-    """Files in a folder of this machine."""
+    """Files in a folder of this machine, or in one that several hosts share.
+
+    These need other leases than files: on some file systems, locks of files are local to a machine.
+    """
 
     def here(self, path: Path) -> Path:
         """See `Store`."""
@@ -146,10 +150,6 @@ class FolderStore(Store):
         for path in paths:
             path.unlink(missing_ok=True)
 
-    def has(self, path: Path) -> bool:
-        """See `Store`."""
-        return path.is_file()
-
     def sizes(self, paths: Iterable[Path]) -> dict[Path, int]:
         """See `Store`."""
         size_of: dict[Path, int] = {}
@@ -168,22 +168,6 @@ class FolderStore(Store):
         """See `Store`."""
         return {path: file_digest(path) for path in self.there(paths)}
 
-    def lease(self, name: str) -> Lease | None:
-        """See `Store`; the lease is a lock on a file, removed at its end."""
-        folder = self.root / LEASES
-        path = folder / name.replace("/", "-")
-        with writable(folder):
-            descriptor = try_lock(path)
-
-        def close() -> None:
-            assert descriptor is not None, "only what is held is closed"
-            path.unlink(missing_ok=True)  # first, so that a process that has opened it finds it gone
-            os.close(descriptor)
-            with suppress(OSError):
-                folder.rmdir()  # unless there are others
-
-        return None if descriptor is None else Lease(close)
-
     def below(self, folder: Path, pattern: str = "**/*") -> list[Path]:
         """See `Store`."""
         files = (path for path in folder.glob(pattern) if path.is_file())
@@ -199,6 +183,22 @@ class FolderStore(Store):
 
     def look(self) -> None:
         """See `Store`."""
+
+
+def _file_lease(folder: Path, name: str) -> Lease | None:
+    """Lock a file, which is removed at the lease's end."""
+    path = folder / name.replace("/", "-")
+    with writable(folder):
+        descriptor = try_lock(path)
+
+    def close() -> None:
+        assert descriptor is not None, "only what is held is closed"
+        path.unlink(missing_ok=True)  # first, so that a process that has opened it finds it gone
+        os.close(descriptor)
+        with suppress(OSError):
+            folder.rmdir()  # unless there are others
+
+    return None if descriptor is None else Lease(close)
 
 
 @contextmanager

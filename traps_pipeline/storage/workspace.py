@@ -238,11 +238,10 @@ class Workspace:
     @cached_property
     def ledger(self) -> Database:
         """The database of answers, votes and money. Raises TrapsError with a remedy."""
-        from traps_pipeline.ledger.postgres import postgres_of
         from traps_pipeline.ledger.sqlite import SqliteDatabase
 
         if self.study.database:
-            return postgres_of(self.study.database, self.study.name)
+            return several_hosts().open_ledger(self.study.database, self.study.name)
         return SqliteDatabase(self.ledger_folder)
 
     def failed_check(self, stage: str, check: str, key: str | None) -> Path:
