@@ -82,6 +82,19 @@ def damage(ledger: Ledger, key: str, content: bytes, digest: bytes | None = None
     assert ledger.database.run(lambda connection: connection.execute(change).rowcount) == 1
 
 
+def test_a_row_is_kept_even_if_the_call_that_paid_for_it_is_cancelled(ledger: Ledger) -> None:
+    async def scenario() -> None:
+        async with ledger.writing("m", print) as writer:
+            writing = asyncio.create_task(writer.write(paid("a", 0.5)))
+            await asyncio.sleep(0)  # it is queued
+            writing.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await writing
+
+    asyncio.run(scenario())
+    assert [*ledger.read("m").rows] == ["a"] and ledger.totals()["m"].dollars == 0.5
+
+
 def test_rows_come_back_by_key_and_evaluation(place: Place) -> None:
     rows = [answer("a", "left – 左 \x00"), {"key": "b", "outcome": "empty", "text": None}]
     write(place.open(), *rows)

@@ -267,8 +267,7 @@ class Writer:
         nothing was stored, and ValueError for a row that JSON cannot hold.
         """
         content = _Content.of(row, beside)
-        future = self._database.submit(lambda batch: self.add(batch, content, paid_by))
-        await asyncio.shield(asyncio.wrap_future(future))  # store what was paid for even if the caller is cancelled
+        await self._database.apply(lambda batch: self.add(batch, content, paid_by))
         self._is_synced = False
 
     def add(self, batch: Batch, content: _Content, paid_by: Sequence[str]) -> None:
