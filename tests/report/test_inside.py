@@ -102,10 +102,10 @@ def test_a_figure_is_drawn_from_them(name: str) -> None:
 # The numbers of each sentence, in their order.
 FINDINGS = {
     "states_and_output": "2 2 0 2 0 1.00 0.75 0.38",  # answered; states of voids, of controls; output; as orders
-    "lens": "+7.0 +1.0 +0.0 +0.0",
+    "lens": "+3.0 +9.0 +1.0 +1.0",  # standard, guided; one layer before
     "probe_baselines": "0 1 0 1",
     "gate_arrows": "0.45 0.64 0.64",
-    "patching": "0.99 0.99",
+    "patching": "0 0.99 1 1 0 0.99 1 1",  # layer, share, panels of panels
     "doses_among_nulls": "19 20 1 1 1 80 % 5",
 }
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.wording import counted, in_percent
 from traps_pipeline.protocol.datasets import SHORT
 from traps_pipeline.protocol.regimes import PROMPTING
-from traps_pipeline.report.figures.expression_figures import orders, scored_items
+from traps_pipeline.report.figures.expression_figures import SCORES, orders, scored_items
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.control_reports import beside
 from traps_pipeline.report.tables.inside_columns import SHORTCUTS
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 ALPHA = 0.05 + 1e-9
-_SCORES = {"states": "states", "margin": "first token", "sentences": "whole abstentions"}
-_CELL = ("directions", "regime", "target", "layer", "unit", "dose", "side")
+_CELL = ["regime", "target", "layer", "unit", "dose", "side"]
+_POSITIONS = {"changed": "changed visual tokens", "unchanged": "unchanged visual tokens", "last": "the last token"}
 
 
 def _joined(sentences: Callable[[Results], Iterator[str]]) -> Callable[[Results], str]:
@@ -51,13 +51,13 @@ def states_and_output(results: Results) -> Iterator[str]:
         yield (
             f"{model} answered {counted(len(voids), 'void')} under standard: its states put {encoded} of them among "
             f"voids (and {wrongly} of {counted(len(controls), 'control')}), its output {expressed}; as orders of sides "
-            f"(AUROC, mean of datasets): {', '.join(f'{_SCORES[name]} {mean:.2f}' for name, mean in means.items())}."
+            f"(AUROC, mean of datasets): {', '.join(f'{SCORES[name]} {mean:.2f}' for name, mean in means.items())}."
         )
 
 
 @_joined
 def lens(results: Results) -> Iterator[str]:
-    """Yield how far guided prompting moves each side's margin at the last two layers."""
+    """Yield how far voids lie above controls, by prompt, at the last two layers."""
     for model, group in _models(results.lens):
         means = group.groupby(["prompt", "layer"], observed=True).agg(
             voids=("voids", "mean"), controls=("controls", "mean")
@@ -66,15 +66,15 @@ def lens(results: Results) -> Iterator[str]:
         top = max(layer for _, layer in row_of)
         if not all((prompt, layer) in row_of for prompt in PROMPTING for layer in (top, top - 1)):
             continue
-        moved = [
-            row_of["guided", layer][side] - row_of["standard", layer][side]
+        above = [
+            row_of[prompt, layer]["voids"] - row_of[prompt, layer]["controls"]
             for layer in (top, top - 1)
-            for side in ("voids", "controls")
+            for prompt in PROMPTING
         ]
         yield (
-            f"In {model} the guided prompt moves the log-odds of abstaining by {moved[0]:+.1f} on voids and "
-            f"{moved[1]:+.1f} on controls at the last layer, and by {moved[2]:+.1f} and {moved[3]:+.1f} one layer "
-            "before (means over datasets)."
+            f"In {model}, voids lie {above[0]:+.1f} above controls in log-odds of abstaining under {PROMPTING[0]} and "
+            f"{above[1]:+.1f} under {PROMPTING[1]} at the last layer; one layer before, {above[2]:+.1f} and "
+            f"{above[3]:+.1f} (means over datasets)."
         )
 
 
@@ -115,42 +115,44 @@ def gate_arrows(results: Results) -> Iterator[str]:
 
 @_joined
 def doses_among_nulls(results: Results) -> Iterator[str]:
-    """Yield where directions exceed 19 of 20 draws of every null, by side."""
+    """Yield where directions of each prompt's states exceed 19 of 20 draws of all nulls."""
     rows = results.nulls
-    for model, group in _models(rows.loc[rows["target"] != "all"]):
-        cells: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
-        for row in group.to_dict("records"):
-            about = {str(name): value for name, value in row.items()}
-            cells.setdefault(tuple(about[name] for name in _CELL), []).append(about)
-        ahead = [of_cell[0] for of_cell in cells.values() if all(row["p"] <= ALPHA for row in of_cell)]
-        best = max(ahead, key=lambda row: row["effect"], default=None)
-        yield (
-            f"{model}: void directions do more than 19 of 20 draws of every null in {len(ahead)} of "
-            f"{counted(len(cells), 'cell')}" + (f", most of all {_cell(best)}." if best else ".")
-        )
+    for model, of_model in _models(rows.loc[rows["target"] != "all"]):
+        for directions, group in of_model.groupby("directions", sort=False, observed=True):
+            cells = [of_cell for _, of_cell in group.groupby(_CELL, sort=False, observed=True)]
+            ahead = [of_cell.to_dict("records")[0] for of_cell in cells if (of_cell["p"] <= ALPHA).all()]
+            best = max(ahead, key=lambda row: row["effect"], default=None)
+            yield (
+                f"{model}: void directions of {directions} states do more than 19 of 20 draws of every null in "
+                f"{len(ahead)} of {counted(len(cells), 'cell')}" + (f", most of all {_cell(best)}." if best else ".")
+            )
 
 
-def _cell(row: dict[str, Any]) -> str:
+def _cell(row: Mapping[Any, Any]) -> str:
     moved = "more" if row["side"] == "control" else "fewer"
+    dose = f"{row['dose']:g} × the class gap" if row["unit"] == "gap" else f"α {row['dose']:g}"
     return (
-        f"{SHORT[row['target']]} at {row['dose']:g} {row['unit']} along its direction of {row['directions']} states, "
-        f"where {in_percent(row['effect'])} {moved} of {row['n']} {row['side']}s are abstained on"
+        f"{SHORT[row['target']]} at {dose}, where {in_percent(row['effect'])} {moved} of {row['n']} {row['side']}s are "
+        "abstained on"
     )
 
 
 @_joined
 def patching(results: Results) -> Iterator[str]:
-    """Return the position group with the largest effect at first and last layer."""
+    """Yield the positions with the largest effect at first and last layer."""
     rows = results.patching
     rows = rows.loc[(rows["source"] == "pair") & (rows["site"] == "residual") & rows["effect"].notna()]
     for model, group in _models(rows.loc[rows["group"] != "all"]):
-        means = group.groupby(["layer", "group"], observed=True).agg(effect=("effect", "mean")).reset_index()
-        first, last = (
+        cells = group.groupby(["layer", "group"], observed=True)
+        means = cells.agg(effect=("effect", "mean"), panels=("effect", "size")).reset_index()
+        panels = len(group[["dataset", "into"]].drop_duplicates())
+        best = (
             max(means.loc[means["layer"] == layer].to_dict("records"), key=lambda row: row["effect"])
             for layer in (group["layer"].min(), group["layer"].max())
         )
-        prompt = " and ".join(sorted({*group["prompt"]}))
-        yield (
-            f"In {model}, under {prompt}, the difference of the output is carried by {first['group']} tokens at the "
-            f"embeddings ({first['effect']:.2f} of it) and by {last['group']} at the last layer ({last['effect']:.2f})."
+        first, last = (
+            f"{_POSITIONS.get(row['group'], row['group'])} at layer {row['layer']} gives {row['effect']:.2f} of the "
+            f"output’s difference between the sides (mean of the {row['panels']} of {panels} panels patched there)"
+            for row in best
         )
+        yield f"In {model} under {' and '.join(sorted({*group['prompt']}))}, patching {first}, and {last}."

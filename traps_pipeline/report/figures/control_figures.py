@@ -154,12 +154,13 @@ def patching(results: Results) -> Figure:
 
     Patches go from the void into the control and back; 1 is the whole difference of the outcome. Framed cells were
     patched; the others are first-order estimates, from one backward pass per pair. The residual stream is the whole
-    output of a block; attention and MLP, where they were patched, are one block's additions to it. stamps are the time
-    stamps, changed and unchanged the visual tokens whose pixels differ or agree between the sides; last is the last
-    token.
+    output of a block, without all of its positions, which give 1 by construction; attention and MLP, where they were
+    patched, are one block's additions to it. stamps are the time stamps, changed and unchanged the visual tokens whose
+    pixels differ or agree between the sides; last is the last token.
     """
     rows = results.patching
     rows = rows.loc[(rows["source"] == "pair") & rows["attributed"].notna()]
+    rows = rows.loc[(rows["site"] != "residual") | (rows["group"] != "all")]  # 1 by construction, and never patched
     if not len(rows):
         absent = "the experiment asks for no `patching`" if results.is_study else "the paper patches nothing"
         raise NotRun(absent)

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CONTROL, VOID = COLOURS[0], COLOURS[1]
+SCORES = {"states": "states", "margin": "first token", "sentences": "whole abstentions"}  # names of `orders`
 _LINES = dict(zip(PROMPTING, ("-", "--"), strict=True))
 
 
@@ -29,8 +30,8 @@ def states_and_output(results: Results) -> Figure:
     Both are read under the standard VQA prompt. Up: the score of a probe that has not seen the item's scenario, above
     its threshold for voids. Right: log-odds that the answer begins with an abstention. A filled marker was answered
     under standard, a hollow one abstained on. Orange filled markers above the line and left of it are encoded and not
-    expressed. Above each panel: how well each score separates voids from controls (AUROC), sentences being whole
-    abstentions against the model's own answer, and the floor of noise under the same split (mean and two deviations).
+    expressed. Above each panel: how well each score separates voids from controls (AUROC), whole abstentions
+    against the model's own answer, and the floor of noise under the same split (mean and two deviations).
     There is a gap in AUROC, too, only if states exceed the output by more than that.
     """
     rows = scored_items(results)
@@ -44,7 +45,7 @@ def states_and_output(results: Results) -> Figure:
             for ax, dataset in zip(line, datasets, strict=True):
                 part = rows.loc[(rows["model"] == model) & (rows["dataset"] == dataset)]
                 _scatter(ax, part)
-                figures = "\n".join(f"{name} {area:.2f}" for name, area in orders(part).items())
+                figures = "\n".join(f"{SCORES[name]} {area:.2f}" for name, area in orders(part).items())
                 title = f"{plain(str(model))[:20]}: {SHORT[dataset]}, n {len(part)}\n{figures}"
                 ax.set_title(title + _floor(results, str(model), dataset), size=6)
             line[0].set_ylabel("states: log-odds of void")
