@@ -11,9 +11,9 @@ from tests.mechanism.study import filled
 from tools.pocket import inside
 from tools.pocket.claims import markdown
 from tools.pocket.commands import CARD, EVALUATION, FACTS, WEIGHTS, card_tables, marks, other_tables
-from tools.pocket.evaluate import read_cells
+from tools.pocket.evaluate import AnswerCounts
 from tools.pocket.recipe import GAP, SHIPPED, load_recipe
-from tools.pocket.seeds import Figure
+from tools.pocket.seeds import Figure, read_seeds, write_seeds
 from tools.pocket.words import PROMPTS
 from traps_pipeline.mechanism.control_rows import PATCHING
 from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES
@@ -38,7 +38,7 @@ def test_the_card_shows_the_shipped_figures() -> None:
 
 @pytest.mark.parametrize("folder", SHIPPED.values(), ids=[*SHIPPED])
 def test_every_family_is_counted_under_every_regime(folder: Path) -> None:
-    cells, recipe = read_cells(folder / EVALUATION), load_recipe(folder / "recipe.yaml")
+    cells, recipe = read_seeds(folder / EVALUATION, AnswerCounts), load_recipe(folder / "recipe.yaml")
     assert {(cell.family, cell.regime) for cell in cells} == {
         (family, regime) for family in recipe.scenes for regime in ("standard", "guided", "json")
     }
@@ -82,9 +82,9 @@ def test_the_card_over_seeds_is_made_from_their_finished_workspaces(tmp_path: Pa
     table = tmp_path / "mechanism.csv"
     for seed, differ in ((2, 3), (1, 4)):
         made = examined_study(tmp_path, seed, differ)
-        inside.write_figures(table, inside.figures_of(made))
-        inside.write_figures(table, inside.figures_of(made))  # the same seed again takes its own place
-    found = inside.read_figures(table)
+        write_seeds(table, inside.figures_of(made))
+        write_seeds(table, inside.figures_of(made))  # the same seed again takes its own place
+    found = read_seeds(table, Figure)
     assert found == [Figure(1, "1" * 12, "differ", 1.0), Figure(2, "2" * 12, "differ", 0.75)]
     head, _, row = markdown(found, found[:1]).splitlines()
     assert "| gap, seed 1, 2 | no gap, seed 1 |" in head

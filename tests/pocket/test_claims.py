@@ -9,16 +9,15 @@ import pytest
 from tests.build.controls import Made
 from tools.pocket.claims import CLAIMS, markdown
 from tools.pocket.commands import MECHANISM
-from tools.pocket.inside import read_figures
 from tools.pocket.recipe import SHIPPED
-from tools.pocket.seeds import Figure
+from tools.pocket.seeds import Figure, read_seeds
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize("folder", SHIPPED.values(), ids=[*SHIPPED])
 def test_every_claim_is_measured_in_both_models(folder: Path) -> None:
-    figures = read_figures(folder / MECHANISM)
+    figures = read_seeds(folder / MECHANISM, Figure)
     assert {figure.claim for figure in figures} == {claim.name for claim in CLAIMS}
 
 

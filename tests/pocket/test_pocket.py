@@ -14,8 +14,9 @@ import pytest
 from tools.pocket.__main__ import build_parser
 from tools.pocket.commands import CARD, FACTS, WEIGHTS
 from tools.pocket.data import STREAM, SceneRecord, ShardJob, draw_shard, released_digests, shard_jobs
-from tools.pocket.evaluate import markdown, read_cells
+from tools.pocket.evaluate import AnswerCounts, markdown
 from tools.pocket.recipe import GAP, SHIPPED, Recipe, load_recipe
+from tools.pocket.seeds import read_seeds
 from tools.pocket.words import PROMPTS, say
 from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
@@ -209,7 +210,8 @@ def test_the_commands_draw_train_and_count_and_what_is_there_is_not_made_again(
     facts = json.loads((tmp_path / "out" / FACTS).read_text())
     assert facts["weights"] == file_digest(tmp_path / "out" / WEIGHTS / "model.safetensors") and facts["seed"] == 3
     # A control, its void, its ill-posed question and one that the void answers too, under three prompts.
-    assert sum(cell.n for cell in read_cells(counts)) == 12 and markdown(read_cells(counts)) in capsys.readouterr().out
+    cells = read_seeds(counts, AnswerCounts)
+    assert sum(cell.n for cell in cells) == 12 and markdown(cells) in capsys.readouterr().out
 
 
 def test_the_card_command_needs_the_figures_of_every_model(

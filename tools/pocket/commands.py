@@ -13,6 +13,7 @@ from tools.pocket import evaluate as evaluation
 from tools.pocket.data import data_digest, render
 from tools.pocket.inside import FACTS
 from tools.pocket.recipe import GAP, NO_GAP, POCKET, SHIPPED, Recipe, Split
+from tools.pocket.seeds import Figure, read_seeds, write_seeds
 from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
@@ -87,7 +88,7 @@ def evaluate(
     _render(recipe, "held-out", data, workers, report)
     asked = list(evaluation.held_out(recipe, data, scenes))
     cells = evaluation.evaluate(evaluation.entry_of(out / WEIGHTS), asked, seed, report=report)
-    evaluation.write_cells(counts, cells)
+    write_seeds(counts, cells)
     return evaluation.markdown(cells)
 
 
@@ -96,8 +97,7 @@ def write_card(workspaces: Sequence[Path]) -> list[str]:
     returns these and the other tables in Markdown. Raises TrapsError if the card lacks the comments around a table."""
     require_own(CARD, "write the card in a checkout of the repository")
     for workspace in map(Workspace.open, workspaces):
-        figures = inside.figures_of(workspace)
-        inside.write_figures(SHIPPED[inside.looked_into(workspace)] / MECHANISM, figures)
+        write_seeds(SHIPPED[inside.looked_into(workspace)] / MECHANISM, inside.figures_of(workspace))
     tables, text = card_tables(), CARD.read_text(encoding="utf-8")
     for name, table in tables.items():
         begin, end = marks(name)
@@ -112,14 +112,18 @@ def write_card(workspaces: Sequence[Path]) -> list[str]:
 
 def card_tables() -> dict[str, str]:
     """Return the tables of the card in Markdown, by the names that their comments have."""
-    gap, no_gap = (inside.read_figures(SHIPPED[name] / MECHANISM) for name in (GAP, NO_GAP))
-    cells = [cell for cell in evaluation.read_cells(SHIPPED[GAP] / EVALUATION) if cell.regime != "json"]
+    gap, no_gap = (read_seeds(SHIPPED[name] / MECHANISM, Figure) for name in (GAP, NO_GAP))
+    cells = [cell for cell in _counts(GAP) if cell.regime != "json"]
     return {"contrast": claims.markdown(gap, no_gap), f"evaluation of {GAP}": evaluation.markdown(cells)}
 
 
 def other_tables() -> list[str]:
     """Return the tables for which the card is too short: what each model answers under every prompt."""
-    return [evaluation.markdown(evaluation.read_cells(folder / EVALUATION)) for folder in SHIPPED.values()]
+    return [evaluation.markdown(_counts(name)) for name in SHIPPED]
+
+
+def _counts(model: str) -> list[evaluation.AnswerCounts]:
+    return read_seeds(SHIPPED[model] / EVALUATION, evaluation.AnswerCounts)
 
 
 def marks(table: str) -> tuple[str, str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -13,8 +12,7 @@ import numpy as np
 
 from tools.pocket.data import SceneRecord, read_shards
 from tools.pocket.recipe import GAP, Recipe
-from tools.pocket.seeds import write_seeds
-from traps_pipeline.base.errors import TrapsError
+from tools.pocket.seeds import SeedRow
 from traps_pipeline.judging.rules import ABSTENTION, read_statement
 from traps_pipeline.models.judged_answers import is_correct
 from traps_pipeline.models.prompts import system_prompt
@@ -44,12 +42,12 @@ class Asked:
 
 
 @dataclass(frozen=True)
-class AnswerCounts:
+class AnswerCounts(SeedRow):
     """Counts of one training seed, family, regime and kind of question. prior: the number of controls whose truth is
     the commonest answer of the family's held-out scenes, which the reference model `prior` would give; 0 for other
     kinds."""
 
-    seed: int
+    COMMAND = "evaluate"
     family: str
     regime: str
     kind: str
@@ -150,28 +148,6 @@ COLUMNS = (
     *("family", "regime", "Acc", "lowest 95 % bound", "prior", "FalseAbs"),
     *("AbsRec visual", "AbsRec ill-posed", "Acc answerable"),
 )
-FIELDS = tuple(AnswerCounts.__dataclass_fields__)
-
-
-def write_cells(path: Path, cells: Sequence[AnswerCounts]) -> None:
-    """Write counts as CSV; they replace those of the same seeds."""
-    write_seeds(path, cells, read_cells)
-
-
-def read_cells(path: Path) -> list[AnswerCounts]:
-    """Return the counts of a CSV of `write_cells`. Raises TrapsError."""
-    try:
-        with path.open(encoding="utf-8", newline="") as stream:
-            return [
-                AnswerCounts(
-                    int(row["seed"]), row["family"], row["regime"], row["kind"], *(int(row[k]) for k in FIELDS[4:])
-                )
-                for row in csv.DictReader(stream)
-            ]
-    except (OSError, KeyError, ValueError) as error:
-        raise TrapsError(
-            f"{path}: is not a table of `python -m tools.pocket evaluate` ({error}); run it again"
-        ) from error
 
 
 def markdown(cells: Sequence[AnswerCounts]) -> str:

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import csv
 import json
-from collections.abc import Sequence
-from pathlib import Path
 
 from tools.pocket.claims import claimed
 from tools.pocket.recipe import SHIPPED
-from tools.pocket.seeds import Figure, write_seeds
+from tools.pocket.seeds import Figure
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES
 from traps_pipeline.models.local.checkpoint import as_folder, folder_digest
@@ -58,24 +55,4 @@ def _seed_of(workspace: Workspace, model: str) -> tuple[int, str]:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise TrapsError(
             f"{facts}: does not name the seed of these weights ({error}); `python -m tools.pocket train` writes it"
-        ) from error
-
-
-def write_figures(path: Path, figures: Sequence[Figure]) -> None:
-    """Write figures as CSV; they replace those of the same seeds."""
-    write_seeds(path, figures, read_figures)
-
-
-def read_figures(path: Path) -> list[Figure]:
-    """Return the figures of a CSV of `write_figures`. Raises TrapsError."""
-    try:
-        with path.open(encoding="utf-8", newline="") as stream:
-            return [
-                Figure(int(row["seed"]), row["weights"], row["claim"], float(row["value"]))
-                for row in csv.DictReader(stream)
-            ]
-    except (OSError, KeyError, ValueError, TypeError) as error:
-        raise TrapsError(
-            f"{path}: is not a table of `python -m tools.pocket card --mechanism` ({error}); write it again from the "
-            "workspaces"
         ) from error

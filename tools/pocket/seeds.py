@@ -3,32 +3,54 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import ClassVar, TypeVar
 
+from pydantic import TypeAdapter
+
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import replacing
+
+Row = TypeVar("Row", bound="SeedRow")
 
 
 @dataclass(frozen=True)
-class Figure:
+class SeedRow:
+    """A row of one training seed, and the command of `python -m tools.pocket` that writes its table."""
+
+    COMMAND: ClassVar[str]
+    seed: int
+
+
+@dataclass(frozen=True)
+class Figure(SeedRow):
     """What a claim of `claims.CLAIMS` comes to in the model of one training seed."""
 
-    seed: int
+    COMMAND = "card --mechanism"
     weights: str
     claim: str
     value: float
 
 
-def write_seeds(path: Path, rows: Sequence[Any], read: Callable[[Path], Sequence[Any]]) -> None:
-    """Write rows (dataclasses with a field `seed`) as CSV; they replace the rows of the same seeds.
-
-    read: reads such a file, and raises TrapsError if it cannot.
-    """
+def write_seeds(path: Path, rows: Sequence[SeedRow]) -> None:
+    """Write rows as CSV; they replace the rows of the same seeds."""
     seeds = {row.seed for row in rows}
-    kept = [row for row in (read(path) if path.is_file() else []) if row.seed not in seeds]
+    kept = [row for row in (read_seeds(path, type(rows[0])) if path.is_file() else []) if row.seed not in seeds]
     with replacing(path) as part, part.open("w", encoding="utf-8", newline="") as stream:
         table = csv.DictWriter(stream, [field.name for field in fields(rows[0])], lineterminator="\n")
         table.writeheader()
         table.writerows(asdict(row) for row in sorted([*kept, *rows], key=lambda row: row.seed))
+
+
+def read_seeds(path: Path, kind: type[Row]) -> list[Row]:
+    """Return the rows of a CSV of `write_seeds`. Raises TrapsError."""
+    rows = TypeAdapter(kind)
+    try:
+        with path.open(encoding="utf-8", newline="") as stream:
+            return [rows.validate_python(row) for row in csv.DictReader(stream)]
+    except (OSError, ValueError) as error:
+        raise TrapsError(
+            f"{path}: is not a table of `python -m tools.pocket {kind.COMMAND}` ({error}); write it again"
+        ) from error
