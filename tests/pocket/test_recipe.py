@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -41,7 +40,7 @@ Planted = tuple[Recipe, Path, dict[str, list[SceneRecord]]]
 
 @pytest.fixture(scope="module")
 def planted(tmp_path_factory: pytest.TempPathFactory) -> Planted:
-    made = recipe(jitter=Jitter(control=0.5, void=0.5), decoys=0.5, abstain_share=None, abstain_shares=SHARES)
+    made = recipe(jitter=Jitter(control=0.5, void=0.5), decoys=0.5, abstain_shares=SHARES)
     folder = tmp_path_factory.mktemp("planted")
     return made, folder, drawn(made, folder)
 
@@ -155,30 +154,12 @@ def test_recipes_that_differ_in_shares_alone_have_the_same_scenes(planted: Plant
     render(other, "train", folder)  # nothing is missing, and the folder is not refused
     assert drawn(other, folder / "again") == records
     with pytest.raises(TrapsError, match="another recipe"):
-        render(made.model_copy(update={"abstain_shares": None, "abstain_share": 0.5}), "train", folder)
-
-
-def test_settings_that_are_not_used_leave_the_data_as_they_were(tmp_path: Path) -> None:
-    shares = {"abstain_share": 0.5, "abstain_shares": None}
-    plain = recipe(scenes={"plinko": 1}, jitter=None, decoys=0.0, **shares)
-    (job,) = shard_jobs(plain, "train", tmp_path)
-    draw_shard(job)
-    line = json.loads(job.lines.read_text())
-    assert not {"control_from", "control_until", "void_length", "decoy"} & set(line) and set(line["visual"]) == {
-        "question",
-        "answer",
-    }
-    assert np.load(job.pixels).shape[1] == 2
+        render(made.model_copy(update={"decoys": 0.4}), "train", folder)
 
 
 def test_every_prompt_needs_one_share() -> None:
-    values = recipe(abstain_share=None, abstain_shares=SHARES).model_dump() | {"hedge": None}
+    values = recipe(abstain_shares=SHARES).model_dump() | {"hedge": None}
     assert Recipe.model_validate(values).hedge is None
     for wrong in ({"abstain_shares": {"standard": 0.1}}, {"hedge": HEDGE.model_dump()}):
         with pytest.raises(ValidationError, match=r"each of standard, .* must be in one of them"):
             Recipe.model_validate(values | wrong)
-    for both in ((0.5, SHARES), (None, None)):
-        with pytest.raises(ValidationError, match=r"give abstain_share .* or abstain_shares"):
-            Recipe.model_validate(values | dict(zip(("abstain_share", "abstain_shares"), both, strict=True)))
-    with pytest.raises(ValidationError, match="hedge needs abstain_shares"):
-        Recipe.model_validate(values | {"abstain_share": 0.5, "abstain_shares": None, "hedge": HEDGE.model_dump()})

@@ -99,11 +99,8 @@ class SceneRecord:
 
     @property
     def line(self) -> str:
-        """The record as a line of JSON. Fields of settings that the recipe does not use are left out, so that the data
-        of a recipe do not depend on settings that came later."""
+        """The record as a line of JSON, without what the scene does not have."""
         values = asdict(self)
-        for name in ("asked", "visual", "ill_posed", "answerable"):
-            values[name] = {key: value for key, value in values[name].items() if key != "draw" or value is not None}
         unused = {"control_from": 0, "control_until": None, "void_length": None, "decoy": False}
         kept = {name: value for name, value in values.items() if name not in unused or value != unused[name]}
         return canonical_json(kept) + "\n"
@@ -168,19 +165,16 @@ def released_digests() -> frozenset[str]:
 # --- labels -----------------------------------------------------------------------------------------------------------
 
 
-def _record(shot: Shot, recipe: Recipe, decoy: bool, rng: np.random.Generator) -> SceneRecord:
-    """Return the scene's questions with their labels: a void's label is an abstention with probability `abstain_share`,
-    else a guess, a control's is the truth; with shares by prompt, the number that decides this is kept."""
+def _record(shot: Shot, decoy: bool, rng: np.random.Generator) -> SceneRecord:
+    """Return the scene's questions with their answers, the truth or of a void a guess, and the number that decides
+    under which prompts the label is an abstention instead."""
 
     def void(question: str, labels: Sequence[str]) -> Question:
-        draw, guessed = rng.random(), guess(question, labels, rng)
-        if recipe.abstain_shares is not None:
-            return Question(question, guessed, draw)
-        assert recipe.abstain_share is not None, "a recipe has one of the two"
-        return Question(question, None if draw < recipe.abstain_share else guessed)
+        draw = rng.random()
+        return Question(question, guess(question, labels, rng), draw)
 
     def known(question: str, answer: str) -> Question:
-        return Question(question, answer, None if recipe.abstain_shares is None else rng.random())
+        return Question(question, answer, rng.random())
 
     wording, both = shot.wording, shot.wording.answerable_question
     family, params, closing = shot.control.family, shot.control.params, shot.control.closing
@@ -222,14 +216,14 @@ def draw_shard(job: ShardJob) -> int:
         try:
             shot = draw_shot(family, rng, job.recipe.jitter)
             sides = [*render_shot(shot, job.recipe.media)]
-            decoy = render_decoy(shot, job.recipe.media) if job.recipe.decoys and job.split == "train" else None
+            decoy = render_decoy(shot, job.recipe.media) if job.split == "train" else None
         except Rejected:
             continue
-        record = _record(shot, job.recipe, decoy is not None, rng)
+        record = _record(shot, decoy is not None, rng)
         if record.params_digest in job.banned:
             continue
         if job.split == "train":
-            if job.recipe.decoys and shot.control.occluder is not None:
+            if shot.control.occluder is not None:
                 sides.append(decoy or sides[0])  # an array has one shape; without a decoy its place is never looked at
             frames.append(np.stack([resize(np.stack(side), job.recipe.media.size) for side in sides]))
         else:
@@ -288,9 +282,7 @@ def _check_recipe(recipe: Recipe, folder: Path) -> None:
     """Raise TrapsError when the folder holds scenes of another recipe."""
     # The numbers of scenes may change: a shard's first scenes do not depend on how many there are. So may the shares by
     # prompt: a scene keeps the numbers that are compared with them.
-    by_prompt = recipe.abstain_shares is not None
-    content = recipe.content("data_seed", "media", "abstain_share", "jitter", "decoys")
-    expected = digest(content | {"by_prompt": by_prompt})
+    expected = digest(recipe.content("data_seed", "media", "jitter", "decoys"))
     note = folder / "recipe.sha256"
     if not note.is_file():
         write_text(note, expected + "\n")

@@ -23,7 +23,7 @@ Split = Literal["train", "held-out"]
 class Training(BaseModel):
     """How the weights are fitted. void_share: share of void clips in a batch; brightness: augmentation; naming: weight
     of the naming loss; naming_steps: number of first steps with the naming loss alone; pairs: from a step on, how many
-    pairs of frames of each clip are shown (`batches.Scenes.pairs`); all where there is none."""
+    pairs of frames of each clip are shown (`batches.Scenes.pairs`); all before the first."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     steps: int = Field(ge=1)
@@ -35,7 +35,7 @@ class Training(BaseModel):
     brightness: float = Field(ge=0, lt=1)
     naming: float = Field(ge=0)
     naming_steps: int = Field(ge=0)
-    pairs: dict[int, int] = Field(default_factory=dict)
+    pairs: dict[int, int]
 
     def pairs_at(self, step: int) -> int | None:
         """Return how many pairs of frames are shown at a step; None for all."""
@@ -63,13 +63,12 @@ class Hedge(BaseModel):
 
 
 class Recipe(BaseModel):
-    """Number of training scenes by family, held-out scenes per family, how a clip is shown, and the share of voids that
-    are labelled with an abstention: `abstain_share`, or by prompt `abstain_shares`.
+    """Number of training scenes by family, held-out scenes per family, how a clip is shown, and its labels.
 
-    jitter: without it, the length of a chaotic clip tells its side. decoys: share of looks at an occlusion control in
-    which an occluder stands where it hides nothing; without it, the occluder tells the side. abstain_shares: by prompt
-    (one of `words.PROMPTS`); a void that is labelled with an abstention under one prompt is so under every prompt with
-    a larger share. hedge: of the other prompts.
+    decoys: share of looks at an occlusion control in which an occluder stands where it hides nothing; without it, the
+    occluder would tell the side. abstain_shares: by prompt (one of `words.PROMPTS`), the share of voids labelled with
+    an abstention; a void that is so under one prompt is so under every prompt with a larger share. hedge: of the other
+    prompts.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -77,21 +76,15 @@ class Recipe(BaseModel):
     held_out: int = Field(ge=1)
     data_seed: int = Field(ge=0)
     media: MediaSpec
-    abstain_share: float | None = Field(default=None, ge=0, le=1)
-    abstain_shares: dict[str, Annotated[float, Field(ge=0, le=1)]] | None = None
+    abstain_shares: dict[str, Annotated[float, Field(ge=0, le=1)]]
     hedge: Hedge | None = None
-    jitter: Jitter | None = None
-    decoys: float = Field(default=0, ge=0, le=1)
+    jitter: Jitter
+    decoys: float = Field(gt=0, le=1)
     training: Training
 
     def content(self, *only: str) -> dict[str, Any]:
-        """Return the settings (only: these) for a digest. One that came later counts only where it is used, so that
-        what was made before it keeps its digest."""
-        later = {"abstain_share", "abstain_shares", "hedge", "jitter", "decoys"}
-        unused = later - self.model_fields_set
-        dumped = self.model_dump(mode="json", include={*only} or None, exclude=unused)
-        if "training" in dumped and not self.training.pairs:
-            del dumped["training"]["pairs"]
+        """Return the settings (only: these) of the file for a digest."""
+        dumped = self.model_dump(mode="json", include={*only} or None, exclude_unset=True)
         return dumped | ({"media": self.media.content()} if "media" in dumped else {})
 
     @field_validator("scenes")
@@ -104,12 +97,6 @@ class Recipe(BaseModel):
 
     @model_validator(mode="after")
     def _every_prompt_has_one_share(self) -> Recipe:
-        if (self.abstain_share is None) == (self.abstain_shares is None):
-            raise ValueError("give abstain_share (one for all prompts) or abstain_shares (by prompt), and not both")
-        if self.abstain_shares is None:
-            if self.hedge is not None:
-                raise ValueError("hedge needs abstain_shares: give the other prompts a share, too")
-            return self
         named = [*self.abstain_shares, *(self.hedge.prompts if self.hedge else ())]
         if sorted(named) != sorted(PROMPTS):
             raise ValueError(
@@ -121,7 +108,7 @@ class Recipe(BaseModel):
         """Return the share of abstentions among the labels of a side's questions under a prompt; ball: its colour."""
         if self.hedge is not None and prompt_name in self.hedge.prompts:
             return self.hedge.balls.get(ball, self.hedge.share)
-        return (self.abstain_shares or {}).get(prompt_name, 0.0) if void else 0.0
+        return self.abstain_shares.get(prompt_name, 0.0) if void else 0.0
 
     def count(self, family: str, split: Split) -> int:
         """Return scenes of a family in a split."""

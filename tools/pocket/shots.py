@@ -47,7 +47,7 @@ class Shot:
         return first + pick(np.arange(length) / self.control.physics.fps, spec)
 
 
-def draw_shot(family: Family, rng: np.random.Generator, jitter: Jitter | None = None) -> Shot:
+def draw_shot(family: Family, rng: np.random.Generator, jitter: Jitter) -> Shot:
     """Return a random scene. Raises Rejected, as `scenes.draw.resolve` does, when it gives no valid pair."""
     params = family.draw(rng)
     wording = family.word(params, rng)
@@ -70,7 +70,7 @@ def draw_shot(family: Family, rng: np.random.Generator, jitter: Jitter | None = 
     if control.outcome.label != outcome.label:
         raise Rejected("the clip ends before its outcome")
     span, held = (0, len(control.qpos)), None
-    if cut is not None and jitter is not None:
+    if cut is not None:
         span, held = _jittered(jitter, control, rng)
     frames = {"first": span[0], "last": min(span[1], control.open_frames) - 1}
     frames |= {} if cut is None else {"cut": cut - 1}

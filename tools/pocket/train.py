@@ -114,45 +114,35 @@ def learning_rate(step: int, training: Training) -> float:
 
 
 class _State:
-    """Weights and the optimizer's moments in one safetensors file, equal bit for bit to those in memory, with the
-    number of steps. It holds digests of recipe and data, so that no other training continues from it."""
+    """A file of model, optimizer and number of steps, with digests of recipe and data, so that no other training
+    continues from it."""
 
     def __init__(self, path: Path, model: Any, optimizer: Any, identity: str) -> None:
-        self._path, self._optimizer, self._identity = path, optimizer, identity
-        self._parameters = dict(model.named_parameters())
+        self._path, self._identity = path, identity
+        self._parts = {"model": model, "optimizer": optimizer}
 
     def save(self, step: int) -> None:
         """Replace the file."""
-        from safetensors.torch import save_file
+        import torch
 
-        tensors = {f"weight.{name}": p.detach().contiguous() for name, p in self._parameters.items()}
-        for name, p in self._parameters.items():
-            tensors |= {f"{kind}.{name}": value for kind, value in self._optimizer.state.get(p, {}).items()}
-        with replacing(self._path) as part:
-            save_file(tensors, part, {"step": str(step), "identity": self._identity})
+        parts = {name: part.state_dict() for name, part in self._parts.items()}
+        with replacing(self._path) as file:
+            torch.save({"step": step, "identity": self._identity, **parts}, file)
 
     def load(self) -> int:
         """Load the file into model and optimizer; returns its number of steps, 0 without a file."""
         import torch
-        from safetensors import safe_open
 
         if not self._path.is_file():
             return 0
-        with safe_open(self._path, "pt") as file, torch.no_grad():
-            metadata = file.metadata()
-            if metadata["identity"] != self._identity:
-                raise TrapsError(
-                    f"{self._path}: belongs to another recipe, data or seed; give another folder, or delete it"
-                )
-            for key in list(file.keys()):
-                kind, _, name = key.partition(".")
-                parameter = self._parameters[name]
-                if kind == "weight":
-                    parameter.copy_(file.get_tensor(key))
-                else:
-                    moment = file.get_tensor(key)  # the count of steps stays on the CPU
-                    self._optimizer.state[parameter][kind] = moment.to(parameter.device) if moment.ndim else moment
-        return int(metadata["step"])
+        state = torch.load(self._path, map_location="cpu", weights_only=True)
+        if state["identity"] != self._identity:
+            raise TrapsError(
+                f"{self._path}: belongs to another recipe, data or seed; give another folder, or delete it"
+            )
+        for name, part in self._parts.items():
+            part.load_state_dict(state[name])
+        return state["step"]
 
 
 def train(
@@ -167,7 +157,7 @@ def train(
 ) -> Path:
     """Train the model of a seed on a device and save it to `folder`/weights; returns that folder.
 
-    The state is saved in `folder`/state.safetensors every two minutes and on Ctrl-C, and the same call continues from
+    The state is saved in `folder`/state.pt every two minutes and on Ctrl-C, and the same call continues from
     it. If training was stopped inside a step, with weights half updated, it continues from the state saved before.
     stop_after: number of the last step to do.
     """
@@ -186,7 +176,7 @@ def train(
     optimizer = torch.optim.AdamW(groups, lr=training.learning_rate, betas=(0.9, 0.98))
     identity = digest([recipe.content(), data_digest(recipe, "train", data), seed])
     words = name_tokens(processor.tokenizer).to(device)
-    state = _State(folder / "state.safetensors", model, optimizer, identity)
+    state = _State(folder / "state.pt", model, optimizer, identity)
     step = state.load()
     last = training.steps if stop_after is None else min(stop_after, training.steps)
     made = DataLoader(
