@@ -105,7 +105,7 @@ FINDINGS = {
     "lens": "+3.0 +9.0 +1.0 +1.0",  # standard, guided; one layer before
     "probe_baselines": "0 1 0 1",
     "gate_arrows": "0.45 0.64 0.64",
-    "patching": "0 0.99 1 1 0 0.99 1 1",  # layer, share, panels of panels
+    "patching": "0.99 0 1 1 0.99 0 1 1",  # share, layer, panels of panels
     "doses_among_nulls": "19 20 1 1 1 80 % 5",
 }
 

@@ -150,9 +150,10 @@ def patching(results: Results) -> Iterator[str]:
             max(means.loc[means["layer"] == layer].to_dict("records"), key=lambda row: row["effect"])
             for layer in (group["layer"].min(), group["layer"].max())
         )
-        first, last = (
-            f"{_POSITIONS.get(row['group'], row['group'])} at layer {row['layer']} gives {row['effect']:.2f} of the "
-            f"output’s difference between the sides (mean of the {row['panels']} of {panels} panels patched there)"
+        shares = (
+            f"{row['effect']:.2f} by {_POSITIONS.get(row['group'], row['group'])} at layer {row['layer']} (mean of the "
+            f"{row['panels']} of {panels} panels patched there)"
             for row in best
         )
-        yield f"In {model} under {' and '.join(sorted({*group['prompt']}))}, patching {first}, and {last}."
+        prompt = " and ".join(sorted({*group["prompt"]}))
+        yield f"In {model} under {prompt}, of the output’s difference a patch gives {' and '.join(shares)}."

@@ -239,6 +239,7 @@ def doses_among_nulls(results: Results) -> Figure:
         raise NotRun(why(results, "the paper has no such nulls"))
     cells = list(dict.fromkeys(zip(rows["model"], rows["directions"], rows["regime"], strict=True)))
     datasets, colour = datasets_of(rows.assign(dataset=rows["target"])), _colours(NULLS)
+    kinds = [null for null in NULLS if null in set(rows["kind"])]
     with figure_style():
         figure = new_figure(PAGE_IN, 0.7 + 2.0 * len(cells))
         axes = figure.subplots(len(cells), len(datasets), squeeze=False, sharey=True)
@@ -249,19 +250,21 @@ def doses_among_nulls(results: Results) -> Figure:
                 _dose(ax, part, colour)
                 own = part.loc[part["kind"] == "void"].assign(mark=few(part.loc[part["kind"] == "void"], "n"))
                 n = from_to(int(own["n"].min()), int(own["n"].max())) + max(own["mark"])
-                ranks = _p_values(results.nulls, str(model), str(directions), str(regime), dataset)
+                ranks = _p_values(results.nulls, kinds, str(model), str(directions), str(regime), dataset)
                 ax.set_title("\n".join([f"{SHORT[dataset]}, {directions}→{regime}", f"n {n}", *ranks]), size=6)
             line[0].set_ylabel(f"{plain(str(model))[:14]}\nabstained, %")
         for ax in axes[-1]:
             ax.set_xlabel("dose in class gaps | nulls", size=7)
         axes[0, 0].set_ylim(-6, 106)
         handles = [legend_key("+ on controls", INK, "o", "-", 3.5), legend_key("− on voids", SOFT, "s", "--", 3.5)]
-        handles += [legend_key(f"{null} null", colour[null], "o", size=3) for null in NULLS]
+        handles += [legend_key(f"{null} null", colour[null], "o", size=3) for null in kinds]
         figure.legend(handles=handles, loc="outside lower center", ncols=5)
     return figure
 
 
-def _p_values(nulls: pd.DataFrame, model: str, directions: str, regime: str, dataset: str) -> list[str]:
+def _p_values(
+    nulls: pd.DataFrame, kinds: Sequence[str], model: str, directions: str, regime: str, dataset: str
+) -> list[str]:
     """Return a direction's p among each null at the largest dose, one line per side."""
     of = nulls.loc[(nulls["model"] == model) & (nulls["directions"] == directions) & (nulls["regime"] == regime)]
     of = of.loc[(of["target"] == dataset) & (of["unit"] == "gap")]
@@ -269,7 +272,7 @@ def _p_values(nulls: pd.DataFrame, model: str, directions: str, regime: str, dat
     for side, sign in (("control", "+"), ("void", "−")):
         rows = of.loc[of["side"] == side].sort_values("dose").drop_duplicates("null", keep="last")
         known = {str(row["null"]): f"{row['p']:.2f}".removeprefix("0") for row in rows.to_dict("records")}
-        lines += [f"p {sign} {' '.join(known.get(null, '–') for null in NULLS)}"] if known else []
+        lines += [f"p {sign} {' '.join(known.get(null, '–') for null in kinds)}"] if known else []
     return lines
 
 
