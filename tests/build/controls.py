@@ -99,7 +99,7 @@ def lens() -> pd.DataFrame:
 
 
 def nulls() -> pd.DataFrame:
-    row = {"directions": "standard", "regime": "guided", "target": "chaotic", "layer": 3, "unit": "gap", "dose": 1.0}
+    row = {"directions": "guided", "regime": "guided", "target": "chaotic", "layer": 3, "unit": "gap", "dose": 1.0}
     row |= {"side": "control", "null": "isotropic", "effect": 0.8, "null_mean": 0.1, "null_lowest": 0.0}
     return frame(STEERING_NULLS, row | {"null_highest": 0.3, "draws": 20, "n_at_least": 0, "p": 1 / 21, "n": 5})
 

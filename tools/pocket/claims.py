@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from traps_pipeline.mechanism.effects import on_both_sides
 from traps_pipeline.mechanism.probes import auroc
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import GUIDED, STANDARD
@@ -136,9 +137,19 @@ def _same_direction(results: Results) -> float | None:
     return _mean(rows.loc[same, "cosine"])
 
 
+def _followed(results: Results) -> float | None:
+    """Return by how many more controls abstain along a dataset's own direction if it comes from guided states and not
+    from standard ones, at one dose for both. An answer that says nothing is no abstention."""
+    rows = on_both_sides(results.effects)
+    rows = rows.loc[(rows["source"] == rows["target"]) & (rows["side"] == "control")]
+    rows = rows.loc[rows["alpha"] == rows["alpha"].max()]
+    share = (rows["abstained"] / (rows["n"] + rows["n_missing"])).groupby(rows["directions"].astype(str)).mean()
+    return float(share[GUIDED] - share[STANDARD]) if {STANDARD, GUIDED} <= {*share.index} else None
+
+
 def _ahead(results: Results) -> float | None:
     rows = results.nulls
-    rows = rows.loc[rows["target"].isin(DATASETS)]
+    rows = rows.loc[rows["target"].isin(DATASETS) & (rows["directions"] == GUIDED)]
     cells = rows.groupby(["regime", "target", "layer", "unit", "dose", "side"], observed=True)["p"].max()
     return float((cells <= P).sum()) if len(cells) else None
 
@@ -178,7 +189,9 @@ CLAIMS = (
           "AUROC against `removed`", 0.65, _removed),
     Claim("direction", "`cosines`", "the void has one direction under both prompts", "cosine standard, guided", 0.65,
           _same_direction),
-    Claim("ahead", "`steering_nulls`", "void directions do more than their nulls", "cells ahead of 19 of "
+    Claim("followed", "`steering_effects`", "answers follow what guided states encode, and not what standard ones do",
+          "controls that abstain at the largest alpha, guided directions − standard", 0.3, _followed),
+    Claim("ahead", "`steering_nulls`", "directions of guided states do more than their nulls", "cells ahead of 19 of "
           "20 draws of every null", 1.0, _ahead),
 )  # fmt: skip
 
