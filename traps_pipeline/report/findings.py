@@ -120,7 +120,9 @@ def doses_among_nulls(results: Results) -> Iterator[str]:
     for model, of_model in _models(rows.loc[rows["target"] != "all"]):
         for directions, group in of_model.groupby("directions", sort=False, observed=True):
             cells = [of_cell for _, of_cell in group.groupby(_CELL, sort=False, observed=True)]
-            ahead = [of_cell.to_dict("records")[0] for of_cell in cells if (of_cell["p"] <= ALPHA).all()]
+            ahead = [
+                of_cell.to_dict("records")[0] for of_cell in cells if (of_cell["p"].to_numpy(float) <= ALPHA).all()
+            ]
             best = max(ahead, key=lambda row: row["effect"], default=None)
             yield (
                 f"{model}: void directions of {directions} states do more than 19 of 20 draws of every null in "
