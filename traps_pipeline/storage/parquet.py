@@ -82,6 +82,7 @@ class TableStore:
 
     def __init__(self, root: Path, store: Store | None = None) -> None:
         self.root, self._store = root, store or FolderStore(root)
+        self._paths: dict[tuple[str, ...], Path] = {}  # a run asks for each a hundred times
 
     def path(self, table: Table, partition: Mapping[str, Any]) -> Path:
         """Return a partition's file: `<table>/<value>/.../<value or table>.parquet`.
@@ -90,8 +91,10 @@ class TableStore:
         """
         if tuple(partition) != table.partition_by:
             raise ValueError(f"table {table.name} is partitioned by {table.partition_by}, not {tuple(partition)}")
-        *folders, name = map(str, partition.values() or [table.name])
-        return self.root.joinpath(table.name, *folders, name + _SUFFIX)
+        names = (table.name, *map(str, partition.values() or [table.name]))
+        if (path := self._paths.get(names)) is None:
+            path = self._paths[names] = self.root.joinpath(*names[:-1], names[-1] + _SUFFIX)
+        return path
 
     def write(
         self,
@@ -238,7 +241,7 @@ class TableStore:
         """Return a table's existing partitions, sorted by path, with the path's values."""
         root = self.root / table.name
         paths = self._store.below(root, "/".join("*" * max(1, len(table.partition_by))) + _SUFFIX)
-        values = [path.relative_to(root).as_posix().removesuffix(_SUFFIX).split("/") for path in paths]
+        values = [str(path)[len(str(root)) + 1 :].removesuffix(_SUFFIX).split("/") for path in paths]
         return [dict(zip(table.partition_by, each, strict=False)) for each in values]
 
     def _load(self, table: Table, path: Path, columns: Sequence[str] | None) -> pa.Table:
