@@ -11,13 +11,13 @@ import pandas as pd
 import pytest
 
 from tests.build.latex import latex_cells
+from traps_pipeline.report.latex_tables import latex
 from traps_pipeline.report.writing import (
     Column,
     PrintedTable,
     SourceItems,
     figure_files,
     figure_style,
-    latex,
     new_figure,
     table_files,
     table_html,
