@@ -167,8 +167,6 @@ class TableStore:
         None if it was never written, or written with other columns (it is then rebuilt). Raises TrapsError if it is
         unreadable.
         """
-        import pyarrow as pa
-
         path = self.path(table, partition)
         if not self._store.has(path):
             return None
@@ -180,7 +178,7 @@ class TableStore:
             else:
                 state, names = _footer_of(self._store.here(path))
             return state if names == table.names else None
-        except (pa.ArrowException, OSError, KeyError, ValueError, TypeError) as error:
+        except (OSError, KeyError, ValueError, TypeError) as error:
             raise _unreadable(path, table, error) from error
 
     def damage(self, table: Table, partition: Mapping[str, Any], *, thorough: bool = False) -> str:
@@ -188,8 +186,6 @@ class TableStore:
 
         The bytes of a file are compared with the digest in it. thorough: do not trust what a store has noted of it.
         """
-        import pyarrow as pa
-
         path = self.path(table, partition)
         if not thorough and self._store.note(path) is not None:
             return ""  # the database's row vouches for it, and every reader compares it with the row's digest
@@ -199,7 +195,7 @@ class TableStore:
             return ""
         except (TrapsError, OSError) as error:
             return str(error)
-        except (pa.ArrowException, KeyError, ValueError, TypeError):
+        except (KeyError, ValueError, TypeError):
             return ""  # the bytes are those that were written; `state` says what is wrong with the footer
         return ""
 
@@ -342,13 +338,15 @@ def _footer_of(path: Path) -> tuple[State, list[str]]:
 
     A run reads each of hundreds of footers dozens of times. Raises as `_verified`, or KeyError without a footer.
     """
-    import pyarrow.parquet as pq
-
     stamp = _stamp(path.stat())
     if (cached := _FOOTERS.get(path)) is None or cached[0] != stamp:
         content = _verified(path)
-        older = _COLUMNS not in content  # written before the names stood there
-        names = pq.ParquetFile(_sound_bytes(path)).schema_arrow.names if older else _json_behind(content, _COLUMNS)
+        if _COLUMNS in content:
+            names = _json_behind(content, _COLUMNS)
+        else:  # written before the names stood there
+            import pyarrow.parquet as pq
+
+            names = pq.ParquetFile(_sound_bytes(path)).schema_arrow.names
         cached = _FOOTERS[path] = stamp, State(**_json_behind(content, _STATE, len(_STATE))), names
     return cached[1], cached[2]
 
