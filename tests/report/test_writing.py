@@ -11,13 +11,13 @@ import pandas as pd
 import pytest
 
 from tests.build.latex import latex_cells
+from traps_pipeline.report.latex_tables import LONG, latex, latex_table
 from traps_pipeline.report.writing import (
     Column,
     PrintedTable,
     SourceItems,
     figure_files,
     figure_style,
-    latex,
     new_figure,
     table_files,
     table_html,
@@ -135,6 +135,24 @@ def test_files_have_the_same_bytes_on_a_second_build():
     assert [content[:4] for content in files.values()] == [b"%PDF", b"<?xm", b"\x89PNG"]
     assert b"CreationDate" not in files["f.pdf"]
     assert b"<dc:date>" not in files["f.svg"]
+
+
+@pytest.mark.parametrize("count", [2, LONG + 1])
+def test_latex_is_what_the_styler_of_pandas_writes(count: int):
+    """Rows of short and of long tables, by the library whose templates `latex_table` replaces."""
+    rows = [[f"model {k}", f"0.{k}"] for k in range(count)]
+    styler = pd.DataFrame(rows, columns=pd.Index(["Model", "J"])).style.hide(axis="index")
+    long = count > LONG
+    expected = styler.to_latex(
+        hrules=True,
+        caption="A table.",
+        label="tab:a",
+        column_format="lr",
+        environment="longtable" if long else None,
+        position=None if long else "t",
+        position_float=None if long else "centering",
+    )
+    assert latex_table("A table.", "tab:a", ["Model", "J"], rows, "lr") == expected
 
 
 def test_a_long_latex_table_breaks_over_pages_and_a_short_one_floats():

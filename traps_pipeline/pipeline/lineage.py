@@ -54,6 +54,7 @@ class Lineage:
         self._workspace, self.graph, self._thorough = workspace, graph or the_graph(), thorough
         workspace.store.look()
         self.version, self.state, self.damage = cache(self._version), cache(self._state), cache(self._damage)
+        self.status, self._failed_checks = cache(self._status), cache(workspace.failed_checks)
         self._wanted = cache(lambda name: {*self.graph[name].wanted(StudyPartitions(workspace))})
         self._there = cache(self._keys_there)
 
@@ -68,7 +69,7 @@ class Lineage:
         versions = {name_of(node): self.version(*node) for node in nodes}
         return {name: version for name, version in versions.items() if version is not None}
 
-    def status(self, name: str, key: str | None) -> Status:
+    def _status(self, name: str, key: str | None) -> Status:
         """Return whether a partition exists, is intact, and matches inputs and code."""
         stage = self.graph[name]
         if damage := self.damage(name, key):
@@ -143,7 +144,7 @@ class Lineage:
         if current and status.outdated:
             return f"is not current: {status.outdated[0]}"
         blocking = {check.name for check in self.graph[name].checks if check.blocks}
-        failed = [check for check in self._workspace.failed_checks(name, key) if check in blocking]
+        failed = [check for check in self._failed_checks(name).get(key, []) if check in blocking]
         return f"does not pass its check {failed[0]}" if failed else ""
 
     def _keys_there(self, name: str) -> Set[str] | None:

@@ -83,16 +83,17 @@ class StageChecks:
 
         Dagster awaits an evaluation from the run, and would say that the check was skipped, or failed to execute.
         """
-        failed = {*self._workspace.failed_checks(self._stage.name, key)}
+        failed = {*self._workspace.failed_checks(self._stage.name).get(key, [])}
         names = {CURRENT, *(check.name for check in self._stage.checks)} - failed
         yield from evaluations(self._history, self._stage.name, key, {name: {} for name in sorted(names)})
 
     def still_failing(self, lineage: Lineage, seen: Collection[str | None]) -> Iterator[dg.AssetCheckEvaluation]:
         """Re-evaluate failing checks of all keys; Dagster shows only the newest result."""
         name = self._stage.name
+        failed = self._workspace.failed_checks(name)
         for key in self._graph.keys(name):
             if key not in seen:
-                for check in self._workspace.failed_checks(name, key):
+                for check in failed.get(key, []):
                     self._failing[check, key] = {STILL: json.loads(self._workspace.failure(name, check, key))}
                 state = lineage.state(name, key)
                 if state is not None and state.failed:

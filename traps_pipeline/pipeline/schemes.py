@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import cache
 
 from traps_pipeline.pipeline.partitioning import ByDimension, FixedKeys, Pairs, Partitioning
 from traps_pipeline.pipeline.wanted import StudyPartitions
@@ -34,24 +35,26 @@ EVALUATION = Partitioning(
     lambda study: [e.key for e in study.evaluations],
 )
 CELL = Partitioning(
-    {**DATASET.dimensions, **EVALUATION.dimensions}, lambda key: Cell.parse(key).partition, lambda study: study.cells
+    {**DATASET.dimensions, **EVALUATION.dimensions},
+    cache(lambda key: Cell.parse(key).partition),
+    lambda study: study.cells,
 )
 # Inside local models: datasets and occlusion's answerable questions; model__prompt; model__directions__regime.
 PROBED = Partitioning({"dataset": _PARTITIONS.probed}, lambda key: {"dataset": key}, lambda study: study.probed)
 EXTRACTION = Partitioning(
     {"extraction": [e.key for e in _PARTITIONS.extractions]},
-    lambda key: Extraction.parse(key).partition,
+    cache(lambda key: Extraction.parse(key).partition),
     lambda study: [e.key for e in study.extractions],
 )
 STATES = Partitioning(
     {**PROBED.dimensions, **EXTRACTION.dimensions},
-    lambda key: StatesCell.parse(key).partition,
+    cache(lambda key: StatesCell.parse(key).partition),
     lambda study: study.states,
 )
 STEERED = Partitioning({"steering": _PARTITIONS.steered}, lambda key: {}, lambda study: study.steered)
 STEERING = Partitioning(
     {**DATASET.dimensions, **STEERED.dimensions},
-    lambda key: SteeringCell.parse(key).partition,
+    cache(lambda key: SteeringCell.parse(key).partition),
     lambda study: study.steering,
 )
 

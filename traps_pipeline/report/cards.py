@@ -6,7 +6,7 @@ import json
 from base64 import b64encode
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 from urllib.parse import urlencode
 
@@ -80,6 +80,7 @@ class Sources:
         return PublishedResults()
 
 
+@lru_cache(4096)  # cells of one row share it, and so do tables
 def explorer_address(behind: SourceItems) -> str:
     """Return the address of the explorer's view of the answers behind a number."""
     query = {name: value for name, value in vars(behind).items() if value}

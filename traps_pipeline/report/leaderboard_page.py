@@ -138,8 +138,7 @@ def leaderboards(
     The ranking is of `overall`, or the board's first dataset if no model has all four. An entry without a row comes
     last. notes: further notes of the first table. brief: only the first table of each panel, with fewer columns.
     """
-    panels = [_of_one_panel(part, robust, brief, suffix) for suffix, part in _by_panel(board)]
-    tables = [table for of_panel in panels for table in of_panel[: 1 if brief else None]]
+    tables = [table for suffix, part in _by_panel(board) for table in _of_one_panel(part, robust, brief, suffix)]
     return [replace(tables[0], notes=[*tables[0].notes, *notes]), *tables[1:]]
 
 
@@ -156,7 +155,10 @@ def _of_one_panel(board: pd.DataFrame, robust: pd.DataFrame | None, brief: bool,
     datasets = set(board["dataset"])
     ranked = next((name for name in TITLES if name in datasets), "overall")
     other_datasets = [name for name in DATASETS if name in datasets and name != ranked]
-    others = [_leaderboard(board.loc[board["dataset"] == name], name, [], {}, brief, suffix) for name in other_datasets]
+    others = [
+        _leaderboard(board.loc[board["dataset"] == name], name, [], {}, brief, suffix)
+        for name in ([] if brief else other_datasets)
+    ]
     rows = []
     if robust is not None and ranked == "overall":
         rows = records(robust)

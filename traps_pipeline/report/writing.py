@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.sheets import csv_bytes
 from traps_pipeline.base.terminal import TextTable, finalized, plain
+from traps_pipeline.report.latex_tables import latex, latex_of_plain, latex_table
 from traps_pipeline.report.numbers import NONE, as_numbers
 
 if TYPE_CHECKING:
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
 TEMPLATES = Path(__file__).parent / "templates"
 STYLE = ASSETS / "figures.mplstyle"
 NOT_RUN = "not run"
-LONG = 40  # rows of a LaTeX table that fit on a page
 TABLE_KINDS = ("parquet", "csv", "tex", "md")
 FIGURE_KINDS = ("pdf", "svg", "png")
 
@@ -115,11 +115,13 @@ class Column:
 
     def text(self, row: Mapping[str, Any]) -> str:
         """Return the cell as printed; a dash where there is no number."""
-        figure, spread, mark = self.parts(row)
-        return figure + (f" ± {spread}" if spread else "") + (f" {mark}" if mark else "")
+        return _joined(self.parts(row))
 
-    def parts(self, row: Mapping[str, Any]) -> tuple[str, str, str]:
-        """Return a cell's text or number, spread and mark, as printed; empty if none."""
+    def parts(self, row: Mapping[str, Any], plain: Callable[[object], str] = plain) -> tuple[str, str, str]:
+        """Return a cell's text or number, spread and mark, as printed; empty if none.
+
+        plain: makes a text plain.
+        """
         import pandas as pd
 
         value = row.get(self.field)
@@ -135,6 +137,11 @@ class Column:
         if self.unit == "p" and value is not None and value < 10**-digits:
             return f"< {10**-digits:.{digits}f}"
         return percent(value, digits) if self.unit == "percent" else fraction(value, digits)
+
+
+def _joined(parts: tuple[str, str, str]) -> str:
+    figure, spread, mark = parts
+    return figure + (f" ± {spread}" if spread else "") + (f" {mark}" if mark else "")
 
 
 @dataclass(frozen=True)
@@ -158,10 +165,16 @@ class PrintedTable:
     lead: str = ""
     deviation: str = "± population standard deviation over runs"
 
-    @property
+    @cached_property
+    def parts(self) -> list[list[tuple[str, str, str]]]:
+        """Text or number, spread and mark of each cell, as printed (rows, columns)."""
+        of_text = cache(plain)  # a column has few different texts
+        return [[column.parts(row, of_text) for column in self.columns] for row in self.records]
+
+    @cached_property
     def cells(self) -> list[list[str]]:
         """Printed cells (rows, columns)."""
-        return [[column.text(row) for column in self.columns] for row in self.records]
+        return [[*map(_joined, row)] for row in self.parts]
 
     @cached_property
     def records(self) -> list[dict[str, Any]]:
@@ -177,7 +190,7 @@ class PrintedTable:
     @cached_property
     def marked(self) -> set[Column]:
         """The columns with a mark on some number; their other cells leave space for one."""
-        return {column for column in self.columns if any(column.parts(row)[2] for row in self.records)}
+        return {column for k, column in enumerate(self.columns) if any(row[k][2] for row in self.parts)}
 
     @property
     def absence(self) -> str:
@@ -187,7 +200,7 @@ class PrintedTable:
     @property
     def remarks(self) -> list[str]:
         """The notes, with the meaning of ± and of a dash if the table has them."""
-        cells = [c for row in self.records for c in (column.text(row) for column in self.columns if column.is_number)]
+        cells = [cell for row in self.cells for cell, column in zip(row, self.columns, strict=True) if column.is_number]
         dashes = [f"{NONE} {self.dash}"] if any(cell.startswith(NONE) for cell in cells) else []
         spreads = [self.deviation] if any("±" in cell for cell in cells) else []
         return [*(note for note in self.notes if note), *spreads, *dashes]
@@ -257,25 +270,16 @@ def _with_marks(column: Column, records: Sequence[Mapping[str, Any]]) -> list[st
 def table_latex(table: PrintedTable) -> str:
     """Return a floating `table` with booktabs rules (`\\usepackage{booktabs}`).
 
-    More than LONG rows become a `longtable`, which breaks over pages (`\\usepackage{longtable}`); notes are in the
-    caption.
+    More than `latex_tables.LONG` rows become a `longtable`, which breaks over pages (`\\usepackage{longtable}`); notes
+    are in the caption.
     """
-    import pandas as pd
-
     parts = [table.title, *([table.lead] if table.lead else []), *table.remarks]
-    caption = latex(". ".join(part.rstrip(".") for part in parts) + ".")
-    cells = [[latex(table.absence)]] if table.absence else [[_latex(cell) for cell in row] for row in table.cells]
-    headings = [""] if table.absence else [latex(column.heading) for column in table.columns]
-    frame = pd.DataFrame(cells, columns=pd.RangeIndex(len(headings)))
-    styler = frame.style.hide(axis="index").format_index(lambda k: headings[int(k)], axis=1)
-    text = styler.to_latex(  # pyright: ignore[reportAttributeAccessIssue] - the stubs lose the Styler in a chain
-        hrules=True,
-        caption=caption,
-        label=f"tab:{table.name}",
-        **({"environment": "longtable"} if len(cells) > LONG else {"position": "t", "position_float": "centering"}),
-        column_format="l" if table.absence else "".join("r" if c.is_number else "l" for c in table.columns),
-    )
-    return str(text)
+    caption, label = latex(". ".join(part.rstrip(".") for part in parts) + "."), f"tab:{table.name}"
+    if table.absence:
+        return latex_table(caption, label, [""], [[latex(table.absence)]], "l")
+    headings = [latex(column.heading) for column in table.columns]
+    rows = [[*map(latex_of_plain, row)] for row in table.cells]
+    return latex_table(caption, label, headings, rows, "".join("r" if c.is_number else "l" for c in table.columns))
 
 
 def table_html(table: PrintedTable, address: Callable[[SourceItems], str] | None = None) -> str:
@@ -286,7 +290,24 @@ def table_html(table: PrintedTable, address: Callable[[SourceItems], str] | None
         trace = table.trace(row, column.field) if is_figure and table.trace and address else None
         return address(trace) if trace and address else None
 
-    return environment().get_template("table.html.j2").render(table=table, marked=table.marked, link=link)
+    columns = [
+        (column, "th" if column.look == "head" else "td", _classes(column), column in table.marked)
+        for column in table.columns
+    ]
+    rows = [
+        [
+            (each, *parts, link(row, each[0], parts[0]), row.get(each[0].field))
+            for each, parts in zip(columns, cells, strict=True)
+        ]
+        for row, cells in zip(table.records, table.parts, strict=True)
+    ]
+    return environment().get_template("table.html.j2").render(table=table, columns=columns, rows=rows)
+
+
+def _classes(column: Column) -> str:
+    """Return the style classes of a column's cells."""
+    names = ("" if column.is_number else "word", "range" if column.unit == "range" else "", column.look)
+    return " ".join(filter(None, (*names, "first" if column.group else "")))
 
 
 @cache
@@ -307,28 +328,6 @@ def environment(folder: Path = TEMPLATES) -> jinja2.Environment:
 def markdown(text: object) -> str:
     """Return the text escaped as neither HTML nor markup, within its table cell."""
     return re.sub(r"([\\`*_{}\[\]()#+!|~$])", r"\\\1", html.escape(plain(text), quote=False))
-
-
-_LATEX = str.maketrans(
-    {
-        **{c: f"\\{c}" for c in "&%$#_{}"},
-        "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}",
-        "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': "''",
-        "−": "$-$", "±": r"$\pm$", "×": r"$\times$", "∞": r"$\infty$", "≤": r"$\le$", "≥": r"$\ge$", "→": r"$\to$",
-        "–": "--", "†": r"\dag{}", "‡": r"\ddag{}", "’": "'", "…": r"\ldots{}", "κ": r"$\kappa$", "α": r"$\alpha$",
-        "Δ": r"$\Delta$", "≈": r"$\approx$", "∩": r"$\cap$", "↑": r"$\uparrow$", "↓": r"$\downarrow$",
-    }
-)  # fmt: skip
-
-
-def latex(text: object) -> str:
-    """Return the text with all LaTeX special characters escaped."""
-    return _latex(plain(text))
-
-
-def _latex(cell: str) -> str:
-    """Return `latex` of a cell's printed text."""
-    return cell.translate(_LATEX)
 
 
 def _parquet(table: PrintedTable) -> bytes:
@@ -375,7 +374,8 @@ def new_figure(
 def freeze_layout(figure: Figure) -> None:
     """Freeze the layout engine's result, which every save would otherwise repeat."""
     with figure_style():
-        figure.draw_without_rendering()
+        if (engine := figure.get_layout_engine()) is not None:
+            engine.execute(figure)  # drawing without rendering does this and then draws all artists
         figure.set_layout_engine(None)  # "none" would leave a placeholder, for which each save draws everything twice
 
 

@@ -18,7 +18,7 @@ from traps_pipeline.models.registry import load_models
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, STANDARD
 from traps_pipeline.scoring.epochs import require_one_epoch
-from traps_pipeline.scoring.metrics import joined_epochs, mean
+from traps_pipeline.scoring.metrics import joined_epochs, joined_in_groups, mean
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -66,7 +66,7 @@ def scoped_cells(metrics: pd.DataFrame, scope: str) -> pd.DataFrame:
     groups = rows.groupby([*_ENTRY, "scope"], sort=True)
     cells = groups[SHARES].agg(mean)
     cells["n_pairs"], cells["n_missing"] = groups["n_pairs"].max(), groups["n_missing"].sum()
-    cells["n_runs"], cells["epoch"] = groups["run"].nunique(), groups["epoch"].agg(joined_epochs)
+    cells["n_runs"], cells["epoch"] = groups["run"].nunique(), joined_in_groups(groups, "epoch", joined_epochs)
     return cells.reset_index()
 
 

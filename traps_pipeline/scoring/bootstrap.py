@@ -12,7 +12,7 @@ Gaffke (2005). So an interval keeps a width even if all answers agree, and with 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import cast
 from zlib import crc32
@@ -267,15 +267,20 @@ def run_sums(group: pd.DataFrame, resampling: Resampling, named: str) -> dict[tu
     """
     totals: dict[tuple[str, int], np.ndarray] = {}
     having: dict[tuple[str, int], np.ndarray] = {}
-    for taxonomy, items in group.groupby("taxonomy", sort=True):
-        scenarios, weights = resampling.scenarios[str(taxonomy)]
-        cells = items.groupby(["dataset", "run"], sort=True)
-        counts = np.zeros((len(scenarios), cells.ngroups, len(COUNTS)))
-        places = scenarios.get_indexer(pd.Index(items["scenario_id"])), cells.ngroup().to_numpy()
-        np.add.at(counts, places, items[COUNTS].to_numpy())
+    values = group[COUNTS].to_numpy()
+    items_of: dict[str, list[tuple[int, tuple[str, int], str]]] = {}  # plain lists: groups are small, and many
+    columns = (group[name].tolist() for name in ("taxonomy", "dataset", "run", "scenario_id"))
+    for row, (taxonomy, dataset, run, scenario) in enumerate(zip(*columns, strict=True)):
+        items_of.setdefault(taxonomy, []).append((row, (dataset, run), scenario))
+    for taxonomy, items in sorted(items_of.items()):
+        scenarios, weights = resampling.scenarios[taxonomy]
+        cells = sorted({cell for _, cell, _ in items})
+        place, column = ({name: k for k, name in enumerate(names)} for names in (scenarios, cells))
+        counts = np.zeros((len(scenarios), len(cells), len(COUNTS)))
+        places = [place[scenario] for *_, scenario in items], [column[cell] for _, cell, _ in items]
+        np.add.at(counts, places, values[[row for row, *_ in items]])
         having_any = (counts[..., 1::2] > 0).sum(axis=0)
-        for cell, sums, n in zip(cells.size().index, resampled_sums(weights, counts), having_any, strict=True):
-            key = cast(tuple[str, int], cell)
+        for key, sums, n in zip(cells, resampled_sums(weights, counts), having_any, strict=True):
             totals[key] = totals.get(key, 0) + sums
             having[key] = having.get(key, 0) + n
     unseen = {
@@ -293,7 +298,7 @@ def means_over_runs(
     """
     runs = sorted({run for _, run in sums})
     means = {
-        dataset: np.mean([figures(sums[dataset, run], False) for run in runs if (dataset, run) in sums], axis=0)
+        dataset: _mean([figures(sums[dataset, run], False) for run in runs if (dataset, run) in sums])
         for dataset in DATASETS
         if any((dataset, run) in sums for run in runs)
     }
@@ -301,5 +306,10 @@ def means_over_runs(
     nothing = np.full((2, len(RESAMPLED), draws), np.nan)
     return {
         **means,
-        "overall": np.mean([figures(own, True) for own in complete_runs], axis=0) if complete_runs else nothing,
+        "overall": _mean([figures(own, True) for own in complete_runs]) if complete_runs else nothing,
     }
+
+
+def _mean(values: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the elementwise mean; that of one array is the array, of which a megabyte need not be copied twice."""
+    return values[0] if len(values) == 1 else np.mean(values, axis=0)

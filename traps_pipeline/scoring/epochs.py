@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from typing import TYPE_CHECKING, NamedTuple
 
 from traps_pipeline.base.errors import TrapsError
@@ -55,15 +56,20 @@ def answered_items(verdicts: pd.DataFrame) -> dict[tuple[str, str, str], Answere
     is_complete = verdicts.groupby(["model", "regime", "run"])["dataset"].transform("nunique") == len(DATASETS)
     columns = ["model", "regime", "dataset", "item_id", "epoch", "panel"]
     origins: dict[tuple[str, str, str], dict[str, Origin]] = {}
+    joined = cache(_joined)  # thousands of items have one origin
     for *cell, item, epoch, panel, in_overall in (
         verdicts[columns].assign(whole=is_complete).drop_duplicates().itertuples(index=False, name=None)
     ):
         model, regime, dataset = cell
         for scope in (dataset, "overall") if in_overall else (dataset,):
             items = origins.setdefault((model, regime, scope), {})
-            old = items.get(item, Origin("", ""))
-            items[item] = Origin(joined_epochs([old.epoch, epoch]), joined_epochs([old.panel, panel]))
+            items[item] = joined(items.get(item), Origin(epoch, panel))
     return dict(origins)
+
+
+def _joined(old: Origin | None, new: Origin) -> Origin:
+    sides = [origin for origin in (old, new) if origin is not None]
+    return Origin(joined_epochs([o.epoch for o in sides]), joined_epochs([o.panel for o in sides]))
 
 
 def refusal(left: Answered, right: Answered) -> str | None:

@@ -19,6 +19,7 @@ from traps_pipeline.scoring.metrics import (
     COUNTED,
     REJECTS,
     joined_epochs,
+    joined_in_groups,
     joined_versions,
     pecs_of,
 )
@@ -51,9 +52,9 @@ def standings(metrics: pd.DataFrame) -> pd.DataFrame:
     board = means.join([deviations.add_suffix("_std"), sums])
     board["n_runs"] = groups["run"].nunique()
     board["n_pairs"] = groups["n_pairs"].max()
-    board["epoch"] = groups["epoch"].agg(joined_epochs)
-    board["panel"] = groups["panel"].agg(joined_epochs)
-    board["benchmark_version"] = groups["benchmark_version"].agg(joined_versions)
+    board["epoch"] = joined_in_groups(groups, "epoch", joined_epochs)
+    board["panel"] = joined_in_groups(groups, "panel", joined_epochs)
+    board["benchmark_version"] = joined_in_groups(groups, "benchmark_version", joined_versions)
     board["answered"] = board["n_answered"] / board["n_items"]
     board["incomplete"] = _anywhere(cast(pd.Series, board["answered"] < INCOMPLETE_BELOW))
     board["broken"] = board[[*BROKEN_COUNTS]].sum(axis=1) / board["n_items"]
@@ -91,9 +92,9 @@ def _overall_runs(cells: pd.DataFrame) -> pd.DataFrame:
     counts = cast(pd.DataFrame, complete_runs[["n_pairs", *_SUMMED]].sum())
     counts[REJECTS] = complete_runs[REJECTS].sum(min_count=1)
     overall = _by_group(complete_runs, [*CELL_FIGURES, "pecs_by_family", *BOUNDS]).join(counts)
-    overall["epoch"] = complete_runs["epoch"].agg(joined_epochs)
-    overall["panel"] = complete_runs["panel"].agg(joined_epochs)
-    overall["benchmark_version"] = complete_runs["benchmark_version"].agg(joined_versions)
+    overall["epoch"] = joined_in_groups(complete_runs, "epoch", joined_epochs)
+    overall["panel"] = joined_in_groups(complete_runs, "panel", joined_epochs)
+    overall["benchmark_version"] = joined_in_groups(complete_runs, "benchmark_version", joined_versions)
     return overall.reset_index().assign(dataset="overall")
 
 

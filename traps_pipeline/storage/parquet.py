@@ -82,6 +82,7 @@ class TableStore:
 
     def __init__(self, root: Path, store: Store | None = None) -> None:
         self.root, self._store = root, store or FolderStore(root)
+        self._paths: dict[tuple[str, ...], Path] = {}  # a run asks for each a hundred times
 
     def path(self, table: Table, partition: Mapping[str, Any]) -> Path:
         """Return a partition's file: `<table>/<value>/.../<value or table>.parquet`.
@@ -90,8 +91,10 @@ class TableStore:
         """
         if tuple(partition) != table.partition_by:
             raise ValueError(f"table {table.name} is partitioned by {table.partition_by}, not {tuple(partition)}")
-        *folders, name = map(str, partition.values() or [table.name])
-        return self.root.joinpath(table.name, *folders, name + _SUFFIX)
+        names = (table.name, *map(str, partition.values() or [table.name]))
+        if (path := self._paths.get(names)) is None:
+            path = self._paths[names] = self.root.joinpath(*names[:-1], names[-1] + _SUFFIX)
+        return path
 
     def write(
         self,
@@ -164,8 +167,6 @@ class TableStore:
         None if it was never written, or written with other columns (it is then rebuilt). Raises TrapsError if it is
         unreadable.
         """
-        import pyarrow as pa
-
         path = self.path(table, partition)
         if not self._store.has(path):
             return None
@@ -177,7 +178,7 @@ class TableStore:
             else:
                 state, names = _footer_of(self._store.here(path))
             return state if names == table.names else None
-        except (pa.ArrowException, OSError, KeyError, ValueError, TypeError) as error:
+        except (OSError, KeyError, ValueError, TypeError) as error:
             raise _unreadable(path, table, error) from error
 
     def damage(self, table: Table, partition: Mapping[str, Any], *, thorough: bool = False) -> str:
@@ -185,8 +186,6 @@ class TableStore:
 
         The bytes of a file are compared with the digest in it. thorough: do not trust what a store has noted of it.
         """
-        import pyarrow as pa
-
         path = self.path(table, partition)
         if not thorough and self._store.note(path) is not None:
             return ""  # the database's row vouches for it, and every reader compares it with the row's digest
@@ -196,7 +195,7 @@ class TableStore:
             return ""
         except (TrapsError, OSError) as error:
             return str(error)
-        except (pa.ArrowException, KeyError, ValueError, TypeError):
+        except (KeyError, ValueError, TypeError):
             return ""  # the bytes are those that were written; `state` says what is wrong with the footer
         return ""
 
@@ -238,7 +237,7 @@ class TableStore:
         """Return a table's existing partitions, sorted by path, with the path's values."""
         root = self.root / table.name
         paths = self._store.below(root, "/".join("*" * max(1, len(table.partition_by))) + _SUFFIX)
-        values = [path.relative_to(root).as_posix().removesuffix(_SUFFIX).split("/") for path in paths]
+        values = [str(path)[len(str(root)) + 1 :].removesuffix(_SUFFIX).split("/") for path in paths]
         return [dict(zip(table.partition_by, each, strict=False)) for each in values]
 
     def _load(self, table: Table, path: Path, columns: Sequence[str] | None) -> pa.Table:
@@ -339,13 +338,15 @@ def _footer_of(path: Path) -> tuple[State, list[str]]:
 
     A run reads each of hundreds of footers dozens of times. Raises as `_verified`, or KeyError without a footer.
     """
-    import pyarrow.parquet as pq
-
     stamp = _stamp(path.stat())
     if (cached := _FOOTERS.get(path)) is None or cached[0] != stamp:
         content = _verified(path)
-        older = _COLUMNS not in content  # written before the names stood there
-        names = pq.ParquetFile(_sound_bytes(path)).schema_arrow.names if older else _json_behind(content, _COLUMNS)
+        if _COLUMNS in content:
+            names = _json_behind(content, _COLUMNS)
+        else:  # written before the names stood there
+            import pyarrow.parquet as pq
+
+            names = pq.ParquetFile(_sound_bytes(path)).schema_arrow.names
         cached = _FOOTERS[path] = stamp, State(**_json_behind(content, _STATE, len(_STATE))), names
     return cached[1], cached[2]
 

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
+from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
 
@@ -170,8 +171,13 @@ class FolderStore(Store):
 
     def below(self, folder: Path, pattern: str = "**/*") -> list[Path]:
         """See `Store`."""
-        files = (path for path in folder.glob(pattern) if path.is_file())
-        return sorted(path for path in files if not is_hidden(path.relative_to(folder)))
+        if "**" in pattern:
+            files = (path for path in folder.glob(pattern) if path.is_file())
+            return sorted(path for path in files if not is_hidden(path.relative_to(folder)))
+        found = [(str(folder),)]
+        for depth, part in enumerate(parts := pattern.split("/"), start=1):  # a run asks for thousands of patterns
+            found = [(*above, name) for above in found for name in _names(above, part, is_file=depth == len(parts))]
+        return [Path(*path) for path in sorted(found)]
 
     def note(self, path: Path) -> str | None:
         """See `Store`."""
@@ -199,6 +205,19 @@ def _file_lease(folder: Path, name: str) -> Lease | None:
             folder.rmdir()  # unless there are others
 
     return None if descriptor is None else Lease(close)
+
+
+def _names(folder: Sequence[str], pattern: str, *, is_file: bool) -> list[str]:
+    """Return the names of a folder's files, or else of all that it holds, that match; none hidden."""
+    path = "/".join(folder)
+    if not any(sign in pattern for sign in "*?["):
+        return [pattern] if not pattern.startswith(".") and (not is_file or Path(path, pattern).is_file()) else []
+    try:
+        with os.scandir(path) as entries:
+            shown = [entry for entry in entries if not entry.name.startswith(".") and fnmatchcase(entry.name, pattern)]
+            return [entry.name for entry in shown if not is_file or entry.is_file()]
+    except (FileNotFoundError, NotADirectoryError, PermissionError):
+        return []
 
 
 @contextmanager

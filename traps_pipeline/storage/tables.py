@@ -105,7 +105,7 @@ class Table(Generic[Row]):
         """The columns by field. Raises TypeError for an annotation without a column type."""
         return tuple(_columns(self.row_type))
 
-    @property
+    @cached_property
     def names(self) -> list[str]:
         """The names of the columns, without evaluating their annotations."""
         return [field.name for field in fields(self.row_type)]  # pyright: ignore[reportArgumentType] - a dataclass

@@ -248,10 +248,12 @@ class Workspace:
         """Return the file that exists, with the details, while a partition's check fails."""
         return self.root / "checks" / stage / check / f"{key or stage}.json"
 
-    def failed_checks(self, stage: str, key: str | None) -> list[str]:
-        """Return the names of a partition's failed checks."""
-        files = self.store.below(self.root / "checks" / stage, f"*/{key or stage}.json")
-        return sorted(path.parent.name for path in files)
+    def failed_checks(self, stage: str) -> dict[str | None, list[str]]:
+        """Return the names of the failed checks of a stage's partitions, by key."""
+        failed: dict[str | None, list[str]] = {}
+        for path in self.store.below(self.root / "checks" / stage, "*/*.json"):
+            failed.setdefault(path.stem if path.stem != stage else None, []).append(path.parent.name)
+        return failed
 
     def failure(self, stage: str, check: str, key: str | None) -> str:
         """Return the details of a failed check, as JSON."""
