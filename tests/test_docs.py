@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from tests.conftest import ROOT
+from traps_pipeline.pipeline.experiment import Experiment
 from traps_pipeline.scoring.published import published_overall
 
 FOLDERS = ("traps_pipeline", "tests", "bench", "docs", "assets", "scene_specs", "tools", ".ci")
@@ -24,6 +25,7 @@ SECTION = re.compile(rf'([\w./-]+\.md)`?,?\s[ #]*(?:sections? )?("[^"\n]+"|{NUMB
 PATH = re.compile(rf"(?<![\w./-])(?:{'|'.join(FOLDERS[:-1])})/[\w./-]*\.(?:md|py|yaml|csv|txt|png)\b")
 MODULE = re.compile(r"(?<![\w./<>-])[\w/]+\.py\b")
 NAMED = re.compile(r"`(\w+)`\s(?:of|in)\s`([\w./]+\.py)`")  # `draw_again` of `scenes/draw/redraw.py`
+YAML = re.compile(r"^```yaml\n(.*?)^```", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\[[^]\n]*\]\((?!\w+:)([^)#\s]*)#?([^)\s]*)\)")
 PAPER_IN = (
     "README.md", "docs/spec.md", "assets/published/README.md", "traps_pipeline/report/templates/report.html.j2",
@@ -79,6 +81,14 @@ def test_what_is_cited_exists() -> None:
 )
 def test_a_citation_of_what_is_not_there_is_named_with_its_line(page: str, cited: str) -> None:
     assert list(wrong(ROOT / page, f"one\n{cited}")) == [f"{page}:2: there is no {cited}"]
+
+
+def test_the_experiments_in_pages_are_valid() -> None:
+    blocks = [block for path in TEXTS if path.suffix == ".md" for block in YAML.findall(path.read_text())]
+    parts = [part for part in map(yaml.safe_load, blocks) if isinstance(part, dict)]  # lists: entries of the registry
+    assert len(parts) >= 6
+    for part in parts:
+        Experiment.model_validate({"name": "page", "models": ["oracle"], **part})
 
 
 def test_the_paper_has_one_name_everywhere() -> None:
