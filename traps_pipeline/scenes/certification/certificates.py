@@ -1,4 +1,4 @@
-"""Certificates of a pair: promises, evidence, and thresholds.
+"""Define the certificates of a pair: promises, evidence and thresholds.
 
 A certificate is one entry of `CERTIFICATES`. From there it is picked up by `resolve` (a draw that loses one is
 rejected, and what it measures goes into the record), by `certify` (all are measured again from the record and its two
@@ -97,7 +97,7 @@ def earliest_cut(physics: Physics) -> int:
 
 
 def least_entropy_bits(labels: int) -> float:
-    """Return the least entropy (bits) of an open cut, by the number of answers."""
+    """Return the minimum entropy (bits) of an open cut for a number of answers."""
     return MIN_ENTROPY_THREE_LABELS_BITS if labels == 3 else MIN_ENTROPY_BITS
 
 
@@ -105,7 +105,7 @@ def least_entropy_bits(labels: int) -> float:
 
 
 def certificates_for(kind: VoidKind, *about: About) -> list[Certificate]:
-    """Return the certificates of a kind of void, or those about something, in order."""
+    """Return a void kind's certificates in order; `about` selects some by subject."""
     return [c for c in CERTIFICATES if kind in c.kinds and (not about or c.about in about)]
 
 
@@ -134,7 +134,7 @@ def futures_of(control: World, seed: int, cut: int | None = None) -> ensemble.Fu
 
 
 def stored_evidence(spec: SceneSpec) -> dict[str, Any]:
-    """Return a record's evidence, and what it says elsewhere of void and twin."""
+    """Return a record's evidence, with its other fields on void and twin."""
     evidence = spec.evidence | {"twin_answer": spec.twin.ground_truth}
     physics = Physics(**spec.physics)
     evidence |= _closes(spec.closes_frame, physics)
@@ -193,7 +193,7 @@ def settled_outcome(family: Family, motion: Motion, params: Any) -> Outcome:
 
 
 def settled_answer(world: World) -> str | None:
-    """Return what a world ends in; None if it cannot be certified."""
+    """Return a world's final answer; None if it cannot be certified."""
     try:
         return settled_outcome(world.family, world.motion, world.params).label
     except Rejected:
@@ -326,7 +326,7 @@ IN_FRAME = Certificate(
 def legible_groups(
     family: Family, model: mujoco.MjModel, scene: Scene, motion: Motion, params: Any
 ) -> list[tuple[tuple[str, ...], float]]:
-    """Return groups of geoms with the least pixels of each at the control's end."""
+    """Return geom groups and the pixels that each must show at the control's end."""
     if family.legible is not None:
         return list(family.legible(motion, params))
     return [(decisive_geoms(model, [body]), LEGIBLE_PIXELS) for body in scene.decisive]
@@ -610,7 +610,7 @@ def _open(pair: Pair) -> Evidence:
 
 
 def open_from_state(futures: ensemble.Futures, cut: int, claim: Claim) -> Evidence:
-    """Return the evidence of what the state at a cut leaves open."""
+    """Return evidence that the state at a cut leaves the outcome open."""
     counts = {label: n for label, n in futures.after(cut).items() if label is not None}
     settled = sum(counts.values())
     return {
@@ -923,7 +923,7 @@ CERTIFICATES = (
 
 
 def table() -> str:
-    """Return the certificates as a Markdown table; OpenGL decides numbers in brackets."""
+    """Return the certificates as a Markdown table; OpenGL affects bracketed numbers."""
     lines = ["| certificate | promises | does not promise | stored |", "| --- | --- | --- | --- |"]
     for certificate in CERTIFICATES:
         kinds = {"occluder": " (occlusion)", "truncation": " (chaotic)"}

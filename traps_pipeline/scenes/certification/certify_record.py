@@ -1,4 +1,4 @@
-"""Certification of a record from its two trajectories alone.
+"""Certify a record from its two trajectories alone.
 
 `certificates` defines them; `docs/scenes.md` says what each promises and what it does not.
 """
@@ -48,7 +48,7 @@ class Verdict:
 def certify(spec: SceneSpec, qpos: np.ndarray, twin: np.ndarray, *, frame_step: int = 1) -> Verdict:
     """Measure and judge all certificates of a record from its trajectories, (F, nq).
 
-    What is measured must also be what the record has stored of it. frame_step: pixel certificates look at every so
+    The measured evidence must also equal the stored evidence. frame_step: pixel certificates look at every so
     many frames (1: full rate; 2: the 5 FPS sample).
     """
     start_s = time.process_time()

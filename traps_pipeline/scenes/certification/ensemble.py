@@ -1,4 +1,4 @@
-"""Futures of many starts that look the same as a control up to a cut.
+"""Simulate futures of starts that look like a control up to a cut.
 
 The initial state is perturbed far below what a pixel shows and simulated on. A rollout counts for a cut while it cannot
 be told from the control by eye. How many must count, and how they must disagree, is the certificate's (`certificates`).
@@ -36,7 +36,9 @@ THREADS = 2
 
 @dataclass(frozen=True)
 class Cut:
-    """A cut and what it leaves open. The void shows control frames [0:frame].
+    """A cut, with outcome counts of its futures.
+
+    The void shows the control frames [0:frame].
 
     accepted: rollouts with an outcome that look like the control up to the cut. unresolved: rollouts that look like it
     but are undecided at the end; they are no outcome of their own and count nowhere else.
@@ -213,7 +215,7 @@ class Futures:
 
 
 def at_cut(rollouts: Sequence[Rollout], frame: int, perturbation: float) -> Cut:
-    """Return what a cut at one frame leaves open."""
+    """Return the cut at a frame, with outcome counts of its futures."""
     lookalikes = [r for r in rollouts if r.parted >= frame]
     counts = Counter(r.label for r in lookalikes if r.label is not None)
     accepted = counts.total()
@@ -222,7 +224,7 @@ def at_cut(rollouts: Sequence[Rollout], frame: int, perturbation: float) -> Cut:
 
 
 def twin_of(rollouts: Sequence[Rollout], frame: int, truth: str | None) -> Rollout:
-    """Return the first accepted rollout at a cut that does not end in the truth."""
+    """Return the first accepted rollout at a cut that ends in another answer."""
     return next(r for r in rollouts if r.parted >= frame and r.label not in (None, truth))
 
 
@@ -247,7 +249,7 @@ def _perturbed_starts(model: mujoco.MjModel, start: np.ndarray, scale: float, se
 
 
 def unseen_steps(model: mujoco.MjModel, data: mujoco.MjData, camera: Camera) -> np.ndarray:
-    """Return the step (m, rad) of each degree of freedom that no viewer sees, (nv,).
+    """Return the invisible step (m, rad) of each degree of freedom, (nv,).
 
     It is one standard deviation: a body moves by UNSEEN_PX, and turns by so much at its furthest point.
     """

@@ -1,4 +1,4 @@
-"""Closing of controls: an occluder comes once the outcome has settled, and stays.
+"""Close controls: an occluder enters once the outcome has settled, and stays.
 
 So the last frame does not tell the answer, and a model must have watched. In an occlusion scene the occluder is that of
 the void: control and void then end in the same frames. In a chaotic scene it stands before the place of all outcomes
@@ -44,7 +44,7 @@ def _certified(pair: Pair, closing: Closing | None, evidence: Mapping[str, Any])
 
 
 def record_of(pair: Pair) -> dict[str, Any] | None:
-    """Return how the control closes, in the form of a record."""
+    """Return a control's closing in the form that a record stores."""
     closing = pair.control.closing
     if closing is None:
         return None

@@ -1,4 +1,4 @@
-"""Redraws of released records, for another look or whatever rule is new.
+"""Redraw released records for a new look or a new rule.
 
 A record of an occlusion family is drawn again from the number of its draw (`draw_again`), which takes seconds. Where
 the record cost thousands of rollouts, and its new look moves neither camera nor occluder, the worlds stay and only what
@@ -49,7 +49,7 @@ def draw_again(
     report: Callable[[str], None] = lambda _: None,
     only: Collection[str] | None = None,
 ) -> dict[str, str]:
-    """Draw a family's records, or some ids, again by today's looks and rules.
+    """Redraw a family's records, or some ids, by the current looks and rules.
 
     Ids and ill-posed questions stay. Takes out those that are rejected now, so that `sample_family` fills their places,
     and returns the reasons by id.

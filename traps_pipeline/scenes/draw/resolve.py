@@ -1,4 +1,4 @@
-"""Resolution of parameters to a scenario: simulate, frame, choose void and twin.
+"""Resolve parameters to a scenario: simulate, frame, choose void and twin.
 
 `resolve` is the only way a record comes to be; it raises `Rejected` with the reason when the draw makes no good pair.
 """
@@ -208,7 +208,7 @@ def _is_hopeless(scouts: Sequence[Rollout], first: int) -> bool:
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON gives it back: lists, and numbers of Python."""
+    """Return a value as JSON would read it back: lists, and Python numbers."""
     if isinstance(value, dict):
         return {key: plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""Sampling of a family's scenarios, until its quotas are full, into records.
+"""Sample a family's scenarios into records until its quotas are full.
 
 Draws are numbered and independent, so they run on all cores; acceptance goes through them in order, so that the same
 seed gives the same scenarios. Every accepted scenario is written at once: a sampling that was stopped goes on.
@@ -44,7 +44,7 @@ _NO_QUESTION = "?"  # stands for the ill-posed question until the scenario has i
 
 @dataclass
 class Tally:
-    """How a family was drawn. file: digest of the family's file, empty in old notes."""
+    """The counts of a family's draws. file: digest of its file, empty in old notes."""
 
     seed: int
     wanted: int
@@ -56,7 +56,7 @@ class Tally:
 
 
 def load_tallies(released: Path) -> dict[str, Tally]:
-    """Return how each family's records were drawn, from `draws.json` beside them."""
+    """Return each family's tally of draws, from `draws.json` beside the records."""
     path = released / DRAWS
     if not path.is_file():
         return {}
@@ -82,7 +82,7 @@ def require_difficulty(names: Iterable[str], difficulty: Difficulty) -> None:
 
 
 def answer_quota(count: int, n_labels: float) -> int:
-    """Return how often one answer may occur among `count` scenarios of a family.
+    """Return the maximum count of one answer among `count` scenarios of a family.
 
     Under ten: once more than the even split, rounded up. Else 60 % of two answers, 1.5 times the fair share of more.
     """
@@ -92,7 +92,7 @@ def answer_quota(count: int, n_labels: float) -> int:
 
 
 def ill_posed_quota(taxonomy: str, count: int) -> int:
-    """Return how often an ill-posed text may occur: once, or in 5 % (chaotic)."""
+    """Return the maximum count of an ill-posed text: 1, or 5 % (chaotic)."""
     return 1 if taxonomy == "occlusion" else max(1, count // 20)
 
 
@@ -189,12 +189,12 @@ def sample_family(
 
 
 def rejection_kind(reason: str) -> str:
-    """Return what a rejection has in common with others: no numbers, no details."""
+    """Return a rejection's reason without numbers or details, to count like ones."""
     return _MEASURED.sub("", reason.split(":")[0])
 
 
 class Records:
-    """Released files of a family; its place in `draws.json` vouches for the others."""
+    """Released files of a family, except its entry in `draws.json`."""
 
     def __init__(self, released: Path, family: str) -> None:
         self._released, self._family = released, family
@@ -307,7 +307,7 @@ def try_draw(draw: Draw) -> Resolved | str:
 
 @dataclass(frozen=True)
 class DrawnScene:
-    """What a draw gives before any pixel is looked at."""
+    """The result of a draw before any pixel is examined."""
 
     params: Any
     wording: Wording
@@ -317,7 +317,7 @@ class DrawnScene:
 def scene_of_draw(draw: Draw) -> DrawnScene:
     """Return the scene of a numbered draw.
 
-    Raises Rejected where its answer has its quota or cannot be certified.
+    Raises Rejected if the quota of its answer is full, or the answer cannot be certified.
     """
     family = get_family(draw.family)
     rng = np.random.default_rng([draw.seed, *draw.family.encode(), draw.number])
@@ -358,14 +358,15 @@ def ill_posed_for(spec: SceneSpec, seed: int, texts: Counter[str], count: int) -
 
 
 def simulated_answer(family: Family, params: Any) -> str:
-    """Return what the control of a draw shows."""
+    """Return the answer that a draw's control shows."""
     return simulated_scene(family, params, family.physics)[0]
 
 
 def simulated_scene(family: Family, params: Any, physics: Physics) -> tuple[str, Scene, np.ndarray]:
-    """Return what a draw's control shows, in a second, before certificates cost more.
+    """Simulate a draw's control; return its answer, its scene and points to frame.
 
-    Also return the scene, and points around all that it shows or covers, (N, 3).
+    It takes a second, so it comes before the certificates. The points, (N, 3), surround everything that is shown or
+    covered. Raises Rejected if the outcome is undecided or settles too late.
     """
     model, scene = compile_scene(family, params, physics)
     qpos = simulated(model, scene, physics)

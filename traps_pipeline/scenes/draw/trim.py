@@ -1,4 +1,4 @@
-"""Trimming of occluders to what the twin needs.
+"""Trim occluders to the area that the twin needs.
 
 A family says what its occluder hides at the most, as a box (`Scene.cover`). How much of that must be hidden follows
 from the pair: where control and twin differ in any frame, where anything of the hidden element shows, and where
@@ -22,7 +22,7 @@ MARGINS_PX = (3, 9)  # around what must be hidden, to be tried one after the oth
 
 
 def trim_candidates(pair: Pair) -> Iterator[Pair]:
-    """Yield a pair behind ever larger occluders, of which each may lose a certificate."""
+    """Yield a pair with ever larger occluders, each of which may fail a certificate."""
     occluder = pair.control.occluder
     assert occluder is not None, "only an occluder can be trimmed"
     needed = must_hide(pair)
@@ -47,7 +47,7 @@ def must_hide(pair: Pair) -> np.ndarray:
 
 
 def cut_to(occluder: Occluder, camera: Camera, needed: np.ndarray, margin_px: int) -> Occluder:
-    """Return the least occluder in its plane, and within it, around pixels (H, W)."""
+    """Return the smallest part of an occluder that covers the pixels (H, W)."""
     rows, columns = np.nonzero(needed)
     if not len(rows):
         return occluder

@@ -35,7 +35,7 @@ PLAY, PLAIN = apart("red", "green", "blue", "cyan", "purple"), shuffled("wood", 
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths from the pivot, direction +1: the ball drops on the left."""
+    """Parameters; lengths run from the pivot; at direction +1 the ball drops left."""
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()
@@ -157,7 +157,7 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
 
 
 def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
-    """Predict the end from the swing: as far over as at first, or level if it slows."""
+    """Predict the end from the swing: still tipped over, or level if it slows."""
     slopes = [(_slope_deg(frame, slots["beam"], 200), _slope_deg(frame, "black", 100)) for frame in frames]
     tilts = [beam - base for beam, base in slopes if beam is not None and base is not None]
     if len(tilts) < 3 or abs(tilts[0]) < TIPPED_DEG:

@@ -45,7 +45,7 @@ def _windows(rng: np.random.Generator, so_far: Drawn) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths run from the wall's start, direction +1: to the right."""
+    """Parameters; lengths run from the wall's start; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()

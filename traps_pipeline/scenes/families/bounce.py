@@ -28,7 +28,7 @@ PLAY, PLAIN = apart("red", "green", "blue", "yellow", "cyan", "purple"), shuffle
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths run from the table's edge, direction +1: to the right."""
+    """Parameters; lengths run from the table's edge; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()
@@ -49,7 +49,7 @@ class Params:
 
     @property
     def wall_at_m(self) -> float:
-        """Where the wall stands: below the top of the bounce."""
+        """Position of the wall, below the top of the bounce."""
         fall_s = float(np.sqrt(2 * self.drop_m / 9.81))
         return (1 + LIVELY) * self.speed_m_s * fall_s + 0.3 * self.radius_m
 

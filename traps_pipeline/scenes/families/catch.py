@@ -44,7 +44,7 @@ def _step(rng: np.random.Generator, so_far: Drawn) -> float:
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths run from the pedestal's middle, direction +1: to the right."""
+    """Parameters; lengths run from the pedestal's middle; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
     radius_m: float = between(0.068, 0.080)
@@ -64,14 +64,14 @@ class Params:
 
     @property
     def landing_m(self) -> float:
-        """Where the ball is when it is as high as the basket's sides."""
+        """Position of the ball when it falls to the height of the basket's sides."""
         fall = self.pedestal_m + 0.01 - self.rim_m
         up = self.speed_up_m_s
         return self.speed_along_m_s * (up + (up * up + 2 * GRAVITY * fall) ** 0.5) / GRAVITY
 
     @property
     def basket_m(self) -> float:
-        """Where the middle of the basket is."""
+        """Position of the basket's middle."""
         return self.landing_m + 0.02 + (0.0 if self.in_place else self.step_m)
 
     @property

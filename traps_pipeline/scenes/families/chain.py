@@ -30,7 +30,7 @@ PLAY, PLAIN = apart("red", "green", "blue", "yellow", "cyan", "purple"), shuffle
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths run from the ramp's upper end, direction +1: to the right."""
+    """Parameters; lengths run from the ramp's upper end; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
     striker_colour: str = PLAY()
@@ -55,7 +55,7 @@ class Params:
 
     @property
     def balls_m(self) -> tuple[float, ...]:
-        """Where the balls of the row rest at first."""
+        """Initial positions of the row's balls."""
         first = self.ramp_m + self.ahead_m + self.radius_m
         return tuple(first + i * (2 * self.radius_m + self.gap_m) for i in range(self.row))
 
@@ -66,7 +66,7 @@ class Params:
 
     @property
     def box_at_m(self) -> float:
-        """Where the box begins."""
+        """Position at which the box begins."""
         return self.balls_m[-1] + self.radius_m + self.beyond_m
 
 

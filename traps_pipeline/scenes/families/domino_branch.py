@@ -32,7 +32,7 @@ PLAY = apart("red", "green", "blue", "yellow", "cyan", "purple")
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths without a unit in domino heights, angles from the row."""
+    """Parameters; unsuffixed lengths in domino heights; angles from the row."""
 
     row_colour: str = PLAY()
     ball_colour: str = PLAY()
@@ -122,7 +122,7 @@ def _add_domino(
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Read the side on which alone the end domino falls, once the branches are still."""
+    """Read the side of the only end domino that falls, once the branches are still."""
     tops = np.stack([top_m(motion, f"end_{side}", p.height_m) for side in SIDES], axis=1) - PLANK * p.height_m
     rest_frame = still_from(*(motion.pos(body) for side in SIDES for body in p.bodies(side)), within_m=STILL_M)
     sides = [("left" if left else "right") if left != right else None for left, right in tops < p.height_m / 2]
@@ -141,7 +141,7 @@ def _aside(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
 
 
 def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
-    """Return the side whose end domino alone is no longer where it stood at first."""
+    """Return the side of the only end domino that has left its initial place."""
     standing = [_is_standing(frames, slots[side]) for side in SIDES]
     if None in standing or standing[0] == standing[1]:
         return None
@@ -149,7 +149,7 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
 
 
 def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
-    """Predict the side whose end domino alone has left its place or is about to."""
+    """Predict the side of the only end domino that has left its place or will soon."""
     falls = []
     for colour in (slots["left"], slots["right"]):
         dominoes = blobs(colour_mask(frames[0], colour), 60)

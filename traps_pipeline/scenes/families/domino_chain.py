@@ -32,7 +32,7 @@ def _plank_colour(rng: np.random.Generator, so_far: Drawn) -> str:
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths without a unit in domino heights, direction +1: right."""
+    """Parameters; unsuffixed lengths in domino heights; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
     concealed: int = one_of(3, 4, longer=(5, 6))  # dominoes after the hand-off, the last one included

@@ -50,7 +50,7 @@ def _gap_after(rng: np.random.Generator, so_far: Drawn) -> int:
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths without a unit in domino heights, direction +1: right."""
+    """Parameters; unsuffixed lengths in domino heights; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
     first_colour: str = PLAY()
@@ -126,7 +126,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 
 def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
-    """Count the second row's dominoes less those that stand where they stood at first."""
+    """Count the second row's dominoes that no longer stand in their initial places."""
     colour = slots["second"]
     before, close, after = (colour_mask(frames[i], colour) for i in (0, -3, -1))
     standing = blobs(before, min_area=60)
@@ -150,7 +150,7 @@ def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
 
 
 def look(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
-    """Count the second row by the choices, less the dominoes that stand at the end."""
+    """Count fallen dominoes: the choices' largest number less those that still stand."""
     close, after = (colour_mask(frames[i], slots["second"]) for i in (-3, -1))
     if "choices" not in slots or not after.any() or (after != close).sum() > 0.1 * after.sum():
         return None

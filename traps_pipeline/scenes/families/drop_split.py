@@ -40,7 +40,7 @@ def _offset(rng: np.random.Generator, so_far: Drawn) -> float:
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; drift: m/s to the right, cube_side +1: to the right of the bins."""
+    """Parameters; drift is in m/s to the right; cube_side +1 is right of the bins."""
 
     radius_m: float = between(0.068, 0.080)
     ball_colour: str = PLAY()

@@ -41,7 +41,7 @@ THROATS = together(_throats)
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; direction +1: to the right. The funnel is in the middle."""
+    """Parameters; the funnel is in the middle; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()

@@ -33,9 +33,9 @@ PLAIN = shuffled("wood", "grey", "white", "black")
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; pairs: first and second ball, lanes: -1 front, +1 back.
+    """Parameters; pairs are the first and second ball; lane -1 is front, +1 back.
 
-    direction: +1 if the first ball, which the switch may turn, rolls to the right. Lengths run along its way from the
+    direction: +1 if the first ball, which the switch may turn, rolls right. Lengths run along its way from the
     middle of the covered part.
     """
 

@@ -31,7 +31,7 @@ PLAY, PLAIN = apart(*COLOURS), shuffled("wood", "grey", "white")
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; direction +1: to the right, tilt +1: the plate sheds to the right."""
+    """Parameters; direction +1 is right; at tilt +1 the plate sheds to the right."""
 
     left_colour: str = PLAY()
     right_colour: str = PLAY()

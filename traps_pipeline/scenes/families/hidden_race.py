@@ -49,7 +49,7 @@ def _direction(rng: np.random.Generator, so_far: Drawn) -> int:
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters by lane, front lane first; direction +1: to the right."""
+    """Parameters by lane, front lane first; direction +1 is right."""
 
     direction: int = drawn_by(_direction, longer=True)
     tunnel_colour: str = PLAIN()
@@ -75,7 +75,7 @@ class Params:
 
     @property
     def exit_m(self) -> float:
-        """Where the tunnel ends, along the lanes."""
+        """Position of the tunnel's end along the lanes."""
         return self.run_m + self.tunnel_m
 
 

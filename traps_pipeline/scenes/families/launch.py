@@ -29,7 +29,7 @@ PLAY, PLAIN = apart("red", "green", "blue", "yellow", "cyan", "purple"), shuffle
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths run from the ledge's end, direction +1: to the right."""
+    """Parameters; lengths run from the ledge's end; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()

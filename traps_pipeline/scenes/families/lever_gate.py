@@ -30,7 +30,7 @@ PLAY, PLAIN = apart("red", "green", "blue", "yellow", "cyan", "purple"), shuffle
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths run from the occluder's edge, direction +1: to the right."""
+    """Parameters; lengths run from the occluder's edge; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()
@@ -54,7 +54,7 @@ class Params:
 
     @property
     def pivot_m(self) -> tuple[float, float]:
-        """Where the pivot is: along, up."""
+        """Position of the pivot (along, up)."""
         return self.gate_at_m + self.arm_m, FLOOR_M + GAP_M + self.drop_m
 
 

@@ -81,7 +81,7 @@ ROWS, ZONES = peg_rows(5, 7), together(_zones)
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; per zone: width, colour, per ball: colour, side (-1: left), way."""
+    """Parameters; a zone has width and colour, a ball colour, side (-1: left), way."""
 
     rows: int = ROWS()
     peg_gap_m: float = ROWS()  # from peg to peg in a row
@@ -104,22 +104,22 @@ class Params:
 
     @property
     def width_m(self) -> float:
-        """Inside of the board."""
+        """Inner width of the board."""
         return sum(self.zone_widths_m)
 
     @property
     def edges_m(self) -> tuple[float, ...]:
-        """Where the zones begin and end, from the middle of the board, left to right."""
+        """Edges of the zones, left to right, from the middle of the board."""
         return tuple(float(x) for x in np.cumsum([-self.width_m / 2, *self.zone_widths_m]))
 
     @property
     def rim_m(self) -> float:
-        """Where the zones open, measured up the board."""
+        """Height of the zones' openings, measured up the board."""
         return SILL_M + ZONE_M
 
     @property
     def lip_m(self) -> float:
-        """Where the shelves end, measured up the board."""
+        """Height of the shelves' ends, measured up the board."""
         return self.rim_m + (self.rows + 0.6) * self.row_gap_m
 
     @property
@@ -138,7 +138,7 @@ class Params:
         return max(w for w, s in zip(self.ways_m, self.sides, strict=True) if s == side) + 1.4 * self.ball_radius_m
 
     def lip_x_m(self, side: int) -> float:
-        """Return where the upper face of a shelf ends, across the board."""
+        """Return the position across the board at which a shelf's upper face ends."""
         return side * (self.width_m / 2 - self.shelf_m(side) * math.cos(self.slope_rad))
 
 

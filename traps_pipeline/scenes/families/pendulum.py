@@ -35,7 +35,7 @@ PLAY, PLAIN = apart("red", "green", "blue", "cyan", "purple"), shuffled("wood", 
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths run from the occluder's edge, direction +1: to the right."""
+    """Parameters; lengths run from the occluder's edge; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()
@@ -65,12 +65,12 @@ class Params:
 
     @property
     def block_at_m(self) -> float:
-        """Centre of the standing block."""
+        """Position of the standing block's centre."""
         return self.pivot_at_m + self.radius_m + self.reach_m + self.block_half_m
 
     @property
     def peg_at_m(self) -> float:
-        """Where the peg sticks out of the board."""
+        """Position of the peg in the board."""
         swing = PEG_DOWN * self.length_m * float(np.tan(np.radians(self.stop_deg)))
         return self.pivot_at_m + (swing + ROD_RADIUS_M + PEG_RADIUS_M if self.peg_stops else self.free_peg_m)
 

@@ -61,7 +61,7 @@ BALLS = together(_balls)
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; per ball: colour, start and push; the first ball is asked for."""
+    """Parameters; a ball has colour, start and push; the question is on the first."""
 
     rows: int = ROWS()
     peg_gap_m: float = ROWS()  # from peg to peg in a row
@@ -88,7 +88,7 @@ class Params:
 
     @property
     def rim_m(self) -> float:
-        """Where the buckets open, measured up the board."""
+        """Height of the buckets' openings, measured up the board."""
         return APRON_M + BUCKET_M
 
     @property

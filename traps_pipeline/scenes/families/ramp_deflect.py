@@ -27,7 +27,7 @@ PLAIN = shuffled("wood", "grey", "black")
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; y from the table's front edge to the back, x from its middle, right."""
+    """Parameters; y runs back from the table's front edge, x right from its middle."""
 
     ramp_colour: str = PLAIN()
     table_colour: str = PLAIN()

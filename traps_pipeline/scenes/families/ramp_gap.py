@@ -25,7 +25,7 @@ PLAY, PLAIN = apart(*COLOURS), shuffled("wood", "grey", "black")
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths run from the ramp's foot, direction +1: to the right."""
+    """Parameters; lengths run from the ramp's foot; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()
@@ -50,12 +50,12 @@ class Params:
 
     @property
     def gap_span(self) -> Span:
-        """Where the gap is."""
+        """Start and end of the gap."""
         return (self.mouth_m + self.lead_m, self.mouth_m + self.lead_m + self.gap_m)
 
     @property
     def deck_end_m(self) -> float:
-        """Where the deck ends and the box begins."""
+        """Position at which the deck ends and the box begins."""
         return self.gap_span[1] + self.after_m
 
 

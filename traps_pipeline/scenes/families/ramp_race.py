@@ -53,7 +53,7 @@ def _starts(rng: np.random.Generator, so_far: Drawn) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; pairs: left and right track, y from the tray's front to the back."""
+    """Parameters; pairs are left and right track; y runs back from the tray's front."""
 
     colours: tuple[str, str] = PLAY(2)
     tray_colour: str = drawn_by(_tray_colour)

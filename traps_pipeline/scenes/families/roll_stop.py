@@ -33,7 +33,7 @@ PARTS = ("ball", "start", "line")
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths run from the track's beginning, direction +1: to the right."""
+    """Parameters; lengths run from the track's beginning; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()
@@ -58,7 +58,7 @@ class Params:
 
     @property
     def line_m(self) -> float:
-        """Where the middle of the line is."""
+        """Position of the line's middle."""
         return self.run_m + self.lead_m + self.patch_m + self.line_at_m
 
 

@@ -121,7 +121,7 @@ def _crates(rng: np.random.Generator, so_far: Drawn) -> tuple[tuple[float, ...],
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths on the board, bins' and seesaw's sideways from the pivot."""
+    """Parameters; lengths on the board; bins and seesaw are measured from the pivot."""
 
     rows: int = ROWS()
     peg_gap_m: float = ROWS()  # from peg to peg in a row
@@ -154,22 +154,22 @@ class Params:
 
     @property
     def width_m(self) -> float:
-        """Inside of the board."""
+        """Inner width of the board."""
         return 2 * self.bin_m + sum(self.trays_m)
 
     @property
     def middle_m(self) -> float:
-        """Where the pivot is across the board."""
+        """Position of the pivot across the board."""
         return (self.trays_m[0] - self.trays_m[1]) / 2
 
     @property
     def rim_m(self) -> float:
-        """Where the bins open, measured up the board."""
+        """Height of the bins' openings, measured up the board."""
         return SILL_M + BIN_M
 
     @property
     def pivot_m(self) -> float:
-        """Where the seesaw turns, measured up the board."""
+        """Height of the seesaw's pivot, measured up the board."""
         return self.rim_m + self.beam_m * math.sin(math.radians(self.swing_deg)) + self.drop_m
 
 

@@ -38,7 +38,7 @@ def _incline_colour(rng: np.random.Generator, so_far: Drawn) -> str:
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths run from the incline's foot, direction +1: to the right."""
+    """Parameters; lengths run from the incline's foot; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
     block_colour: str = PLAY()
@@ -67,12 +67,12 @@ class Params:
 
     @property
     def board_span(self) -> Span:
-        """Where the rough board is."""
+        """Start and end of the rough board."""
         return (self.mouth_m + self.lead_m, self.mouth_m + self.lead_m + self.board_m)
 
     @property
     def deck_end_m(self) -> float:
-        """Where the deck ends."""
+        """Position of the deck's end."""
         return self.board_span[1] + self.after_m
 
 

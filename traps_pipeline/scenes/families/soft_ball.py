@@ -35,7 +35,7 @@ PLAY, PLAIN = apart(*COLOURS), shuffled("wood", "grey", "white")
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; passes: pairs of bars passed, wide, narrow: gaps in ball diameters."""
+    """Parameters; passes counts pairs of bars; wide and narrow are in ball diameters."""
 
     ball_colour: str = PLAY()
     upper_colour: str = PLAY()
@@ -60,7 +60,7 @@ class Params:
     elevation_deg: float = between(-24, -16)
 
     def gap_m(self, pair: int) -> float:
-        """From bar to bar of the upper pair (0) or the lower one (1)."""
+        """Return the gap between the bars of the upper pair (0) or the lower one (1)."""
         return 2 * self.radius_m * (self.wide if pair < self.passes else self.narrow)
 
 

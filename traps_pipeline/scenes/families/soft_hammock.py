@@ -36,7 +36,7 @@ PLAIN = shuffled("wood", "grey", "white")
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; direction +1: cube on the right, cloth tied left if at one end."""
+    """Parameters; at direction +1 the cube is right, and a half-tied cloth hangs left."""
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()

@@ -34,7 +34,7 @@ PLAIN = shuffled("wood", "grey", "white")
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; direction +1: cube on the right, as is a peg beside the middle."""
+    """Parameters; at direction +1 the cube is right, and so is an off-centre peg."""
 
     direction: int = one_of(-1, 1)
     rope_colour: str = PLAY()

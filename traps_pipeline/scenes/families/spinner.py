@@ -38,7 +38,7 @@ PLAIN = shuffled("wood", "grey", "white")
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; direction +1: to the right, sectors: as the pointer passes them."""
+    """Parameters; direction +1 is right; sectors are in the order the pointer passes."""
 
     direction: int = one_of(-1, 1)
     sectors: tuple[str, ...] = drawn_by(lambda rng, so_far: distinct_colours(rng, int(rng.integers(3, 5)), SECTORS))

@@ -43,7 +43,7 @@ PLUNGER = together(_plungers)
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths run from where the ball starts, direction +1: to the right."""
+    """Parameters; lengths run from where the ball starts; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()
@@ -67,12 +67,12 @@ class Params:
 
     @property
     def edge_m(self) -> float:
-        """Where the deck ends."""
+        """Position of the deck's end."""
         return self.run_m + 2 * self.radius_m + 0.06
 
     @property
     def head_m(self) -> float:
-        """Where the plunger's face is at rest."""
+        """Rest position of the plunger's face."""
         return self.edge_m + self.lane_m
 
 

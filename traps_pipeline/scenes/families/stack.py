@@ -32,7 +32,7 @@ STACKED, PLAIN = shuffled(*COLOURS), shuffled("wood", "grey", "white")
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; direction +1: to the right, block_colours: from the stand upwards."""
+    """Parameters; direction +1 is right; block_colours run from the stand upwards."""
 
     direction: int = one_of(-1, 1)
     ledge_colour: str = PLAIN()
@@ -71,7 +71,7 @@ class Params:
 
     @property
     def travel_m(self) -> float:
-        """How far the pusher can slide."""
+        """Distance that the pusher can slide."""
         return self.block_width_m + 0.05
 
 

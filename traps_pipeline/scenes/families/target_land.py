@@ -37,7 +37,7 @@ PLAY, PLAIN = apart(*COLOURS), shuffled(*GREYS)
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters, left to right as the camera sees them; direction +1: to the right."""
+    """Parameters, left to right as the camera sees them; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()
@@ -126,7 +126,7 @@ def _colours(slots: Mapping[str, str]) -> Sequence[str]:
 
 
 def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
-    """Return the tray colour that most of the picture around the resting ball has."""
+    """Return the tray colour that covers most of the picture around the resting ball."""
     path = [round_blob(frame, slots["ball"]) for frame in frames[-3:]]
     ball = path[-1]
     if ball is None or not is_at_rest(path):

@@ -32,7 +32,7 @@ PLAY, PLAIN = apart("red", "green", "blue", "orange", "cyan", "purple"), shuffle
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; heights are shares of the pillar's, direction +1: to the right."""
+    """Parameters; heights are shares of the pillar's; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
     pillar_colour: str = PLAY()

@@ -33,7 +33,7 @@ GIVES = 0.25  # of its width: a block that is so far from its place falls
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; direction +1: to the right. Only the top block's colour is unique."""
+    """Parameters; direction +1 is right. Only the top block's colour is unique."""
 
     direction: int = one_of(-1, 1)
     blocks: int = one_of(3, 4, longer=(5,))
@@ -65,7 +65,7 @@ class Params:
 
     @property
     def names(self) -> list[str]:
-        """Bodies of the tower, from the ground up."""
+        """Names of the tower's bodies, from the ground up."""
         return [f"block_{i}" for i in range(self.blocks)]
 
 

@@ -29,7 +29,7 @@ PLAIN = shuffled("wood", "grey", "white")
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths run from the ramp's upper end, direction +1: to the right."""
+    """Parameters; lengths run from the ramp's upper end; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
     ball_colour: str = PLAY()
@@ -54,12 +54,12 @@ class Params:
 
     @property
     def block_at_m(self) -> float:
-        """Where the middle of the block stands at first."""
+        """Initial position of the block's middle."""
         return self.ramp_m + self.ahead_m + self.block_m / 2
 
     @property
     def zone_at_m(self) -> float:
-        """Where the zone begins."""
+        """Position at which the zone begins."""
         return self.block_at_m + self.block_m / 2 + self.gap_m
 
 

@@ -77,7 +77,7 @@ def _faces(rng: np.random.Generator, so_far: Drawn) -> tuple[tuple[str, ...], ..
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; per die: start, turn and throw, faces on +x, -x, +y, -y, +z, -z."""
+    """Parameters; a die has start, turn, throw, and faces on +x, -x, +y, -y, +z, -z."""
 
     direction: int = drawn_by(_direction)  # +1: the steps go down to the right
     half_m: float = between(0.060, 0.068)  # half a die's edge
@@ -99,7 +99,7 @@ class Params:
 
     @property
     def run_m(self) -> float:
-        """Where the steps end and the tray begins."""
+        """Position at which the steps end and the tray begins."""
         return self.steps * self.step_m
 
     def floor_m(self, step: int) -> float:

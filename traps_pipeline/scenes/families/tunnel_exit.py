@@ -35,7 +35,7 @@ PLAY, PLAIN = apart(*COLOURS), shuffled("wood", "grey", "white", "black")
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; the ball rolls to the camera, turn +1: deflected to the right."""
+    """Parameters; the ball rolls to the camera; turn +1 deflects it to the right."""
 
     ball_colour: str = PLAY()
     tunnel_colour: str = PLAY()

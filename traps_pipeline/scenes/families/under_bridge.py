@@ -28,7 +28,7 @@ PLAY, PLAIN = apart(*BALL_COLOURS), shuffled("wood", "grey", "white", "black")
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths run from the bridge's near edge, direction +1: to the right."""
+    """Parameters; lengths run from the bridge's near edge; direction +1 is right."""
 
     ball_colour: str = PLAY()
     bridge_colour: str = PLAY()

@@ -33,7 +33,7 @@ PLAY = apart("red", "green", "blue", "orange", "cyan", "purple")
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; direction +1: to the right."""
+    """Parameters; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
     wedge_colour: str = PLAY()
@@ -54,7 +54,7 @@ class Params:
 
     @property
     def mat_at_m(self) -> float:
-        """Where the mat begins, from the middle of the wedge at the start."""
+        """Position at which the mat begins, from the wedge's middle at the start."""
         return self.wedge_length_m / 2 + 0.03 + STRIP_M + 0.03
 
 

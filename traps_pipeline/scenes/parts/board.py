@@ -1,4 +1,4 @@
-"""A tilted board under glass on which balls run down past pegs.
+"""Build a tilted board under glass on which balls run down past pegs.
 
 Places are (across, up, out) in metres: from the middle of the board to the right, up its slope from its lower edge, and
 out of it towards the glass. Everything is added in the order of the calls, which is the order of the compiled model.
@@ -154,8 +154,8 @@ class Board:
     ) -> None:
         """Add rows of pegs, without those that leave a ball just room to jam at a side.
 
-        heights: up the board; shifts: sideways; one a row. gap: from peg to peg. where: whether a peg may stand at a
-        place (across, up).
+        heights: up the board; shifts: sideways; one a row. gap: distance of neighbouring pegs. where: whether a peg may
+        stand at a place (across, up).
         """
         reach = self.side - radius
         for row, (height, shift) in enumerate(zip(heights, shifts, strict=True)):
@@ -203,6 +203,6 @@ def place(motion: Motion, body: str, tilt_deg: float) -> tuple[np.ndarray, np.nd
 
 
 def round_ball(frame: np.ndarray, colour: str) -> Blob | None:
-    """Return the largest round thing of a ball's size that has a colour."""
+    """Return the largest round region of a colour and of a ball's size."""
     candidates = blobs(colour_mask(frame, colour), min_area=90)
     return next((b for b in candidates if b.area < 900 and b.fill > 0.6 and 0.7 < b.box[2] / b.box[3] < 1.4), None)

@@ -1,4 +1,4 @@
-"""A world with one way through it, and what stands along the way.
+"""Build a world with one path through it, and the things along that path.
 
 Places are (along, across, up) in metres: along the way, away from the camera, above the floor. `direction` is +1 for a
 way to the right, -1 for one to the left: a course mirrors all that is placed on it, so that a family is written once.
@@ -48,7 +48,7 @@ MAST = (0.20, 0.20, 0.21, 1.0)  # neither black nor grey to an observer
 
 @dataclass(frozen=True)
 class Surface:
-    """How a surface meets what touches it.
+    """Contact properties of a surface.
 
     rolling: friction (m) that brings a rolling ball to rest. sliding: Coulomb friction, no unit. spinning: friction
     (m) against turning on the spot. solref: MuJoCo's contact, (-stiffness, -damping) or (time constant in s, damping
@@ -62,7 +62,7 @@ class Surface:
     priority: int = 1
 
     def on(self, geom: mujoco.MjsGeom) -> mujoco.MjsGeom:
-        """Give a geom this surface; returns the geom."""
+        """Give a geom this surface; return the geom."""
         geom.condim = 6  # with less, MuJoCo leaves rolling friction out
         geom.priority = self.priority
         geom.friction = [self.sliding, self.spinning, self.rolling]
@@ -87,7 +87,7 @@ def brake(radius_m: float, loss: float, length_m: float, physics: Physics) -> fl
 
 
 class Course:
-    """A world under construction. surface: of blocks without one, None: MuJoCo's own."""
+    """A world under construction. surface: default of blocks; None is MuJoCo's own."""
 
     def __init__(self, physics: Physics, direction: int = 1, surface: Surface | None = None) -> None:
         self.spec = new_spec(physics)
@@ -409,7 +409,7 @@ class Course:
         return length if self.direction > 0 else 0.0
 
     def cover(self, along: Span, across: Span, high: float) -> Box:
-        """Return what the occluder must hide of things up to `high`, with their shadows."""
+        """Return the box that hides things up to `high` m, with their shadows."""
         right = SHADOW_RIGHT * high if self.direction > 0 else 0.01
         return self.box(along, (across[0], across[1] + SHADOW_BACK * high), (0, high), left=0.01, right=right)
 

@@ -1,6 +1,6 @@
 """Make scenes harder to follow: distractors, faster events, longer rows.
 
-The settings belong to a draw (`traps benchmark sample`). What they come to in one scene is stored with its parameters,
+The settings belong to a draw (`traps benchmark sample`). Their values for one scene is stored with its parameters,
 as `difficulty`, and its speed with its physics; a record without either is as scenes were before there were settings.
 """
 
@@ -52,7 +52,7 @@ BALL_COLOURS: dict[str, Colour] = {colour: colour for colour in get_args(Colour)
 class Difficulty:
     """Settings of a draw.
 
-    distractors: how many. speed: how many times as fast everything happens. longer: rows, lanes and counts from the
+    distractors: their number. speed: factor on the speed of all events. longer: rows, lanes and counts from the
     longer ranges of their family.
     """
 
@@ -61,7 +61,7 @@ class Difficulty:
     longer: bool = False
 
     def settings(self) -> dict[str, Any]:
-        """Return the settings that are not the usual ones."""
+        """Return the settings that differ from the defaults."""
         return {name: value for name, value in asdict(self).items() if value != getattr(USUAL, name)}
 
 
@@ -69,7 +69,7 @@ USUAL = Difficulty()
 
 
 def untakeable(family: Family, difficulty: Difficulty) -> list[str]:
-    """Return which of the settings a family cannot be drawn with.
+    """Return the settings that a family does not support.
 
     Distractors move, and the board that closes a chaotic control must hide all that moves.
     """
@@ -102,7 +102,7 @@ class Distractor:
 
 @dataclass(frozen=True)
 class SceneDifficulty:
-    """What the settings of a draw come to in one scene."""
+    """The values that a draw's settings take in one scene."""
 
     __pydantic_config__ = _PLAUSIBLE
     distractors: Annotated[tuple[Distractor, ...], Field(max_length=MOST_DISTRACTORS)] = ()

@@ -1,4 +1,4 @@
-"""A family put together from its parts, as the registry takes it."""
+"""Assemble a family from its parts, for the registry."""
 
 from __future__ import annotations
 

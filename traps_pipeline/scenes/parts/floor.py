@@ -1,4 +1,4 @@
-"""Floors of two muted colours in a pattern, which nothing that moves depends on."""
+"""Draw floors with a pattern of two muted colours; no motion depends on them."""
 
 from __future__ import annotations
 

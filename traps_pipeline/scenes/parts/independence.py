@@ -1,4 +1,4 @@
-"""Independence of the hidden element from what is seen, so that no void tells it.
+"""Test that the hidden element is independent of everything that a void shows.
 
 Tested over draws: which of a scene's possible worlds was drawn (it and its twins, in a fixed order) must not go with a
 parameter that they share, nor with two of them together. So it does not matter how a family draws and makes its twins.
@@ -21,7 +21,7 @@ LEAST_EXPECTED = 5  # draws of each world in a row of a table; rarer values shar
 
 
 def dependence(family: Family) -> str | None:
-    """Return how the hidden element goes with what is seen, in words; None if not."""
+    """Return how the hidden element depends on what is seen; None if it does not."""
     if family.twins is None:
         return None
     scenes = [_worlds(family, family.draw(np.random.default_rng(seed))) for seed in range(DRAWS)]

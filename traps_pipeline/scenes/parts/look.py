@@ -1,4 +1,4 @@
-"""Looks of a scene: floor, light, occluder, bystanders, camera, frame size.
+"""Vary a scene's look: floor, light, occluder, bystanders, camera, frame size.
 
 A look is a value that is drawn with a scenario and stored with its parameters, as `look`; a record without one looks as
 scenes did before there were looks. It touches nothing that moves, so the trajectory is the same; camera, occluder and
@@ -45,9 +45,9 @@ BEHIND_M = (0.25, 0.9)  # so far behind all that is shown a bystander stands: it
 
 @dataclass(frozen=True)
 class Look:
-    """Look of a scene. None or an empty field leaves things as without a look.
+    """The look of a scene; a field that is None or empty changes nothing.
 
-    floor_*: `parts.floor`. light_turn_deg: of the key light about the vertical; light: what its brightness is
+    floor_*: `parts.floor`. light_turn_deg: turn of the key light about the vertical; light: what its brightness is
     multiplied by, RGB. panel: a name of `OCCLUDERS`. bystanders: (across, behind, half width, half height) in metres,
     from the middle of the back edge of what is shown, and a tone each. orbit_deg: camera, around and up. material: of
     the occluder, of `MATERIALS`. size: of a frame, of `SIZES`.
@@ -129,7 +129,7 @@ def look_of(params: Any) -> Look | None:
 
 
 def fineness(params: Any) -> int:
-    """Return how many times as fine as 480x360 the frames of a scene are."""
+    """Return the factor by which a scene's frames are finer than 480x360."""
     look = look_of(params)
     return 1 if look is None else SIZES[look.size]
 

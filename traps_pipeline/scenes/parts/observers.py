@@ -1,4 +1,4 @@
-"""Observers, which answer a question by its slots from frames, or abstain.
+"""Build observers, which answer a question from frames and its slots, or abstain.
 
 An `Observer(frames, slots)` gets the sampled frames (N, 360, 480, 3) RGB and what the question names, read back from
 its templates: part -> colour, and 'choices' where it offers some. It gives a label, or None if the decisive thing is
@@ -50,7 +50,7 @@ def compact_blob(
 ) -> Blob | None:
     """Return the largest region of a colour that may be a ball: filled, about round.
 
-    area: at most so many pixels. shape: width over height, between. fill: least share of its bounding box.
+    area: maximum in pixels. shape: range of width over height. fill: minimum share of its bounding box.
     """
     for blob in blobs(colour_mask(frame, colour), 60):
         if blob.area < area and shape[0] < blob.box[2] / blob.box[3] < shape[1] and blob.fill > fill:
@@ -92,14 +92,14 @@ def is_upper_half_in_place(frames: np.ndarray, colour: str, first: Blob) -> bool
 
 
 def end_of(path: Sequence[Blob | None], ahead: float | None = None, tolerance_px: float = 1.5) -> Blob | None:
-    """Return the thing at rest, or, with `ahead`, so many frames later; else None."""
+    """Return the thing at rest, or extrapolated by `ahead` frames; else None."""
     if ahead is not None:
         return carried_on(path, ahead)
     return path[-1] if is_at_rest(path, tolerance_px=tolerance_px) else None
 
 
 def carried_on(path: Sequence[Blob | None], ahead: float) -> Blob | None:
-    """Return the thing so many frames on, at its last speed; None if lost for long."""
+    """Extrapolate a thing some frames ahead at its last speed; None if long lost."""
     sightings = [(index, blob) for index, blob in enumerate(path) if blob is not None]
     if not sightings or len(path) - 1 - sightings[-1][0] > LOST:
         return None

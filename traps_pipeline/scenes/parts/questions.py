@@ -1,4 +1,4 @@
-"""Questions of a scene as values: templates, labels and other forms of these.
+"""Represent a scene's questions as values: templates, labels and their aliases.
 
 A template names parts in braces: '{ball}' is the value of the field `ball_colour`, and `fills` adds others. A family
 has one `Question` and some answerable asides, of which each scenario has one; even the void answers those.

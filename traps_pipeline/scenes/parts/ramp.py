@@ -1,4 +1,4 @@
-"""Ramps along the way or towards the camera, and places on them."""
+"""Build ramps along the path or towards the camera, and locate points on them."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 class Ramp:
     """A slope, from its foot: `up` it, `over` its surface, `aside` of its middle (m).
 
-    foot_m: where the foot is; along the way that is 0 for most, towards the camera it is how far away in y. height_m:
-    of the surface at the foot. towards_camera: the ramp falls towards the camera and its middle is at `middle_m` in x;
-    else it falls along the way.
+    foot_m: position of the foot, along the path or, towards the camera, in y. height_m: height of the
+    surface at the foot. towards_camera: the ramp falls towards the camera and its middle is at `middle_m` in x; else it
+    falls along the path.
     """
 
     slope_deg: float
@@ -35,7 +35,7 @@ class Ramp:
         return float(np.radians(self.slope_deg))
 
     def at(self, up: float, over: float = 0.0, aside: float = 0.0) -> Vec3:
-        """Return a place by the slope, as a course takes it."""
+        """Return a point on the slope in the course's coordinates."""
         sin, cos = float(np.sin(self.slope_rad)), float(np.cos(self.slope_rad))
         away, high = self.foot_m + up * cos - over * sin, self.height_m + up * sin + over * cos
         return (self.middle_m + aside, away, high) if self.towards_camera else (-away, aside, high)
@@ -70,7 +70,7 @@ class Ramp:
 class SteppedRamp:
     """A ramp that ends in a step above the deck: nothing comes back up.
 
-    length_m: along the ground. height_m: of its lower end.
+    length_m: length along the ground. height_m: height of its lower end.
     """
 
     length_m: float
@@ -78,7 +78,7 @@ class SteppedRamp:
     height_m: float
 
     def at(self, along: float, over: float = 0.0) -> Vec3:
-        """Return the place so far along the way and out of the surface there."""
+        """Return the point at a distance along the path and above the surface."""
         slope = np.radians(self.slope_deg)
         high = self.height_m + (self.length_m - along) * np.tan(slope)
         return (float(along + over * np.sin(slope)), 0.0, float(high + over * np.cos(slope)))

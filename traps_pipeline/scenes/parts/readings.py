@@ -1,4 +1,4 @@
-"""Readings of a simulation: each frame's outcome label and the end state's margin.
+"""Read simulations: each frame's outcome label, and the end state's margin.
 
 A family's `outcome(motion, p)` gives a `kit.Reading`, mostly from one of the functions here. Arrays over the frames are
 (F,), lengths in metres.
@@ -88,8 +88,8 @@ def read_passage(rear_past: np.ndarray, radius_m: float) -> Reading:
 def first_past(motion: Motion, ahead: np.ndarray, names: Sequence[str], min_lead_s: float) -> Reading:
     """Read which name is first past the line: `ahead` (F, N) m above 0.
 
-    No reading at all if somebody never gets past or the lead is below `min_lead_s`. The margin is how far the second
-    still is from the line when the first is past it.
+    There is no reading if a competitor never gets past or the lead is below `min_lead_s`. The margin is how far the
+    second still is from the line when the first is past it.
     """
     past = ahead > 0
     margin = float(-np.sort(ahead[int(past.any(axis=1).argmax())])[-2])

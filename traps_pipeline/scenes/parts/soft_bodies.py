@@ -1,4 +1,4 @@
-"""Soft bodies on a course: a rope, a cloth and a ball that give way.
+"""Add soft bodies to a course: a rope, a cloth and a ball.
 
 Each is one of MuJoCo's flexes, by whose name it is called in the roles of a scene; its family reads it by
 `motion.vertices`. Places are those of `parts.course`. A scene with one is integrated with MuJoCo's `discrete`
@@ -35,7 +35,7 @@ def rope(
 ) -> mujoco.MjsFlex:
     """Return a rope that lies straight along the way at first and does not stretch.
 
-    thrown: speeds along and up (m/s). links: of which it is made, each longer than the rope is thick. sliding:
+    thrown: speeds along and up (m/s). links: their number, each longer than the rope is thick. sliding:
     friction, no unit. drag: viscosity of the air (Pa s).
     """
     count, spacing = (links + 1, 1, 1), (length / links,) * 3

@@ -1,4 +1,4 @@
-"""Fields of a family's `Params`, each with the range that it is drawn from.
+"""Declare fields of a family's `Params`, each with the range it is drawn from.
 
     @dataclass(frozen=True)
     class Params:
@@ -50,19 +50,19 @@ def drawn_by(draw: Draw, **metadata: Any) -> Any:
 
 
 def between(low: float, high: float) -> Any:
-    """Return a float between two bounds, rounded to 0.0001."""
+    """Return a field: a float between two bounds, rounded to 0.0001."""
     return drawn_by(lambda rng, so_far: uniform(rng, low, high), range=(low, high))
 
 
 def several_between(count: Count, low: float, high: float) -> Any:
-    """Return a tuple of floats between two bounds. count: a number or a drawn field."""
+    """Return a field: a tuple of `count` (a number or a drawn field) floats in bounds."""
     return drawn_by(
         lambda rng, so_far: tuple(uniform(rng, low, high) for _ in range(_number(count, so_far))), range=(low, high)
     )
 
 
 def one_of(*values: Any, longer: tuple[Any, ...] = ()) -> Any:
-    """Return one of these values, each as often: colours, -1 and 1, counts.
+    """Return a field with one of these values, each equally likely.
 
     longer: the values instead, where a draw asks for longer rows.
     """
@@ -75,12 +75,12 @@ def one_of(*values: Any, longer: tuple[Any, ...] = ()) -> Any:
 
 
 def chance(share: float) -> Any:
-    """Return a boolean field that is true in this share of the draws."""
+    """Return a boolean field that is true with this probability."""
     return drawn_by(lambda rng, so_far: bool(rng.random() < share))
 
 
 def facing(low: float, high: float) -> Any:
-    """Return the azimuth of a camera, off the front towards where things come from.
+    """Return a field: a camera's azimuth, turned towards where things come from.
 
     Needs a field `direction` above it.
     """
@@ -88,7 +88,7 @@ def facing(low: float, high: float) -> Any:
 
 
 def in_front(low: float, high: float) -> Any:
-    """Return the azimuth (degrees) of a camera, off the front whatever the direction."""
+    """Return a field: a camera's azimuth (degrees) off the front, for any direction."""
     return drawn_by(lambda rng, so_far: 90 + uniform(rng, low, high))
 
 
@@ -97,7 +97,7 @@ def in_front(low: float, high: float) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Fields that are drawn together, in place of the first. A call gives one field.
+    """Fields that are drawn together, where the first stands. A call gives one field.
 
     draw(rng, so_far, count): as many values as the group's fields take, in the order of the fields.
     """
@@ -141,12 +141,12 @@ def together(draw: Callable[[np.random.Generator, Drawn], Sequence[Any]]) -> Gro
 
 
 def hidden(*values: Any) -> Any:
-    """Return the hidden element: one of these values, whatever else is drawn."""
+    """Return the field of the hidden element: one of these values, drawn by itself."""
     return _hidden(lambda so_far: values)
 
 
 def hidden_index(of: str) -> Any:
-    """Return the hidden element as an index of the tuple in the field `of`."""
+    """Return the field of the hidden element: an index of the tuple in field `of`."""
     return _hidden(lambda so_far: range(len(so_far[of])))
 
 

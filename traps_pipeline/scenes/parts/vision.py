@@ -1,4 +1,4 @@
-"""Classical vision for observers: where a colour is in a frame, how it moves.
+"""Locate and track colours in frames, for observers (classical vision).
 
 Frames are RGB uint8, shape (360, 480, 3); pixel coordinates are x to the right, y down. Colours are named as in
 `kit.COLOURS`. A colour that is none of them (most occluders') belongs to no mask.
@@ -50,7 +50,7 @@ class Blob:
 
 
 def colour_mask(frame: np.ndarray, colour: str) -> np.ndarray:
-    """Return where a frame has a colour, bool (H, W), tolerant of shade."""
+    """Return the mask of a colour in a frame, bool (H, W), tolerant of shade."""
     hsv = cv2.cvtColor(frame.astype(np.float32) / 255, cv2.COLOR_RGB2HSV)
     hue, saturation, value = hsv[..., 0], hsv[..., 1], hsv[..., 2]
     if colour in _HUES:
@@ -107,7 +107,7 @@ def largest_board(frame: np.ndarray, min_area: int = 12) -> Blob | None:
 def slanting_edges(
     frame: np.ndarray, part: tuple[slice, slice], slants: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return where edges of a part fall to the left, and to the right, bool masks.
+    """Return two masks: a part's edges that fall to the left, and to the right.
 
     slants: least and greatest slope, in rows a column.
     """
@@ -176,7 +176,7 @@ def after_occluder(frames: np.ndarray) -> np.ndarray:
 
 
 def motion_mask(frames: np.ndarray) -> np.ndarray:
-    """Return where the last frame differs from the one before, bool (H, W)."""
+    """Return the mask of pixels that changed in the last frame, bool (H, W)."""
     return _levels(frames[-1], frames[-2]) > CHANGED if len(frames) > 1 else np.zeros(frames.shape[1:3], bool)
 
 

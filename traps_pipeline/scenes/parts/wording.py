@@ -1,4 +1,4 @@
-"""Words of a scenario: templates that can be read back, and ill-posed questions.
+"""Word scenarios: templates that can be parsed back, and ill-posed questions.
 
 An ill-posed question is drawn from shared templates over the scene's inventory, and checked by vocabulary alone, so
 that a question which a reviewer wrote is checked in the same way (docs/spec.md 2.4).
@@ -32,7 +32,7 @@ def _pattern(template: str) -> re.Pattern[str]:
 
 
 def match_slots(templates: Sequence[str], question: str) -> dict[str, str] | None:
-    """Return what a question has in a template's placeholders; None if none fits."""
+    """Return a question's values of a template's placeholders; None if none matches."""
     for template in templates:
         match = _pattern(template).fullmatch(question)
         if match:
@@ -169,7 +169,7 @@ _COLOUR_WORDS = frozenset(COLOURS) - {"wood"} | frozenset(ABSENT_COLOURS)
 
 
 def false_premises(question: str, inventory: Inventory, *, near: bool = False) -> list[str]:
-    """Return what a question presumes and the inventory refutes.
+    """Return a question's presumptions that the inventory refutes.
 
     near: include colours like those in view, which a viewer may take for another false premise, though they refute
     nothing.

@@ -1,4 +1,4 @@
-"""Values that a scene family is made of, and builders that all families share.
+"""Define the values that make a scene family, and builders that families share.
 
 A family file defines one `FAMILY`, put together by `parts.family`. Its functions are pure: `draw` and `word` take the
 generator they draw from, `build` and `outcome` draw nothing, so that a stored spec always gives the same scene.
@@ -92,7 +92,7 @@ class Box:
 
 @dataclass(frozen=True)
 class View:
-    """Where the camera looks from. Distance and aim are fitted (`camera.fit_camera`).
+    """The camera's direction. Distance and aim are fitted (`camera.fit_camera`).
 
     Azimuth 90 looks along +y (from the front), elevation is negative when looking down: MuJoCo's free camera.
     """
@@ -104,7 +104,7 @@ class View:
 
 @dataclass(frozen=True)
 class Inventory:
-    """What a viewer can name; ill-posed questions are made from it (`wording.py`).
+    """The things a viewer can name; ill-posed questions use it (`wording.py`).
 
     colours: every colour in view. objects: every noun, singular ('ball', 'ramp'). things: phrases that single one out
     ('red ball', 'wooden ramp'), which occlusion scenes are asked about; at least three of them.
@@ -219,7 +219,7 @@ class Family:
     params: a frozen dataclass of plain values with units in the names.
     draw(rng, longer=False): parameters of one scenario.
     build(params, physics): the scene. Draws nothing.
-    outcome(motion, params): what a run comes to.
+    outcome(motion, params): the run's outcome.
     word(params, rng): the question and its companions.
     questions: the templates that `word` fills; no other family has the same.
     observe(frames, question): the answer of one who sees only the 5 FPS frames (N, 360, 480, 3) RGB and the question;

@@ -1,4 +1,4 @@
-"""Simulation of a built scene to a trajectory, and replay of it to poses."""
+"""Simulate a built scene to a trajectory, and replay it to poses."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def initial_velocity(model: mujoco.MjModel, velocity: Mapping[str, Sequence[float]]) -> np.ndarray:
-    """Return qvel at the start, (nv,): a number a freedom, three a soft body."""
+    """Return the initial qvel, (nv,), from velocities by body (3 numbers if soft)."""
     qvel, soft = np.zeros(model.nv), flexes(model)
     for body, values in velocity.items():
         if body in soft:
@@ -67,7 +67,7 @@ def replay(model: mujoco.MjModel, qpos: np.ndarray, physics: Physics) -> Motion:
 
 
 def swept_points(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
-    """Return corners of boxes of all that moves, over a trajectory, (N, 3), by eights."""
+    """Return box corners of all that moves, over a trajectory: (N, 3), in eights."""
     import mujoco
 
     data = mujoco.MjData(model)

@@ -1,4 +1,4 @@
-"""Camera and occluder, both fitted, neither placed by hand."""
+"""Fit camera and occluder to a scene; neither is placed by hand."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class Occluder:
 
 @dataclass(frozen=True)
 class Closing:
-    """How a control ends: from this frame on an occluder stands before its outcome."""
+    """A control's end: from this frame on an occluder stands before the outcome."""
 
     frame: int
     occluder: Occluder
@@ -146,7 +146,7 @@ def fit_occluder(camera: Camera, cover: Box) -> Occluder:
 
 
 def fit_shot(view: View, points: np.ndarray, cover: Box | None) -> tuple[Camera, Occluder | None]:
-    """Return a camera, and an occluder placed by it that it has in frame."""
+    """Fit a camera, and an occluder in its frame; return both."""
     camera, occluder = fit_camera(view, points), None
     if cover is None:
         return camera, None

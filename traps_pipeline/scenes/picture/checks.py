@@ -1,4 +1,4 @@
-"""Pixel evidence: of a geom, past an occluder, between two worlds."""
+"""Measure pixels: of a geom, past an occluder, between two worlds."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ SAMPLED_FPS = 5  # models are shown this rate (docs/spec.md 3.1)
 
 
 def last_sampled(n_frames: int, fps: int, count: int = 3) -> list[int]:
-    """Return indices of the last frames that a 5 FPS sample has."""
+    """Return indices of the last frames of a 5 FPS sample."""
     return list(range(0, n_frames, fps // SAMPLED_FPS))[-count:]
 
 
 def least_visible(renderer: Renderer, qpos: np.ndarray, groups: Sequence[tuple[tuple[str, ...], float]]) -> list[float]:
-    """Return the least pixels of each group of geoms in any of some control frames."""
+    """Return each geom group's minimum of visible pixels over some control frames."""
     geoms = sorted({name for names, _ in groups for name in names})
     counts = renderer.visible_pixels(qpos, geoms)
     return [float(counts[:, [geoms.index(n) for n in names]].sum(axis=1).min()) for names, _ in groups]
@@ -44,13 +44,13 @@ class PastOccluder:
 
 
 def past_occluder(renderer: Renderer, qpos: np.ndarray, decisive: Sequence[str], hidden: Sequence[str]) -> PastOccluder:
-    """Return what is seen past the occluder of some geoms, by segmentation."""
+    """Return the visible pixels of some geoms past the occluder, by segmentation."""
     counts = renderer.visible_pixels(qpos, [*decisive, *hidden], occluder=True)
     return PastOccluder(counts[:, : len(decisive)].sum(axis=1), counts[:, len(decisive) :].sum(axis=1))
 
 
 def seen_moving(pixels: np.ndarray, places: np.ndarray, *, least_px: float, step_px: float) -> int:
-    """Count the steps in which a body is visible in both frames and moves so far.
+    """Count the steps of at least `step_px` whose body is visible in both frames.
 
     pixels (F,), places (F, 2) in pixels.
     """
@@ -84,7 +84,7 @@ def closing_frames(
 ) -> Iterator[np.ndarray]:
     """Yield a trajectory (F, nq) with its closing board, and the void's if `occluder`.
 
-    board: of each row, where the board is; once it stands it is drawn in place of the void's own.
+    board: offset of the board in each row; once it stands it is drawn in place of the void's own.
     """
     for row, offset in zip(qpos, board, strict=True):
         stands = offset == LANDED
@@ -94,7 +94,7 @@ def closing_frames(
 def ablation_pixels(
     renderer: Renderer, qpos: np.ndarray, geoms: Sequence[str], void: Iterable[np.ndarray] | None = None
 ) -> int:
-    """Return how many void pixels change when geoms are taken away; 0: no trace shows.
+    """Return the number of void pixels that change without some geoms (0: no trace).
 
     void: the frames with them, if they are drawn already.
     """

@@ -1,4 +1,4 @@
-"""The board that closes a control: it falls into the picture and stands.
+"""Animate the board that closes a control: it falls into the picture and stands.
 
 A camera that looks down on the scene sees it slide in from the side instead. It comes just in front of where a void's
 own board stands, in control and void alike: neither that a board comes nor when tells the sides of an occlusion pair
@@ -25,7 +25,7 @@ Coming = list[Offset | None]  # of each frame: how far from its place (m) the bo
 
 
 def coming_board(closing: Closing | None, camera: Camera, n_frames: int, fps: float) -> Coming:
-    """Return where the board is in every frame of a clip that it closes."""
+    """Return the board's offset (m) in every frame of the clip, None before it comes."""
     if closing is None:
         return [None] * n_frames
     way = _way(closing.occluder, camera)

@@ -1,4 +1,4 @@
-"""Frames of a trajectory, drawn by MuJoCo at twice the size and averaged 2x2.
+"""Render a trajectory's frames with MuJoCo at twice the size, averaged 2x2.
 
 One off-screen GL context lives as long as the process; each `Renderer` owns one `MjrContext` for its model.
 """
@@ -91,8 +91,8 @@ def _make_floors_finite(model: mujoco.MjModel, camera: Camera) -> None:
 class Renderer:
     """Context manager that draws a model from a camera: uint8 RGB, (360, 480, 3).
 
-    Frames are (720, 960, 3) of a model whose look is as fine as that. supersample: by how much the drawing is larger; 1
-    takes a quarter of the time, where edges need not be smooth.
+    Frames are (720, 960, 3) of a model whose look is as fine as that. supersample: factor by which the drawing is
+    larger; 1 takes a quarter of the time, where edges need not be smooth.
     """
 
     def __init__(self, model: mujoco.MjModel, camera: Camera, *, supersample: int = SUPERSAMPLE) -> None:

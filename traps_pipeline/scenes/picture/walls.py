@@ -1,4 +1,4 @@
-"""Walls that are not drawn, and the drawn edges by which a viewer knows of them.
+"""Find walls that are not drawn, and the drawn edges that reveal them.
 
 A thing that turns round where nothing is to be seen breaks the physics that a viewer can reckon with. So a wall that
 is not drawn (a pane that would tint what is behind it) must have edges that are. A pane before the scene that lies

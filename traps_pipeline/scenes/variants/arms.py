@@ -1,4 +1,4 @@
-"""Arms: further clips and questions that take one shortcut away (docs/arms.md).
+"""Define arms: clips and questions that take one shortcut away (docs/arms.md).
 
 A shortcut tells control from void without looking at what happens: an occluder in the first frame, a short clip, the
 words of a question. In an arm the shortcut points the wrong way, and a certificate says that it may: what must be
@@ -91,7 +91,7 @@ class Scenario:
 
 @dataclass(frozen=True)
 class Take:
-    """What an arm shows, and the numbers behind its certificate."""
+    """The frames that an arm shows, and the numbers behind its certificate."""
 
     frames: list[np.ndarray]
     evidence: Mapping[str, Any]

@@ -1,4 +1,4 @@
-"""Graded cuts of controls, where one answer is as likely as wanted.
+"""Cut controls where the commonest answer has a set probability (graded cuts).
 
 The void of a pair is cut where nobody can know, an arm where everybody should. Here the cuts of a family spread over
 all that is between, and the certificate is the distribution over answers itself.

@@ -1,4 +1,4 @@
-"""Variations of how a scenario is asked and shown, one thing changed in each.
+"""Define variations: a scenario asked or shown with one thing changed.
 
 docs/hypotheses.md says what each is for. What varies the question or the way it is put shows the pair's own clips; what
 varies the occluder is drawn and certified here. An occluder that lets the outcome through makes no void, and is not
@@ -103,7 +103,7 @@ def _offered(scenario: Scenario) -> Take:
 
 @dataclass(frozen=True)
 class Look:
-    """Look of an occluder. colour: RGB or None, alpha: 1 is opaque, wide: factor."""
+    """An occluder's look. colour: RGB or None; alpha: 1 is opaque; wide: a factor."""
 
     colour: tuple[float, float, float] | None = None
     alpha: float = 1.0

@@ -1,4 +1,4 @@
-"""Clips of a scenario, replayed from its frozen trajectory without simulation.
+"""Render a scenario's clips from its frozen trajectory, without simulation.
 
 Occluder: the void is the same replay with the occluder drawn. Truncation: the void is a prefix of the control. A
 board comes before a control that closes, and before its void if an occluder makes it; the twin's clip never has one.

@@ -1,4 +1,4 @@
-"""Outcomes: a compiled scene, what its run comes to, and the geoms that decide it."""
+"""Compile scenes, read their outcomes, and name the geoms that decide these."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Rejected(ValueError):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a run comes to, before it is certified.
+    """The outcome of a run, before it is certified.
 
     label: None if it is undecided at the end. commit_frame: first frame from which the label holds to the end (the
     number of frames if it is undecided). margin_m: distance (m) of the end from the nearest other outcome. in_order,

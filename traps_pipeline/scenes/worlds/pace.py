@@ -1,4 +1,4 @@
-"""Pace: how long a clip is, and when it closes.
+"""Decide how long a clip is, and when it closes.
 
 An outcome settles neither at a clip's beginning nor at its very end. A scene is simulated for as long as its family
 says. Where the outcome settles early the clip ends earlier, void and control alike, so that its length tells nothing of
@@ -40,7 +40,7 @@ def settles_share(commit_frame: int, n_frames: int) -> float:
 
 
 def out_of_pace(share: float) -> str | None:
-    """Return what is wrong with an outcome that settles after a share of a clip."""
+    """Return why an outcome settles too early or late in a clip, in words."""
     if share < EARLIEST_SHARE:
         return f"the outcome settles after {share:.0%} of the clip, {EARLIEST_SHARE:.0%} is wanted"
     if share > LATEST_SHARE:

@@ -1,4 +1,4 @@
-"""Camera and occluder of a pair, fitted to both worlds, whichever is the control."""
+"""Fit a pair's camera and occluder to both worlds, whichever is the control."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scenarios as data: resolved records of `scene_specs/`, and their trajectories."""
+"""Define the records of `scene_specs/`, and read and write their trajectories."""
 
 from __future__ import annotations
 
@@ -194,7 +194,7 @@ class SceneSpec(BaseModel):
 
 
 def physics_record(physics: Physics) -> dict[str, Any]:
-    """Return `kit.Physics` as a record has it: without a speed that is the usual one."""
+    """Return `kit.Physics` as records store it, without a default speed."""
     return {name: value for name, value in asdict(physics).items() if name != "speed" or value != 1.0}
 
 
