@@ -36,7 +36,7 @@ class Proxy:
 
     @property
     def problem(self) -> str | None:
-        """Why no call can go through this proxy; None if one may."""
+        """The reason why no call can use this proxy; None if calls can."""
         if not _is_address(self.url):
             return f"{self.variable} is no address of a proxy: write it as http://HOST:PORT, or unset it"
         if urlsplit(self.url).scheme in PROXY_SCHEMES:

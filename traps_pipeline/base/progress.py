@@ -53,7 +53,7 @@ class Traffic:
 
     @property
     def per_second(self) -> float:
-        """Answers a second since the first call."""
+        """Answers per second since the first call."""
         return self.done / max(time.monotonic() - self.began, 1e-9)
 
     def latency_s(self, share: float) -> float:

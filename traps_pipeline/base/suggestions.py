@@ -17,6 +17,6 @@ def nearest(word: str, candidates: Iterable[str]) -> str | None:
 
 
 def did_you_mean(word: str, candidates: Iterable[str]) -> str:
-    """Return a sentence's end that suggests the nearest known word, or nothing."""
+    """Return a clause that suggests the nearest known word; empty if none is near."""
     near = nearest(word, candidates)
     return f"; did you mean {near}?" if near else ""

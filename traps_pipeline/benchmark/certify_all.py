@@ -43,7 +43,7 @@ def certify_all(
     fresh: bool = False,
     report: Callable[[str], None] = lambda _: None,
 ) -> tuple[list[Verdict], list[str]]:
-    """Return verdicts on a folder's records, and all problems, scenarios' ones first.
+    """Return verdicts on a folder's records, and problems, scenarios' before others.
 
     Verdicts are cached in `cache_folder` by record and code, so that an interrupted call resumes.
     """

@@ -1,4 +1,4 @@
-"""Sample a benchmark with so many scenarios per family, and check it as a whole."""
+"""Sample a benchmark with set numbers of scenarios, and check it as a whole."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def sample_benchmark(
     """Sample a benchmark into `out`: records, trajectories, and `benchmark.yaml`.
 
     It has a canary of its own. Existing records of the same seed and numbers stay: an interrupted sampling resumes.
-    Raises TrapsError if a family cannot be filled, or not with a difficulty.
+    Raises TrapsError if a family cannot be filled, or does not support a setting of the difficulty.
     """
     require_difficulty(counts, difficulty)
     with kept_workers():
@@ -76,7 +76,7 @@ def sample_benchmark(
 
 
 def problems(specs: Sequence[SceneSpec], counts: Mapping[str, int] | None = None) -> list[str]:
-    """Return problems of records as a whole (against `counts`), one sentence each."""
+    """Check all records together (numbers against `counts`); return problems in words."""
     families: defaultdict[str, list[SceneSpec]] = defaultdict(list)
     for spec in specs:
         families[spec.family].append(spec)

@@ -63,7 +63,7 @@ class Correction(BaseModel):
 
 @dataclass(frozen=True)
 class Scenario:
-    """A scenario after corrections: its changes, and its record (None if added).
+    """A scenario with its corrections; `record` is the released one, None if added.
 
     `params` is not None if the scene itself must be resolved again; the scene_specs stage does that.
     """
@@ -78,7 +78,7 @@ class Scenario:
 
     @property
     def released(self) -> SceneSpec | None:
-        """The released record, None if added. Raises TrapsError for a line that is none."""
+        """The released record, None if added. Raises TrapsError for an invalid line."""
         return self.record.spec if isinstance(self.record, ReleasedLine) else self.record
 
     @property
@@ -103,7 +103,7 @@ _OfFamily = TypeVar("_OfFamily", bound=_HasFamily)
 
 
 def apply_words(spec: SceneSpec, words: Mapping[str, Any], where: str) -> SceneSpec:
-    """Return a record with other words and checked labels. Raises TrapsError."""
+    """Return a record with corrected words. Raises TrapsError if labels do not fit."""
     if not words:
         return spec
     record = spec.model_dump(mode="json") | {name: value for name, value in words.items() if name != "answer"}

@@ -1,4 +1,4 @@
-"""Append review decisions to the corrections, also of several reviewers at once.
+"""Append review decisions to the corrections; reviewers may write concurrently.
 
 The append-only file is the only store. A decision is checked by folding it over all earlier ones, written at once and
 synced to disk before it is confirmed; so a kill loses no confirmed decision, and concurrent reviewers append one after

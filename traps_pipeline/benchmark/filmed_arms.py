@@ -56,7 +56,7 @@ class ArmResult:
 
 @dataclass(frozen=True)
 class Job:
-    """A scenario's arms to render, by arm with its clip; trajectories are (F, nq)."""
+    """A scenario's arms to render: clip paths by arm, and trajectories (F, nq)."""
 
     spec: SceneSpec
     qpos: np.ndarray

@@ -22,8 +22,8 @@ FEWEST = 100  # records of a family; fewer cannot tell such a leakage from chanc
 class OutcomeLeakage:
     """Accuracy of predicting the outcomes.
 
-    best: of the better of two cross-validated classifiers of the states, which favours them; prior: of always giving
-    the commonest outcome.
+    best: accuracy of the better of two cross-validated classifiers of the states, which favours them; prior: accuracy
+    of always giving the commonest outcome.
     """
 
     best: float

@@ -29,9 +29,9 @@ Job = TypeVar("Job")
 class Filming(Generic[Job]):
     """The work to do for rows of scene_specs.
 
-    name: of the work, the same on every host. missing: returns the rows with missing files. files: the study's files of
-    a finished row. job: returns what to draw for a row (None: nothing), after existing files were fetched. draw: draws
-    it, in a process of its own, and returns the number of new frames.
+    name: the work's name, the same on every host. missing: returns the rows with missing files. files: the study's
+    files of a finished row. job: returns what to draw for a row (None: nothing), after existing files were fetched.
+    draw: draws it, in a process of its own, and returns the number of new frames.
     """
 
     name: str

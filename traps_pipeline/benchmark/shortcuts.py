@@ -1,4 +1,4 @@
-"""Measure how well superficial cues (wording, length, file size) tell the side.
+"""Measure how well superficial cues (wording, length, file size) predict the side.
 
 A model that abstained on such a cue alone would score without having seen anything, so a reader must know their size.
 They are reported beside the observer and are no gate: a cut clip *is* shorter.

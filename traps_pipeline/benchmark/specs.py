@@ -98,7 +98,7 @@ def _wording(scenario: Scenario, params: Mapping[str, Any]) -> Wording:
 
 
 def wording_of(family_name: str, seed: int, scenario_id: str, params: Mapping[str, Any]) -> Wording:
-    """Return the family's words for parameters, fixed for a scenario.
+    """Return the question and labels of a scenario, which seed and id determine.
 
     Raises ValueError or TypeError if the family has no such parameters.
     """
@@ -212,7 +212,7 @@ def corrections_version(workspace: Workspace, category: str) -> str:
 
 
 def void_from_s(spec: SceneSpec) -> float:
-    """Return the time (s) of hiding (occluder) or of the cut (truncation) in the void."""
+    """Return the time (s) from which the void's occluder or its cut hides the outcome."""
     frame = spec.void["hidden_from_frame"] if spec.void_kind == "occluder" else spec.void["cut_frame"]
     return frame / spec.physics["fps"]
 
@@ -245,7 +245,7 @@ def _relative(path: Path, *roots: Path) -> str:
 
 
 def spec_of(row: Mapping[str, Any]) -> SceneSpec:
-    """Return the record of a row of scene_specs."""
+    """Return the record that a row of scene_specs holds."""
     record = {name: row[name] for name in SceneSpec.model_fields}
     for name in (*_AS_JSON, "evidence"):
         record[name] = json.loads(record[name])

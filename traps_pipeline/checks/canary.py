@@ -58,7 +58,7 @@ CANARY = Table("canary", CanaryRow, partition_by=(), key=("model", "item_id", "e
 
 
 def canary_items(workspace: Workspace) -> list[dict[str, Any]]:
-    """Return each dataset's items of smallest digest. Raises TrapsError without items."""
+    """Return each dataset's items of smallest digest. Raises TrapsError if none exist."""
     items = workspace.tables.read_all(ITEMS, dataset=DATASETS).to_dict("records")
     if not items:
         raise TrapsError("canary: no items yet; materialize items first")

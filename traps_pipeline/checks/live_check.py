@@ -85,7 +85,7 @@ def _studio() -> Studio:
 
 
 def requests_of(entry: Entry) -> dict[str, Request]:
-    """Return the calls to an entry by name; they hold the time, so none is reused."""
+    """Return an entry's test calls by name, stamped with the time so none is reused."""
     now = datetime.now(UTC).isoformat()
     if isinstance(entry, JudgeEntry):
         tasks: tuple[Task, ...] = ("abstention", "correctness")
@@ -153,7 +153,7 @@ def reach(entry: Entry, account: Account) -> ServerCheck:
 
 
 def nobody_at(address: str, why: str = "the cause stands above") -> str:
-    """Return the sentence about an address without a server."""
+    """Return the error message for an address at which no server listens."""
     is_here = is_loopback(urlsplit(address).hostname or "")
     remedy = "start the server there" if is_here else "look at this machine's network and proxy variables"
     return f"nothing answers at {address} ({why}): {remedy}, or mend its `base_url`"
@@ -381,7 +381,7 @@ def _outcome(row: Row) -> Outcome:
 
 
 def require_sound(results: Sequence[LiveResult]) -> None:
-    """Raise TrapsError that names every problem of every entry."""
+    """Raise TrapsError naming all problems of all entries, if there are any."""
     wrong = [f"{result.entry.id}: {problem}" for result in results for problem in result.problems]
     if wrong:
         more = "nothing was rendered and nothing was judged; --no-preflight runs all the same"

@@ -171,7 +171,7 @@ class Commands:
 
 
 def print_failure(text: str, *, as_json: bool = False) -> None:
-    """Print an error to standard error: lines wrapped between words, or a line of JSON."""
+    """Print an error to standard error, as wrapped lines or as a line of JSON."""
     if as_json:
         from datetime import UTC, datetime
 

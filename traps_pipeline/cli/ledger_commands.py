@@ -1,4 +1,4 @@
-"""Commands that export or import a study's ledger, move the study, or release money."""
+"""Export or import a study's ledger, move a study, or release money."""
 
 from __future__ import annotations
 

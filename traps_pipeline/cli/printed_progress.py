@@ -26,7 +26,7 @@ _OF_CALLS = 58  # columns of the live table beside the name
 
 
 def make_progress(form: Form = "auto", stream: TextIO | None = None) -> PrintedProgress:
-    """Return and start the progress of a form; `auto` is live on a terminal."""
+    """Start and return a progress printer; `auto` is live on a terminal, else text."""
     out: TextIO = stream or sys.stderr or Path(os.devnull).open("w")  # noqa: SIM115 - None where closed (`2>&-`)
     is_terminal = out.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown")
     kind = LiveProgress if form == "auto" and is_terminal else PrintedProgress
@@ -36,9 +36,9 @@ def make_progress(form: Form = "auto", stream: TextIO | None = None) -> PrintedP
 
 
 class PrintedProgress(Progress):
-    """Progress as text: a line per stage that called, rendered or took long.
+    """Progress as text: a line per stage that made calls, rendered or took long.
 
-    Another line stands for all others, and one comes every 30 s.
+    One more line sums up all other stages; the running stage prints a line every 30 s.
     """
 
     beat_s = HEARTBEAT_S
@@ -111,7 +111,7 @@ class PrintedProgress(Progress):
 
 
 class JsonProgress(PrintedProgress):
-    """Progress as JSON lines: `begin` and `end` of stages, `progress`, `note`, `finish`."""
+    """Progress as JSON lines: `begin`, `end` (stages), `progress`, `note`, `finish`."""
 
     def __init__(self, stream: TextIO) -> None:
         super().__init__(stream)

@@ -1,4 +1,4 @@
-"""Reach an object store (S3, Google, Azure) by obstore; its errors are sentences."""
+"""Access an object store (S3, Google, Azure) with obstore; reword its errors."""
 
 from __future__ import annotations
 

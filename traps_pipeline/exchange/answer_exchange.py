@@ -192,7 +192,8 @@ def _line(request: Request, out: Path) -> dict[str, Any]:
 class AnswerContext:
     """The context that a file of answers by item lacks.
 
-    model: of the experiment (None: its only one); run; key: of the held-out set whose opaque names the file has.
+    model: a model of the experiment (None: its only one); run; key: key of the held-out set whose opaque names the
+    file has.
     """
 
     model: str | None = None

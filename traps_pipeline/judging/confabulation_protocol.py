@@ -1,4 +1,4 @@
-"""The protocol of confabulation's labels (`assets/confabulation.yaml`): what is sampled, and which judge labels it.
+"""Read the confabulation protocol (`assets/confabulation.yaml`): samples, judges.
 
 Nothing here asks a judge: `traps status` reads the protocol's digest, and the study's partitions follow its models.
 """
@@ -50,7 +50,7 @@ class Validation(BaseModel):
 
 
 class Protocol(BaseModel):
-    """The contents of `assets/confabulation.yaml`: each model's sample, each panel's judge, and the judge's prompt."""
+    """The contents of `assets/confabulation.yaml`: models' samples and panels' judges."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     n: int = Field(ge=1, description="failures per model; all if there are fewer")
@@ -73,7 +73,7 @@ class Protocol(BaseModel):
 
 @cache
 def load_protocol(path: Path = PROTOCOL_FILE) -> Protocol:
-    """Return the protocol. Raises TrapsError naming the file and the wrong field, model or judge."""
+    """Return the protocol. Raises TrapsError naming file and field, model or judge."""
     protocol = parse_yaml_model(Protocol, read_yaml(path), path)
     with within(path):
         runs = {model: get_model(model).runs for model in protocol.models}
@@ -92,7 +92,7 @@ def load_protocol(path: Path = PROTOCOL_FILE) -> Protocol:
 
 
 def protocol_digest(panel: str) -> str:
-    """Return the digest of everything, except the answers, that the labels of a study with this panel depend on."""
+    """Return the digest of all inputs of a panel's labels except the answers."""
     protocol = load_protocol()
     judge = protocol.judge(panel)
     call = [judge.id, judge.provider_id, judge.params, SCHEMA, prompt(f"judge_{TASK}"), VOID_KINDS] if judge else None

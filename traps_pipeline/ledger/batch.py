@@ -54,7 +54,7 @@ class Batch:
         return reserved
 
     def spend(self, participant: str, usd: float) -> None:
-        """Count dollars as spent; a negative amount is taken back."""
+        """Add dollars to a participant's spending; a negative amount is a refund."""
         self.more_usd[participant] = self.more_usd.get(participant, 0.0) + usd
         if "spent" in self.__dict__:
             self.spent[participant] = self.spent.get(participant, 0.0) + usd

@@ -44,7 +44,7 @@ GiveUp = Callable[[], bool]  # returns whether to stop waiting
 
 
 def wait_forever() -> bool:
-    """Return False: wait without end."""
+    """Return False, so that a wait has no limit."""
     return False
 
 

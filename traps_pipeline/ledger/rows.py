@@ -56,7 +56,7 @@ _CHECKS: dict[str, Callable[[Any], bool]] = {
 
 
 def heal(row: dict[str, Any]) -> list[str]:
-    """Replace impossible values by unknown ones, in place; return the fields' names."""
+    """Replace impossible values by None, in place; return the names of these fields."""
     healed = []
     for name, fits in _CHECKS.items():
         value = row.get(name)

@@ -177,7 +177,7 @@ UNSEEN = "log-odds of void above the mid threshold, by a probe that has not seen
 
 @dataclass(frozen=True, kw_only=True)
 class ItemScoreRow(Extracted):
-    """What a model's states and its output say of one item, beside its verdicts."""
+    """An item's scores from a model's states and output, beside its verdicts."""
 
     item_id: shared.ItemId
     dataset: shared.Dataset
@@ -196,7 +196,7 @@ ITEM_SCORES = Table("item_scores", ItemScoreRow, partition_by=("model", "prompt"
 
 @dataclass(frozen=True, kw_only=True)
 class SentenceRow(Extracted):
-    """How likely an abstention is after an item's prompt, beside the model's answer."""
+    """Log-probabilities of an abstention and of the model's answer, for an item."""
 
     item_id: shared.ItemId
     dataset: shared.Dataset

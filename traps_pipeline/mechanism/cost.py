@@ -71,7 +71,7 @@ class Cost:
 
 
 def passes_inside(settings: MechanismSettings, datasets: Sequence[str], scenarios: Mapping[str, int]) -> list[Work]:
-    """Return passes for states, sentences, random weights and patching.
+    """Return the forward passes of states, sentences, random weights and patching.
 
     scenarios: their number by taxonomy.
     """

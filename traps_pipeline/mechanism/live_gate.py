@@ -31,7 +31,7 @@ Threshold = Literal["mid", "J", "conformal"]
 class Gate:
     """A probe of a layer's states, whose score above the threshold means abstain.
 
-    pooling: of the states that it was fitted on.
+    pooling: the pooling of the states that it was fitted on.
     """
 
     layer: int

@@ -30,7 +30,7 @@ Percentile = Annotated[float | None, "95 % percentile interval"]
 
 @dataclass(frozen=True, kw_only=True)
 class Extracted:
-    """Columns of what is made from one model's states under one prompt."""
+    """Columns of rows that are computed from a model's states under one prompt."""
 
     model: shared.Model
     prompt: Prompt

@@ -125,7 +125,7 @@ def probed_item(workspace: Workspace, model: LocalModel, spec: MediaSpec, row: M
 
 
 def unsound_layers(workspace: Workspace, cell: StatesCell, n_layers: int) -> list[int]:
-    """Return which of the first and last layers contain a number that is not finite."""
+    """Return which of the first and last layers contain non-finite numbers."""
     from traps_pipeline.mechanism.hidden_states import read_layer
 
     folder = workspace.bring_folder(states_folder(workspace, cell))

@@ -71,7 +71,7 @@ class Strength:
 
 
 def sign_of(signs: str, side: str) -> int:
-    """Return whether a policy adds (1) or subtracts (-1) on a side."""
+    """Return 1 if a policy adds the direction on a side, -1 if it subtracts it."""
     return {"plus": 1, "minus": -1}.get(signs, 1 if side == "control" else -1)
 
 
@@ -211,7 +211,7 @@ def wanted_steered(
     cell: SteeringCell,
     directions: Mapping[str, Directions],
 ) -> list[SteeredQuestion]:
-    """Return a cell's calls, those with the same prompt together, to share a clip."""
+    """Return a cell's calls, grouped by prompt so that answers share a clip."""
     settings = workspace.mechanism
     assert settings.steering is not None, "an experiment without steering has no steering cells"
     items = workspace.tables.read(ITEMS, {"dataset": cell.dataset})
@@ -258,7 +258,7 @@ def steered_request(
 
 
 def shared_item(item: Mapping[str, Any]) -> str:
-    """Return an item's id in the ledger, one for a taxonomy's shared controls."""
+    """Return an item's ledger id; a taxonomy's datasets share the ids of controls."""
     dataset = taxonomy_of(item["dataset"]) if item["side"] == "control" else item["dataset"]
     return f"{dataset}:{item['scenario_id']}:{item['side']}"
 

@@ -68,7 +68,7 @@ class AccountBudget:
             return dict(self._spent)
 
     def begin(self, known_usd: float) -> None:
-        """Add this study's spending through the account that the folder lacks.
+        """Record this study's earlier spending that the account's folder lacks.
 
         The study spent it before it named the folder, or the file was lost. known_usd: dollars by the study's own
         ledgers and journal.

@@ -16,7 +16,8 @@ ROUNDING = 1e-3  # above 0, which some providers round a certain token to
 def of_chat(logprobs: Any) -> dict[str, float]:
     """Return the alternatives for the first token that contains a letter or a digit.
 
-    Quotes, stars and white space begin no answer. logprobs: of a choice of OpenAI's chat API; empty if missing.
+    Quotes, stars and white space begin no answer. logprobs: the field of a choice in OpenAI's chat API; the result is
+    empty without it.
     """
     for place in _objects(logprobs.get("content")) if isinstance(logprobs, dict) else []:
         if any(character.isalnum() for character in str(place.get("token"))):

@@ -54,7 +54,7 @@ class Participant:
 
 
 def allow_connections(count: int) -> None:
-    """Raise the open-file limit for so many connections. Raises TrapsError if denied."""
+    """Increase the open-file limit for these connections. Raises TrapsError if denied."""
     needed = count + FILES
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft == resource.RLIM_INFINITY or soft >= needed:
@@ -262,5 +262,5 @@ def ledger_row(
 
 
 def when_asked(row: Row) -> Row:
-    """Return when a row's call was asked, as columns of every table from a ledger."""
+    """Return the epoch and time of a row's call, columns of all tables from a ledger."""
     return {"epoch": row["epoch"], "created_at": datetime.fromisoformat(row["created_at"])}

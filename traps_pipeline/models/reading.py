@@ -1,7 +1,8 @@
 """Interpret a ledger row: an answer, or a text that is none (docs/models.md).
 
 The ledger keeps what a provider sent; the responses table comes from this interpretation, so that improving it asks
-nothing again. A text that is no answer has an outcome of its own and reaches no judge, who would take it for modesty.
+nothing again. A text that is no answer has an outcome of its own and reaches no judge, who would take it for an
+abstention.
 """
 
 from __future__ import annotations

@@ -112,7 +112,7 @@ def _belief(answer: str | None, request: Request) -> dict[str, float]:
 
 
 class ReferenceBackend:
-    """A player of one strategy; with `faults` it fails like a bad provider."""
+    """A backend that plays one strategy; with `faults` it fails like a bad provider."""
 
     def __init__(self) -> None:
         self._attempts: Counter[str] = Counter()

@@ -95,7 +95,7 @@ class Prices(BaseModel):
 
 
 class Groups(BaseModel):
-    """The paper's groups of models, by which tables select."""
+    """A model's groups in the paper, by which tables select rows."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     family: str
@@ -188,7 +188,7 @@ class Entry(BaseModel):
 
 
 class ModelEntry(Entry):
-    """One model configuration."""
+    """One model of the registry, with the settings that decide its answers."""
 
     backend: Literal["reference", "observer", "rule", "api", "local"] = Field(  # pyright: ignore[reportIncompatibleVariableOverride]
         description="what answers: a strategy, a server, or a checkpoint on this machine"

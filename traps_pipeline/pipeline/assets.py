@@ -18,10 +18,10 @@ OWNERS = ["team:benchmark"]
 
 
 class WorkspaceResource(dg.ConfigurableResource):
-    """The study that a run works in: the one whose partitions are loaded.
+    """The workspace of a run: that of the study whose partitions are loaded.
 
-    It is no configuration. A run keeps its configuration, and done again in a copy of the study it would work in the
-    study that was copied.
+    It is no run configuration. Dagster stores that with a run, so a run repeated in a copy of the study would write to
+    the original.
     """
 
     _steps: ExitStack = PrivateAttr(default_factory=ExitStack)

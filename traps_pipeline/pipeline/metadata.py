@@ -44,7 +44,7 @@ def visible_metadata(value: Any) -> Any:
 
 
 def tally_metadata(stage: Stage, tally: Tally) -> dict[str, int]:
-    """Return a run's work on a partition, one number an entry, since Dagster plots numbers.
+    """Return a run's work on a partition, one number per entry for Dagster's plots.
 
     Zeros are left out where a stage never does such work.
     """

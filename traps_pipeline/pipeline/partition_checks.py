@@ -79,7 +79,7 @@ class StageChecks:
         yield from self.of_made(key, {CURRENT: {"not made": str(error), REACHED: isinstance(error, BudgetReached)}})
 
     def of_fresh(self, key: str | None) -> Iterator[dg.AssetCheckEvaluation]:
-        """Evaluate the checks that a partition passes which is fresh, so that this run does not build it.
+        """Evaluate the passing checks of a fresh partition, which this run does not build.
 
         Dagster awaits an evaluation from the run, and would say that the check was skipped, or failed to execute.
         """

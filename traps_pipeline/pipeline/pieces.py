@@ -31,8 +31,9 @@ _DATE = (1980, 1, 1, 0, 0, 0)  # date of every member, so that equal pieces give
 
 @dataclass(frozen=True)
 class Piece:
-    """One part of an asset. reads: the stages and sources whose versions decide whether it is rebuilt.
+    """One part of an asset.
 
+    reads: the stages and sources whose versions decide whether it is rebuilt.
     inputs: returns what it shows of them, as JSON; if their versions have changed, it is rebuilt only if this has, too.
     is_shared: whether all studies have the same; it is then built once per user.
     """

@@ -31,7 +31,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 @dataclass
 class WalkResult:
-    """A walk's problems in sentences, whether a budget ended it, and its seconds."""
+    """The problems of `materialize_stale`, whether a budget ended it, and its seconds."""
 
     problems: list[str] = field(default_factory=list)
     over_budget: bool = False

@@ -41,9 +41,9 @@ class _Strict(BaseModel):
 class Commitment(_Strict):
     """The public file.
 
-    draws: scenarios by family. look: the varied parts of the look, by family. difficulty: of every scene. seed: digest
-    of the seed. specs: digest of each record. made_with: machine and libraries, which may affect the arithmetic of a
-    draw.
+    draws: scenarios by family. look: the varied parts of the look, by family. difficulty: settings of every scene.
+    seed: digest of the seed. specs: digest of each record. made_with: machine and libraries, which may affect the
+    arithmetic of a draw.
     """
 
     format: Literal[1] = 1
@@ -77,8 +77,8 @@ def _sealed_spec(reveal: Reveal, spec: SceneSpec) -> str:
 def commit(benchmark: Path, commitment: Path, reveal: Path) -> Commitment:
     """Commit to a benchmark: write the public file, and the secret one for its owner.
 
-    benchmark: of `traps benchmark sample`. Raises TrapsError if the folder is no such benchmark, or of several seeds,
-    and if either file exists.
+    benchmark: folder that `traps benchmark sample` wrote. Raises TrapsError if the folder is no such benchmark, or of
+    several seeds, and if either file exists.
     """
     for path in (commitment, reveal):
         if path.exists():

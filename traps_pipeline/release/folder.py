@@ -53,8 +53,8 @@ class Options:
     """Options of a release.
 
     arms: published beside the pairs. held_out: the file of the key that gives items opaque names, beside which their
-    answers are written; None to publish the answers. date: of the publication, YYYY-MM-DD. commitment: a file of `traps
-    benchmark commit`.
+    answers are written; None to publish the answers. date: date of publication, YYYY-MM-DD. commitment: a file of
+    `traps benchmark commit`.
     """
 
     arms: Sequence[str] = ()

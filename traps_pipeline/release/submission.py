@@ -65,7 +65,7 @@ class SubmittedJudge(_Strict):
 class About(_Strict):
     """The contents of `submission.json`.
 
-    panel: name of the panel. prompts: version of each regime's. versions: of the code that made the tables. files:
+    panel: name of the panel. prompts: version of each regime's. versions: code versions of the tables. files:
     SHA-256 of each table.
     """
 

@@ -61,7 +61,7 @@ class TableReport:
 
     @property
     def published(self) -> bool:
-        """Whether the paper has anything to show here."""
+        """Whether the paper has such a table."""
         return bool(self.paper or self.recomputed)
 
     def tables(self, results: Results) -> list[PrintedTable]:
@@ -81,14 +81,14 @@ class TableReport:
         return [table for table in tables if results.is_study or table.name in self.recomputed]
 
     def as_printed(self) -> list[PrintedTable]:
-        """Return the paper's own tables, and figures that only its text states."""
+        """Return the paper's tables as printed, with figures that only its text states."""
         from traps_pipeline.report.printed_tables import in_text
 
         of_paper = _function(f"printed_tables.{self.paper}")() if self.paper else []
         return [*of_paper, *in_text(self.name)]
 
     def files(self, results: Results) -> dict[str, bytes]:
-        """Return files by path below `tables`; for the paper below `tables/published` and `tables/recomputed`."""
+        """Return files by path; the paper's are in `tables/published` and `recomputed`."""
         from traps_pipeline.report.writing import table_files
 
         if results.is_study:
@@ -101,8 +101,9 @@ class TableReport:
 
 @dataclass(frozen=True)
 class FigureReport:
-    """A figure. reads: the stages whose tables it uses; published: whether the paper prints its numbers.
+    """A figure.
 
+    reads: the stages whose tables it uses; published: whether the paper prints its numbers.
     frames: the frames of `Results` that it draws, if it is to be drawn again only when these change.
     """
 
@@ -133,7 +134,7 @@ class FigureReport:
         return f"{self.finding(results)} {self.doc}".strip()
 
     def inputs(self, results: Results) -> list[str]:
-        """Return the frames that it draws, and the words of those that were refused and of those who judged."""
+        """Return the frames that it draws, with refusals and judges, as text."""
         frames: list[pd.DataFrame] = [getattr(results, name) for name in self.frames]
         return [repr(rows.to_dict("split")) for rows in frames] + [repr(results.refused), results.judged_by]
 

@@ -28,8 +28,8 @@ class Layout:
     """Widths (inches) and texts of a pair.
 
     The defaults fit the width of a printed page, on which no text may be smaller than 6 points. header: room for the
-    words above its frames; letters: of a question per line; questions: maximum lines of each question; ids: whether its
-    scenario is named; moments: frames per clip; columns: pairs side by side.
+    words above its frames; letters: letters of a question per line; questions: maximum lines of each question; ids:
+    whether its scenario is named; moments: frames per clip; columns: pairs side by side.
     """
 
     block: float = 1.98

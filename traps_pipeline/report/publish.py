@@ -39,7 +39,9 @@ PAPER = "paper"  # the chapter of the paper's cards, which use only `assets/publ
 
 @dataclass(frozen=True)
 class Part:
-    """A card before it is built. reads: its stages; inputs: returns what it shows of them, as JSON; null for all."""
+    """A card before it is built.
+
+    reads: its stages; inputs: returns what it shows of them, as JSON; null for all."""
 
     chapter: str
     name: str

@@ -170,7 +170,7 @@ class PrintedTable:
 
     @property
     def content(self) -> str:
-        """All that it prints, links and exports: two tables with equal content give the same files."""
+        """All that it prints, links and exports; equal content gives equal files."""
         words = [getattr(self, field.name) for field in fields(self) if field.name not in ("rows", "trace")]
         return repr([*words, [*self.rows.columns], self.records])
 

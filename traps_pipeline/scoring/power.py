@@ -42,9 +42,9 @@ class Shares:
 class Precision:
     """The precision of a study.
 
-    width: of the 95 % interval of PECS. difference: the smallest one between two models with independent answers that a
-    test at 5 % detects in 80 % of studies; among_all: the same after Holm's correction over the pairs of all models, if
-    it is tested first. Answers to the same items are correlated, which makes both smaller. None if not even a
+    width: width of PECS's 95 % interval. difference: the smallest one between two models with independent answers that
+    a test at 5 % detects in 80 % of studies; among_all: the same after Holm's correction over the pairs of all models,
+    if it is tested first. Answers to the same items are correlated, which makes both smaller. None if not even a
     difference of 1 is detected so often.
     """
 

@@ -19,7 +19,7 @@ ALIKE_BELOW = 0.1  # share of differing bits below which two scenarios are near 
 
 @dataclass(frozen=True)
 class Neighbour:
-    """The most similar scenario, and the share of differing bits."""
+    """The most similar scenario, and the share of fingerprint bits that differ."""
 
     scenario_id: str
     distance: float

@@ -104,9 +104,9 @@ class Frames:
 class Media:
     """A clip as it is sent.
 
-    path: the mp4, or the zip of JPEGs; None for profile frames, which `sample` returns. sha256: of the sent content
-    (the mp4; the JPEGs one after another; pixels and times), wherever the clip lies. times_s: seconds into the clip.
-    fps: playing speed of a video; None for other profiles. size_bytes: of the file, or of the pixels.
+    path: the mp4, or the zip of JPEGs; None for profile frames, which `sample` returns. sha256: digest of the sent
+    content (the mp4; the JPEGs one after another; pixels and times), wherever the clip lies. times_s: seconds into the
+    clip. fps: playing speed of a video; None for other profiles. size_bytes: size of the file, or of the pixels.
     """
 
     profile: Profile

@@ -85,7 +85,7 @@ class Store(ABC):
 
     @abstractmethod
     def there(self, paths: Iterable[Path]) -> set[Path]:
-        """Return those of these paths that have a file, without looking at any content."""
+        """Return which of these paths have a file, without reading any content."""
 
     @abstractmethod
     def digests(self, paths: Iterable[Path]) -> dict[Path, str]:

@@ -151,7 +151,7 @@ class Workspace:
         return cls(scratch_of(place), study, place) if isinstance(place, str) else cls(place.absolute(), study)
 
     def copy_dagster_yaml(self, home: Path | None = None) -> None:
-        """Copy `assets/dagster.yaml` to Dagster's folder (default: the workspace's) if it has none.
+        """Copy `assets/dagster.yaml` to Dagster's folder (default: the workspace's), once.
 
         A study's own `dagster.yaml` may name another storage.
         """

@@ -95,7 +95,7 @@ class LocalModel:
 
     @cached_property
     def identity(self) -> dict[str, Any]:
-        """What decides hidden states besides the prompt (no paths, no device), for keys."""
+        """Inputs of hidden states besides the prompt (no paths, no device), for keys."""
         return {
             "checkpoint_digest": self.checkpoint.digest,
             "class": type(self.network).__name__,

@@ -306,7 +306,7 @@ def parquet_text(table: pa.Table) -> str:
 def data_script(name: str, version: str, content: Mapping[str, Any]) -> bytes:
     """Return the script of one data file, which calls the page's `TRAPS_DATA`.
 
-    version: of the whole site, so that a page never mixes files of two. content: JSON values; Parquet is
+    version: version of the whole site, so that a page never mixes files of two. content: JSON values; Parquet is
     `parquet_text`.
     """
     # "<" cannot close a script element, should a host inline the file; JSON knows the escape.

@@ -60,7 +60,7 @@ def landscape_figure(points: pd.DataFrame, scope: str) -> Figure:
 
 
 def reasoning(results: Results) -> Figure:
-    """Return arrows from less to more thinking models, under standard and guided."""
+    """Return arrows from each model to the one that thinks more, under both prompts."""
     points = results.overall
     chains = [list(reversed(pair)) for pair in analyses.REASONING_PAIRS] + [list(analyses.REASONING_LADDER)]
     chains = [[m for m in chain if m in set(points["model"])] for chain in chains]
