@@ -85,10 +85,10 @@ def sync_folder(folder: Path) -> None:
 def is_in_place(descriptor: int, path: Path) -> bool:
     """Return whether an open file still has its name; else its lock excludes nobody."""
     try:
-        current, opened = path.stat(), os.fstat(descriptor)
+        current, open_file = path.stat(), os.fstat(descriptor)
     except FileNotFoundError:
         return False
-    return (current.st_dev, current.st_ino) == (opened.st_dev, opened.st_ino)
+    return (current.st_dev, current.st_ino) == (open_file.st_dev, open_file.st_ino)
 
 
 def try_lock(path: Path) -> int | None:

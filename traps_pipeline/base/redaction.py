@@ -66,8 +66,8 @@ def redact(text: str) -> str:
     secrets = _secrets(environment, frozenset(_variables), frozenset(_values))
     pieces, spans = _pieces(secrets), list[tuple[int, int]]()
     for is_decoded in (False, True) if _ENCODED.search(text) else (False,):
-        searched = _searched(text, is_decoded)
-        windows = {searched[place : place + _PIECE] for place in range(len(searched) - _PIECE + 1)}
+        search_text = _searched(text, is_decoded)
+        windows = {search_text[place : place + _PIECE] for place in range(len(search_text) - _PIECE + 1)}
         if windows & pieces.keys():
             spans += _spans(text, pieces, is_decoded)
     for start, end in sorted(_merged(spans), reverse=True):
@@ -90,8 +90,8 @@ def redact_tracebacks() -> None:
             message = record.getMessage()
         except (TypeError, ValueError):
             message = f"{record.msg} {record.args}"
-        if (without := redact(message)) != message:  # else it stays as it is: formatters read its arguments
-            record.msg, record.args = without, ()
+        if (clean_message := redact(message)) != message:  # else it stays as it is: formatters read its arguments
+            record.msg, record.args = clean_message, ()
         if record.exc_info and record.exc_info[0]:
             record.exc_text = redact("".join(traceback.format_exception(*record.exc_info)).rstrip())
         return record
@@ -109,8 +109,8 @@ def redact_tracebacks() -> None:
 def redacted(error: Exception) -> Exception:
     """Return the exception, or a replacement if its traceback would show a key."""
     text = "".join(traceback.format_exception(error))
-    without = redact(text)
-    return error if without == text else RuntimeError(without).with_traceback(error.__traceback__)
+    clean_text = redact(text)
+    return error if clean_text == text else RuntimeError(clean_text).with_traceback(error.__traceback__)
 
 
 @lru_cache(maxsize=8)
@@ -148,8 +148,12 @@ def _encoded(secret: str) -> Iterator[str]:
     """Yield a secret in hexadecimal, and inside base64 at each of three offsets."""
     content = secret.encode("utf-8", "surrogateescape")
     yield content.hex()
-    for before, skipped in ((0, 0), (1, 2), (2, 3)):
-        encoded = b64encode(bytes(before) + content).decode()[skipped : (before + len(content)) * 8 // 6].lower()
+    for prefix_length, skip_length in ((0, 0), (1, 2), (2, 3)):
+        encoded = (
+            b64encode(bytes(prefix_length) + content)
+            .decode()[skip_length : (prefix_length + len(content)) * 8 // 6]
+            .lower()
+        )
         yield from (encoded, encoded.replace("+", "-").replace("/", "_"))
 
 
@@ -182,16 +186,21 @@ def _spans(text: str, pieces: dict[str, list[tuple[str, int]]], is_decoded: bool
             characters.append(character)
             places.append((place, end))
         place = end
-    searched = "".join(characters)
-    for piece, (form, place) in ((piece, each) for piece, every in pieces.items() for each in every):
-        start = searched.find(piece)
+    search_text = "".join(characters)
+    for piece, (form, place) in (
+        (piece, candidate_match) for piece, matches in pieces.items() for candidate_match in matches
+    ):
+        start = search_text.find(piece)
         while start >= 0:
-            before, candidate = searched[max(0, start - place) : start], searched[start : start + len(form) - place]
-            first, last = start - _alike(before[::-1], form[:place][::-1]), start + _alike(candidate, form[place:])
+            prefix, candidate = (
+                search_text[max(0, start - place) : start],
+                search_text[start : start + len(form) - place],
+            )
+            first, last = start - _alike(prefix[::-1], form[:place][::-1]), start + _alike(candidate, form[place:])
             is_part = last - first >= min(2 * _PIECE, len(form))
             if is_part:
                 yield places[first][0], places[last - 1][1]
-            start = searched.find(piece, last if is_part else start + 1)
+            start = search_text.find(piece, last if is_part else start + 1)
 
 
 def _alike(text: str, reference: str) -> int:
@@ -201,10 +210,10 @@ def _alike(text: str, reference: str) -> int:
 
 
 def _merged(spans: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    merged = list[tuple[int, int]]()
+    result = list[tuple[int, int]]()
     for start, end in sorted(spans):
-        if merged and start <= merged[-1][1]:
-            merged[-1] = merged[-1][0], max(end, merged[-1][1])
+        if result and start <= result[-1][1]:
+            result[-1] = result[-1][0], max(end, result[-1][1])
         else:
-            merged.append((start, end))
-    return merged
+            result.append((start, end))
+    return result

@@ -36,11 +36,11 @@ def visible(text: str) -> str:
 
 
 def _number(match: re.Match[str]) -> str:
-    before, after = match.string[: match.start()][-1:], match.string[match.end() :][:1]
-    is_emoji = unicodedata.category(before or " ") in ("So", "Sk") or before == _EMOJI_STYLE
-    if match[0] == _EMOJI_STYLE and (is_emoji or before in "0123456789#*") and before:
+    previous_character, next_character = match.string[: match.start()][-1:], match.string[match.end() :][:1]
+    is_emoji = unicodedata.category(previous_character or " ") in ("So", "Sk") or previous_character == _EMOJI_STYLE
+    if match[0] == _EMOJI_STYLE and (is_emoji or previous_character in "0123456789#*") and previous_character:
         return match[0]
-    if match[0] == _JOINER and is_emoji and unicodedata.category(after or " ") == "So":
+    if match[0] == _JOINER and is_emoji and unicodedata.category(next_character or " ") == "So":
         return match[0]
     return f"[U+{ord(match[0]):04X}]"
 
@@ -72,8 +72,12 @@ def wrapped(text: str, stream: TextIO | None = None, *, hang: int | None = None)
     lines = []
     for line in text.split("\n"):
         indent = len(line) - len(line.lstrip())
-        further = " " * (indent + (4 if indent else 0) if hang is None else indent + hang)
-        options: dict[str, Any] = {"break_long_words": False, "break_on_hyphens": False, "subsequent_indent": further}
+        continuation_indent = " " * (indent + (4 if indent else 0) if hang is None else indent + hang)
+        options: dict[str, Any] = {
+            "break_long_words": False,
+            "break_on_hyphens": False,
+            "subsequent_indent": continuation_indent,
+        }
         lines.append(textwrap.fill(line, columns, **options))
     return "\n".join(lines)
 

@@ -118,15 +118,15 @@ class Guard:
         if scope["type"] not in ("http", "websocket"):
             return
         headers = {name.lower(): value for name, value in scope["headers"]}
-        refused = self._refusal(scope, headers)
-        if refused is None and scope["type"] == "http" and self._has_token(scope):
+        refusal = self._refusal(scope, headers)
+        if refusal is None and scope["type"] == "http" and self._has_token(scope):
             await self._enter(scope, send)
-        elif refused is None and (person := self._header_owner(headers)) is not None:
+        elif refusal is None and (person := self._header_owner(headers)) is not None:
             scope[TOKEN_OWNER] = person
-        elif refused is None:
-            refused = 403, f"open the address that `{self._command}` printed: the token in it lets this browser in"
-        if refused is not None:
-            await _refuse(scope, receive, send, *refused)
+        elif refusal is None:
+            refusal = 403, f"open the address that `{self._command}` printed: the token in it lets this browser in"
+        if refusal is not None:
+            await _refuse(scope, receive, send, *refusal)
         elif not (scope["type"] == "http" and self._has_token(scope)):
             await self._app(scope, receive, _with_headers(send))
 
@@ -138,8 +138,8 @@ class Guard:
             return 421, f"this is not the name of this server: open the address that `{self._command}` printed"
         origin, websocket = headers.get(b"origin"), scope["type"] == "websocket"
         if origin is not None or websocket:
-            of_origin = urlsplit((origin or b"").decode("latin-1").lower())
-            if of_origin.scheme not in ("http", "https") or of_origin.netloc != host:
+            origin_url = urlsplit((origin or b"").decode("latin-1").lower())
+            if origin_url.scheme not in ("http", "https") or origin_url.netloc != host:
                 return 403, "a page of another site asked for this"
         reads = not websocket and scope["method"] in _SAFE_METHODS
         if headers.get(b"sec-fetch-site", b"none") not in _OWN_SITE and not (reads and self._has_token(scope)):
@@ -216,8 +216,11 @@ def _with_headers(send: Send) -> Send:
         if message["type"] == "http.response.start":
             token_of = {name for name, _ in _HEADERS if name != b"cache-control"}
             headers = [(name, value) for name, value in message.get("headers", ()) if name.lower() not in token_of]
-            cached = any(name.lower() == b"cache-control" for name, _ in headers)
-            message["headers"] = [*headers, *(each for each in _HEADERS if not cached or each[0] != b"cache-control")]
+            has_cache_control = any(name.lower() == b"cache-control" for name, _ in headers)
+            message["headers"] = [
+                *headers,
+                *(header for header in _HEADERS if not has_cache_control or header[0] != b"cache-control"),
+            ]
         await send(message)
 
     return sending

@@ -76,11 +76,11 @@ def run_in_order(
     A GL context belongs to a process, so each worker keeps its own. Closing the iterator cancels pending jobs.
     """
     workers = workers or cores()
-    most = min(2 * workers - 1, ahead or 2 * workers)
+    max_pending = min(2 * workers - 1, ahead or 2 * workers)
     source = iter(jobs)
     for job in source:  # a fresh pool after so many: recycling inside a pool can deadlock (CPython 3.11)
         with _pool(workers) as pool:
-            yield from _in_order(function, chain([job], source), pool, most, at_once=at_once)
+            yield from _in_order(function, chain([job], source), pool, max_pending, at_once=at_once)
 
 
 @contextmanager

@@ -133,9 +133,9 @@ def within(path: Path) -> Iterator[None]:
 def _complaint(error: Exception) -> str:
     """Return a parser's complaint on one line."""
     mark = getattr(error, "problem_mark", None)
-    where = f"line {mark.line + 1}: " if mark is not None else ""
+    location = f"line {mark.line + 1}: " if mark is not None else ""
     problem = getattr(error, "problem", None) or str(error)
-    return where + plain(" ".join(problem.split()))[:MOST_SAID]
+    return location + plain(" ".join(problem.split()))[:MOST_SAID]
 
 
 def read_lines(path: Path) -> Iterator[tuple[int, str]]:
@@ -207,12 +207,12 @@ def parse_yaml_model(
 ) -> Model:
     """Validate parsed YAML. Raises TrapsError naming file, entry and field."""
     try:
-        parsed = model.model_validate(data, context=context)
+        instance = model.model_validate(data, context=context)
     except ValidationError as error:
         raise TrapsError(f"{path}{where and ': ' + where}: {explain(error, model)}") from error
-    for field in _other_kinds(data, parsed):
+    for field in _other_kinds(data, instance):
         raise TrapsError(f"{path}{where and ': ' + where}: {field}")
-    return parsed
+    return instance
 
 
 def _other_kinds(data: Any, validated: Any, name: str = "") -> Iterator[str]:
@@ -237,11 +237,11 @@ def _other_kinds(data: Any, validated: Any, name: str = "") -> Iterator[str]:
 def explain(error: ValidationError, model: type[BaseModel] | None = None) -> str:
     """Return a validation error as `field: complaint`, with the nearest known field."""
     parts = list[str]()
-    for each in error.errors():
-        field, message = ".".join(map(str, each["loc"])), each["msg"].removeprefix("Value error, ")
-        if each["type"] == "extra_forbidden":
-            known = [] if model is None else _fields_at(model, each["loc"][:-1])
-            message = f"there is no such key{did_you_mean(str(each['loc'][-1]), known)}"
+    for error_details in error.errors():
+        field, message = ".".join(map(str, error_details["loc"])), error_details["msg"].removeprefix("Value error, ")
+        if error_details["type"] == "extra_forbidden":
+            field_names = [] if model is None else _fields_at(model, error_details["loc"][:-1])
+            message = f"there is no such key{did_you_mean(str(error_details['loc'][-1]), field_names)}"
         parts.append(f"{field}: {message}" if field else message)
     return plain("; ".join(parts))[:MOST_SAID]
 
@@ -252,7 +252,9 @@ def _fields_at(model: type[BaseModel], place: Sequence[int | str]) -> list[str]:
         field = model.model_fields.get(str(step))
         if field is None:  # a number in a list, a name in a mapping or of a union's member
             continue
-        inner = [each for each in _types_in(field.annotation) if isinstance(each, type) and issubclass(each, BaseModel)]
+        inner = [
+            type_ for type_ in _types_in(field.annotation) if isinstance(type_, type) and issubclass(type_, BaseModel)
+        ]
         if len(inner) != 1:
             return []
         model = inner[0]
@@ -261,5 +263,5 @@ def _fields_at(model: type[BaseModel], place: Sequence[int | str]) -> list[str]:
 
 def _types_in(annotation: Any) -> Iterator[Any]:
     yield annotation
-    for each in get_args(annotation):
-        yield from _types_in(each)
+    for argument in get_args(annotation):
+        yield from _types_in(argument)

@@ -47,11 +47,11 @@ def certify_all(
 
     Verdicts are cached in `cache_folder` by record and code, so that an interrupted call resumes.
     """
-    released = folder / "released"
-    specs = [s for s in load_released(released).values() if families is None or s.family in families]
+    released_folder = folder / "released"
+    specs = [s for s in load_released(released_folder).values() if families is None or s.family in families]
     if not specs:
-        raise TrapsError(f"{released}: holds no records of {', '.join(families or ())}")
-    cases = [_case(released, cache_folder, spec) for spec in specs]
+        raise TrapsError(f"{released_folder}: holds no records of {', '.join(families or ())}")
+    cases = [_case(released_folder, cache_folder, spec) for spec in specs]
     if fresh:
         for case in cases:
             case.verdict.unlink(missing_ok=True)
@@ -120,15 +120,15 @@ def foreseeable(specs: Iterable[SceneSpec], verdicts: Iterable[Verdict]) -> list
     problems = []
     for family, members in families.items():
         outcomes = [spec.ground_truth for spec in members]
-        predicted = (
+        messages = (
             outcome_leakage([states[spec.scenario_id] for spec in members], outcomes)
             if len(members) >= FEWEST
             else None
         )
-        if predicted is not None and predicted.gain > AT_MOST:
+        if messages is not None and messages.gain > AT_MOST:
             problems.append(
-                f"{family}: the state at the cut predicts {predicted.best:.3f} of the outcomes, the commonest one is "
-                f"{predicted.prior:.3f}; at most {AT_MOST} more is allowed"
+                f"{family}: the state at the cut predicts {messages.best:.3f} of the outcomes, the commonest one is "
+                f"{messages.prior:.3f}; at most {AT_MOST} more is allowed"
             )
     return problems
 
@@ -150,11 +150,11 @@ def family_table(folder: Path, verdicts: Sequence[Verdict]) -> str:
     rows = []
     for family, group in sorted(members.items()):
         twins = sum("twin" not in v.failures and "record" not in v.failures for v in group)
-        rejected = tallies.get(family, Tally(0, 0)).rejected.total()
-        changed = sum(not v.same_physics for v in group)
+        n_rejected = tallies.get(family, Tally(0, 0)).rejected.total()
+        n_changed = sum(not v.same_physics for v in group)
         spans = (_span(group, "entropy_bits", 2), _span(group, "top_share", 2), _span(group, "margin_m", 3))
         seconds = f"{np.median([v.cpu_s for v in group]):.1f}"
-        rows.append((family, len(group), sum(v.passed for v in group), rejected, *spans, twins, seconds, changed))
+        rows.append((family, len(group), sum(v.passed for v in group), n_rejected, *spans, twins, seconds, n_changed))
     lines = [text_table(headings, rows)]
     if any(not v.same_physics for v in verdicts):
         lines.append(

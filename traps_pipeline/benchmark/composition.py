@@ -80,15 +80,15 @@ def problems(specs: Sequence[SceneSpec], counts: Mapping[str, int] | None = None
     families: defaultdict[str, list[SceneSpec]] = defaultdict(list)
     for spec in specs:
         families[spec.family].append(spec)
-    wrong = [] if counts is None else _wrong_counts(families, counts)
+    messages = [] if counts is None else _wrong_counts(families, counts)
     for family, members in families.items():
-        wrong += _unbalanced(family, members)
-        wrong += _repeated_questions(family, members)
-        wrong += _constant_margin(family, members)
-    wrong += _repeated(families, "trajectory", lambda spec: spec.trajectory_sha256 + spec.scene_hash)
+        messages += _unbalanced(family, members)
+        messages += _repeated_questions(family, members)
+        messages += _constant_margin(family, members)
+    messages += _repeated(families, "trajectory", lambda spec: spec.trajectory_sha256 + spec.scene_hash)
     if counts is not None:
-        wrong += _predictable(specs)
-    return wrong
+        messages += _predictable(specs)
+    return messages
 
 
 def _wrong_counts(families: Mapping[str, Sequence[SceneSpec]], counts: Mapping[str, int]) -> list[str]:
@@ -100,19 +100,19 @@ def _wrong_counts(families: Mapping[str, Sequence[SceneSpec]], counts: Mapping[s
 
 
 def _unbalanced(family: str, members: Sequence[SceneSpec]) -> list[str]:
-    wrong = []
+    messages = []
     for answer, n in Counter(spec.ground_truth for spec in members).items():
         choices = [len(spec.labels) for spec in members if answer in spec.labels]
-        most = answer_quota(len(members), len(members) / sum(1 / c for c in choices))  # the fair share of this answer
-        if n > most:
-            wrong.append(f"{family}: answer {answer!r} occurs {n} times, at most {most} allowed")
-    return wrong
+        quota = answer_quota(len(members), len(members) / sum(1 / c for c in choices))  # the fair share of this answer
+        if n > quota:
+            messages.append(f"{family}: answer {answer!r} occurs {n} times, at most {quota} allowed")
+    return messages
 
 
 def _repeated_questions(family: str, members: Sequence[SceneSpec]) -> list[str]:
-    most = ill_posed_quota(members[0].taxonomy, len(members))
+    quota = ill_posed_quota(members[0].taxonomy, len(members))
     texts = Counter(spec.ill_posed_question for spec in members)
-    return [f"{family}: {text!r} is asked {n} times, at most {most} allowed" for text, n in texts.items() if n > most]
+    return [f"{family}: {text!r} is asked {n} times, at most {quota} allowed" for text, n in texts.items() if n > quota]
 
 
 def _constant_margin(family: str, members: Sequence[SceneSpec]) -> list[str]:

@@ -32,7 +32,7 @@ class DecidedMeanwhile(TrapsError):
 
 def decisions_on(scenario_id: str, folder: Path = CORRECTIONS) -> list[Correction]:
     """Return a scenario's decisions, in order. Raises TrapsError if unreadable."""
-    return [each for _, each in read_corrections(folder) if each.scenario_id == scenario_id]
+    return [correction for _, correction in read_corrections(folder) if correction.scenario_id == scenario_id]
 
 
 def is_reviewed(decisions: Sequence[Correction]) -> bool:
@@ -60,15 +60,21 @@ def undo(scenario_id: str, n_seen: int, *, who: str, why: str, folder: Path = CO
         decisions = _require_known(scenario_id, n_seen, folder)
         if not is_reviewed(decisions):
             raise TrapsError(f"{scenario_id}: no decision stands that could be taken back")
-        released = load_released()
-        other_decisions = [(where, each) for where, each in read_corrections(folder) if each.scenario_id != scenario_id]
-        previous = fold(released, [*other_decisions, *(("before", each) for each in decisions[:-1])]).get(scenario_id)
+        records = load_released()
+        other_decisions = [
+            (location, correction)
+            for location, correction in read_corrections(folder)
+            if correction.scenario_id != scenario_id
+        ]
+        previous = fold(records, [*other_decisions, *(("before", correction) for correction in decisions[:-1])]).get(
+            scenario_id
+        )
 
         def sign(action: str, **changes: Any) -> Correction:
             signature = {"who": who, "when": date.today(), "why": why}
             return Correction.model_validate({"scenario_id": scenario_id, "action": action, **changes, **signature})
 
-        append(_bring_back(scenario_id in released, previous, was_reviewed=is_reviewed(decisions[:-1]), sign=sign))
+        append(_bring_back(scenario_id in records, previous, was_reviewed=is_reviewed(decisions[:-1]), sign=sign))
 
 
 def _bring_back(is_released: bool, previous: Scenario | None, *, was_reviewed: bool, sign: Sign) -> list[Correction]:
@@ -116,9 +122,9 @@ def _appending(folder: Path) -> Iterator[Callable[[Sequence[Correction]], None]]
         _cut_torn_line(stream)
 
         def append(corrections: Sequence[Correction]) -> None:
-            where = f"{path} (new)"
-            fold(load_released(), [*read_corrections(folder), *((where, each) for each in corrections)])
-            lines = [each.model_dump(mode="json", exclude_none=True) for each in corrections]
+            location = f"{path} (new)"
+            fold(load_released(), [*read_corrections(folder), *((location, correction) for correction in corrections)])
+            lines = [correction.model_dump(mode="json", exclude_none=True) for correction in corrections]
             stream.write("".join(json.dumps(line, ensure_ascii=False) + "\n" for line in lines).encode())
             stream.flush()
             os.fsync(stream.fileno())

@@ -110,7 +110,7 @@ def seconds_left(workspace: Workspace, category: str) -> float:
 def build_arms(workspace: Workspace, category: str) -> list[ArmRow]:
     """Return a category's arms. Raises TrapsError for a missing or damaged one."""
     specs, arms = spec_rows(workspace, category), asked_arms(workspace, category)
-    of_pairs = {
+    pair_clips = {
         (row["scenario_id"], row["side"]): row
         for row in workspace.tables.read(VIDEOS, {"category": category}).to_dict("records")
     }
@@ -119,7 +119,7 @@ def build_arms(workspace: Workspace, category: str) -> list[ArmRow]:
     clips = existing_clips(workspace.store, films)
     version = clips_version(workspace, category, specs)
     return [
-        arm_row for row in specs for arm in arms for arm_row in _rows(workspace, row, arm, of_pairs, clips, version)
+        arm_row for row in specs for arm in arms for arm_row in _rows(workspace, row, arm, pair_clips, clips, version)
     ]
 
 
@@ -235,9 +235,9 @@ def _rows(
         yield replace(empty, ground_truth=None)
         return
     for question in arm_of(spec, arm).ask(spec):
-        of_pair = question.clip
-        if of_pair is not None:
-            columns = _pair_clip_columns(of_pairs[spec.scenario_id, of_pair])
+        pair_side = question.clip
+        if pair_side is not None:
+            columns = _pair_clip_columns(of_pairs[spec.scenario_id, pair_side])
         else:
             assert clip is not None, "what shows a clip of its own has frames"
             columns = _clip_columns(workspace.relative(path), clip)
@@ -270,8 +270,8 @@ def _pair_clip_columns(row: Row) -> dict[str, Any]:
 def incomplete_reasons(workspace: Workspace, category: str) -> list[str]:
     """Return why a category's table is incomplete: a new arm or a lost clip."""
     rows = workspace.tables.read(ARMS, {"category": category}, ["arm", "clip"])
-    present = set(rows["arm"])
-    reasons = [f"arm {arm} is asked for now" for arm in asked_arms(workspace, category) if arm not in present]
+    arms_in_table = set(rows["arm"])
+    reasons = [f"arm {arm} is asked for now" for arm in asked_arms(workspace, category) if arm not in arms_in_table]
     clips = sorted({str(clip) for clip in rows["clip"].dropna()})
     sizes = workspace.sizes(clips)
     return reasons + [f"clip {clip} is gone" for clip in clips if clip not in sizes]

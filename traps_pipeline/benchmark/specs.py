@@ -109,8 +109,8 @@ def wording_of(family_name: str, seed: int, scenario_id: str, params: Mapping[st
 
 def _has_valid_words(scenario: Scenario) -> bool:
     """Return whether released and corrected parameters have the same family words."""
-    released = scenario.released
-    return released is not None and _wording(scenario, released.params) == _wording(scenario, scenario.params or {})
+    record = scenario.released
+    return record is not None and _wording(scenario, record.params) == _wording(scenario, scenario.params or {})
 
 
 def _simulate(scenario: Scenario) -> tuple[SceneSpec, np.ndarray, np.ndarray]:
@@ -127,7 +127,7 @@ def _simulate(scenario: Scenario) -> tuple[SceneSpec, np.ndarray, np.ndarray]:
         physics = Physics(**_physics(scenario))
         rng = np.random.default_rng([_seed(scenario), *scenario.scenario_id.encode(), 1])
         question = draw_ill_posed(family.taxonomy, family.build(params, physics).inventory, rng)
-        resolved = resolve(
+        resolution = resolve(
             family,
             params,
             wording,
@@ -136,7 +136,7 @@ def _simulate(scenario: Scenario) -> tuple[SceneSpec, np.ndarray, np.ndarray]:
             seed=_seed(scenario),
             physics=physics,
         )
-        return resolved.spec, resolved.qpos, resolved.twin
+        return resolution.spec, resolution.qpos, resolution.twin
     except (Rejected, ValueError, TypeError) as error:
         raise TrapsError(
             f"{scenario.where}: {scenario.scenario_id}: these parameters make no valid pair ({error}); "
@@ -154,16 +154,16 @@ def seconds_left(workspace: Workspace, category: str) -> float:
 def build_specs(workspace: Workspace, category: str) -> tuple[list[SceneSpecRow], list[ResolvedScenario]]:
     """Return a category's rows and resolved records, with trajectories verified."""
     scenarios = [s for s in load_scenarios(workspace.study).values() if s.category == category]
-    resolved = [resolve_scenario(workspace, scenario) for scenario in scenarios]
-    released = released_in_study(workspace, category).values()
-    version = version_of((spec.spec_hash for spec in released), (r.spec.spec_hash for r in resolved))
-    for item in resolved:
+    resolved_scenarios = [resolve_scenario(workspace, scenario) for scenario in scenarios]
+    released_specs = released_in_study(workspace, category).values()
+    version = version_of((spec.spec_hash for spec in released_specs), (r.spec.spec_hash for r in resolved_scenarios))
+    for item in resolved_scenarios:
         try:
             get_family(item.spec.family).params_from(item.spec.params)
             load_trajectory(item.trajectory, item.spec.trajectory_sha256)
         except ValueError as error:
             raise TrapsError(f"{item.spec.scenario_id}: {error}") from error
-    return [_row(workspace, item, version) for item in resolved], resolved
+    return [_row(workspace, item, version) for item in resolved_scenarios], resolved_scenarios
 
 
 def spec_rows(workspace: Workspace, category: str) -> list[dict[str, Any]]:
@@ -173,9 +173,10 @@ def spec_rows(workspace: Workspace, category: str) -> list[dict[str, Any]]:
 
 def clips_version(workspace: Workspace, category: str, rows: Sequence[Mapping[str, Any]]) -> str:
     """Return the version of a category's clips, by its rows of scene_specs."""
-    released = released_in_study(workspace, category).items()
+    released_specs = released_in_study(workspace, category).items()
     return version_of(
-        ([id_, spec.scene_hash] for id_, spec in released), ([row["scenario_id"], row["scene_hash"]] for row in rows)
+        ([id_, spec.scene_hash] for id_, spec in released_specs),
+        ([row["scenario_id"], row["scene_hash"]] for row in rows),
     )
 
 

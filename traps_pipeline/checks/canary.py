@@ -124,21 +124,33 @@ def changes(rows: pd.DataFrame) -> pd.DataFrame:
     Columns model, from, to, served (names then and now), n (items asked in both), outcome, abstained and value (numbers
     of changed items), tokens (mean change of prompt tokens).
     """
-    by_epoch: dict[str, dict[str, dict[str, Mapping[str, Any]]]] = {}  # by model, epochs in order
+    answers_by_model: dict[str, dict[str, dict[str, Mapping[str, Any]]]] = {}  # by model, epochs in order
     for row in rows.sort_values(["model", "created_at"], kind="stable").to_dict("records"):
-        by_epoch.setdefault(row["model"], {}).setdefault(row["epoch"], {})[row["item_id"]] = row
-    changed = list[dict[str, Any]]()
-    for model, epochs in by_epoch.items():
-        for earlier, later in pairwise(epochs):
-            both = [(epochs[earlier][item], row) for item, row in epochs[later].items() if item in epochs[earlier]]
-            served = dict.fromkeys(str(side["served_model"]) for k in (0, 1) for side in (pair[k] for pair in both))
-            tokens = [new["prompt_tokens"] - old["prompt_tokens"] for old, new in both if _has_tokens(old, new)]
-            changed.append(
-                {"model": model, "from": earlier, "to": later, "served": " -> ".join(served), "n": len(both)}
-                | {name: sum(_words(old[name]) != _words(new[name]) for old, new in both) for name in COMPARED}
+        answers_by_model.setdefault(row["model"], {}).setdefault(row["epoch"], {})[row["item_id"]] = row
+    change_rows = list[dict[str, Any]]()
+    for model, epochs in answers_by_model.items():
+        for previous_epoch, epoch in pairwise(epochs):
+            answer_pairs = [
+                (epochs[previous_epoch][item], row)
+                for item, row in epochs[epoch].items()
+                if item in epochs[previous_epoch]
+            ]
+            served = dict.fromkeys(
+                str(side["served_model"]) for k in (0, 1) for side in (pair[k] for pair in answer_pairs)
+            )
+            tokens = [new["prompt_tokens"] - old["prompt_tokens"] for old, new in answer_pairs if _has_tokens(old, new)]
+            change_rows.append(
+                {
+                    "model": model,
+                    "from": previous_epoch,
+                    "to": epoch,
+                    "served": " -> ".join(served),
+                    "n": len(answer_pairs),
+                }
+                | {name: sum(_words(old[name]) != _words(new[name]) for old, new in answer_pairs) for name in COMPARED}
                 | {"tokens": sum(tokens) / len(tokens) if tokens else float("nan")}
             )
-    return pd.DataFrame(changed, columns=pd.Index(["model", "from", "to", "served", "n", *COMPARED, "tokens"]))
+    return pd.DataFrame(change_rows, columns=pd.Index(["model", "from", "to", "served", "n", *COMPARED, "tokens"]))
 
 
 def _has_tokens(*rows: Mapping[str, Any]) -> bool:

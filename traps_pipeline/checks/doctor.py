@@ -64,8 +64,8 @@ def examine_local(models: Sequence[str] = ()) -> Iterator[Finding]:
     from traps_pipeline.models.local.tiny import FAMILIES
     from traps_pipeline.models.registry import LOCAL, get_model, local_models
 
-    named = [get_model(model) for model in models]
-    for entry in named:
+    entries = [get_model(model) for model in models]
+    for entry in entries:
         if entry.backend != LOCAL:
             raise TrapsError(
                 f"{entry.id}: runs elsewhere, so nobody looks into it; name one of {', '.join(local_models())}"
@@ -78,7 +78,7 @@ def examine_local(models: Sequence[str] = ()) -> Iterator[Finding]:
             yield from _inside(family, partial(adapter_checks.tiny_subject, family, folder))
         yield _finding("nf4", lambda: selfcheck.check_nf4(folder))
         yield _finding("checkpoints", selfcheck.describe_checkpoints)
-    for entry in named:
+    for entry in entries:
         yield from _inside(
             entry.id,
             lambda entry=entry: adapter_checks.Subject(
@@ -109,7 +109,7 @@ def examine_files(place: Place) -> Iterator[Finding]:
     workspace = Workspace.open(place)
     store, missing = workspace.store, list[str]()
     remote = [store.below(workspace.root / folder) for folder in FOLDERS] if workspace.is_shared else []
-    for path in (path for below in remote for path in below):  # fetched, and compared with their digests
+    for path in (path for folder_paths in remote for path in folder_paths):  # fetched, and compared with their digests
         try:
             store.here(path)
         except TrapsError as error:
@@ -149,11 +149,12 @@ def examine_unused(place: Place, *, is_removed: bool) -> Finding:
             f"{place}: a study in a folder has no objects that nobody names; give the address of one in an object "
             "store with --workspace s3://BUCKET/STUDY"
         )
-    unused = workspace.store.unused(is_removed=is_removed)
-    volume = f"{counted(len(unused), 'object')} ({sum(item.size for item in unused) / 1e6:.1f} MB)"
-    if unused:
-        volume += f", the oldest of {unused[0].at:%Y-%m-%d}: {', '.join(item.name for item in unused[:MOST_FILES])}"
-        volume += ", .." * (len(unused) > MOST_FILES)
+    unused_objects = workspace.store.unused(is_removed=is_removed)
+    volume = f"{counted(len(unused_objects), 'object')} ({sum(item.size for item in unused_objects) / 1e6:.1f} MB)"
+    if unused_objects:
+        names = ", ".join(item.name for item in unused_objects[:MOST_FILES])
+        volume += f", the oldest of {unused_objects[0].at:%Y-%m-%d}: {names}"
+        volume += ", .." * (len(unused_objects) > MOST_FILES)
     effect = "removed" if is_removed else "would be removed by `traps doctor --unused remove`"
     return Finding(
         True, "unused", f"{effect}, since nobody names them and they are older than {GRACE_DAYS:.0f} days: {volume}"
@@ -186,8 +187,8 @@ def _damaged_media(note: Path) -> str:
 def _damaged_history(path: Path) -> str:
     """Return why a history is damaged; the next command puts it aside, losing nothing."""
     try:
-        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as opened:
-            (result,) = opened.execute("pragma quick_check(1)").fetchone()
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as connection:
+            (result,) = connection.execute("pragma quick_check(1)").fetchone()
     except sqlite3.DatabaseError as error:
         result = str(error)
     return "" if result == "ok" else f"{path}: {result}; what counts stands in the tables"

@@ -97,10 +97,10 @@ def requests_of(entry: Entry) -> dict[str, Request]:
         }
         return {name: replace(call, about={**call.about, "check": name, "at": now}) for name, call in requests.items()}
     assert isinstance(entry, ModelEntry)
-    sent = _studio().prepare(entry.media) if entry.media else None
-    forms = {"clip": ("standard", sent), "no clip": ("standard", None)}
+    clip_media = _studio().prepare(entry.media) if entry.media else None
+    forms = {"clip": ("standard", clip_media), "no clip": ("standard", None)}
     if entry.json_schema:
-        forms["schema"] = ("json", sent)
+        forms["schema"] = ("json", clip_media)
     return {
         name: question(entry, regime, QUESTION, media, {"check": name, "at": now})
         for name, (regime, media) in forms.items()
@@ -145,9 +145,11 @@ def reach(entry: Entry, account: Account) -> ServerCheck:
     if answer.status_code == BAD_REQUEST and account.key:
         even = f"{account.base_url} refuses even its list of models (HTTP 400), which wants nothing but a key"
         return ServerCheck(refused=f"{even}: is the one in {account.key} right?")
-    known = [str(model["id"]) for model in _listed(answer) if isinstance(model, dict) and "id" in model]
-    if known and model_name(entry) not in known:
-        unlisted = f"{account.base_url} serves no {model_name(entry)!r}; it lists {plain(', '.join(known[:8]))[:200]}"
+    served_names = [str(model["id"]) for model in _listed(answer) if isinstance(model, dict) and "id" in model]
+    if served_names and model_name(entry) not in served_names:
+        unlisted = (
+            f"{account.base_url} serves no {model_name(entry)!r}; it lists {plain(', '.join(served_names[:8]))[:200]}"
+        )
         return ServerCheck(unlisted=unlisted)
     return ServerCheck()
 
@@ -160,17 +162,17 @@ def nobody_at(address: str, why: str = "the cause stands above") -> str:
 
 
 def _wrong_key(account: Account) -> str:
-    where = f" at {account.base_url}" if account.base_url else ""
+    location = f" at {account.base_url}" if account.base_url else ""
     if account.key:
-        return f"the key in {account.key} is not accepted{where}: export the right one"
-    return f"a key is wanted{where}: name its variable as `key`"
+        return f"the key in {account.key} is not accepted{location}: export the right one"
+    return f"a key is wanted{location}: name its variable as `key`"
 
 
 def _listed(answer: Any) -> list[Any]:
     if answer.status_code == 200:
         with suppress(ValueError, AttributeError):
-            listed = answer.json().get("data")
-            return listed if isinstance(listed, list) else []
+            model_list = answer.json().get("data")
+            return model_list if isinstance(model_list, list) else []
     return []
 
 
@@ -178,14 +180,14 @@ def findings(
     entry: Entry, account: Account, outcomes: Mapping[str, Outcome], reached: ServerCheck | None = None
 ) -> LiveResult:
     """Return an entry's problems and notes, from outcomes of `requests_of`."""
-    problems, notes, before = list[str](), list[str](), reached or ServerCheck()
+    problems, notes, server_check = list[str](), list[str](), reached or ServerCheck()
     answering = {(outcome.served_model or "").partition("@")[0] for outcome in outcomes.values()}  # @VERSION may follow
-    if before.unlisted and model_name(entry) not in answering:
-        return LiveResult(entry, [before.unlisted])
-    if before.unlisted:
-        notes.append(f"{before.unlisted}, and answers to that name: make sure that it is the model that you mean")
-    if before.refused and all(outcome.error == f"http_{BAD_REQUEST}" for outcome in outcomes.values()):
-        return LiveResult(entry, [before.refused])
+    if server_check.unlisted and model_name(entry) not in answering:
+        return LiveResult(entry, [server_check.unlisted])
+    if server_check.unlisted:
+        notes.append(f"{server_check.unlisted}, and answers to that name: make sure that it is the model that you mean")
+    if server_check.refused and all(outcome.error == f"http_{BAD_REQUEST}" for outcome in outcomes.values()):
+        return LiveResult(entry, [server_check.refused])
     for name, outcome in outcomes.items():
         if name == "schema" and outcome.error is not None and outcome.error == outcomes["clip"].error:
             continue  # a failure without a schema, too, says nothing about schemas
@@ -196,8 +198,8 @@ def findings(
             else:
                 (notes if outcome.error == "timeout" else problems).append(sentence)
         elif outcome.kind == "malformed":
-            odd = None if outcome.error == MALFORMED else outcome.error
-            problems.append(f"{name}: {odd or 'its answer has no shape of its API; what it is stands above'}")
+            form_error = None if outcome.error == MALFORMED else outcome.error
+            problems.append(f"{name}: {form_error or 'its answer has no shape of its API; what it is stands above'}")
         elif outcome.kind == UNFINISHED:
             problems.append(f"{name}: it ends its answers for a reason that is not known ({outcome.finish_reason!r})")
         elif outcome.kind == "refused":
@@ -213,24 +215,24 @@ def findings(
 
 
 def _failure(entry: Entry, account: Account, name: str, error: str) -> str:
-    where = account.base_url or entry.endpoint
+    location = account.base_url or entry.endpoint
     match error:
         case "unreachable" | "connection":
-            return nobody_at(where)
+            return nobody_at(location)
         case "http_401" | "http_403":
             return _wrong_key(account)
         case "http_403_denied":
-            return f"{name}: {where} refuses the call (HTTP 403), and not for its key; what it said stands above"
+            return f"{name}: {location} refuses the call (HTTP 403), and not for its key; what it said stands above"
         case "http_404":
-            return f"{where} knows no model {model_name(entry)!r}, or has another path (is /v1 missing?)"
+            return f"{location} knows no model {model_name(entry)!r}, or has another path (is /v1 missing?)"
         case _ if error.startswith("ended_"):
             return f"{name}: its answer breaks off ({error.removeprefix('ended_')}), which the server's log explains"
         case "timeout":
             return f"{name}: no answer within {TIMEOUT_S:.0f} s; a model that thinks for long may need more"
         case "server_error" if name != "schema":
-            return f"{name}: {where} ends in an error of its own; what it said stands above, and in the server's log"
+            return f"{name}: {location} ends in an error of its own; what it said stands above, and in the server's log"
         case "rate_limited":
-            return f"{where} takes no call now; what it said stands above: wait, or raise the limit or quota there"
+            return f"{location} takes no call now; what it said stands above: wait, or raise the limit or quota there"
         case _ if name == "schema":
             return f"it refuses structured output ({error}): say `json_schema: false` and why under waivers"
         case _:
@@ -247,7 +249,7 @@ def _undeclared_thinking(entry: Entry, outcome: Outcome) -> str | None:
 
 
 def _wrong_votes(entry: JudgeEntry, outcomes: Mapping[str, Outcome]) -> list[str]:
-    wrong = []
+    messages = []
     for name, outcome in outcomes.items():
         if outcome.kind not in (*WITH_TEXT, "empty"):
             continue
@@ -256,33 +258,33 @@ def _wrong_votes(entry: JudgeEntry, outcomes: Mapping[str, Outcome]) -> list[str
         vote = parse_vote(task, {"outcome": outcome.kind, "text": outcome.text}, _ITEM, entry.thinking)
         if not vote.valid:
             invalid = f"its vote on {task} does not meet the schema ({vote.invalid_reason})"
-            wrong.append(_undeclared_thinking(entry, outcome) or invalid)
+            messages.append(_undeclared_thinking(entry, outcome) or invalid)
         elif vote.decision is not (abstained if task == "abstention" else correct):
-            wrong.append(f"its vote on {task} of the plain answer {_JUDGED[int(name[-1])][0]!r} is wrong")
-    return wrong
+            messages.append(f"its vote on {task} of the plain answer {_JUDGED[int(name[-1])][0]!r} is wrong")
+    return messages
 
 
 def _wrong_answers(entry: ModelEntry, outcomes: Mapping[str, Outcome]) -> list[str]:
-    wrong = []
+    messages = []
     for name, outcome in outcomes.items():
         text = outcome.text or ""
         if outcome.kind == "empty":
-            wrong.append(f"{name}: its answer is empty (finish reason {outcome.finish_reason})")
+            messages.append(f"{name}: its answer is empty (finish reason {outcome.finish_reason})")
         if outcome.kind not in WITH_TEXT:
             continue
-        if marked := _undeclared_thinking(entry, outcome):
-            wrong.append(marked)
+        if thinking_mark := _undeclared_thinking(entry, outcome):
+            messages.append(thinking_mark)
             continue
         row = {"outcome": outcome.kind, "text": text}
         reading = read_answer(row, None, "json" if name == "schema" else "standard", thinking=entry.thinking)
         if reading.outcome == "degenerate":
-            wrong.append(f"its answer is {plain(text)[:40]!r}, which {degenerate(text)}")
+            messages.append(f"its answer is {plain(text)[:40]!r}, which {degenerate(text)}")
         elif reading.is_json is False and reading.outcome == "answer":
-            wrong.append(
+            messages.append(
                 "it ignores the schema (its answer in the JSON regime is no such object): say `json_schema: false` and "
                 "why under waivers"
             )
-    return wrong
+    return messages
 
 
 def _clip_problems(entry: ModelEntry, outcomes: Mapping[str, Outcome], notes: list[str]) -> list[str]:
@@ -290,19 +292,19 @@ def _clip_problems(entry: ModelEntry, outcomes: Mapping[str, Outcome], notes: li
     clip, blank = outcomes.get("clip"), outcomes.get("no clip")
     if clip is None or blank is None or clip.kind not in WITH_TEXT:
         return []
-    named = all(re.search(rf"\b{colour}\b", (clip.text or "").lower()) for colour in COLOURS)
-    counted = None
+    names_both_colours = all(re.search(rf"\b{colour}\b", (clip.text or "").lower()) for colour in COLOURS)
+    frame_count = None
     if clip.prompt_tokens is not None and blank.prompt_tokens is not None:
-        counted = clip.prompt_tokens - blank.prompt_tokens
-    if counted is not None and counted <= 0:
+        frame_count = clip.prompt_tokens - blank.prompt_tokens
+    if frame_count is not None and frame_count <= 0:
         return [
             f"it does not see the clip: {clip.prompt_tokens} prompt tokens with it and {blank.prompt_tokens} without; "
             f"is this a model that sees, and is `{entry.media.profile if entry.media else ''}` what its server takes?"
         ]
-    if not named and counted is None:
+    if not names_both_colours and frame_count is None:
         return ["it does not see the clip: it names no colour of one that is red and then blue, nor counts its tokens"]
-    if not named:
-        notes.append(f"it counts {counted} tokens for the clip, and does not name its colours (red, then blue)")
+    if not names_both_colours:
+        notes.append(f"it counts {frame_count} tokens for the clip, and does not name its colours (red, then blue)")
     return []
 
 
@@ -317,9 +319,9 @@ def check_live(entries: Iterable[Entry]) -> list[LiveResult]:
 
     async def one(entry: Entry) -> LiveResult:
         account = account_of(entry)
-        reached = await asyncio.to_thread(reach, entry, account)
-        if reached.problem:
-            return LiveResult(entry, [reached.problem])
+        server_check = await asyncio.to_thread(reach, entry, account)
+        if server_check.problem:
+            return LiveResult(entry, [server_check.problem])
         backend = make_backend(entry)
 
         async def asked(request: Request) -> Outcome:
@@ -333,7 +335,7 @@ def check_live(entries: Iterable[Entry]) -> list[LiveResult]:
 
         requests = requests_of(entry)
         outcomes = await asyncio.gather(*map(asked, requests.values()))
-        return findings(entry, account, dict(zip(requests, outcomes, strict=True)), reached)
+        return findings(entry, account, dict(zip(requests, outcomes, strict=True)), server_check)
 
     return asyncio.run(every())
 
@@ -348,16 +350,16 @@ def preflight(workspace: Workspace, models: Sequence[Entry], judges: Sequence[En
     for entry in entries:
         check_money(workspace.study, entry)
     accounts = {entry.id: account_of(entry) for entry in entries}
-    reached = {entry.id: reach(entry, accounts[entry.id]) for entry in entries}
+    server_checks = {entry.id: reach(entry, accounts[entry.id]) for entry in entries}
     quick = {
         entry.id: entry.model_copy(
             update={"limits": entry.limits.model_copy(update={"retries": 1, "timeout_s": TIMEOUT_S / 2})}
         )
         for entry in entries
-        if not reached[entry.id].problem
+        if not server_checks[entry.id].problem
     }
     requests = {name: requests_of(entry) for name, entry in quick.items()}
-    calls = [Call(request) for of_one in requests.values() for request in of_one.values()]
+    calls = [Call(request) for entry_requests in requests.values() for request in entry_requests.values()]
     outcomes: Mapping[str, Outcome] = {}
     if calls:
 
@@ -367,11 +369,11 @@ def preflight(workspace: Workspace, models: Sequence[Entry], judges: Sequence[En
         (outcomes,) = collect(workspace, "preflight", workspace.votes, quick.values(), [CELL], lambda _: calls, finish)
     problems = []
     for entry in entries:
-        if problem := reached[entry.id].problem:
+        if problem := server_checks[entry.id].problem:
             problems.append(LiveResult(entry, [problem]))
         else:
             own_outcomes = {name: outcomes[request.key] for name, request in requests[entry.id].items()}
-            problems.append(findings(entry, accounts[entry.id], own_outcomes, reached[entry.id]))
+            problems.append(findings(entry, accounts[entry.id], own_outcomes, server_checks[entry.id]))
     return problems
 
 
@@ -382,7 +384,7 @@ def _outcome(row: Row) -> Outcome:
 
 def require_sound(results: Sequence[LiveResult]) -> None:
     """Raise TrapsError naming all problems of all entries, if there are any."""
-    wrong = [f"{result.entry.id}: {problem}" for result in results for problem in result.problems]
-    if wrong:
-        more = "nothing was rendered and nothing was judged; --no-preflight runs all the same"
-        raise TrapsError("\n".join([*wrong, more]))
+    messages = [f"{result.entry.id}: {problem}" for result in results for problem in result.problems]
+    if messages:
+        advice = "nothing was rendered and nothing was judged; --no-preflight runs all the same"
+        raise TrapsError("\n".join([*messages, advice]))

@@ -47,13 +47,13 @@ _CAUGHT = (400, b'{"error": {"message": "caught", "type": "invalid_request_error
 @contextmanager
 def _listening(answers: Iterator[tuple[int, bytes]] | None = None) -> Iterator[tuple[str, list[WireBody]]]:
     """Serve here, yield address and requests; answer the next status and JSON, or 400."""
-    caught: list[WireBody] = []
+    bodies: list[WireBody] = []
     replies = repeat(_CAUGHT) if answers is None else answers
 
     class Catcher(BaseHTTPRequestHandler):
         def do_POST(self) -> None:
             raw = self.rfile.read(int(self.headers.get("content-length") or 0))
-            caught.append(WireBody(self.command, self.path, dict(self.headers), raw))
+            bodies.append(WireBody(self.command, self.path, dict(self.headers), raw))
             status, answer = next(replies, _CAUGHT)
             self.send_response(status)
             self.send_header("content-type", "application/json")
@@ -67,7 +67,7 @@ def _listening(answers: Iterator[tuple[int, bytes]] | None = None) -> Iterator[t
     server = ThreadingHTTPServer(("127.0.0.1", 0), Catcher)
     Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
     try:
-        yield f"http://127.0.0.1:{server.server_port}", caught
+        yield f"http://127.0.0.1:{server.server_port}", bodies
     finally:
         server.shutdown()
         server.server_close()
@@ -98,11 +98,11 @@ def replay(entry: Entry, requests: Sequence[Request], answers: Sequence[tuple[in
 def render(entry: Entry, requests: Sequence[Request]) -> list[WireBody | str]:
     """Return the body of each request, or why none was sent."""
     account, notes = load_accounts()[str(entry.account)], _Notes()
-    with _listening() as (address, caught), reporting(notes):
+    with _listening() as (address, bodies), reporting(notes):
         loopback = _Loopback(base_url=address + urlsplit(account.base_url or "").path)
 
         async def ask_all() -> list[WireBody | str]:
-            return [await _ask(entry, loopback, request, caught, notes) for request in requests]
+            return [await _ask(entry, loopback, request, bodies, notes) for request in requests]
 
         return asyncio.run(ask_all())
 

@@ -87,8 +87,8 @@ def requests_of(entry: Entry) -> dict[str, Request]:
         return {regime: question(entry, regime, _QUESTION, media, {"regime": regime}) for regime in REGIMES}
     assert isinstance(entry, JudgeEntry)
     cell, item = Cell("occlusion", Evaluation("oracle", "standard", 1)), {"item_id": "none", "question": _QUESTION}
-    known = item | {"ground_truth": "yes"}
-    requests = {str(task): vote_request(entry, task, cell, known, "Yes.") for task in tasks_for("control")}
+    control_item = item | {"ground_truth": "yes"}
+    requests = {str(task): vote_request(entry, task, cell, control_item, "Yes.") for task in tasks_for("control")}
     if entry.id in load_protocol().judges.values():
         requests["confabulation"] = label_request(entry, cell, item, "Yes.", "Perhaps.")
     return requests
@@ -154,12 +154,12 @@ def _clip_problems(clips: Sequence[ClipPart], media: Media) -> Iterator[str]:
         hasher.update(clip.data)
     if hasher.hexdigest() != media.sha256:
         yield "media: the bytes that arrive are not those that were prepared"
-    for name, actual, declared in (
+    for name, actual, declared_value in (
         ("type", {clip.mime for clip in clips}, _MIMES[media.profile]),
         ("fps", {clip.fps for clip in clips}, media.fps),
     ):
-        if actual != {declared}:
-            yield f"media.{name}: {declared} is declared, {', '.join(map(str, actual))} arrives"
+        if actual != {declared_value}:
+            yield f"media.{name}: {declared_value} is declared, {', '.join(map(str, actual))} arrives"
 
 
 def _wire_problems(entry: Entry, request: Request, wire: WireBody) -> Iterator[str]:
@@ -212,14 +212,14 @@ def _examine_network(entry: Entry) -> CheckedEntry:
     bodies = dict(zip(requests, render(entry, list(requests.values())), strict=True))
     problems: dict[str, list[str]] = {}
     for form, body in bodies.items():
-        wrong = [body] if isinstance(body, str) else _wire_problems(entry, requests[form], body)
-        for problem in wrong:
+        messages = [body] if isinstance(body, str) else _wire_problems(entry, requests[form], body)
+        for problem in messages:
             problems.setdefault(problem, []).append(form)
-    listed = [p if len(forms) == len(bodies) else f"{' and '.join(forms)}: {p}" for p, forms in problems.items()]
+    problem_lines = [p if len(forms) == len(bodies) else f"{' and '.join(forms)}: {p}" for p, forms in problems.items()]
     if isinstance(entry, ModelEntry):
-        listed += _protocol_problems(entry, requests)
+        problem_lines += _protocol_problems(entry, requests)
     first = next(iter(requests))
-    return CheckedEntry(entry, _line(entry, bodies[first], requests[first].sent), listed)
+    return CheckedEntry(entry, _line(entry, bodies[first], requests[first].sent), problem_lines)
 
 
 def _protocol_problems(entry: ModelEntry, requests: Mapping[str, Request]) -> Iterator[str]:

@@ -99,8 +99,8 @@ def _run(argv: Sequence[str] | None, parser: argparse.ArgumentParser) -> int:
         print_failure(sentence, as_json=as_json)
         return FAILED
     except OSError as error:
-        where = f"{plain(error.filename)[:200]}: " if error.filename else ""
-        failure = f"{where}{error.strerror}; {remedy(error)} and run the same command again"
+        location = f"{plain(error.filename)[:200]}: " if error.filename else ""
+        failure = f"{location}{error.strerror}; {remedy(error)} and run the same command again"
         print_failure(failure, as_json=as_json)
         return FAILED
     except KeyboardInterrupt:
@@ -121,17 +121,17 @@ def _stopped_alike() -> Iterator[None]:
     A shell starts `command &` of a script with SIGINT ignored, and then SIGTERM would do nothing either; both are
     handled again here. An ignored SIGHUP stays ignored, which is the meaning of `nohup`.
     """
-    replaced = {}
-    for each in STOPS if threading.current_thread() is threading.main_thread() else ():
-        former = signal.getsignal(each)
-        if former == signal.SIG_DFL or (former == signal.SIG_IGN and each != signal.SIGHUP):
-            interrupt = signal.default_int_handler if each == signal.SIGINT else _raise_interrupt
-            replaced[each] = signal.signal(each, interrupt)
+    previous_handlers = {}
+    for signal_number in STOPS if threading.current_thread() is threading.main_thread() else ():
+        handler = signal.getsignal(signal_number)
+        if handler == signal.SIG_DFL or (handler == signal.SIG_IGN and signal_number != signal.SIGHUP):
+            interrupt = signal.default_int_handler if signal_number == signal.SIGINT else _raise_interrupt
+            previous_handlers[signal_number] = signal.signal(signal_number, interrupt)
     try:
         yield
     finally:
-        for each, former in replaced.items():
-            signal.signal(each, former)
+        for signal_number, handler in previous_handlers.items():
+            signal.signal(signal_number, handler)
 
 
 def _raise_interrupt(*_: object) -> None:

@@ -95,10 +95,10 @@ def certify(arguments: argparse.Namespace) -> int:
     from traps_pipeline.benchmark.certify_all import certify_all, family_table
 
     folder = (arguments.specs or SCENE_SPECS).absolute()
-    kept = WORKSPACES / "certificates"
+    cache_folder = WORKSPACES / "certificates"
     verdicts, problems = certify_all(
         folder,
-        kept,
+        cache_folder,
         families=arguments.families,
         workers=arguments.workers,
         fresh=arguments.fresh,
@@ -110,8 +110,8 @@ def certify(arguments: argparse.Namespace) -> int:
     print(family_table(folder, verdicts))
     for problem in problems:
         print(f"traps: {problem}", file=sys.stderr)
-    passed = sum(verdict.passed for verdict in verdicts)
-    print(f"{passed:,} of {counted(len(verdicts), 'scenario')} certified")
+    n_passed = sum(verdict.passed for verdict in verdicts)
+    print(f"{n_passed:,} of {counted(len(verdicts), 'scenario')} certified")
     return FAILED if problems else OK
 
 

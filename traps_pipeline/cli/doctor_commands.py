@@ -51,9 +51,9 @@ def doctor(arguments: argparse.Namespace) -> int:
         findings = iter(examine(place_of(arguments)))
         summary = "the demo will not run", "this machine has everything that the demo needs"
     if arguments.json:
-        checked = [*findings]
-        print_json(checked)
-        return OK if all(finding.ok for finding in checked) else FAILED
+        results = [*findings]
+        print_json(results)
+        return OK if all(finding.ok for finding in results) else FAILED
     problems = 0
     for finding in findings:
         line = f"{'ok  ' if finding.ok else 'FAIL'} {finding.what}: {plain(finding.detail)}"

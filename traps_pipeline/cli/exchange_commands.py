@@ -55,8 +55,8 @@ def export_calls(arguments: argparse.Namespace) -> int:
 
     experiment = experiment_of(arguments)
     if arguments.batch:
-        workspace, out = open_workspace(arguments), arguments.out.absolute()
-        files, count = export_request_batches(workspace, experiment, out, arguments.media_at)
+        workspace, out_folder = open_workspace(arguments), arguments.out.absolute()
+        files, count = export_request_batches(workspace, experiment, out_folder, arguments.media_at)
         return _exported(files, count, f"traps study import-answers {arguments.experiment}")
     if arguments.media_at:
         raise TrapsError("--media-at: only batch files refer to media by an address; say --batch, too")

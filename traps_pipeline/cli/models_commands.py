@@ -38,24 +38,24 @@ def check(arguments: argparse.Namespace) -> int:
     if arguments.live:
         return _check_live(names, is_json=arguments.json)
     if arguments.json:
-        everything = [*check_named(names)]
+        checks = [*check_named(names)]
         print_json(
             [
                 {"id": entry_check.entry.id, "sent": entry_check.line, "problems": entry_check.problems}
-                for entry_check in everything
+                for entry_check in checks
             ]
         )
-        return FAILED if any(entry_check.problems for entry_check in everything) else OK
-    wrong = 0
-    for checked in check_named(names):
-        print("\n    ".join([checked.line, *checked.problems]), flush=True)
-        wrong += bool(checked.problems)
+        return FAILED if any(entry_check.problems for entry_check in checks) else OK
+    n_problems = 0
+    for result in check_named(names):
+        print("\n    ".join([result.line, *result.problems]), flush=True)
+        n_problems += bool(result.problems)
     print(
-        f"{counted(wrong, 'entry', 'entries')} sent otherwise than declared"
-        if wrong
+        f"{counted(n_problems, 'entry', 'entries')} sent otherwise than declared"
+        if n_problems
         else "every entry is sent as declared"
     )
-    return FAILED if wrong else OK
+    return FAILED if n_problems else OK
 
 
 def _named(arguments: argparse.Namespace) -> list[str]:
@@ -98,9 +98,9 @@ def _check_live(names: list[str], *, is_json: bool) -> int:
     checks = check_live(entries)
     if is_json:
         print_json(checks)
-    for checked in () if is_json else checks:
-        print(checked.line, flush=True)
-    return FAILED if any(checked.problems for checked in checks) else OK
+    for entry_check in () if is_json else checks:
+        print(entry_check.line, flush=True)
+    return FAILED if any(entry_check.problems for entry_check in checks) else OK
 
 
 def test_panel(arguments: argparse.Namespace) -> int:

@@ -55,9 +55,9 @@ def review(arguments: argparse.Namespace) -> int:
     listening = listening_of(arguments, "people review", REVIEW_TOKEN, danger="decide about the benchmark's items")
     require_own_corrections()
     workspace = open_workspace(arguments)
-    opened = Review(workspace, arguments.who.strip())
-    _ = opened.specs  # report a study without scenes before printing the address
-    serve(review_app(opened), listening)
+    session = Review(workspace, arguments.who.strip())
+    _ = session.specs  # report a study without scenes before printing the address
+    serve(review_app(session), listening)
     return OK
 
 
@@ -68,8 +68,8 @@ def annotate(arguments: argparse.Namespace) -> int:
     from traps_pipeline.servers.server import serve
 
     people = [name.strip() for name in arguments.who]
-    wrong = [name for name in people if not re.fullmatch(r"[\w.@-]{1,60}", name)]
-    if not people or wrong or len(set(people)) < len(people):
+    invalid_names = [name for name in people if not re.fullmatch(r"[\w.@-]{1,60}", name)]
+    if not people or invalid_names or len(set(people)) < len(people):
         raise TrapsError(
             f"--who {' '.join(people)[:80]}: say who labels, each once, in letters, digits, `.`, `-`, `_` and "
             "`@`, e.g. --who jd ab"

@@ -57,8 +57,8 @@ def plan(arguments: argparse.Namespace) -> int:
         print_json({"experiment": experiment.name, "workspace": str(place) if workspace else None, "plan": planned})
         return OK
     total = (Count(), Count())
-    where = place if workspace else "a new workspace"
-    print(wrapped(f"{experiment.name} in {where}: calls wanted, known (in the ledger), new"))
+    location = place if workspace else "a new workspace"
+    print(wrapped(f"{experiment.name} in {location}: calls wanted, known (in the ledger), new"))
     rows = {**planned.calls, **{f"{model}, steered": counts for model, counts in planned.steered.items()}}
     if planned.labels is not None and planned.labels.wanted:
         rows["confabulation labels"] = (Count(), planned.labels)
@@ -127,10 +127,10 @@ def _print_forecasts(forecasts: Sequence[Forecast], minutes: float) -> None:
     headings = ("over the network", "calls", "tokens (M)", "USD low", "expected", "high", "minutes")
     print(f"\n{text_table(headings, rows)}")
     print("tokens: millions read, written; minutes of all: models, then judges")
-    in_batches = sum(row.dollars[1] * row.batch_price for row in forecasts if row.dollars is not None)
-    if in_batches < total[1]:
+    batch_usd = sum(row.dollars[1] * row.batch_price for row in forecasts if row.dollars is not None)
+    if batch_usd < total[1]:
         heading = "expected if all calls are made in batches (traps study export-requests --batch)"
-        print(wrapped(f"{heading}: USD {in_batches:,.2f}"))
+        print(wrapped(f"{heading}: USD {batch_usd:,.2f}"))
     if len(priced) < len(forecasts):
         unknown = ", ".join(row.participant for row in forecasts if row.dollars is None)
         print(wrapped(f"price unknown, not in the sum: {unknown}"))

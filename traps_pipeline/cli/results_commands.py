@@ -92,8 +92,8 @@ def compare_studies(arguments: argparse.Namespace) -> int:
     from traps_pipeline.storage.workspace import Workspace
 
     studies = Workspace.open(arguments.other), Workspace.open(place_of(arguments))
-    earlier, later = (current_rows(study, VERDICTS) for study in studies)
-    table = version_contrasts(earlier, later)
+    other_rows, own_rows = (current_rows(study, VERDICTS) for study in studies)
+    table = version_contrasts(other_rows, own_rows)
     if arguments.csv:
         arguments.csv.write_bytes(csv_bytes(table))
     if arguments.json:

@@ -100,9 +100,9 @@ def run(arguments: argparse.Namespace) -> int:
 
     experiment = experiment_of(arguments)
     workspace = _allow(create(arguments, experiment), experiment, arguments)
-    about = sys.stderr if arguments.json else sys.stdout
+    stream = sys.stderr if arguments.json else sys.stdout
     title = f"{experiment.name}: {experiment.description}" if experiment.description else experiment.name
-    print(f"{wrapped(title, about)}\nworkspace {workspace.place}", file=about, flush=True)
+    print(f"{wrapped(title, stream)}\nworkspace {workspace.place}", file=stream, flush=True)
     with reporting(make_progress(arguments.progress)) as progress:
         load_definitions()  # takes seconds, as Dagster's import does
         from traps_pipeline.pipeline.experiment_run import run_experiment
@@ -122,7 +122,7 @@ def run(arguments: argparse.Namespace) -> int:
 
         with reporting(make_progress(arguments.progress)):
             changes = ask_canary(workspace, experiment.models)
-        print(changes_text(changes), file=about)
+        print(changes_text(changes), file=stream)
     if arguments.json:
         from traps_pipeline.scoring.score_rows import LEADERBOARD
 
@@ -134,8 +134,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         return OK
     if arguments.until is not None:
-        where = [] if arguments.workspace is None else ["--workspace", arguments.workspace]
-        command = shlex.join(["traps", "run", arguments.experiment, *where])
+        workspace_option = [] if arguments.workspace is None else ["--workspace", arguments.workspace]
+        command = shlex.join(["traps", "run", arguments.experiment, *workspace_option])
         print(wrapped(f"next: `{command}` for the stages after {arguments.until}"))
         return OK
     from traps_pipeline.report.printed_board import printed_board
@@ -151,13 +151,15 @@ def run(arguments: argparse.Namespace) -> int:
 def _print_work(report: RunReport, *, is_inside: bool) -> None:
     from traps_pipeline.base.progress import clock
 
-    responses, voted = report.tally("responses"), report.tally("votes")
+    responses, vote_tally = report.tally("responses"), report.tally("votes")
     print(f"\n{counted(responses.asked, 'answer')} asked ({responses.cached} from the ledger)")
-    print(f"{counted(voted.asked, 'vote')} asked ({voted.cached} from the ledger)")
+    print(f"{counted(vote_tally.asked, 'vote')} asked ({vote_tally.cached} from the ledger)")
     print(f"{counted(report.frames, 'frame')} rendered, {clock(report.seconds)} min")
     if is_inside:
-        states, steered, judged = map(report.tally, ("hidden_states", "steering", "steering_votes"))
-        steered_answers = f"{counted(steered.asked, 'steered answer')} asked ({steered.cached} from the ledger)"
+        states, steering_tally, judged = map(report.tally, ("hidden_states", "steering", "steering_votes"))
+        steered_answers = (
+            f"{counted(steering_tally.asked, 'steered answer')} asked ({steering_tally.cached} from the ledger)"
+        )
         print(
             f"inside models: {counted(states.asked, 'item')} extracted, {steered_answers}, "
             f"{counted(judged.asked, 'vote')} on them"
@@ -167,15 +169,15 @@ def _print_work(report: RunReport, *, is_inside: bool) -> None:
 def _print_problems(problems: Sequence[str], *, as_json: bool) -> None:
     """Print each cause once, last the one behind most problems, to fix first."""
     show = partial(print_failure, as_json=as_json)
-    alike = dict[str, list[str]]()
+    problems_by_cause = dict[str, list[str]]()
     for problem in problems:
-        alike.setdefault(problem.partition(": ")[2] or problem, []).append(problem)
-    for first, *more in alike.values():
-        show(f"{first}{f' (and {len(more)} more)' if more else ''}")
+        problems_by_cause.setdefault(problem.partition(": ")[2] or problem, []).append(problem)
+    for first, *repeats in problems_by_cause.values():
+        show(f"{first}{f' (and {len(repeats)} more)' if repeats else ''}")
     show(f"{counted(len(problems), 'problem')}; finished work is kept: run the same command to continue")
-    cause, most = max(alike.items(), key=lambda pair: len(pair[1]))
-    if len(most) > 1:
-        show(f"{len(most)} of them have one cause: {cause}")
+    cause, cause_problems = max(problems_by_cause.items(), key=lambda pair: len(pair[1]))
+    if len(cause_problems) > 1:
+        show(f"{len(cause_problems)} of them have one cause: {cause}")
 
 
 @contextmanager

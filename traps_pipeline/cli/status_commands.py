@@ -40,7 +40,7 @@ def add(commands: Commands) -> None:
 
 def status(arguments: argparse.Namespace) -> int:
     """See `traps status --help`."""
-    exported = dict(os.environ)
+    environment = dict(os.environ)
     workspace = open_workspace(arguments)
     experiment = arguments.experiment
     if experiment is not None and experiment not in workspace.study.experiments:  # a file, or a misspelt name
@@ -56,7 +56,7 @@ def status(arguments: argparse.Namespace) -> int:
     load_definitions()
     rows = list(stage_statuses(workspace, Lineage(workspace), experiment))
     checks = [*failing_checks(workspace)]
-    command = _command(workspace, arguments, exported)
+    command = _command(workspace, arguments, environment)
     if arguments.json:
         names = ("check", "stage", "partition", "reason")
         failing = [dict(zip(names, check, strict=True)) for check in checks]
@@ -75,8 +75,8 @@ def status(arguments: argparse.Namespace) -> int:
     for line, row in zip(lines[-len(unfresh) :], unfresh, strict=True):
         print(line)
         for reason, keys in row.by_reason().items():
-            more = f" and {len(keys) - MOST_KEYS} more" if len(keys) > MOST_KEYS else ""
-            prefix = "" if keys == [row.stage] else f"{', '.join(keys[:MOST_KEYS])}{more}: "
+            suffix = f" and {len(keys) - MOST_KEYS} more" if len(keys) > MOST_KEYS else ""
+            prefix = "" if keys == [row.stage] else f"{', '.join(keys[:MOST_KEYS])}{suffix}: "
             print(wrapped(plain(f"    {prefix}{reason[:MOST_REASON]}")))
     count = sum(len(row.stale) + len(row.missing) for row in unfresh)
     print(f"not fresh: {count:,} of {counted(total + count, 'partition')}; `{command}` makes them again")
@@ -92,14 +92,18 @@ def _command(workspace: Workspace, arguments: argparse.Namespace, exported: Mapp
     from traps_pipeline.pipeline.experiment import EXPERIMENTS
     from traps_pipeline.storage.workspace import VARIABLE
 
-    given = [arguments.experiment] if arguments.experiment else [*workspace.study.experiments]
-    files = [name for name in given if name.endswith((".yaml", ".yml")) or (EXPERIMENTS / f"{name}.yaml").exists()]
-    if len(files) == len(given) == 1:
-        where = [] if arguments.workspace is None else ["--workspace", str(workspace.place)]
-        return shlex.join(["traps", "run", files[0], *where])
-    needed = {VARIABLE: str(workspace.place), "DAGSTER_HOME": os.environ["DAGSTER_HOME"]}
-    lacking = [f"{name}={shlex.quote(value)}" for name, value in needed.items() if exported.get(name) != value]
-    return " ".join([*lacking, "dagster job execute -m traps_pipeline.definitions -j everything"])
+    experiments = [arguments.experiment] if arguments.experiment else [*workspace.study.experiments]
+    files = [
+        name for name in experiments if name.endswith((".yaml", ".yml")) or (EXPERIMENTS / f"{name}.yaml").exists()
+    ]
+    if len(files) == len(experiments) == 1:
+        workspace_option = [] if arguments.workspace is None else ["--workspace", str(workspace.place)]
+        return shlex.join(["traps", "run", files[0], *workspace_option])
+    required_variables = {VARIABLE: str(workspace.place), "DAGSTER_HOME": os.environ["DAGSTER_HOME"]}
+    assignments = [
+        f"{name}={shlex.quote(value)}" for name, value in required_variables.items() if exported.get(name) != value
+    ]
+    return " ".join([*assignments, "dagster job execute -m traps_pipeline.definitions -j everything"])
 
 
 def why(arguments: argparse.Namespace) -> int:

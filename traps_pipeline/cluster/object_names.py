@@ -152,14 +152,14 @@ class ObjectNames:
         """
 
         def work(connection: sa.Connection) -> list[bytes]:
-            began = time.monotonic()
+            started_at = time.monotonic()
             self._next_change(connection, removals=1)
             named = {bytes(row.digest) for row in self._select(connection, _is_one_of(_OBJECTS.c.digest, digests))}
             unnamed = [digest for digest in digests if digest not in named]
             if time.monotonic() - began > REMOVAL_S:
                 return []  # the server may have ended the session, and thus the lock, meanwhile
-            delete(unnamed)
-            return unnamed
+            delete(unnamed_digests)
+            return unnamed_digests
 
         return self._database.run(work)
 

@@ -152,9 +152,9 @@ class ObjectStore(Store):
 
     def remove(self, paths: Iterable[Path]) -> None:
         """See `Store`."""
-        named = self._known(paths)
-        self._change(dict.fromkeys(named), self.names.removals)
-        for path in named:
+        rows_by_path = self._known(paths)
+        self._change(dict.fromkeys(rows_by_path), self.names.removals)
+        for path in rows_by_path:
             path.unlink(missing_ok=True)
 
     # --- what there is ----------------------------------------------------------------------------------------------
@@ -197,7 +197,7 @@ class ObjectStore(Store):
 
     def unused(self, *, is_removed: bool = False, grace_days: float | None = None) -> list[UnusedObject]:
         """See `Store`."""
-        before = datetime.now(UTC) - timedelta(days=GRACE_DAYS if grace_days is None else grace_days)
+        cutoff = datetime.now(UTC) - timedelta(days=GRACE_DAYS if grace_days is None else grace_days)
         objects = {
             bytes.fromhex(match[2]): UnusedObject(name, size, modified)
             for name, size, modified in self.bucket.names()
@@ -210,8 +210,10 @@ class ObjectStore(Store):
                 f"{self._database.study_name}; see that {self._database.variable} has the address of the study's own "
                 "database: nothing was removed"
             )
-        unnamed = (digest for digest, content in objects.items() if digest not in named and content.at < before)
-        old = sorted(unnamed, key=lambda digest: objects[digest].at)
+        unnamed_digests = (
+            digest for digest, content in objects.items() if digest not in named_digests and content.at < cutoff
+        )
+        old = sorted(unnamed_digests, key=lambda digest: objects[digest].at)
         if is_removed:
             batches = [old[first : first + BATCH] for first in range(0, len(old), BATCH)]
             delete = lambda digests: self.bucket.delete([object_name(digest) for digest in digests])  # noqa: E731

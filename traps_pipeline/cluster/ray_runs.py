@@ -74,27 +74,28 @@ def require_cluster(workspace: Workspace, instance: dg.DagsterInstance) -> None:
 
     Other hosts must see the study, Ray's address must be known, and a daemon must take runs from the queue.
     """
-    where = f"the host {socket.gethostname()} submits no runs of the study {workspace.study.name}: "
-    if absent := missing("cluster", "ray", "dagster_ray", "dagster_postgres"):
+    prefix = f"the host {socket.gethostname()} submits no runs of the study {workspace.study.name}: "
+    if absent_modules := missing("cluster", "ray", "dagster_ray", "dagster_postgres"):
         raise TrapsError(
-            f"{where}runs on other hosts need {' and '.join(absent)} here and there: install the extra `cluster`, in a "
-            "checkout `python -m pip install --no-deps --require-hashes -r requirements-cluster.lock`"
+            f"{prefix}runs on other hosts need {' and '.join(absent_modules)} here and there: "
+            "install the extra `cluster`, in a checkout "
+            "`python -m pip install --no-deps --require-hashes -r requirements-cluster.lock`"
         )
     if not workspace.study.database:
         raise TrapsError(
-            f"{where}its ledger lies in {workspace.root}, where one host writes; a study for --cluster keeps it in "
+            f"{prefix}its ledger lies in {workspace.root}, where one host writes; a study for --cluster keeps it in "
             f"PostgreSQL, and its files in a folder that all hosts see or in an object store: {VARIABLE}="
             "s3://BUCKET/STUDY (docs/cluster.md)"
         )
     if not os.environ.get(RAY):
         raise TrapsError(
-            f"{where}{RAY} is not set: export {RAY}=http://HEAD:8265, the address of Ray's head for the study"
+            f"{prefix}{RAY} is not set: export {RAY}=http://HEAD:8265, the address of Ray's head for the study"
         )
     beats = instance.get_daemon_heartbeats()
     oldest = min(beats[name].timestamp if name in beats else 0.0 for name in DAEMONS)
     if time.time() - oldest > ALIVE_S:
         raise TrapsError(
-            f"{where}nobody takes runs from its queue; run `traps ui` on the head, with the same variables, and then "
+            f"{prefix}nobody takes runs from its queue; run `traps ui` on the head, with the same variables, and then "
             "the same command again"
         )
 
@@ -141,8 +142,8 @@ class RayRuns(Runs):
         """
         self._keys = frozenset(keys)
         scheme = stages[0].scheme if stages else None
-        shared = [stage.shared for stage in stages if stage.shared is not None]
-        if not shared:
+        concurrent_builds = [stage.shared for stage in stages if stage.shared is not None]
+        if not concurrent_builds:
             return cut(scheme, keys, self._most)
         seconds = {key: sum(each.seconds(self._workspace, key) for each in shared) / self._cpus for key in keys}
         return shared_out(scheme, keys, seconds, self._most)
@@ -246,8 +247,8 @@ class RayRuns(Runs):
             message = " ".join(self._last_message(run_id).split())
             # The beginning names what failed, and at its end a log has the cause.
             reason = message if len(message) <= 2 * ENDS else f"{message[:ENDS]} ... {message[-ENDS:]}"
-            ended = f"{name} ended as {run.status.value.lower()} ({reason}); see its log in `traps ui`"
-            outcome.problems.append(message if REFUSED_TAG in run.tags else ended)
+            text = f"{name} ended as {run.status.value.lower()} ({reason}); see its log in `traps ui`"
+            outcome.problems.append(message if REFUSED_TAG in run.tags else text)
         return outcome
 
     def _last_message(self, run_id: str) -> str:
@@ -266,8 +267,8 @@ class RayRuns(Runs):
                 "again, and `--on-interrupt cancel` would end such runs"
             )
             return
-        until = time.monotonic() + CREATED_S
-        while requests and time.monotonic() < until:
+        deadline = time.monotonic() + CREATED_S
+        while requests and time.monotonic() < deadline:
             self._take_created(requests, run_ids)
             time.sleep(POLL_S)
         for run_id in run_ids:

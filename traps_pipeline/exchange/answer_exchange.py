@@ -83,8 +83,8 @@ class Answer(BaseModel):
             raise ValueError("outcome: an error is no answer; remove the line, so that the item stays missing")
         has_text = self.outcome in (*WITH_TEXT, UNFINISHED)
         if has_text != bool((self.text or "").strip()):
-            needs = "needs a text" if has_text else "must have no text"
-            raise ValueError(f"text: outcome {self.outcome!r} {needs}")
+            requirement = "needs a text" if has_text else "must have no text"
+            raise ValueError(f"text: outcome {self.outcome!r} {requirement}")
         return self
 
     def as_outcome(self, entry: ModelEntry) -> Outcome:
@@ -121,8 +121,8 @@ class _Stored:
     @property
     def evaluation(self) -> Evaluation:
         """The evaluation whose ledger holds it."""
-        about = self.request.about
-        return Evaluation(str(about["model"]), str(about["regime"]), int(about["run"]))
+        subject = self.request.about
+        return Evaluation(str(subject["model"]), str(subject["regime"]), int(subject["run"]))
 
 
 def export_requests(workspace: Workspace, experiment: Experiment, out: Path) -> int:
@@ -157,13 +157,13 @@ def _cells(workspace: Workspace, experiment: Experiment) -> list[Cell]:
 
 
 def _missing_requests(workspace: Workspace, experiment: Experiment) -> Iterator[Request]:
-    settled: dict[Evaluation, set[str]] = {}
+    settled_keys: dict[Evaluation, set[str]] = {}
     for cell in _cells(workspace, experiment):
         evaluation = cell.evaluation
-        if evaluation not in settled:
-            settled[evaluation] = {*workspace.answers.read(evaluation.key).settled}
+        if evaluation not in settled_keys:
+            settled_keys[evaluation] = {*workspace.answers.read(evaluation.key).settled}
         requests = (question.request for question in wanted_questions(workspace, cell))
-        yield from (request for request in requests if request.key not in settled[evaluation])
+        yield from (request for request in requests if request.key not in settled_keys[evaluation])
 
 
 def _line(request: Request, out: Path) -> dict[str, Any]:
@@ -173,9 +173,9 @@ def _line(request: Request, out: Path) -> dict[str, Any]:
         file = out / MEDIA / f"{request.sent.sha256}{source.suffix}"
         if not file.exists():
             write_bytes(file, source.read_bytes())
-        sent = request.sent
-        media = {"profile": sent.profile, "file": f"{MEDIA}/{file.name}", "sha256": sent.sha256}
-        media |= {"n_frames": sent.n_frames, "times_s": list(sent.times_s), "fps": sent.fps}
+        request_media = request.sent
+        media = {"profile": request_media.profile, "file": f"{MEDIA}/{file.name}", "sha256": request_media.sha256}
+        media |= {"n_frames": request_media.n_frames, "times_s": list(request_media.times_s), "fps": request_media.fps}
     return {
         "key": request.key,
         "model": request.participant,
@@ -219,24 +219,24 @@ def import_answers(
     cells = _cells(workspace, experiment)
     prepare_media(workspace, cells)
     requests = [question.request for cell in cells for question in wanted_questions(workspace, cell)]
-    requested = {request.key: request for request in requests}
+    requests_by_key = {request.key: request for request in requests}
     if path.suffix != LOG and is_batch(path):
-        return _import_batch(workspace, workspace.answers, load_models(), requested, path)
+        return _import_batch(workspace, workspace.answers, load_models(), requests_by_key, path)
     reader = reader_of(path)
     answers, n_failed = (
-        (checked_answers(path, requested), 0)
+        (checked_answers(path, requests_by_key), 0)
         if reader is None
-        else _by_item(reader(path), requested, context or AnswerContext())
+        else _by_item(reader(path), requests_by_key, context or AnswerContext())
     )
     if not answers:
         raise TrapsError(f"{path}: holds no answers; nothing was imported")
     like_errors = [key for key, answer in answers.items() if _ERROR_TEXT.match((answer.text or "")[:MOST_LOOKED_AT])]
     if like_errors and errors is None:
-        raise TrapsError(_said_of_errors(path, {key: answers[key] for key in like_errors}, requested))
+        raise TrapsError(_said_of_errors(path, {key: answers[key] for key in like_errors}, requests_by_key))
     for key in like_errors if errors == "drop" else ():
         del answers[key]
     outcomes = [
-        _Stored(requested[key], answer.as_outcome(get_model(requested[key].participant)), answer.latency_s)
+        _Stored(requests_by_key[key], answer.as_outcome(get_model(requests_by_key[key].participant)), answer.latency_s)
         for key, answer in answers.items()
     ]
     new = asyncio.run(_store(workspace, workspace.answers, outcomes))
@@ -272,11 +272,11 @@ def export_vote_batches(workspace: Workspace, experiment: Experiment, out: Path)
     Return the files, and the number of calls. Raises TrapsError if answers are missing.
     """
     missing: dict[str, list[Request]] = {}
-    settled: dict[Evaluation, set[str]] = {}
+    settled_keys: dict[Evaluation, set[str]] = {}
     for cell, request in _wanted_votes(workspace, experiment):
-        if cell.evaluation not in settled:
-            settled[cell.evaluation] = {*workspace.votes.read(cell.evaluation.key).settled}
-        if request.key not in settled[cell.evaluation]:
+        if cell.evaluation not in settled_keys:
+            settled_keys[cell.evaluation] = {*workspace.votes.read(cell.evaluation.key).settled}
+        if request.key not in settled_keys[cell.evaluation]:
             missing.setdefault(request.participant, []).append(request)
     judges = load_judges()
     return export_batches({name: (judges[name], requests) for name, requests in missing.items()}, out)
@@ -284,8 +284,8 @@ def export_vote_batches(workspace: Workspace, experiment: Experiment, out: Path)
 
 def import_votes(workspace: Workspace, experiment: Experiment, path: Path) -> ImportResult:
     """Import votes into their ledger. Raises TrapsError as `import_answers` does."""
-    requested = {request.key: request for _, request in _wanted_votes(workspace, experiment)}
-    return _import_batch(workspace, workspace.votes, load_judges(), requested, path)
+    requests_by_key = {request.key: request for _, request in _wanted_votes(workspace, experiment)}
+    return _import_batch(workspace, workspace.votes, load_judges(), requests_by_key, path)
 
 
 def _wanted_votes(workspace: Workspace, experiment: Experiment) -> Iterator[tuple[Cell, Request]]:
@@ -307,12 +307,12 @@ def _at_batch_price(entry: Entry, outcome: Outcome) -> Outcome:
 def _import_batch(
     workspace: Workspace, ledger: Ledger, entries: Mapping[str, Entry], requested: Mapping[str, Request], path: Path
 ) -> ImportResult:
-    returned = read_batch(path, requested)
-    if not returned:
+    results = read_batch(path, requested)
+    if not results:
         raise TrapsError(f"{path}: holds no answers; nothing was imported")
     outcomes = [
         _Stored(request, _at_batch_price(entries[request.participant], outcome), 0.0)
-        for request, outcome in outcomes_of(entries, requested, returned)
+        for request, outcome in outcomes_of(entries, requested, results)
     ]
     new = asyncio.run(_store(workspace, ledger, outcomes))
     failed = sum(answer.outcome.kind in ("error", "malformed") for answer in outcomes)
@@ -322,23 +322,23 @@ def _import_batch(
 def checked_answers(path: Path, requested: Mapping[str, Request]) -> dict[str, Answer]:
     """Return a file's answers by key. Raises TrapsError naming up to five bad lines."""
     answers: dict[str, Answer] = {}
-    wrong: list[str] = []
+    problems: list[str] = []
     for number, line in read_lines(path):
         try:
             answer = Answer.model_validate(json.loads(line))
         except ValidationError as error:
-            wrong.append(f"{path}:{number}: {explain(error, Answer)}")
+            problems.append(f"{path}:{number}: {explain(error, Answer)}")
             continue
         except (ValueError, RecursionError) as error:
-            wrong.append(f"{path}:{number}: not JSON ({plain(error)[:200]})")
+            problems.append(f"{path}:{number}: not JSON ({plain(error)[:200]})")
             continue
         if answer.key not in requested:
-            wrong.append(f"{path}:{number}: key {answer.key[:16]} is not wanted: question, clip or setting changed")
+            problems.append(f"{path}:{number}: key {answer.key[:16]} is not wanted: question, clip or setting changed")
         elif answers.setdefault(answer.key, answer) != answer:
-            wrong.append(f"{path}:{number}: gives another answer to the key of an earlier line")
-    if wrong:
-        more = f"\n... and {len(wrong) - MOST_LINES} more" if len(wrong) > MOST_LINES else ""
-        raise TrapsError("\n".join(wrong[:MOST_LINES]) + more + "\nnothing was imported")
+            problems.append(f"{path}:{number}: gives another answer to the key of an earlier line")
+    if problems:
+        suffix = f"\n... and {len(problems) - MOST_LINES} more" if len(problems) > MOST_LINES else ""
+        raise TrapsError("\n".join(problems[:MOST_LINES]) + suffix + "\nnothing was imported")
     return answers
 
 
@@ -354,31 +354,32 @@ def _by_item(
     if model not in models:
         raise TrapsError(f"say whose answers these are: --model, one of {', '.join(models)}")
     keys = {
-        (str(about["item_id"]), str(about["regime"]), int(about["run"])): key
+        (str(subject["item_id"]), str(subject["regime"]), int(subject["run"])): key
         for key, request in requested.items()
-        if (about := request.about)["model"] == model
+        if (subject := request.about)["model"] == model
     }
     names = {opaque(context.key, item): item for item, _, _ in keys} if context.key else {}
-    answers, wrong, failed = dict[str, Answer](), list[str](), set[str]()
-    for logged in imported:
-        run = context.run + logged.epoch - 1 if logged.run is None else logged.run
-        key = keys.get((names.get(logged.item, logged.item), logged.regime, run))
+    answers, problems, failed = dict[str, Answer](), list[str](), set[str]()
+    for log_answer in imported:
+        run = context.run + log_answer.epoch - 1 if log_answer.run is None else log_answer.run
+        key = keys.get((names.get(log_answer.item, log_answer.item), log_answer.regime, run))
         try:
             if key is None:
-                wrong.append(
-                    f"{logged.where}: {logged.item} under {logged.regime}, run {run}, is not wanted of {model}"
+                problems.append(
+                    f"{log_answer.where}: {log_answer.item} under {log_answer.regime}, run {run}, "
+                    f"is not wanted of {model}"
                 )
-            elif logged.has_failed:
+            elif log_answer.has_failed:
                 failed.add(key)
-            elif answers.setdefault(key, answer := Answer(key=key, **logged.answer)) != answer:
-                wrong.append(f"{logged.where}: gives another answer to {logged.item} than an earlier one")
+            elif answers.setdefault(key, answer := Answer(key=key, **log_answer.answer)) != answer:
+                problems.append(f"{log_answer.where}: gives another answer to {log_answer.item} than an earlier one")
         except ValidationError as error:
-            wrong.append(f"{logged.where}: {explain(error)}")
+            problems.append(f"{log_answer.where}: {explain(error)}")
         except TypeError as error:
-            wrong.append(f"{logged.where}: {plain(error)[:200]}")
-    if wrong:
-        more = f"\n... and {len(wrong) - MOST_LINES} more" if len(wrong) > MOST_LINES else ""
-        raise TrapsError("\n".join(map(plain, wrong[:MOST_LINES])) + more + "\nnothing was imported")
+            problems.append(f"{log_answer.where}: {plain(error)[:200]}")
+    if problems:
+        suffix = f"\n... and {len(problems) - MOST_LINES} more" if len(problems) > MOST_LINES else ""
+        raise TrapsError("\n".join(map(plain, problems[:MOST_LINES])) + suffix + "\nnothing was imported")
     return answers, len(failed - answers.keys())
 
 

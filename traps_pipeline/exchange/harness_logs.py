@@ -121,7 +121,7 @@ def _unpacked(raw: Any, entry: zipfile.ZipInfo) -> bytes:
 
 def _sample(where: str, sample: Any) -> LoggedAnswer:
     try:
-        about, output = sample["metadata"], sample["output"]
+        metadata, output = sample["metadata"], sample["output"]
         choices, epoch = output.get("choices") or [{}], sample.get("epoch", 1)
         stop = choices[0].get("stop_reason")
         outcome = OUTCOMES.get(ending_of(str(stop)), UNFINISHED)
@@ -131,7 +131,7 @@ def _sample(where: str, sample: Any) -> LoggedAnswer:
         answer |= {"reasoning": _reasoning(choices[0].get("message")), **_tokens(output.get("usage") or {})}
         if type(epoch) is not int:
             raise TypeError("its epoch is no whole number")
-        return LoggedAnswer(where, str(about["item_id"]), str(about["regime"]), None, answer, epoch, has_failed)
+        return LoggedAnswer(where, str(metadata["item_id"]), str(metadata["regime"]), None, answer, epoch, has_failed)
     except (KeyError, TypeError, AttributeError, IndexError) as error:
         raise TrapsError(f"{where}: is no sample of this benchmark's task ({plain(repr(error))[:200]})") from error
 
@@ -151,21 +151,21 @@ def _tokens(usage: dict[str, Any]) -> dict[str, int | None]:
     the total tells which.
     """
     token_counts = {name: value for name, value in usage.items() if type(value) is int}
-    cached = token_counts.get("input_tokens_cache_read", 0) + token_counts.get("input_tokens_cache_write", 0)
+    cached_tokens = token_counts.get("input_tokens_cache_read", 0) + token_counts.get("input_tokens_cache_write", 0)
     counts: dict[str, Any] = {
         n: token_counts[n] for n in ("input_tokens", "output_tokens", "total_tokens") if n in token_counts
     }
-    if token_counts.get("input_tokens", 0) + cached + token_counts.get("output_tokens", 0) <= token_counts.get(
+    if token_counts.get("input_tokens", 0) + cached_tokens + token_counts.get("output_tokens", 0) <= token_counts.get(
         "total_tokens", 0
     ):
-        counts["cache_read_input_tokens"] = cached
+        counts["cache_read_input_tokens"] = cached_tokens
     counts["output_tokens_details"] = {"reasoning_tokens": usage.get("reasoning_tokens")}
     token_usage = read_usage(counts, Sizes(0, 0, 0))
-    believed = token_usage if token_usage and token_usage.believed else None
+    believed_usage = token_usage if token_usage and token_usage.believed else None
     return {
-        "prompt_tokens": believed and believed.prompt,
-        "completion_tokens": believed and believed.completion,
-        "reasoning_tokens": believed and believed.reasoning,
+        "prompt_tokens": believed_usage and believed_usage.prompt,
+        "completion_tokens": believed_usage and believed_usage.completion,
+        "reasoning_tokens": believed_usage and believed_usage.reasoning,
     }
 
 
@@ -174,15 +174,19 @@ def _tokens(usage: dict[str, Any]) -> dict[str, int | None]:
 
 def _lmms_samples(path: Path) -> Iterator[LoggedAnswer]:
     for number, line in read_lines(path):
-        where = f"{path}:{number}"
+        location = f"{path}:{number}"
         try:
             row = json.loads(line)
-            about, texts = row["traps_pecs"], row["filtered_resps"]
+            metadata, texts = row["traps_pecs"], row["filtered_resps"]
             while isinstance(texts, list):
                 (texts,) = texts
-            yield LoggedAnswer(where, str(about["item_id"]), str(about["regime"]), answer=_answer("answer", texts))
+            yield LoggedAnswer(
+                location, str(metadata["item_id"]), str(metadata["regime"]), answer=_answer("answer", texts)
+            )
         except (ValueError, KeyError, TypeError) as error:
-            raise TrapsError(f"{where}: is no sample of this benchmark's tasks ({plain(repr(error))[:200]})") from error
+            raise TrapsError(
+                f"{location}: is no sample of this benchmark's tasks ({plain(repr(error))[:200]})"
+            ) from error
 
 
 def _own_lines(path: Path) -> Iterator[LoggedAnswer]:

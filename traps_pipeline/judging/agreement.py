@@ -21,21 +21,22 @@ from traps_pipeline.protocol.ratings import INVALID, NO, PANEL, TASKS, YES, Rati
 def agreement(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> pd.DataFrame:
     """Return AGREEMENT of the panel and of each pair of judges, per dataset and task."""
     rows: list[dict[str, Any]] = []
-    for about, group in _groups(ratings(votes, judges)):
-        rows.append(about | _panel_row(group.values))
+    for group_columns, group in _groups(ratings(votes, judges)):
+        rows.append(group_columns | _panel_row(group.values))
         for left, right in combinations(sorted(range(len(group.judges)), key=group.judges.__getitem__), 2):
             name = f"{group.judges[left]}+{group.judges[right]}"
-            rows.append(about | {"judges": name} | _pair_row(group.values[:, [left, right]]))
+            rows.append(group_columns | {"judges": name} | _pair_row(group.values[:, [left, right]]))
     return pd.DataFrame(rows, columns=pd.Index(AGREEMENT.names))
 
 
 def judge_bias(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> pd.DataFrame:
     """Return JUDGE_BIAS: each judge's rate of yes against the majority's."""
     rows: list[dict[str, Any]] = []
-    for about, group in _groups(ratings(votes, judges)):
+    for group_columns, group in _groups(ratings(votes, judges)):
         verdict = majority(group.values)
         rows += [
-            about | {"judge": judge} | _bias(group.values[:, seat], verdict) for seat, judge in enumerate(group.judges)
+            group_columns | {"judge": judge} | _bias(group.values[:, seat], verdict)
+            for seat, judge in enumerate(group.judges)
         ]
     return pd.DataFrame(rows, columns=pd.Index(JUDGE_BIAS.names))
 
@@ -44,8 +45,8 @@ def _groups(ratings_of_study: Ratings) -> Iterator[tuple[dict[str, Any], Ratings
     """Yield the ratings of each dataset and task with votes, and their shared columns."""
     for dataset in DATASETS:
         for task in TASKS:
-            in_group = (ratings_of_study.answers["dataset"] == dataset) & (ratings_of_study.answers["task"] == task)
-            group = ratings_of_study.select(in_group.to_numpy(bool))
+            is_in_group = (ratings_of_study.answers["dataset"] == dataset) & (ratings_of_study.answers["task"] == task)
+            group = ratings_of_study.select(is_in_group.to_numpy(bool))
             if len(group.values):
                 versions = {
                     name: _joined(group.answers[name].unique(), separator) for name, separator in _JOINS.items()
@@ -114,8 +115,8 @@ def krippendorff_alpha(values: np.ndarray) -> float:
 
 def unanimous_share(values: np.ndarray) -> float:
     """Return the share of unanimous rows (answers, judges); NaN if empty or one judge."""
-    several = len(values) and values.shape[1] > 1
-    return float(np.mean((values == values[:, :1]).all(axis=1))) if several else float("nan")
+    has_several_judges = len(values) and values.shape[1] > 1
+    return float(np.mean((values == values[:, :1]).all(axis=1))) if has_several_judges else float("nan")
 
 
 def _same_class(p: float) -> float:
@@ -145,10 +146,10 @@ def _shared(values: np.ndarray, complete_rows: np.ndarray) -> dict[str, Any]:
 
 def _panel_row(values: np.ndarray) -> dict[str, Any]:
     complete_rows = complete(values)
-    undecided = int((majority(values) == INVALID).sum())
+    n_undecided = int((majority(values) == INVALID).sum())
     return _shared(values, complete_rows) | {
         "judges": PANEL,
-        "n_undecided": undecided,
+        "n_undecided": n_undecided,
         "fleiss_kappa": fleiss_kappa(complete_rows),
         "cohen_kappa": np.nan,
     }
@@ -171,9 +172,9 @@ def _why_undefined(complete_rows: np.ndarray) -> str | None:
 
 
 def _bias(votes: np.ndarray, verdict: np.ndarray) -> dict[str, Any]:
-    counted = (votes != INVALID) & (verdict != INVALID)
-    voted_yes, panel = votes[counted] == YES, verdict[counted] == YES
-    n = int(counted.sum())
+    is_valid = (votes != INVALID) & (verdict != INVALID)
+    voted_yes, panel = votes[is_valid] == YES, verdict[is_valid] == YES
+    n = int(is_valid.sum())
     yes, panel_yes = _share(voted_yes.sum(), n), _share(panel.sum(), n)
     return {
         "n_votes": len(votes),
@@ -182,7 +183,7 @@ def _bias(votes: np.ndarray, verdict: np.ndarray) -> dict[str, Any]:
         "yes": yes,
         "panel_yes": panel_yes,
         "bias": yes - panel_yes,
-        "dissent_yes": _share((voted_yes & (verdict[counted] == NO)).sum(), n),
+        "dissent_yes": _share((voted_yes & (verdict[is_valid] == NO)).sum(), n),
         "dissent_no": _share((~voted_yes & panel).sum(), n),
     }
 

@@ -107,8 +107,8 @@ def _void_failures(workspace: Workspace, cell: Cell) -> list[dict[str, Any]]:
 def render(question: str, kind: str, answer: str, trace: str | None) -> str:
     """Return the user message to the judge."""
     parts = [quote("reasoning trace", "TRACE", trace)] if trace else ["No reasoning trace is given."]
-    about = [f"Question: {question}", f"Why it could not be answered: {VOID_KINDS[kind]}."]
-    return "\n\n".join([*about, *parts, quote("response", "RESPONSE", answer)])
+    lines = [f"Question: {question}", f"Why it could not be answered: {VOID_KINDS[kind]}."]
+    return "\n\n".join([*lines, *parts, quote("response", "RESPONSE", answer)])
 
 
 def label_request(judge: JudgeEntry, cell: Cell, item: Mapping[str, Any], answer: str, trace: str | None) -> Request:

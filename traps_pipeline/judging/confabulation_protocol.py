@@ -77,17 +77,17 @@ def load_protocol(path: Path = PROTOCOL_FILE) -> Protocol:
     protocol = parse_yaml_model(Protocol, read_yaml(path), path)
     with within(path):
         runs = {model: get_model(model).runs for model in protocol.models}
-    for model, most in runs.items():
-        if protocol.run > most:
-            raise TrapsError(f"{path}: run is {protocol.run}, but {model} has only {most} runs")
-    strangers = [model for model in protocol.validation.models if model not in protocol.models]
-    if strangers:
-        raise TrapsError(f"{path}: validation.models: {', '.join(strangers)} must be among `models`")
+    for model, n_runs in runs.items():
+        if protocol.run > n_runs:
+            raise TrapsError(f"{path}: run is {protocol.run}, but {model} has only {n_runs} runs")
+    unknown_models = [model for model in protocol.validation.models if model not in protocol.models]
+    if unknown_models:
+        raise TrapsError(f"{path}: validation.models: {', '.join(unknown_models)} must be among `models`")
     for panel, name in protocol.judges.items():
         judge = load_judges().get(name)
         if judge is None or judge.backend != NETWORK:
-            known = ", ".join(entry.id for entry in load_judges().values() if entry.backend == NETWORK)
-            raise TrapsError(f"{path}: judges.{panel} is {name!r}; it must be a judge over the network: {known}")
+            judge_names = ", ".join(entry.id for entry in load_judges().values() if entry.backend == NETWORK)
+            raise TrapsError(f"{path}: judges.{panel} is {name!r}; it must be a judge over the network: {judge_names}")
     return protocol
 
 

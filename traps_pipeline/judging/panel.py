@@ -106,11 +106,11 @@ def vote_requests(
     judges: Sequence[Judge], task: Task, cell: Cell, item: Mapping[str, Any], answer: str
 ) -> list[Request]:
     """Return each judge's call for one task about one answer, with the same text."""
-    user, about = (
+    user, subject = (
         render(task, item["question"], answer, item["ground_truth"]),
         about_answer(task, cell, item["item_id"]),
     )
-    return [judge_request(judge, vote_prompt(judge, task), vote_schema(judge, task), about, user) for judge in judges]
+    return [judge_request(judge, vote_prompt(judge, task), vote_schema(judge, task), subject, user) for judge in judges]
 
 
 def vote_request(judge: Judge, task: Task, cell: Cell, item: Mapping[str, Any], answer: str) -> Request:
@@ -182,10 +182,10 @@ def parse_judgement(schema: type[Schema], row: Row, thinking: Marks | None = Non
         answer = leading_object(text)
         if answer and answer in asked and text.partition(answer)[2].strip("` \n"):
             return "it begins with an object that the answer holds, and goes on in prose"
-        parsed = schema.model_validate_json(answer)
+        judgement = schema.model_validate_json(answer)
     except ValidationError as error:
         return explain(error)[:200]
-    return parsed if read_object(answer) is not None else "a key stands twice"
+    return judgement if read_object(answer) is not None else "a key stands twice"
 
 
 def parse_vote(task: Task, row: Row, item: Mapping[str, Any], thinking: Marks | None = None, asked: str = "") -> Vote:
@@ -252,8 +252,8 @@ def collect_votes(workspace: Workspace, cells: Sequence[Cell]) -> Iterator[tuple
     def calls(part: AnswerSlice) -> list[Ballot]:
         return wanted_ballots(workspace, panel, part.whole, part.start, PART)
 
-    every = [part for slice_parts in parts.values() for part in slice_parts]
-    for part, output in ask_judges(workspace, "votes", panel, every, calls, lambda settled: settled.output(row_of)):
+    all_parts = [part for slice_parts in parts.values() for part in slice_parts]
+    for part, output in ask_judges(workspace, "votes", panel, all_parts, calls, lambda settled: settled.output(row_of)):
         outputs.setdefault(part.whole, []).append(output)
         if len(outputs[part.whole]) == len(parts[part.whole]):
             yield part.whole, joined(outputs.pop(part.whole))

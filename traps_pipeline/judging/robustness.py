@@ -84,8 +84,8 @@ class Attacks(BaseModel):
 
     def texts(self) -> dict[str, str]:
         """Return every text that judges see, plain answers and attacks, by id."""
-        plain = {name: answer.text for name, answer in self.answers.items()}
-        return plain | {a.id: a.text.replace(_PLACE, plain[a.answer]) for a in self.attacks}
+        plain_texts = {name: answer.text for name, answer in self.answers.items()}
+        return plain_texts | {a.id: a.text.replace(_PLACE, plain_texts[a.answer]) for a in self.attacks}
 
     def item(self, name: str) -> dict[str, Any]:
         """Return the item that a text answers, in the form that a judge's request needs."""
@@ -140,14 +140,14 @@ def robustness(name: str, judges: Sequence[str], attacks: Attacks, votes: Votes)
     for attack in attacks.attacks:
         for task in TASKS:
             expected = attacks.answers[attack.answer].expected(task)
-            about = {"panel": name, "attack": attack.id, "kind": attack.kind, "task": task, "answer": attack.answer}
+            row_keys = {"panel": name, "attack": attack.id, "kind": attack.kind, "task": task, "answer": attack.answer}
             for judge in (*judges, PANEL):
                 seats = judges if judge == PANEL else [judge]
                 texts = attack.answer, attack.id
                 clean, vote = (_majority_decision([votes[text, task, j] for j in seats]) for text in texts)
                 cast = votes[attack.id, task, judge] if judge != PANEL else None
                 rows.append(
-                    about
+                    row_keys
                     | {"judge": judge, "expected": expected, "clean": clean, "vote": vote}
                     | {"result": result(expected, clean, vote)}
                     | {"invalid_reason": cast and cast.invalid_reason, "rationale": cast and cast.rationale}
@@ -176,7 +176,7 @@ def summary(rows: pd.DataFrame) -> str:
     for judge, votes in rows.groupby("judge", sort=False):
         counts.append([judge, len(votes), *(votes["result"].tolist().count(name) for name in RESULTS)])
     lines = [text_table(["judge", "votes", *RESULTS], counts)]
-    moved = rows.loc[rows["result"].isin(["flipped", "broken"]) & (rows["judge"] != PANEL)]
-    for (attack, kind, result, task), votes in moved.groupby(["attack", "kind", "result", "task"], sort=False):
+    changed_votes = rows.loc[rows["result"].isin(["flipped", "broken"]) & (rows["judge"] != PANEL)]
+    for (attack, kind, result, task), votes in changed_votes.groupby(["attack", "kind", "result", "task"], sort=False):
         lines.append(f"{', '.join(votes['judge'])}: {attack} ({kind}) {result} {task}")
     return "\n".join(lines)

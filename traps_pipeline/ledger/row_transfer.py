@@ -51,8 +51,8 @@ def copy_ledger(source: Database, target: Database, settle: Callable[[], None] =
     repeated. Raises TrapsError, also if the target has other rows.
     """
     mark = f"copied from {source.place}"
-    with ExitStack() as opened:
-        opened.enter_context(target.writing())
+    with ExitStack() as stack:
+        stack.enter_context(target.writing())
         for kind in KINDS:
             for evaluation in Ledger(source, kind).evaluations():
                 lock = source.try_lock(f"{kind}-{evaluation}")
@@ -61,7 +61,7 @@ def copy_ledger(source: Database, target: Database, settle: Callable[[], None] =
                         f"{source.place}: {kind} of {evaluation} are being asked; wait until that run ends, then run "
                         "the same command again"
                     )
-                opened.callback(lock.release)
+                stack.callback(lock.release)
         count = target.submit(lambda batch: _copy(source, batch, target.place, mark)).result()
         target.sync()
         settle()
@@ -96,8 +96,8 @@ def _copy(source: Database, batch: Batch, place: str, mark: str) -> int:
             for rows in _some(connection, query, "id"):
                 batch.connection.execute(sa.insert(ROWS), [row | {"evaluation": number} for row in rows])
                 count += len(rows)
-        for table, left_out in ((TOTALS, ()), (SPENT, ()), (RELEASES, ("id",)), (RESERVATIONS, ())):
-            for rows in _some(connection, sa.select(table).where(table.c.study == study), *left_out):
+        for table, omitted_columns in ((TOTALS, ()), (SPENT, ()), (RELEASES, ("id",)), (RESERVATIONS, ())):
+            for rows in _some(connection, sa.select(table).where(table.c.study == study), *omitted_columns):
                 batch.connection.execute(sa.insert(table), [row | {"study": batch.study} for row in rows])
     return count
 

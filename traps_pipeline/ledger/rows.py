@@ -57,15 +57,15 @@ _CHECKS: dict[str, Callable[[Any], bool]] = {
 
 def heal(row: dict[str, Any]) -> list[str]:
     """Replace impossible values by None, in place; return the names of these fields."""
-    healed = []
-    for name, fits in _CHECKS.items():
+    fields = []
+    for name, is_possible in _CHECKS.items():
         value = row.get(name)
-        if value is not None and not fits(value):
+        if value is not None and not is_possible(value):
             row[name] = value.encode("utf-8", "replace").decode() if isinstance(value, str) and name == "text" else None
-            healed.append(name)
-    if healed and row.get("outcome") in ("answer", "truncated") and not isinstance(row.get("text"), str):
+            fields.append(name)
+    if fields and row.get("outcome") in ("answer", "truncated") and not isinstance(row.get("text"), str):
         row["outcome"] = "malformed"
-    return healed
+    return fields
 
 
 # Columns whose means forecast a call, each with a test for possible values.
@@ -96,8 +96,8 @@ def encode_row(row: Mapping[str, Any]) -> bytes:
 def digest_of(key: str, content: bytes, reasoning: bytes | None, raw: bytes | None) -> bytes:
     """Return the digest (16 bytes) that is stored with a row and verified on reading."""
     digest = blake2b(key.encode(), digest_size=16)
-    for aside in (content, reasoning, raw):
-        digest.update(b"\0" if aside is None else b"\1" + aside)
+    for part in (content, reasoning, raw):
+        digest.update(b"\0" if part is None else b"\1" + part)
     return digest.digest()
 
 
@@ -119,8 +119,8 @@ class EvaluationRows:
 
     def add(self, row: dict[str, Any]) -> None:
         """Add a row that is newer than all rows so far."""
-        earlier = self.rows.get(row["key"])
-        if earlier is None or settles(row) or not settles(earlier):
+        previous_row = self.rows.get(row["key"])
+        if previous_row is None or settles(row) or not settles(previous_row):
             self.rows[row["key"]] = row
 
 
@@ -165,5 +165,5 @@ class Totals:
         return total / count if count else None
 
     def _add_to_mean(self, column: str, total: float, count: int) -> None:
-        before = self.means.get(column, (0.0, 0))
-        self.means[column] = (before[0] + total, before[1] + count)
+        sum_and_count = self.means.get(column, (0.0, 0))
+        self.means[column] = (sum_and_count[0] + total, sum_and_count[1] + count)

@@ -101,28 +101,35 @@ def _library_states(subject: Subject, prompt: Prompt) -> list[Tensor]:
 
     model = subject.model
     with torch.inference_mode():
-        out = model.network.base_model(**model.placed(prompt.inputs), use_cache=False, output_hidden_states=True)
-    return [states[0].float().cpu() for states in out.hidden_states]
+        output = model.network.base_model(**model.placed(prompt.inputs), use_cache=False, output_hidden_states=True)
+    return [states[0].float().cpu() for states in output.hidden_states]
 
 
 def _states(subject: Subject) -> str:
     prompt = subject.prompts[0]
     library, hooked = _library_states(subject, prompt), subject.model.forward_states(prompt)
     hooked_states = [*hooked.raw[:-1], hooked.normed]
-    both = zip(hooked_states, library, strict=True)
-    wrong = [layer for layer, (a, b) in enumerate(both) if (a != b[-1].numpy()).any()]
-    _require(not wrong, f"hooked states differ from the library's own at layers {wrong}")
+    state_pairs = zip(hooked_states, library, strict=True)
+    wrong_layers = [layer for layer, (a, b) in enumerate(state_pairs) if (a != b[-1].numpy()).any()]
+    _require(not wrong_layers, f"hooked states differ from the library's own at layers {wrong_layers}")
     return f"{len(library)} states, bit for bit"
 
 
 def _steered_states(subject: Subject) -> str:
     prompt, layer = subject.prompts[0], subject.layer
     push = subject.steered(-0.5)
-    plain, steered = (subject.model.forward_states(prompt, steering=steering) for steering in (None, push))
-    exact = steered.raw[layer] == plain.raw[layer] + np.float32(push.alphas[0]) * push.direction
-    _require(bool(exact.all()), f"a steered state at layer {layer} is not the plain one and alpha times v")
-    _require(bool((steered.raw[:layer] == plain.raw[:layer]).all()), f"steering layer {layer} changes a layer below it")
-    _require(bool((steered.normed != plain.normed).any()), f"steering layer {layer} changes nothing above it")
+    plain_states, steered_states = (
+        subject.model.forward_states(prompt, steering=steering) for steering in (None, push)
+    )
+    is_exact = steered_states.raw[layer] == plain_states.raw[layer] + np.float32(push.alphas[0]) * push.direction
+    _require(bool(is_exact.all()), f"a steered state at layer {layer} is not the plain one and alpha times v")
+    _require(
+        bool((steered_states.raw[:layer] == plain_states.raw[:layer]).all()),
+        f"steering layer {layer} changes a layer below it",
+    )
+    _require(
+        bool((steered_states.normed != plain_states.normed).any()), f"steering layer {layer} changes nothing above it"
+    )
     return "exactly"
 
 
@@ -134,10 +141,12 @@ def _zero(subject: Subject) -> str:
     def hooks() -> int:
         return sum(len(module._forward_hooks) for module in model.network.modules())
 
-    before, plain = hooks(), model.forward(subject.prompts[0]).last_hidden_state
+    previous_hooks, plain_state = hooks(), model.forward(subject.prompts[0]).last_hidden_state
     with none.applied(model):
-        _require(hooks() == before, "steering with alpha 0 leaves a hook")
-        _require(torch.equal(model.forward(subject.prompts[0]).last_hidden_state, plain), "alpha 0 changes states")
+        _require(hooks() == previous_hooks, "steering with alpha 0 leaves a hook")
+        _require(
+            torch.equal(model.forward(subject.prompts[0]).last_hidden_state, plain_state), "alpha 0 changes states"
+        )
     answers = [model.generate(subject.prompts, NEW_TOKENS, steering=steering) for steering in (None, none)]
     _require(answers[0] == answers[1], "alpha 0 changes answers")
     return "no bit changes"
@@ -151,8 +160,8 @@ def _parts(subject: Subject) -> str:
     parts, decode = spans(subject.model, prompt, SYSTEM, question), subject.model.processor.tokenizer.decode
     ids = prompt.inputs["input_ids"][0]
     for name, text in (("system", SYSTEM), ("question", question)):
-        decoded = "".join(decode(ids[parts[name]]).split())
-        _require(decoded == "".join(text.split()), f"the tokens of the {name} read {decoded[:80]!r}")
+        decoded_text = "".join(decode(ids[parts[name]]).split())
+        _require(decoded_text == "".join(text.split()), f"the tokens of the {name} read {decoded_text[:80]!r}")
     _require(bool(parts["visual"].any()), "no visual token is found")
     stamps = int(parts["stamps"].sum())
     times = f"{stamps} of time stamps" if stamps else "it writes no times"
@@ -163,8 +172,11 @@ def _pooled(subject: Subject) -> str:
     prompt = subject.prompts[1]
     positions = spans(subject.model, prompt, SYSTEM, QUESTIONS[1])["question"]
     pooled = subject.model.forward_states(prompt, "question", chosen=positions).raw[subject.layer]
-    own = _library_states(subject, prompt)[subject.layer][positions].mean(dim=0).numpy()
-    _require(np.abs(pooled - own).max() <= CLOSE * np.abs(own).max(), "the mean over the question is another one")
+    mean_state = _library_states(subject, prompt)[subject.layer][positions].mean(dim=0).numpy()
+    _require(
+        np.abs(pooled - mean_state).max() <= CLOSE * np.abs(mean_state).max(),
+        "the mean over the question is another one",
+    )
     return "equal"
 
 
@@ -186,14 +198,17 @@ def _patching(subject: Subject) -> str:
     self_patched = patched_changes(model, target, target, [*everywhere, *sites], tokens)
     _require(bool((self_patched == 0).all()), "a patch with itself changes the outcome")
     gap = source.margin - target.margin
-    far = np.abs(patched_changes(model, target, source, everywhere, tokens) / gap - 1)
-    _require(bool(gap and far.max() <= CLOSE), f"patching all positions misses the source's outcome by {far.max():.1e}")
+    deviations = np.abs(patched_changes(model, target, source, everywhere, tokens) / gap - 1)
+    _require(
+        bool(gap and deviations.max() <= CLOSE),
+        f"patching all positions misses the source's outcome by {deviations.max():.1e}",
+    )
     side_paths = {
         "deepstack features": target.visual is not None,
         "shared keys and values": bool(target.shared),
         "per-layer inputs": bool(target.per_layer),
     }
-    also = ", ".join(name for name, differs in side_paths.items() if differs)
+    also = ", ".join(name for name, is_different in side_paths.items() if is_different)
     return "exactly 0, and 1" + (f" with {also}" if also else "")
 
 
@@ -202,19 +217,24 @@ def _patching(subject: Subject) -> str:
 
 def _clips(subject: Subject) -> str:
     model, memory = subject.model, ClipMemory()
-    plain = [model.forward_states(prompt).raw for prompt in subject.prompts]
+    uncached_states = [model.forward_states(prompt).raw for prompt in subject.prompts]
     with memory.remembering(model.network):
-        known = [model.forward_states(prompt).raw for prompt in subject.prompts]
-    _require(all((a == b).all() for a, b in zip(plain, known, strict=True)), "a remembered clip gives other states")
+        cached_states = [model.forward_states(prompt).raw for prompt in subject.prompts]
+    _require(
+        all((a == b).all() for a, b in zip(uncached_states, cached_states, strict=True)),
+        "a remembered clip gives other states",
+    )
     return "seen once" if memory.passes == 1 else "seen by every pass"
 
 
 def _batches(subject: Subject) -> str:
     model, prompts = subject.model, subject.prompts
     with _ending(model, model.generate(prompts[:1], 2)[0].tokens[-1]):
-        together = model.generate(prompts, NEW_TOKENS)
-        alone = [model.generate([prompt], NEW_TOKENS)[0] for prompt in prompts]
-    _require([a.tokens for a in together] == [a.tokens for a in alone], "an answer depends on its batch")
+        batched_answers = model.generate(prompts, NEW_TOKENS)
+        single_answers = [model.generate([prompt], NEW_TOKENS)[0] for prompt in prompts]
+    _require(
+        [a.tokens for a in batched_answers] == [a.tokens for a in single_answers], "an answer depends on its batch"
+    )
     return "equal"
 
 
@@ -222,11 +242,11 @@ def _batches(subject: Subject) -> str:
 def _ending(model: LocalModel, token: int) -> Iterator[None]:
     """Stop generation at a token, so that rows of a batch end at different steps."""
     config = model.network.generation_config
-    before, config.eos_token_id = config.eos_token_id, [token]
+    previous_ending, config.eos_token_id = config.eos_token_id, [token]
     try:
         yield
     finally:
-        config.eos_token_id = before
+        config.eos_token_id = previous_ending
 
 
 CHECKS = (

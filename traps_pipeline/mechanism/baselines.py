@@ -117,11 +117,11 @@ def raw_features(
     words = CountVectorizer(ngram_range=(1, 2), binary=True, token_pattern=r"(?u)\b\w+\b").fit(questions)
     clips = {clip for rows in items.values() for name in ("clip", "times_clip") for clip in rows[name].dropna()}
     clip_frames = {clip: _thumbnails(resolve(clip), spec) for clip in sorted(clips)}
-    most = max(len(frames) for frames, _, _ in clip_frames.values())
+    max_frames = max(len(frames) for frames, _, _ in clip_frames.values())
 
     def pixels(clip: str) -> np.ndarray:
         frames = clip_frames[clip][0]
-        missing = np.repeat(frames.mean(axis=0, keepdims=True), most - len(frames), axis=0)
+        missing = np.repeat(frames.mean(axis=0, keepdims=True), max_frames - len(frames), axis=0)
         return np.concatenate([frames, missing]).ravel()
 
     def stamps(row: Mapping[str, Any]) -> list[float]:
@@ -150,8 +150,8 @@ def _thumbnails(clip: Path, spec: MediaSpec) -> tuple[np.ndarray, np.ndarray, fl
         frames = sample(clip, spec)
     except DamagedClip as error:
         raise TrapsError(str(error)) from error
-    small = [cv2.resize(frame, THUMBNAIL, interpolation=cv2.INTER_AREA) for frame in frames.frames]
-    return np.stack(small) / 255, frames.times_s, float(frames.times_s[-1])
+    thumbnails = [cv2.resize(frame, THUMBNAIL, interpolation=cv2.INTER_AREA) for frame in frames.frames]
+    return np.stack(thumbnails) / 255, frames.times_s, float(frames.times_s[-1])
 
 
 class NoMargin(TrapsError):
@@ -217,7 +217,7 @@ def noise_floor(run: ProbeRun, seed: int, draws: int = NOISE_DRAWS) -> list[Row]
 
 
 def _without_figure() -> Row:
-    nothing = dict.fromkeys(("value", "low", "high", "spread"))
+    null_figures = dict.fromkeys(("value", "low", "high", "spread"))
     return {
         "analysis": "held_out",
         "source": "",
@@ -225,5 +225,5 @@ def _without_figure() -> Row:
         "scope": "all",
         "n_voids": 0,
         "n_controls": 0,
-        **nothing,
+        **null_figures,
     }

@@ -58,8 +58,10 @@ def disattenuated(first: PairDifferences, second: PairDifferences, weights: np.n
     A cosine may exceed 1, and is NaN if a mean difference is not longer than its noise.
     """
     lengths = cross_product(first, first, weights) * cross_product(second, second, weights)
-    known = (lengths > 0) & (cross_product(first, first, weights) > 0)
-    return np.where(known, cross_product(first, second, weights) / np.sqrt(np.where(known, lengths, 1)), np.nan)
+    is_defined = (lengths > 0) & (cross_product(first, first, weights) > 0)
+    return np.where(
+        is_defined, cross_product(first, second, weights) / np.sqrt(np.where(is_defined, lengths, 1)), np.nan
+    )
 
 
 def split_half(of: PairDifferences, seed: Sequence[int]) -> float:
@@ -86,26 +88,30 @@ def cosine_rows(workspace: Workspace) -> list[CosineRow]:
 
 
 def _of_model(workspace: Workspace, extractions: Sequence[Extraction]) -> list[CosineRow]:
-    named = [
+    rows_by_name = [
         (StoredStates.of(workspace, extraction), dataset, directions.void)
         for extraction in extractions
         for dataset, directions in saved_directions(workspace, extraction).items()
     ]
-    pairs = [direction_pairs(workspace.mechanism, dataset, states.dataset(dataset)) for states, dataset, _ in named]
+    pairs = [
+        direction_pairs(workspace.mechanism, dataset, states.dataset(dataset)) for states, dataset, _ in rows_by_name
+    ]
     ids = pd.Index(sorted({name for names, _, _ in pairs for name in names}))
     places = [ids.get_indexer(pd.Index(names)) for names, _, _ in pairs]
-    taxonomies = {name: taxonomy_of(d) for (_, d, _), (names, _, _) in zip(named, pairs, strict=True) for name in names}
+    taxonomies = {
+        name: taxonomy_of(d) for (_, d, _), (names, _, _) in zip(rows_by_name, pairs, strict=True) for name in names
+    }
     weights = _weights([taxonomies[name] for name in ids], workspace.mechanism.seed)
     rows: list[CosineRow] = []
-    for layer in range(min(len(vectors) for _, _, vectors in named)):
-        cosines = cosine_matrix(np.stack([vectors[layer] for _, _, vectors in named]))
+    for layer in range(min(len(vectors) for _, _, vectors in rows_by_name)):
+        cosines = cosine_matrix(np.stack([vectors[layer] for _, _, vectors in rows_by_name]))
         differences = []
-        for (states, dataset, _), (_, voids, controls), place in zip(named, pairs, places, strict=True):
+        for (states, dataset, _), (_, voids, controls), place in zip(rows_by_name, pairs, places, strict=True):
             layer_states = np.asarray(states.read(dataset, layer), float)
             differences.append(PairDifferences(layer_states[voids] - layer_states[controls], place))
         halves = [split_half(of, [workspace.mechanism.seed, layer]) for of in differences]
-        for i, (first, dataset, _) in enumerate(named):
-            for j, (second, other_dataset, _) in enumerate(named):
+        for i, (first, dataset, _) in enumerate(rows_by_name):
+            for j, (second, other_dataset, _) in enumerate(rows_by_name):
                 if np.isfinite(cosines[i, j]):
                     rows.append(
                         CosineRow(

@@ -75,15 +75,15 @@ def passes_inside(settings: MechanismSettings, datasets: Sequence[str], scenario
 
     scenarios: their number by taxonomy.
     """
-    paired = sum(2 * scenarios.get(taxonomy_of(name), 0) for name in datasets if name in DATASETS)
+    n_pair_items = sum(2 * scenarios.get(taxonomy_of(name), 0) for name in datasets if name in DATASETS)
     extra_prompts = scenarios.get("occlusion", 0) * ("occlusion" in datasets)  # voids with a question that they answer
     extra_prompts += 2 * scenarios.get("chaotic", 0) * ("chaotic" in datasets)  # sides with the other's times
     extra_prompts += sum(len(sides_of(arm)) * sum(scenarios.values()) for arm in datasets if arm in PROBED_ARMS)
-    work = [Work("states", len(settings.prompts) * paired + extra_prompts)]
+    work = [Work("states", len(settings.prompts) * n_pair_items + extra_prompts)]
     if settings.sentences:  # and the model's own answer, under each regime
-        work.append(Work("sentences", (len(settings.sentences) + 1) * len(settings.prompts) * paired))
+        work.append(Work("sentences", (len(settings.sentences) + 1) * len(settings.prompts) * n_pair_items))
     if settings.gate.untrained:
-        work.append(Work("states of random weights", paired + extra_prompts))
+        work.append(Work("states of random weights", n_pair_items + extra_prompts))
     if settings.patching is not None:
         pairs = sum(min(settings.patching.pairs, scenarios.get(name, 0)) for name in ("occlusion", "chaotic"))
         estimate = 2 + 3  # two recorded passes; one with gradients takes three times as long

@@ -30,10 +30,10 @@ def repeats(text: str) -> bool:
     """Return whether a phrase of at most LONGEST words stands REPEATED times in a row."""
     words = text.lower().split()
     for size in range(1, LONGEST + 1):
-        repeated = 0
+        n_repeats = 0
         for place in range(size, len(words)):
-            repeated = repeated + 1 if words[place] == words[place - size] else 0
-            if repeated >= size * (REPEATED - 1):
+            n_repeats = n_repeats + 1 if words[place] == words[place - size] else 0
+            if n_repeats >= size * (REPEATED - 1):
                 return True
     return False
 

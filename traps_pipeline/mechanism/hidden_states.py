@@ -87,11 +87,18 @@ def clip_item(
         frames = sample(frames_of, spec)
         return model.prompt(system, row["question"], frames.frames, shown_times(frames, frames_of, spec, times))
 
-    about = {"question": row["question"], "clip": row["media_digest"], "media": profile_digest(spec), "system": system}
+    key_parts = {
+        "question": row["question"],
+        "clip": row["media_digest"],
+        "media": profile_digest(spec),
+        "system": system,
+    }
     if times is not None:
-        about["times"] = row["times_digest"]
-    about |= {"other": other[1]} if other else {}
-    return Item(row["item_id"], row["side"], about, partial(asked, clip), partial(asked, other[0]) if other else None)
+        key_parts["times"] = row["times_digest"]
+    key_parts |= {"other": other[1]} if other else {}
+    return Item(
+        row["item_id"], row["side"], key_parts, partial(asked, clip), partial(asked, other[0]) if other else None
+    )
 
 
 def shown_times(shown: Frames, clip: Path, spec: MediaSpec, times: Path | None) -> np.ndarray:
@@ -126,18 +133,18 @@ def extract(
     written.
     """
     keys = [states_key(model, item, pooling) for item in items]
-    places, count, here = dict[str, _Place](), 0, FolderStore(folder)
-    with alone(here, _WRITING):
+    places, count, local_files = dict[str, _Place](), 0, FolderStore(folder)
+    with alone(local_files, _WRITING):
         _look_for(folder, places)
     total = sum(key not in places for key in keys)
-    for chunk in leased_ranges(here, "chunks", len(items), shard_size):
+    for chunk in leased_ranges(local_files, "chunks", len(items), shard_size):
         if any(keys[n] not in places for n in chunk):
             _look_for(folder, places)  # another process may have made this chunk
         missing = [(items[n], keys[n]) for n in chunk if keys[n] not in places]
         if missing:
             tick = partial(_tick, noun, count, total)
             count += _make(model, missing, folder, pooling, tick, places)
-    with alone(here, _WRITING):
+    with alone(local_files, _WRITING):
         _write_ids(folder, items, keys, places, _record(model, pooling))
         _sweep(folder, {places[key][0] for key in keys})
     _note_devices(folder, sorted({places[key][2] for key in keys}))
@@ -224,30 +231,30 @@ def _pooled_tokens(model: LocalModel, prompt: Prompt, item: Item, pooling: Pooli
 
 
 def _of_pair(visual: np.ndarray, prompt: Prompt, item: Item) -> dict[str, np.ndarray]:
-    changed = changed_tokens(prompt, item.other(), visual) if item.other else None
-    if changed is None:
+    is_changed = changed_tokens(prompt, item.other(), visual) if item.other else None
+    if is_changed is None:
         raise TrapsError(
             f"{item.item_id}: its visual tokens cannot be compared with those of the pair's other clip (not as many, "
             "or pixels that do not come token by token); choose another pooling"
         )
-    return {"changed": changed, "unchanged": visual & ~changed}
+    return {"changed": is_changed, "unchanged": visual & ~is_changed}
 
 
 def _prepared(missing: Sequence[tuple[Item, str]]) -> Iterator[tuple[tuple[Item, str], Prompt]]:
     """Yield items with their prompts, preparing the next ones while the model works."""
     with ThreadPoolExecutor(1) as pool:
-        waiting: deque[tuple[tuple[Item, str], Future[Prompt]]] = deque()
+        queue: deque[tuple[tuple[Item, str], Future[Prompt]]] = deque()
         try:
             for pair in missing:
-                waiting.append((pair, pool.submit(pair[0].prompt)))
-                if len(waiting) > PREPARED_AHEAD:
-                    first, prompt = waiting.popleft()
+                queue.append((pair, pool.submit(pair[0].prompt)))
+                if len(queue) > PREPARED_AHEAD:
+                    first, prompt = queue.popleft()
                     yield first, prompt.result()
-            while waiting:
-                first, prompt = waiting.popleft()
+            while queue:
+                first, prompt = queue.popleft()
                 yield first, prompt.result()
         finally:
-            for _, prompt in waiting:
+            for _, prompt in queue:
                 prompt.cancel()
 
 

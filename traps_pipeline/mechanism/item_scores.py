@@ -25,23 +25,23 @@ from traps_pipeline.storage.workspace import Workspace
 def item_score_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> list[ItemScoreRow]:
     """Return ITEM_SCORES of an extraction, a row per item of the pairs' datasets."""
     settings, table = workspace.mechanism, gate_table(states)
-    present = [name for name in DATASETS if len(states.dataset(name))]
-    layers = chosen_layers(workspace, states, present)
+    datasets = [name for name in DATASETS if len(states.dataset(name))]
+    layers = chosen_layers(workspace, states, datasets)
     outcomes = {regime: outcomes_of(workspace, entry.id, regime, states) for regime in PROMPTING}
     try:
-        margins = output_margins(entry, states, present)
+        margins = output_margins(entry, states, datasets)
     except NoMargin as error:
         progress.current().note(f"item_scores: no output margin ({error})")
         margins = {}
-    about = {"folds": settings.probes.folds, "seed": settings.seed, "false_abs": settings.gate.false_abs}
+    probe_settings = {"folds": settings.probes.folds, "seed": settings.seed, "false_abs": settings.gate.false_abs}
     rows: list[ItemScoreRow] = []
-    for dataset in present:
+    for dataset in datasets:
         features = read_states(states, [*dict.fromkeys(table["dataset"])], layers[dataset])
         scores: dict[str, np.ndarray] = {}
         items = gate_items(table, features, shuffled=False, seed=settings.seed)
         for name, source in (("own", f"one:{dataset}"), ("others", OTHER_DATASETS)):
-            if sources_of_gate(source, dataset, present):
-                decision = decide(items, source, dataset, **about)
+            if sources_of_gate(source, dataset, datasets):
+                decision = decide(items, source, dataset, **probe_settings)
                 scores[name] = decision.score - decision.threshold[MID]
         for place, item in enumerate(states.dataset(dataset).to_dict("records")):
             abstained: dict[str, Any] = {

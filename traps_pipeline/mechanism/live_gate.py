@@ -105,11 +105,11 @@ def gate(
 
 def _train(states: StoredStates, source: str, target: str, layer: int, without: Collection[str]) -> Items:
     table = gate_table(states)
-    present = [name for name in DATASETS if name in set(table["dataset"])]
-    names = sources_of_gate(source, target, present)
+    datasets = [name for name in DATASETS if name in set(table["dataset"])]
+    names = sources_of_gate(source, target, datasets)
     if not names:
-        raise TrapsError(f"no gate from {source!r}; the study has states of {', '.join(present) or 'no dataset'}")
+        raise TrapsError(f"no gate from {source!r}; the study has states of {', '.join(datasets) or 'no dataset'}")
     table = table.loc[table["dataset"].isin(names)].reset_index(drop=True)
-    unseen = ~(table["scenario_id"].isin(without) | table["family"].isin(without)).to_numpy(bool)
+    is_training = ~(table["scenario_id"].isin(without) | table["family"].isin(without)).to_numpy(bool)
     features = {name: states.read(name, layer) for name in names}
-    return gate_items(table, features, shuffled=False, seed=0).rows(unseen)
+    return gate_items(table, features, shuffled=False, seed=0).rows(is_training)

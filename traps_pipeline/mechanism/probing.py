@@ -137,8 +137,8 @@ class ProbeRun:
     def rows(self, progress: Callable[[int, int], None] = lambda layers_done, total: None) -> list[Row]:
         """Return every row of the probes table without the columns that partition it."""
         rows: list[Row] = []
-        for layers_done, of_layer in enumerate(each_layer(self.layer_rows, self.n_layers), start=1):
-            rows += of_layer
+        for layers_done, layer_rows in enumerate(each_layer(self.layer_rows, self.n_layers), start=1):
+            rows += layer_rows
             progress(layers_done, self.n_layers)
         return mark_layers(rows + self._problems())
 
@@ -151,10 +151,10 @@ class ProbeRun:
     def comparable(self, layer: int, splits: Mapping[str, Split] | None = None) -> list[Row]:
         """Return one layer's rows that baselines share, from transfer to swapped times."""
         splits = splits or {name: self._split(name, layer) for name in self._datasets}
-        unseen = {source: self._unseen_scores(source, splits) for source in self._own}
-        rows = self.transfer(layer, splits) + self.held_out(layer, splits, unseen)
+        unseen_scores = {source: self._unseen_scores(source, splits) for source in self._own}
+        rows = self.transfer(layer, splits) + self.held_out(layer, splits, unseen_scores)
         rows += self.confabulated_transfer(layer, splits) + self.confabulated_held_out(layer, splits)
-        return rows + self.answerable(layer, splits, unseen) + self.time_swapped(layer, splits, unseen)
+        return rows + self.answerable(layer, splits, unseen_scores) + self.time_swapped(layer, splits, unseen_scores)
 
     def transfer(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
         """Return the twelve ordered pairs on all samples.
@@ -167,24 +167,26 @@ class ProbeRun:
 
     def confabulated_transfer(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
         """Return the same pairs restricted to confabulated voids and their controls."""
-        restricted = self._confabulated(splits)
-        pairs = [pair for pair in self._pairs if set(pair) <= set(restricted)]
-        scores = transfer_scores(restricted, pairs, self.fit)
-        return [self._scored("confabulated", path, layer, restricted[path[1]], v) for path, v in scores.items()]
+        confabulated_splits = self._confabulated(splits)
+        pairs = [pair for pair in self._pairs if set(pair) <= set(confabulated_splits)]
+        scores = transfer_scores(confabulated_splits, pairs, self.fit)
+        return [
+            self._scored("confabulated", path, layer, confabulated_splits[path[1]], v) for path, v in scores.items()
+        ]
 
     def confabulated_held_out(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
         """Return Cf->Cf within a taxonomy by held-out probes, null with few scenarios."""
-        restricted, rows = self._confabulated(splits), []
+        confabulated_splits, rows = self._confabulated(splits), []
         for source, target in self._pairs:
-            if not {source, target} <= set(restricted) or taxonomy_of(source) != taxonomy_of(target):
+            if not {source, target} <= set(confabulated_splits) or taxonomy_of(source) != taxonomy_of(target):
                 continue
-            both = {name: restricted[name] for name in (source, target)}
-            few = self._too_few(source, both)
-            scores = None if few else self._unseen_scores(source, both)[target]
+            split_pair = {name: confabulated_splits[name] for name in (source, target)}
+            note = self._too_few(source, split_pair)
+            scores = None if note else self._unseen_scores(source, split_pair)[target]
             if scores is None:
-                rows.append(_row("confabulated_held_out", (source, target), layer, None, both[target], note=few))
+                rows.append(_row("confabulated_held_out", (source, target), layer, None, split_pair[target], note=note))
             else:
-                rows.append(self._scored("confabulated_held_out", (source, target), layer, both[target], scores))
+                rows.append(self._scored("confabulated_held_out", (source, target), layer, split_pair[target], scores))
         return rows
 
     def _confabulated(self, splits: Mapping[str, Split]) -> dict[str, Split]:
@@ -193,15 +195,15 @@ class ProbeRun:
     def _too_few(self, source: str, splits: Mapping[str, Split]) -> str:
         """Return why a source's probes cannot hold out a fold of scenarios, if so."""
         n, folds = len(np.unique(splits[source].scenario)), self.settings.folds
-        every = np.unique(np.concatenate([split.scenario for split in splits.values()]))
-        if len(every) >= folds and len(np.unique(self._folds(splits)[source])) > 1:
+        scenarios = np.unique(np.concatenate([split.scenario for split in splits.values()]))
+        if len(scenarios) >= folds and len(np.unique(self._folds(splits)[source])) > 1:
             return ""
         return f"{path_name(*splits)}, held out: {n} confabulated voids are too few for {folds} folds of scenarios"
 
     def _folds(self, splits: Mapping[str, Split]) -> dict[str, np.ndarray]:
         """Return the fold of each item, by dataset; a scenario's fold is the same in all."""
-        every = np.unique(np.concatenate([split.scenario for split in splits.values()]))
-        fold_of = dict(zip(every, scenario_folds(every, self.settings.folds, self.seed), strict=True))
+        scenarios = np.unique(np.concatenate([split.scenario for split in splits.values()]))
+        fold_of = dict(zip(scenarios, scenario_folds(scenarios, self.settings.folds, self.seed), strict=True))
         return {name: np.array([fold_of[s] for s in split.scenario]) for name, split in splits.items()}
 
     def within(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
@@ -212,9 +214,11 @@ class ProbeRun:
             folds = scenario_folds(split.scenario, self.settings.folds, self.seed)
             swapped = swapped_labels(split.void, split.scenario, self.settings.shuffles, self.seed)
             areas = within_split(split, np.column_stack([split.void, swapped]), folds)
-            shuffled = areas[1:]
+            shuffled_areas = areas[1:]
             rows.append(_row("within", (name, name), layer, areas[0], split))
-            rows.append(_row("shuffled", (name, name), layer, shuffled.mean(), split, spread=shuffled.std()))
+            rows.append(
+                _row("shuffled", (name, name), layer, shuffled_areas.mean(), split, spread=shuffled_areas.std())
+            )
         return rows
 
     def held_out(
@@ -235,12 +239,12 @@ class ProbeRun:
         of these against the controls; the reverse. Probes of the same taxonomy are fitted without the scored scenario.
         """
         rows = []
-        for source, (extra, of_extra) in product(self._own, LOOK_ALIKES.items()):
-            if not {extra, of_extra} <= set(splits):
+        for source, (extra, extra_kind) in product(self._own, LOOK_ALIKES.items()):
+            if not {extra, extra_kind} <= set(splits):
                 continue
             for analysis, positive, negative in (
-                ("answerable_void", (of_extra, True), (extra, None)),
-                ("answerable_control", (extra, None), (of_extra, False)),
+                ("answerable_void", (extra_kind, True), (extra, None)),
+                ("answerable_control", (extra, None), (extra_kind, False)),
             ):
                 sides = [self._side(splits, unseen[source], *side) for side in (positive, negative)]
                 labels = np.repeat([True, False], [len(values) for values, _ in sides])
@@ -371,9 +375,9 @@ def mark_layers(rows: Sequence[Row]) -> list[Row]:
             key = (row["analysis"], row["source"], row["target"])
             curves.setdefault(key, {})[row["layer"]] = row["value"]
     best = {key: min(curve, key=lambda layer: (-curve[layer], layer)) for key, curve in curves.items()}
-    of_pairs = pair_curves(rows)
+    curve_of = pair_curves(rows)
     targets = {row["target"] for row in rows if row["analysis"] in CURVES}
-    layers = {target: layer_choice(of_pairs, target).layer for target in targets} if of_pairs else {}
+    layers = {target: layer_choice(curve_of, target).layer for target in targets} if curve_of else {}
     return [
         row
         if row["analysis"] not in CURVES

@@ -47,9 +47,9 @@ def sentence_rows(workspace: Workspace, entry: ModelEntry, extraction: Extractio
         items = workspace.tables.read(PROBE_ITEMS, {"dataset": dataset}).to_dict("records")
         for number, item in enumerate(items, start=1):
             progress.current().tick("sentences", f"items of {cell.key}", number, len(items))
-            about = {str(name): value for name, value in item.items()}
-            prompt = probed_item(workspace, model, entry.media, about, system_prompt(regime)).prompt()
-            text = texts.get(about["item_id"])
+            item_columns = {str(name): value for name, value in item.items()}
+            prompt = probed_item(workspace, model, entry.media, item_columns, system_prompt(regime)).prompt()
+            text = texts.get(item_columns["item_id"])
             answer_ids = answer_tokens(model, text)[:OWN_TOKENS] if isinstance(text, str) and text else []
             with model.caching_clips():
                 likely = {name: mean_log_probability(model, prompt, tokens) for name, tokens in sentences.items()}
@@ -58,7 +58,7 @@ def sentence_rows(workspace: Workspace, entry: ModelEntry, extraction: Extractio
             rows.append(
                 SentenceRow(
                     **extraction.partition,
-                    **{name: about[name] for name in ("item_id", "dataset", "scenario_id", "side")},
+                    **{name: item_columns[name] for name in ("item_id", "dataset", "scenario_id", "side")},
                     sentence=best,
                     abstention=likely[best],
                     own=answer,

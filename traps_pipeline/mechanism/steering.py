@@ -187,13 +187,15 @@ def count_answers(
             if side in row.sides:
                 along = (owner, side, row.source, row.kind, row.draw, row.layer, sign_of(row.signs, side))
                 doses = row.doses if row.kind == "void" else row.doses[-1:]
-                cells |= {(*along, *rest) for rest in product(steering.direction_regimes, doses)}
+                cells |= {(*along, *combination) for combination in product(steering.direction_regimes, doses)}
     answers = Counter[str]()
     for cell in cells:
         source, taxonomy = str(cell[2]), taxonomy_of(str(cell[0]))
-        own = source != UNSTEERED and taxonomy_of(source) == taxonomy  # along a direction of its own scenarios
-        unseen = scenarios.get(taxonomy, 0) - (steering.direction_pairs(source) if own else 0)
-        answers[cell[1]] += max(0, min(steering.pairs, unseen))
+        is_own_direction = (
+            source != UNSTEERED and taxonomy_of(source) == taxonomy
+        )  # along a direction of its own scenarios
+        n_scenarios = scenarios.get(taxonomy, 0) - (steering.direction_pairs(source) if is_own_direction else 0)
+        answers[cell[1]] += max(0, min(steering.pairs, n_scenarios))
     return dict.fromkeys(steering.inference_regimes, answers)
 
 
@@ -218,9 +220,9 @@ def wanted_steered(
     scenarios = steered_scenarios(sorted(set(items["scenario_id"])), settings.steering.pairs, settings.seed)
     rows = items.loc[items["scenario_id"].isin(scenarios)].to_dict("records")
     plan = strengths(cell.dataset, settings.models[entry.id], settings, directions)
-    most = settings.steering.max_new_tokens
+    max_tokens = settings.steering.max_new_tokens
     return [
-        SteeredQuestion(steered_request(workspace, entry, item, cell, strength, most), item, strength)
+        SteeredQuestion(steered_request(workspace, entry, item, cell, strength, max_tokens), item, strength)
         for item in rows
         for strength, sides in plan
         if item["side"] in sides
@@ -242,8 +244,8 @@ def steered_request(
     media = workspace.media.prepare(clip, item["media_digest"], entry.media)
     steering = None
     if strength.alpha:
-        signed = strength.signed_alpha(item["side"])
-        steering = {"direction": strength.digest, "layer": strength.layer, "alpha": signed}
+        signed_alpha = strength.signed_alpha(item["side"])
+        steering = {"direction": strength.digest, "layer": strength.layer, "alpha": signed_alpha}
     return Request(
         participant=entry.id,
         endpoint=entry.backend,
@@ -279,8 +281,8 @@ def collect_steered(
     """
     vectors = {
         vector_digest(vector): vector
-        for of_prompt in directions.values()
-        for group in of_prompt.values()
+        for prompt_directions in directions.values()
+        for group in prompt_directions.values()
         for kind in group.vectors
         for draw in group.vectors[kind]
         for vector in draw
@@ -290,14 +292,14 @@ def collect_steered(
 
     def calls(cell: SteeringCell) -> list[SteeredQuestion]:
         questions = wanted_steered(workspace, entry, cell, directions[cell.directions])
-        store.chunks([each.request for each in questions])
+        store.chunks([question.request for question in questions])
         return questions
 
     def finish(settled: SettledCell[SteeringCell, SteeredQuestion]) -> tuple[SteeringCell, StageOutput]:
-        store.forget([each.request for each in settled.calls])
-        answered = settled.answered()
-        plain = {q.item["item_id"]: row["text"] for q, row in answered if q.strength.kind == UNSTEERED}
-        return settled.output(partial(_steering_row, plain))
+        store.forget([call.request for call in settled.calls])
+        answers = settled.answered()
+        unsteered_texts = {q.item["item_id"]: row["text"] for q, row in answers if q.strength.kind == UNSTEERED}
+        return settled.output(partial(_steering_row, unsteered_texts))
 
     def make(entry: Entry) -> SteeredBackend:
         return SteeredBackend(entry, vectors, store)
@@ -318,7 +320,7 @@ def _make_meanwhile(
     """Generate answers of a cell while another process writes those of its evaluation."""
     report = progress.current()
     report.note(f"{cell.key}: another process writes the answers; some are made here, from the last one on")
-    requests = [each.request for each in questions]
+    requests = [question.request for question in questions]
     tick = partial(report.tick, "steering", f"chunks of answers of {cell.key}")
     count = make_meanwhile(shared, workspace.answers, cell.evaluation.key, requests, backend.generate, tick)
     report.note(f"{cell.key}: {count} answers were made for the process that writes them")
@@ -358,18 +360,18 @@ def wanted_steering_ballots(workspace: Workspace, panel: Sequence[JudgeEntry], c
     """Return the calls for every vote on the steered answers of a cell."""
     ballots = []
     for answer, item in judged_answers(workspace, STEERING, cell):
-        shared = item | {"item_id": shared_item(answer)}
-        both = item | answer
+        control_item = item | {"item_id": shared_item(answer)}
+        answer_row = item | answer
         for task in tasks_for(answer["side"]):
-            for request in vote_requests(panel, task, cell, shared, answer["text"]):
-                about = {**request.about, "steered": answer["request_key"]}
-                ballots.append(Ballot(replace(request, about=about), both, task))
+            for request in vote_requests(panel, task, cell, control_item, answer["text"]):
+                subject = {**request.about, "steered": answer["request_key"]}
+                ballots.append(Ballot(replace(request, about=subject), answer_row, task))
     return ballots
 
 
 def _vote_row(cell: SteeringCell, ballot: Ballot, row: Row) -> SteeringVoteRow:
-    copied = ("source", "kind", "draw", "layer", "unit", "dose", "signs", "alpha", "item_id", "side")
-    about = {name: ballot.item[name] for name in (*copied, "benchmark_version")}
+    columns = ("source", "kind", "draw", "layer", "unit", "dose", "signs", "alpha", "item_id", "side")
+    item_columns = {name: ballot.item[name] for name in (*columns, "benchmark_version")}
     vote = ballot.vote(row)
     correct = vote.decision if ballot.task == "correctness" else None
-    return SteeringVoteRow(**cell.partition, **about, **vote_columns(ballot, vote, row), correct=correct)
+    return SteeringVoteRow(**cell.partition, **item_columns, **vote_columns(ballot, vote, row), correct=correct)

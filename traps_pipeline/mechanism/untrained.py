@@ -47,14 +47,14 @@ def untrained_states(
     model = untrained_model(entry, workspace.mechanism.seed)
     system, layer = states_prompt(workspace.mechanism.system, states.extraction.prompt), (model.n_layers + 1) // 2
     assert entry.media is not None, "local entries have media"
-    by_dataset: dict[str, np.ndarray] = {}
+    states_by_dataset: dict[str, np.ndarray] = {}
     parts: dict[str, list[np.ndarray]] = {}
     for dataset, rows in items.items():
         keys = states.dataset(dataset)["states_key"]
         for key, row in zip(keys, rows.to_dict("records"), strict=True):
-            if key not in by_dataset:
-                named = {str(name): value for name, value in row.items()}
-                item = probed_item(workspace, model, entry.media, named, system)
-                by_dataset[key] = item_states(model, item, item.prompt(), workspace.mechanism.pooling).raw[layer]
-            parts.setdefault(dataset, []).append(by_dataset[key])
+            if key not in states_by_dataset:
+                item_row = {str(name): value for name, value in row.items()}
+                item = probed_item(workspace, model, entry.media, item_row, system)
+                states_by_dataset[key] = item_states(model, item, item.prompt(), workspace.mechanism.pooling).raw[layer]
+            parts.setdefault(dataset, []).append(states_by_dataset[key])
     return {dataset: np.stack(vectors) for dataset, vectors in parts.items()}

@@ -93,11 +93,11 @@ class AccountBudget:
 
     def explain(self, worst_usd: float) -> str:
         """Return why there is no room for a call."""
-        spent = self.spent_usd
+        spent_usd = self.spent_usd
         return (
-            f"the budget of the account {self.account} is reached: {len(spent)} studies have spent "
-            f"${sum(spent.values()):.2f} of ${self.cap_usd:.2f} (calls in flight count as their worst case), the next "
-            f"call may cost ${worst_usd:.4f}. Raise `usd` in {self.folder / CAP} and run the same command to go on"
+            f"the budget of the account {self.account} is reached: {len(spent_usd)} studies have spent "
+            f"${sum(spent_usd.values()):.2f} of ${self.cap_usd:.2f} (calls in flight count as their worst case), the "
+            f"next call may cost ${worst_usd:.4f}. Raise `usd` in {self.folder / CAP} and run the same command to go on"
         )
 
     def close(self) -> None:
@@ -135,8 +135,10 @@ class AccountBudget:
             self._read = 0
             self._spent.clear()
         content = os.pread(self._descriptor, size - self._read, self._read)
-        if torn := len(content) - (content.rfind(b"\n") + 1):  # torn line of a dead process: its call was never sent
-            size, content = size - torn, content[:-torn]
+        if torn_length := len(content) - (
+            content.rfind(b"\n") + 1
+        ):  # torn line of a dead process: its call was never sent
+            size, content = size - torn_length, content[:-torn_length]
             os.ftruncate(self._descriptor, size)
         for line in content.splitlines(keepends=True):
             if not is_whole(line):

@@ -117,8 +117,8 @@ def with_posteriors(workspace: Workspace, dataset: str, items: list[dict[str, An
     """Add `posterior`, which strategy `bayes` reads, to items of graded cuts."""
     if dataset != GRADED:
         return items
-    known = posteriors(workspace)
-    return [item | {"posterior": known[item["pair_id"].removeprefix(f"{GRADED}:")]} for item in items]
+    posterior_of = posteriors(workspace)
+    return [item | {"posterior": posterior_of[item["pair_id"].removeprefix(f"{GRADED}:")]} for item in items]
 
 
 def _secret(entry: ModelEntry, item: Mapping[str, Any]) -> dict[str, Any]:

@@ -170,8 +170,8 @@ class ApiBackend:
                     return self._failure(error, exchange)
             if exchange.status is None:  # a bug of ours, or of a new version of the client library
                 exchange.sent = None
-            elif (reported := read_error(exchange.content)) is not None:
-                return self._reported(reported, exchange)
+            elif (provider_error := read_error(exchange.content)) is not None:
+                return self._reported(provider_error, exchange)
             return self._read(request, exchange)  # whatever exception the library raises for it
 
     def _read(self, request: Request, exchange: Exchange) -> Outcome:
@@ -199,7 +199,7 @@ class ApiBackend:
         prompt_bytes = len((request.system + request.user).encode("utf-8", "replace"))
         frames = request.sent.n_frames if request.sent else 0
         usage = read_usage(reply.usage, Sizes(prompt_bytes, frames, len((reply.text or reply.refusal).encode())))
-        believed = usage if usage and usage.believed else None
+        believed_usage = usage if usage and usage.believed else None
         kind = _kind(reply)
         return Outcome(
             kind,
@@ -208,9 +208,9 @@ class ApiBackend:
             finish_reason=reply.finish,
             served_model=reply.served_model,
             client=client_version(),
-            prompt_tokens=believed and believed.prompt,
-            completion_tokens=believed and believed.completion,
-            reasoning_tokens=believed and believed.reasoning,
+            prompt_tokens=believed_usage and believed_usage.prompt,
+            completion_tokens=believed_usage and believed_usage.completion,
+            reasoning_tokens=believed_usage and believed_usage.reasoning,
             cost_usd=self._cost(usage, request),
             first_token=stored_alternatives(reply.first_token, request.about.get("regime")),
         )
@@ -222,11 +222,11 @@ class ApiBackend:
         """
         if self._entry.prices is None or usage is None:
             return None
-        cost, worst = self._entry.prices.cost(usage.prompt, usage.completion), worst_case_usd(self._entry, request)
-        if not usage.believed and cost > worst:
+        cost, worst_usd = self._entry.prices.cost(usage.prompt, usage.completion), worst_case_usd(self._entry, request)
+        if not usage.believed and cost > worst_usd:
             counts = f"{usage.prompt} tokens of prompt and {usage.completion} of the answer"
             self._tell("usage", f"contradicts itself; the most that it says is booked, {counts}")
-        return cost if usage.believed else max(cost, worst)
+        return cost if usage.believed else max(cost, worst_usd)
 
     def _failure(self, error: Exception, exchange: Exchange) -> Outcome:
         """Return a failure as an outcome, without its text, or raise it as TransientError."""
@@ -236,9 +236,9 @@ class ApiBackend:
             reason = redact(plain(exchange.problem or cause_of(error)))
             self._tell(UNREACHABLE, reason, passes=True)
             raise TransientError(UNREACHABLE, billed=False, why=reason) from None
-        reported = read_error(exchange.content)
-        if reported is not None or (exchange.status is not None and not exchange.is_answered):
-            return self._reported(reported, exchange)
+        provider_error = read_error(exchange.content)
+        if provider_error is not None or (exchange.status is not None and not exchange.is_answered):
+            return self._reported(provider_error, exchange)
         kind = "timeout" if isinstance(error, self._litellm.Timeout) else "connection"
         self._tell(kind, exchange.problem or cause_of(error), passes=True)
         raise TransientError(kind) from None
@@ -249,29 +249,29 @@ class ApiBackend:
         The status is the one on the wire, or the one in the error object if that came with a 200. error: None if the
         body holds none.
         """
-        reported = error or ProviderError(self._beginning(exchange))
-        status = (reported.status or UNKNOWN_ERROR) if exchange.is_answered else exchange.status
+        provider_error = error or ProviderError(self._beginning(exchange))
+        status = (provider_error.status or UNKNOWN_ERROR) if exchange.is_answered else exchange.status
         assert status is not None
         is_explained = error is not None and not error.is_beside_answer
         billed = exchange.is_billable(status, is_explained=is_explained)
         origin = " (an error object in an HTTP 200)" if exchange.is_answered else ""
         origin += f" (through the proxy of {exchange.proxy})" if exchange.proxy else ""
-        if reported.is_filtered and status not in TRANSIENT_STATUSES:
-            self._tell(REFUSED_CONTENT, f"{reported}{origin}")
+        if provider_error.is_filtered and status not in TRANSIENT_STATUSES:
+            self._tell(REFUSED_CONTENT, f"{provider_error}{origin}")
             return Outcome("refused", error=REFUSED_CONTENT, cost_usd=None if billed else 0.0)
-        kind = failure_kind(status, reported)
+        kind = failure_kind(status, provider_error)
         is_final = kind.startswith("http_")
-        self._tell(kind, f"{reported}{origin}", passes=not is_final)
+        self._tell(kind, f"{provider_error}{origin}", passes=not is_final)
         if is_final:
             return Outcome("error", error=kind, cost_usd=None if billed else 0.0)
-        raise TransientError(kind, retry_after_s(exchange.headers, reported), billed=billed) from None
+        raise TransientError(kind, retry_after_s(exchange.headers, provider_error), billed=billed) from None
 
     def _beginning(self, exchange: Exchange) -> str:
         """Return the beginning of an answer without an error object, for people."""
         text = redact((exchange.content or b"").decode("utf-8", "replace"))  # before it is cut
         kind = exchange.headers.get("Content-Type", "no content type").partition(";")[0]
-        begins = f", beginning {text[:60]!r}" if text.strip() else ""
-        return f"HTTP {exchange.status}, {kind}, {len(exchange.content or b'')} bytes{begins}"
+        quotation = f", beginning {text[:60]!r}" if text.strip() else ""
+        return f"HTTP {exchange.status}, {kind}, {len(exchange.content or b'')} bytes{quotation}"
 
     def _tell(self, kind: str, message: str, *, passes: bool | None = None) -> None:
         """Report a message once per kind, without the key, and whether a run retries.
@@ -282,11 +282,11 @@ class ApiBackend:
             self._told.add(kind)
             message = redact(" ".join(message.split())).removeprefix(f"{kind}: ")  # before it is cut
             happened = _HAPPENED.get(kind, "a call failed")
-            most = self._entry.limits.retries if passes else 0
-            retries = min(most, 1) if kind == MALFORMED else most
-            again = f"again, at most {counted(retries, 'time')}" if retries else "only once"
-            further = "" if passes is None else f"; a run tries such a call {again}"
-            progress.current().note(f"{self._entry.id}: {happened}{further} ({kind}: {plain(message)[:300]})")
+            max_retries = self._entry.limits.retries if passes else 0
+            retries = min(max_retries, 1) if kind == MALFORMED else max_retries
+            retry_text = f"again, at most {counted(retries, 'time')}" if retries else "only once"
+            retry_note = "" if passes is None else f"; a run tries such a call {retry_text}"
+            progress.current().note(f"{self._entry.id}: {happened}{retry_note} ({kind}: {plain(message)[:300]})")
 
 
 def failure_kind(status: int, reported: ProviderError) -> str:

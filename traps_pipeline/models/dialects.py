@@ -163,8 +163,8 @@ def _responses(body: Json) -> Reply:
             texts.add(item.get("content"), "reasoning" if item.get("phase") == "commentary" else None)
         elif item.get("type") == "reasoning":
             texts.add(item.get("summary") or item.get("content"), "reasoning")
-    why = body.get("incomplete_details")
-    reason = why.get("reason") if isinstance(why, dict) else None
+    details = body.get("incomplete_details")
+    reason = details.get("reason") if isinstance(details, dict) else None
     return texts.reply(reason or body.get("status"), body.get("model"), body.get("usage"))
 
 

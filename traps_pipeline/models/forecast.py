@@ -50,10 +50,10 @@ class Forecast:
 
 def experience(totals: Iterable[Totals]) -> Experience:
     """Return means over one participant's ledger rows."""
-    joined = Totals()
+    sum_of_totals = Totals()
     for part in totals:
-        joined.join(part)
-    return Experience(*(joined.mean(column) for column in AVERAGED))
+        sum_of_totals.join(part)
+    return Experience(*(sum_of_totals.mean(column) for column in AVERAGED))
 
 
 def forecast(entry: Entry, calls: int, seen: Experience) -> Forecast:
@@ -88,15 +88,15 @@ def forecast(entry: Entry, calls: int, seen: Experience) -> Forecast:
 
 def minutes_of(forecasts: Iterable[Forecast]) -> float:
     """Return parallel calls' minutes: the slowest participant's, or an account's pace."""
-    rows, shared = list(forecasts), dict[str, float]()
+    rows, minutes_by_account = list(forecasts), dict[str, float]()
     for row in rows:
-        shared[row.account] = shared.get(row.account, 0.0) + row.paced_minutes
-    return max([row.minutes for row in rows] + [*shared.values()], default=0.0)
+        minutes_by_account[row.account] = minutes_by_account.get(row.account, 0.0) + row.paced_minutes
+    return max([row.minutes for row in rows] + [*minutes_by_account.values()], default=0.0)
 
 
 def _clip_tokens(entry: Entry) -> tuple[float, float]:
     """Return the prompt tokens of a clip: expected, and maximum."""
     if not isinstance(entry, ModelEntry) or entry.media is None:
         return 0.0, 0.0
-    most = entry.tokens_per_frame * (entry.media.uniform or entry.media.most)
-    return min(expected_clip_tokens(entry), most), most
+    max_tokens = entry.tokens_per_frame * (entry.media.uniform or entry.media.most)
+    return min(expected_clip_tokens(entry), max_tokens), max_tokens

@@ -31,9 +31,9 @@ def openai_frame(model: str, size: Size) -> float | None:
     calculation discrepancy", 2026-06-17).
     """
     width, height = size
-    for name, each in PATCHED.items():
+    for name, patch_rule in PATCHED.items():
         if model.startswith(name):
-            return each * ceil(width / 32) * ceil(height / 32)
+            return patch_rule * ceil(width / 32) * ceil(height / 32)
     for name, (base, tile) in TILED.items():
         if model.startswith(name):
             return base + tile * ceil(width / 512) * ceil(height / 512)
@@ -75,8 +75,8 @@ def expected_clip_tokens(entry: ModelEntry) -> float:
     media = entry.media
     if media is None:
         return 0.0
-    route, _, rest = str(entry.provider_id).partition("/")
-    model, size = rest.removeprefix("responses/"), media.size or (WIDTH, HEIGHT)
+    route, _, model_name = str(entry.provider_id).partition("/")
+    model, size = model_name.removeprefix("responses/"), media.size or (WIDTH, HEIGHT)
     counts: dict[str, Callable[[], float | None]] = {
         "openai": lambda: openai_frame(model, size),
         "gemini": lambda: gemini_frame(model, size, media.profile),

@@ -55,16 +55,16 @@ class Participant:
 
 def allow_connections(count: int) -> None:
     """Increase the open-file limit for these connections. Raises TrapsError if denied."""
-    needed = count + FILES
+    n_needed = count + FILES
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if soft == resource.RLIM_INFINITY or soft >= needed:
+    if soft == resource.RLIM_INFINITY or soft >= n_needed:
         return
-    if hard != resource.RLIM_INFINITY and hard < needed:
+    if hard != resource.RLIM_INFINITY and hard < n_needed:
         raise TrapsError(
-            f"{count} connections at once need {needed} open files, and this shell allows {hard}: raise that "
-            f"(`ulimit -n {needed}`), or lower limits.concurrency of the models that are asked; nothing was sent"
+            f"{count} connections at once need {n_needed} open files, and this shell allows {hard}: raise that "
+            f"(`ulimit -n {n_needed}`), or lower limits.concurrency of the models that are asked; nothing was sent"
         )
-    resource.setrlimit(resource.RLIMIT_NOFILE, (needed, hard))
+    resource.setrlimit(resource.RLIMIT_NOFILE, (n_needed, hard))
 
 
 class Participants:
@@ -141,11 +141,11 @@ async def attempt(
             await participant.meter.admit(tokens.prompt + tokens.completion, allowed.halted)
             if allowed.halted():
                 return _given_up("interrupted", number - 1, seconds, lost_usd)
-            began = time.monotonic()
+            started_at = time.monotonic()
             try:
                 outcome = await _send(participant, request, allowed)
             except TransientError as error:
-                failure, seconds = error, time.monotonic() - began
+                failure, seconds = error, time.monotonic() - started_at
             except BudgetReached:
                 if lost_usd:  # record lost money in the ledger first; the next call meets the cap again
                     return _given_up("budget", number - 1, seconds, lost_usd)
@@ -155,7 +155,7 @@ async def attempt(
                 participant.breaker.connected()
                 if lost_usd:
                     outcome = replace(outcome, cost_usd=(outcome.cost_usd or 0.0) + lost_usd)
-                return outcome, number, time.monotonic() - began
+                return outcome, number, time.monotonic() - started_at
         if failure.kind == RATE_LIMITED:
             participant.gate.slow_down()
         if failure.kind == UNREACHABLE and not lost_usd:  # record what may be billed in the ledger first

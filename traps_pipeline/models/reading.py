@@ -144,10 +144,10 @@ def degenerate(text: str) -> str | None:
         return "repeats a character"
     if len(words) >= _LEAST_WORDS:
         for unit in range(1, _LONGEST_UNIT + 1):
-            repeated = 0
-            while repeated < len(words) - unit and words[-1 - repeated] == words[-1 - repeated - unit]:
-                repeated += 1
-            repeats, share = repeated // unit + 1, (repeated + unit) / len(words)
+            n_repeats = 0
+            while n_repeats < len(words) - unit and words[-1 - n_repeats] == words[-1 - n_repeats - unit]:
+                n_repeats += 1
+            repeats, share = n_repeats // unit + 1, (n_repeats + unit) / len(words)
             if repeats >= _LEAST_REPEATS and share >= _LEAST_SHARE:
                 return "repeats itself"
     return None
@@ -159,7 +159,7 @@ def _is_json(text: str, fields: Sequence[str]) -> bool:
     These are `final_answer`, and `abstain` if requested. The reason may have any form.
     """
     try:
-        parsed = json.loads(strip_fence(text))
+        value = json.loads(strip_fence(text))
     except (ValueError, RecursionError):
         return False
-    return isinstance(parsed, dict) and {"final_answer", *({*fields} - {"reason"})} <= parsed.keys()
+    return isinstance(value, dict) and {"final_answer", *({*fields} - {"reason"})} <= value.keys()

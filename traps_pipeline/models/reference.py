@@ -56,11 +56,11 @@ def believed_probabilities(request: Request) -> dict[str, float]:
     """
     secret, noise = request.secret, request.params["noise"]
     truth, even = {secret.get("ground_truth"): 1.0}, dict.fromkeys(secret["labels"], 1.0)
-    believed = secret.get("posterior") or (truth if secret["side"] == "control" else even)
+    probabilities = secret.get("posterior") or (truth if secret["side"] == "control" else even)
     weights = dict[str, float]()
     for label in secret["labels"]:
-        off = NormalDist().inv_cdf(uniform(request, f"noise {label}") or _TINY) if noise else 0.0
-        weights[label] = (believed.get(label, 0.0) + (_DOUBT if noise else 0.0)) * exp(noise * off)
+        error = NormalDist().inv_cdf(uniform(request, f"noise {label}") or _TINY) if noise else 0.0
+        weights[label] = (probabilities.get(label, 0.0) + (_DOUBT if noise else 0.0)) * exp(noise * error)
     return {label: weight / sum(weights.values()) for label, weight in weights.items()}
 
 

@@ -41,11 +41,11 @@ def marks_of(declared: str | Sequence[str]) -> Marks:
     usual = dict(USUAL)
     if isinstance(declared, str) and declared in usual:
         return declared, usual[declared]
-    both = [] if isinstance(declared, str) else [mark for mark in declared if isinstance(mark, str) and mark.strip()]
-    if len(both) != 2 or both[0] == both[1]:
-        known = ", ".join(usual)
-        raise ValueError(f"give what opens and what closes the thinking, [OPEN, CLOSE], or one of {known}")
-    return both[0], both[1]
+    marks = [] if isinstance(declared, str) else [mark for mark in declared if isinstance(mark, str) and mark.strip()]
+    if len(marks) != 2 or marks[0] == marks[1]:
+        known_marks = ", ".join(usual)
+        raise ValueError(f"give what opens and what closes the thinking, [OPEN, CLOSE], or one of {known_marks}")
+    return marks[0], marks[1]
 
 
 def split_thinking(text: str, marks: Marks | None) -> ThinkingSplit:
@@ -56,9 +56,9 @@ def split_thinking(text: str, marks: Marks | None) -> ThinkingSplit:
     """
     if marks is None:
         return ThinkingSplit("", text, is_open=False)
-    opens, closes = (re.escape(mark) for mark in marks)
+    opening_mark, closing_mark = (re.escape(mark) for mark in marks)
     thinking, answer, is_open = "", "", False
-    for piece in re.split(rf"({opens}|{closes})", text, flags=re.IGNORECASE):
+    for piece in re.split(rf"({opening_mark}|{closing_mark})", text, flags=re.IGNORECASE):
         if piece.lower() == marks[0].lower():
             is_open = True
         elif piece.lower() == marks[1].lower():
@@ -90,14 +90,21 @@ def strip_fence(text: str) -> str:
     text = text.strip().strip(_INVISIBLE).strip()
     if text[:3] not in ("```", "~~~") or not text[3:].endswith(text[:3]):
         return text
-    inside = text[3:-3]
-    return (inside[4:] if inside[:4].lower() == "json" else inside).strip()
+    content = text[3:-3]
+    return (content[4:] if content[:4].lower() == "json" else content).strip()
 
 
 def undeclared_mark(text: str) -> str | None:
     """Return the opening mark of the first common pair in a text, if any."""
     lower = text.lower()
-    return next((opens for opens, closes in USUAL if opens.lower() in lower or closes.lower() in lower), None)
+    return next(
+        (
+            opening_mark
+            for opening_mark, closing_mark in USUAL
+            if opening_mark.lower() in lower or closing_mark.lower() in lower
+        ),
+        None,
+    )
 
 
 def how_to_declare(mark: str) -> str:

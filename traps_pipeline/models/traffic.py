@@ -98,8 +98,8 @@ class Meter:
 
         The bucket may go below zero: later calls wait longer.
         """
-        until = time.monotonic() + self._take((1.0, float(tokens)))
-        while (remaining := until - time.monotonic()) > 0 and not halted():
+        send_at = time.monotonic() + self._take((1.0, float(tokens)))
+        while (remaining := send_at - time.monotonic()) > 0 and not halted():
             await asyncio.sleep(min(remaining, LOOK_S))
 
     def _take(self, amounts: tuple[float, float]) -> float:
@@ -143,9 +143,9 @@ class Breaker:
 
     def check(self) -> None:
         """Raise ParticipantStopped if the participant was stopped (`remembering_stops`)."""
-        for stopped in _stopped:
-            if self._participant in stopped:
-                raise ParticipantStopped(stopped[self._participant])
+        for stops in _stopped:
+            if self._participant in stops:
+                raise ParticipantStopped(stops[self._participant])
 
     def no_connection(self, why: str = "") -> None:
         """Raise ParticipantStopped after five unsent calls in a row, over some time.
@@ -155,8 +155,8 @@ class Breaker:
         self._unmade += 1
         self._unmade_since = self._unmade_since or time.monotonic()
         if self._unmade >= UNMADE_IN_A_ROW and time.monotonic() - self._unmade_since >= UNMADE_S:
-            where = f" to {self._address}" if self._address else ""
-            self._stop(f"{self._unmade} calls in a row{where} could not be sent{why and f': {why}'}")
+            address_text = f" to {self._address}" if self._address else ""
+            self._stop(f"{self._unmade} calls in a row{address_text} could not be sent{why and f': {why}'}")
 
     def connected(self) -> None:
         """Record that a call was sent."""
@@ -189,8 +189,8 @@ class Breaker:
             f"{self._participant} is stopped: {why}; its answers so far are kept. Mend the cause and run the same "
             "command again: only what is missing is asked"
         )
-        for stopped in _stopped:
-            stopped.setdefault(self._participant, message)  # calls in flight return later, and raise too
+        for stops in _stopped:
+            stops.setdefault(self._participant, message)  # calls in flight return later, and raise too
         raise ParticipantStopped(message)
 
 

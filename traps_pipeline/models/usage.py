@@ -59,8 +59,8 @@ class Sizes:
 
     def contradict(self, usage: Usage) -> bool:
         """Return whether a usage is below the minimum for these sizes."""
-        least = self.prompt_bytes // BYTES_A_TOKEN + self.frames * TOKENS_A_FRAME
-        return usage.prompt < least or usage.completion < max(1, -(-self.text_bytes // BYTES_A_TOKEN))
+        min_tokens = self.prompt_bytes // BYTES_A_TOKEN + self.frames * TOKENS_A_FRAME
+        return usage.prompt < min_tokens or usage.completion < max(1, -(-self.text_bytes // BYTES_A_TOKEN))
 
 
 def read_usage(fields: Mapping[str, Any], sizes: Sizes) -> Usage | None:
@@ -98,8 +98,10 @@ def _complete_usage(
         del counts[str(total)]
     if completion not in counts or not all(map(_is_count, counts.values())):
         return None
-    read_tokens = counts[prompt] + sum(counts.get(name, 0) for name, of_answer in apart.items() if not of_answer)
-    completion_tokens = counts[completion] + sum(counts.get(name, 0) for name, of_answer in apart.items() if of_answer)
+    read_tokens = counts[prompt] + sum(counts.get(name, 0) for name, is_of_answer in apart.items() if not is_of_answer)
+    completion_tokens = counts[completion] + sum(
+        counts.get(name, 0) for name, is_of_answer in apart.items() if is_of_answer
+    )
     if total in counts:
         if counts[total] < counts[prompt] + counts[completion]:
             return None

@@ -93,11 +93,11 @@ class Wire(httpx.AsyncBaseTransport):
             exchange.proxy = proxy.variable
             if proxy.problem:
                 raise TrapsError(proxy.problem)
-        named = [os.environ.get(name) for name in TLS_VARIABLES]
-        if request.url.scheme == "https" and self._tls is not False and self._certificates != named:
+        tls_files = [os.environ.get(name) for name in TLS_VARIABLES]
+        if request.url.scheme == "https" and self._tls is not False and self._certificates != tls_files:
             if problem := certificate_problem(TLS_VARIABLES):
                 raise TrapsError(problem)
-            self._tls, self._certificates = self._tls or httpx.create_ssl_context(), named
+            self._tls, self._certificates = self._tls or httpx.create_ssl_context(), tls_files
         return await self._session().request(
             request.method,
             URL(url, encoded=True),
@@ -113,7 +113,7 @@ class Wire(httpx.AsyncBaseTransport):
 
     def _session(self) -> aiohttp.ClientSession:
         loop = asyncio.get_running_loop()
-        for session in [each for each in self._sessions if each.is_closed()]:
+        for session in [closed_loop for closed_loop in self._sessions if closed_loop.is_closed()]:
             _dispose(self._sessions.pop(session))
         if loop not in self._sessions:
             connector = aiohttp.TCPConnector(limit=0, keepalive_timeout=KEEPALIVE_S, ttl_dns_cache=NAMES_KEPT_S)
@@ -128,7 +128,7 @@ class Wire(httpx.AsyncBaseTransport):
         running = self._sessions.pop(asyncio.get_running_loop(), None)
         if running is not None:
             await running.close()
-        for session in [self._sessions.pop(each) for each in list(self._sessions) if each.is_closed()]:
+        for session in [self._sessions.pop(loop) for loop in list(self._sessions) if loop.is_closed()]:
             _dispose(session)
 
     def __del__(self) -> None:
@@ -176,14 +176,14 @@ def _explain(error: BaseException, url: httpx.URL, exchange: Exchange) -> str:
     """Return in words why a request or its answer did not arrive."""
     if isinstance(error, TrapsError):
         return str(error)
-    where = f"{url.host}:{url.port or {'http': 80, 'https': 443}.get(url.scheme, '?')}"
+    location = f"{url.host}:{url.port or {'http': 80, 'https': 443}.get(url.scheme, '?')}"
     text = cause_of(error)
     if exchange.sent:
-        return f"the connection to {where} broke after the request was sent: {text}"
+        return f"the connection to {location} broke after the request was sent: {text}"
     if exchange.proxy:
         proxy = proxy_of(str(url))
-        return f"nothing was sent to {where} through the proxy {proxy and proxy.address} of {exchange.proxy}: {text}"
-    return f"nothing was sent to {where}: {text}"
+        return f"nothing was sent to {location} through the proxy {proxy and proxy.address} of {exchange.proxy}: {text}"
+    return f"nothing was sent to {location}: {text}"
 
 
 def cause_of(error: BaseException) -> str:

@@ -76,4 +76,4 @@ def with_intervals(names: Sequence[str], draws: np.ndarray, suffix: str = "") ->
     draws: (2, names, 1 + resamples), observed ones first.
     """
     columns = [with_interval(f"{name}{suffix}", draws[:, k], limits_of(name)) for k, name in enumerate(names)]
-    return {name: value for of_figure in columns for name, value in of_figure.items()}
+    return {name: value for figure_columns in columns for name, value in figure_columns.items()}

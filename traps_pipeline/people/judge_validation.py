@@ -121,7 +121,7 @@ def read_labels(path: Path, samples: Sequence[str]) -> HumanLabels:
     lines and columns that are wrong.
     """
     labels: dict[tuple[str, str], tuple[int, list[bool]]] = {}
-    wrong: list[str] = []
+    line_problems: list[str] = []
     for line, row in _lines(path):
         annotator, sample = row["annotator"], row["sample_id"]
         problems = [f"{name} is empty" for name in ("annotator", "sample_id") if not row[name]]
@@ -134,9 +134,9 @@ def read_labels(path: Path, samples: Sequence[str]) -> HumanLabels:
         ]
         if (annotator, sample) in labels:
             problems.append(f"{annotator:.40} has already labelled {sample:.40} on line {labels[annotator, sample][0]}")
-        wrong += [f"{path}:{line}: {problem}" for problem in problems]
+        line_problems += [f"{path}:{line}: {problem}" for problem in problems]
         labels.setdefault((annotator, sample), (line, [row[axis].lower() in YES_WORDS for axis in AXES]))
-    _refuse(wrong)
+    _refuse(line_problems)
     return _paired(path, labels)
 
 
@@ -147,8 +147,8 @@ def _lines(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
             reader = csv.DictReader(stream)
             missing = [name for name in LABEL_COLUMNS if name not in (reader.fieldnames or ())]
             if missing:
-                needed = ", ".join(LABEL_COLUMNS)
-                raise TrapsError(f"{path}:1: column {', '.join(missing)} is missing; it needs {needed}")
+                column_names = ", ".join(LABEL_COLUMNS)
+                raise TrapsError(f"{path}:1: column {', '.join(missing)} is missing; it needs {column_names}")
             for row in reader:
                 yield reader.line_num, {name: (row[name] or "").strip() for name in LABEL_COLUMNS}
     except (OSError, UnicodeDecodeError, csv.Error) as error:
@@ -163,18 +163,18 @@ def _paired(path: Path, by_sample: Mapping[tuple[str, str], tuple[int, list[bool
         )
     first, second = names
     samples = sorted({sample for _, sample in by_sample})
-    alone = [
+    unpaired = [
         (a, s, line) for (a, s), (line, _) in by_sample.items() if (second if a == first else first, s) not in by_sample
     ]
-    _refuse([f"{path}:{line}: only {a:.40} has labelled {s:.40}; both annotators must" for a, s, line in alone])
+    _refuse([f"{path}:{line}: only {a:.40} has labelled {s:.40}; both annotators must" for a, s, line in unpaired])
     labels = np.array([[by_sample[name, sample][1] for sample in samples] for name in names], bool)
     return HumanLabels((first, second), tuple(samples), labels)
 
 
 def _refuse(wrong: Sequence[str]) -> None:
     if wrong:
-        more = f"\n... and {len(wrong) - _MOST_PROBLEMS} more" if len(wrong) > _MOST_PROBLEMS else ""
-        raise TrapsError("\n".join(wrong[:_MOST_PROBLEMS]) + more)
+        suffix = f"\n... and {len(wrong) - _MOST_PROBLEMS} more" if len(wrong) > _MOST_PROBLEMS else ""
+        raise TrapsError("\n".join(wrong[:_MOST_PROBLEMS]) + suffix)
 
 
 # --- the comparison ---------------------------------------------------------------------------------------------------
@@ -206,11 +206,11 @@ def compare(judge: np.ndarray, human: HumanLabels) -> pd.DataFrame:
     consensus: 2 x failures per axis.
     """
     rows = [_axis_row(axis, judge[:, k], human.labels[:, :, k], human) for k, axis in enumerate(AXES)]
-    agreed = [float(np.mean(human.labels[k] == judge)) for k in (0, 1)]
+    agreements = [float(np.mean(human.labels[k] == judge)) for k in (0, 1)]
     rows.append(
         _shared(POOLED, judge.shape[0], human)
         | {"n_labels": 2 * judge.size, "accuracy": float(np.mean(human.labels == judge))}
-        | {"accuracy_a": agreed[0], "accuracy_b": agreed[1]}
+        | {"accuracy_a": agreements[0], "accuracy_b": agreements[1]}
         | {"human_agreement": float(np.mean(human.labels[0] == human.labels[1]))}
     )
     return pd.DataFrame(rows, columns=pd.Index(JUDGE_VALIDATION.names))
@@ -262,8 +262,8 @@ def _kappa(first: np.ndarray, second: np.ndarray) -> tuple[float, float, float]:
         return np.nan, np.nan, np.nan
     cells = np.bincount(2 * first.astype(int) + second, minlength=4)  # no and no, no and yes, yes and no, yes and yes
     rng = np.random.default_rng(SEED)
-    gamma, unseen = rng.standard_gamma(cells, (RESAMPLES, 4)), rng.standard_exponential((RESAMPLES, 1))
-    shares = gamma + np.eye(4)[:, None] * unseen  # (cell of the unseen failure, resamples, cells)
+    gamma, unseen_weights = rng.standard_gamma(cells, (RESAMPLES, 4)), rng.standard_exponential((RESAMPLES, 1))
+    shares = gamma + np.eye(4)[:, None] * unseen_weights  # (cell of the unseen failure, resamples, cells)
     shares /= shares.sum(axis=-1, keepdims=True)
     p, q = shares[..., 2] + shares[..., 3], shares[..., 1] + shares[..., 3]
     chance = p * q + (1 - p) * (1 - q)

@@ -101,19 +101,21 @@ def _answers(workspace: Workspace, task: TaskName) -> pd.DataFrame:
     """Return the answers whose abstention or correctness the study's panel decided."""
     decision = "abstained" if task == "abstention" else "correct"
     verdicts = current_rows(workspace, VERDICTS, [*_ANSWER, "scenario_id", "side", "unanimous", "panel", decision])
-    decided = verdicts.loc[verdicts[decision].notna() & (verdicts["panel"] == panel_id(workspace.study.panel))]
-    if decided.empty:
-        return decided.assign(unit="")
+    decided_rows = verdicts.loc[verdicts[decision].notna() & (verdicts["panel"] == panel_id(workspace.study.panel))]
+    if decided_rows.empty:
+        return decided_rows.assign(unit="")
     texts = workspace.tables.read_all(RESPONSES, [*_ANSWER, "text"], dataset=DATASETS)
     items = workspace.tables.read_all(
         ITEMS, ["item_id", "question", "ground_truth", "benchmark_version"], dataset=DATASETS
     )
-    rows = decided.merge(texts, on=_ANSWER, validate="one_to_one").merge(items, on="item_id", validate="many_to_one")
+    rows = decided_rows.merge(texts, on=_ANSWER, validate="one_to_one").merge(
+        items, on="item_id", validate="many_to_one"
+    )
     panel = rows[decision].astype(bool)
     fields = ["question"] if task == "abstention" else ["question", "ground_truth"]
     answers = rows[[*_ANSWER, *fields, "text"]].itertuples(index=False, name=None)
     return rows.assign(
-        unit=[_unit(task, *map(str, each)) for each in answers],
+        unit=[_unit(task, *map(str, answer_key)) for answer_key in answers],
         group=rows["side"] + np.where(panel, " yes", " no"),
         split=~rows["unanimous"].astype(bool),
         panel=panel,
@@ -154,10 +156,10 @@ def drawn_units(group: pd.DataFrame, size: int, protocol: AnnotationProtocol) ->
     """
     order = [digest([protocol.seed, unit]) for unit in group["unit"]]
     ordered = group.iloc[np.argsort(order)]
-    at_random = ordered.head(size - round(size * protocol.split_share))
-    remaining = ordered.loc[~ordered["unit"].isin(at_random["unit"])]
+    random_units = ordered.head(size - round(size * protocol.split_share))
+    remaining = ordered.loc[~ordered["unit"].isin(random_units["unit"])]
     split_first = remaining.sort_values("split", ascending=False, kind="stable")
-    return pd.concat([at_random, split_first.head(size - len(at_random))])
+    return pd.concat([random_units, split_first.head(size - len(random_units))])
 
 
 def strata(population: pd.DataFrame) -> pd.Series:

@@ -64,10 +64,10 @@ def _observable(source: Source) -> dg.AssetsDefinition:
         metadata={"owner": OWNERS[0]},
     )
     def observe(workspace: WorkspaceResource) -> dg.DataVersion | dg.DataVersionsByPartition:
-        opened = workspace.open()
+        study_workspace = workspace.open()
         if source.scheme is None:
-            return dg.DataVersion(source.version(opened, None))
-        return dg.DataVersionsByPartition({key: source.version(opened, key) for key in source.scheme.keys})
+            return dg.DataVersion(source.version(study_workspace, None))
+        return dg.DataVersionsByPartition({key: source.version(study_workspace, key) for key in source.scheme.keys})
 
     return cast(dg.AssetsDefinition, observe)
 

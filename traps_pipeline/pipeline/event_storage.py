@@ -86,9 +86,9 @@ class _EventStorage(SqliteEventLogStorage):
                 self._initialized_dbs.add(shard)
             engine = self._engine(shard)
             with _transaction(engine) as connection:
-                before = _changes(connection)
+                n_changes = _changes(connection)
                 yield connection
-                is_changed = _changes(connection) != before
+                is_changed = _changes(connection) != n_changes
             if is_changed:
                 with contextlib.suppress(FileNotFoundError):
                     os.utime(self.path_for_shard(shard))

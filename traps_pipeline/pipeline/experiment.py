@@ -61,13 +61,13 @@ class Experiment(BaseModel):
             return data
         if "own" in data:
             raise ValueError("own: describe models under `models`, and judges under `judges`")
-        rest = {name: value for name, value in data.items() if name not in ("accounts", "judges", "panels")}
-        described = {name: data[name] for name in ("accounts", "judges", "panels") if name in data}
+        own_fields = {name: value for name, value in data.items() if name not in ("accounts", "judges", "panels")}
+        registry_fields = {name: data[name] for name in ("accounts", "judges", "panels") if name in data}
         models = data.get("models")
         if isinstance(models, list):
-            described["models"] = [model for model in models if isinstance(model, dict)]
-            rest["models"] = [model.get("id", "?") if isinstance(model, dict) else model for model in models]
-        return rest | {"own": described}
+            registry_fields["models"] = [model for model in models if isinstance(model, dict)]
+            own_fields["models"] = [model.get("id", "?") if isinstance(model, dict) else model for model in models]
+        return own_fields | {"own": registry_fields}
 
     @field_validator("scenarios", mode="before")
     @classmethod
@@ -136,10 +136,10 @@ class Experiment(BaseModel):
             raise TrapsError(
                 f"study.yaml: panel is {study.panel!r}, experiment {self.name} has {self.panel!r}; edit one of them"
             )
-        named = panel or (base.panel if study else self.panel) or self.panel or ""
+        panel_name = panel or (base.panel if study else self.panel) or self.panel or ""
         is_judged_by_rules = judged_by_rules or bool(self.judged_by_rules) or base.judged_by_rules
-        require_panel(named, self.models, judged_by_rules=is_judged_by_rules)
-        return base.model_copy(update={"panel": named, "judged_by_rules": is_judged_by_rules})
+        require_panel(panel_name, self.models, judged_by_rules=is_judged_by_rules)
+        return base.model_copy(update={"panel": panel_name, "judged_by_rules": is_judged_by_rules})
 
     def check_study(self, study: Study, path: Path) -> None:
         """Raise TrapsError if a study has another panel, epoch or `mechanism` section."""
@@ -168,8 +168,8 @@ class Experiment(BaseModel):
 def _known_names(values: list[str], names: tuple[str, ...]) -> list[str]:
     unknown = [value for value in values if value not in names]
     if unknown or not values:
-        near = did_you_mean(unknown[0], names) if unknown else ""
-        raise ValueError(f"{unknown or 'nothing'} given; choose from {', '.join(names)}{near}")
+        suggestion = did_you_mean(unknown[0], names) if unknown else ""
+        raise ValueError(f"{unknown or 'nothing'} given; choose from {', '.join(names)}{suggestion}")
     return values
 
 

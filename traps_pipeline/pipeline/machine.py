@@ -38,12 +38,14 @@ def wanted_parts(workspace: Workspace, stages: Collection[str], experiment: str 
 def parts_of_run(context: dg.AssetExecutionContext, stage: Stage, partitions: StudyPartitions) -> Parts:
     """Return stages of a Dagster run that share a step's partitions, with wanted keys."""
     keys = {str(key) for key in context.partition_keys} if stage.scheme else {None}
-    selected = context.run.asset_selection or context.job_def.asset_layer.executable_asset_keys
-    names = {key.path[-1] for key in selected}
-    alike = [
+    asset_keys = context.run.asset_selection or context.job_def.asset_layer.executable_asset_keys
+    names = {key.path[-1] for key in asset_keys}
+    same_partitions = [
         candidate for candidate in the_graph().stages if candidate.name in names and candidate.scheme is stage.scheme
     ]
-    return {candidate.name: [key for key in candidate.wanted(partitions) if key in keys] for candidate in alike}
+    return {
+        candidate.name: [key for key in candidate.wanted(partitions) if key in keys] for candidate in same_partitions
+    }
 
 
 def why_nothing(keys: Sequence[str | None], tags: Mapping[str, str], workspace: Workspace) -> str:
@@ -68,7 +70,7 @@ def require_machine(workspace: Workspace, parts: Parts) -> None:
         check_network()
     graph = the_graph()
     drawing = ((graph[name].shared, key) for name, keys in parts.items() for key in keys if CLIPS in graph[name].kinds)
-    if any(shared is not None and shared.seconds(workspace, key) > 0 for shared, key in drawing):
+    if any(build is not None and build.seconds(workspace, key) > 0 for build, key in drawing):
         ClipCache.of_user()
         _check_rendering(*opengl_variables().items())
 

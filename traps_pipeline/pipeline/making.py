@@ -70,7 +70,7 @@ class PartitionMaker:
 
     def _beside_others(self, shared: ConcurrentBuild, inputs: Inputs) -> Iterator[tuple[str | None, StageOutput]]:
         """Make files beside other runs, then build the partition as its lease holder."""
-        store, later, lineage = self._workspace.store, dict[str | None, Tally](), Lineage(self._workspace)
+        store, postponed, lineage = self._workspace.store, dict[str | None, Tally](), Lineage(self._workspace)
         self._made_at = {key: lineage.made_at(self._stage.name, key) for key in inputs}
         with kept_workers():
             for key in inputs:
@@ -78,12 +78,12 @@ class PartitionMaker:
                 is_whole = self._make_files(shared, key, tally, wait=False)
                 lease = store.lease(f"{self._stage.name}/{key}") if is_whole else None
                 if lease is None:
-                    later[key] = tally
+                    postponed[key] = tally
                     continue
                 with closing(lease):
                     if not self._takes_over(key, inputs[key], tally):
                         yield from self._make_partition(key, tally)
-            for key, tally in later.items():
+            for key, tally in postponed.items():
                 if key not in self.unmade and self._make_files(shared, key, tally, wait=True):
                     with alone(store, f"{self._stage.name}/{key}"):
                         if not self._takes_over(key, inputs[key], tally):

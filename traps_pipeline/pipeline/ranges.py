@@ -48,10 +48,10 @@ def batches(scheme: Partitioning | None, keys: Sequence[str | None]) -> Iterator
     if scheme is None or not keys:
         yield from ((key, key) for key in keys)
         return
-    grid, by_row = _Grid.of(scheme), dict[int, list[int]]()
+    grid, columns_by_row = _Grid.of(scheme), dict[int, list[int]]()
     for row, column in grid.cells(keys):
-        by_row.setdefault(row, []).append(column)
-    spans = sorted((span, row) for row, numbers in by_row.items() for span in _spans(numbers))
+        columns_by_row.setdefault(row, []).append(column)
+    spans = sorted((span, row) for row, numbers in columns_by_row.items() for span in _spans(numbers))
     for (left, right), group in groupby(spans, key=lambda pair: pair[0]):
         for top, bottom in _spans([row for _, row in group]):
             yield grid.range(top, bottom, left, right)
@@ -84,8 +84,8 @@ def cut(scheme: Partitioning | None, keys: Sequence[str | None], most: int) -> l
     for row, column in grid.cells(keys):
         is_wanted[row, column] = True
     heads = np.array([name.partition("__")[0] for name in grid.columns])
-    by_model = most < len({*heads[is_wanted.any(axis=0)]})
-    return [grid.range(*corners) for corners in _parts(is_wanted, heads, 0, 0, most, by_model=by_model)]
+    is_by_model = most < len({*heads[is_wanted.any(axis=0)]})
+    return [grid.range(*corners) for corners in _parts(is_wanted, heads, 0, 0, most, by_model=is_by_model)]
 
 
 def _parts(

@@ -31,10 +31,10 @@ def stages_until(until: str | None) -> set[str]:
     graph = the_graph()
     if until is None:
         return {stage.name for stage in graph.stages}
-    known = [stage.name for stage in graph.stages]
-    if unknown := [name for name in until.split(",") if name not in known]:
-        near = did_you_mean(unknown[0], known) or f"; choose from {', '.join(known)}"
-        raise TrapsError(f"--until {', '.join(unknown)}: no such stage{near}")
+    stage_names = [stage.name for stage in graph.stages]
+    if unknown := [name for name in until.split(",") if name not in stage_names]:
+        suggestion = did_you_mean(unknown[0], stage_names) or f"; choose from {', '.join(stage_names)}"
+        raise TrapsError(f"--until {', '.join(unknown)}: no such stage{suggestion}")
     return graph.above(until.split(","))
 
 
@@ -53,8 +53,8 @@ def require_work(workspace: Workspace, experiment: str, until: str | None) -> No
 def failed_checks(workspace: Workspace, experiment: str | None) -> list[str]:
     """Return failed checks of wanted partitions, from this or any earlier run."""
     failing: dict[tuple[str, str], list[str]] = {}
-    for check, of_stage, partition, _ in failing_checks(workspace):
-        failing.setdefault((of_stage, partition), []).append(check)
+    for check, stage_name, partition, _ in failing_checks(workspace):
+        failing.setdefault((stage_name, partition), []).append(check)
     partitions, problems = StudyPartitions(workspace, experiment), []
     for stage in the_graph().stages if failing else ():
         for key in stage.wanted(partitions):
@@ -82,9 +82,9 @@ def note_versions(workspace: Workspace, stages: Collection[str], experiment: str
         for name in sorted(stages)
         for key in graph[name].wanted(partitions)
     }
-    former = _read_note(workspace)
-    if former.get("history") == history:  # keep versions of other stages or experiments
-        versions = former["versions"] | versions
+    previous_note = _read_note(workspace)
+    if previous_note.get("history") == history:  # keep versions of other stages or experiments
+        versions = previous_note["versions"] | versions
     note = json.dumps({"history": history, "versions": versions})
     workspace.store.write({workspace.dagster_home / _NOTE: note.encode()})
 
@@ -94,9 +94,9 @@ def is_nothing_to_do(workspace: Workspace, stages: Collection[str], experiment: 
     note = _read_note(workspace)
     if not note or note.get("history") != _history_state(workspace):
         return False
-    lineage, partitions, known = Lineage(workspace), StudyPartitions(workspace, experiment), note["versions"]
+    lineage, partitions, noted_versions = Lineage(workspace), StudyPartitions(workspace, experiment), note["versions"]
     return all(
-        known.get(name_of((name, key))) == lineage.version(name, key) is not None
+        noted_versions.get(name_of((name, key))) == lineage.version(name, key) is not None
         and lineage.status(name, key).kind == "fresh"
         for name in stages
         for key in lineage.graph[name].wanted(partitions)

@@ -37,14 +37,14 @@ def explain(workspace: Workspace, item_id: str) -> dict[str, Any]:
         truth = current["ground_truth"] if current["side"] == "control" else "none, it is void"
         clip = str(workspace.resolve(current["clip"]))
         explanation |= {"question": current["question"], "ground_truth": truth, "clip": clip}
-    answered = workspace.answers.naming(item_id)
+    rows_by_evaluation = workspace.answers.naming(item_id)
     for model, entry in load_models().items():
         for regime in REGIMES:
             for run in range(1, entry.runs + 1):
                 evaluation = Evaluation(model, regime, run)
-                if evaluation.key not in answered:
+                if evaluation.key not in rows_by_evaluation:
                     continue
-                rows = [row for row in answered[evaluation.key].rows.values() if _about(row) == item_id]
+                rows = [row for row in rows_by_evaluation[evaluation.key].rows.values() if _about(row) == item_id]
                 if not rows:
                     continue
                 request = answer_request(workspace, entry, current, evaluation) if current else None
@@ -68,11 +68,11 @@ def lines_of(explanation: Mapping[str, Any]) -> Iterator[str]:
         yield f"question: {explanation['question']}"
         yield f"ground truth: {explanation['ground_truth']}"
         yield f"clip: {explanation['clip']}"
-    for each in explanation["evaluations"]:
-        yield f"{each['evaluation']}: {each['state']}"
-        for answer in each["answers"]:
+    for evaluation in explanation["evaluations"]:
+        yield f"{evaluation['evaluation']}: {evaluation['state']}"
+        for answer in evaluation["answers"]:
             yield f"    {answer['outcome']}: {_short(answer['text']) if answer['text'] else answer['error'] or ''}"
-        for vote in each["votes"]:
+        for vote in evaluation["votes"]:
             decision = vote["abstained"] if vote["task"] == "abstention" else vote["correct"]
             word = "invalid" if not vote["valid"] else "yes" if decision else "no"
             yield f"    {vote['judge']} on {vote['task']}: {word} ({vote['rationale'] or vote['invalid_reason']})"
@@ -113,8 +113,8 @@ def _about(row: Mapping[str, Any]) -> Any:
 def _current_item(workspace: Workspace, dataset: str, item_id: str) -> dict[str, Any] | None:
     if workspace.tables.state(ITEMS, {"dataset": dataset}) is None:
         return None
-    named = _rows_about(workspace, ITEMS, {"dataset": dataset}, item_id)
-    return next(iter(with_posteriors(workspace, dataset, named)), None)
+    rows = _rows_about(workspace, ITEMS, {"dataset": dataset}, item_id)
+    return next(iter(with_posteriors(workspace, dataset, rows)), None)
 
 
 def _state(rows: list[dict[str, Any]], wanted: Mapping[str, Any] | None) -> str:
@@ -126,8 +126,8 @@ def _state(rows: list[dict[str, Any]], wanted: Mapping[str, Any] | None) -> str:
         if row["components"] == dict(wanted):
             return f"answered {row['created_at'][:19]} ({row['outcome']}), key {row['key'][:12]}: still stands"
     old = newest["components"]
-    changed = [name for name in sorted(old.keys() | wanted.keys()) if old.get(name) != wanted.get(name)]
-    parts = [f"{name}: {_short(old.get(name))} -> {_short(wanted.get(name))}" for name in changed]
+    changed_parts = [name for name in sorted(old.keys() | wanted.keys()) if old.get(name) != wanted.get(name)]
+    parts = [f"{name}: {_short(old.get(name))} -> {_short(wanted.get(name))}" for name in changed_parts]
     return f"will be asked again; changed since {newest['created_at'][:19]}: {'; '.join(parts)}"
 
 

@@ -55,16 +55,16 @@ def run_step(stage: Stage, context: dg.AssetExecutionContext, workspace: Workspa
     made_result: dg.MaterializeResult | None = None
     for key, output in step.make():
         version = step.write(key, output)
-        found = step.checks.test(key, output)
+        failures = step.checks.test(key, output)
         progress.current().partition(stage.name, key or "", output.tally, is_empty=not len(output.content))
         metadata = partition_metadata(workspace, stage, output)
         if stage.scheme is None:
-            yield from step.checks.of_made(key, found)
+            yield from step.checks.of_made(key, failures)
             metadata = visible_metadata(metadata)
             made_result = dg.MaterializeResult(metadata=metadata, data_version=dg.DataVersion(version))
         else:
             yield step.history.event(stage, key, version, step.provenance, metadata)
-            yield from step.checks.of_made(key, found)
+            yield from step.checks.of_made(key, failures)
     yield from step.tell_taken()
     yield from step.tell_fresh()
     yield from step.tell_unmade()
@@ -100,17 +100,17 @@ class _Step:
         if self.stage.scheme and not self._wanted and BACKFILL_TAG not in self.tags:
             reason = why_nothing(self._unwanted, self.tags, self.workspace)
             raise TrapsError(f"{self.stage.name}: nothing is made: {reason}")
-        about = {UNWANTED: f"nothing is made: no experiment in {self.workspace.root / 'study.yaml'} asks for it"}
+        metadata = {UNWANTED: f"nothing is made: no experiment in {self.workspace.root / 'study.yaml'} asks for it"}
         for key in self._unwanted:
-            yield self.history.event(self.stage, key, UNWANTED, self.provenance, about)
+            yield self.history.event(self.stage, key, UNWANTED, self.provenance, metadata)
 
     def to_make(self) -> list[str | None]:
         """Return the wanted keys, or those among them that the run's tag selects."""
         if MAKE_TAG not in self.tags:
             return self._wanted
-        recorded, existing = self.history.recorded(self.stage.name), self.tags[MAKE_TAG] == OUTDATED
+        recorded_versions, existing = self.history.recorded(self.stage.name), self.tags[MAKE_TAG] == OUTDATED
         name, lineage = self.stage.name, self.lineage
-        keys = [k for k in self._wanted if to_make(lineage, recorded, name, k, existing=existing)]
+        keys = [k for k in self._wanted if to_make(lineage, recorded_versions, name, k, existing=existing)]
         # A partition that waits for an upstream one would be built twice.
         return [k for k in keys if not (existing and lineage.waits(name, k))]
 
@@ -145,8 +145,8 @@ class _Step:
         """Report partitions that other runs have built."""
         for key, (version, tally) in self._maker.taken.items():
             progress.current().partition(self.stage.name, key or "", tally)
-            about = {TAKEN: "made by another run meanwhile", **tally_metadata(self.stage, tally)}
-            yield self.history.event(self.stage, key, version, self.provenance, about)
+            metadata = {TAKEN: "made by another run meanwhile", **tally_metadata(self.stage, tally)}
+            yield self.history.event(self.stage, key, version, self.provenance, metadata)
 
     def tell_fresh(self) -> Iterator[dg.AssetCheckEvaluation]:
         """Report partitions of this run that need not be built."""
@@ -157,12 +157,12 @@ class _Step:
 
     def tell_unmade(self) -> Iterator[dg.AssetCheckEvaluation]:
         """Report partitions that could not be built or fail a check, now or before."""
-        unmade = self._maker.unmade
-        if unmade:
+        unbuilt = self._maker.unmade
+        if unbuilt:
             end_if_resumed(self.context.instance, self.context.run.run_id, _ATTEMPTS[self.context.run.run_id])
-        for key, error in unmade.items():
+        for key, error in unbuilt.items():
             yield from self.checks.of_unmade(key, error)
-        yield from self.checks.still_failing(self.lineage, {*self._inputs, *unmade} - self._maker.taken.keys())
+        yield from self.checks.still_failing(self.lineage, {*self._inputs, *unbuilt} - self._maker.taken.keys())
 
     def hand_on(self, result: dg.MaterializeResult | None) -> Iterator[dg.Output | dg.MaterializeResult]:
         """Yield the result of an asset without partitions, or outputs that write no event.
@@ -177,8 +177,8 @@ class _Step:
 
     def stages_below(self) -> set[str]:
         """Return the stages of this run that are directly downstream of this one."""
-        selected = self.context.run.asset_selection or self.context.job_def.asset_layer.executable_asset_keys
-        return self.graph.below(self.stage.name) & {key.path[-1] for key in selected}
+        asset_keys = self.context.run.asset_selection or self.context.job_def.asset_layer.executable_asset_keys
+        return self.graph.below(self.stage.name) & {key.path[-1] for key in asset_keys}
 
 
 def guard_events(events: Events, context: dg.AssetExecutionContext) -> Events:

@@ -29,8 +29,8 @@ class StageStatus:
         """
         groups = dict[str, list[str]]()
         for key, reasons in self.stale.items():
-            shared = [reason.replace(f"/{key} ", " ") for reason in reasons]
-            groups.setdefault("; ".join(shared), []).append(key)
+            general_reasons = [reason.replace(f"/{key} ", " ") for reason in reasons]
+            groups.setdefault("; ".join(general_reasons), []).append(key)
         return groups | ({"not made yet": [*self.missing]} if self.missing else {})
 
 

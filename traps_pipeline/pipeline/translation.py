@@ -58,7 +58,7 @@ def _mapping(mapping: KeyMapping) -> dg.PartitionMapping:
         case ByDimension():
             return dg.MultiToSingleDimensionPartitionMapping(mapping.name)
         case Pairs():
-            return dg.StaticPartitionMapping({key: [*below] for key, below in mapping.below.items()})
+            return dg.StaticPartitionMapping({key: [*downstream] for key, downstream in mapping.below.items()})
         case FixedKeys():
             return dg.SpecificPartitionsPartitionMapping([*mapping.keys])
         case _:

@@ -39,10 +39,10 @@ class StudyPartitions:
     def __init__(self, workspace: Workspace | None, experiment: str | None = None) -> None:
         self._workspace = workspace
         if workspace is None:
-            every = Asked(
+            everything = Asked(
                 datasets=(*DATASETS, *UNPAIRED), models=tuple(load_models()), regimes=REGIMES, runs=(), mechanism=True
             )
-            self._asked: Sequence[Asked] = [every]
+            self._asked: Sequence[Asked] = [everything]
         else:
             self._asked = [e for name, e in workspace.study.experiments.items() if experiment in (None, name)]
 
@@ -74,28 +74,28 @@ class StudyPartitions:
         return bool({*self.datasets} & {*DATASETS})
 
     def _datasets(self, experiments: Iterable[Asked]) -> list[str]:
-        present = {dataset for category in self._present for dataset in all_datasets_of(category)}
-        named = {dataset for experiment in experiments for dataset in experiment.datasets}
-        return [dataset for dataset in (*DATASETS, *UNPAIRED) if dataset in present & named]
+        possible_datasets = {dataset for category in self._present for dataset in all_datasets_of(category)}
+        asked_datasets = {dataset for experiment in experiments for dataset in experiment.datasets}
+        return [dataset for dataset in (*DATASETS, *UNPAIRED) if dataset in possible_datasets & asked_datasets]
 
     @cached_property
     def evaluations(self) -> list[Evaluation]:
         """Every requested model, regime and run, in the registry's order."""
-        named = {e for experiment in self._asked for e in _evaluations(experiment)}
+        asked_evaluations = {e for experiment in self._asked for e in _evaluations(experiment)}
         place = {model: number for number, model in enumerate(load_models())}
-        return sorted(named, key=lambda e: (place[e.model], REGIMES.index(e.regime), e.run))
+        return sorted(asked_evaluations, key=lambda e: (place[e.model], REGIMES.index(e.regime), e.run))
 
     @cached_property
     def cells(self) -> list[str]:
         """Keys of the requested cells."""
-        named = {
+        asked_cells = {
             Cell(dataset, evaluation).key
             for experiment in self._asked
             for dataset in self._datasets([experiment])
             for evaluation in _evaluations(experiment)
         }
-        every = (Cell(dataset, evaluation).key for dataset, evaluation in product(self.datasets, self.evaluations))
-        return [key for key in every if key in named]
+        all_cells = (Cell(dataset, evaluation).key for dataset, evaluation in product(self.datasets, self.evaluations))
+        return [key for key in all_cells if key in asked_cells]
 
     # --- inside local models ------------------------------------------------------------------------------------------
 

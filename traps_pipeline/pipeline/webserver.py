@@ -89,8 +89,8 @@ def study_route(workspace: Workspace) -> Route:
         path = PurePosixPath(request.path_params["path"])
         if path.parts[0] in SERVED_FOLDERS and not any(part.startswith(".") for part in path.parts):
             file = workspace.resolve(path.as_posix())
-            inside = file.resolve().is_relative_to((workspace.root / path.parts[0]).resolve())
-            if inside and file.is_file():
+            is_inside = file.resolve().is_relative_to((workspace.root / path.parts[0]).resolve())
+            if is_inside and file.is_file():
                 return FileResponse(file)
         return PlainTextResponse(f"the study has no file {path}; materialize the asset that makes it\n", 404)
 

@@ -49,8 +49,8 @@ class Ratings:
         """
         keys = [*self.answer]
         judged = self.answers.loc[self.answers["task"].isin(tasks), keys]
-        merged = items[keys].merge(judged.assign(row=judged.index), on=keys, how="left", validate="many_to_one")
-        rows = merged["row"].to_numpy(float)
+        item_rows = items[keys].merge(judged.assign(row=judged.index), on=keys, how="left", validate="many_to_one")
+        rows = item_rows["row"].to_numpy(float)
         is_judged = ~np.isnan(rows)
         values = np.full((len(items), len(self.judges)), INVALID, np.int8)
         values[is_judged] = self.values[rows[is_judged].astype(np.int64)]
@@ -75,8 +75,8 @@ def ratings(votes: pd.DataFrame, judges: Sequence[str] | None = None, answer: Se
     answers = votes.loc[first, [*answer, "epoch", "benchmark_version"]].reset_index(drop=True)
     first_votes = votes.loc[first, ["task", "side"]]
     answers["task"] = np.where(first_votes["task"] == "correctness", "correctness", first_votes["side"] + "_abstention")
-    complete = has_vote.all(axis=1)
-    return Ratings(answers.loc[complete].reset_index(drop=True), values[complete], seats, answer)
+    is_complete = has_vote.all(axis=1)
+    return Ratings(answers.loc[is_complete].reset_index(drop=True), values[is_complete], seats, answer)
 
 
 def _grouped(votes: pd.DataFrame, by: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
@@ -85,8 +85,8 @@ def _grouped(votes: pd.DataFrame, by: Sequence[str]) -> tuple[np.ndarray, np.nda
 
     code = np.zeros(len(votes), np.int64)
     for name in by:
-        own, known = pd.factorize(votes[name])
-        code = code * max(len(known), 1) + own
+        codes, levels = pd.factorize(votes[name])
+        code = code * max(len(levels), 1) + codes
     _, first, rows = np.unique(code, return_index=True, return_inverse=True)
     return rows.ravel(), first
 

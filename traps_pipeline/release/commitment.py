@@ -212,6 +212,8 @@ def is_same_scene(spec: SceneSpec, other: SceneSpec) -> bool:
 
 def other_arithmetic(commitment: Commitment) -> str:
     """Return how machine and libraries differ from the commitment's, if they do."""
-    here = _made_with()
-    names = [name for name in here if commitment.made_with.get(name) != here[name]]
-    return ", ".join(f"{name} {commitment.made_with.get(name, 'unknown')} there, {here[name]} here" for name in names)
+    own_machine = _made_with()
+    names = [name for name in own_machine if commitment.made_with.get(name) != own_machine[name]]
+    return ", ".join(
+        f"{name} {commitment.made_with.get(name, 'unknown')} there, {own_machine[name]} here" for name in names
+    )

@@ -122,9 +122,9 @@ def _clear(target: Path) -> None:
 
     if not (target / CHECKSUMS).is_file():
         return
-    strangers = sorted({*released_files(target)} - {*read_checksums(target)})
-    if strangers:
-        raise TrapsError(f"{target / strangers[0]}: is no file of the release there; move it away")
+    foreign_files = sorted({*released_files(target)} - {*read_checksums(target)})
+    if foreign_files:
+        raise TrapsError(f"{target / foreign_files[0]}: is no file of the release there; move it away")
     for name in (*released_files(target), CHECKSUMS, SIGNATURE):
         (target / name).unlink(missing_ok=True)
 

@@ -124,7 +124,7 @@ def pack(workspace: Workspace, target: Path, name: str) -> About:
         for seat in load_panel(study.panel)
     ]
     try:
-        about = About(
+        description = About(
             name=name,
             benchmark=load_release().name,
             version=load_release().version,
@@ -137,8 +137,8 @@ def pack(workspace: Workspace, target: Path, name: str) -> About:
         )
     except ValidationError as error:
         raise TrapsError(f"--name {name!r:.100}: {explain(error)}; use lower-case letters, digits, - and .") from error
-    write_bytes(target, _zipped({ABOUT: about.model_dump_json(indent=1).encode() + b"\n", **content}))
-    return about
+    write_bytes(target, _zipped({ABOUT: description.model_dump_json(indent=1).encode() + b"\n", **content}))
+    return description
 
 
 def table_bytes(table: Table[Any], frame: pd.DataFrame) -> bytes:
@@ -181,12 +181,14 @@ def read_submission(path: Path) -> Submission:
     except _NO_ZIP as error:
         raise TrapsError(f"{path}: is no submission ({plain(error)[:200]}); get it again") from error
     try:
-        about = About.model_validate_json(content[ABOUT])
+        description = About.model_validate_json(content[ABOUT])
     except ValidationError as error:
         raise TrapsError(f"{path}: {ABOUT}: {explain(error)}; pack it again with `traps publish submit`") from error
-    altered = [file for file in TABLES if about.files.get(file) != hashlib.sha256(content[file]).hexdigest()]
+    altered_tables = [
+        file for file in TABLES if description.files.get(file) != hashlib.sha256(content[file]).hexdigest()
+    ]
     frames = {file: _frame(path, file, content[file]) for file in TABLES}
-    return Submission(path, about, frames, tuple(altered))
+    return Submission(path, description, frames, tuple(altered_tables))
 
 
 def _members(path: Path, archive: zipfile.ZipFile) -> dict[str, bytes]:

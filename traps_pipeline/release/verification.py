@@ -74,26 +74,26 @@ def verify(submission: Submission, release: Path | None = None) -> Verification:
 
     Raises TrapsError for an unreadable release.
     """
-    verified = Verification()
+    verification = Verification()
     items = {row["item_id"]: row for row in records(submission.table(ITEMS))}
     answers, votes = records(submission.table(RESPONSES)), records(submission.table(VOTES))
-    verified.look("tables", (f"{file}: is not the table that was packed" for file in submission.altered))
-    verified.look("items", _wrong_items(items.values()))
-    verified.look("prompts", _wrong_prompts(submission))
-    verified.look("answers", _wrong_answers(answers, items))
-    verified.look("panel", _wrong_panel(submission, votes))
+    verification.look("tables", (f"{file}: is not the table that was packed" for file in submission.altered))
+    verification.look("items", _wrong_items(items.values()))
+    verification.look("prompts", _wrong_prompts(submission))
+    verification.look("answers", _wrong_answers(answers, items))
+    verification.look("panel", _wrong_panel(submission, votes))
     is_judged_by_rules = all(seat.backend == RULE for seat in submission.about.judges)
-    verified.look("votes", _wrong_votes(submission, votes, answers, items))
-    _numbers(verified, submission)
+    verification.look("votes", _wrong_votes(submission, votes, answers, items))
+    _numbers(verification, submission)
     if release is None:
-        verified.unchecked.append("items and clips against a release: name its folder with --release")
+        verification.unchecked.append("items and clips against a release: name its folder with --release")
     else:
-        verified.look("items and clips against the release", _strangers(items, release))
-    verified.unchecked.append("that the answers are the model's: only who asked it knows")
-    verified.unchecked.append("that the clips named by digest are those that the model was sent")
+        verification.look("items and clips against the release", _strangers(items, release))
+    verification.unchecked.append("that the answers are the model's: only who asked it knows")
+    verification.unchecked.append("that the clips named by digest are those that the model was sent")
     if not is_judged_by_rules:
-        verified.unchecked.append("that the judges cast these votes: asking language models again needs their keys")
-    return verified
+        verification.unchecked.append("that the judges cast these votes: asking language models again needs their keys")
+    return verification
 
 
 # --- items and prompts ------------------------------------------------------------------------------------------------
@@ -126,9 +126,9 @@ def released_items(release: Path) -> dict[str, tuple[str, str]]:
     from traps_pipeline.release.checksums import altered_files
     from traps_pipeline.release.content import CLIPS
 
-    altered = altered_files(release)
-    if altered:
-        raise TrapsError(f"{release}: is not what was released: {altered[0]}")
+    problems = altered_files(release)
+    if problems:
+        raise TrapsError(f"{release}: is not what was released: {problems[0]}")
     items = {}
     for number, line in read_lines(release / CLIPS / "metadata.jsonl"):
         row = json.loads(line)
@@ -141,15 +141,15 @@ def released_items(release: Path) -> dict[str, tuple[str, str]]:
 
 
 def _strangers(items: Mapping[str, Row], release: Path) -> Iterator[str]:
-    released = released_items(release)
+    released_digests = released_items(release)
     for id_, row in items.items():
-        if id_ not in released:
+        if id_ not in released_digests:
             yield f"item {id_}: is not in the release"
-        elif released[id_][1] != row["media_digest"]:
+        elif released_digests[id_][1] != row["media_digest"]:
             yield f"item {id_}: its clip is not the released one"
-        elif released[id_][0] != row["item_hash"]:
+        elif released_digests[id_][0] != row["item_hash"]:
             yield f"item {id_}: its question, choices or answer are not the released ones"
-    missing_ids = sorted(id_ for id_ in released if id_.partition(":")[0] in DATASETS and id_ not in items)
+    missing_ids = sorted(id_ for id_ in released_digests if id_.partition(":")[0] in DATASETS and id_ not in items)
     for id_ in missing_ids:
         yield f"item {id_}: is in the release and was not asked"
 
@@ -185,19 +185,19 @@ def _wrong_answers(answers: Sequence[Row], items: Mapping[str, Row]) -> Iterator
 
 
 def _wrong_panel(submission: Submission, votes: Sequence[Row]) -> Iterator[str]:
-    about = submission.about
-    own = id_of_judges(about.panel, about.judges)
-    for panel in sorted({row["panel"] for row in votes} - {own}):
-        yield f"panel {panel!r:.100}: these judges and this version's prompts are {own}"
-    if RULE in {seat.backend for seat in about.judges} and not about.judged_by_rules:
+    description = submission.about
+    own_id = id_of_judges(description.panel, description.judges)
+    for panel in sorted({row["panel"] for row in votes} - {own_id}):
+        yield f"panel {panel!r:.100}: these judges and this version's prompts are {own_id}"
+    if RULE in {seat.backend for seat in description.judges} and not description.judged_by_rules:
         for model in sorted({row["model"] for row in votes}):
             if not is_reference(model):
                 yield f"model {model!r:.100}: rules judged it, which are made for reference models, and nobody says so"
-    for judge in sorted({row["judge"] for row in votes} - {seat.id for seat in about.judges}):
+    for judge in sorted({row["judge"] for row in votes} - {seat.id for seat in description.judges}):
         yield f"judge {judge!r:.100}: sits in no panel of the submission"
-    rules = [seat for seat in about.judges if seat.backend == RULE]
+    rules = [seat for seat in description.judges if seat.backend == RULE]
     if rules and any(seat.params != {"rules": RULES_VERSION} for seat in rules):
-        yield f"panel {about.panel!r}: its rules are of another version than {RULES_VERSION}"
+        yield f"panel {description.panel!r}: its rules are of another version than {RULES_VERSION}"
 
 
 def _wrong_votes(
@@ -220,9 +220,9 @@ def _wrong_votes(
         if request.key != row["vote_key"]:
             yield f"answer of {_named(row)}: is not the text, or not to the question, that {seat.id} judged"
             continue
-        wrong = _other_vote(row, item, _cast_again(str(row["task"]), request.user) if seat.backend == RULE else None)
-        if wrong:
-            yield f"vote of {seat.id} on {row['task']} of {_named(row)}: {wrong}"
+        problem = _other_vote(row, item, _cast_again(str(row["task"]), request.user) if seat.backend == RULE else None)
+        if problem:
+            yield f"vote of {seat.id} on {row['task']} of {_named(row)}: {problem}"
     for key, row in texts.items():
         item = items.get(row["item_id"])
         expected = {(task, judge) for task in tasks_for(item["side"]) for judge in seats} if item else set()
@@ -251,16 +251,24 @@ def _difference(row: Row, item: Row, again: Outcome | None) -> str:
         vote = parse_vote(row["task"], {"outcome": again.kind, "text": again.text}, item)
         expected = {decision: vote.decision}
         expected |= {name: getattr(vote, name) for name in ("extracted_value", "valid", "invalid_reason")}
-        wrong = [name for name, value in expected.items() if row[name] != value]
-        return f"{wrong[0]} is {row[wrong[0]]!r:.40}, its rules say {expected[wrong[0]]!r:.40}" if wrong else ""
+        wrong_columns = [name for name, value in expected.items() if row[name] != value]
+        return (
+            f"{wrong_columns[0]} is {row[wrong_columns[0]]!r:.40}, its rules say {expected[wrong_columns[0]]!r:.40}"
+            if wrong_columns
+            else ""
+        )
     if not row["valid"]:
         return "is invalid and decides nothing, yet has a decision" if row[decision] is not None else ""
     if row[decision] is None:
         return "is valid and has no decision"
     if decision == "correct":
         labels, aliases = list(item["labels"]), json.loads(item["aliases"])
-        own = is_correct(row["extracted_value"], item["ground_truth"], item["answer_type"], labels, aliases)
-        return "" if own == row["correct"] else f"correct is {row['correct']}, its extracted value gives {own}"
+        own_decision = is_correct(row["extracted_value"], item["ground_truth"], item["answer_type"], labels, aliases)
+        return (
+            ""
+            if own_decision == row["correct"]
+            else f"correct is {row['correct']}, its extracted value gives {own_decision}"
+        )
     return ""
 
 

@@ -66,8 +66,8 @@ def _moments(clip: Path) -> np.ndarray:
 def _rows(sides: pd.DataFrame, arms: pd.DataFrame, scenario: str, root: Path, times: np.ndarray) -> Iterator[Row]:
     """Yield control and void, then arms to be answered, then arms to be abstained on."""
     pair = sides.loc[sides["scenario_id"] == scenario].sort_values("side")
-    own = arms.loc[arms["scenario_id"] == scenario].sort_values(["side", "arm"])
-    for row in (*pair.to_dict("records"), *own.to_dict("records")):
+    scenario_arms = arms.loc[arms["scenario_id"] == scenario].sort_values(["side", "arm"])
+    for row in (*pair.to_dict("records"), *scenario_arms.to_dict("records")):
         frames, times_s = decode(root / str(row["clip"]))
         truth = row["ground_truth"]
         name = str(row.get("arm") or row["side"])
@@ -81,8 +81,8 @@ def _sheet(scenario: str, rows: list[Row], times: np.ndarray) -> Figure:
 
     Frames after a clip's end are hatched.
     """
-    _, tall, wide, _ = rows[0].clip.frames.shape
-    row_in = FRAME_IN * tall / wide + GAP_IN
+    _, frame_height, frame_width, _ = rows[0].clip.frames.shape
+    row_in = FRAME_IN * frame_height / frame_width + GAP_IN
     width, height = WORDS_IN + MOMENTS * (FRAME_IN + GAP_IN), HEAD_IN + len(rows) * row_in
     with figure_style():
         figure = new_figure(width, height, 150, layout=None)

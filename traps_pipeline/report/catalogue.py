@@ -84,8 +84,8 @@ class TableReport:
         """Return the paper's tables as printed, with figures that only its text states."""
         from traps_pipeline.report.printed_tables import in_text
 
-        of_paper = _function(f"printed_tables.{self.paper}")() if self.paper else []
-        return [*of_paper, *in_text(self.name)]
+        paper_tables = _function(f"printed_tables.{self.paper}")() if self.paper else []
+        return [*paper_tables, *in_text(self.name)]
 
     def files(self, results: Results) -> dict[str, bytes]:
         """Return files by path; the paper's are in `tables/published` and `recomputed`."""
@@ -95,8 +95,10 @@ class TableReport:
             parts = {"tables": self.tables(results)}
         else:
             parts = {f"tables/{PAPER}": self.as_printed(), f"tables/{RECOMPUTED}": self.tables(results)}
-        named = [(folder, file) for folder, tables in parts.items() for t in tables for file in table_files(t).items()]
-        return {f"{folder}/{name}": content for folder, (name, content) in named}
+        folder_files = [
+            (folder, file) for folder, tables in parts.items() for t in tables for file in table_files(t).items()
+        ]
+        return {f"{folder}/{name}": content for folder, (name, content) in folder_files}
 
 
 @dataclass(frozen=True)

@@ -78,8 +78,10 @@ def pairs_figure(items: pd.DataFrame, root: Path, layout: Layout = PAGE) -> Figu
             row, column = divmod(k, columns)
             left = column * (layout.block + layout.gap) + 0.8 * layout.gap
             top = height - 0.1 - sum(rows[:row]) - layout.header
-            tall = layout.block * ratio_of(block[0])
-            axes = figure.add_axes((left / width, (top - tall) / height, layout.block / width, tall / height))
+            block_height = layout.block * ratio_of(block[0])
+            axes = figure.add_axes(
+                (left / width, (top - block_height) / height, layout.block / width, block_height / height)
+            )
             draw_pair(axes, pair, *block, layout)
     return figure
 
@@ -101,11 +103,11 @@ def six_pairs(items: pd.DataFrame) -> pd.DataFrame:
 
 def whole_pairs(items: pd.DataFrame) -> list[pd.DataFrame]:
     """Return complete pairs as frames of two rows indexed by side, occlusion first."""
-    complete = items.loc[items.groupby("pair_id")["side"].transform("nunique") == 2]
-    complete = complete.assign(place=complete["dataset"].map(DATASETS.index)).sort_values(
+    complete_items = items.loc[items.groupby("pair_id")["side"].transform("nunique") == 2]
+    complete_items = complete_items.assign(place=complete_items["dataset"].map(DATASETS.index)).sort_values(
         ["place", "sub_scenario", "pair_id"]
     )
-    return [pair.set_index("side") for _, pair in complete.groupby("pair_id", sort=False)]
+    return [pair.set_index("side") for _, pair in complete_items.groupby("pair_id", sort=False)]
 
 
 def moments_of(pair: pd.DataFrame, root: Path, moments: int) -> tuple[SampledClip, SampledClip, np.ndarray]:
@@ -174,9 +176,11 @@ def draw_pair(
 
 def _draw_header(axes: Axes, pair: pd.DataFrame, layout: Layout) -> None:
     """Draw scenario and ground truth in bold, and the questions below them."""
-    by_side = {side: str(pair.at[side, "question"]) for side in ("control", "void")}
-    is_same = by_side["control"] == by_side["void"]
-    questions = [by_side["control"]] if is_same else [f"{side}: {question}" for side, question in by_side.items()]
+    question_of = {side: str(pair.at[side, "question"]) for side in ("control", "void")}
+    is_same = question_of["control"] == question_of["void"]
+    questions = (
+        [question_of["control"]] if is_same else [f"{side}: {question}" for side, question in question_of.items()]
+    )
     fit = {"max_lines": layout.questions, "placeholder": " …"}
     lines = [line for question in questions for line in textwrap.wrap(question, layout.letters, **fit)]
     truth = pair.at["control", "ground_truth"]

@@ -66,14 +66,14 @@ def lens(results: Results) -> Iterator[str]:
         top = max(layer for _, layer in row_of)
         if not all((prompt, layer) in row_of for prompt in PROMPTING for layer in (top, top - 1)):
             continue
-        moved = [
+        shifts = [
             row_of["guided", layer][side] - row_of["standard", layer][side]
             for layer in (top, top - 1)
             for side in ("voids", "controls")
         ]
         yield (
-            f"In {model} the guided prompt moves the log-odds of abstaining by {moved[0]:+.1f} on voids and "
-            f"{moved[1]:+.1f} on controls at the last layer, and by {moved[2]:+.1f} and {moved[3]:+.1f} one layer "
+            f"In {model} the guided prompt moves the log-odds of abstaining by {shifts[0]:+.1f} on voids and "
+            f"{shifts[1]:+.1f} on controls at the last layer, and by {shifts[2]:+.1f} and {shifts[3]:+.1f} one layer "
             "before (means over datasets)."
         )
 
@@ -84,9 +84,9 @@ def probe_baselines(results: Results) -> Iterator[str]:
     for model, group in _models(beside(results)):
         states, noise, spread = (group[name].to_numpy(float) for name in ("value", "noise", "noise_spread"))
         beaten = np.column_stack([group[[*SHORTCUTS, "output margin"]].to_numpy(float), noise + 2 * spread])
-        above, across = states > np.fmax.reduce(beaten, axis=1), (group["source"] != group["target"]).to_numpy(bool)
+        is_above, across = states > np.fmax.reduce(beaten, axis=1), (group["source"] != group["target"]).to_numpy(bool)
         counts = [
-            f"{np.count_nonzero(above & kind)} of {counted(int(np.count_nonzero(kind)), noun)}"
+            f"{np.count_nonzero(is_above & kind)} of {counted(int(np.count_nonzero(kind)), noun)}"
             for kind, noun in ((across, "pair"), (~across, "dataset"))
         ]
         yield (
@@ -103,13 +103,13 @@ def gate_arrows(results: Results) -> Iterator[str]:
     for model, group in _models(rows.loc[rows["pecs"].notna()]):
         for regime, part in group.groupby("regime", sort=False, observed=True):
             gates = {row["features"]: row for row in part.to_dict("records")}
-            by_states = gates.pop("states", None)
-            if by_states is None or not gates:
+            states_gates = gates.pop("states", None)
+            if states_gates is None or not gates:
                 continue
             best = max(gates.values(), key=lambda row: row["pecs"])
             yield (
-                f"{model} under {regime}: a gate on states takes PECS from {by_states['plain_pecs']:.2f} to "
-                f"{by_states['pecs']:.2f}, the best other gate ({best['features']}) to {best['pecs']:.2f}."
+                f"{model} under {regime}: a gate on states takes PECS from {states_gates['plain_pecs']:.2f} to "
+                f"{states_gates['pecs']:.2f}, the best other gate ({best['features']}) to {best['pecs']:.2f}."
             )
 
 
@@ -120,9 +120,9 @@ def doses_among_nulls(results: Results) -> Iterator[str]:
     for model, group in _models(rows.loc[rows["target"] != "all"]):
         cells: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
         for row in group.to_dict("records"):
-            about = {str(name): value for name, value in row.items()}
-            cells.setdefault(tuple(about[name] for name in _CELL), []).append(about)
-        ahead = [of_cell[0] for of_cell in cells.values() if all(row["p"] <= ALPHA for row in of_cell)]
+            row_keys = {str(name): value for name, value in row.items()}
+            cells.setdefault(tuple(row_keys[name] for name in _CELL), []).append(row_keys)
+        ahead = [cell_rows[0] for cell_rows in cells.values() if all(row["p"] <= ALPHA for row in cell_rows)]
         best = max(ahead, key=lambda row: row["effect"], default=None)
         yield (
             f"{model}: void directions do more than 19 of 20 draws of every null in {len(ahead)} of "
@@ -131,10 +131,10 @@ def doses_among_nulls(results: Results) -> Iterator[str]:
 
 
 def _cell(row: dict[str, Any]) -> str:
-    moved = "more" if row["side"] == "control" else "fewer"
+    change_word = "more" if row["side"] == "control" else "fewer"
     return (
         f"{SHORT[row['target']]} at {row['dose']:g} {row['unit']} along its direction of {row['directions']} states, "
-        f"where {in_percent(row['effect'])} {moved} of {row['n']} {row['side']}s are abstained on"
+        f"where {in_percent(row['effect'])} {change_word} of {row['n']} {row['side']}s are abstained on"
     )
 
 

@@ -118,13 +118,13 @@ class PairPictures:
         """The table of `benchmark.shortcuts`; unchanged results come from a cache."""
         from traps_pipeline.benchmark.shortcuts import shortcuts
 
-        kept, store = self.workspace.reports / ".state" / "shortcuts.json", self.workspace.store
+        cache_path, store = self.workspace.reports / ".state" / "shortcuts.json", self.workspace.store
         cache: dict[str, list[float]] = {}
         with suppress(ValueError):  # a damaged file counts as none
-            cache = json.loads(store.here(kept).read_text(encoding="utf-8")) if store.has(kept) else {}
+            cache = json.loads(store.here(cache_path).read_text(encoding="utf-8")) if store.has(cache_path) else {}
         clips = self.workspace.bring(self.items["clip"]) if len(self.items) else self.workspace.root
         table = shortcuts(self.items, self.workspace.tables.read_all(VIDEOS), clips, cache)
-        store.write({kept: json.dumps(cache).encode()})
+        store.write({cache_path: json.dumps(cache).encode()})
         return table
 
     def _shortcuts(self) -> Figure:

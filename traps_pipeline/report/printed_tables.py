@@ -28,11 +28,11 @@ PATH, TYPE = Column("path", "Source → target"), Column("transfer_type", "Trans
 
 def of_paper(name: str, rows: pd.DataFrame, columns: Sequence[Column]) -> PrintedTable:
     """Return the paper's table `name`, with title, place and notes of `tables.csv`."""
-    (about,) = as_printed("tables").query("name == @name").to_dict("records")
-    where = f"as the paper prints it (line {about['line']} of its LaTeX source)"
-    notes = [where, *([str(about["note"])] if about["note"] else [])]
+    (table_row,) = as_printed("tables").query("name == @name").to_dict("records")
+    source_note = f"as the paper prints it (line {table_row['line']} of its LaTeX source)"
+    notes = [source_note, *([str(table_row["note"])] if table_row["note"] else [])]
     return PrintedTable(
-        name, str(about["title"]), rows.reset_index(drop=True), columns, notes,
+        name, str(table_row["title"]), rows.reset_index(drop=True), columns, notes,
         dash="not given in the paper", deviation="± standard deviation over three runs",
     )  # fmt: skip
 
@@ -57,14 +57,14 @@ def in_text(card: str) -> list[PrintedTable]:
 def overall() -> list[PrintedTable]:
     """Return all sixteen models under the three regimes."""
     rows = as_printed("overall")
-    wide: pd.DataFrame = rows.loc[:, ["model"]].drop_duplicates()
+    table_rows: pd.DataFrame = rows.loc[:, ["model"]].drop_duplicates()
     columns = [MODEL]
     for regime in PRINTED_REGIMES:
         names = {field: f"{regime}_{field}" for field in SHARES}
         part = rows.loc[rows["regime"] == regime, ["model", *names]]
-        wide = wide.merge(part.rename(columns=names), on="model")
+        table_rows = table_rows.merge(part.rename(columns=names), on="model")
         columns += figures({names[field]: f"{heading}, {regime}" for field, heading in SHARES.items()})
-    return [of_paper("overall", wide, columns)]
+    return [of_paper("overall", table_rows, columns)]
 
 
 def replication_overall() -> list[PrintedTable]:
@@ -89,15 +89,15 @@ def _cells_of(cells: pd.DataFrame, dataset: str, regime: str) -> pd.DataFrame:
 def per_dataset() -> list[PrintedTable]:
     """Return PECS of the fourteen main-family models by dataset and regime."""
     cells = _cells("main")
-    wide: pd.DataFrame = cells.loc[:, ["model"]].drop_duplicates()
+    table_rows: pd.DataFrame = cells.loc[:, ["model"]].drop_duplicates()
     columns = [MODEL]
     for dataset in DATASETS:
         for regime in PRINTED_REGIMES:
             name = f"{dataset}_{regime}"
             part = _cells_of(cells, dataset, regime).loc[:, ["model", "pecs"]].rename(columns={"pecs": name})
-            wide = wide.merge(part, on="model")
+            table_rows = table_rows.merge(part, on="model")
             columns += figures({name: f"{TITLES[dataset]}, {regime[0].upper()}"})
-    return [of_paper("per_dataset", wide, columns)]
+    return [of_paper("per_dataset", table_rows, columns)]
 
 
 def expanded() -> list[PrintedTable]:
@@ -216,7 +216,7 @@ def confabulation() -> list[PrintedTable]:
     rows = as_printed("confabulation_taxonomy")
     names = {"hp_pct": "HP", "ii_pct": "II", "hp_and_ii_pct": "HP∩II", "es_pct": "ES", "doubt_pct": "Doubt"}
     rows[[*names]] = rows[[*names]] + "%"
-    rows["model"] = rows["model"] + ["†" if where == "trace" else "" for where in rows["doubt_read_from"]]
+    rows["model"] = rows["model"] + ["†" if evidence == "trace" else "" for evidence in rows["doubt_read_from"]]
     return [of_paper("confabulation", rows, [MODEL, *figures({"n": "n", **names})])]
 
 
@@ -227,20 +227,20 @@ def probes() -> list[PrintedTable]:
     """Return probe transfer of the three families by pair, and means by transfer type."""
     pairs = _paths(as_printed("probe_transfer"))
     pairs["best_layer"] = "L" + pairs["best_layer"]
-    wide: pd.DataFrame = pairs.loc[:, ["transfer_type", "path"]].drop_duplicates()
+    table_rows: pd.DataFrame = pairs.loc[:, ["transfer_type", "path"]].drop_duplicates()
     columns, words = [TYPE, PATH], {"best_layer": "layer", "auroc": "AUC", "auroc_confabulated": "Cf"}
     for model in STEERED:
         names = {f"{model}_{field}": f"{model}, {word}" for field, word in words.items()}
         part = pairs.query("model == @model").add_prefix(f"{model}_").rename(columns={f"{model}_path": "path"})
-        wide = wide.merge(part[["path", *names]], on="path")
+        table_rows = table_rows.merge(part[["path", *names]], on="path")
         columns += figures(names)
     means = as_printed("probe_means")
     means["both"] = means["auroc"] + " / " + means["auroc_confabulated"]
-    by_type = means.pivot(index="transfer_type", columns="model", values="both")
-    by_type = by_type.loc[[*dict.fromkeys(means["transfer_type"])]].reset_index()
+    means_by_type = means.pivot(index="transfer_type", columns="model", values="both")
+    means_by_type = means_by_type.loc[[*dict.fromkeys(means["transfer_type"])]].reset_index()
     return [
-        of_paper("probe_transfer", wide, columns),
-        of_paper("probe_means", by_type, [TYPE, *figures({model: model for model in STEERED})]),
+        of_paper("probe_transfer", table_rows, columns),
+        of_paper("probe_means", means_by_type, [TYPE, *figures({model: model for model in STEERED})]),
     ]
 
 
@@ -249,9 +249,9 @@ def cosines() -> list[PrintedTable]:
     rows = as_printed("cosine_qwen")
     order = [*dict.fromkeys(rows["source"])]
     rows["cosine"] = rows["cosine"].str.replace("-", "−")
-    wide = rows.pivot(index="source", columns="other", values="cosine").loc[order].reset_index()
+    table_rows = rows.pivot(index="source", columns="other", values="cosine").loc[order].reset_index()
     columns = [Column("source", "Direction"), *figures({name: name for name in order})]
-    return [of_paper("cosines", wide, columns)]
+    return [of_paper("cosines", table_rows, columns)]
 
 
 def steering() -> list[PrintedTable]:
@@ -262,12 +262,12 @@ def steering() -> list[PrintedTable]:
 def _regimes() -> PrintedTable:
     import pandas as pd
 
-    short = {"standard": "Std", "guided": "Gui", "oc": "Oc-family", "ch": "Ch-family"}
+    short_names = {"standard": "Std", "guided": "Gui", "oc": "Oc-family", "ch": "Ch-family"}
     rows: dict[tuple[str, str], dict[str, str]] = {}
     for row in as_printed("steering_regime").to_dict("records"):
         family = str(row["direction_family"])
-        first = short[row["direction_regime"] if family == "all" else family]
-        second = short[row["inference_regime"]] if family == "all" else "guided inf."
+        first = short_names[row["direction_regime"] if family == "all" else family]
+        second = short_names[row["inference_regime"]] if family == "all" else "guided inf."
         sides = [f"{row[f'{side}_alpha0']}→{row[f'{side}_alpha10']}" for side in ("control", "void")]
         rows.setdefault((first, second), {})[str(row["model"])] = " / ".join(sides)
     table = pd.DataFrame([{"directions": d, "inference": i, **cells} for (d, i), cells in rows.items()])
@@ -292,16 +292,16 @@ def _domains() -> PrintedTable:
 
 def _dose(family: str) -> PrintedTable:
     rows = _paths(as_printed(f"steering_dose_{family}"))
-    wide: pd.DataFrame = rows.loc[:, ["path"]].drop_duplicates()
+    table_rows: pd.DataFrame = rows.loc[:, ["path"]].drop_duplicates()
     sides = {"C": "control_abstention_pct", "V": "void_abstention_pct"}
     # The first family's table alternates the sides at each alpha; the other has all controls first.
     order = [(letter, alpha) for alpha in ALPHAS for letter in sides]
     order = order if family == "qwen" else sorted(order, key=lambda pair: pair[0])
     for letter, alpha in order:
         part = rows.loc[rows["alpha"] == alpha, ["path", sides[letter]]]
-        wide = wide.merge(part.rename(columns={sides[letter]: f"{letter}{alpha}"}), on="path")
+        table_rows = table_rows.merge(part.rename(columns={sides[letter]: f"{letter}{alpha}"}), on="path")
     names = {f"{letter}{alpha}": f"{letter}, α {alpha}" for letter, alpha in order}
-    return of_paper(f"steering_dose_{family}", wide, [PATH, *figures(names)])
+    return of_paper(f"steering_dose_{family}", table_rows, [PATH, *figures(names)])
 
 
 def _paths(rows: pd.DataFrame) -> pd.DataFrame:

@@ -94,14 +94,14 @@ def _probes(results: Results) -> pd.DataFrame:
 def _cosines(results: Results) -> pd.DataFrame:
     """Return COSINES rows: qwen3-vl-8b's matrix, and other models' values in the text."""
     matrix = published("cosine_qwen").assign(model="qwen3-vl-8b")
-    few = published("other")
-    few = few.loc[few["id"].str.fullmatch(r"cos-(gemma|llava)-\w+-\w+")]
-    pairs = few["id"].str.split("-", n=2).str[2].str.split("-", expand=True)
-    few = few.assign(source=pairs[0], other=pairs[1], cosine=few["value"].astype(float))
-    mirrored = few.rename(columns={"source": "other", "other": "source"})
-    both = pd.concat([matrix, few, mirrored], ignore_index=True)
-    both = _long(both).rename(columns={"source": "dataset", "other": "other_dataset"})
-    return _as(COSINES, [both.assign(layer=_steered(both), prompt="standard", other_prompt="standard")])
+    other_figures = published("other")
+    other_figures = other_figures.loc[other_figures["id"].str.fullmatch(r"cos-(gemma|llava)-\w+-\w+")]
+    pairs = other_figures["id"].str.split("-", n=2).str[2].str.split("-", expand=True)
+    other_figures = other_figures.assign(source=pairs[0], other=pairs[1], cosine=other_figures["value"].astype(float))
+    mirrored = other_figures.rename(columns={"source": "other", "other": "source"})
+    all_cosines = pd.concat([matrix, other_figures, mirrored], ignore_index=True)
+    all_cosines = _long(all_cosines).rename(columns={"source": "dataset", "other": "other_dataset"})
+    return _as(COSINES, [all_cosines.assign(layer=_steered(all_cosines), prompt="standard", other_prompt="standard")])
 
 
 def _effects(results: Results) -> pd.DataFrame:

@@ -41,8 +41,8 @@ def _cells(results: StudyResults) -> pd.DataFrame:
 
 def _overall(results: StudyResults) -> pd.DataFrame:
     intervals = [f"{name}_ci_{end}" for name in ("acc", "abs_rec", "false_abs", "j", "pecs") for end in ("low", "high")]
-    more = ["j", "j_std", *intervals, "rank", "rank_low", "rank_high"]
-    columns = [name for name in (*CELL_COLUMNS, *more) if name != "dataset"]
+    extra_columns = ["j", "j_std", *intervals, "rank", "rank_low", "rank_high"]
+    columns = [name for name in (*CELL_COLUMNS, *extra_columns) if name != "dataset"]
     board = _of_panel(results, results.board)
     rows = board.loc[board["dataset"] == "overall", columns]
     return analyses.of_several_runs(rows.reset_index(drop=True))
@@ -67,14 +67,14 @@ def _gaps(results: StudyResults, rows: pd.DataFrame) -> list[pd.DataFrame]:
             return [gap for part in models for gap in _gaps(results, part)]
         results.refused.setdefault("rates", []).append(str(error))
         return []
-    of_model = rows.groupby("model").agg(
+    model_means = rows.groupby("model").agg(
         n_pairs=("n_pairs", "sum"),
         n_missing=("n_missing", "sum"),
         n_runs=("n_runs", "min"),
         incomplete=("incomplete", "any"),
         epoch=("epoch", joined_epochs),
     )
-    return [gaps.merge(of_model, left_on="model", right_index=True, how="left", sort=False)]
+    return [gaps.merge(model_means, left_on="model", right_index=True, how="left", sort=False)]
 
 
 def _scoped(results: StudyResults, scope: str) -> pd.DataFrame:
@@ -108,15 +108,17 @@ def _composition(results: StudyResults) -> pd.DataFrame:
 
 def _cosines(results: StudyResults) -> pd.DataFrame:
     rows, mechanism = results.rows(COSINES), results.mechanism
-    steered = {model: layers.steering for model, layers in mechanism.models.items()} if mechanism else {}
-    is_steered = [layer == steered.get(model) for layer, model in zip(rows["layer"], rows["model"], strict=True)]
+    steering_layers = {model: layers.steering for model, layers in mechanism.models.items()} if mechanism else {}
+    is_steered = [
+        layer == steering_layers.get(model) for layer, model in zip(rows["layer"], rows["model"], strict=True)
+    ]
     return rows.loc[is_steered].reset_index(drop=True)
 
 
 def _effects(results: StudyResults) -> pd.DataFrame:
     """Return the paper's protocol rows, with dose in class gaps and degenerate share."""
-    every = results.rows(STEERING_EFFECTS)
-    rows = in_gaps(of_paper(every), every)
+    all_effects = results.rows(STEERING_EFFECTS)
+    rows = in_gaps(of_paper(all_effects), all_effects)
     answers = rows["n"].astype(float) + rows["n_missing"].astype(float)
     return rows.assign(broken=rows["degenerate"].astype(float) / answers)
 
@@ -156,10 +158,10 @@ class StudyResults(Results):
     @cached_property
     def panel(self) -> str:
         """The panel of all tables and figures: the study's, else the first that decided."""
-        decided = self.board if len(self.board) else self.tables.read_all(METRICS, ["panel"], dataset=DATASETS)
-        panels = sorted({*decided["panel"]}, key=lambda name: ("+" in name, name))
-        own = panel_id(self._panel)
-        return own if own in panels or not panels else panels[0]
+        judged_rows = self.board if len(self.board) else self.tables.read_all(METRICS, ["panel"], dataset=DATASETS)
+        panels = sorted({*judged_rows["panel"]}, key=lambda name: ("+" in name, name))
+        own_panel = panel_id(self._panel)
+        return own_panel if own_panel in panels or not panels else panels[0]
 
     @cached_property
     def judged_by(self) -> str:

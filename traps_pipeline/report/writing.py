@@ -197,8 +197,8 @@ class PrintedTable:
         """The printed cells' numbers: columns and their spreads, then all other fields."""
         import pandas as pd
 
-        printed = [field for column in self.columns for field in (column.field, column.spread) if field]
-        fields = dict.fromkeys([*printed, *map(str, self.rows.columns)])
+        printed_fields = [field for column in self.columns for field in (column.field, column.spread) if field]
+        fields = dict.fromkeys([*printed_fields, *map(str, self.rows.columns)])
         data = self.rows.reindex(columns=pd.Index(list(fields)))
         words = {column.field for column in self.columns if column.unit == "text"}
         texts = [str(name) for name, kind in data.dtypes.items() if kind.kind == "O" and name not in words]
@@ -250,8 +250,8 @@ def _with_marks(column: Column, records: Sequence[Mapping[str, Any]]) -> list[st
     """Return heading and cells of a marked column: numbers right, marks after them."""
     marks = ["", *(column.parts(row)[2] for row in records)]
     numbers = _without_marks(replace(column, mark=""), records)
-    wide, widest = max(map(len, numbers)), max(map(len, marks))
-    return [f"{number:>{wide}} {mark:{widest}}" for number, mark in zip(numbers, marks, strict=True)]
+    number_width, widest = max(map(len, numbers)), max(map(len, marks))
+    return [f"{number:>{number_width}} {mark:{widest}}" for number, mark in zip(numbers, marks, strict=True)]
 
 
 def table_latex(table: PrintedTable) -> str:
@@ -338,13 +338,13 @@ def _parquet(table: PrintedTable) -> bytes:
 
     data = table.data
     texts = {c.field for c in table.columns if c.unit in ("text", "range")}
-    loose = [str(name) for name, kind in data.dtypes.items() if kind.kind == "O" and str(kind) == "object"]
-    numeric = {name for name in loose if name not in texts and not any(isinstance(v, str) for v in data[name])}
-    data = data.astype({name: "Float64" if name in numeric else "string" for name in loose})
+    object_columns = [str(name) for name, kind in data.dtypes.items() if kind.kind == "O" and str(kind) == "object"]
+    numeric = {name for name in object_columns if name not in texts and not any(isinstance(v, str) for v in data[name])}
+    data = data.astype({name: "Float64" if name in numeric else "string" for name in object_columns})
     arrow = pa.Table.from_pandas(data, preserve_index=False)
-    about = {"title": table.title, "notes": "\n".join(table.remarks), "absence": table.absence}
+    metadata = {"title": table.title, "notes": "\n".join(table.remarks), "absence": table.absence}
     stream = io.BytesIO()
-    pq.write_table(arrow.replace_schema_metadata(about), stream, compression="zstd")
+    pq.write_table(arrow.replace_schema_metadata(metadata), stream, compression="zstd")
     return stream.getvalue()
 
 

@@ -109,8 +109,8 @@ def uplift(cells: pd.DataFrame, means: pd.DataFrame | None = None) -> pd.DataFra
     require_one_epoch(cells.pivot(index=["model", "dataset"], columns="regime", values="epoch"), "uplift")
     rows = overall(cells) if means is None else means
     guided, standard = (rows[rows["regime"] == r].set_index("model")["abs_rec"] for r in (GUIDED, STANDARD))
-    both = [model for model in rows["model"].unique() if model in guided.index and model in standard.index]
-    return pd.DataFrame({"model": both, "ratio": ratio(guided.loc[both], standard.loc[both])})
+    models = [model for model in rows["model"].unique() if model in guided.index and model in standard.index]
+    return pd.DataFrame({"model": models, "ratio": ratio(guided.loc[models], standard.loc[models])})
 
 
 def spread(cells: pd.DataFrame, column: str = "pecs_std") -> pd.DataFrame:
@@ -182,14 +182,14 @@ def degenerate_strategies() -> pd.DataFrame:
     """
     import pandas as pd
 
-    some = 0.2  # an arbitrary share: it is the same on both sides
+    share = 0.2  # an arbitrary share: it is the same on both sides
     rows = [
         ("always-abstain", 0.0, 1.0, 1.0),
         ("never-abstain", np.nan, 0.0, 0.0),
         ("random-50", np.nan, 0.5, 0.5),
         ("perfect-answerer", 1.0, 0.0, 0.0),
         ("inverse-oracle", 0.0, 1.0, 0.0),
-        ("confidence-noise", np.nan, some, some),
+        ("confidence-noise", np.nan, share, share),
     ]
     table = pd.DataFrame(rows, columns=pd.Index(["strategy", "acc", "false_abs", "abs_rec"]))
     table["j"] = table["abs_rec"] - table["false_abs"]
@@ -242,16 +242,16 @@ def pair_differences(cells: pd.DataFrame) -> pd.DataFrame:
     import pandas as pd
 
     cells = _checked(cells, datasets=(*DATASETS, "overall"))
-    by_model = cells.set_index(_ENTRY)
+    indexed_cells = cells.set_index(_ENTRY)
     rows = []
-    for thinking, plain in REASONING_PAIRS:
-        if not {thinking, plain} <= set(cells["model"]):
+    for thinking, other in REASONING_PAIRS:
+        if not {thinking, other} <= set(cells["model"]):
             continue
-        sides = {name: by_model.loc[name] for name in (thinking, plain)}
+        sides = {name: indexed_cells.loc[name] for name in (thinking, other)}
         epochs = pd.DataFrame({name: side["epoch"] for name, side in sides.items()}).dropna()
-        require_one_epoch(epochs, f"{thinking} against {plain}")
-        change = (sides[thinking][SHARES] - sides[plain][SHARES]).loc[epochs.index].reset_index()
-        rows.append(change.assign(thinking=thinking, other=plain))
+        require_one_epoch(epochs, f"{thinking} against {other}")
+        change = (sides[thinking][SHARES] - sides[other][SHARES]).loc[epochs.index].reset_index()
+        rows.append(change.assign(thinking=thinking, other=other))
     columns = ["thinking", "other", "regime", "dataset", *SHARES]
     return pd.concat(rows, ignore_index=True).loc[:, columns] if rows else pd.DataFrame(columns=pd.Index(columns))
 
@@ -276,18 +276,22 @@ def sub_scenarios(cells: pd.DataFrame) -> pd.DataFrame:
     for key, group in cells.groupby([cells["dataset"].str.removesuffix("_ill_posed"), "scope"]):
         taxonomy, scope = cast(tuple[str, str], key)
         visual, textual = group.loc[group["dataset"] == taxonomy], group.loc[group["dataset"] != taxonomy]
-        by_regime = {r: visual.loc[visual["regime"] == r].set_index("model") for r in PROMPTING}
-        standard, guided = (by_regime[r].dropna(subset=SHARES) for r in PROMPTING)
+        regime_rows = {r: visual.loc[visual["regime"] == r].set_index("model") for r in PROMPTING}
+        standard, guided = (regime_rows[r].dropna(subset=SHARES) for r in PROMPTING)
         textual_voids = textual.loc[textual["regime"] == "standard"].set_index("model").dropna(subset=["abs_rec"])
         epochs = pd.DataFrame(
             {"standard": standard["epoch"], "guided": guided["epoch"], "ill-posed": textual_voids["epoch"]}
         )
         require_one_epoch(epochs, f"sub-scenario {scope} of {taxonomy}")
-        both, common = (standard.index.intersection(side.index) for side in (guided, textual_voids))
-        change = (guided.loc[both, SHARES] - standard.loc[both, SHARES]).mean()
+        guided_models, common = (standard.index.intersection(side.index) for side in (guided, textual_voids))
+        change = (guided.loc[guided_models, SHARES] - standard.loc[guided_models, SHARES]).mean()
         row = {"dataset": taxonomy, "sub_scenario": scope, "n_pairs": visual["n_pairs"].max()}
         row |= {"n_models": len(standard)} | standard[SHARES].mean().to_dict()
-        row |= {"guided_n_models": len(guided), "uplift_n_models": len(both), "ill_posed_n_models": len(common)}
+        row |= {
+            "guided_n_models": len(guided),
+            "uplift_n_models": len(guided_models),
+            "ill_posed_n_models": len(common),
+        }
         row |= guided[SHARES].mean().add_prefix("guided_").to_dict()
         row |= {f"{share}_uplift": change[share] for share in ("abs_rec", "false_abs")}
         means = [pd.Series([side.loc[common, "abs_rec"].mean()]) for side in (textual_voids, standard)]
@@ -350,9 +354,9 @@ def _checked(cells: pd.DataFrame, more: Sequence[str] = (), datasets: Sequence[s
     missing = [name for name in (*_ENTRY, *SHARES, "epoch", *more) if name not in cells]
     if missing:
         raise ValueError(f"cells lack the columns {missing}")
-    twice = cells.loc[cells.duplicated([*_ENTRY, *more])]
-    if len(twice):
-        first = twice.iloc[0]
+    repeated_cells = cells.loc[cells.duplicated([*_ENTRY, *more])]
+    if len(repeated_cells):
+        first = repeated_cells.iloc[0]
         raise ValueError(
             f"cells have two rows for {first['model']}, {first['dataset']}, {first['regime']}: average runs first"
         )

@@ -73,9 +73,9 @@ def resample(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEE
             entries.append((model, regime, dataset))
             observed.append(mean[1, :, 0])
             values.append(mean[..., 1:].astype(np.float32))  # half the memory, and the time of quantiles
-    nothing = np.zeros((0, 2, len(RESAMPLED), resamples), np.float32)
+    no_values = np.zeros((0, 2, len(RESAMPLED), resamples), np.float32)
     return ResampledFigures(
-        entries, np.array(observed).reshape(len(entries), len(RESAMPLED)), np.stack(values) if values else nothing
+        entries, np.array(observed).reshape(len(entries), len(RESAMPLED)), np.stack(values) if values else no_values
     )
 
 
@@ -105,8 +105,8 @@ def interval(
     """
     low = np.fmin(quantile(ends[..., 0, :], (1 - level) / 2), observed)
     high = np.fmax(quantile(ends[..., 1, :], (1 + level) / 2), observed)
-    nothing = np.all(np.isnan(ends), axis=(-2, -1), keepdims=True)[..., 0]
-    return np.where(nothing, np.nan, np.clip(np.stack([low, high], axis=-1), *limits))
+    is_undefined = np.all(np.isnan(ends), axis=(-2, -1), keepdims=True)[..., 0]
+    return np.where(is_undefined, np.nan, np.clip(np.stack([low, high], axis=-1), *limits))
 
 
 def with_interval(name: str, ends: np.ndarray, limits: tuple[float, float]) -> dict[str, float]:
@@ -172,13 +172,13 @@ class Resampling:
 
 def draw_scenarios(items: pd.DataFrame, resamples: int, seed: int) -> Resampling:
     """Draw the weights of the scenarios of items (columns scenario_id, taxonomy)."""
-    by_taxonomy = {}
+    scenario_weights_of = {}
     for k, taxonomy in enumerate(TAXONOMIES):
         ids = pd.Index(sorted(items.loc[items["taxonomy"] == taxonomy, "scenario_id"].unique()))
         weights = np.random.default_rng([seed, k]).standard_exponential((resamples, len(ids)), np.float32)
         weights = np.ceil(weights * _GRAIN) / _GRAIN
-        by_taxonomy[taxonomy] = ids, np.concatenate([np.ones((1, len(ids)), np.float32), weights])
-    return Resampling(by_taxonomy, resamples, seed)
+        scenario_weights_of[taxonomy] = ids, np.concatenate([np.ones((1, len(ids)), np.float32), weights])
+    return Resampling(scenario_weights_of, resamples, seed)
 
 
 def resampled_sums(weights: np.ndarray, counts: np.ndarray) -> np.ndarray:
@@ -213,10 +213,10 @@ def shares_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:
     weigh less (_IN_MEAN).
     """
     decisions = sums.shape[-2] // 3
-    yes, decided = sums[..., 0 : 2 * decisions : 2, :], sums[..., 1 : 2 * decisions : 2, :]
-    unseen = sums[..., 2 * decisions :, :] * (_IN_MEAN if in_mean else 1.0)
+    yes, n_decided = sums[..., 0 : 2 * decisions : 2, :], sums[..., 1 : 2 * decisions : 2, :]
+    unseen_weights = sums[..., 2 * decisions :, :] * (_IN_MEAN if in_mean else 1.0)
     with np.errstate(invalid="ignore"):
-        return np.stack([yes, yes + unseen]) / (decided + unseen)
+        return np.stack([yes, yes + unseen_weights]) / (n_decided + unseen_weights)
 
 
 def ends_of_mean(values: pd.Series, resampling: Resampling, named: str) -> np.ndarray:
@@ -226,8 +226,8 @@ def ends_of_mean(values: pd.Series, resampling: Resampling, named: str) -> np.nd
     """
     sums = np.zeros((1, 2, 1 + resampling.resamples))
     for scenarios, weights in resampling.scenarios.values():
-        own = values.reindex(scenarios)
-        counts = np.stack([own.fillna(0.0), own.notna()], axis=1).astype(float)
+        scenario_values = values.reindex(scenarios)
+        counts = np.stack([scenario_values.fillna(0.0), scenario_values.notna()], axis=1).astype(float)
         sums += resampled_sums(weights, counts[:, None])
     return shares_of(with_unseen(sums, np.array([[len(values)]]), resampling.unseen(named, 1)))[:, 0, 0]
 
@@ -266,7 +266,7 @@ def run_sums(group: pd.DataFrame, resampling: Resampling, named: str) -> dict[tu
     the items' unseen scenarios.
     """
     totals: dict[tuple[str, int], np.ndarray] = {}
-    having: dict[tuple[str, int], np.ndarray] = {}
+    n_with_decision: dict[tuple[str, int], np.ndarray] = {}
     for taxonomy, items in group.groupby("taxonomy", sort=True):
         scenarios, weights = resampling.scenarios[str(taxonomy)]
         cells = items.groupby(["dataset", "run"], sort=True)
@@ -277,11 +277,11 @@ def run_sums(group: pd.DataFrame, resampling: Resampling, named: str) -> dict[tu
         for cell, sums, n in zip(cells.size().index, resampled_sums(weights, counts), having_any, strict=True):
             key = cast(tuple[str, int], cell)
             totals[key] = totals.get(key, 0) + sums
-            having[key] = having.get(key, 0) + n
-    unseen = {
+            n_with_decision[key] = n_with_decision.get(key, 0) + n
+    unseen_weights = {
         dataset: resampling.unseen(f"{named}|{dataset}", len(COUNTS) // 2) for dataset in {name for name, _ in totals}
     }
-    return {key: with_unseen(sums, having[key], unseen[key[0]]) for key, sums in totals.items()}
+    return {key: with_unseen(sums, n_with_decision[key], unseen_weights[key[0]]) for key, sums in totals.items()}
 
 
 def means_over_runs(
@@ -298,8 +298,10 @@ def means_over_runs(
         if any((dataset, run) in sums for run in runs)
     }
     complete_runs = [sums[d, run] for run in runs if all((d, run) in sums for d in DATASETS) for d in DATASETS]
-    nothing = np.full((2, len(RESAMPLED), draws), np.nan)
+    undefined = np.full((2, len(RESAMPLED), draws), np.nan)
     return {
         **means,
-        "overall": np.mean([figures(own, True) for own in complete_runs], axis=0) if complete_runs else nothing,
+        "overall": np.mean([figures(run_of_four, True) for run_of_four in complete_runs], axis=0)
+        if complete_runs
+        else undefined,
     }

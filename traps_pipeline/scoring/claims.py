@@ -56,9 +56,9 @@ def _naive_gap() -> Recomputed:
 
 def _zeros(regime: str) -> Recomputed:
     cells = _main_cells(regime)
-    at_zero = zero_boundary(cells)
-    cell = f" ({' '.join(at_zero.iloc[0][['model', 'dataset']])})" if len(at_zero) == 1 else ""
-    return Recomputed(f"{len(at_zero)} of {len(cells)}{cell}")
+    zero_cells = zero_boundary(cells)
+    cell = f" ({' '.join(zero_cells.iloc[0][['model', 'dataset']])})" if len(zero_cells) == 1 else ""
+    return Recomputed(f"{len(zero_cells)} of {len(cells)}{cell}")
 
 
 def _spread(models: Sequence[str]) -> Recomputed:
@@ -143,8 +143,8 @@ def _family_gaps() -> Recomputed:
         family: sum(_pooled(row, "textual") for row in members) / sum(_pooled(row, "visual") for row in members)
         for family, members in families.items()
     }
-    listed = ", ".join(f"{family} {value:.1f}" for family, value in gaps.items())
-    return Recomputed(f"{min(gaps.values()):.1f} to {max(gaps.values()):.1f}", listed)
+    ratio_text = ", ".join(f"{family} {value:.1f}" for family, value in gaps.items())
+    return Recomputed(f"{min(gaps.values()):.1f} to {max(gaps.values()):.1f}", ratio_text)
 
 
 def _by_regime(figure: str, models: Sequence[str]) -> dict[tuple[str, str], dict[str, float]]:
@@ -218,8 +218,8 @@ def _same_agreement() -> Recomputed:
         [(row["unanimous_pct"], row["fleiss_kappa"]) for row in rows if row["task"] != "void_abstention"]
         for rows in (published_rows("judge_agreement", dataset=name) for name in ("chaotic", "chaotic_ill_posed"))
     ]
-    listed = "; ".join(f"{share:g} % and {kappa:.3f}" for share, kappa in figures[0])
-    reason = f"both have {listed}, though the items, Acc and FalseAbs differ; the epoch is not stated"
+    figure_text = "; ".join(f"{share:g} % and {kappa:.3f}" for share, kappa in figures[0])
+    reason = f"both have {figure_text}, though the items, Acc and FalseAbs differ; the epoch is not stated"
     return Recomputed("different" if figures[0] != figures[1] else "equal to three digits", reason)
 
 
@@ -238,9 +238,9 @@ def _textual_ratio(sub_scenario: str) -> Recomputed:
     (row,) = published_rows("chaotic_subscenarios", sub_scenario=sub_scenario)
     visual, textual = row["abs_rec_pct"], row["abs_rec_ill_posed_pct"]
     low, high = (textual - 0.05) / (visual + 0.05), (textual + 0.05) / (visual - 0.05)
-    (printed,) = published_rows("other", id=f"{sub_scenario}-ratio")
-    half_unit = 0.05 if "." in printed["value"] else 0.5
-    agrees = low - half_unit <= float(printed["value"]) <= high + half_unit
+    (printed_row,) = published_rows("other", id=f"{sub_scenario}-ratio")
+    half_unit = 0.05 if "." in printed_row["value"] else 0.5
+    agrees = low - half_unit <= float(printed_row["value"]) <= high + half_unit
     return Recomputed(f"{textual / visual:.2f}", f"rounding of the rates allows {low:.1f} to {high:.1f}", agrees=agrees)
 
 
@@ -251,16 +251,16 @@ def _validated() -> Recomputed:
 
 
 def _es_scores() -> Recomputed:
-    positives, missed, labels, agreeing = 13, 8, 100, 92
+    positives, missed, labels, n_agreeing = 13, 8, 100, 92
     recall, accuracy = (positives - missed) / positives, 1 - missed / labels
     chance = (positives**2 + (labels - positives) ** 2) / labels**2
-    f1, kappa = 2 * recall / (1 + recall), (agreeing / labels - chance) / (1 - chance)
+    f1, kappa = 2 * recall / (1 + recall), (n_agreeing / labels - chance) / (1 - chance)
     return Recomputed(f"{accuracy:.4f} and {recall:.4f} and {f1:.4f} and {kappa:.4f}")
 
 
 def _reviewed() -> Recomputed:
-    kept, corrected, discarded = (text_figure(f"review-{kind}") for kind in ("kept", "corrected", "discarded"))
-    return Recomputed(f"{kept + corrected + discarded:g}")
+    n_kept, corrected, discarded = (text_figure(f"review-{kind}") for kind in ("kept", "corrected", "discarded"))
+    return Recomputed(f"{n_kept + corrected + discarded:g}")
 
 
 def _evaluated() -> Recomputed:

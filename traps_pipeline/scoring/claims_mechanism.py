@@ -56,10 +56,10 @@ def _replication() -> Recomputed:
 
 
 def _replication_shift() -> Recomputed:
-    most = max(_shifts(GEMMA) + _shifts(LLAVA))
-    listed = ", ".join(f"{value:.3f}" for value in _shifts(GEMMA))
-    reason = f"the bound of line 386 is stated of {QWEN}; the three shifts of {GEMMA} are {listed}"
-    return Recomputed(f"{most:.3f}", reason, agrees=most <= 0.035)
+    largest_shift = max(_shifts(GEMMA) + _shifts(LLAVA))
+    shift_text = ", ".join(f"{value:.3f}" for value in _shifts(GEMMA))
+    reason = f"the bound of line 386 is stated of {QWEN}; the three shifts of {GEMMA} are {shift_text}"
+    return Recomputed(f"{largest_shift:.3f}", reason, agrees=largest_shift <= 0.035)
 
 
 def _across_domains() -> Recomputed:
@@ -106,8 +106,8 @@ def _of_family(family: str, column: str, **where: object) -> list[float]:
 
 
 def _chaotic_control() -> Recomputed:
-    most = max(_of_family("ch", "control_abstention_pct"))
-    return Recomputed(f"{most:g}", "ch_ip to ch has 36, 60 and 96, and ch_ip to oc has 6 at alpha 5")
+    largest_share = max(_of_family("ch", "control_abstention_pct"))
+    return Recomputed(f"{largest_share:g}", "ch_ip to ch has 36, 60 and 96, and ch_ip to oc has 6 at alpha 5")
 
 
 def _chaotic_void() -> Recomputed:

@@ -31,7 +31,9 @@ def leave_one_out(
     if not judged:
         return pd.DataFrame(columns=_COLUMNS)
     # All judges in one pass: a model without one of them is scored like a model of its own.
-    seats = [two.assign(model=f"{seat}|" + two["model"]) for seat, (_, two) in enumerate(judged)]
+    seats = [
+        verdict_rows.assign(model=f"{seat}|" + verdict_rows["model"]) for seat, (_, verdict_rows) in enumerate(judged)
+    ]
     rows = _scored(pd.concat(seats, ignore_index=True))
     names = [name.split("|", 1) for name in rows["model"]]
     rows = rows.assign(model=[model for _, model in names], without=[judged[int(seat)][0] for seat, _ in names])

@@ -77,9 +77,9 @@ def _studies(counts: Sequence[int], shares: Shares, seed: int) -> tuple[np.ndarr
     for n in counts:
         answers = rng.multinomial(n, np.outer(control, void).ravel(), size=STUDIES)
         gamma = rng.standard_gamma(answers[:, :, None], size=(STUDIES, 6, RESAMPLES))
-        unseen = rng.standard_exponential((3, RESAMPLES))
+        unseen_weights = rng.standard_exponential((3, RESAMPLES))
         observed += _pecs(answers[..., None], np.zeros((3, 1)), False)[:, 1, 0] / len(counts)
-        ends += _pecs(gamma, unseen, len(counts) > 1) / len(counts)
+        ends += _pecs(gamma, unseen_weights, len(counts) > 1) / len(counts)
     return observed, ends
 
 
@@ -106,8 +106,10 @@ def _detectable(
     for seed in range(SEED + 1, SEED + 1 + ROUNDS):
         better, better_ends = _studies(counts, _better(shares, smallest), seed)
         difference, low = better - observed, better_ends[:, 0] - ends[:, 1]
-        below = np.quantile(low.mean(axis=1, keepdims=True) - low, 1 - SEPARABLE_BELOW / 2 / comparisons)
-        smallest = float(difference.mean() - low.mean() + below + NormalDist().inv_cdf(POWER) * difference.std())
+        lower_half_width = np.quantile(low.mean(axis=1, keepdims=True) - low, 1 - SEPARABLE_BELOW / 2 / comparisons)
+        smallest = float(
+            difference.mean() - low.mean() + lower_half_width + NormalDist().inv_cdf(POWER) * difference.std()
+        )
     return smallest if smallest <= 1 else None
 
 
@@ -119,6 +121,8 @@ def _pecs(answers: np.ndarray, unseen: np.ndarray, in_mean: bool) -> np.ndarray:
     """
     all_pairs = answers.sum(axis=1)
     yes = answers[:, :2].sum(axis=1), answers[:, 2:4].sum(axis=1), answers[:, ::2].sum(axis=1)
-    sums = np.stack([part for own in yes for part in (own, all_pairs)], axis=1)
-    added = np.broadcast_to(unseen, (len(answers), *unseen.shape))
-    return np.moveaxis(figures_of(np.concatenate([sums, added], axis=1), in_mean)[:, :, RESAMPLED.index("pecs")], 0, 1)
+    sums = np.stack([part for n_yes in yes for part in (n_yes, all_pairs)], axis=1)
+    unseen_draws = np.broadcast_to(unseen, (len(answers), *unseen.shape))
+    return np.moveaxis(
+        figures_of(np.concatenate([sums, unseen_draws], axis=1), in_mean)[:, :, RESAMPLED.index("pecs")], 0, 1
+    )

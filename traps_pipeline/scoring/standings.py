@@ -122,8 +122,8 @@ def _ranks(board: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:
 
     Null without PECS, and if the row is of several panels.
     """
-    known = contrasts["separable"].astype("boolean").fillna(False)
-    separable = contrasts.loc[(contrasts["kind"] == "models") & (contrasts["figure"] == "pecs") & known]
+    is_separable = contrasts["separable"].astype("boolean").fillna(False)
+    separable = contrasts.loc[(contrasts["kind"] == "models") & (contrasts["figure"] == "pecs") & is_separable]
     wins, losses = Counter[tuple[str, ...]](), Counter[tuple[str, ...]]()
     for row in separable.to_dict("records"):
         winner, loser = (row["left_model"], row["right_model"])[:: 1 if row["difference"] > 0 else -1]
@@ -136,14 +136,14 @@ def _ranks(board: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:
         "rank_low": pd.Series([1 + losses[entry] for entry in entries], board.index),
         "rank_high": peers.transform("count") - pd.Series([wins[entry] for entry in entries], board.index),
     }
-    ranked = board["pecs"].notna() & ~board["panel"].str.contains("+", regex=False)
-    return pd.DataFrame(ranks).where(ranked).astype("Int64")
+    is_ranked = board["pecs"].notna() & ~board["panel"].str.contains("+", regex=False)
+    return pd.DataFrame(ranks).where(is_ranked).astype("Int64")
 
 
 def wrong_intervals(board: pd.DataFrame) -> int:
     """Return how many intervals are out of order or outside their score's limits."""
-    wrong = 0
+    n_wrong = 0
     for figure in RESAMPLED:
         low, high = (board[f"{figure}_ci_{end}"].to_numpy(float) for end in ("low", "high"))
-        wrong += int(((low < (-1 if figure == "j" else 0)) | (low > high) | (high > 1)).sum())
-    return wrong
+        n_wrong += int(((low < (-1 if figure == "j" else 0)) | (low > high) | (high > 1)).sum())
+    return n_wrong

@@ -72,13 +72,13 @@ def correction_effect(workspace: Workspace, spec: Mapping[str, Any], correction:
     cost = CorrectionEffect(question=question, rendered=[spec["scenario_id"]] if renders else [])
     for model, dataset, evaluations in _evaluation_counts(workspace, spec["taxonomy"]):
         for side in SIDES:
-            of_ill_posed = is_ill_posed(dataset) and side == "void"
-            again = renders or (ill_posed if of_ill_posed else asked_again)
+            is_ill_posed_void = is_ill_posed(dataset) and side == "void"
+            is_asked_again = renders or (ill_posed if is_ill_posed_void else asked_again)
             item = f"{dataset}:{spec['scenario_id']}:{side}"
-            if again or (judged_again and side == "control"):
+            if is_asked_again or (judged_again and side == "control"):
                 cost.items += [] if item in cost.items else [item]
-                cost.votes += evaluations * seats * (len(tasks_for(side)) if again else 1)
-            if again:
+                cost.votes += evaluations * seats * (len(tasks_for(side)) if is_asked_again else 1)
+            if is_asked_again:
                 cost.answers += evaluations
                 cost.dollars = _plus(cost.dollars, _dollars(model, evaluations))
     return cost

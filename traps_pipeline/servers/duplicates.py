@@ -36,9 +36,9 @@ def fingerprint(clip: Path) -> np.ndarray:
     bits = []
     for place in PLACES:
         grey = cv2.cvtColor(frames[round(place * (len(frames) - 1))], cv2.COLOR_RGB2GRAY)
-        small = cv2.resize(grey, (SIDE + 1, SIDE), interpolation=cv2.INTER_AREA)
-        bits.append(small[:, 1:] > small[:, :-1])
-    return np.concatenate([each.ravel() for each in bits])
+        thumbnail = cv2.resize(grey, (SIDE + 1, SIDE), interpolation=cv2.INTER_AREA)
+        bits.append(thumbnail[:, 1:] > thumbnail[:, :-1])
+    return np.concatenate([part.ravel() for part in bits])
 
 
 def neighbours(prints: Mapping[str, np.ndarray], families: Mapping[str, str]) -> dict[str, Neighbour]:
@@ -92,4 +92,4 @@ class Comparison:
     @property
     def found(self) -> Mapping[str, Neighbour]:
         """The near duplicates, once all scenarios are compared; empty until then."""
-        return {name: each for name, each in (self._found or {}).items() if each.distance < ALIKE_BELOW}
+        return {name: neighbour for name, neighbour in (self._found or {}).items() if neighbour.distance < ALIKE_BELOW}

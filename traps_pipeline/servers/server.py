@@ -51,7 +51,7 @@ def new_app() -> FastAPI:
 
     @app.exception_handler(RequestValidationError)
     async def malformed(request: Request, error: RequestValidationError) -> Response:
-        fields = sorted({".".join(map(str, each["loc"][1:])) or "body" for each in error.errors()})
+        fields = sorted({".".join(map(str, error_details["loc"][1:])) or "body" for error_details in error.errors()})
         return JSONResponse({"error": f"not understood: {', '.join(fields)}"}, 400)
 
     return app
@@ -75,8 +75,8 @@ def script(*names: str) -> str:
 def study_file(workspace: Workspace, relative: str) -> Path:
     """Return a clip that the study's tables name. Raises NotFound for any other path."""
     path = workspace.resolve(relative)
-    inside = path.resolve().is_relative_to((workspace.root / "clips").resolve())
-    if not inside or not path.is_file():
+    is_inside = path.resolve().is_relative_to((workspace.root / "clips").resolve())
+    if not is_inside or not path.is_file():
         raise NotFound("the study has no such clip")
     return path
 

@@ -64,8 +64,10 @@ class MediaSpec(BaseModel):
 
     def content(self) -> dict[str, Any]:
         """Return the fields for a digest; fields added later count only if set."""
-        unused = {name for name in ("fit", "later") if getattr(self, name) == type(self).model_fields[name].default}
-        return self.model_dump(mode="json", exclude=unused)
+        default_fields = {
+            name for name in ("fit", "later") if getattr(self, name) == type(self).model_fields[name].default
+        }
+        return self.model_dump(mode="json", exclude=default_fields)
 
     @model_validator(mode="after")
     def _one_frame_policy(self) -> MediaSpec:
@@ -207,8 +209,8 @@ class MediaStore:
 
 def read_note(note: Path) -> Media:
     """Return the media that a note describes, or raise ValueError or OSError."""
-    (line, *more) = [*read_checked(note)] or [None]
-    if line is None or more or not line.whole:
+    (line, *other_lines) = [*read_checked(note)] or [None]
+    if line is None or other_lines or not line.whole:
         raise ValueError(f"{note}: {NOT_WHOLE}; delete it and run again: it is prepared anew")
     record: dict[str, Any] = json.loads(line.content)
     record.pop("sum")
@@ -262,21 +264,21 @@ def _file(note: Path, profile: Profile) -> Path | None:
 def _make(clip: Path, clip_digest: str, spec: MediaSpec, note: Path) -> Media:
     """Pick and encode frames, write the file, and last the note with its digest."""
     _require(clip, clip_digest)
-    sampled = sample(clip, spec)
+    frames = sample(clip, spec)
     path, rate = _file(note, spec.profile), None
     if path is None:
-        header = str((sampled.frames.shape, sampled.times_s.tolist())).encode()
-        sha256, size = _sha256([header, sampled.frames.tobytes()]), sampled.frames.nbytes
+        header = str((frames.frames.shape, frames.times_s.tolist())).encode()
+        sha256, size = _sha256([header, frames.frames.tobytes()]), frames.frames.nbytes
     elif spec.profile == "video":
-        rate = _rate(clip, sampled, spec)
-        encode(list(sampled.frames), path, rate)
+        rate = _rate(clip, frames, spec)
+        encode(list(frames.frames), path, rate)
         sha256, size = file_digest(path), path.stat().st_size
     else:
-        jpegs = [_jpeg(frame) for frame in sampled.frames]
+        jpegs = [_jpeg(frame) for frame in frames.frames]
         data = _zipped(jpegs)
         write_bytes(path, data)
         sha256, size = _sha256(jpegs), len(data)
-    times = tuple(sampled.times_s.tolist())
+    times = tuple(frames.times_s.tolist())
     media = Media(spec.profile, path, sha256, len(times), times, rate, size)
     write_bytes(note, line_with_checksum({name: value for name, value in asdict(media).items() if name != "path"}))
     return media

@@ -69,8 +69,8 @@ class StageOutput:
 
 def joined(parts: Sequence[StageOutput]) -> StageOutput:
     """Join the outputs of a partition's parts: concatenate rows, add up the numbers."""
-    first, *later = parts
-    for later_part in later:
+    first, *other_parts = parts
+    for later_part in other_parts:
         first.tally.add(later_part.tally)
     rows = [row for part in parts for row in part.content]
     figures = {name: round(sum(part.shown[name] for part in parts), 6) for name in first.shown}
@@ -124,14 +124,14 @@ class TableStore:
         import pyarrow as pa
 
         schema = table.arrow_schema()
-        listed = rows if isinstance(rows, Sequence) else None
-        kinds = () if listed is None else {cast("Any", type(row)) for row in listed}
-        names = {*map(str, rows)} if listed is None else {each.name for kind in kinds for each in fields(kind)}
+        row_list = rows if isinstance(rows, Sequence) else None
+        kinds = () if row_list is None else {cast("Any", type(row)) for row in row_list}
+        names = {*map(str, rows)} if row_list is None else {member.name for kind in kinds for member in fields(kind)}
         try:
             if names - set(schema.names):
                 raise ValueError(f"unknown columns {sorted(names - set(schema.names))}")
-            if listed is not None:  # a column at a time: a dictionary a row would be a copy of all
-                data = pa.table([_column(listed, field) for field in schema], schema=schema)
+            if row_list is not None:  # a column at a time: a dictionary a row would be a copy of all
+                data = pa.table([_column(row_list, field) for field in schema], schema=schema)
             else:
                 data = pa.Table.from_pandas(rows, schema=schema, preserve_index=False, safe=True)
                 data = data.replace_schema_metadata(None).cast(schema)
@@ -149,13 +149,13 @@ class TableStore:
         if not len(data):
             return data
         data = data.sort_by([(name, "ascending") for name in table.key])
-        before = None
+        previous_key = None
         for batch in data.select([*table.key]).to_batches(_ROWS_AT_ONCE):
             for key in zip(*(column.to_pylist() for column in batch.columns), strict=True):
-                if key == before:
-                    named = dict(zip(table.key, key, strict=True))
-                    raise TrapsError(f"table {table.name} {dict(partition)}: key {named} repeats")
-                before = key
+                if key == previous_key:
+                    key_values = dict(zip(table.key, key, strict=True))
+                    raise TrapsError(f"table {table.name} {dict(partition)}: key {key_values} repeats")
+                previous_key = key
         return data
 
     def state(self, table: Table, partition: Mapping[str, Any]) -> State | None:
@@ -223,9 +223,9 @@ class TableStore:
         """Return `read_all` as an Arrow table."""
         import pyarrow as pa
 
-        strangers = sorted(set(equal) - set(table.partition_by))
-        if strangers:
-            raise ValueError(f"table {table.name} is partitioned by {table.partition_by}, not by {strangers}")
+        unknown_columns = sorted(set(equal) - set(table.partition_by))
+        if unknown_columns:
+            raise ValueError(f"table {table.name} is partitioned by {table.partition_by}, not by {unknown_columns}")
         values = {c: v if isinstance(v, tuple | list) else [v] for c, v in equal.items()}
         parts = product(*(values.get(column, "*") for column in table.partition_by))
         patterns = ["/".join(map(str, part or [table.name])) + _SUFFIX for part in parts]
@@ -239,7 +239,7 @@ class TableStore:
         root = self.root / table.name
         paths = self._store.below(root, "/".join("*" * max(1, len(table.partition_by))) + _SUFFIX)
         values = [path.relative_to(root).as_posix().removesuffix(_SUFFIX).split("/") for path in paths]
-        return [dict(zip(table.partition_by, each, strict=False)) for each in values]
+        return [dict(zip(table.partition_by, path_values, strict=False)) for path_values in values]
 
     def _load(self, table: Table, path: Path, columns: Sequence[str] | None) -> pa.Table:
         import pyarrow as pa
@@ -342,12 +342,12 @@ def _footer_of(path: Path) -> tuple[State, list[str]]:
     import pyarrow.parquet as pq
 
     stamp = _stamp(path.stat())
-    if (cached := _FOOTERS.get(path)) is None or cached[0] != stamp:
+    if (cached_footer := _FOOTERS.get(path)) is None or cached_footer[0] != stamp:
         content = _verified(path)
         older = _COLUMNS not in content  # written before the names stood there
         names = pq.ParquetFile(_sound_bytes(path)).schema_arrow.names if older else _json_behind(content, _COLUMNS)
-        cached = _FOOTERS[path] = stamp, State(**_json_behind(content, _STATE, len(_STATE))), names
-    return cached[1], cached[2]
+        cached_footer = _FOOTERS[path] = stamp, State(**_json_behind(content, _STATE, len(_STATE))), names
+    return cached_footer[1], cached_footer[2]
 
 
 def _json_behind(content: bytes, mark: bytes, within: int = 0) -> Any:

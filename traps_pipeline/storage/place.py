@@ -35,8 +35,8 @@ def place_of(text: str) -> Place:
 
 def name_of(place: Place) -> str:
     """Return a unique name of a study: its folder's, and a digest of where it began."""
-    plain = re.sub(r"[^a-z0-9]+", "-", str(place).rpartition("/")[2].lower()).strip("-")[:LONGEST]
-    return f"{plain}-{digest(str(place))[:8]}".lstrip("-")
+    plain_name = re.sub(r"[^a-z0-9]+", "-", str(place).rpartition("/")[2].lower()).strip("-")[:LONGEST]
+    return f"{plain_name}-{digest(str(place))[:8]}".lstrip("-")
 
 
 def scratch_of(address: str) -> Path:

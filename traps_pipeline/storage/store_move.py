@@ -32,9 +32,9 @@ def move_to_store(workspace: Workspace, address: Place) -> int:
     if not isinstance(address, str):
         raise TrapsError(f"{address}: is a folder; --store names an address in an object store, s3://BUCKET/STUDY")
     if workspace.is_shared or workspace.study.database:
-        where = workspace.place if workspace.is_shared else "a database"
+        destination = workspace.place if workspace.is_shared else "a database"
         raise TrapsError(
-            f"{workspace.place}: the study's ledger lies in {where}, and not in a folder; export it first "
+            f"{workspace.place}: the study's ledger lies in {destination}, and not in a folder; export it first "
             "(`traps study export-ledger`), take `database` from study.yaml, and import it again"
         )
     if Workspace.is_there(address):
@@ -58,9 +58,9 @@ def _move_files(workspace: Workspace, target: Workspace) -> None:
         [p for p in workspace.store.below(workspace.root) if p.relative_to(workspace.root).parts[0] not in STAYS]
     )
     count = 0
-    while some := list(islice(files, AT_ONCE)):
-        moved = list[Path]()
-        for path in some:
+    while chunk := list(islice(files, AT_ONCE)):
+        moved_paths = list[Path]()
+        for path in chunk:
             destination = target.root / path.relative_to(workspace.root)
             if path.is_relative_to(workspace.tables.root):
                 try:
@@ -70,7 +70,7 @@ def _move_files(workspace: Workspace, target: Workspace) -> None:
                 continue
             destination.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, destination)
-            moved.append(destination)
-        target.store.keep(moved)
-        count += len(some)
+            moved_paths.append(destination)
+        target.store.keep(moved_paths)
+        count += len(chunk)
         progress.current().note(f"{counted(count, 'file')} copied to {target.place}")

@@ -157,9 +157,9 @@ class MechanismSettings(BaseModel):
         missing = set(self.steering.direction_regimes if self.steering else ()) - set(self.prompts)
         if missing:
             raise ValueError(f"steering.direction_regimes: {sorted(missing)} are not among the prompts {self.prompts}")
-        unread = {*self.probes.prompts} - {*self.prompts, PROBE_PROMPT}
-        if unread:
-            raise ValueError(f"probes.prompts: {sorted(unread)} are not among the prompts {self.prompts}")
+        missing_prompts = {*self.probes.prompts} - {*self.prompts, PROBE_PROMPT}
+        if missing_prompts:
+            raise ValueError(f"probes.prompts: {sorted(missing_prompts)} are not among the prompts {self.prompts}")
         return self
 
     @field_validator("models")

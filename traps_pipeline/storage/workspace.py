@@ -127,9 +127,9 @@ class Workspace:
 
     def allow(self, **changes: Any) -> Workspace:
         """Return the workspace with changed fields of its study, such as budgets."""
-        changed = Workspace(self.root, self.study.model_copy(update=changes), self._address)
-        changed.save_study()
-        return changed
+        workspace = Workspace(self.root, self.study.model_copy(update=changes), self._address)
+        workspace.save_study()
+        return workspace
 
     @classmethod
     def open(cls, place: Place | None = None) -> Workspace:
@@ -155,9 +155,9 @@ class Workspace:
 
         A study's own `dagster.yaml` may name another storage.
         """
-        own = (home or self.dagster_home) / "dagster.yaml"
-        if own.is_symlink() or not own.exists():
-            write_text(own, (ASSETS / "dagster.yaml").read_text(encoding="utf-8"))
+        own_file = (home or self.dagster_home) / "dagster.yaml"
+        if own_file.is_symlink() or not own_file.exists():
+            write_text(own_file, (ASSETS / "dagster.yaml").read_text(encoding="utf-8"))
 
     @property
     def is_on_cluster(self) -> bool:

@@ -71,15 +71,15 @@ def decode(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
     try:
         with av.open(str(path)) as container:
-            declared = container.streams.video[0].frames
+            n_declared = container.streams.video[0].frames
             pairs = [(f.to_ndarray(format="rgb24"), float(f.time or 0.0)) for f in container.decode(video=0)]
     except (FFmpegError, OSError, IndexError) as error:  # IndexError: no video stream
         raise DamagedClip(
             f"{path}: cannot be decoded ({error}); delete the file and materialize videos again"
         ) from error
-    if not pairs or len(pairs) != declared:
+    if not pairs or len(pairs) != n_declared:
         raise DamagedClip(
-            f"{path}: holds {len(pairs)} of {declared} frames; delete the file and materialize videos again"
+            f"{path}: holds {len(pairs)} of {n_declared} frames; delete the file and materialize videos again"
         )
     return np.stack([p[0] for p in pairs]), np.array([p[1] for p in pairs])
 

@@ -76,10 +76,10 @@ def _make_room(checkpoint: Checkpoint, params: LocalParams, device: str) -> None
     """
     import torch
 
-    needed = weight_bytes(checkpoint.folder, params.dtype, params.quantisation)
+    needed_bytes = weight_bytes(checkpoint.folder, params.dtype, params.quantisation)
     loaded_keys = [key for key, model in _LOADED.items() if SPREAD in (device, model.device) or model.device == device]
     for key in loaded_keys:
-        if needed <= WEIGHTS_SHARE * free_bytes(device):
+        if needed_bytes <= WEIGHTS_SHARE * free_bytes(device):
             return
         del _LOADED[key]
         gc.collect()
@@ -145,16 +145,16 @@ def _load(checkpoint: Checkpoint, params: LocalParams, device: str) -> LocalMode
 
 def _require_packable(network: Any, name: str) -> None:
     """Raise TrapsError for modules that bitsandbytes cannot pack on a CPU (rows % 64)."""
-    odd = [
+    odd_layers = [
         part
         for part, module in network.named_modules()
         if type(module).__name__ == "Linear4bit" and module.in_features % NF4_CPU_BLOCK
     ]
-    if odd:
+    if odd_layers:
         raise TrapsError(
             f"checkpoint {name}: NF4 on a CPU wants modules {NF4_CPU_BLOCK} weights wide or a multiple of it, and "
-            f"{len(odd)}, {odd[0]} first, are not: name them, or what holds them, under nf4_skip beside the "
-            "entry's quantisation: nf4 (in params or in mechanism), or use a GPU"
+            f"{len(odd_layers)}, {odd_layers[0]} first, are not: name them, or what holds them, under nf4_skip beside "
+            "the entry's quantisation: nf4 (in params or in mechanism), or use a GPU"
         )
 
 

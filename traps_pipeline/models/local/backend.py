@@ -103,19 +103,19 @@ class LocalBackend:
         sampling = None
         if self._params.temperature is not None and self._params.top_p is not None:
             sampling = Sampling(self._params.temperature, self._params.top_p, seeds(batch.requests))
-        generated = model.generate(prompts, self._params.max_new_tokens, sampling, stopped=batch.abandoned.is_set)
+        answers = model.generate(prompts, self._params.max_new_tokens, sampling, stopped=batch.abandoned.is_set)
         return [
             replace(
                 outcome(
-                    decoded.text,
-                    decoded.finish_reason,
-                    decoded.prompt_tokens,
-                    decoded.completion_tokens,
+                    answer.text,
+                    answer.finish_reason,
+                    answer.prompt_tokens,
+                    answer.completion_tokens,
                     model.served_model,
                 ),
-                first_token=stored_alternatives(decoded.first_token, request.about.get("regime")),
+                first_token=stored_alternatives(answer.first_token, request.about.get("regime")),
             )
-            for request, decoded in zip(batch.requests, generated, strict=True)
+            for request, answer in zip(batch.requests, answers, strict=True)
         ]
 
 

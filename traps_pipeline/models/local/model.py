@@ -201,10 +201,10 @@ class LocalModel:
         mask = None if chosen is None else torch.from_numpy(chosen)
         if pooling == "answer":
             prompt = self._answered(prompt, steering)
-        with steering_context(steering, self), capturing(iter(self.blocks), self.norm, pooling, mask) as captured:
+        with steering_context(steering, self), capturing(iter(self.blocks), self.norm, pooling, mask) as states:
             self.forward(prompt)
-        assert captured.normed is not None and len(captured.raw) == self.n_layers + 1
-        rows = torch.stack([row.float().cpu() for row in (*captured.raw, captured.normed)]).numpy()
+        assert states.normed is not None and len(states.raw) == self.n_layers + 1
+        rows = torch.stack([row.float().cpu() for row in (*states.raw, states.normed)]).numpy()
         return States(rows[:-1], rows[-1])
 
     def _answered(self, prompt: Prompt, steering: Steers | None) -> Prompt:
@@ -229,17 +229,17 @@ class LocalModel:
         early. Raises TrapsError if a single prompt does not fit.
         """
         answers: dict[int, GeneratedAnswer] = {}
-        each = [self._row_bytes(prompt, max_new_tokens) for prompt in prompts]
-        for group in batches(prompts, each, MEMORY_SHARE * free_bytes(self.device)):
+        row_bytes = [self._row_bytes(prompt, max_new_tokens) for prompt in prompts]
+        for group in batches(prompts, row_bytes, MEMORY_SHARE * free_bytes(self.device)):
             pending = [group]
             while pending:
                 rows = pending.pop()
-                generated = self._fitting(prompts, rows, max_new_tokens, sampling, steering, stopped)
-                if generated is None:
+                fitting_answers = self._fitting(prompts, rows, max_new_tokens, sampling, steering, stopped)
+                if fitting_answers is None:
                     middle = len(rows) // 2
                     pending += [rows[middle:], rows[:middle]]
                 else:
-                    answers.update(zip(rows, generated, strict=True))
+                    answers.update(zip(rows, fitting_answers, strict=True))
         return [answers[i] for i in range(len(prompts))]
 
     def _fitting(
@@ -275,16 +275,16 @@ class LocalModel:
     def _answer(self, prompt: Prompt, tokens: list[int], first: Mapping[int, float]) -> GeneratedAnswer:
         eos = self.network.generation_config.eos_token_id
         ends = {eos} if isinstance(eos, int) else {*eos}
-        ended = next((i for i, token in enumerate(tokens) if token in ends), None)
-        own_tokens = tokens if ended is None else tokens[: ended + 1]
+        end_index = next((i for i, token in enumerate(tokens) if token in ends), None)
+        own_tokens = tokens if end_index is None else tokens[: end_index + 1]
         with self._processing:
             text = self.processor.tokenizer.decode(own_tokens, skip_special_tokens=True)
-            named = dict[str, float]()
+            logprob_of = dict[str, float]()
             for token, logprob in first.items():  # several may have one text
                 name = self.processor.tokenizer.decode([token])
-                named[name] = float(np.logaddexp(named.get(name, -np.inf), logprob))
-        finish = "length" if ended is None else "stop"
-        return GeneratedAnswer(text, prompt.n_tokens, len(own_tokens), finish, tuple(own_tokens), named)
+                logprob_of[name] = float(np.logaddexp(logprob_of.get(name, -np.inf), logprob))
+        finish = "length" if end_index is None else "stop"
+        return GeneratedAnswer(text, prompt.n_tokens, len(own_tokens), finish, tuple(own_tokens), logprob_of)
 
     def placed(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return inputs on the model's device, with pictures in its precision."""

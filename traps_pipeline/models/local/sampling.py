@@ -40,8 +40,8 @@ class SeededNucleus:
         import torch
 
         probabilities, order = (scores.float() / self._sampling.temperature).softmax(dim=-1).sort(descending=True)
-        before = probabilities.cumsum(dim=-1) - probabilities
-        nucleus = probabilities.masked_fill(before >= self._sampling.top_p, 0.0)
+        preceding = probabilities.cumsum(dim=-1) - probabilities
+        nucleus = probabilities.masked_fill(preceding >= self._sampling.top_p, 0.0)
         upto = nucleus.cumsum(dim=-1)
         uniform = torch.tensor([[stream.random()] for stream in self._streams], dtype=upto.dtype, device=upto.device)
         place = torch.searchsorted(upto, uniform * upto[:, -1:], right=True)

@@ -51,8 +51,8 @@ def check_family(family: Family, folder: Path) -> str:
 
 def check_nf4(folder: Path) -> str:
     """Load a tiny checkpoint in 4 bits, if possible; describe the result in words."""
-    if absent := missing("nf4"):
-        return f"{' and '.join(absent)} not installed (`{install_line('nf4')}`): entries in NF4 do not load"
+    if missing_modules := missing("nf4"):
+        return f"{' and '.join(missing_modules)} not installed (`{install_line('nf4')}`): entries in NF4 do not load"
     model = tiny_model("qwen3-vl", folder / "nf4", "nf4")
     model.forward_states(_prompt(model, folder))
     import bitsandbytes

@@ -119,14 +119,16 @@ def make_tokenizer(family: Family, tokenizer: Tokenizer | None = None) -> Any:
     transformers = load_transformers()
     special = _SPECIAL[family]
     base = _byte_level() if tokenizer is None else tokenizer
-    named = {f"{name}_token": token for name, token in special.items()}
-    plain = {name: named.pop(name) for name in ("pad_token", "eos_token", "bos_token") if name in named}
+    special_tokens = {f"{name}_token": token for name, token in special.items()}
+    main_tokens = {
+        name: special_tokens.pop(name) for name in ("pad_token", "eos_token", "bos_token") if name in special_tokens
+    }
     wrapped = transformers.PreTrainedTokenizerFast(
         tokenizer_object=base,
         padding_side="left",
-        extra_special_tokens=named,
+        extra_special_tokens=special_tokens,
         clean_up_tokenization_spaces=False,
-        **plain,
+        **main_tokens,
     )
     if "bos" in special:  # as the families' own tokenizers do, whether or not the chat template writes it too
         from tokenizers.processors import TemplateProcessing
@@ -153,16 +155,16 @@ def make_config(family: Family, tokenizer: Any, text: Overrides | None = None, v
     """Return the family's tiny configuration for a tokenizer, with overrides."""
     transformers = load_transformers()
     ids = {name: tokenizer.convert_tokens_to_ids(token) for name, token in _SPECIAL[family].items()}
-    shared = {"vocab_size": len(tokenizer), "pad_token_id": ids["pad"], "eos_token_id": ids["eos"]}
+    text_settings = {"vocab_size": len(tokenizer), "pad_token_id": ids["pad"], "eos_token_id": ids["eos"]}
     if "bos" in ids:
-        shared["bos_token_id"] = ids["bos"]
+        text_settings["bos_token_id"] = ids["bos"]
     match family:
         case "qwen3-vl":
-            return _qwen3_vl(transformers, ids, _TEXT | shared, text or {}, vision or {})
+            return _qwen3_vl(transformers, ids, _TEXT | text_settings, text or {}, vision or {})
         case "gemma-4":
-            return _gemma_4(transformers, ids, _TEXT | shared, text or {}, vision or {})
+            return _gemma_4(transformers, ids, _TEXT | text_settings, text or {}, vision or {})
         case "llava-next-video":
-            return _llava_next_video(transformers, ids, _TEXT | shared, text or {}, vision or {})
+            return _llava_next_video(transformers, ids, _TEXT | text_settings, text or {}, vision or {})
 
 
 def _qwen3_vl(transformers: Any, ids: Mapping[str, int], base: Overrides, text: Overrides, vision: Overrides) -> Any:
@@ -264,12 +266,17 @@ def make_processor(family: Family, tokenizer: Any, video: Overrides | None = Non
     video_settings = dict(video or {})
     match family:
         case "qwen3-vl":
-            small = {"size": {"shortest_edge": 32 * 32, "longest_edge": 2 * 64 * 64}, "cap_pixels_per_frame": False}
-            eyes = transformers.Qwen3VLVideoProcessor(**small | video_settings)
-            still = {name: getattr(eyes, name) for name in ("patch_size", "image_mean", "image_std")}
-            still["size"] = {"shortest_edge": (2 * eyes.patch_size) ** 2, "longest_edge": _STILL_PIXELS}
+            video_sizes = {
+                "size": {"shortest_edge": 32 * 32, "longest_edge": 2 * 64 * 64},
+                "cap_pixels_per_frame": False,
+            }
+            eyes = transformers.Qwen3VLVideoProcessor(**video_sizes | video_settings)
+            image_settings = {name: getattr(eyes, name) for name in ("patch_size", "image_mean", "image_std")}
+            image_settings["size"] = {"shortest_edge": (2 * eyes.patch_size) ** 2, "longest_edge": _STILL_PIXELS}
             return transformers.Qwen3VLProcessor(
-                image_processor=transformers.Qwen2VLImageProcessor(**still),  # a server may receive frames one by one
+                image_processor=transformers.Qwen2VLImageProcessor(
+                    **image_settings
+                ),  # a server may receive frames one by one
                 tokenizer=tokenizer,
                 video_processor=eyes,
                 chat_template=_TEMPLATES[family],

@@ -57,7 +57,7 @@ class ClipMemory:
         @functools.wraps(original)  # the library inspects the names of its arguments
         def features(*given: Any, **named: Any) -> Any:
             arguments = dict(names.bind(*given, **named).arguments)
-            rest = arguments.pop("kwargs", {})
+            keyword_arguments = arguments.pop("kwargs", {})
             clips = _clips_of(arguments)
             if clips is None:
                 return original(*given, **named)
@@ -65,7 +65,7 @@ class ClipMemory:
             rows = {key: self._kept[key] for key in keys if key in self._kept}
             for key, clip in zip(keys, clips, strict=True):
                 if key not in rows:
-                    rows[key] = self._pass(original, key, {**arguments, **clip, **rest})
+                    rows[key] = self._pass(original, key, {**arguments, **clip, **keyword_arguments})
             return self._joined([rows[key] for key in keys])
 
         owner.get_video_features = features
@@ -115,9 +115,9 @@ def _clips_of(arguments: dict[str, Any]) -> list[dict[str, Tensor]] | None:
         ]
     counts, places = arguments.get("num_frames_per_video"), arguments.get("video_position_ids")
     if counts is not None and places is not None:  # Gemma 4: frames of all clips one after the other
-        each = zip(pixels.split(counts.tolist()), places.split(counts.tolist()), counts, strict=True)
+        clip_parts = zip(pixels.split(counts.tolist()), places.split(counts.tolist()), counts, strict=True)
         names = ("pixel_values_videos", "video_position_ids", "num_frames_per_video")
-        return [dict(zip(names, (part, place, count[None]), strict=True)) for part, place, count in each]
+        return [dict(zip(names, (part, place, count[None]), strict=True)) for part, place, count in clip_parts]
     if pixels.dim() == 5:  # LLaVA-NeXT-Video: a row a clip
         return [{"pixel_values_videos": row[None]} for row in pixels]
     return None

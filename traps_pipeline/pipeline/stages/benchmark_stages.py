@@ -104,8 +104,8 @@ def scene_specs(workspace: Workspace, category: str) -> StageOutput:
 
     A scenario with corrected parameters is simulated here, once.
     """
-    rows, resolved = build_specs(workspace, category)
-    return StageOutput(rows, beside=resolved)
+    rows, resolved_scenarios = build_specs(workspace, category)
+    return StageOutput(rows, beside=resolved_scenarios)
 
 
 def _render(workspace: Workspace, category: str, wait: bool) -> tuple[Tally, bool]:
@@ -205,7 +205,7 @@ def _odd_pairs(workspace: Workspace, key: str | None, output: StageOutput) -> di
     sides: dict[str, list[str]] = {}
     for row in output.rows(ITEMS):
         sides.setdefault(row.pair_id, []).append(row.side)
-    return {pair: present for pair, present in sides.items() if tuple(sorted(present)) != sides_of(str(key))}
+    return {pair: pair_sides for pair, pair_sides in sides.items() if tuple(sorted(pair_sides)) != sides_of(str(key))}
 
 
 @_stage(

@@ -65,8 +65,8 @@ def _items_shown(workspace: Workspace, cell: Cell, rows: Sequence[ResponseRow | 
     e = cell.evaluation
     page, _, view = explorer_address(SourceItems(cell.dataset, e.model, e.regime)).partition("#")
     columns = ("item_id", "side", "outcome", "error", "attempts")
-    without = [row for row in rows if isinstance(row, ResponseRow) and row.outcome not in JUDGED]
-    records = [{name: str(getattr(row, name)) for name in columns} for row in without[:ITEMS_SHOWN]]
+    unanswered = [row for row in rows if isinstance(row, ResponseRow) and row.outcome not in JUDGED]
+    records = [{name: str(getattr(row, name)) for name in columns} for row in unanswered[:ITEMS_SHOWN]]
     table = {"without an answer": Records(records)} if records else {}
     reason = {"one item": f"traps why {rows[0].item_id}"} if rows else {}
     return {**table, "all items": StudyFile(workspace.relative(workspace.reports / page), view), **reason}
@@ -98,8 +98,8 @@ def responses(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str |
 def _many_invalid(workspace: Workspace, key: str | None, output: StageOutput) -> str:
     cast_votes = output.rows(VOTES)
     invalid = sum(not vote.valid for vote in cast_votes)
-    many = invalid > MAX_INVALID_SHARE * len(cast_votes)
-    return f"invalid: {invalid:,} of {counted(len(cast_votes), 'vote')}" if many else ""
+    is_too_many = invalid > MAX_INVALID_SHARE * len(cast_votes)
+    return f"invalid: {invalid:,} of {counted(len(cast_votes), 'vote')}" if is_too_many else ""
 
 
 @_stage(
@@ -125,8 +125,8 @@ def votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | Non
 
 
 def _verdicts_missing(workspace: Workspace, key: str | None, output: StageOutput) -> str:
-    answered = workspace.tables.state(RESPONSES, Cell.parse(str(key)).partition)
-    n_answers, n_verdicts = answered.rows if answered else 0, len(output.frame)
+    answers_state = workspace.tables.state(RESPONSES, Cell.parse(str(key)).partition)
+    n_answers, n_verdicts = answers_state.rows if answers_state else 0, len(output.frame)
     return "" if n_answers == n_verdicts else f"{counted(n_verdicts, 'verdict')} for {counted(n_answers, 'answer')}"
 
 

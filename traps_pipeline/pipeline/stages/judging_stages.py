@@ -89,8 +89,8 @@ def leave_one_out(workspace: Workspace, _: None) -> "pd.DataFrame":
 def _many_invalid(workspace: Workspace, key: str | None, output: StageOutput) -> str:
     labels = output.rows(CONFABULATION)
     invalid = sum(not label.valid for label in labels)
-    many = invalid > MAX_INVALID_SHARE * len(labels)
-    return f"invalid: {invalid:,} of {counted(len(labels), 'label')}" if many else ""
+    is_too_many = invalid > MAX_INVALID_SHARE * len(labels)
+    return f"invalid: {invalid:,} of {counted(len(labels), 'label')}" if is_too_many else ""
 
 
 _SAMPLED = these_keys(CELL, [c.key for m in load_protocol().models for c in load_protocol().cells(m)])

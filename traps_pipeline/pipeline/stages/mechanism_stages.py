@@ -132,8 +132,8 @@ def _outside_shares(workspace: Workspace, key: str | None, output: StageOutput) 
         figures = (row.value, row.low, row.high)
         return any(f is not None and f == f and not -1e-9 <= f <= 1 + 1e-9 for f in figures)
 
-    wrong = sum(is_wrong(row) for row in output.rows(PROBES))
-    return f"{counted(wrong, 'row')} with a share outside 0 to 1" if wrong else ""
+    n_wrong = sum(is_wrong(row) for row in output.rows(PROBES))
+    return f"{counted(n_wrong, 'row')} with a share outside 0 to 1" if n_wrong else ""
 
 
 @_stage(

@@ -87,10 +87,10 @@ def _resampled(judged: "pd.DataFrame") -> "ResampledFigures":
     """Return the bootstrap of verdicts, which one run needs twice: for the contrasts, then for the leaderboard."""
     from traps_pipeline.scoring.bootstrap import resample
 
-    kept = [figures for rows, figures in _RESAMPLED if rows.equals(judged)]
+    cached_figures = [figures for rows, figures in _RESAMPLED if rows.equals(judged)]
     _RESAMPLED.clear()  # after the second time the memory is free again
-    if kept:
-        return kept[0]
+    if cached_figures:
+        return cached_figures[0]
     _RESAMPLED.append((judged, resample(judged)))
     return _RESAMPLED[0][1]
 
@@ -109,9 +109,9 @@ def contrasts(workspace: Workspace, _: None) -> StageOutput:
 
     cells, judged = _scored(workspace, "contrasts")
     table = paired(_resampled(judged), cells, judged)
-    separable, refused = table["separable"].to_numpy(bool, na_value=False), len(table.loc[table["refused"].notna()])
+    separable, n_refused = table["separable"].to_numpy(bool, na_value=False), len(table.loc[table["refused"].notna()])
     separable_overall = table.loc[separable & (table["dataset"] == "overall")]
-    figures = {"contrasts": rows_shown(separable_overall), "separable": int(separable.sum()), "refused": refused}
+    figures = {"contrasts": rows_shown(separable_overall), "separable": int(separable.sum()), "refused": n_refused}
     return StageOutput(table, shown=figures)
 
 
@@ -192,8 +192,8 @@ def hypotheses(workspace: Workspace, _: None) -> "pd.DataFrame":
 
     judged = current_rows(workspace, VERDICTS, dataset=DATASETS_READ)
     rows = workspace.tables.read_all(ITEMS, ["item_id", "labels"], dataset=DATASETS_READ)
-    offered = {str(id_): len(labels) for id_, labels in zip(rows["item_id"], rows["labels"], strict=True)}
-    return by_dose(judged, offered)
+    n_labels = {str(id_): len(labels) for id_, labels in zip(rows["item_id"], rows["labels"], strict=True)}
+    return by_dose(judged, n_labels)
 
 
 @_stage(

@@ -71,8 +71,8 @@ class StudyAnswers:
         """Yield the shards, in order, without splitting a pair."""
         item_of = self.decisions["item"].to_numpy()
         pairs = self.items["pair_id"].to_numpy()
-        begins = [0, *(np.flatnonzero(pairs[1:] != pairs[:-1]) + 1).tolist(), len(pairs)]
-        rows = np.searchsorted(item_of, begins)
+        starts = [0, *(np.flatnonzero(pairs[1:] != pairs[:-1]) + 1).tolist(), len(pairs)]
+        rows = np.searchsorted(item_of, starts)
         votes = np.searchsorted(self.votes["answer"].to_numpy(), rows)
         first = 0
         for k in range(1, len(rows)):
@@ -80,8 +80,8 @@ class StudyAnswers:
             if rows[k] > rows[first] and (last or rows[k + 1] - rows[first] > SHARD_ROWS):
                 texts = self.texts.slice(rows[first], rows[k] - rows[first])
                 cast = self.votes.slice(votes[first], votes[k] - votes[first])
-                own = pc.subtract(cast["answer"], pa.scalar(int(rows[first]), pa.int32()))
-                yield Shard(int(rows[first]), texts, cast.set_column(0, "answer", own))
+                shard_rows = pc.subtract(cast["answer"], pa.scalar(int(rows[first]), pa.int32()))
+                yield Shard(int(rows[first]), texts, cast.set_column(0, "answer", shard_rows))
                 first = k
 
 
@@ -106,8 +106,8 @@ def study_answers(workspace: Workspace) -> StudyAnswers:
     evaluations = _evaluations(responses)
     responses = _sorted(_keyed(responses, evaluations))
     keys = responses["key"].to_numpy()
-    decided = ("outcome", "abstained", "correct", "unanimous")
-    verdicts = _keyed(_of_items(workspace, VERDICTS, decided, items), evaluations)
+    decision_columns = ("outcome", "abstained", "correct", "unanimous")
+    verdicts = _keyed(_of_items(workspace, VERDICTS, decision_columns, items), evaluations)
     judged = verdicts["key"].to_numpy()
     positions = np.full(len(items) * max(len(evaluations), 1), -1, np.int64)
     positions[judged] = np.arange(len(judged))
@@ -159,9 +159,9 @@ def _evaluations(responses: pa.Table) -> list[Evaluation]:
 
 def _keyed(rows: pa.Table, evaluations: Sequence[Evaluation]) -> pa.Table:
     """Return rows of known evaluations with `key`, the index of item and evaluation."""
-    own = pc.binary_join_element_wise(*(rows[name].cast(pa.string()) for name in _EVALUATION), "|")
-    known = pa.array([f"{e.model}|{e.regime}|{e.run}" for e in evaluations], pa.string())
-    evaluation = pc.fill_null(pc.index_in(own, value_set=known), -1).to_numpy().astype(np.int64)
+    row_keys = pc.binary_join_element_wise(*(rows[name].cast(pa.string()) for name in _EVALUATION), "|")
+    evaluation_keys = pa.array([f"{e.model}|{e.regime}|{e.run}" for e in evaluations], pa.string())
+    evaluation = pc.fill_null(pc.index_in(row_keys, value_set=evaluation_keys), -1).to_numpy().astype(np.int64)
     key = rows["item"].to_numpy() * max(len(evaluations), 1) + evaluation
     return rows.append_column("key", pa.array(key)).filter(pa.array(evaluation >= 0))
 
@@ -178,5 +178,5 @@ def _coded(column: pa.ChunkedArray) -> tuple[list[str], np.ndarray]:
 
 def _decision(column: pa.ChunkedArray, rows: np.ndarray) -> np.ndarray:
     """Return the column at these rows as NO, YES or NONE; NONE where the row is -1."""
-    filled = pc.fill_null(column.cast(pa.int8()), NONE)
-    return np.append(filled.to_numpy(), NONE)[rows]
+    codes = pc.fill_null(column.cast(pa.int8()), NONE)
+    return np.append(codes.to_numpy(), NONE)[rows]

@@ -56,8 +56,8 @@ def sub_scenarios(results: Results) -> Figure:
     names = [plain(name).replace("_", " ") for name in rows["sub_scenario"]]
     with figure_style():
         figure = new_figure(PAGE_IN, 1.35 + 0.17 * len(rows))
-        wide = [len(panel.columns) for panel in panels]
-        axes = figure.subplots(1, len(panels), sharey=True, squeeze=False, width_ratios=wide)[0]
+        column_counts = [len(panel.columns) for panel in panels]
+        axes = figure.subplots(1, len(panels), sharey=True, squeeze=False, width_ratios=column_counts)[0]
         first = int((~rows["order"]).sum())
         scales = {panel.scale: _draw_grid(ax, panel, names, first) for ax, panel in zip(axes, panels, strict=True)}
         for scale, image in scales.items():
@@ -86,9 +86,9 @@ def _by_model(results: Results, rows: pd.DataFrame) -> list[Panel]:
     for regime in PROMPTING:
         part = cells.loc[(cells["regime"] == regime) & cells["model"].isin(models)]
         if len(part):
-            wide = part.pivot(index=["dataset", "scope"], columns="model", values="abs_rec")
+            abs_rec_grid = part.pivot(index=["dataset", "scope"], columns="model", values="abs_rec")
             index = list(zip(rows["dataset"], rows["sub_scenario"], strict=True))
-            values = 100 * wide.reindex(index=index, columns=models).to_numpy(float)
+            values = 100 * abs_rec_grid.reindex(index=index, columns=models).to_numpy(float)
             panels.append(Panel(f"AbsRec, {regime}", models, values))
     return panels
 
@@ -127,8 +127,8 @@ def confabulation(results: Results) -> Figure:
     """
     rows = results.confabulation
     if not len(rows):
-        why = "no judge of confabulation is configured for this study’s panel" if results.is_study else ""
-        raise NotRun(why or results.why("confabulation"))
+        reason = "no judge of confabulation is configured for this study’s panel" if results.is_study else ""
+        raise NotRun(reason or results.why("confabulation"))
     at, width = np.arange(len(rows)), 0.16
     with figure_style():
         figure = new_figure(PAGE_IN, 2.5)
@@ -172,15 +172,15 @@ def shortcut_figure(table: pd.DataFrame) -> Figure:
         for k, cue in enumerate(cues):
             rows = table.loc[table["cue"] == cue].set_index("dataset")
             at = [datasets.index(str(name)) + 0.17 * (k - (len(cues) - 1) / 2) for name in rows.index]
-            share, half = rows["accuracy"].to_numpy(float), rows["half_width"].to_numpy(float)
-            ends = np.minimum(half, share), np.minimum(half, 1 - share)  # no share is below 0 or above 1
+            share, half_width = rows["accuracy"].to_numpy(float), rows["half_width"].to_numpy(float)
+            ends = np.minimum(half_width, share), np.minimum(half_width, 1 - share)  # no share is below 0 or above 1
             axes.errorbar(
                 share, at, xerr=np.vstack(ends), fmt=MARKERS[k], color=COLOURS[k], markersize=4,
                 linestyle="none", linewidth=0.8, label=cue, clip_on=False, zorder=3,
             )  # fmt: skip
-        least = min([0.4, *(table["accuracy"] - table["half_width"])])
+        lowest_value = min([0.4, *(table["accuracy"] - table["half_width"])])
         axes.set(
-            xlim=(max(0.0, least) - 0.02, 1.02),
+            xlim=(max(0.0, lowest_value) - 0.02, 1.02),
             ylim=(len(datasets) - 0.5, -0.5),
             xlabel="share of sides predicted correctly",
         )

@@ -28,14 +28,14 @@ class Label:
 def merged_labels(labels: Sequence[Label], axes: Axes) -> list[Label]:
     """Join labels of coinciding points: one name per line, in a neutral colour."""
     size = np.array([np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())])
-    merged: list[Label] = []
+    result: list[Label] = []
     for label in labels:
-        twin = next((m for m in merged if np.hypot(*((m.x - label.x, m.y - label.y) / size)) < SAME_POINT), None)
+        twin = next((m for m in result if np.hypot(*((m.x - label.x, m.y - label.y) / size)) < SAME_POINT), None)
         if twin is None:
-            merged.append(label)
+            result.append(label)
         else:
-            merged[merged.index(twin)] = Label(twin.x, twin.y, f"{twin.text}\n{label.text}", "#1b1f27")
-    return merged
+            result[result.index(twin)] = Label(twin.x, twin.y, f"{twin.text}\n{label.text}", "#1b1f27")
+    return result
 
 
 def place_labels(axes: Axes, labels: Sequence[Label], markers: np.ndarray) -> None:

@@ -72,8 +72,8 @@ def probe_curves(results: Results) -> Figure:
         for ax in axes[-1]:
             ax.set_xlabel("layer (0: embeddings)")
         axes[0, 0].set_ylim(min(0.35, float(curves["value"].min()) - 0.03), 1.02)
-        shuffled = _bar_key("labels shuffled, mean ± 2 sd", 7, GRID)
-        _legend(figure, legend_key("layer chosen without the target", SOFT, "o", markerfacecolor="white"), shuffled)
+        shuffled_key = _bar_key("labels shuffled, mean ± 2 sd", 7, GRID)
+        _legend(figure, legend_key("layer chosen without the target", SOFT, "o", markerfacecolor="white"), shuffled_key)
     return figure
 
 
@@ -85,13 +85,13 @@ def _curves(ax: Axes, curves: pd.DataFrame, crossing: str) -> None:
         if transfer_type(source, target) != crossing:
             continue
         curve = curve.sort_values("layer")
-        every = max(1, len(curve) // 8)
+        marker_step = max(1, len(curve) // 8)
         style: dict[str, Any] = {"color": COLOUR[source], "marker": MARKER[target], "markersize": 3.2}
-        line: dict[str, Any] = {**style, "linestyle": LINE[source], "linewidth": 0.9, "markevery": every}
+        line: dict[str, Any] = {**style, "linestyle": LINE[source], "linewidth": 0.9, "markevery": marker_step}
         ax.plot(curve["layer"], curve["value"], **line)
-        chosen = curve.loc[curve["chosen"]]
+        chosen_layers = curve.loc[curve["chosen"]]
         style |= {"markersize": 5, "markerfacecolor": "white", "linestyle": "none"}
-        ax.plot(chosen["layer"], chosen["value"], **style)
+        ax.plot(chosen_layers["layer"], chosen_layers["value"], **style)
     ax.axhline(0.5, color=GRID, linewidth=0.8, zorder=0.5)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
 
@@ -112,8 +112,8 @@ def confabulated_strip(results: Results) -> Figure:
     """
     rows = best_layers(results.probes)
     if not len(rows) or rows.loc[:, "cf_value"].isna().all():
-        absent = "no dataset has confabulated voids" if len(rows) else why(results)
-        raise NotRun(absent)
+        reason = "no dataset has confabulated voids" if len(rows) else why(results)
+        raise NotRun(reason)
     models = list(dict.fromkeys(rows["model"]))
     with figure_style():
         figure = new_figure(PAGE_IN, 2.5)
@@ -124,8 +124,11 @@ def confabulated_strip(results: Results) -> Figure:
         lowest = np.nanmin(rows[["best_value", "cf_value"]].to_numpy(float))
         axes[0].set(ylim=(min(0.45, lowest - 0.04), 1.03), ylabel="AUROC on the target")
         chance = legend_key("chance", SOFT, line=(0, (4, 2.5)), linewidth=0.8)
-        hollow, filled = legend_key("all samples", SOFT, "o", markerfacecolor="white"), legend_key("Cf→Cf", SOFT, "o")
-        _legend(figure, hollow, filled, _bar_key("median of Cf→Cf"), chance)
+        hollow_key, filled_key = (
+            legend_key("all samples", SOFT, "o", markerfacecolor="white"),
+            legend_key("Cf→Cf", SOFT, "o"),
+        )
+        _legend(figure, hollow_key, filled_key, _bar_key("median of Cf→Cf"), chance)
     return figure
 
 
@@ -176,8 +179,8 @@ def dose_response(results: Results) -> Figure:
         for line in axes:
             line[0].set_ylabel("abstained, %")
         axes[0, 0].set_ylim(-4, 104)
-        more = [_bar_key("mean, 95 % by scenario")] if len(results.shares) else []
-        _legend(figure, *more, colours={d: FAMILY_COLOUR[taxonomy_of(d)] for d in DATASETS})
+        interval_key = [_bar_key("mean, 95 % by scenario")] if len(results.shares) else []
+        _legend(figure, *interval_key, colours={d: FAMILY_COLOUR[taxonomy_of(d)] for d in DATASETS})
     return figure
 
 
@@ -189,8 +192,8 @@ def _answers(part: pd.DataFrame, side: str) -> str:
 
 def _of_panel(shares: pd.DataFrame, part: pd.DataFrame, path_set: str, side: str) -> pd.DataFrame:
     """Return the shares over a panel's paths along void directions, by alpha."""
-    of_side = shares.loc[(shares["path_set"] == path_set) & (shares["side"] == side)]
-    return of_side.merge(part[[*effects.CELL, "kind"]].drop_duplicates()).sort_values("alpha")
+    side_shares = shares.loc[(shares["path_set"] == path_set) & (shares["side"] == side)]
+    return side_shares.merge(part[[*effects.CELL, "kind"]].drop_duplicates()).sort_values("alpha")
 
 
 def _mean_band(ax: Axes, shares: pd.DataFrame) -> None:
@@ -239,7 +242,7 @@ def cosine_heatmaps(results: Results) -> Figure:
     if not len(rows):
         raise NotRun(why(results))
     panels = [(str(key[0]), str(key[1]), part) for key, part in rows.groupby(["model", "prompt"], sort=False)]  # pyright: ignore[reportIndexIssue]
-    several = len({prompt for _, prompt, _ in panels}) > 1
+    has_several_prompts = len({prompt for _, prompt, _ in panels}) > 1
     columns = min(3, len(panels))
     lines = -(-len(panels) // columns)
     with figure_style():
@@ -247,7 +250,7 @@ def cosine_heatmaps(results: Results) -> Figure:
         axes = figure.subplots(lines, columns, squeeze=False)
         images = [_heatmap(ax, part) for ax, (_, _, part) in zip(axes.flat, panels, strict=False)]
         for ax, (model, prompt, _) in zip(axes.flat, panels, strict=False):
-            ax.set_title(f"{plain(model)[:26]}\n{prompt} prompt" if several else plain(model)[:26], size=7)
+            ax.set_title(f"{plain(model)[:26]}\n{prompt} prompt" if has_several_prompts else plain(model)[:26], size=7)
         for ax in axes.flat[len(panels) :]:
             ax.set_axis_off()
         figure.colorbar(images[-1], ax=list(axes.flat), label="cosine", shrink=0.85, aspect=25, pad=0.01)
@@ -256,10 +259,10 @@ def cosine_heatmaps(results: Results) -> Figure:
 
 def _heatmap(ax: Axes, part: pd.DataFrame) -> Any:
     names = [TITLES[name].replace(", ill", ",\nill") for name in DATASETS]
-    by_pair = {(row["dataset"], row["other_dataset"]): row for row in part.to_dict("records")}
+    row_of = {(row["dataset"], row["other_dataset"]): row for row in part.to_dict("records")}
     values, texts = np.full((4, 4), np.nan), dict[tuple[int, ...], str]()
     for (row, one), (column, other) in product(enumerate(DATASETS), repeat=2):
-        at = by_pair.get((one, other), {})
+        at = row_of.get((one, other), {})
         cleaned = row < column and _known(at.get("disattenuated"))
         figure = at.get("split_half" if row == column else "disattenuated" if cleaned else "cosine")
         if not _known(figure):

@@ -43,9 +43,9 @@ def graded(results: Results) -> list[PrintedTable]:
 
 
 def _notes(rows: pd.DataFrame) -> list[str]:
-    most = rows.loc[rows["n_items"].idxmax()]
-    known = ("points_ideal", "points_best", "points_prior", "brier_ideal", "brier_even")
-    figures = {name: fraction(most[name], 2) for name in known}
+    largest_row = rows.loc[rows["n_items"].idxmax()]
+    reference_columns = ("points_ideal", "points_best", "points_prior", "brier_ideal", "brier_even")
+    figures = {name: fraction(largest_row[name], 2) for name in reference_columns}
     return [
         f"points a question: 1 for a right answer, -{WRONG_COSTS} for a wrong one, 0 for an abstention, as expected by "
         f"the cut's posterior; from a probability of {ANSWER_FROM:g} on an answer is worth its risk",

@@ -43,7 +43,7 @@ def people(results: Results) -> list[PrintedTable]:
         "agree, α: on whether the clip lets the question be answered",
     ]
     agreement = ordered(results.human_agreement, ["task", "decision"])
-    of_tasks = [
+    task_notes = [
         Column("task", "Task"), Column("decision", "Decision"), Column("agreement", "Agree %", "percent"),
         Column("alpha", "Krippendorff’s α", "fraction", 2), Column("n_shared", "Labelled twice", "count"),
         Column("n_units", "Labelled", "count"), Column("seconds", "Seconds", "ratio"),
@@ -52,7 +52,7 @@ def people(results: Results) -> list[PrintedTable]:
     return [
         PrintedTable("people", "People", rows, columns, notes if len(rows) else [], BY_PEOPLE),
         PrintedTable(
-            "people_agreement", "Agreement of people", agreement, of_tasks, [], BY_PEOPLE,
+            "people_agreement", "Agreement of people", agreement, task_notes, [], BY_PEOPLE,
             dash="; ".join(undefined) or "undefined",
         ),
     ]  # fmt: skip
@@ -61,7 +61,7 @@ def people(results: Results) -> list[PrintedTable]:
 def judge_corrected(results: Results) -> list[PrintedTable]:
     """Return the panel against people, and the leaderboard corrected for its errors."""
     errors = _with_intervals(results.panel_errors, ["sensitivity", "specificity"])
-    of_panel = [
+    panel_notes = [
         Column("task", "Task"), Column("sensitivity_shown", "Sensitivity %", "range"),
         Column("specificity_shown", "Specificity %", "range"), Column("n_answers", "Answers", "count"),
         Column("n_yes", "People’s yes", "count"), Column("n_tied", "Tied", "count"),
@@ -84,7 +84,7 @@ def judge_corrected(results: Results) -> list[PrintedTable]:
     reason = "not validated: people labelled no answers (run traps people annotate)"
     reasons = sorted(set(results.panel_errors["undefined"].dropna()))
     return [
-        PrintedTable("panel_errors", "The panel against people", errors, of_panel, reasons, reason),
+        PrintedTable("panel_errors", "The panel against people", errors, panel_notes, reasons, reason),
         PrintedTable(
             "judge_corrected", "Judged, and corrected for the panel’s errors", entries,
             [MODEL, REGIME, DATASET, *figures, RUNS], notes if len(entries) else [], reason,
@@ -110,8 +110,8 @@ def said_by_people(human_row: pd.DataFrame, panel_errors: pd.DataFrame) -> list[
 def _score_of_people(rows: pd.DataFrame) -> str:
     if rows.empty:
         return f"{NOT_RUN}, {BY_PEOPLE}"
-    by_dataset = {row["dataset"]: row for row in rows.to_dict("records")}
-    row = by_dataset.get("overall", {})
+    row_of = {row["dataset"]: row for row in rows.to_dict("records")}
+    row = row_of.get("overall", {})
     if not row or row["pecs"] != row["pecs"]:
         return f"{NOT_RUN} in full, since PECS needs labels of both sides of all four datasets"
     figures = ", ".join(f"{heading.removesuffix(' %')} {_ranged(row, field)}" for field, heading in _FIGURES.items())

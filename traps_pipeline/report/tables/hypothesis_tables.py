@@ -62,8 +62,8 @@ def _hypothesis_table(rows: pd.DataFrame, hypothesis: Hypothesis) -> PrintedTabl
         notes.append(
             "through an occluder of these alphas the outcome is seen: FalseAbs is the share that abstains all the same"
         )
-    refused = doses.dropna(subset=["refused"]).to_dict("records")
-    notes += [f"{row['model']}, {row['dose']}: not compared, {row['refused']}" for row in refused]
+    refusals = doses.dropna(subset=["refused"]).to_dict("records")
+    notes += [f"{row['model']}, {row['dose']}: not compared, {row['refused']}" for row in refusals]
     rows = ordered(doses, ["model", "regime", "place"])
     name = f"hypothesis_{hypothesis.name.replace(' ', '_')}"
     return PrintedTable(name, _TITLES[hypothesis.name], rows, columns, notes if len(doses) else [], WHY_EMPTY)

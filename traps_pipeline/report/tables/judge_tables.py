@@ -67,7 +67,7 @@ def judge_bias(results: Results) -> list[PrintedTable]:
         else leave_one_out
     )
     leave_one_out = ordered(with_titles(leave_one_out), ["model", "regime", "without"])
-    without = [
+    leave_one_out_columns = [
         MODEL, REGIME, DATASET, Column("without", "Without"),
         Column("pecs", "PECS of two", "fraction"), Column("pecs_panel", "PECS of three", "fraction"),
         Column("difference", "Difference", "fraction"), N, RUNS, MISSING,
@@ -77,7 +77,13 @@ def judge_bias(results: Results) -> list[PrintedTable]:
     return [
         PrintedTable("judge_bias", "Each judge against the panel", bias, columns, [epochs(bias)], reason, _task_trace),
         PrintedTable(
-            "leave_one_judge_out", "PECS without one judge", leave_one_out, without, notes, reason, cell_trace
+            "leave_one_judge_out",
+            "PECS without one judge",
+            leave_one_out,
+            leave_one_out_columns,
+            notes,
+            reason,
+            cell_trace,
         ),
     ]
 

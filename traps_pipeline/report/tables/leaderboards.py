@@ -56,8 +56,10 @@ def _overall(results: Results, name: str, title: str, replication: bool) -> Prin
         rows = rows.assign(ci=[interval(row) for row in records], ranks=[ranks(row) for row in records])
         columns[3:3] = [Column("ci", "95 % CI", "range"), Column("ranks", "Rank", "range")]
         notes.append("rank by PECS within the regime; 2–4: paired contrasts (Holm) do not separate these ranks")
-        printed = published_overall().loc[:, ["model", "regime", "pecs"]].rename(columns={"pecs": "published_pecs"})
-        rows = rows.merge(printed, on=["model", "regime"], how="left")
+        published_scores = (
+            published_overall().loc[:, ["model", "regime", "pecs"]].rename(columns={"pecs": "published_pecs"})
+        )
+        rows = rows.merge(published_scores, on=["model", "regime"], how="left")
         if rows["published_pecs"].notna().any():
             columns.append(Column("published_pecs", "published PECS", "fraction"))
             notes.append("published PECS: as printed in the paper, from its own benchmark and epochs")
@@ -105,8 +107,8 @@ def replication_per_dataset(results: Results) -> list[PrintedTable]:
 
 def _n(title: str, counts: pd.Series) -> str:
     """Return a heading with the number of pairs, if it is the same in all rows."""
-    known = counts.dropna().unique()
-    return f"{title} (n = {int(known[0])})" if len(known) == 1 else title
+    known_counts = counts.dropna().unique()
+    return f"{title} (n = {int(known_counts[0])})" if len(known_counts) == 1 else title
 
 
 def expanded(results: Results) -> list[PrintedTable]:

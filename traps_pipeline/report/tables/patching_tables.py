@@ -15,11 +15,11 @@ def patching(results: Results) -> list[PrintedTable]:
     rows = results.patching
     keys = ["model", "dataset", "into", "site", "layer", "group"]
     nulls = rows.loc[rows["source"] != "pair"]
-    wide = nulls.pivot_table(index=keys, columns="source", values="effect", observed=True)
+    null_grid = nulls.pivot_table(index=keys, columns="source", values="effect", observed=True)
     names = ["other scenario", "same side", "other times"]
-    own = rows.loc[(rows["source"] == "pair") & rows["effect"].notna()].astype(dict.fromkeys(keys, object))
-    table = own.merge(
-        wide.reindex(columns=names).reset_index().astype(dict.fromkeys(keys, object)), on=keys, how="left"
+    pair_effects = rows.loc[(rows["source"] == "pair") & rows["effect"].notna()].astype(dict.fromkeys(keys, object))
+    table = pair_effects.merge(
+        null_grid.reindex(columns=names).reset_index().astype(dict.fromkeys(keys, object)), on=keys, how="left"
     )
     table = table.assign(
         name=short_names(table["dataset"]),
@@ -49,5 +49,5 @@ def patching(results: Results) -> list[PrintedTable]:
         "site, layer and positions whose estimates are largest",
         *few_note(table, of="pairs"),
     ]
-    absent = "the experiment asks for no `patching`" if results.is_study else "the paper patches nothing"
-    return [PrintedTable("patching", "Activation patching", table, columns, notes, absent)]
+    reason = "the experiment asks for no `patching`" if results.is_study else "the paper patches nothing"
+    return [PrintedTable("patching", "Activation patching", table, columns, notes, reason)]

@@ -80,12 +80,12 @@ def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
     import pandas as pd
 
     def by_pair(analysis: str, chosen: Any) -> dict[tuple[str, ...], dict[str, Any]]:
-        matching = rows.loc[(rows["analysis"] == analysis) & chosen].drop_duplicates(KEYS)
-        return {tuple(row[key] for key in KEYS): row for row in matching.to_dict("records")}  # pyright: ignore[reportReturnType]
+        layer_rows = rows.loc[(rows["analysis"] == analysis) & chosen].drop_duplicates(KEYS)
+        return {tuple(row[key] for key in KEYS): row for row in layer_rows.to_dict("records")}  # pyright: ignore[reportReturnType]
 
     transfers = by_pair("transfer", rows["model"].notna())
-    known = rows["value"].notna()
-    figures = {name: by_pair(rule.analysis, rows[rule.flag].eq(True) & known) for name, rule in PAIR_FIGURES.items()}
+    is_known = rows["value"].notna()
+    figures = {name: by_pair(rule.analysis, rows[rule.flag].eq(True) & is_known) for name, rule in PAIR_FIGURES.items()}
     notes = [by_pair(name, rows["note"].notna()) for name in ("confabulated", "confabulated_held_out")]
     table = [
         dict(zip(KEYS, key, strict=True))
@@ -144,7 +144,7 @@ def _transfer(results: Results, rows: pd.DataFrame) -> PrintedTable:
 
 def _confabulated(results: Results, pairs: pd.DataFrame) -> PrintedTable:
     rows = pairs.loc[pairs["cf_value"].notna()].reset_index(drop=True) if len(pairs) else pairs
-    silent = sorted({note for note in pairs["note"] if note}) if len(pairs) else []
+    gap_notes = sorted({note for note in pairs["note"] if note}) if len(pairs) else []
     columns = [
         MODEL, PATH, TYPE, Column("cf_layer", "Best layer", "count"),
         Column("cf_value", "Cf→Cf", "fraction", mark="cf_mark"), *interval("cf_"), *_held_out(results, "cf_"),
@@ -156,16 +156,16 @@ def _confabulated(results: Results, pairs: pd.DataFrame) -> PrintedTable:
         "source and target have only the voids on which the model confabulated under standard in run 1, each with its "
         "control; best layer: that of all samples",
         *_shared_controls(results),
-        *silent,
+        *gap_notes,
         *baseline_notes(results),
         *few_note(rows, "cf_mark"),
     ]
-    absent = why(results, "the paper has these figures in its table of probe transfer")
+    reason = why(results, "the paper has these figures in its table of probe transfer")
     if results.is_study and len(results.probes):
-        absent = "; ".join(silent) or absent
+        reason = "; ".join(gap_notes) or reason
     title = "Probes on confabulated voids (Cf→Cf)"
     rows = rows if results.is_study else rows.head(0)
-    return PrintedTable("probe_confabulated", title, rows, columns, notes, absent, dash=WHY_UNSHARED, deviation=DRAWS)
+    return PrintedTable("probe_confabulated", title, rows, columns, notes, reason, dash=WHY_UNSHARED, deviation=DRAWS)
 
 
 def _means(results: Results, rows: pd.DataFrame) -> PrintedTable:
@@ -227,8 +227,8 @@ def _shared_controls(results: Results) -> list[str]:
 
 def _within_table(results: Results) -> PrintedTable:
     rows = results.probes
-    shuffled = rows.loc[rows["analysis"] == "shuffled"].groupby(["model", "source"], sort=False, dropna=False)
-    table = shuffled.agg(shuffled=("value", "mean"), spread=("spread", "mean")).reset_index()
+    shuffled_means = rows.loc[rows["analysis"] == "shuffled"].groupby(["model", "source"], sort=False, dropna=False)
+    table = shuffled_means.agg(shuffled=("value", "mean"), spread=("spread", "mean")).reset_index()
     best = rows.loc[(rows["analysis"] == "within") & rows["own_best"], ["model", "source", "layer", "value"]]
     table = table.merge(best, on=["model", "source"], how="left")
     itself = rows.loc[(rows["analysis"] == "held_out") & (rows["source"] == rows["target"]) & rows["chosen"]]
@@ -252,8 +252,11 @@ def _within_table(results: Results) -> PrintedTable:
             *BASELINE_NOTES,
         ]
     notes += few_note(table)
-    title, over = "Probes within a dataset", "± standard deviation over shuffles of labels, or over draws of noise"
-    return PrintedTable("probe_within", title, table, columns, notes, why(results), deviation=over)
+    title, spread_note = (
+        "Probes within a dataset",
+        "± standard deviation over shuffles of labels, or over draws of noise",
+    )
+    return PrintedTable("probe_within", title, table, columns, notes, why(results), deviation=spread_note)
 
 
 def _catch(results: Results) -> PrintedTable:
@@ -308,14 +311,16 @@ def _caught_beside(results: Results) -> pd.DataFrame:
 
     keys = ["model", "target", "sub_scenario"]
     rows = _centroids(results.baselines).astype(dict.fromkeys(("model", "features", "analysis"), object))
-    wide = rows.pivot_table(index=[*keys, "features"], columns="analysis", values="value", observed=True)
-    wide = wide.reindex(columns=pd.Index(["centroid_void", "centroid_control"])).reset_index()
-    wide.columns = pd.Index([*keys, "features", "void", "control"])
-    order = wide.assign(above=wide["void"] - wide["control"]).sort_values("above", ascending=False, kind="stable")
+    by_analysis = rows.pivot_table(index=[*keys, "features"], columns="analysis", values="value", observed=True)
+    by_analysis = by_analysis.reindex(columns=pd.Index(["centroid_void", "centroid_control"])).reset_index()
+    by_analysis.columns = pd.Index([*keys, "features", "void", "control"])
+    order = by_analysis.assign(above=by_analysis["void"] - by_analysis["control"]).sort_values(
+        "above", ascending=False, kind="stable"
+    )
     raw = order.loc[order["features"].isin(SHORTCUTS)].drop_duplicates(keys).set_index(keys)
     table = raw[["features"]].rename(columns={"features": "raw"})
     kinds = {"raw": raw} | {
-        name: wide.loc[wide["features"] == features].set_index(keys)
+        name: by_analysis.loc[by_analysis["features"] == features].set_index(keys)
         for name, features in (("margin", "output margin"), ("noise", "noise"))
     }
     for name, part in kinds.items():
@@ -327,7 +332,7 @@ def _layers(results: Results) -> PrintedTable:
     table, notes = layer_curves(results.probes)
     columns = [
         MODEL, LAYER,
-        *(Column(name, f"without {short}", "fraction", mark=f"{name}_mark") for name, short in SHORT.items()
+        *(Column(name, f"without {short_name}", "fraction", mark=f"{name}_mark") for name, short_name in SHORT.items()
           if name in table),
         Column("n_at_top", "Own maxima", "count"),
     ]  # fmt: skip
@@ -338,8 +343,8 @@ def _layers(results: Results) -> PrintedTable:
         "chooses none of them",
         *notes,
     ]
-    absent = why(results, "the paper prints no curves")
-    return PrintedTable("probe_layers", "Layers chosen without the target’s labels", table, columns, notes, absent)
+    reason = why(results, "the paper prints no curves")
+    return PrintedTable("probe_layers", "Layers chosen without the target’s labels", table, columns, notes, reason)
 
 
 def layer_curves(rows: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
@@ -363,6 +368,6 @@ def layer_curves(rows: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
             part[name] = pd.Series(choice.curve)
             part[f"{name}_mark"] = ["*" if layer == choice.layer else "" for layer in part.index]
         parts.append(part.reset_index().assign(model=model))
-        tied = [f"{SHORT[name]} {len(choice.tied)}" for name, choice in choices.items()]
-        notes.append(f"{model}: layers with the highest mean, by the dataset left out: {', '.join(tied)}")
+        tie_notes = [f"{SHORT[name]} {len(choice.tied)}" for name, choice in choices.items()]
+        notes.append(f"{model}: layers with the highest mean, by the dataset left out: {', '.join(tie_notes)}")
     return pd.concat(parts, ignore_index=True), notes

@@ -47,8 +47,8 @@ def hyperparameters(results: Results) -> list[PrintedTable]:
     """Return parameters sent to models and judges; protocol departures are marked."""
     judges = [*load_judges().values()]
     if results.is_study:
-        voted = set(results.bias["judge"])
-        judges = [judge for judge in judges if judge.id in voted]
+        voting_judges = set(results.bias["judge"])
+        judges = [judge for judge in judges if judge.id in voting_judges]
     rows = [_sent_params(entry, "model") for entry in _entries(results)] + [
         _sent_params(entry, "judge") for entry in judges
     ]
@@ -68,8 +68,8 @@ def hyperparameters(results: Results) -> list[PrintedTable]:
 
 
 def _sent_params(entry: Entry, role: str) -> dict[str, Any]:
-    named = ("temperature", "top_p", "max_tokens", "max_completion_tokens")
-    other_params = {name: value for name, value in entry.params.items() if name not in named}
+    common_names = ("temperature", "top_p", "max_tokens", "max_completion_tokens")
+    other_params = {name: value for name, value in entry.params.items() if name not in common_names}
     return {
         "id": entry.id,
         "role": role,

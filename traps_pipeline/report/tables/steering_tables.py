@@ -49,8 +49,8 @@ def cosines(results: Results) -> list[PrintedTable]:
     rows = rows.assign(step=np.subtract(other_place, place))
     across = (rows["prompt"] == STANDARD) & (rows["other_prompt"] == GUIDED) & (rows["step"] == 0)
     rows = rows.loc[((rows["prompt"] == rows["other_prompt"]) & (rows["step"] > 0)) | across]
-    own = ["model", "prompt", "dataset"]
-    halves = results.cosines.drop_duplicates(own).loc[:, [*own, "split_half"]]
+    own_columns = ["model", "prompt", "dataset"]
+    halves = results.cosines.drop_duplicates(own_columns).loc[:, [*own_columns, "split_half"]]
     halves = halves.rename(columns={name: f"other_{name}" for name in ("prompt", "dataset", "split_half")})
     rows = rows.merge(halves, on=["model", "other_prompt", "other_dataset"], how="left")
     rows = rows.assign(name=_named_directions(rows, ""), other=_named_directions(rows, "other_"))
@@ -76,7 +76,7 @@ def _named_directions(rows: pd.DataFrame, prefix: str) -> list[str]:
 
 def _place(values: pd.Series) -> pd.Series:
     if values.name == "name":
-        return values.map({short: place for place, short in enumerate(SHORT.values())})
+        return values.map({short_name: place for place, short_name in enumerate(SHORT.values())})
     order = {"prompt": PROMPTING, "kind": KINDS}.get(str(values.name))
     return values if order is None else values.map(order.index)
 
@@ -105,8 +105,8 @@ def _shares(results: Results) -> PrintedTable:
         rows.loc[rows["side"] == side].set_index(keys)[["abstention", "low", "high", "n_answers", "n_scenarios"]]
         for side in ("control", "void")
     ]
-    wide = sides[0].add_prefix("control_").join(sides[1].add_prefix("void_"), how="outer").reset_index()
-    wide = wide.sort_values(keys, key=_place, ignore_index=True)
+    by_side = sides[0].add_prefix("control_").join(sides[1].add_prefix("void_"), how="outer").reset_index()
+    by_side = by_side.sort_values(keys, key=_place, ignore_index=True)
     columns = [MODEL, KIND, LAYER, ALPHA]
     for side in ("control", "void"):
         columns += [
@@ -118,8 +118,10 @@ def _shares(results: Results) -> PrintedTable:
         "mean over all paths and regimes; answers: distinct answers, each of which may belong to several paths",
         "from, to: 95 % interval from resampled scenarios, not answers; its width is 0 where all scenarios agree",
     ]
-    absent = why(results, "the paper prints no answers to resample")
-    return PrintedTable("steering_shares", "Steering in all, with intervals by scenario", wide, columns, notes, absent)
+    reason = why(results, "the paper prints no answers to resample")
+    return PrintedTable(
+        "steering_shares", "Steering in all, with intervals by scenario", by_side, columns, notes, reason
+    )
 
 
 def _regimes(results: Results, name: str, title: str) -> PrintedTable:
@@ -132,10 +134,10 @@ def _regimes(results: Results, name: str, title: str) -> PrintedTable:
         Column("void_top", "Void, α, %", "percent"), Column("n_paths", "Paths", "count"),
     ]  # fmt: skip
     notes = ["mean over the paths of a set; +α on controls, −α on voids", *_cell_notes(results)]
-    absent = why(results)
+    reason = why(results)
     if name.endswith("families") and len(results.effects):
-        absent = "no directions of the guided prompt were steered under guided inference"
-    return PrintedTable(name, title, rows, columns, notes, absent)
+        reason = "no directions of the guided prompt were steered under guided inference"
+    return PrintedTable(name, title, rows, columns, notes, reason)
 
 
 def _domains(results: Results) -> PrintedTable:
@@ -182,8 +184,8 @@ def _layers(results: Results) -> PrintedTable:
         Column("control", "Controls abstained on %", "percent"), Column("n_splits", "Splits", "count"),
     ]  # fmt: skip
     notes = ["each dataset’s direction on its own controls, mean over the four splits", *_cell_notes(results)]
-    absent = "only one layer was steered" if len(results.effects) else why(results)
-    table = PrintedTable("steering_layers", "Steering by layer", rows, columns, notes, absent)
+    reason = "only one layer was steered" if len(results.effects) else why(results)
+    table = PrintedTable("steering_layers", "Steering by layer", rows, columns, notes, reason)
     return rightly_empty(table, results.is_study and bool(len(results.effects)))
 
 

@@ -82,8 +82,8 @@ def _sub_table(results: Results, rows: pd.DataFrame, name: str, title: str) -> P
         Column("abs_rec_ill_posed", "AbsRec %, ill-posed", "percent"),
         Column("textual_over_visual", "Textual / visual", "ratio"), MISSING,
     ]  # fmt: skip
-    left_out = "; reference strategies left out where others were asked" if results.is_study else ""
-    notes = [epochs(rows), f"means over models{left_out}", "standard, where no regime is named"]
+    omission_note = "; reference strategies left out where others were asked" if results.is_study else ""
+    notes = [epochs(rows), f"means over models{omission_note}", "standard, where no regime is named"]
     fewer = {"guided": "guided_n_models", "Δ": "uplift_n_models", "ill-posed": "ill_posed_n_models"}
     if any(((rows[name] != rows["n_models"]) & (rows[name] > 0)).any() for name in fewer.values()):
         columns += [Column(name, f"Models, {words}", "count") for words, name in fewer.items()]

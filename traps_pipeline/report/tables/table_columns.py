@@ -75,9 +75,9 @@ def counted(rows: pd.DataFrame, entries: pd.DataFrame, sides: Sequence[Sequence[
     """
     import pandas as pd
 
-    by_key = {(e["model"], e["regime"], e["dataset"]): e for e in entries.to_dict("records")}
+    entry_of = {(e["model"], e["regime"], e["dataset"]): e for e in entries.to_dict("records")}
     keys = [[tuple(row[name] for name in side) for side in sides] for row in rows.to_dict("records")]
-    counts = [together([by_key[key] for key in of_row if key in by_key]) for of_row in keys]
+    counts = [together([entry_of[key] for key in entry_keys if key in entry_of]) for entry_keys in keys]
     return marked(rows.join(pd.DataFrame(counts, index=rows.index, columns=pd.Index(COUNTED))))
 
 
@@ -95,25 +95,25 @@ def marks(rows: pd.DataFrame) -> list[str]:
 
 def meanings(marks: Iterable[str]) -> list[str]:
     """Return the meaning of each of these marks, once."""
-    used = set(marks)
-    return [f"{mark} {meaning}" for mark, meaning in MARKS.items() if mark in used]
+    used_marks = set(marks)
+    return [f"{mark} {meaning}" for mark, meaning in MARKS.items() if mark in used_marks]
 
 
 def epochs(rows: pd.DataFrame) -> str:
     """Return a note on the only epoch, or on mixed ones; empty without rows."""
     dated = rows.dropna(subset=["epoch"]) if "epoch" in rows else rows.iloc[:0]
-    single = sorted({part for epoch in dated["epoch"] for part in str(epoch).split("+")})
-    if len(single) <= 1:
-        return f"epoch {single[0]}" if single else ""
+    epoch_names = sorted({part for epoch in dated["epoch"] for part in str(epoch).split("+")})
+    if len(epoch_names) <= 1:
+        return f"epoch {epoch_names[0]}" if epoch_names else ""
     groups: dict[str, list[str]] = {}
     for key, part in dated.groupby("dataset", sort=False) if "dataset" in dated else []:
         names = " and ".join(sorted(set(part["epoch"].astype(str))))
         groups.setdefault(names, []).append(SHORT.get(str(key), str(key)))
-    most = max(groups, key=lambda name: len(groups[name]), default="")
-    parts = [f"{', '.join(keys)}: {epoch}" for epoch, keys in groups.items() if epoch != most]
+    main_epoch = max(groups, key=lambda name: len(groups[name]), default="")
+    parts = [f"{', '.join(keys)}: {epoch}" for epoch, keys in groups.items() if epoch != main_epoch]
     if not parts:
-        return f"mixed epochs ({' and '.join(single)})"
-    return f"mixed epochs ({'; '.join([*parts, f'else {most}'])})"
+        return f"mixed epochs ({' and '.join(epoch_names)})"
+    return f"mixed epochs ({'; '.join([*parts, f'else {main_epoch}'])})"
 
 
 def printed(results: Results, rows: pd.DataFrame, columns: Sequence[Column]) -> list[Column]:
@@ -146,8 +146,8 @@ def interval(row: Mapping[str, Any]) -> str:
 
 def figure_with_interval(row: Mapping[Any, Any], name: str, as_printed: Callable[[float], str]) -> str:
     """Return a figure as printed, with its interval in brackets where it has one."""
-    own, low, high = (as_printed(row[column]) for column in (name, f"{name}_ci_low", f"{name}_ci_high"))
-    return own if NONE in (own, low) else f"{own} [{low}, {high}]"
+    value, low, high = (as_printed(row[column]) for column in (name, f"{name}_ci_low", f"{name}_ci_high"))
+    return value if NONE in (value, low) else f"{value} [{low}, {high}]"
 
 
 def ranks(row: Mapping[str, Any]) -> str:

@@ -55,15 +55,15 @@ def certify(spec: SceneSpec, qpos: np.ndarray, twin: np.ndarray, *, frame_step: 
     pair = pair_of(spec, qpos, twin, frame_step=frame_step)
     same_physics = _same_physics(pair)
     failures: dict[str, str] = {}
-    measured: dict[str, Any] = {}
+    evidence_so_far: dict[str, Any] = {}
     for certificate in certificates_for(spec.void_kind):
         try:
             evidence = certificate.measured(pair)
         except Rejected as impossible:
             failures[certificate.name] = str(impossible)
             continue
-        measured |= evidence
-        failure = certificate.failure(measured, pair.claim)
+        evidence_so_far |= evidence
+        failure = certificate.failure(evidence_so_far, pair.claim)
         failure = failure or certificate.contradiction(evidence, spec.evidence, exact=same_physics)
         if failure is not None:
             failures[certificate.name] = failure
@@ -72,7 +72,7 @@ def certify(spec: SceneSpec, qpos: np.ndarray, twin: np.ndarray, *, frame_step: 
         scenario_id=spec.scenario_id,
         family=spec.family,
         failures=failures,
-        measured=measured,
+        measured=evidence_so_far,
         same_physics=same_physics,
         control_end=control_end,
         void_end=void_end,
@@ -83,8 +83,8 @@ def certify(spec: SceneSpec, qpos: np.ndarray, twin: np.ndarray, *, frame_step: 
 
 def state_at_cut(qpos: np.ndarray, cut_frame: int) -> np.ndarray:
     """Return the last poses of a cut void, and their last change, shape (2 nq,)."""
-    last, before = qpos[cut_frame - 1], qpos[max(cut_frame - 2, 0)]  # a void of one frame shows no change
-    return np.concatenate([last, last - before])
+    last, previous_pose = qpos[cut_frame - 1], qpos[max(cut_frame - 2, 0)]  # a void of one frame shows no change
+    return np.concatenate([last, last - previous_pose])
 
 
 def _same_physics(pair: Pair) -> bool:

@@ -136,12 +136,12 @@ class Futures:
         import mujoco
 
         model, control = self._prepared.model, self._control
-        state, past = mujoco.MjData(model), np.empty((cut, model.nq))
+        state, past_qpos = mujoco.MjData(model), np.empty((cut, model.nq))
         state.qvel[:] = self._prepared.velocity
         for i in range(cut):
             if i:
                 mujoco.mj_step(model, state, control.physics.substeps)
-            past[i] = state.qpos
+            past_qpos[i] = state.qpos
         steps = np.random.default_rng([self._seed, count, cut]).normal(size=(count, 2, model.nv))
         unseen_step = unseen_steps(model, state, control.camera)
 
@@ -152,7 +152,7 @@ class Futures:
             mujoco.mj_integratePos(model, qpos, along_contacts(model, state, step[0] * unseen_step), 1.0)
             data.qpos[:] = qpos
             data.qvel += step[1] * unseen_step * math.sqrt(2) / READ_OVER_S
-            frames, outcome = past, None
+            frames, outcome = past_qpos, None
             for n_frames in (len(control.qpos) - cut, beyond):
                 if outcome is None and n_frames:
                     frames = np.concatenate([frames, np.empty((n_frames, model.nq))])
@@ -196,19 +196,22 @@ class Futures:
         """Simulate one start; give up if it parts before `first`, unless `to_end`."""
         import mujoco
 
-        control, prepared = self._control, self._prepared
-        shown, outline = prepared.shown, prepared.silhouette
-        data, scratch = mujoco.MjData(prepared.model), mujoco.MjData(prepared.model)
-        data.qpos[:], data.qvel[:] = prepared.starts[number], prepared.velocity
-        frames = np.empty((len(shown), prepared.model.nq))
-        parted = len(shown)
-        for i in range(len(shown)):
+        control, camera_view = self._control, self._prepared
+        shown_geoms, outline = camera_view.shown, camera_view.silhouette
+        data, scratch = mujoco.MjData(camera_view.model), mujoco.MjData(camera_view.model)
+        data.qpos[:], data.qvel[:] = camera_view.starts[number], camera_view.velocity
+        frames = np.empty((len(shown_geoms), camera_view.model.nq))
+        parted = len(shown_geoms)
+        for i in range(len(shown_geoms)):
             frames[i] = data.qpos
-            if parted == len(shown) and np.abs(outline.pixels(data.qpos, scratch) - shown[i]).max() > self._alike_px:
+            if (
+                parted == len(shown_geoms)
+                and np.abs(outline.pixels(data.qpos, scratch) - shown_geoms[i]).max() > self._alike_px
+            ):
                 parted = i
                 if i < self.first and not to_end:
                     return Rollout(number, parted, None)
-            mujoco.mj_step(prepared.model, data, control.physics.substeps)
+            mujoco.mj_step(camera_view.model, data, control.physics.substeps)
         if not np.isfinite(frames).all():
             return Rollout(number, parted, None)
         return Rollout(number, parted, self._settled_label(frames), frames.astype(np.float32))
@@ -294,9 +297,9 @@ class _Silhouette:
         import mujoco
 
         self._model, self._camera = model, camera
-        moving = np.flatnonzero(model.body_weldid[model.geom_bodyid] > 0)
-        ball = model.geom_type[moving] == mujoco.mjtGeom.mjGEOM_SPHERE
-        self._balls, self._solids = moving[ball], moving[~ball]
+        moving_geoms = np.flatnonzero(model.body_weldid[model.geom_bodyid] > 0)
+        ball = model.geom_type[moving_geoms] == mujoco.mjtGeom.mjGEOM_SPHERE
+        self._balls, self._solids = moving_geoms[ball], moving_geoms[~ball]
         signs = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, 8).T
         boxes = model.geom_aabb[self._solids]
         self._corners = boxes[:, None, :3] + signs * boxes[:, None, 3:]

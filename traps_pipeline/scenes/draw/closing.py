@@ -57,5 +57,5 @@ def occluder_from(frame: int, control: World, *others: World) -> Occluder:
     if control.occluder is not None:
         return control.occluder
     boxes = control.scene.framed if control.scene.rest is None else (control.scene.rest,)
-    moving = [swept_points(world.model, world.qpos[frame:]) for world in (control, *others)]
-    return fit_occluder(control.camera, box_around([*moving, *(box.corners() for box in boxes)]))
+    swept_corners = [swept_points(world.model, world.qpos[frame:]) for world in (control, *others)]
+    return fit_occluder(control.camera, box_around([*swept_corners, *(box.corners() for box in boxes)]))

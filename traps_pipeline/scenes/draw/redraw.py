@@ -96,24 +96,24 @@ def _rewrite(
     only: Collection[str] | None = None,
 ) -> dict[str, str]:
     """Change records of a family, take out those rejected, and return reasons by id."""
-    tally, rejected = load_tallies(released)[name], dict[str, str]()
+    tally, rejections = load_tallies(released)[name], dict[str, str]()
     lines = (released / f"{name}.jsonl").read_text(encoding="utf-8").splitlines()
     records = {spec.scenario_id: spec for spec in map(SceneSpec.model_validate_json, lines)}
-    chosen = [id_ for id_ in records if only is None or id_ in only]
-    jobs = [(records[id_], released / "trajectories", tally) for id_ in chosen]
+    chosen_ids = [id_ for id_ in records if only is None or id_ in only]
+    jobs = [(records[id_], released / "trajectories", tally) for id_ in chosen_ids]
     for finished, ((spec, folder, _), result) in enumerate(run_in_order(change, jobs, workers), start=1):
         if isinstance(result, str):
-            rejected[spec.scenario_id] = result
+            rejections[spec.scenario_id] = result
         else:
             save_trajectory(folder, spec.scenario_id, result.qpos, result.twin)
             records[spec.scenario_id] = result.spec
-        report(f"{spec.scenario_id}: {rejected.get(spec.scenario_id, 'written again')}; {finished} of {len(jobs)}")
+        report(f"{spec.scenario_id}: {rejections.get(spec.scenario_id, 'written again')}; {finished} of {len(jobs)}")
     write_text(released / f"{name}.jsonl", "".join(map(record_line, records.values())))
     tallies = load_tallies(released)
     tallies[name] = replace(tallies[name], file=family_digest(name), look=sorted(get_family(name).looks))
     save_tallies(released, tallies)
-    take_out(released, {id_: rejection_kind(why) for id_, why in rejected.items()})
-    return rejected
+    take_out(released, {id_: rejection_kind(reason) for id_, reason in rejections.items()})
+    return rejections
 
 
 def _draw_record_again(job: _Job) -> Resolved | str:
@@ -123,7 +123,9 @@ def _draw_record_again(job: _Job) -> Resolved | str:
     result = try_draw(Draw(spec.family, tally.seed, spec.seed, frozenset(), looks, tally.difficulty))
     if isinstance(result, str):
         return result
-    worlds = [{field: value for field, value in each.params.items() if field != "look"} for each in (spec, result.spec)]
+    worlds = [
+        {field: value for field, value in world.params.items() if field != "look"} for world in (spec, result.spec)
+    ]
     if worlds[0] != worlds[1]:
         return "its draw gives another scene"
     names = {"scenario_id": spec.scenario_id, "ill_posed_question": spec.ill_posed_question}

@@ -71,13 +71,13 @@ def load_tallies(released: Path) -> dict[str, Tally]:
 
 def require_difficulty(names: Iterable[str], difficulty: Difficulty) -> None:
     """Raise TrapsError naming families that cannot be drawn with the settings."""
-    lacking = {name: untakeable(get_family(name), difficulty) for name in names}
-    lacking = {name: settings for name, settings in lacking.items() if settings}
-    if lacking:
-        told = "; ".join(f"{name}: no --{', no --'.join(settings)}" for name, settings in sorted(lacking.items()))
+    unsupported = {name: untakeable(get_family(name), difficulty) for name in names}
+    unsupported = {name: settings for name, settings in unsupported.items() if settings}
+    if unsupported:
+        advice = "; ".join(f"{name}: no --{', no --'.join(settings)}" for name, settings in sorted(unsupported.items()))
         able = [name for name in family_names() if not untakeable(get_family(name), difficulty)]
         raise TrapsError(
-            f"some families cannot be drawn like this ({told}): name others with --families: {', '.join(able)}"
+            f"some families cannot be drawn like this ({advice}): name others with --families: {', '.join(able)}"
         )
 
 
@@ -156,7 +156,7 @@ def sample_family(
         for number in range(tally.draws, MOST_DRAWS * count):
             yield Draw(name, seed, number, full_answers(), tuple(parts), difficulty)
 
-    reported: set[str] = set()  # kinds of rejections that the report has
+    reported_kinds: set[str] = set()  # kinds of rejections that the report has
     # A draw takes seconds, and those that were begun are waited for: no more than could all be wanted.
     results = run_in_order(try_draw, jobs(), workers, ahead=len(places))
     try:
@@ -169,8 +169,8 @@ def sample_family(
                 result = f"its first frame looks like that of another: {lookalike}"
             if isinstance(result, str):
                 tally.rejected[result.split(":")[0]] += 1
-                if rejection_kind(result) not in reported:  # so that a family that never passes says why at once
-                    reported.add(rejection_kind(result))
+                if rejection_kind(result) not in reported_kinds:  # so that a family that never passes says why at once
+                    reported_kinds.add(rejection_kind(result))
                     report(f"{name}: draw {draw.number + 1} is rejected: {result}")
                 continue
             placed = _with_id(family, result, draw, places.pop(0), texts, count)
@@ -216,9 +216,9 @@ class Records:
                 specs.append(SceneSpec.model_validate(json.loads(line)))
             except ValueError:  # a line that a kill tore
                 break
-        in_tally = [spec for spec in specs if spec.seed < tally.draws]
-        write_text(self._lines, "".join(record_line(spec) for spec in in_tally))
-        return in_tally
+        known_specs = [spec for spec in specs if spec.seed < tally.draws]
+        write_text(self._lines, "".join(record_line(spec) for spec in known_specs))
+        return known_specs
 
     def qpos(self, spec: SceneSpec) -> np.ndarray:
         """Return the trajectory of a record."""
@@ -258,9 +258,9 @@ def take_out(released: Path, reasons: Mapping[str, str]) -> None:
 def save_tallies(released: Path, tallies: Mapping[str, Tally]) -> None:
     """Write `draws.json`."""
     notes = dict[str, dict[str, Any]]()
-    for name, each in tallies.items():
-        notes[name] = {**vars(each), "rejected": dict(each.rejected), "difficulty": each.difficulty.settings()}
-        if each.difficulty == USUAL:
+    for name, tally in tallies.items():
+        notes[name] = {**vars(tally), "rejected": dict(tally.rejected), "difficulty": tally.difficulty.settings()}
+        if tally.difficulty == USUAL:
             del notes[name]["difficulty"]
     write_text(released / DRAWS, json.dumps(notes, indent=1, sort_keys=True) + "\n")
 
@@ -291,15 +291,15 @@ def _choices(family: Family, longer: bool = False) -> Mapping[str, float]:
 def try_draw(draw: Draw) -> Resolved | str:
     """Return a draw, resolved, or the reason why it is rejected."""
     try:
-        drawn = scene_of_draw(draw)
+        drawn_scene = scene_of_draw(draw)
         return resolve(
             get_family(draw.family),
-            drawn.params,
-            drawn.wording,
+            drawn_scene.params,
+            drawn_scene.wording,
             _NO_QUESTION,
             scenario_id=f"{draw.family}-0000",
             seed=draw.number,
-            physics=drawn.physics,
+            physics=drawn_scene.physics,
         )
     except Rejected as rejected:
         return str(rejected)
@@ -331,10 +331,12 @@ def scene_of_draw(draw: Draw) -> DrawnScene:
     if answer in draw.closed:
         raise Rejected(f"answer {answer!r} has its quota")
     if draw.difficulty.distractors:
-        own = np.random.default_rng([draw.seed, *draw.family.encode(), draw.number, *b"distractors"])
+        distractor_rng = np.random.default_rng([draw.seed, *draw.family.encode(), draw.number, *b"distractors"])
         duration_s = physics.duration_s * physics.speed
-        things = draw_distractors(own, draw.difficulty.distractors, scene, points, wording, params, duration_s)
-        params = replace(params, difficulty=SceneDifficulty(things, draw.difficulty.longer))
+        distractors = draw_distractors(
+            distractor_rng, draw.difficulty.distractors, scene, points, wording, params, duration_s
+        )
+        params = replace(params, difficulty=SceneDifficulty(distractors, draw.difficulty.longer))
     return DrawnScene(params, wording, physics)
 
 
@@ -352,9 +354,9 @@ def ill_posed_for(spec: SceneSpec, seed: int, texts: Counter[str], count: int) -
     """
     family = get_family(spec.family)
     inventory = family.build(family.params_from(spec.params), family.physics).inventory
-    most, place = ill_posed_quota(spec.taxonomy, count), int(spec.scenario_id.rpartition("-")[2])
+    quota, place = ill_posed_quota(spec.taxonomy, count), int(spec.scenario_id.rpartition("-")[2])
     rng = np.random.default_rng([seed, *spec.family.encode(), spec.seed, place])
-    return draw_ill_posed(spec.taxonomy, inventory, rng, lambda text: texts[text] < most)
+    return draw_ill_posed(spec.taxonomy, inventory, rng, lambda text: texts[text] < quota)
 
 
 def simulated_answer(family: Family, params: Any) -> str:

@@ -25,8 +25,8 @@ def trim_candidates(pair: Pair) -> Iterator[Pair]:
     """Yield a pair with ever larger occluders, each of which may fail a certificate."""
     occluder = pair.control.occluder
     assert occluder is not None, "only an occluder can be trimmed"
-    needed = must_hide(pair)
-    occluders = [cut_to(occluder, pair.control.camera, needed, margin) for margin in MARGINS_PX]
+    needed_mask = must_hide(pair)
+    occluders = [cut_to(occluder, pair.control.camera, needed_mask, margin) for margin in MARGINS_PX]
     for smaller in dict.fromkeys((*occluders, occluder)):
         control, twin = (replace(world, occluder=smaller) for world in (pair.control, pair.other_world))
         yield replace(pair, control=control, twin=twin, void_frame=control.past_occluder.hidden_from())
@@ -34,16 +34,18 @@ def trim_candidates(pair: Pair) -> Iterator[Pair]:
 
 def must_hide(pair: Pair) -> np.ndarray:
     """Return the pixels (H, W) that an occluder must cover to hide what differs."""
-    needed, videos = np.zeros((HEIGHT, WIDTH), bool), list[list[np.ndarray]]()
+    needed_mask, videos = np.zeros((HEIGHT, WIDTH), bool), list[list[np.ndarray]]()
     for world in (pair.control, pair.other_world):
         settled_from = max(world.outcome.commit_frame - 1, 0)
         decisive = decisive_geoms(world.model, world.scene.decisive)
         with world.renderer(supersample=1) as renderer:  # a margin is left, and certificates judge
             frames = list(renderer.frames(world.qpos))
-            needed |= _differing(frames, renderer.frames(world.qpos, without=world.scene.hidden))
-            needed |= _differing(frames[settled_from:], renderer.frames(world.qpos[settled_from:], without=decisive))
+            needed_mask |= _differing(frames, renderer.frames(world.qpos, without=world.scene.hidden))
+            needed_mask |= _differing(
+                frames[settled_from:], renderer.frames(world.qpos[settled_from:], without=decisive)
+            )
         videos.append(frames)
-    return needed | _differing(*videos)
+    return needed_mask | _differing(*videos)
 
 
 def cut_to(occluder: Occluder, camera: Camera, needed: np.ndarray, margin_px: int) -> Occluder:
@@ -55,23 +57,23 @@ def cut_to(occluder: Occluder, camera: Camera, needed: np.ndarray, margin_px: in
     top, bottom = rows.min() - margin_px, rows.max() + 1 + margin_px
     ahead, across = _directions(occluder)
     corners = np.array([[x, y] for x in (left, right) for y in (top, bottom)], dtype=float)
-    on_plane = _on_plane(camera, corners, ahead, float(np.array(occluder.centre) @ ahead) - occluder.half[1])
-    side, middle = on_plane @ across, float(np.array(occluder.centre) @ across)
+    plane_points = _on_plane(camera, corners, ahead, float(np.array(occluder.centre) @ ahead) - occluder.half[1])
+    side, middle = plane_points @ across, float(np.array(occluder.centre) @ across)
     low, high = max(side.min(), middle - occluder.half[0]), min(side.max(), middle + occluder.half[0])
-    height = min(float(on_plane[:, 2].max()), 2 * occluder.half[2])
+    height = min(float(plane_points[:, 2].max()), 2 * occluder.half[2])
     centre = np.array(occluder.centre) + across * ((low + high) / 2 - middle)
     x, y = (round(float(v), 6) for v in centre[:2])
-    half = (round((high - low) / 2, 6), occluder.half[1], round(height / 2, 6))
-    return replace(occluder, centre=(x, y, half[2]), half=half)
+    half_size = (round((high - low) / 2, 6), occluder.half[1], round(height / 2, 6))
+    return replace(occluder, centre=(x, y, half_size[2]), half=half_size)
 
 
 def _differing(frames: Iterable[np.ndarray], counterparts: Iterable[np.ndarray]) -> np.ndarray:
     """Return where any frame differs from its counterpart, on the grid of 480x360."""
     mask = np.zeros((HEIGHT, WIDTH), bool)
     for frame, counterpart in zip(frames, counterparts, strict=True):
-        differs = (frame != counterpart).any(axis=2)
-        fine = differs.shape[0] // HEIGHT
-        mask |= differs.reshape(HEIGHT, fine, WIDTH, fine).any(axis=(1, 3))
+        is_different = (frame != counterpart).any(axis=2)
+        scale = is_different.shape[0] // HEIGHT
+        mask |= is_different.reshape(HEIGHT, scale, WIDTH, scale).any(axis=(1, 3))
     return mask
 
 

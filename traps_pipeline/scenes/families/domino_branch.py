@@ -103,10 +103,10 @@ def _add_branch(course: Course, p: Params, side: str, yaw: float, junction: floa
     start = np.array([0.0, junction]) + (BALL - PUSH + p.thickness / 2) * ahead
     colours = [p.row_colour] * (p.branch - 1) + [p.left_colour if side == "left" else p.right_colour]
     for i, (name, colour) in enumerate(zip(p.bodies(side), colours, strict=True)):
-        at, lying = start + i * p.spacing * ahead, i == p.gap_index and side == p.gap_side
-        if lying:
+        at, is_lying = start + i * p.spacing * ahead, i == p.gap_index and side == p.gap_side
+        if is_lying:
             at = at + (p.width + 0.15) * inwards
-        _add_domino(course, p, name, at, yaw, colour, lying=lying)
+        _add_domino(course, p, name, at, yaw, colour, lying=is_lying)
 
 
 def _add_domino(
@@ -114,10 +114,10 @@ def _add_domino(
 ) -> None:
     """Add a free domino at (across, along), its thickness along `yaw` from the row."""
     h = p.height_m
-    deep, high = (1.0, p.thickness) if lying else (p.thickness, 1.0)
+    depth, high = (1.0, p.thickness) if lying else (p.thickness, 1.0)
     place = (float(at[0]) * h, -float(at[1]) * h, (PLANK + high / 2) * h)
-    half = (p.width * h / 2, deep * h / 2, high * h / 2)
-    body = course.free_box(name, place, half, colour, density=500, sliding=0.2, solref=(0.006, 1))
+    half_size = (p.width * h / 2, depth * h / 2, high * h / 2)
+    body = course.free_box(name, place, half_size, colour, density=500, sliding=0.2, solref=(0.006, 1))
     body.quat = [float(np.cos(yaw / 2)), 0, 0, float(np.sin(yaw / 2))]
 
 
@@ -142,24 +142,24 @@ def _aside(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
 
 def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return the side of the only end domino that has left its initial place."""
-    standing = [_is_standing(frames, slots[side]) for side in SIDES]
-    if None in standing or standing[0] == standing[1]:
+    is_standing = [_is_standing(frames, slots[side]) for side in SIDES]
+    if None in is_standing or is_standing[0] == is_standing[1]:
         return None
-    return "right" if standing[0] else "left"
+    return "right" if is_standing[0] else "left"
 
 
 def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Predict the side of the only end domino that has left its place or will soon."""
-    falls = []
+    predictions = []
     for colour in (slots["left"], slots["right"]):
         dominoes = blobs(colour_mask(frames[0], colour), 60)
-        falls.append(
+        predictions.append(
             any(
                 not is_upper_half_in_place(frames, colour, domino) or is_struck(frames, domino, 0.0)
                 for domino in dominoes
             )
         )
-    return None if falls[0] == falls[1] else "left" if falls[0] else "right"
+    return None if predictions[0] == predictions[1] else "left" if predictions[0] else "right"
 
 
 def look(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:

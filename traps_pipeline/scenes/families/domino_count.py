@@ -119,44 +119,48 @@ def twins(p: Params) -> list[Params]:
 def outcome(motion: Motion, p: Params) -> Reading:
     """Read the choice for the number of low tops, once the second row is still."""
     tops = np.stack([top_m(motion, body, p.height_m) for body in p.second], axis=1) - dominoes.PLANK * p.height_m
-    fallen = (tops < FALLEN * p.height_m).sum(axis=1)
+    n_fallen = (tops < FALLEN * p.height_m).sum(axis=1)
     rest_frame = still_from(*(motion.pos(body) for body in p.second), within_m=dominoes.STILL_M)
-    labels = [range_of(p.ranges, int(n)) if i >= rest_frame else None for i, n in enumerate(fallen)]
+    labels = [range_of(p.ranges, int(n)) if i >= rest_frame else None for i, n in enumerate(n_fallen)]
     return Reading(labels, float(np.abs(tops[-1] - FALLEN * p.height_m).min()))
 
 
 def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Count the second row's dominoes that no longer stand in their initial places."""
     colour = slots["second"]
-    before, close, after = (colour_mask(frames[i], colour) for i in (0, -3, -1))
-    standing = blobs(before, min_area=60)
-    ranges = _choices(slots, len(standing))
-    if ranges is None or after.sum() < 0.3 * before.sum() or (after != close).sum() > 0.1 * after.sum():
+    mask_before, close, mask_after = (colour_mask(frames[i], colour) for i in (0, -3, -1))
+    dominoes = blobs(mask_before, min_area=60)
+    ranges = _choices(slots, len(dominoes))
+    if (
+        ranges is None
+        or mask_after.sum() < 0.3 * mask_before.sum()
+        or (mask_after != close).sum() > 0.1 * mask_after.sum()
+    ):
         return None
-    return range_of(ranges, sum(not is_upper_half_in_place(frames, colour, domino) for domino in standing))
+    return range_of(ranges, sum(not is_upper_half_in_place(frames, colour, domino) for domino in dominoes))
 
 
 def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Count the second row's dominoes that are out of place or about to be struck."""
-    standing, change = blobs(colour_mask(frames[0], slots["second"]), min_area=60), motion_mask(frames)
-    ranges = _choices(slots, len(standing))
+    dominoes, change = blobs(colour_mask(frames[0], slots["second"]), min_area=60), motion_mask(frames)
+    ranges = _choices(slots, len(dominoes))
     if ranges is None:
         return None
-    falls = [
+    is_falling = [
         not is_upper_half_in_place(frames, slots["second"], domino) or change[around(domino, 0.0)].mean() > GIVES
-        for domino in standing
+        for domino in dominoes
     ]
-    return range_of(ranges, sum(falls))
+    return range_of(ranges, sum(is_falling))
 
 
 def look(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Count fallen dominoes: the choices' largest number less those that still stand."""
-    close, after = (colour_mask(frames[i], slots["second"]) for i in (-3, -1))
-    if "choices" not in slots or not after.any() or (after != close).sum() > 0.1 * after.sum():
+    close, mask_after = (colour_mask(frames[i], slots["second"]) for i in (-3, -1))
+    if "choices" not in slots or not mask_after.any() or (mask_after != close).sum() > 0.1 * mask_after.sum():
         return None
     ranges = [[int(n) for n in choice.split("-")] for choice in choices_in(slots["choices"])]
-    stand = sum(domino.box[3] > UPRIGHT * domino.box[2] for domino in blobs(after, min_area=60))
-    return range_of(ranges, ranges[-1][1] - stand)
+    n_standing = sum(domino.box[3] > UPRIGHT * domino.box[2] for domino in blobs(mask_after, min_area=60))
+    return range_of(ranges, ranges[-1][1] - n_standing)
 
 
 def _choices(slots: Mapping[str, str], dominoes_seen: int) -> Sequence[Sequence[int]] | None:

@@ -56,19 +56,19 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build two ramps, steps, and a deck whose two boards differ only in friction."""
     course = Course(physics)
-    r, half, side, high = p.radius_m, p.half_deck_m, 1.7 * p.radius_m, DECK_M + 2 * p.radius_m
-    deep, on_deck, board_at = (-side, side), (0, DECK_M), half - 0.10
+    r, half_deck, side, high = p.radius_m, p.half_deck_m, 1.7 * p.radius_m, DECK_M + 2 * p.radius_m
+    depth_span, deck_span, board_at = (-side, side), (0, DECK_M), half_deck - 0.10
     for i, name in enumerate(SIDES):
         outwards = course.towards((-1, 1)[i])
         board = Surface(_roughness(p), priority=2) if outwards.direction == p.rough_side else FELT
-        outwards.block(f"deck_{name}", (LINE_M, board_at - BOARD_M), deep, on_deck, p.deck_colour, FELT)
-        outwards.block(f"board_{name}", (board_at - BOARD_M, board_at), deep, on_deck, "wood", board)
-        outwards.block(f"entry_{name}", (board_at, half), deep, on_deck, p.deck_colour, FELT)
+        outwards.block(f"deck_{name}", (LINE_M, board_at - BOARD_M), depth_span, deck_span, p.deck_colour, FELT)
+        outwards.block(f"board_{name}", (board_at - BOARD_M, board_at), depth_span, deck_span, "wood", board)
+        outwards.block(f"entry_{name}", (board_at, half_deck), depth_span, deck_span, p.deck_colour, FELT)
         _add_ramp(outwards, p, name, side)
         at = _on_ramp(p, p.ramp_m - p.starts_m[i], r)
         LIVELY.on(outwards.ball(f"ball_{name}", at, r, p.colours[i]))
-    course.block("line", (-LINE_M, LINE_M), deep, on_deck, "black", FELT)
-    course.sides("rim", (-half, half), side, WALL_M, (0, DECK_M + 0.2 * r), p.ramp_colour)
+    course.block("line", (-LINE_M, LINE_M), depth_span, deck_span, "black", FELT)
+    course.sides("rim", (-half_deck, half_deck), side, WALL_M, (0, DECK_M + 0.2 * r), p.ramp_colour)
 
     across = (-side - WALL_M - 0.02, side + WALL_M + 0.5 * high)
     course.mark("line", "line")
@@ -76,8 +76,8 @@ def build(p: Params, physics: Physics) -> Scene:
         p,
         decisive=[f"ball_{name}" for name in SIDES],
         hidden=[f"board_{name}" for name in SIDES],
-        cover=course.box((-half + 0.01, half - 0.01), across, (0, high)),
-        in_view=[course.box((-half - p.ramp_m, half + p.ramp_m), deep, (0, high))],
+        cover=course.box((-half_deck + 0.01, half_deck - 0.01), across, (0, high)),
+        in_view=[course.box((-half_deck - p.ramp_m, half_deck + p.ramp_m), depth_span, (0, high))],
         things=[*(f"{colour} ball" for colour in p.colours), *(f"{name} ramp" for name in SIDES)],
         also=["deck", "line", "board", "side"],
         colours=[*p.colours, "wood", "black"],
@@ -104,8 +104,8 @@ def _on_ramp(p: Params, along: float, over: float = 0.0) -> Vec3:
 def _add_ramp(course: Course, p: Params, name: str, side: float) -> None:
     """Add the ramp of one side, and the prop under its upper end."""
     slope, half_thick = float(np.radians(p.slope_deg)), 0.012
-    half = (p.ramp_m / 2 / float(np.cos(slope)), side, half_thick)
-    course.slab(f"ramp_{name}", _on_ramp(p, p.ramp_m / 2, -half_thick), half, p.ramp_colour, falls_rad=-slope)
+    half_size = (p.ramp_m / 2 / float(np.cos(slope)), side, half_thick)
+    course.slab(f"ramp_{name}", _on_ramp(p, p.ramp_m / 2, -half_thick), half_size, p.ramp_colour, falls_rad=-slope)
     foot, _, top = _on_ramp(p, p.ramp_m - 0.05)
     middle = top / 2 - 0.012
     course.slab(f"prop_{name}", (foot, 0, middle), (0.012, side, middle), p.ramp_colour)
@@ -135,15 +135,15 @@ def _aside(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
 
 def observe(frames: np.ndarray, slots: Mapping[str, str], ahead: float | None = None) -> str | None:
     """Return the ball that ends on its own side of the black line, if both rest there."""
-    line, at_home = largest(frames[0], "black"), []
+    line, home_balls = largest(frames[0], "black"), []
     for colour in colours_of_balls(frames, slots, BALL_COLOURS):
         path = track(frames, colour, 60)
         start, end = path[0], end_of(path, ahead)
         if line is None or start is None or end is None or is_occluder(start) or is_occluder(end):
             return None
         if (start.x - line.x) * (end.x - line.x) > 0:
-            at_home.append(colour)
-    return at_home[0] if len(at_home) == 1 else None
+            home_balls.append(colour)
+    return home_balls[0] if len(home_balls) == 1 else None
 
 
 FAMILY = scene_family(

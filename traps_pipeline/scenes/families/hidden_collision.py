@@ -58,8 +58,8 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build a flat track with rails; each lane is closed where no ball enters."""
     course = Course(physics, p.direction)
-    r, half, side = p.radius_m, p.middle_m / 2, 2 * HALF_PITCH * p.radius_m
-    end, switch_at, length = half + p.run_m, -half + p.switch_m, float(np.hypot(*SWITCH)) * r
+    r, half_middle, side = p.radius_m, p.middle_m / 2, 2 * HALF_PITCH * p.radius_m
+    end, switch_at, length = half_middle + p.run_m, -half_middle + p.switch_m, float(np.hypot(*SWITCH)) * r
     track, outer, up = (-end, end), (-side - WALL_M, side + WALL_M), (DECK_M, DECK_M + 1.1 * r)
 
     course.block("deck", track, (-side, side), (0, DECK_M), p.deck_colour)
@@ -67,7 +67,7 @@ def build(p: Params, physics: Physics) -> Scene:
     course.block("wall_back", track, (side, outer[1]), (0, up[1]), p.rail_colour)
     course.block("rail_in", (-end, switch_at - 0.3 * r), (-0.004, 0.004), up, p.rail_colour)
     course.block("rail_out", (switch_at + length + 0.3 * r, end), (-0.004, 0.004), up, p.rail_colour)
-    for name, at, lane in (("stop_near", -half, p.lanes[0]), ("stop_far", half - 0.02, p.lanes[1])):
+    for name, at, lane in (("stop_near", -half_middle, p.lanes[0]), ("stop_far", half_middle - 0.02, p.lanes[1])):
         course.block(name, (at, at + 0.02), (-side, 0) if lane > 0 else (0, side), up, p.rail_colour)
     _add_switch(course, p, switch_at, length)
     for i, (start, speed) in enumerate(((1.5 * r - end, p.speeds_m_s[0]), (end - 1.5 * r, -p.speeds_m_s[1]))):
@@ -82,7 +82,7 @@ def build(p: Params, physics: Physics) -> Scene:
         p,
         decisive=["ball_0", "ball_1"],
         hidden=["switch"],
-        cover=course.box((-half - 0.01, half + 0.01), across, (0, high), right=SHADOW_RIGHT * high),
+        cover=course.box((-half_middle - 0.01, half_middle + 0.01), across, (0, high), right=SHADOW_RIGHT * high),
         in_view=[course.box(track, outer, (0, high))],
         things=[*(f"{c} ball" for c in p.colours), "track", "front lane of the track", "back lane of the track"],
         also=["lane", "rail"],
@@ -156,14 +156,14 @@ def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     if a is None or b is None or a_next is None or b_next is None:
         return None
     gap, closing = np.array([b.x - a.x, b.y - a.y]), np.array([b_next.x - a_next.x, b_next.y - a_next.y])
-    way = _along(paths)
-    if way is None:
+    direction = _along(paths)
+    if direction is None:
         return None
-    aside = np.array([-way[1], way[0]])
-    if (gap @ way) * (closing @ way) < 0:  # they will have passed in the next frame
-        share = (gap @ way) / ((gap - closing) @ way)
+    normal = np.array([-direction[1], direction[0]])
+    if (gap @ direction) * (closing @ direction) < 0:  # they will have passed in the next frame
+        share = (gap @ direction) / ((gap - closing) @ direction)
         gap = gap + share * (closing - gap)
-    return "yes" if abs(gap @ aside) < ASIDE * max(a.box[3], b.box[3]) else "no"
+    return "yes" if abs(gap @ normal) < ASIDE * max(a.box[3], b.box[3]) else "no"
 
 
 def _along(paths: Sequence[Sequence[Blob | None]]) -> np.ndarray | None:
@@ -171,8 +171,8 @@ def _along(paths: Sequence[Sequence[Blob | None]]) -> np.ndarray | None:
     first, second = (next((blob for blob in path if blob), None) for path in paths)
     if first is None or second is None:
         return None
-    way = np.array([second.x - first.x, second.y - first.y])
-    return way / np.linalg.norm(way)
+    direction = np.array([second.x - first.x, second.y - first.y])
+    return direction / np.linalg.norm(direction)
 
 
 FAMILY = scene_family(

@@ -84,12 +84,12 @@ def build(p: Params, physics: Physics) -> Scene:
     course = Course(physics, p.direction)
     lanes, r, pitch, wall = len(p.colours), p.radius_m, 2.8 * p.radius_m, 0.012
     side, roof, rim, end = lanes * pitch / 2, DECK_M + 2.6 * r, TRAY_M + 0.9 * r, p.exit_m + p.tray_m
-    deep, outer, tunnel = (-side, side), (-side - wall, side + wall), (p.run_m, p.exit_m)
+    depth_span, outer, tunnel = (-side, side), (-side - wall, side + wall), (p.run_m, p.exit_m)
     rough_at = p.run_m + p.mouth_m + 2 * r + 0.04  # no ball feels it before it is wholly behind the occluder
-    after = rough_at + ROUGH_BOARD_M
+    rough_end = rough_at + ROUGH_BOARD_M
 
-    course.block("deck_in", (-0.03, rough_at), deep, (0, DECK_M), p.deck_colour)
-    course.block("deck_out", (after, p.exit_m), deep, (0, DECK_M), p.deck_colour)
+    course.block("deck_in", (-0.03, rough_at), depth_span, (0, DECK_M), p.deck_colour)
+    course.block("deck_out", (rough_end, p.exit_m), depth_span, (0, DECK_M), p.deck_colour)
     for i in range(lanes + 1):
         y = -side + i * pitch
         across, up = (y - 0.004, y + 0.004), (DECK_M, DECK_M + 0.4 * r)
@@ -97,12 +97,12 @@ def build(p: Params, physics: Physics) -> Scene:
     for i, ball in enumerate(p.balls):
         y = (i - (lanes - 1) / 2) * pitch
         board = Surface(2e-5 if i == p.clear_lane else _roughness(p, i, physics))
-        course.block(f"board_{i}", (rough_at, after), (y - pitch / 2, y + pitch / 2), (0, DECK_M), "black", board)
+        course.block(f"board_{i}", (rough_at, rough_end), (y - pitch / 2, y + pitch / 2), (0, DECK_M), "black", board)
         course.ball(ball, (p.starts_m[i], y, DECK_M + r), r, p.colours[i], speed=p.speeds_m_s[i])
     course.sides("tunnel", tunnel, side, wall, (0, roof), p.tunnel_colour)
     course.block("tunnel_roof", tunnel, outer, (roof, roof + wall), p.tunnel_colour)
-    felt = Surface(4e-4)  # the balls come to rest in view
-    course.block("tray", (p.exit_m, end), deep, (0, TRAY_M), p.tray_colour, felt)
+    surface = Surface(4e-4)  # the balls come to rest in view
+    course.block("tray", (p.exit_m, end), depth_span, (0, TRAY_M), p.tray_colour, surface)
     course.sides("tray", (p.exit_m, end), side, wall, (0, rim), p.tunnel_colour)
     course.block("tray_end", (end, end + wall), outer, (0, rim), p.tunnel_colour)
 
@@ -136,20 +136,20 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return the ball seen first after it was out of sight, once all are seen again."""
     colours = colours_of_balls(frames, slots, BALL_COLOURS)
     returns = [_return_frame(frames, colour) for colour in colours]
-    returned = [frame for frame in returns if frame is not None]
-    if not returned or len(returned) < len(returns) or returned.count(min(returned)) > 1:
+    return_frames = [frame for frame in returns if frame is not None]
+    if not return_frames or len(return_frames) < len(returns) or return_frames.count(min(return_frames)) > 1:
         return None
-    return colours[returned.index(min(returned))]
+    return colours[return_frames.index(min(return_frames))]
 
 
 def _return_frame(frames: np.ndarray, colour: str) -> int | None:
     """Return the first frame with half of the ball after the tunnel, None if none."""
     areas = np.array([_ball_pixels(frame, colour) for frame in frames])
-    gone = np.flatnonzero(areas == 0)
-    if not gone.size or areas[-3:].min() == 0:
+    frames_out_of_sight = np.flatnonzero(areas == 0)
+    if not frames_out_of_sight.size or areas[-3:].min() == 0:
         return None
     half_seen = np.flatnonzero(areas >= np.median(areas[-3:]) / 2)
-    return int(half_seen[half_seen > gone[0]][0])
+    return int(half_seen[half_seen > frames_out_of_sight[0]][0])
 
 
 def _ball_pixels(frame: np.ndarray, colour: str) -> int:

@@ -65,8 +65,8 @@ def _zones(rng: np.random.Generator, so_far: Drawn) -> tuple[Any, ...]:
     """Draw widths and colours of two or three zones, and the one that is asked for."""
     zones, width = int(rng.integers(2, 4)), uniform(rng, 1.10, 1.25)
     sides = so_far["sides"]
-    fall = sides[0] * (width / 2 - 0.52) if len(set(sides)) == 1 else 0.0  # about where the balls fall
-    edge = fall + float(rng.choice([-1, 1]) * rng.uniform(0.04, 0.17))
+    fall_at = sides[0] * (width / 2 - 0.52) if len(set(sides)) == 1 else 0.0  # about where the balls fall
+    edge = fall_at + float(rng.choice([-1, 1]) * rng.uniform(0.04, 0.17))
     edges = sorted([edge, edge - math.copysign(rng.uniform(0.22, 0.32), edge)]) if zones == 3 else [edge]
     widths = tuple(round(float(w), 4) for w in np.diff([-width / 2, *edges, width / 2]))
     return widths, distinct_colours(rng, zones, ZONE_COLOURS), int(rng.integers(zones))
@@ -181,13 +181,13 @@ def build(p: Params, physics: Physics) -> Scene:
 
 def _add_shelf(board: Board, p: Params, side: int) -> None:
     """Add a shelf from a side wall down towards the middle, as thick as a wall."""
-    slope, half = p.slope_rad, p.shelf_m(side) / 2
+    slope, half_length = p.slope_rad, p.shelf_m(side) / 2
     centre = (
-        p.lip_x_m(side) + side * (half * math.cos(slope) + WALL_M * math.sin(slope)),
-        p.lip_m + half * math.sin(slope) - WALL_M * math.cos(slope),
+        p.lip_x_m(side) + side * (half_length * math.cos(slope) + WALL_M * math.sin(slope)),
+        p.lip_m + half_length * math.sin(slope) - WALL_M * math.cos(slope),
         board.deep / 2,
     )
-    shelf = add_box(board.body, f"shelf_{side}", centre, (half, WALL_M, board.deep / 2), TRIM[p.board_colour])
+    shelf = add_box(board.body, f"shelf_{side}", centre, (half_length, WALL_M, board.deep / 2), TRIM[p.board_colour])
     shelf.friction, shelf.quat = list(FRICTION), turned(side * slope, 3)
 
 
@@ -203,8 +203,8 @@ def outcome(motion: Motion, p: Params) -> Reading:
     places = [place(motion, f"ball_{i}", p.tilt_deg) for i in range(BALLS)]
     across, up = (np.stack(values, axis=1) for values in zip(*places, strict=True))
     low, high = p.edges_m[p.asked : p.asked + 2]
-    inside, down = (across > low) & (across < high), up < p.rim_m
-    labels = [str(i.sum()) if d.all() else None for i, d in zip(inside, down, strict=True)]
+    is_inside, down = (across > low) & (across < high), up < p.rim_m
+    labels = [str(i.sum()) if d.all() else None for i, d in zip(is_inside, down, strict=True)]
     walls = [x for x in (low, high) if abs(x) < 0.49 * p.width_m]
     return Reading(labels, float(min(p.rim_m - up[-1].max(), *(np.abs(across[-1] - x).min() for x in walls))))
 
@@ -262,8 +262,10 @@ def _ground(frame: np.ndarray, colour: str) -> np.ndarray | None:
 
 def _home(ball: Blob, grounds: Mapping[str, np.ndarray | None]) -> str | None:
     """Return the colour of the zone that a ball's centre lies in."""
-    inside = (c for c, g in grounds.items() if g is not None and cv2.pointPolygonTest(g, (ball.x, ball.y), False) > 0)
-    return next(inside, None)
+    zones_around = (
+        c for c, g in grounds.items() if g is not None and cv2.pointPolygonTest(g, (ball.x, ball.y), False) > 0
+    )
+    return next(zones_around, None)
 
 
 FAMILY = scene_family(

@@ -79,13 +79,13 @@ def build(p: Params, physics: Physics) -> Scene:
     """Build a raised lane, floor and block before a board with pendulum and peg."""
     course = Course(physics, p.direction)
     r, side, rim, high = p.radius_m, 1.6 * p.radius_m, 0.012, p.pivot_z_m + 0.05
-    deep, top = (-side, side), FLOOR_M + p.lane_m
+    depth_span, top = (-side, side), FLOOR_M + p.lane_m
     end = p.block_at_m + p.block_height_m + 0.14  # the fallen block has room before it
     lip = p.pivot_at_m - 2 * r + 0.80 * r  # the ball touches it a little after it has touched the bob
 
-    course.block("lane_in", (-p.run_m, STEP_AT_M), deep, (0, top + STEP_M), p.lane_colour)
-    course.block("lane", (STEP_AT_M, lip + 0.008), deep, (0, top), p.lane_colour, Surface(3e-4))
-    course.block("lip", (lip, lip + 0.008), deep, (top, top + 0.25 * r), p.board_colour)
+    course.block("lane_in", (-p.run_m, STEP_AT_M), depth_span, (0, top + STEP_M), p.lane_colour)
+    course.block("lane", (STEP_AT_M, lip + 0.008), depth_span, (0, top), p.lane_colour, Surface(3e-4))
+    course.block("lip", (lip, lip + 0.008), depth_span, (top, top + 0.25 * r), p.board_colour)
     course.block("front_in", (-p.run_m, STEP_AT_M), (-side - rim, -side), (0, top + STEP_M + 0.3 * r), p.board_colour)
     course.block("back_in", (-p.run_m, 0), (side, side + rim), (0, top + STEP_M + 0.3 * r), p.board_colour)
     course.block("front", (STEP_AT_M, lip + 0.008), (-side - rim, -side), (0, top + 0.3 * r), p.board_colour)
@@ -95,8 +95,8 @@ def build(p: Params, physics: Physics) -> Scene:
     _add_pendulum(course, p, side)
     peg_z = p.pivot_z_m - PEG_DOWN * p.length_m
     course.rod("peg", (p.peg_at_m, -0.04, peg_z), (p.peg_at_m, side, peg_z), PEG_RADIUS_M, "yellow")
-    half = (p.block_half_m, 0.6 * side, p.block_height_m / 2)
-    course.free_box("block", (p.block_at_m, 0, FLOOR_M + p.block_height_m / 2), half, p.block_colour, density=400)
+    half_size = (p.block_half_m, 0.6 * side, p.block_height_m / 2)
+    course.free_box("block", (p.block_at_m, 0, FLOOR_M + p.block_height_m / 2), half_size, p.block_colour, density=400)
     course.ball("ball", (-p.run_m + 1.2 * r, 0, top + STEP_M + r), r, p.ball_colour, speed=p.speed_m_s)
     course.mark("bob", (p.pivot_at_m, side), p.bob_colour)
     course.mark("block", "block")
@@ -105,7 +105,7 @@ def build(p: Params, physics: Physics) -> Scene:
         decisive=["block"],
         hidden=["peg"],
         cover=course.box((0, end + 0.02), (-side - rim, side + 0.03), (0, high + 0.02), right=0.02),
-        in_view=[course.box((-p.run_m, end), deep, (0, high))],
+        in_view=[course.box((-p.run_m, end), depth_span, (0, high))],
         things=[f"{p.ball_colour} ball", f"{p.block_colour} block", f"{p.bob_colour} pendulum bob", "pendulum"],
         also=["lane", "board", "peg", "rod"],
         colours=["black", "yellow"],
@@ -130,8 +130,8 @@ def outcome(motion: Motion, p: Params) -> Reading:
     """Read 'yes' once the block's top is low, 'no' once the pendulum swings back."""
     top = top_m(motion, "block", p.block_height_m, FLOOR_M)
     swing = -p.direction * motion.rot("pendulum")[:, 0, 2]
-    fallen = top < p.block_height_m / 2
-    return Reading(yes_while(fallen, int(np.argmax(swing)) + 1), float(abs(top[-1] - p.block_height_m / 2)))
+    has_fallen = top < p.block_height_m / 2
+    return Reading(yes_while(has_fallen, int(np.argmax(swing)) + 1), float(abs(top[-1] - p.block_height_m / 2)))
 
 
 def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:

@@ -108,10 +108,10 @@ def build(p: Params, physics: Physics) -> Scene:
         bounce=(-20000.0, -12.0),
     )
     *rows, start = p.row_heights_m
-    top, whole = start + max(p.rises_m) + 2.5 * p.ball_radius_m, (-board.outer, board.outer)
+    top, full_width = start + max(p.rises_m) + 2.5 * p.ball_radius_m, (-board.outer, board.outer)
     frame = "black" if p.board_colour not in ("black", "purple", "blue") else "white"
-    board.block("plate", whole, (APRON_M, top), (-0.02, 0), p.board_colour)
-    board.block("apron", whole, (0, APRON_M), (-0.02, 0), "white")
+    board.block("plate", full_width, (APRON_M, top), (-0.02, 0), p.board_colour)
+    board.block("apron", full_width, (0, APRON_M), (-0.02, 0), "white")
     board.frame(APRON_M, top, frame)
     for i in range(1, p.buckets):
         board.divider(i, -board.side + i * p.pitch_m, (APRON_M, p.rim_m), WALL_M / 2, frame)
@@ -135,16 +135,16 @@ def build(p: Params, physics: Physics) -> Scene:
 
 def _add_digit(board: Board, digit: int, x: float) -> None:
     """Add a seven-segment digit on the apron, drawn only."""
-    half, pen = 0.024, 0.007  # half the digit's width, half a stroke
+    half_width, pen = 0.024, 0.007  # half the digit's width, half a stroke
     low, mid, high = 0.025, 0.07, 0.115
     strokes = {
-        "a": (0, high, half + pen, pen),
-        "g": (0, mid, half + pen, pen),
-        "d": (0, low, half + pen, pen),
-        "f": (-half, (mid + high) / 2, pen, (high - mid) / 2),
-        "b": (half, (mid + high) / 2, pen, (high - mid) / 2),
-        "e": (-half, (low + mid) / 2, pen, (mid - low) / 2),
-        "c": (half, (low + mid) / 2, pen, (mid - low) / 2),
+        "a": (0, high, half_width + pen, pen),
+        "g": (0, mid, half_width + pen, pen),
+        "d": (0, low, half_width + pen, pen),
+        "f": (-half_width, (mid + high) / 2, pen, (high - mid) / 2),
+        "b": (half_width, (mid + high) / 2, pen, (high - mid) / 2),
+        "e": (-half_width, (low + mid) / 2, pen, (mid - low) / 2),
+        "c": (half_width, (low + mid) / 2, pen, (mid - low) / 2),
     }
     for segment in SEGMENTS[digit]:
         right, up, half_x, half_y = strokes[segment]
@@ -203,9 +203,9 @@ def _digits(frame: np.ndarray, edge: tuple[np.ndarray, np.ndarray]) -> int:
     up = np.array([along[1], -along[0]])
     across, heights = np.linspace(0.02, 0.98, 600), np.linspace(*INK, 24)
     x, y = (left[i] + across * along[i] + heights[:, None] * up[i] for i in (0, 1))
-    inside = (x >= 0) & (x < frame.shape[1]) & (y >= 0) & (y < frame.shape[0])
+    is_inside = (x >= 0) & (x < frame.shape[1]) & (y >= 0) & (y < frame.shape[0])
     rows, columns = (np.clip(v.round().astype(int), 0, n - 1) for v, n in zip((y, x), frame.shape[:2], strict=True))
-    ink = ((frame[rows, columns].max(axis=2) < 110) & inside).any(axis=0).astype(np.uint8)
+    ink = ((frame[rows, columns].max(axis=2) < 110) & is_inside).any(axis=0).astype(np.uint8)
     ink = cv2.morphologyEx(ink[None], cv2.MORPH_CLOSE, np.ones((1, 9), np.uint8))[0]
     return int((np.diff(ink, prepend=0) == 1).sum())
 

@@ -52,11 +52,17 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build table with front and back wall, deflector, two bins, and a ramp behind."""
     course = Course(physics)
-    r, top, wide, rim, side = p.radius_m, p.table_m, p.half_width_m, p.table_m + 1.1 * p.radius_m, 1.5 * p.radius_m
+    r, top, half_width, rim, side = (
+        p.radius_m,
+        p.table_m,
+        p.half_width_m,
+        p.table_m + 1.1 * p.radius_m,
+        1.5 * p.radius_m,
+    )
 
-    course.block("table", (-wide, wide), (0, p.depth_m), (0, top), p.table_colour)
-    front = course.block("wall_front", (-wide, wide), (-WALL_M, 0), (0, rim), p.table_colour)
-    for name, x in (("left", (-wide, p.ramp_x_m - side)), ("right", (p.ramp_x_m + side, wide))):
+    course.block("table", (-half_width, half_width), (0, p.depth_m), (0, top), p.table_colour)
+    front = course.block("wall_front", (-half_width, half_width), (-WALL_M, 0), (0, rim), p.table_colour)
+    for name, x in (("left", (-half_width, p.ramp_x_m - side)), ("right", (p.ramp_x_m + side, half_width))):
         course.block(f"wall_{name}", x, (p.depth_m, p.depth_m + WALL_M), (0, rim), p.table_colour)
     turn = np.radians(90 + p.angle_deg if p.deflects == "left" else 90 - p.angle_deg) / 2
     centre = (p.ramp_x_m, p.deflector_m * float(np.cos(np.radians(p.angle_deg))) + 0.02, top + 0.9 * r)
@@ -75,7 +81,7 @@ def build(p: Params, physics: Physics) -> Scene:
     ramp.support(course, "support", p.ramp_m - 0.05, BOARD_M, 0.8 * side, p.ramp_colour)
     course.ball("ball", ramp.at(p.ramp_m - p.start_m, r), r, p.ball_colour)
 
-    high, out = top + 2 * r + 0.01, wide + p.bin_m + WALL_M
+    high, outer_x = top + 2 * r + 0.01, half_width + p.bin_m + WALL_M
     _, back, highest = ramp.at(p.ramp_m)
     for name in ("left", "right"):
         course.mark(f"{name} bin", f"bin_{name}")
@@ -83,9 +89,9 @@ def build(p: Params, physics: Physics) -> Scene:
         p,
         decisive=["ball"],
         hidden=["deflector"],
-        cover=course.box((-out, out), (-WALL_M - 0.01, p.depth_m), (0, high), right=0.02),
+        cover=course.box((-outer_x, outer_x), (-WALL_M - 0.01, p.depth_m), (0, high), right=0.02),
         in_view=[
-            course.box((-out, out), (-WALL_M, p.depth_m), (0, high)),
+            course.box((-outer_x, outer_x), (-WALL_M, p.depth_m), (0, high)),
             course.box((p.ramp_x_m - side, p.ramp_x_m + side), (back, back), (0, highest)),
         ],
         things=[f"{p.ball_colour} ball", "red bin", "blue bin", "ramp", "table"],
@@ -96,21 +102,21 @@ def build(p: Params, physics: Physics) -> Scene:
 
 def _add_bin(course: Course, p: Params, name: str, sign: int, colour: str) -> None:
     """Add an open box beside the table (sign -1: on the left), lower than it."""
-    near, far = p.half_width_m, p.half_width_m + p.bin_m
-    middle, half, depth = sign * (near + far) / 2, p.bin_m / 2, p.depth_m / 2
-    course.slab(f"bin_{name}", (middle, depth, 0.006), (half, depth, 0.006), colour).friction = [0.8, 0.005, 0.006]
+    near_x, far_x = p.half_width_m, p.half_width_m + p.bin_m
+    middle, half_bin, depth = sign * (near_x + far_x) / 2, p.bin_m / 2, p.depth_m / 2
+    course.slab(f"bin_{name}", (middle, depth, 0.006), (half_bin, depth, 0.006), colour).friction = [0.8, 0.005, 0.006]
     for end, y, high in (("front", -WALL_M / 2, 0.04), ("back", p.depth_m + WALL_M / 2, p.table_m)):
-        course.slab(f"bin_{name}_{end}", (middle, y, high / 2), (half, WALL_M / 2, high / 2), colour)
+        course.slab(f"bin_{name}_{end}", (middle, y, high / 2), (half_bin, WALL_M / 2, high / 2), colour)
     high = p.table_m + p.radius_m
-    at = (sign * (far + WALL_M / 2), depth, high / 2)
+    at = (sign * (far_x + WALL_M / 2), depth, high / 2)
     course.slab(f"bin_{name}_end", at, (WALL_M / 2, depth + WALL_M, high / 2), colour)
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
     """Read the end of the table that the ball is past, and by how far its middle."""
     x = motion.pos("ball")[:, 0]
-    past = np.abs(x) - p.half_width_m
-    return Reading(side_while(past > 0, x, "right", "left"), float(past[-1]))
+    past_m = np.abs(x) - p.half_width_m
+    return Reading(side_while(past_m > 0, x, "right", "left"), float(past_m[-1]))
 
 
 FAMILY = scene_family(

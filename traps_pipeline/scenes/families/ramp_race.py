@@ -85,8 +85,8 @@ def build(p: Params, physics: Physics) -> Scene:
     for i, (x, ramp) in enumerate(zip(tracks, ramps, strict=True)):
         across, colour = (x - side, x + side), p.track_colours[i]
         course.block(f"track_out_{i}", across, (p.tray_m, rough[0]), track, colour)
-        mat, rolling = (mat_colour, _roughness(p, i, physics)) if i == p.rough_track else (colour, 2e-5)
-        course.block(f"board_{i}", across, rough, track, mat).friction = [4.0, 0.005, rolling]
+        mat, rolling_friction = (mat_colour, _roughness(p, i, physics)) if i == p.rough_track else (colour, 2e-5)
+        course.block(f"board_{i}", across, rough, track, mat).friction = [4.0, 0.005, rolling_friction]
         course.block(f"track_in_{i}", across, (rough[1], foot + 0.01), track, colour)
         for k in (-1, 1):
             rail = (x + k * side - 0.004, x + k * side + 0.004)
@@ -97,19 +97,23 @@ def build(p: Params, physics: Physics) -> Scene:
         ramp.support(course, f"support_{i}", p.ramp_m - 0.05, BOARD_M, 0.8 * side, colour)
         course.ball(BALLS[i], ramp.at(p.starts_m[i], r), r, p.colours[i])
 
-    half = p.apart_m / 2 + side + 0.02
-    outer, deep, rim = (-half - WALL_M, half + WALL_M), (0, p.tray_m), (0, p.track_m + 0.01)
-    course.block("tray_floor", (-half, half), deep, (0, WALL_M), p.tray_colour).friction = [0.8, 0.005, 0.006]
+    half_width = p.apart_m / 2 + side + 0.02
+    outer, tray_depth, rim = (-half_width - WALL_M, half_width + WALL_M), (0, p.tray_m), (0, p.track_m + 0.01)
+    course.block("tray_floor", (-half_width, half_width), tray_depth, (0, WALL_M), p.tray_colour).friction = [
+        0.8,
+        0.005,
+        0.006,
+    ]
     course.block("tray_front", outer, (-WALL_M, 0), (0, 1.1 * r), p.tray_colour)
-    course.block("tray_side_-1", (outer[0], -half), deep, rim, p.tray_colour)
-    course.block("tray_side_1", (half, outer[1]), deep, rim, p.tray_colour)
-    course.block("divider", (-0.006, 0.006), deep, (0, 0.9 * r), p.tray_colour)
+    course.block("tray_side_-1", (outer[0], -half_width), tray_depth, rim, p.tray_colour)
+    course.block("tray_side_1", (half_width, outer[1]), tray_depth, rim, p.tray_colour)
+    course.block("divider", (-0.006, 0.006), tray_depth, (0, 0.9 * r), p.tray_colour)
 
     hidden_y = rough[1] + 1.8 * r + 0.03  # the ball that feels the rough board is behind the occluder with its shadow
     high = p.track_m + 2 * r + 0.015
     _, back, top = ramps[0].at(p.ramp_m)
-    beside = half if p.azimuth_deg < 94 else -half  # where no ball rolls behind the flag
-    course.mark("tray", (beside, p.tray_m), p.tray_colour)
+    flag_x = half_width if p.azimuth_deg < 94 else -half_width  # where no ball rolls behind the flag
+    course.mark("tray", (flag_x, p.tray_m), p.tray_colour)
     return course.scene(
         p,
         decisive=BALLS,

@@ -79,14 +79,14 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build deck, incline with its support and block, the board in the deck, and tray."""
     course = Course(physics, p.direction)
-    side, far, end = p.block_half_m[1] + 0.04, p.deck_end_m, p.deck_end_m + p.tray_m
-    deep, outer, tray = (-side, side), (-side - WALL_M, side + WALL_M), (p.deck_end_m, end)
+    side, deck_end, end = p.block_half_m[1] + 0.04, p.deck_end_m, p.deck_end_m + p.tray_m
+    depth_span, outer, tray = (-side, side), (-side - WALL_M, side + WALL_M), (p.deck_end_m, end)
 
-    deck = course.block("deck", (-OVERLAP_M, far), deep, (0, p.deck_m), p.deck_colour)
+    deck = course.block("deck", (-OVERLAP_M, deck_end), depth_span, (0, p.deck_m), p.deck_colour)
     ramp = Ramp(p.slope_deg, p.deck_m)
-    half = ((p.incline_m + OVERLAP_M / 2) / 2, side, INCLINE_M / 2)
+    half_size = ((p.incline_m + OVERLAP_M / 2) / 2, side, INCLINE_M / 2)
     middle = (p.incline_m - OVERLAP_M / 2) / 2
-    incline = ramp.board(course, "incline", middle, -INCLINE_M / 2, half, p.incline_colour)
+    incline = ramp.board(course, "incline", middle, -INCLINE_M / 2, half_size, p.incline_colour)
     for geom in (deck, incline):
         geom.friction, geom.priority = [p.deck_friction, 0.001, 0.0001], 1
     ramp.support(course, "support", p.incline_m - 0.05, INCLINE_M, 0.8 * side, p.deck_colour)
@@ -95,7 +95,7 @@ def build(p: Params, physics: Physics) -> Scene:
     turn = ramp.slope_rad / 2
     block.quat = [float(np.cos(turn)), 0.0, p.direction * float(np.sin(turn)), 0.0]
     _add_board(course, p, side)
-    course.block("tray_floor", tray, deep, (0, WALL_M), p.tray_colour)
+    course.block("tray_floor", tray, depth_span, (0, WALL_M), p.tray_colour)
     course.block("tray_front", tray, (outer[0], -side), (0, 0.03), p.tray_colour)
     course.block("tray_back", tray, (side, outer[1]), (0, 0.07), p.tray_colour)
     course.block("tray_end", (end, end + WALL_M), outer, (0, p.deck_m + 0.02), p.tray_colour)
@@ -109,7 +109,7 @@ def build(p: Params, physics: Physics) -> Scene:
         decisive=["block"],
         hidden=["board"],
         cover=course.box(along, across, (0, high), right=course.ahead(SHADOW_RIGHT * high)),
-        in_view=[course.box(along, outer, (0, p.deck_m)), course.box((highest[0], 0), deep, (0, highest[2]))],
+        in_view=[course.box(along, outer, (0, p.deck_m)), course.box((highest[0], 0), depth_span, (0, highest[2]))],
         things=[f"{p.block_colour} block", f"{p.tray_colour} tray", "incline", "deck"],
         also=["end"],
         shown_by={"end": ["deck"]},
@@ -119,19 +119,19 @@ def build(p: Params, physics: Physics) -> Scene:
 def _add_board(course: Course, p: Params, side: float) -> None:
     """Add the rough board, tilted a little; it stands out of the deck or stays below."""
     begin, end = p.board_span
-    half, thick = (end - begin) / 2, 0.03
-    rise = half * TILT_RAD - 0.001  # of its middle over the deck when the near edge is just below the surface
-    middle = (begin + half, 0, p.deck_m + rise - thick / 2 - (0.0 if p.rough else SUNK_M))
-    board = course.slab("board", middle, (half, side - 0.002, thick / 2), "black", falls_rad=-TILT_RAD)
+    half_length, thickness = (end - begin) / 2, 0.03
+    rise = half_length * TILT_RAD - 0.001  # of its middle over the deck when the near edge is just below the surface
+    middle = (begin + half_length, 0, p.deck_m + rise - thickness / 2 - (0.0 if p.rough else SUNK_M))
+    board = course.slab("board", middle, (half_length, side - 0.002, thickness / 2), "black", falls_rad=-TILT_RAD)
     board.friction, board.priority = [p.rough_friction, 0.005, 0.0001], 2
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
     """Read whether the block is off the deck, past its end; 'no' only once it rests."""
     block = motion.pos("block")
-    past = p.direction * block[:, 0] - p.deck_end_m
-    is_off = (past > 0) & (block[:, 2] < p.deck_m)
-    return Reading(yes_while(is_off, still_from(block, within_m=STILL_M)), float(abs(past[-1])))
+    past_m = p.direction * block[:, 0] - p.deck_end_m
+    is_off = (past_m > 0) & (block[:, 2] < p.deck_m)
+    return Reading(yes_while(is_off, still_from(block, within_m=STILL_M)), float(abs(past_m[-1])))
 
 
 BLOCK = partial(compact_blob, area=4500, shape=(0.3, 3.5), fill=0.4)

@@ -71,11 +71,13 @@ def build(p: Params, physics: Physics) -> Scene:
         for side_name, across_sign in (("front", -1), ("back", 1)):
             at = (along_sign * (p.span_m / 2 + POST_M), across_sign * p.deep_m / 2, high / 2)
             course.post(f"post_{end_name}_{side_name}", at, POST_M, high / 2, p.post_colour)
-    half, beside = p.cube_m / 2, outer + 0.12 + p.cube_m / 2 + course.ahead(0.22)
-    course.block("cube", (beside - half, beside + half), (-half, half), (0, p.cube_m), p.cube_colour)
+    half_cube, cube_at = p.cube_m / 2, outer + 0.12 + p.cube_m / 2 + course.ahead(0.22)
+    course.block(
+        "cube", (cube_at - half_cube, cube_at + half_cube), (-half_cube, half_cube), (0, p.cube_m), p.cube_colour
+    )
 
-    size, tied = (p.span_m, p.deep_m), (-1, 1) if p.ends_tied == 2 else (-1,)
-    hammock(course, "cloth", (0, 0, p.post_m), size, CELLS, p.cloth_colour, sag=p.sag_m, tied=tied)
+    size, tied_ends = (p.span_m, p.deep_m), (-1, 1) if p.ends_tied == 2 else (-1,)
+    hammock(course, "cloth", (0, 0, p.post_m), size, CELLS, p.cloth_colour, sag=p.sag_m, tied=tied_ends)
     course.ball("ball", (0, 0, p.release_m), p.radius_m, p.ball_colour, thrown=(p.drift_m_s, p.toss_m_s), density=350)
     course.mark("cloth", (0.55 * end, side), p.cloth_colour)
     course.mark("tray", (-0.55 * end, side), p.tray_colour)
@@ -86,7 +88,7 @@ def build(p: Params, physics: Physics) -> Scene:
         cover=course.box((-outer, outer), (-back, back + 0.06), (0, high + 0.02), left=0.01, right=SHADOW_RIGHT * high),
         in_view=[
             course.box((-outer, outer), (-back, back), (0, high)),
-            course.box((beside - half, beside + half), (-half, half), (0, p.cube_m)),
+            course.box((cube_at - half_cube, cube_at + half_cube), (-half_cube, half_cube), (0, p.cube_m)),
         ],
         things=[f"{p.ball_colour} ball", f"{p.cube_colour} cube", f"{p.cloth_colour} cloth", f"{p.tray_colour} tray"],
         also=["post", "board"],
@@ -96,10 +98,10 @@ def build(p: Params, physics: Physics) -> Scene:
 def outcome(motion: Motion, p: Params) -> Reading:
     """Read 'no' once the ball is below half the posts' height, 'yes' if it stays up."""
     ball = motion.pos("ball")
-    over = ball[:, 2] - p.post_m / 2
-    first = lasting_from(over < 0) if over[-1] < 0 else still_from(ball, within_m=STILL_M)
-    label = "no" if over[-1] < 0 else "yes"
-    return Reading([label if i >= first else None for i in range(len(over))], float(abs(over[-1])))
+    over_m = ball[:, 2] - p.post_m / 2
+    first = lasting_from(over_m < 0) if over_m[-1] < 0 else still_from(ball, within_m=STILL_M)
+    label = "no" if over_m[-1] < 0 else "yes"
+    return Reading([label if i >= first else None for i in range(len(over_m))], float(abs(over_m[-1])))
 
 
 def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
@@ -108,8 +110,8 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     rows, columns = np.nonzero(colour_mask(frames[-1], slots["cloth"]))
     if len(rows) < CLOTH_PX or not is_at_rest(path, tolerance_px=4):
         return None
-    wide, high = (float(np.ptp(np.percentile(along, (1, 99)))) for along in (columns, rows))
-    return "yes" if wide > 1.2 * high else "no"
+    width, height = (float(np.ptp(np.percentile(along, (1, 99)))) for along in (columns, rows))
+    return "yes" if width > 1.2 * height else "no"
 
 
 FAMILY = scene_family(

@@ -67,12 +67,12 @@ def build(p: Params, physics: Physics) -> Scene:
     course = Course(physics, p.direction)
     r, lane, side = p.radius_m, -LANE * p.disc_m, p.disc_m + 0.025
     start, end, rim = -side - p.run_m, side + 0.12, (0, TABLE_M + 0.035)
-    deep, outer, floor = (-side, side), (-side - RIM_M, side + RIM_M), (0, TABLE_M)
+    depth_span, outer, floor = (-side, side), (-side - RIM_M, side + RIM_M), (0, TABLE_M)
 
     gripping = Surface(1e-4)
     course.block("lane", (start - 0.07, -side), (lane - 1.5 * r, lane + 1.5 * r), floor, p.table_colour, gripping)
-    course.block("table", deep, deep, floor, p.table_colour, gripping)
-    course.block("tray", (side, end), deep, floor, p.table_colour, Surface(4e-3))
+    course.block("table", depth_span, depth_span, floor, p.table_colour, gripping)
+    course.block("tray", (side, end), depth_span, floor, p.table_colour, Surface(4e-3))
     course.sides("rim", (-side, end), side, RIM_M, rim, p.rim_colour)
     course.block("rim_end", (end, end + RIM_M), outer, (0, TABLE_M + 0.06), p.rim_colour)
     for i, colour in enumerate(p.sectors):  # thin, and nothing touches them
@@ -82,8 +82,8 @@ def build(p: Params, physics: Physics) -> Scene:
         course.hull(f"sector_{i}", [(x, y, z) for z in heights for x, y in corners], colour)
     _add_pointer(course, p)
     # The peg stands just past the angle at which it is to stop the pointer.
-    wide = np.degrees(np.arcsin((PEG_M + POINTER_HALF_M) / PEG_AT_M))
-    along, across = _place(PEG_AT_M, FIRST_DEG + (p.stop_sector + p.stop_at) * p.sector_deg + wide)
+    stop_angle = np.degrees(np.arcsin((PEG_M + POINTER_HALF_M) / PEG_AT_M))
+    along, across = _place(PEG_AT_M, FIRST_DEG + (p.stop_sector + p.stop_at) * p.sector_deg + stop_angle)
     peg = course.post("peg", (along, across, TABLE_M + 0.03), PEG_M, 0.03, "white")
     peg.solref, peg.priority = [0.02, 4], 1  # overdamped: the pointer does not bounce back
     at = (start, lane, TABLE_M + r)
@@ -114,11 +114,11 @@ def _place(radius: float, angle_deg: float) -> tuple[float, float]:
 
 def _add_pointer(course: Course, p: Params) -> None:
     """Add a bar that turns about the hub; it starts at the near side."""
-    half = POINTER * p.disc_m / 2
+    half_pointer = POINTER * p.disc_m / 2
     body = course.hinge("pointer", (0, 0, TABLE_M + 0.03), axis=(0, 0, p.direction), damping=2e-4)
     joint = body.first_joint()
     joint.frictionloss, joint.armature = 0.003, 0.002
-    bar = add_box(body, "pointer", (0, -half, 0), (POINTER_HALF_M, half, 0.016), POINTER_COLOUR)
+    bar = add_box(body, "pointer", (0, -half_pointer, 0), (POINTER_HALF_M, half_pointer, 0.016), POINTER_COLOUR)
     bar.density, bar.friction = 300, [0.1, 0.005, 0.0001]
     course.post("hub", (0, 0, 0), 0.026, 0.022, POINTER_COLOUR, body=body).density = 300
 

@@ -72,21 +72,21 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build ledge, stop or strip, tower and tray."""
     course = Course(physics, p.direction)
-    r, half_w, deep = p.radius_m, p.block_width_m / 2, (-HALF_DEPTH_M, HALF_DEPTH_M)
+    r, half_w, depth_span = p.radius_m, p.block_width_m / 2, (-HALF_DEPTH_M, HALF_DEPTH_M)
     ledge = p.strike * p.block_height_m - r  # height of the ledge that the ball rolls on
     ledge_end, end = -half_w - 0.02, half_w + p.tray_m
     strip = (ledge_end - 2 * r - 0.03 - STRIP_M, ledge_end - 2 * r - 0.03)
-    screened = strip[0] - 2 * r - 0.05
-    start = screened - p.run_m + r
+    occluder_at = strip[0] - 2 * r - 0.05
+    start = occluder_at - p.run_m + r
 
     is_strip, rough = p.kind == "strip", Surface(0.03)
     for name, along, surface, colour in (
-        ("ledge_in", (start - 0.06, screened + 2 * r), Surface(1e-4), p.ledge_colour),
-        ("felt", (screened + 2 * r, strip[0]), FELT, p.ledge_colour),
+        ("ledge_in", (start - 0.06, occluder_at + 2 * r), Surface(1e-4), p.ledge_colour),
+        ("felt", (occluder_at + 2 * r, strip[0]), FELT, p.ledge_colour),
         ("strip", strip, rough if p.barred and is_strip else FELT, "black" if is_strip else p.ledge_colour),
         ("ledge_out", (strip[1], ledge_end), FELT, p.ledge_colour),
     ):
-        course.block(name, along, deep, (0, ledge), colour, surface)
+        course.block(name, along, depth_span, (0, ledge), colour, surface)
     if p.kind == "stop":
         y = 0.0 if p.barred else HALF_DEPTH_M - 0.018
         course.block("stop", (strip[1] - 0.05, strip[1]), (y - 0.018, y + 0.018), (ledge, ledge + 1.6 * r), "black")
@@ -94,12 +94,12 @@ def build(p: Params, physics: Physics) -> Scene:
     course.block("wall_front", (half_w + 0.02, end), (-0.165, -0.15), (0, 0.03), p.tray_colour)
     course.block("wall_end", (end, end + 0.015), (-0.165, 0.165), (0, 0.16), p.tray_colour)
     colours = [p.block_colours[i % len(p.block_colours)] for i in range(p.blocks - 1)] + [p.top_colour]
-    half = (half_w, half_w, p.block_height_m / 2)
-    course.tower(p.names, half, colours, density=300, sliding=0.35, solref=(0.006, 1))
+    half_size = (half_w, half_w, p.block_height_m / 2)
+    course.tower(p.names, half_size, colours, density=300, sliding=0.35, solref=(0.006, 1))
     at = (start, 0, ledge + r)
     course.ball("ball", at, r, p.ball_colour, speed=p.speed_m_s, rolling=1e-4, sliding=0.3, density=2500)
 
-    view_box = course.box((screened, end + 0.02), (-0.165, 0.165), (0, p.tower_m))
+    view_box = course.box((occluder_at, end + 0.02), (-0.165, 0.165), (0, p.tower_m))
     right = max(view_box.high[0], SHADOW_RIGHT * p.tower_m + half_w) + course.ahead(0.07) - view_box.high[0]
     across = (-0.17, half_w + SHADOW_BACK * p.tower_m)
     course.mark("block", p.names[-1])
@@ -107,7 +107,7 @@ def build(p: Params, physics: Physics) -> Scene:
         p,
         decisive=[p.names[-1]],
         hidden=[p.kind],
-        cover=course.box((screened, end + 0.02), across, (0, p.tower_m + 0.02), right=right),
+        cover=course.box((occluder_at, end + 0.02), across, (0, p.tower_m + 0.02), right=right),
         in_view=[view_box],
         things=[
             f"{p.ball_colour} ball",

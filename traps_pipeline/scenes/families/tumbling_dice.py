@@ -56,8 +56,8 @@ def _turns(rng: np.random.Generator, so_far: Drawn) -> tuple[tuple[float, ...], 
 
 def _starts(rng: np.random.Generator, so_far: Drawn) -> tuple[tuple[float, ...], ...]:
     """Draw the starts in a zigzag, so that dice do not touch before they land."""
-    dice, half, ahead = so_far["dice"], so_far["half_m"], so_far["ahead"]
-    lanes = [(i - (dice - 1) / 2) * 2.5 * half for i in range(dice)]
+    dice, half_edge, ahead = so_far["dice"], so_far["half_m"], so_far["ahead"]
+    lanes = [(i - (dice - 1) / 2) * 2.5 * half_edge for i in range(dice)]
     return tuple(
         (uniform(rng, 0.13, 0.17) + 0.24 * ((i + ahead) % 2), round(y, 4), uniform(rng, 0.22, 0.34))
         for i, y in enumerate(lanes)
@@ -127,8 +127,8 @@ def build(p: Params, physics: Physics) -> Scene:
     course.block("wall_back", (-WALL_M, end + WALL_M), back, (0, high + 2 * p.half_m), "wood")
     for i, along in enumerate(treads):  # a low front wall that follows the steps, so that it hides nothing
         course.block(f"front_{i}", along, front, (0, p.floor_m(i) + 0.5 * p.half_m), "wood")
-    whole = (-WALL_M, end + WALL_M)
-    panes = {"front": (whole, front), "back": (whole, back)}
+    full_width = (-WALL_M, end + WALL_M)
+    panes = {"front": (full_width, front), "back": (full_width, back)}
     panes |= {"top": ((-WALL_M, 0), (-side, side)), "end": ((end, end + WALL_M), (-side, side))}
     for name, (along, across) in panes.items():
         glass = course.block(f"fence_{name}", along, across, (0, high + 1.0), "white")
@@ -140,7 +140,7 @@ def build(p: Params, physics: Physics) -> Scene:
     scene = course.scene(
         p,
         decisive=dice,
-        in_view=[course.box(whole, (front[0], back[1]), (0, TRAY_M))],
+        in_view=[course.box(full_width, (front[0], back[1]), (0, TRAY_M))],
         also=["die", "step", "tray", "wall", "face"],
         colours=sorted({*FACES, *p.edge_colours, "grey", "wood"}),
     )
@@ -160,15 +160,15 @@ def _add_glass_edges(course: Course, along: tuple[float, float], side: float, up
 
 def _add_die(course: Course, p: Params, i: int) -> None:
     """Add a cube in the edge colour with a thin plate, only drawn, on every face."""
-    (along, across, above), h, edge = p.starts_m[i], p.half_m, p.edge_colours[i]
-    body = course.free_box(f"die_{i}", (along, across, p.floor_m(0) + above), (h, h, h), edge, density=600.0)
+    (along, across, height), h, edge = p.starts_m[i], p.half_m, p.edge_colours[i]
+    body = course.free_box(f"die_{i}", (along, across, p.floor_m(0) + height), (h, h, h), edge, density=600.0)
     body.quat, cube = list(p.turns[i]), body.first_geom()
     if edge != "black":
         cube.material = "bright"
     cube.friction, cube.solref, cube.priority, cube.condim = [0.5, 0.003, 0.0001], [-6000.0, -p.bounce], 1, 4
     for colour, normal in zip(p.faces[i], NORMALS, strict=True):
-        half = [0.0015 if n else PLATE * h for n in normal]
-        add_box(body, f"die_{i}_{colour}", [h * n for n in normal], half, colour, contype=0, conaffinity=0, mass=0)
+        half_size = [0.0015 if n else PLATE * h for n in normal]
+        add_box(body, f"die_{i}_{colour}", [h * n for n in normal], half_size, colour, contype=0, conaffinity=0, mass=0)
 
 
 def _short_of_tray(motion: Motion, p: Params) -> tuple[np.ndarray, np.ndarray]:
@@ -182,18 +182,18 @@ def _first_die(motion: Motion, p: Params) -> tuple[int, int] | None:
 
     By the look of it, a die may reach the tray when it is past the steps or when it lands.
     """
-    along, above = _short_of_tray(motion, p)
-    firsts = [_first(has_reached, motion.times) for has_reached in (along <= 0, np.maximum(along, above) <= 0)]
+    along, height = _short_of_tray(motion, p)
+    firsts = [_first(has_reached, motion.times) for has_reached in (along <= 0, np.maximum(along, height) <= 0)]
     return firsts[1] if firsts[0] and firsts[1] and firsts[0][0] == firsts[1][0] else None
 
 
 def _first(has_reached: np.ndarray, times: np.ndarray) -> tuple[int, int] | None:
     """Return the first die (column) to reach something, and the frame; None if close."""
-    arrivals = np.where(has_reached.any(axis=0), times[has_reached.argmax(axis=0)], math.inf)
-    first, second = np.sort(arrivals)[:2]
+    arrival_times = np.where(has_reached.any(axis=0), times[has_reached.argmax(axis=0)], math.inf)
+    first, second = np.sort(arrival_times)[:2]
     if math.isinf(first) or second - first < LEAD_S - 1e-9:
         return None
-    die = int(arrivals.argmin())
+    die = int(arrival_times.argmin())
     return die, int(has_reached[:, die].argmax())
 
 
@@ -216,18 +216,18 @@ def outcome(motion: Motion, p: Params) -> Reading:
     die, arrival = first
     top, lean = _lean(motion, die)
     steps = np.linalg.norm(np.diff(motion.pos(f"die_{die}"), axis=0, prepend=math.inf), axis=1)
-    lies = (lean < FLAT_RAD) & (steps < STILL * 2 * p.half_m) & (np.arange(len(top)) > arrival)
+    is_lying = (lean < FLAT_RAD) & (steps < STILL * 2 * p.half_m) & (np.arange(len(top)) > arrival)
     lead = np.min(np.delete(np.maximum(*_short_of_tray(motion, p))[arrival], die))
     rise = 2 * p.half_m * math.sin(max(0.0, math.pi / 4 - lean[-1]))
-    labels = [p.faces[die][face] if lying else None for face, lying in zip(top, lies, strict=True)]
+    labels = [p.faces[die][face] if does_lie else None for face, does_lie in zip(top, is_lying, strict=True)]
     return Reading(labels, float(min(lead, rise)), _in_order(motion, p, die))
 
 
 def _in_order(motion: Motion, p: Params, die: int) -> tuple[int, int]:
     """Return the frames from which the first die, and another, are past the steps."""
-    past = _short_of_tray(motion, p)[0] <= 0
-    others: np.ndarray = np.delete(past, die, axis=1).max(axis=1)
-    return int(past[:, die].argmax()), int(others.argmax()) if others.any() else len(past)
+    is_past = _short_of_tray(motion, p)[0] <= 0
+    is_other_past: np.ndarray = np.delete(is_past, die, axis=1).max(axis=1)
+    return int(is_past[:, die].argmax()), int(is_other_past.argmax()) if is_other_past.any() else len(is_past)
 
 
 def legible(motion: Motion, p: Params) -> list[tuple[tuple[str, ...], float]]:
@@ -293,16 +293,16 @@ def _sight(frame: np.ndarray, edge: str) -> _Sight | None:
 
 def _tray_edge(frames: np.ndarray) -> tuple[int, float, float] | None:
     """Return the steps' end, x = slope y + offset, and the tray's side (+1: right)."""
-    still = np.median(frames, axis=0).astype(np.uint8)
-    shade = still.mean(axis=2)
-    grey = (np.ptp(still, axis=2) < 22) & (shade > 125) & (shade < 185)
-    wooden = colour_mask(still, "wood").astype(np.uint8)
+    median_frame = np.median(frames, axis=0).astype(np.uint8)
+    shade = median_frame.mean(axis=2)
+    grey = (np.ptp(median_frame, axis=2) < 22) & (shade > 125) & (shade < 185)
+    wooden = colour_mask(median_frame, "wood").astype(np.uint8)
     wood = np.nonzero(wooden)[1]
     solid = cv2.findNonZero(cv2.morphologyEx(wooden, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8)))
     if solid is None:
         return None
-    around = cv2.convexHull(solid)
-    grey &= cv2.fillConvexPoly(np.zeros(grey.shape, np.uint8), around, 1) > 0  # a floor may be grey as well
+    hull = cv2.convexHull(solid)
+    grey &= cv2.fillConvexPoly(np.zeros(grey.shape, np.uint8), hull, 1) > 0  # a floor may be grey as well
     tray = next(iter(blobs(grey, 400)), None)
     if tray is None:
         return None
@@ -313,10 +313,10 @@ def _tray_edge(frames: np.ndarray) -> tuple[int, float, float] | None:
     if len(rows) < 5:
         return None
     slope, offset = np.polyfit(rows, edge, 1)
-    near = np.abs(edge - slope * np.array(rows) - offset) < 6
-    if near.sum() < 5:
+    is_near = np.abs(edge - slope * np.array(rows) - offset) < 6
+    if is_near.sum() < 5:
         return None
-    slope, offset = np.polyfit(np.array(rows)[near], edge[near], 1)
+    slope, offset = np.polyfit(np.array(rows)[is_near], edge[is_near], 1)
     return side, float(slope), float(offset)
 
 
@@ -328,33 +328,33 @@ def _first_over(
         return None
     side, slope, offset = edge
     for sights in zip(*dice, strict=True):
-        past = [
+        is_past = [
             -math.inf if s is None else side * (s.x - slope * (s.y + 0.3 * s.size) - offset)  # where it stands
             for s in sights
         ]
-        if max(past) > 0:
-            return dice[int(np.argmax(past))]
+        if max(is_past) > 0:
+            return dice[int(np.argmax(is_past))]
     return None
 
 
 def _has_come_to_rest(frames: np.ndarray, path: Sequence[_Sight | None]) -> bool:
     """Return whether a die lies still by itself; a frozen clip stops all at once."""
     places = np.array([(math.nan, math.nan) if sight is None else (sight.x, sight.y) for sight in path])
-    lies = np.linalg.norm(places - np.median(places[-3:], axis=0), axis=1) <= NEAR_PX
-    if lies.all() or not lies[-3:].all():
+    is_lying = np.linalg.norm(places - np.median(places[-3:], axis=0), axis=1) <= NEAR_PX
+    if is_lying.all() or not is_lying[-3:].all():
         return False
-    since = int(np.flatnonzero(~lies)[-1]) + 1
-    changes = np.abs(np.diff(frames[since:].astype(np.int16), axis=0)).max(axis=3) > 40
+    rest_frame = int(np.flatnonzero(~is_lying)[-1]) + 1
+    changes = np.abs(np.diff(frames[rest_frame:].astype(np.int16), axis=0)).max(axis=3) > 40
     if (changes.sum(axis=(1, 2)) > 60).sum() >= 2:
         return True
-    steps = np.linalg.norm(np.diff(places[max(since - 2, 0) : since + 1], axis=0), axis=1)
+    steps = np.linalg.norm(np.diff(places[max(rest_frame - 2, 0) : rest_frame + 1], axis=0), axis=1)
     return bool(steps[-1] <= LAST_STEP_PX and steps[0] <= 2 * LAST_STEP_PX)
 
 
 def _upper_face(frame: np.ndarray, die: _Sight) -> str | None:
     """Return the colour of the upper face, the highest in the picture."""
     faces = {colour: blobs(colour_mask(frame, colour) & die.outline, 60) for colour in FACES}
-    heights = {colour: found[0].y for colour, found in faces.items() if found}
+    heights = {colour: blobs_of_face[0].y for colour, blobs_of_face in faces.items() if blobs_of_face}
     return min(heights, key=lambda colour: heights[colour], default=None)
 
 

@@ -56,17 +56,17 @@ def build(p: Params, physics: Physics) -> Scene:
     """Build a ramp, a road with an end wall, and a bridge on four legs across it."""
     course = Course(physics, p.direction)
     r, end, side = p.radius_m, p.bridge_m + p.beyond_m, 1.6 * p.radius_m
-    deep, road = (-side, side), (0, ROAD_M)
+    depth_span, road = (-side, side), (0, ROAD_M)
     stop = 0.62 * p.bridge_m + r  # where the kerb's face is: the ball rests in the middle of the bridge
     bed = (stop - 3.5 * r, stop)  # rough: a ball that bounces off the kerb stays there
 
-    course.block("road_in", (-p.flat_m, bed[0]), deep, road, p.road_colour, Surface(1e-4))
-    course.block("road_bed", bed, deep, road, p.road_colour, Surface(0.003))
-    course.block("road_out", (bed[1], end), deep, road, p.road_colour, Surface(0.004))
-    course.block("end_wall", (end, end + 0.015), deep, (0, ROAD_M + 1.4 * r), p.road_colour)
+    course.block("road_in", (-p.flat_m, bed[0]), depth_span, road, p.road_colour, Surface(1e-4))
+    course.block("road_bed", bed, depth_span, road, p.road_colour, Surface(0.003))
+    course.block("road_out", (bed[1], end), depth_span, road, p.road_colour, Surface(0.004))
+    course.block("end_wall", (end, end + 0.015), depth_span, (0, ROAD_M + 1.4 * r), p.road_colour)
     start = _add_ramp(course, p, side)
     _add_bridge(course, p)
-    along, across, up = (stop, stop + 0.04), deep, (ROAD_M, ROAD_M + 0.9 * r)
+    along, across, up = (stop, stop + 0.04), depth_span, (ROAD_M, ROAD_M + 0.9 * r)
     if not p.blocked:
         along, across, up = (stop + 0.02 - side, stop + 0.02 + side), (side, side + 0.04), (0, 0.9 * r)
     course.block("kerb", along, across, up, p.kerb_colour, Surface(0.001, sliding=0.2))
@@ -80,7 +80,7 @@ def build(p: Params, physics: Physics) -> Scene:
         hidden=["kerb"],
         cover=course.cover((p.mouth_m, end + 0.015), (front, side + 0.04), high),
         in_view=[
-            course.box((-(p.flat_m + p.ramp_m), end), deep, (0, high)),
+            course.box((-(p.flat_m + p.ramp_m), end), depth_span, (0, high)),
             course.box((0, p.bridge_m), (front, -front), (0, top)),
         ],
         things=[
@@ -97,15 +97,15 @@ def build(p: Params, physics: Physics) -> Scene:
 
 def _add_ramp(course: Course, p: Params, side: float) -> Vec3:
     """Add the ramp down to the road; return where the ball starts on it."""
-    slope, thick = float(np.radians(p.slope_deg)), 0.012
+    slope, thickness = float(np.radians(p.slope_deg)), 0.012
     length = p.ramp_m / np.cos(slope)
     foot = np.array([-p.flat_m, ROAD_M])
     up, normal = np.array([-np.cos(slope), np.sin(slope)]), np.array([np.sin(slope), np.cos(slope)])
-    middle = foot + up * length / 2 - normal * thick
-    course.slab("ramp", (middle[0], 0, middle[1]), (length / 2, side, thick), p.ramp_colour, falls_rad=slope)
-    top = foot + up * (length - 0.03) - normal * thick
-    half = (top[1] - 0.008) / 2
-    course.slab("ramp_post", (top[0], 0, half), (0.02, side * 0.8, half), p.ramp_colour)
+    middle = foot + up * length / 2 - normal * thickness
+    course.slab("ramp", (middle[0], 0, middle[1]), (length / 2, side, thickness), p.ramp_colour, falls_rad=slope)
+    top = foot + up * (length - 0.03) - normal * thickness
+    half_height = (top[1] - 0.008) / 2
+    course.slab("ramp_post", (top[0], 0, half_height), (0.02, side * 0.8, half_height), p.ramp_colour)
     ball = foot + up * (length - 1.2 * p.radius_m) + normal * p.radius_m
     return float(ball[0]), 0.0, float(ball[1])
 

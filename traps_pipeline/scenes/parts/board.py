@@ -97,8 +97,8 @@ class Board:
     def block(self, name: str, across: Span, up: Span, out: Span, colour: str, *, solid: bool = True) -> mujoco.MjsGeom:
         """Return a box of the board from its three spans; without solid, paint only."""
         spans = (across, up, out)
-        centre, half = [sum(s) / 2 for s in spans], [(s[1] - s[0]) / 2 for s in spans]
-        geom = add_box(self.body, name, centre, half, colour)
+        centre, half_size = [sum(s) / 2 for s in spans], [(s[1] - s[0]) / 2 for s in spans]
+        geom = add_box(self.body, name, centre, half_size, colour)
         if self._friction is not None:
             geom.friction = list(self._friction)
         if not solid:
@@ -111,12 +111,12 @@ class Board:
 
     def frame(self, bottom: float, top: float, colour: str, *, sill: bool = True) -> None:
         """Add sill, head and sides from `bottom` to `top`, and the glass, never drawn."""
-        side, outer, out = self.side, self.outer, (0, self.deep)
+        side, outer, depth_span = self.side, self.outer, (0, self.deep)
         if sill:
-            self.block("sill", (-outer, outer), (bottom - 2 * WALL_M, bottom), out, colour)
-        self.block("head", (-outer, outer), (top, top + 2 * WALL_M), out, colour)
-        self.block("left", (-outer, -side), (bottom, top), out, colour)
-        self.block("right", (side, outer), (bottom, top), out, colour)
+            self.block("sill", (-outer, outer), (bottom - 2 * WALL_M, bottom), depth_span, colour)
+        self.block("head", (-outer, outer), (top, top + 2 * WALL_M), depth_span, colour)
+        self.block("left", (-outer, -side), (bottom, top), depth_span, colour)
+        self.block("right", (side, outer), (bottom, top), depth_span, colour)
         glass = self.block("glass", (-outer, outer), (bottom, top), (self.deep, self.deep + 0.02), "white")
         glass.rgba, glass.friction, glass.priority = [1, 1, 1, 0], [0, 0, 0], 1
 
@@ -124,12 +124,12 @@ class Board:
         """Add a lively post up to the glass: round, or square with a corner up."""
         import mujoco
 
-        half = self.deep / 2
+        half_depth = self.deep / 2
         post = self.body.add_geom(
             name=name,
             type=mujoco.mjtGeom.mjGEOM_BOX if square else mujoco.mjtGeom.mjGEOM_CYLINDER,
-            pos=[*at, half],
-            size=[radius, radius if square else half, half],
+            pos=[*at, half_depth],
+            size=[radius, radius if square else half_depth, half_depth],
             rgba=rgba(colour),
         )
         post.solref, post.priority, post.condim, post.friction = list(self._bounce), 1, 6, [0.3, 0.002, 0.0001]
@@ -183,9 +183,9 @@ class Board:
 
     def region(self, up: Span, out: float) -> Box:
         """Return the box around a strip of the board from side to side, `out` thick (m)."""
-        corners = np.array([self.up * height + self.normal * away for height in up for away in (0.0, out)])
-        (_, near, low), (_, far, high) = corners.min(axis=0).tolist(), corners.max(axis=0).tolist()
-        return Box((-self.outer, near, low + LIFT_M), (self.outer, far, high + LIFT_M))
+        corners = np.array([self.up * height + self.normal * distance for height in up for distance in (0.0, out)])
+        (_, near_y, low), (_, far_y, high) = corners.min(axis=0).tolist(), corners.max(axis=0).tolist()
+        return Box((-self.outer, near_y, low + LIFT_M), (self.outer, far_y, high + LIFT_M))
 
     def ends(self, top: float) -> tuple[Box, ...]:
         """Return the board's lower and the frame's upper edge, which must be in frame."""

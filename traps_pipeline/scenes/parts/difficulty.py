@@ -136,28 +136,30 @@ def draw_distractors(
     whole clip.
     """
     low, high, front = float(points[:, 0].min()), float(points[:, 0].max()), float(points[:, 1].min())
-    hides = 2 / np.tan(np.radians(max(-scene.view.elevation_deg, LEAST_DOWN_DEG)))  # so many radii behind a ball
-    most = RADIUS[1] * (high - low)
+    hidden_depth = 2 / np.tan(np.radians(max(-scene.view.elevation_deg, LEAST_DOWN_DEG)))  # so many radii behind a ball
+    max_radius = RADIUS[1] * (high - low)
     texts = (wording.question, wording.answerable_question.question)
     words = {*re.findall(r"\w+", " ".join((*texts, *wording.answerable_question.labels, *wording.labels)).lower())}
-    asked = re.findall(r"\w+", wording.question)
-    coloured = dict.fromkeys((*asked, *scene.inventory.colours))
-    named: list[Colour] = [BALL_COLOURS[word] for word in coloured if word in BALL_COLOURS]
-    taken = words | {*scene.inventory.colours}
+    question_words = re.findall(r"\w+", wording.question)
+    coloured = dict.fromkeys((*question_words, *scene.inventory.colours))
+    named_colours: list[Colour] = [BALL_COLOURS[word] for word in coloured if word in BALL_COLOURS]
+    taken_colours = words | {*scene.inventory.colours}
     things = list[Distractor]()
     for number, lane in enumerate(rng.permutation(count)):
-        like = named[(number // 2) % len(named)]
-        near = [] if number % 2 == 0 else _like_and_free(like, taken | {thing.colour for thing in things})
-        shape: Shape = "ball" if near else "puck"
+        like = named_colours[(number // 2) % len(named_colours)]
+        similar_colours = (
+            [] if number % 2 == 0 else _like_and_free(like, taken_colours | {thing.colour for thing in things})
+        )
+        shape: Shape = "ball" if similar_colours else "puck"
         ahead = getattr(p, "direction", 0) if shape == "ball" else 0
-        radius, towards = rng.uniform(*RADIUS) * (high - low), ahead or int(rng.choice([-1, 1]))
-        way, begins = rng.uniform(*WAY), 0.0 if ahead else rng.uniform(0.0, 1.0)
+        radius, direction = rng.uniform(*RADIUS) * (high - low), ahead or int(rng.choice([-1, 1]))
+        path_share, start_share = rng.uniform(*WAY), 0.0 if ahead else rng.uniform(0.0, 1.0)
         room = high - low - 2 * radius
-        start = begins * (1 - way) * room
-        x = low + radius + start if towards > 0 else high - radius - start
-        y = front - most * (1 + hides + LANE * int(lane))
-        colour = near[int(rng.integers(len(near)))] if near else like
-        speed = towards * way * room / duration_s
+        start = start_share * (1 - path_share) * room
+        x = low + radius + start if direction > 0 else high - radius - start
+        y = front - max_radius * (1 + hidden_depth + LANE * int(lane))
+        colour = similar_colours[int(rng.integers(len(similar_colours)))] if similar_colours else like
+        speed = direction * path_share * room / duration_s
         things.append(Distractor(shape, colour, (round(x, 4), round(y, 4)), round(radius, 4), round(speed, 4)))
     return tuple(things)
 
@@ -165,8 +167,8 @@ def draw_distractors(
 def _like_and_free(colour: str, taken: Collection[str]) -> list[Colour]:
     """Return free colours that are easily taken for a colour, else all free ones."""
     free: list[Colour] = [other for word, other in BALL_COLOURS.items() if word not in taken]
-    alike: list[Colour] = [other for other in free if {colour, other} in LOOK_ALIKE]
-    return alike or free
+    similar_colours: list[Colour] = [other for other in free if {colour, other} in LOOK_ALIKE]
+    return similar_colours or free
 
 
 # --- building ---------------------------------------------------------------------------------------------------------
@@ -193,11 +195,11 @@ def _add(spec: mujoco.MjSpec, name: str, thing: Distractor) -> None:
     import mujoco
 
     ball = thing.shape == "ball"
-    half = thing.radius_m if ball else PUCK_HALF * thing.radius_m
-    body = spec.worldbody.add_body(name=name, pos=[*thing.place_m, half])
+    half_height = thing.radius_m if ball else PUCK_HALF * thing.radius_m
+    body = spec.worldbody.add_body(name=name, pos=[*thing.place_m, half_height])
     body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[1, 0, 0])
     geom = body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_SPHERE if ball else mujoco.mjtGeom.mjGEOM_CYLINDER)
-    geom.size, geom.rgba = [thing.radius_m, 0 if ball else half, 0], rgba(thing.colour)
+    geom.size, geom.rgba = [thing.radius_m, 0 if ball else half_height, 0], rgba(thing.colour)
     geom.contype = geom.conaffinity = 0
 
 

@@ -86,8 +86,8 @@ def add_domino(course: Course, size: Size, domino: Domino, row_at: float) -> Non
     h = size.height_m
     x = (row_at + domino.place * size.spacing) * h
     at = (x, h * (size.width + 0.10), size.thickness * h / 2) if domino.aside else (x, 0.0, (PLANK + 0.5) * h)
-    half = (size.thickness * h / 2, size.width * h / 2, h / 2)
-    body = course.free_box(domino.name, at, half, domino.colour, density=500, sliding=0.2, solref=(0.006, 1))
+    half_size = (size.thickness * h / 2, size.width * h / 2, h / 2)
+    body = course.free_box(domino.name, at, half_size, domino.colour, density=500, sliding=0.2, solref=(0.006, 1))
     if domino.aside:
         body.quat = [0.5**0.5, 0, 0.5**0.5, 0]
 

@@ -27,17 +27,17 @@ def dependence(family: Family) -> str | None:
     scenes = [_worlds(family, family.draw(np.random.default_rng(seed))) for seed in range(DRAWS)]
     hidden = sorted({name for scene, *twins in scenes for twin in twins for name in scene if twin[name] != scene[name]})
     keys = [[[world[name] for name in hidden] for world in worlds] for worlds in scenes]
-    drawn_index = np.array([sorted(of_worlds).index(of_worlds[0]) for of_worlds in keys])
+    drawn_index = np.array([sorted(world_keys).index(world_keys[0]) for world_keys in keys])
     numbers = np.array([len(worlds) for worlds in scenes])
     for number in np.unique(numbers):  # which of three lanes, which of four: each number of worlds by itself
-        chosen = np.flatnonzero(numbers == number)
-        if number < 2 or len(chosen) < 4 * LEAST_EXPECTED * number:
+        draw_indices = np.flatnonzero(numbers == number)
+        if number < 2 or len(draw_indices) < 4 * LEAST_EXPECTED * number:
             continue
-        columns = _rows([_flat({k: v for k, v in scenes[i][0].items() if k not in hidden}) for i in chosen])
+        columns = _rows([_flat({k: v for k, v in scenes[i][0].items() if k not in hidden}) for i in draw_indices])
         tables = [((name,), rows) for name, rows in columns.items()]
         tables += [((a, b), columns[a] * (columns[b].max() + 1) + columns[b]) for a, b in combinations(columns, 2)]
         for names, rows in tables:
-            if _is_associated(drawn_index[chosen], _pooled(rows, LEAST_EXPECTED * int(number))):
+            if _is_associated(drawn_index[draw_indices], _pooled(rows, LEAST_EXPECTED * int(number))):
                 return f"`{', '.join(hidden)}` goes with {' and '.join(f'`{name}`' for name in names)}"
     return None
 
@@ -45,12 +45,12 @@ def dependence(family: Family) -> str | None:
 def _worlds(family: Family, params: Any) -> list[dict[str, Any]]:
     """Return a scene, its twins, their twins and so on, each once, up to MOST_WORLDS."""
     assert family.twins is not None
-    worlds, waiting = [], [params]
-    while waiting and len(worlds) < MOST_WORLDS:
-        world = waiting.pop(0)
+    worlds, queue = [], [params]
+    while queue and len(worlds) < MOST_WORLDS:
+        world = queue.pop(0)
         if world not in worlds:
             worlds.append(world)
-            waiting += family.twins(world)
+            queue += family.twins(world)
     return [params_to_dict(world) for world in worlds]
 
 

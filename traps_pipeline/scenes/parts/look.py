@@ -79,9 +79,9 @@ class Look:
                 raise ValueError(f"look: no tone {name!r}; there are {', '.join(TONES)}")
         if look.panel not in (None, *OCCLUDERS):
             raise ValueError(f"look: no panel {look.panel!r}; there are {', '.join(OCCLUDERS)}")
-        for name, allowed in (("material", MATERIALS), ("size", SIZES)):
-            if getattr(look, name) not in allowed:
-                raise ValueError(f"look: no {name} {getattr(look, name)!r}; there are {', '.join(allowed)}")
+        for name, allowed_values in (("material", MATERIALS), ("size", SIZES)):
+            if getattr(look, name) not in allowed_values:
+                raise ValueError(f"look: no {name} {getattr(look, name)!r}; there are {', '.join(allowed_values)}")
         return look
 
 
@@ -137,8 +137,8 @@ def fineness(params: Any) -> int:
 def frame_size(record: Mapping[str, Any]) -> tuple[int, int]:
     """Return width and height (px) of the clips of a record, from its parameters."""
     look = record.get("look")
-    fine = 1 if look is None else SIZES[Look.from_record(look).size]
-    return WIDTH * fine, HEIGHT * fine
+    scale = 1 if look is None else SIZES[Look.from_record(look).size]
+    return WIDTH * scale, HEIGHT * scale
 
 
 def paint_occluders(spec: mujoco.MjSpec, occluders: Sequence[mujoco.MjsGeom], params: Any) -> None:
@@ -163,9 +163,11 @@ def paint_occluders(spec: mujoco.MjSpec, occluders: Sequence[mujoco.MjsGeom], pa
     material.texuniform, material.texrepeat = True, [LINES_PER_M] * 2
     for geom in occluders:
         geom.material, geom.rgba = "occluder", [1, 1, 1, 1]
-        wide, thick, tall = (float(half) for half in geom.size)  # a texture lies in a box's own x and y: stand it up
+        width, thickness, height = (
+            float(half_size) for half_size in geom.size
+        )  # a texture lies in a box's own x and y: stand it up
         cos, _, _, sin = (float(part) for part in geom.quat)
-        geom.size, geom.quat = [wide, tall, thick], [part / np.sqrt(2) for part in (cos, cos, sin, sin)]
+        geom.size, geom.quat = [width, height, thickness], [part / np.sqrt(2) for part in (cos, cos, sin, sin)]
 
 
 def apply_look(scene: Scene, look: Look | None) -> Scene:
@@ -179,10 +181,13 @@ def apply_look(scene: Scene, look: Look | None) -> Scene:
     if SIZES[look.size] > 1:  # a renderer reads from the model how fine it draws
         scale = SUPERSAMPLE * SIZES[look.size]
         scene.spec.visual.global_.offwidth, scene.spec.visual.global_.offheight = WIDTH * scale, HEIGHT * scale
-    around, up = look.orbit_deg
+    azimuth_turn, elevation_turn = look.orbit_deg
     view = scene.view
     return replace(
-        scene, view=replace(view, azimuth_deg=view.azimuth_deg + around, elevation_deg=view.elevation_deg + up)
+        scene,
+        view=replace(
+            view, azimuth_deg=view.azimuth_deg + azimuth_turn, elevation_deg=view.elevation_deg + elevation_turn
+        ),
     )
 
 
@@ -201,9 +206,12 @@ def _add_bystanders(scene: Scene, look: Look) -> None:
     corners = np.concatenate([box.corners() for box in (*scene.framed, *([scene.cover] if scene.cover else []))])
     middle, back = float(corners[:, 0].mean()), float(corners[:, 1].max())
     for i, (place, tone) in enumerate(zip(look.bystanders, look.bystander_tones, strict=True)):
-        across, behind, half, tall = place
+        across, distance_behind, half_width, half_height = place
         box = scene.spec.worldbody.add_geom(name=f"bystander_{i}", type=mujoco.mjtGeom.mjGEOM_BOX)
-        box.pos, box.size = [middle + across, back + behind + half, tall], [half, half, tall]
+        box.pos, box.size = (
+            [middle + across, back + distance_behind + half_width, half_height],
+            [half_width, half_width, half_height],
+        )
         box.rgba, box.contype, box.conaffinity = [*TONES[tone], 1], 0, 0
 
 

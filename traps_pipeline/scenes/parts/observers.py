@@ -65,8 +65,10 @@ def offered(slots: Mapping[str, str], otherwise: Sequence[str]) -> Sequence[str]
 
 def colours_of_balls(frames: np.ndarray, slots: Mapping[str, str], pool: Sequence[str]) -> Sequence[str]:
     """Return the offered colours, or else those of the pool that a ball has at first."""
-    at_first = [colour for colour in pool if sum(compact_blob(frame, colour) is not None for frame in frames[:3]) >= 2]
-    return offered(slots, at_first)
+    ball_colours = [
+        colour for colour in pool if sum(compact_blob(frame, colour) is not None for frame in frames[:3]) >= 2
+    ]
+    return offered(slots, ball_colours)
 
 
 def round_blob(frame: np.ndarray, colour: str, *, fill: float = 0.9, longer: float = 1.9) -> Blob | None:
@@ -84,8 +86,8 @@ def is_upper_half_in_place(frames: np.ndarray, colour: str, first: Blob) -> bool
     """Return whether a thing's upper half is in the last frame where it was at first."""
     x, y, width, height = first.box
     part = np.s_[y : y + height // 2, x : x + width]
-    before, after = (colour_mask(frame, colour)[part] for frame in (frames[0], frames[-1]))
-    return bool((before & after).sum() > 0.7 * before.sum())
+    mask_before, mask_after = (colour_mask(frame, colour)[part] for frame in (frames[0], frames[-1]))
+    return bool((mask_before & mask_after).sum() > 0.7 * mask_before.sum())
 
 
 # --- where a thing comes to be ---------------------------------------------------------------------------------------
@@ -106,9 +108,9 @@ def carried_on(path: Sequence[Blob | None], ahead: float) -> Blob | None:
     index, last = sightings[-1]
     if len(sightings) == 1 or index - sightings[-2][0] > LOST + 1:
         return last
-    before, frames = sightings[-2], ahead + len(path) - 1 - index
-    steps = frames / (index - before[0])
-    dx, dy = steps * (last.x - before[1].x), steps * (last.y - before[1].y)
+    previous_sighting, frames = sightings[-2], ahead + len(path) - 1 - index
+    steps = frames / (index - previous_sighting[0])
+    dx, dy = steps * (last.x - previous_sighting[1].x), steps * (last.y - previous_sighting[1].y)
     x, y, width, height = last.box
     return replace(last, x=last.x + dx, y=last.y + dy, box=(round(x + dx), round(y + dy), width, height))
 
@@ -121,8 +123,8 @@ def is_struck(frames: np.ndarray, thing: Blob, reach: float) -> bool:
 def around(thing: Blob, reach: float) -> tuple[slice, slice]:
     """Return the slices of a frame around a thing, with a margin in its longer sides."""
     x, y, width, height = thing.box
-    beside = round(reach * max(width, height))
-    return slice(max(0, y - beside), y + height + beside), slice(max(0, x - beside), x + width + beside)
+    margin = round(reach * max(width, height))
+    return slice(max(0, y - margin), y + height + margin), slice(max(0, x - margin), x + width + margin)
 
 
 # --- observers --------------------------------------------------------------------------------------------------------
@@ -210,8 +212,8 @@ def reaches(thing: str, goal: str, foot: float | None = None, ahead: float | Non
         first, last = path[0], end_of(path, ahead)
         if first is None or last is None or box is None or is_occluder(last) or is_occluder(box):
             return None
-        way = np.array([box.x, box.y]) - place(first)
-        return "yes" if (place(last) - place(first)) @ way / (way @ way) > 0.6 else "no"
+        direction = np.array([box.x, box.y]) - place(first)
+        return "yes" if (place(last) - place(first)) @ direction / (direction @ direction) > 0.6 else "no"
 
     return observe
 
@@ -248,16 +250,20 @@ def will_clear(thing: str, mark: str) -> Observer:
 
     def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
         path, wall = track(frames, slots[thing], 60), largest(frames[-1], slots[mark], 60)
-        start, now, soon = next((blob for blob in path if blob), None), carried_on(path, 0.0), carried_on(path, 1.0)
-        if wall is None or start is None or now is None or soon is None:
+        start, now, later_blob = (
+            next((blob for blob in path if blob), None),
+            carried_on(path, 0.0),
+            carried_on(path, 1.0),
+        )
+        if wall is None or start is None or now is None or later_blob is None:
             return None
         side = 1.0 if wall.x > start.x else -1.0
-        lead, speed = side * (now.x - wall.x), side * (soon.x - now.x)
+        lead, speed = side * (now.x - wall.x), side * (later_blob.x - now.x)
         if lead > 0:
             return "yes"
         if speed <= 0 or lead + FLIGHT * speed < 0:
             return "no"  # it comes back, or does not get there
-        height = now.y - lead / speed * (soon.y - now.y)
+        height = now.y - lead / speed * (later_blob.y - now.y)
         return "yes" if height < wall.box[1] else "no"
 
     return foresee

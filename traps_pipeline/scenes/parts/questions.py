@@ -40,9 +40,9 @@ class Question:
 
     def word(self, p: Any, rng: np.random.Generator, asides: Sequence[Aside]) -> Wording:
         """Word the question and one of the asides; a sole aside costs no draw."""
-        filled = self.fill(p, rng)
-        text = str(rng.choice(self.templates)).format_map({**part_colours(p), **filled.fills})
-        return Wording(text, filled.labels, filled.aliases, _one_of(asides, rng)(p, rng))
+        question = self.fill(p, rng)
+        text = str(rng.choice(self.templates)).format_map({**part_colours(p), **question.fills})
+        return Wording(text, question.labels, question.aliases, _one_of(asides, rng)(p, rng))
 
     def slots_in(self, question: str) -> dict[str, str] | None:
         """Return what fills this question's placeholders; None if it is another one."""
@@ -75,8 +75,8 @@ def left_or_right(*templates: str, forms: Forms, colours: Callable[[Any], tuple[
     """
 
     def fill(p: Any, rng: np.random.Generator) -> Filled:
-        of_sides = ("", "") if colours is None else colours(p)
-        sides = tuple(zip(("left", "right"), of_sides, strict=True))
+        side_colours = ("", "") if colours is None else colours(p)
+        sides = tuple(zip(("left", "right"), side_colours, strict=True))
         return Filled(("left", "right"), {form.format(*side): side[0] for side in sides for form in forms}, {})
 
     return Question("direction", templates, fill)
@@ -170,8 +170,8 @@ def colour_from(part: str, question: str, pool: Sequence[str], unlike: Sequence[
     def ask(p: Any, rng: np.random.Generator) -> AnswerableQuestion:
         colours = part_colours(p)
         excluded = [colours[name] for name in unlike]
-        others = [str(c) for c in rng.permutation([c for c in pool if c not in excluded])[:2]]
-        return choice_of(question, lambda p: [colours[part], *others], lambda p: colours[part])(p, rng)
+        other_colours = [str(c) for c in rng.permutation([c for c in pool if c not in excluded])[:2]]
+        return choice_of(question, lambda p: [colours[part], *other_colours], lambda p: colours[part])(p, rng)
 
     return ask
 

@@ -37,8 +37,8 @@ class Ramp:
     def at(self, up: float, over: float = 0.0, aside: float = 0.0) -> Vec3:
         """Return a point on the slope in the course's coordinates."""
         sin, cos = float(np.sin(self.slope_rad)), float(np.cos(self.slope_rad))
-        away, high = self.foot_m + up * cos - over * sin, self.height_m + up * sin + over * cos
-        return (self.middle_m + aside, away, high) if self.towards_camera else (-away, aside, high)
+        distance, height = self.foot_m + up * cos - over * sin, self.height_m + up * sin + over * cos
+        return (self.middle_m + aside, distance, height) if self.towards_camera else (-distance, aside, height)
 
     def board(
         self,
@@ -62,8 +62,8 @@ class Ramp:
     def support(self, course: Course, name: str, up: float, under: float, half_width: float, colour: str) -> None:
         """Add a post from the ground to a depth under the surface."""
         x, y, z = self.at(up, -under)
-        half = (half_width, 0.02, z / 2) if self.towards_camera else (0.02, half_width, z / 2)
-        course.slab(name, (x, y, z / 2), half, colour)
+        half_size = (half_width, 0.02, z / 2) if self.towards_camera else (0.02, half_width, z / 2)
+        course.slab(name, (x, y, z / 2), half_size, colour)
 
 
 @dataclass(frozen=True)
@@ -86,8 +86,8 @@ class SteppedRamp:
     def add(self, course: Course, half_width: float, colour: str) -> mujoco.MjsGeom:
         """Add the board `ramp` and the `prop` under its upper end; return the board."""
         slope, half_thick = np.radians(self.slope_deg), 0.012
-        half = (self.length_m / 2 / float(np.cos(slope)), half_width, half_thick)
-        ramp = course.slab("ramp", self.at(self.length_m / 2, -half_thick), half, colour, falls_rad=float(slope))
+        half_size = (self.length_m / 2 / float(np.cos(slope)), half_width, half_thick)
+        ramp = course.slab("ramp", self.at(self.length_m / 2, -half_thick), half_size, colour, falls_rad=float(slope))
         top = self.at(0.05)[2] / 2 - 0.012
         course.slab("prop", (0.05, 0, top), (0.012, half_width, top), colour)
         return ramp

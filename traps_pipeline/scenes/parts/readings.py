@@ -29,8 +29,10 @@ def still_from(*paths: np.ndarray, within_m: float) -> int:
 
     A path is (F,), a place along a line, or (F, ..., 3), places in space.
     """
-    moves = [np.abs(path - path[-1]) if path.ndim == 1 else np.linalg.norm(path - path[-1], axis=-1) for path in paths]
-    restless = [(move > within_m).reshape(len(move), -1).any(axis=1) for move in moves]
+    distances = [
+        np.abs(path - path[-1]) if path.ndim == 1 else np.linalg.norm(path - path[-1], axis=-1) for path in paths
+    ]
+    restless = [(move > within_m).reshape(len(move), -1).any(axis=1) for move in distances]
     return lasting_from(~np.any(restless, axis=0))
 
 
@@ -91,13 +93,13 @@ def first_past(motion: Motion, ahead: np.ndarray, names: Sequence[str], min_lead
     There is no reading if a competitor never gets past or the lead is below `min_lead_s`. The margin is how far the
     second still is from the line when the first is past it.
     """
-    past = ahead > 0
-    margin = float(-np.sort(ahead[int(past.any(axis=1).argmax())])[-2])
-    arrivals = motion.times[past.argmax(axis=0)]
-    first, second = np.sort(arrivals)[:2]
-    if not past[-1].all() or second - first < min_lead_s:
+    is_past = ahead > 0
+    margin = float(-np.sort(ahead[int(is_past.any(axis=1).argmax())])[-2])
+    arrival_times = motion.times[is_past.argmax(axis=0)]
+    first, second = np.sort(arrival_times)[:2]
+    if not is_past[-1].all() or second - first < min_lead_s:
         return Reading(undecided(motion), margin)
-    winner, frames = names[int(arrivals.argmin())], np.sort(past.argmax(axis=0))
+    winner, frames = names[int(arrival_times.argmin())], np.sort(is_past.argmax(axis=0))
     labels = [winner if t >= first else None for t in motion.times]
     return Reading(labels, margin, (int(frames[0]), int(frames[1])))
 

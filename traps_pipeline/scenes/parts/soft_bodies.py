@@ -74,8 +74,8 @@ def hammock(
     for body in _vertices(course, name):
         along, across = (2 * (float(body.pos[i]) - middle[i] * (course.direction, 1)[i]) / size[i] for i in (0, 1))
         body.pos[2] -= sag * (1 - along**2) * (1 - 0.4 * across**2)
-        at_corner = abs(along) > 1 - 1e-6 and abs(across) > 1 - 1e-6
-        if at_corner and round(along) * course.direction in tied:
+        is_corner = abs(along) > 1 - 1e-6 and abs(across) > 1 - 1e-6
+        if is_corner and round(along) * course.direction in tied:
             knot = course.spec.add_equality(type=mujoco.mjtEq.mjEQ_CONNECT, objtype=mujoco.mjtObj.mjOBJ_BODY)
             knot.name1, knot.name2 = body.name, "world"
     return flex

@@ -160,7 +160,7 @@ def _hidden(values: Callable[[Mapping[str, Any]], Sequence[Any]]) -> Any:
 
 def hidden_field(params: type) -> str | None:
     """Return the hidden element's name, None if none. Raises TypeError if several."""
-    names = [each.name for each in fields(params) if _HIDDEN in each.metadata]
+    names = [member.name for member in fields(params) if _HIDDEN in member.metadata]
     if len(names) > 1:
         raise TypeError(f"{params.__module__}: several hidden elements {names}; a scene has one")
     return names[0] if names else None
@@ -171,14 +171,14 @@ def twins(p: Any) -> list[Any]:
     name = hidden_field(type(p))
     if name is None:
         raise TypeError(f"{type(p).__module__}: no field of Params is `hidden(...)`, so there are no twins")
-    values = {each.name: each for each in fields(p)}[name].metadata[_HIDDEN](vars(p))
+    values = {member.name: member for member in fields(p)}[name].metadata[_HIDDEN](vars(p))
     return [replace(p, **{name: value}) for value in values if value != getattr(p, name)]
 
 
 def with_field(params: type, name: str, kind: Any) -> type:
     """Return the class with a last field, None by default, that is not drawn."""
-    read = field(default=None, metadata={READ: lambda value: None if value is None else kind.from_record(value)})
-    extended = make_dataclass(params.__name__, [(name, kind | None, read)], bases=(params,), frozen=True)
+    new_field = field(default=None, metadata={READ: lambda value: None if value is None else kind.from_record(value)})
+    extended = make_dataclass(params.__name__, [(name, kind | None, new_field)], bases=(params,), frozen=True)
     extended.__module__, extended.__doc__ = params.__module__, params.__doc__
     return extended
 
@@ -192,16 +192,16 @@ def check(p: Any) -> None:
     A number may lie outside of its range by the width of the range, as a correction may need.
     """
     types = _types(type(p))
-    for each in fields(p):
-        value = getattr(p, each.name)
+    for member in fields(p):
+        value = getattr(p, member.name)
         try:
-            types[each.name].validate_python(value, strict=True)
+            types[member.name].validate_python(value, strict=True)
         except ValidationError as error:
-            raise ValueError(f"parameter {each.name} is {_short_repr(value)}: {error.errors()[0]['msg']}") from None
+            raise ValueError(f"parameter {member.name} is {_short_repr(value)}: {error.errors()[0]['msg']}") from None
         for member in _members(value):
             if isinstance(member, float) and not np.isfinite(member):
-                raise ValueError(f"parameter {each.name} is {_short_repr(value)}; it must be finite")
-            _check_member(p, each, member)
+                raise ValueError(f"parameter {member.name} is {_short_repr(value)}; it must be finite")
+            _check_member(p, member, member)
 
 
 @cache
@@ -214,8 +214,8 @@ def _check_member(p: Any, each: Field[Any], value: Any) -> None:
         low, high = bounds
         if not low - (high - low) <= value <= high + (high - low):
             raise ValueError(f"parameter {each.name} is {_short_repr(value)}; it is drawn from {low} to {high}")
-    hides = each.metadata.get(_HIDDEN)
-    values = tuple(hides(vars(p))) if hides else each.metadata.get(_VALUES)
+    hidden_values = each.metadata.get(_HIDDEN)
+    values = tuple(hidden_values(vars(p))) if hidden_values else each.metadata.get(_VALUES)
     difficulty = getattr(p, "difficulty", None)
     if difficulty is not None and difficulty.longer and isinstance(each.metadata.get(_LONGER), tuple):
         values = each.metadata[_LONGER] or values
@@ -243,7 +243,7 @@ def is_longer(so_far: Mapping[str, Any]) -> bool:
 
 def can_be_longer(params: type) -> bool:
     """Return whether some field has longer ranges."""
-    return any(each.metadata.get(_LONGER) for each in fields(params))
+    return any(member.metadata.get(_LONGER) for member in fields(params))
 
 
 def draw_params(params: type[Params], rng: np.random.Generator, longer: bool = False) -> Params:
@@ -253,28 +253,30 @@ def draw_params(params: type[Params], rng: np.random.Generator, longer: bool = F
     """
     so_far: Drawn = {_LONGER: True} if longer else {}
     members = fields(params)  # type: ignore[arg-type]
-    for each in members:
-        if each.name in so_far or each.default is not MISSING:
+    for member in members:
+        if member.name in so_far or member.default is not MISSING:
             continue
-        draw = each.metadata.get(_HOW)
+        draw = member.metadata.get(_HOW)
         if draw is None:
-            raise TypeError(f"{params.__module__}: Params.{each.name} has no range; write it as `= between(low, high)`")
+            raise TypeError(
+                f"{params.__module__}: Params.{member.name} has no range; write it as `= between(low, high)`"
+            )
         if isinstance(draw, Group):
             so_far |= _of_group(draw, members, rng, so_far)
         else:
-            so_far[each.name] = draw(rng, so_far)
-    return params(**{each.name: so_far[each.name] for each in members if each.name in so_far})
+            so_far[member.name] = draw(rng, so_far)
+    return params(**{member.name: so_far[member.name] for member in members if member.name in so_far})
 
 
 def _of_group(group: Group, members: Sequence[Field[Any]], rng: np.random.Generator, so_far: Drawn) -> Drawn:
     """Return the values of all fields of a group."""
-    counts = {each.name: each.metadata[_COUNT] for each in members if each.metadata.get(_HOW) is group}
+    counts = {member.name: member.metadata[_COUNT] for member in members if member.metadata.get(_HOW) is group}
     numbers = {name: 1 if count is None else _number(count, so_far) for name, count in counts.items()}
     values = list(group.draw(rng, so_far, sum(numbers.values())))
     field_values: Drawn = {}
     for name, number in numbers.items():
-        chosen, values = values[:number], values[number:]
-        field_values[name] = chosen[0] if counts[name] is None else tuple(chosen)
+        member_values, values = values[:number], values[number:]
+        field_values[name] = member_values[0] if counts[name] is None else tuple(member_values)
     return field_values
 
 

@@ -253,16 +253,16 @@ def _beyond_video(inventory: Inventory) -> Iterator[str]:
 
 
 def _false_premises(inventory: Inventory, rng: np.random.Generator) -> Iterator[str]:
-    absent = [thing for thing in ABSENT_OBJECTS if thing not in inventory.objects]
+    absent_objects = [thing for thing in ABSENT_OBJECTS if thing not in inventory.objects]
     colours = [colour for colour in ABSENT_COLOURS if is_far(colour, inventory.colours)]
-    present = [colour for colour in inventory.colours if colour in _COLOUR_WORDS]
+    colour_words = [colour for colour in inventory.colours if colour in _COLOUR_WORDS]
     for template in _FALSE_PREMISES:
         if "{colour}" in template and not colours:
             continue
         for _ in range(6):
             yield template.format(
-                absent=rng.choice(absent),
+                absent=rng.choice(absent_objects),
                 colour=rng.choice(colours) if colours else "",
-                present=rng.choice(present),
+                present=rng.choice(colour_words),
                 object=rng.choice(inventory.objects),
             )

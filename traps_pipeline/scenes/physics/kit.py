@@ -174,8 +174,8 @@ class Motion:
         """Return points of a body, its middle and three beside it, or vertices, (F, N, 3)."""
         if body in self.vertices:
             return self.vertices[body]
-        beside = np.pad(self.rot(body).swapaxes(1, 2), ((0, 0), (1, 0), (0, 0)))
-        return self.pos(body)[:, None] + beside_m * beside
+        offsets = np.pad(self.rot(body).swapaxes(1, 2), ((0, 0), (1, 0), (0, 0)))
+        return self.pos(body)[:, None] + beside_m * offsets
 
 
 @dataclass(frozen=True)
@@ -259,16 +259,16 @@ class Family:
                 f"family {self.name}: unknown parameters {unknown}, missing parameters {missing}; "
                 f"known: {sorted(field_of)}"
             )
-        read = {name: field_of[name].metadata.get(READ, _as_tuple) for name in values}
-        params = self.params(**{name: read[name](value) for name, value in values.items()})
+        reader_of = {name: field_of[name].metadata.get(READ, _as_tuple) for name in values}
+        params = self.params(**{name: reader_of[name](value) for name, value in values.items()})
         self.check(params)
         return params
 
 
 def params_to_dict(params: Any) -> dict[str, Any]:
     """Return a family's parameters as a plain mapping, without a missing look."""
-    absent = {each.name for each in fields(params) if each.default is None and getattr(params, each.name) is None}
-    return {name: value for name, value in asdict(params).items() if name not in absent}
+    unset = {m.name for m in fields(params) if m.default is None and getattr(params, m.name) is None}
+    return {name: value for name, value in asdict(params).items() if name not in unset}
 
 
 def _as_tuple(value: Any) -> Any:
@@ -388,9 +388,9 @@ LOOK_ALIKE = (
 def distinct_colours(rng: np.random.Generator, count: int, pool: Sequence[str]) -> tuple[str, ...]:
     """Return `count` colours of the pool, no two of which look alike."""
     for _ in range(1000):
-        chosen = tuple(str(c) for c in rng.permutation(list(pool))[:count])
-        if len(chosen) == count and not any(pair <= set(chosen) for pair in LOOK_ALIKE):
-            return chosen
+        colours = tuple(str(c) for c in rng.permutation(list(pool))[:count])
+        if len(colours) == count and not any(pair <= set(colours) for pair in LOOK_ALIKE):
+            return colours
     raise ValueError(f"no {count} distinct colours among {list(pool)}; enlarge the pool")
 
 

@@ -71,18 +71,18 @@ def swept_points(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
     import mujoco
 
     data = mujoco.MjData(model)
-    moving = np.flatnonzero(model.body_dofnum[model.geom_bodyid] > 0)
+    moving_geoms = np.flatnonzero(model.body_dofnum[model.geom_bodyid] > 0)
     signs = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, 8).T
-    centre, half = model.geom_aabb[moving, :3], model.geom_aabb[moving, 3:]
-    local = centre[:, None] + signs[None] * half[:, None]
+    centre, half_size = model.geom_aabb[moving_geoms, :3], model.geom_aabb[moving_geoms, 3:]
+    local = centre[:, None] + signs[None] * half_size[:, None]
     points, soft = [], flexes(model).values()
     for row in qpos:
         data.qpos[:] = row
         mujoco.mj_kinematics(model, data)
-        rotation = data.geom_xmat[moving].reshape(-1, 3, 3)
-        points.append(np.einsum("gij,gkj->gki", rotation, local) + data.geom_xpos[moving][:, None])
+        rotation = data.geom_xmat[moving_geoms].reshape(-1, 3, 3)
+        points.append(np.einsum("gij,gkj->gki", rotation, local) + data.geom_xpos[moving_geoms][:, None])
         for flex in soft:
             at, reach = vertices(model, data, flex)[elements(model, flex)], float(model.flex_radius[flex])
-            middle, wide = (at.max(axis=1) + at.min(axis=1)) / 2, np.ptp(at, axis=1) / 2 + reach
-            points.append(middle[:, None] + signs[None] * wide[:, None])
+            middle, half_extent = (at.max(axis=1) + at.min(axis=1)) / 2, np.ptp(at, axis=1) / 2 + reach
+            points.append(middle[:, None] + signs[None] * half_extent[:, None])
     return np.concatenate(points).reshape(-1, 3)

@@ -133,10 +133,10 @@ def fit_occluder(camera: Camera, cover: Box) -> Occluder:
     corners = cover.corners()
     front = float((corners @ ahead).min()) - OCCLUDER_GAP - 2 * OCCLUDER_HALF_THICKNESS
     reach = (corners - eye) @ ahead
-    on_plane = eye + (corners - eye) * ((front - eye @ ahead) / reach)[:, None]
-    side = on_plane @ across
+    plane_points = eye + (corners - eye) * ((front - eye @ ahead) / reach)[:, None]
+    side = plane_points @ across
     low, high = float(side.min()) - OCCLUDER_MARGIN, float(side.max()) + OCCLUDER_MARGIN
-    top = float(on_plane[:, 2].max()) + OCCLUDER_MARGIN
+    top = float(plane_points[:, 2].max()) + OCCLUDER_MARGIN
     centre = across * (low + high) / 2 + ahead * (front + OCCLUDER_HALF_THICKNESS) + np.array([0, 0, top / 2])
     return Occluder(
         centre=_vec(centre),

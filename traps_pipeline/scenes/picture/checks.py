@@ -54,9 +54,9 @@ def seen_moving(pixels: np.ndarray, places: np.ndarray, *, least_px: float, step
 
     pixels (F,), places (F, 2) in pixels.
     """
-    moves = np.abs(np.diff(places, axis=0)).max(axis=1) >= step_px
+    is_moving = np.abs(np.diff(places, axis=0)).max(axis=1) >= step_px
     visible = pixels >= least_px
-    return int((moves & visible[1:] & visible[:-1]).sum())
+    return int((is_moving & visible[1:] & visible[:-1]).sum())
 
 
 def swept_behind(camera: Camera, swept: Sequence[np.ndarray], occluder: Occluder) -> float:
@@ -66,12 +66,12 @@ def swept_behind(camera: Camera, swept: Sequence[np.ndarray], occluder: Occluder
     """
     import cv2
 
-    moving, board = (np.zeros((HEIGHT, WIDTH), np.uint8) for _ in range(2))
-    for mask, solids in ((moving, swept), (board, [occluder.corners()])):
+    motion_mask, board = (np.zeros((HEIGHT, WIDTH), np.uint8) for _ in range(2))
+    for mask, solids in ((motion_mask, swept), (board, [occluder.corners()])):
         for corners in solids:
             outline = cv2.convexHull(camera.project(corners).round().astype(np.int32))
             cv2.fillConvexPoly(mask, outline, 1)
-    return float((moving & board).sum() / max(1, moving.sum()))
+    return float((motion_mask & board).sum() / max(1, motion_mask.sum()))
 
 
 def void_frames(renderer: Renderer, qpos: np.ndarray, without: Sequence[str] = ()) -> Iterator[np.ndarray]:
@@ -98,8 +98,8 @@ def ablation_pixels(
 
     void: the frames with them, if they are drawn already.
     """
-    complete = void_frames(renderer, qpos) if void is None else void
-    return differing_pixels(complete, void_frames(renderer, qpos, without=geoms))[0]
+    complete_frames = void_frames(renderer, qpos) if void is None else void
+    return differing_pixels(complete_frames, void_frames(renderer, qpos, without=geoms))[0]
 
 
 def differing_pixels(frames: Iterable[np.ndarray], counterparts: Iterable[np.ndarray]) -> tuple[int, int]:

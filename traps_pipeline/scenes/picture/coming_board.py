@@ -28,14 +28,14 @@ def coming_board(closing: Closing | None, camera: Camera, n_frames: int, fps: fl
     """Return the board's offset (m) in every frame of the clip, None before it comes."""
     if closing is None:
         return [None] * n_frames
-    way = _way(closing.occluder, camera)
-    distance = _out_of_picture_m(closing.occluder, camera, way)
+    direction = _way(closing.occluder, camera)
+    distance = _out_of_picture_m(closing.occluder, camera, direction)
     speed = math.sqrt(2 * FASTER_M_S2 * distance)  # m/s, as it lands
 
     def offset(left_s: float) -> Offset | None:
         if left_s >= speed / FASTER_M_S2:
             return None
-        x, y, z = (speed * left_s - FASTER_M_S2 * left_s**2 / 2) * way
+        x, y, z = (speed * left_s - FASTER_M_S2 * left_s**2 / 2) * direction
         return (float(x), float(y), float(z))
 
     return [LANDED if i >= closing.frame else offset((closing.frame - i) / fps) for i in range(n_frames)]

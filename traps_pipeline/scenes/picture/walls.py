@@ -39,12 +39,12 @@ def outlines(model: mujoco.MjModel, camera: Camera, qpos: np.ndarray) -> Mapping
     for wall in np.flatnonzero(solid & ~visible):
         if _is_facing_eye(model, data, camera, int(wall)):
             continue
-        near = [
+        nearby_edges = [
             int(edge)
             for edge in edges
             if mujoco.mj_geomDistance(model, data, int(wall), int(edge), 2 * TOUCHES_M, np.zeros(6)) < TOUCHES_M
         ]
-        names[model.geom(int(wall)).name] = tuple(model.geom(edge).name for edge in near)
+        names[model.geom(int(wall)).name] = tuple(model.geom(edge).name for edge in nearby_edges)
     return names
 
 

@@ -142,14 +142,14 @@ def _decoys(scenario: Scenario, points: np.ndarray) -> Iterator[Occluder]:
     azimuth = np.radians(control.camera.azimuth_deg)
     ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     across = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
-    centre, half = np.array(occluder.centre), occluder.half[0]
+    centre, half_width = np.array(occluder.centre), occluder.half[0]
     low, high = float((points @ across).min()), float((points @ across).max())
-    behind = float((points @ ahead).max()) - float(centre @ ahead) + BEHIND_M + OCCLUDER_HALF_THICKNESS
+    depth_behind = float((points @ ahead).max()) - float(centre @ ahead) + BEHIND_M + OCCLUDER_HALF_THICKNESS
     at = float(centre @ across)
-    for aside in (0.0, high - at, low - at):
-        yield _moved(occluder, ahead * behind + across * aside)
-    for aside in (high + half + BEHIND_M - at, low - half - BEHIND_M - at):
-        yield _moved(occluder, across * aside)
+    for offset in (0.0, high - at, low - at):
+        yield _moved(occluder, ahead * depth_behind + across * offset)
+    for offset in (high + half_width + BEHIND_M - at, low - half_width - BEHIND_M - at):
+        yield _moved(occluder, across * offset)
 
 
 def _moved(occluder: Occluder, by: np.ndarray) -> Occluder:
@@ -167,19 +167,20 @@ def _decoy(scenario: Scenario) -> Take:
         model, scene = compile_scene(control.family, control.params, control.physics, occluder)
         geoms = [*decisive_geoms(model, scene.decisive), *scene.hidden]
         groups = legible_groups(control.family, model, scene, control.motion, control.params)
-        sampled = control.qpos[scenario.sampled]
+        sampled_qpos = control.qpos[scenario.sampled]
         with Renderer(model, camera) as renderer:
-            shown = float(renderer.visible_pixels(sampled[:1], ["occluder"], occluder=True)[0, 0])
-            without, beside = (renderer.visible_pixels(sampled, geoms, occluder=drawn) for drawn in (False, True))
-            hidden = float(np.abs(without - beside).sum())
-            least = checks.least_visible(renderer, sampled[-3:], groups)
-            small = [f"{px:.0f} of {want:.0f} pixels" for px, (_, want) in zip(least, groups, strict=True) if px < want]
-            if shown < OCCLUDER_PX or hidden or small:
-                reason = (
-                    f"the decoy shows {shown:.0f} pixels, hides {hidden:.0f}, leaves {small or 'enough'} to be seen"
-                )
+            occluder_px = float(renderer.visible_pixels(sampled_qpos[:1], ["occluder"], occluder=True)[0, 0])
+            pixels = [renderer.visible_pixels(sampled_qpos, geoms, occluder=is_drawn) for is_drawn in (False, True)]
+            hidden = float(np.abs(pixels[0] - pixels[1]).sum())
+            min_pixels = checks.least_visible(renderer, sampled_qpos[-3:], groups)
+            needs = [needed for _, needed in groups]
+            too_small = [f"{px:.0f} of {n:.0f} pixels" for px, n in zip(min_pixels, needs, strict=True) if px < n]
+            if occluder_px < OCCLUDER_PX or hidden or too_small:
+                visible = too_small or "enough"
+                reason = f"the decoy shows {occluder_px:.0f} pixels, hides {hidden:.0f}, leaves {visible} to be seen"
                 continue
-            evidence = {"panel_px": shown, "hides_px": hidden, "least_visible_px": min(least), "panel": vars(occluder)}
+            evidence = {"panel_px": occluder_px, "hides_px": hidden, "least_visible_px": min(min_pixels)}
+            evidence |= {"panel": vars(occluder)}
             return Take(list(renderer.frames(control.qpos, occluder=True)), evidence)
     raise Rejected(f"{spec.scenario_id}: no place for an occluder that hides nothing ({reason})")
 
@@ -202,15 +203,15 @@ def _late_occluder(scenario: Scenario) -> Take:
     at = scenario.control.outcome.commit_frame - 1
     if at < EARLIEST_COVER_S * scenario.fps:
         raise Rejected(f"the outcome is settled at {(at + 1) / scenario.fps:.1f} s: nothing can be seen before it")
-    before = slice(0, at, scenario.fps // checks.SAMPLED_FPS)
-    pairs = zip(scenario.control_frames[before], scenario.twin_frames[before], strict=True)
-    differing = max(int((a != b).any(axis=2).sum()) for a, b in pairs)
-    if differing < SEEN_PX:
+    frames_before = slice(0, at, scenario.fps // checks.SAMPLED_FPS)
+    pairs = zip(scenario.control_frames[frames_before], scenario.twin_frames[frames_before], strict=True)
+    n_differing = max(int((a != b).any(axis=2).sum()) for a, b in pairs)
+    if n_differing < SEEN_PX:
         raise Rejected(
-            f"before the occluder comes the two worlds differ in {differing} pixels, {SEEN_PX:.0f} are wanted"
+            f"before the occluder comes the two worlds differ in {n_differing} pixels, {SEEN_PX:.0f} are wanted"
         )
     frames = [*scenario.control_frames[:at], *scenario.void_frames[at:]]
-    return Take(frames, {"covered_from_s": at / scenario.fps, "differing_px": differing})
+    return Take(frames, {"covered_from_s": at / scenario.fps, "differing_px": n_differing})
 
 
 # --- length -----------------------------------------------------------------------------------------------------------
@@ -300,8 +301,8 @@ def crossed(partner: SceneSpec | None) -> Arm:
     def film(scenario: Scenario) -> Take:
         ask(scenario.spec)
         assert partner is not None, "asked for above"
-        if why := false_premise(_presumed(partner), scenario.control.inventory):
-            return Take([], {"refuted_by": why})
+        if premise := false_premise(_presumed(partner), scenario.control.inventory):
+            return Take([], {"refuted_by": premise})
         raise Rejected(f"the scene does not refute {partner.question!r}")
 
     return Arm(
@@ -328,11 +329,11 @@ def partners(specs: Iterable[SceneSpec]) -> dict[str, str]:
     The scenes of partners refute each other's question. So each question is asked in vain as often as it is answered.
     Scenarios with the fewest candidates choose first, which leaves few without a partner.
     """
-    by_id = {spec.scenario_id: spec for spec in sorted(specs, key=lambda spec: spec.scenario_id)}
-    inventories = {id_: World.of_record(spec, np.empty((0, 0))).inventory for id_, spec in by_id.items()}
-    presumed = {id_: _presumed(spec) for id_, spec in by_id.items()}
-    refuted = {(a, b) for a in by_id for b in by_id if false_premise(presumed[b], inventories[a]) is not None}
-    free = {a: {b for b in by_id if (a, b) in refuted and (b, a) in refuted} for a in by_id}
+    spec_of = {spec.scenario_id: spec for spec in sorted(specs, key=lambda spec: spec.scenario_id)}
+    inventories = {id_: World.of_record(spec, np.empty((0, 0))).inventory for id_, spec in spec_of.items()}
+    presumed = {id_: _presumed(spec) for id_, spec in spec_of.items()}
+    refuted = {(a, b) for a in spec_of for b in spec_of if false_premise(presumed[b], inventories[a]) is not None}
+    free = {a: {b for b in spec_of if (a, b) in refuted and (b, a) in refuted} for a in spec_of}
     partner_of: dict[str, str] = {}
     while candidates := [a for a in free if free[a]]:
         a = min(candidates, key=lambda name: len(free[name]))

@@ -49,7 +49,7 @@ def graded_cut(spec: SceneSpec, control: World) -> tuple[int, dict[str, Any]]:
     if not control.same_physics:
         raise Rejected("simulating here does not give the frozen trajectory, so that its futures are not known")
     fps = control.physics.fps
-    beyond = round(BEYOND_S * fps)
+    extra_frames = round(BEYOND_S * fps)
     futures, step = futures_of(control, spec.seed), fps // checks.SAMPLED_FPS
     commit, shares = control.outcome.commit_frame, dict[int, float]()
     cuts = [frame for frame in range(earliest_cut(control.physics), commit + 1) if (frame - 1) % step == 0]
@@ -57,16 +57,18 @@ def graded_cut(spec: SceneSpec, control: World) -> tuple[int, dict[str, Any]]:
         raise Rejected(f"the outcome is settled at {commit / fps:.1f} s, before the earliest cut")
     while cuts:
         middle = cuts[len(cuts) // 2]
-        shares[middle] = max(probabilities(futures.after(middle, SEARCH_FUTURES, beyond=beyond)).values(), default=0.0)
+        shares[middle] = max(
+            probabilities(futures.after(middle, SEARCH_FUTURES, beyond=extra_frames)).values(), default=0.0
+        )
         is_early = shares[middle] < target_probability(spec)
         cuts = [frame for frame in cuts if (frame > middle if is_early else frame < middle)]
     frame = min(shares, key=lambda cut: (abs(shares[cut] - target_probability(spec)), cut))
-    counts = futures.after(frame, FUTURES, beyond=beyond)
-    decided = FUTURES - counts[None]
-    if decided < DECIDED * FUTURES:
-        raise Rejected(f"{decided} of {FUTURES} futures end in an answer, {DECIDED:.0%} are wanted")
+    counts = futures.after(frame, FUTURES, beyond=extra_frames)
+    n_decided = FUTURES - counts[None]
+    if n_decided < DECIDED * FUTURES:
+        raise Rejected(f"{n_decided} of {FUTURES} futures end in an answer, {DECIDED:.0%} are wanted")
     evidence = {"cut_s": frame / fps, "settled_s": commit / fps, "wanted": target_probability(spec), "futures": FUTURES}
-    return frame, evidence | {"decided": decided, "posterior": probabilities(counts)}
+    return frame, evidence | {"decided": n_decided, "posterior": probabilities(counts)}
 
 
 def _film(scenario: Scenario) -> Take:

@@ -126,20 +126,24 @@ def _renderer(world: World, look: Look) -> Renderer:
 def _void_with(scenario: Scenario, look: Look) -> Take:
     """Return the void with another occluder, alike in both worlds. Raises Rejected."""
     control, twin = scenario.control, scenario.twin
-    moving = moving_geoms(control.model)
+    moving_names = moving_geoms(control.model)
     with _renderer(control, look) as renderer:
         frames = list(checks.void_frames(renderer, control.qpos))
         shown_px = float(renderer.visible_pixels(control.qpos[:1], ["occluder"], occluder=True)[0, 0])
-        cause = float(renderer.visible_pixels(control.qpos[scenario.sampled], moving, occluder=True).sum(axis=1).max())
+        cause = float(
+            renderer.visible_pixels(control.qpos[scenario.sampled], moving_names, occluder=True).sum(axis=1).max()
+        )
     with _renderer(twin, look) as renderer:
-        differing, levels = checks.differing_pixels(frames, checks.void_frames(renderer, twin.qpos))
-    if differing:
-        raise Rejected(f"behind this occluder the two worlds differ in {differing} pixels, by {levels} levels at most")
+        n_differing, levels = checks.differing_pixels(frames, checks.void_frames(renderer, twin.qpos))
+    if n_differing:
+        raise Rejected(
+            f"behind this occluder the two worlds differ in {n_differing} pixels, by {levels} levels at most"
+        )
     if cause < SEEN_PX:
         raise Rejected(
             f"past this occluder at most {cause:.0f} pixels of what moves are seen, {SEEN_PX:.0f} are wanted"
         )
-    evidence = {"panel_px": shown_px, "cause_px": cause, "twin_px": differing}
+    evidence = {"panel_px": shown_px, "cause_px": cause, "twin_px": n_differing}
     looks = {"wide": look.wide, "contrast": _contrast(frames[0], scenario.control_frames[0])}
     return Take(frames, evidence | looks)
 
@@ -149,8 +153,8 @@ def _contrast(void: np.ndarray, control: np.ndarray) -> float:
     import cv2
 
     lab = [cv2.cvtColor((frame / 255).astype(np.float32), cv2.COLOR_RGB2LAB) for frame in (void, control)]
-    far = np.linalg.norm(lab[0] - lab[1], axis=2)
-    return round(float(far[far > 0].mean()), 1) if (far > 0).any() else 0.0
+    colour_distances = np.linalg.norm(lab[0] - lab[1], axis=2)
+    return round(float(colour_distances[colour_distances > 0].mean()), 1) if (colour_distances > 0).any() else 0.0
 
 
 def _coloured(colour: tuple[float, float, float]) -> Callable[[Scenario], Take]:
@@ -188,17 +192,19 @@ def _sheer(alpha: float) -> Callable[[Scenario], Take]:
 def _later(scenario: Scenario) -> Take:
     """Return no clip, if the frames after those shown at the end show the outcome too."""
     control = scenario.control
-    at_end = shown_at_end(len(control.qpos), scenario.fps, END_S, control.open_frames - 1)
-    late = [frame + 1 for frame in at_end]
+    end_frames = shown_at_end(len(control.qpos), scenario.fps, END_S, control.open_frames - 1)
+    late = [frame + 1 for frame in end_frames]
     if late[0] < control.outcome.commit_frame:
         raise Rejected(f"the outcome is settled at frame {control.outcome.commit_frame}, frame {late[0]} is shown")
     groups = legible_groups(control.family, control.model, control.scene, control.motion, control.params)
     with control.renderer() as renderer:
-        least = checks.least_visible(renderer, control.qpos[late], groups)
-    small = [f"{px:.0f} of {want:.0f} pixels" for px, (_, want) in zip(least, groups, strict=True) if px < want]
-    if small:
-        raise Rejected(f"the frames that are shown later show {', '.join(small)} of the outcome")
-    return Take([], {"late_frames": late, "least_visible_px": min(least)})
+        min_pixels = checks.least_visible(renderer, control.qpos[late], groups)
+    too_small = [
+        f"{px:.0f} of {needed:.0f} pixels" for px, (_, needed) in zip(min_pixels, groups, strict=True) if px < needed
+    ]
+    if too_small:
+        raise Rejected(f"the frames that are shown later show {', '.join(too_small)} of the outcome")
+    return Take([], {"late_frames": late, "least_visible_px": min(min_pixels)})
 
 
 # --- all of them ------------------------------------------------------------------------------------------------------

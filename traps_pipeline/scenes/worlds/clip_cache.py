@@ -91,12 +91,12 @@ class ClipCache:
     def trim(self) -> None:
         """Remove least recently used entries until nine tenths of the bound are left."""
         entries = self._entries()
-        size = sum(each for _, each, _ in entries)
+        size = sum(n_bytes for _, n_bytes, _ in entries)
         if size <= self.most_bytes:
             return
-        for _, each, entry in sorted(entries):
+        for _, n_bytes, entry in sorted(entries):
             _remove(entry)
-            size -= each
+            size -= n_bytes
             if size <= 0.9 * self.most_bytes:
                 break
 

@@ -71,11 +71,11 @@ def compile_scene(
     scene = family.build(params, physics)
     if occluder is not None:
         occluders = []
-        for name, group, beside in (("occluder", OCCLUDER_GROUP, 0), ("coming_occluder", COMING_GROUP, 1)):
-            centre = np.array(occluder.centre) + beside * before_board(occluder)
+        for name, group, offset in (("occluder", OCCLUDER_GROUP, 0), ("coming_occluder", COMING_GROUP, 1)):
+            centre = np.array(occluder.centre) + offset * before_board(occluder)
             geom = add_box(scene.spec.worldbody, name, centre.tolist(), occluder.half, "navy")
-            half = np.radians(occluder.yaw_deg) / 2
-            geom.quat = [float(np.cos(half)), 0.0, 0.0, float(np.sin(half))]
+            half_turn = np.radians(occluder.yaw_deg) / 2
+            geom.quat = [float(np.cos(half_turn)), 0.0, 0.0, float(np.sin(half_turn))]
             geom.contype = geom.conaffinity = 0
             geom.group = group
             occluders.append(geom)
@@ -93,8 +93,8 @@ def simulated(model: mujoco.MjModel, scene: Scene, physics: Physics) -> np.ndarr
 
 def moving_geoms(model: mujoco.MjModel) -> tuple[str, ...]:
     """Return the names of the geoms of bodies that move, and of soft bodies."""
-    moving = np.flatnonzero(model.body_weldid[model.geom_bodyid] > 0)
-    return (*(model.geom(int(i)).name for i in moving if model.geom(int(i)).name), *flexes(model))
+    geom_ids = np.flatnonzero(model.body_weldid[model.geom_bodyid] > 0)
+    return (*(model.geom(int(i)).name for i in geom_ids if model.geom(int(i)).name), *flexes(model))
 
 
 def decisive_geoms(model: mujoco.MjModel, bodies: Sequence[str]) -> tuple[str, ...]:

@@ -71,11 +71,11 @@ def lengths(worlds: Sequence[World], seed: int) -> list[int]:
     first, last = (of(world.outcome.commit_frame for world in worlds) for of in (min, max))
     if None in [world.outcome.label for world in worlds] or settles_share(first, n_frames) >= EARLIEST_SHARE:
         return [n_frames]
-    most = _even(first / EARLIEST_SHARE)
-    least = min(most, _even(max(last / DRAWN_SHARE, last + FRAMES_AFTER * fps / 10)))
+    max_frames = _even(first / EARLIEST_SHARE)
+    min_frames = min(max_frames, _even(max(last / DRAWN_SHARE, last + FRAMES_AFTER * fps / 10)))
     rng = np.random.default_rng([seed, *worlds[0].family.name.encode(), *b"pace"])
-    length = least + 2 * int(rng.integers((most - least) // 2 + 1))
-    return list(dict.fromkeys((length, most)))
+    length = min_frames + 2 * int(rng.integers((max_frames - min_frames) // 2 + 1))
+    return list(dict.fromkeys((length, max_frames)))
 
 
 def moments(worlds: Sequence[World], seed: int) -> Iterator[int]:

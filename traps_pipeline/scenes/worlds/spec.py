@@ -148,15 +148,15 @@ class SceneSpec(BaseModel):
             raise ValueError(f"ground_truth {self.ground_truth!r} is not one of the labels {self.labels}")
         if len(set(self.labels)) != len(self.labels):
             raise ValueError(f"labels {self.labels} repeat")
-        strays = sorted(set(self.aliases.values()) - set(self.labels))
-        if strays:
-            raise ValueError(f"aliases point to unknown labels {strays}; labels are {self.labels}")
+        unknown_labels = sorted(set(self.aliases.values()) - set(self.labels))
+        if unknown_labels:
+            raise ValueError(f"aliases point to unknown labels {unknown_labels}; labels are {self.labels}")
         if self.answerable_question.answer not in self.answerable_question.labels:
             raise ValueError(
                 f"answerable_question: answer {self.answerable_question.answer!r} is not one of its labels"
             )
-        of_cut = self.void_kind == "truncation"
-        if (self.twin.params is None) != of_cut or (self.twin.rollout is not None) != of_cut:
+        is_cut = self.void_kind == "truncation"
+        if (self.twin.params is None) != is_cut or (self.twin.rollout is not None) != is_cut:
             raise ValueError("twin: an occluder's has `params` and no `rollout`, a truncation's has a `rollout` alone")
         return self
 
@@ -219,9 +219,9 @@ def trajectory_digest(qpos: np.ndarray) -> str:
 def save_trajectory(folder: Path, scenario_id: str, qpos: np.ndarray, twin: np.ndarray) -> None:
     """Write `<folder>/<scenario_id>.npz`: trajectories of a scenario and its twin."""
     arrays = {"qpos": qpos, "twin": twin}
-    plain = {name: np.ascontiguousarray(values, dtype="<f4") for name, values in arrays.items()}
+    plain_arrays = {name: np.ascontiguousarray(values, dtype="<f4") for name, values in arrays.items()}
     with replacing(folder / f"{scenario_id}.npz") as part, part.open("wb") as stream:
-        np.savez_compressed(stream, allow_pickle=False, **plain)
+        np.savez_compressed(stream, allow_pickle=False, **plain_arrays)
 
 
 def load_trajectory(path: Path, sha256: str, world: Literal["qpos", "twin"] = "qpos") -> np.ndarray:

@@ -117,8 +117,8 @@ class World:
         """The outcome that the frames before the closing show by themselves."""
         open_frames, motion = slice(0, self.open_frames), self.motion
         parts = (
-            {k: v[open_frames] for k, v in each.items()}
-            for each in (motion.positions, motion.rotations, motion.vertices)
+            {k: v[open_frames] for k, v in poses.items()}
+            for poses in (motion.positions, motion.rotations, motion.vertices)
         )
         return read_outcome(self.family, Motion(motion.times[open_frames], *parts), self.params)
 
@@ -198,10 +198,10 @@ class World:
         """Return how many pixels of some frames change when geoms are taken away."""
         missing = [frame for frame in frames if (frame, geoms) not in self._ablated]
         if missing:
-            complete = self.behind_occluder(missing)
+            complete_frames = self.behind_occluder(missing)
             with self.closed_renderer() as renderer:
-                without = void_frames(renderer, self.qpos[missing], without=geoms)
-                for frame, ablated, unablated in zip(missing, complete, without, strict=True):
+                ablated_frames = void_frames(renderer, self.qpos[missing], without=geoms)
+                for frame, ablated, unablated in zip(missing, complete_frames, ablated_frames, strict=True):
                     self._ablated[frame, geoms] = differing_pixels([ablated], [unablated])[0]
         return sum(self._ablated[frame, geoms] for frame in frames)
 
