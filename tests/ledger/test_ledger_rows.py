@@ -8,14 +8,14 @@ from typing import Any
 
 import pytest
 
-from traps_pipeline.ledger.rows import MOST_TOKENS, MOST_USD, heal, is_cost, is_count, is_seconds
+from traps_pipeline.ledger.rows import MAX_TOKENS, MAX_USD, heal, is_cost, is_count, is_seconds
 
 
 @pytest.mark.parametrize(
     ("fits", "values", "others"),
     [
-        (is_count, [0, 1, MOST_TOKENS], [-1, MOST_TOKENS + 1, 1.0, True, "1", None, math.nan]),
-        (is_cost, [0, 0.0, 0.25, MOST_USD], [-1e-9, MOST_USD + 1, math.inf, math.nan, True, "0.25", None]),
+        (is_count, [0, 1, MAX_TOKENS], [-1, MAX_TOKENS + 1, 1.0, True, "1", None, math.nan]),
+        (is_cost, [0, 0.0, 0.25, MAX_USD], [-1e-9, MAX_USD + 1, math.inf, math.nan, True, "0.25", None]),
         (is_seconds, [0, 0.5], [-0.5, math.inf, "1"]),
     ],
 )

@@ -58,7 +58,7 @@ ROW, OTHER = clip("plinko-0001"), clip("plinko-0002")
 def test_rows_that_are_not_of_the_table_are_refused_and_nothing_is_written(
     store: TableStore, rows: Any, names: list[str]
 ) -> None:
-    with raises(TrapsError, "storage.parquet.TableStore._checked", "videos", *names):
+    with raises(TrapsError, "storage.parquet.TableStore._arrow_of", "videos", *names):
         store.write(VIDEOS, PARTITION, rows, {})
     assert store.state(VIDEOS, PARTITION) is None
 

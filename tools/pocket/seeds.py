@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from traps_pipeline.base.files import replacing
+from traps_pipeline.base.files import replace_file
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ def write_seeds(path: Path, rows: Sequence[Any], read: Callable[[Path], Sequence
     """
     seeds = {row.seed for row in rows}
     kept = [row for row in (read(path) if path.is_file() else []) if row.seed not in seeds]
-    with replacing(path) as part, part.open("w", encoding="utf-8", newline="") as stream:
+    with replace_file(path) as part, part.open("w", encoding="utf-8", newline="") as stream:
         table = csv.DictWriter(stream, [field.name for field in fields(rows[0])], lineterminator="\n")
         table.writeheader()
         table.writerows(asdict(row) for row in sorted([*kept, *rows], key=lambda row: row.seed))

@@ -14,7 +14,7 @@ from tools.pocket.model import make_model, save, train_tokenizer
 from tools.pocket.recipe import Recipe, Training
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.files import replacing
+from traps_pipeline.base.files import replace_file
 from traps_pipeline.models.local.library import load_transformers
 
 if TYPE_CHECKING:
@@ -128,7 +128,7 @@ class _State:
         tensors = {f"weight.{name}": p.detach().contiguous() for name, p in self._parameters.items()}
         for name, p in self._parameters.items():
             tensors |= {f"{kind}.{name}": value for kind, value in self._optimizer.state.get(p, {}).items()}
-        with replacing(self._path) as part:
+        with replace_file(self._path) as part:
             save_file(tensors, part, {"step": str(step), "identity": self._identity})
 
     def load(self) -> int:

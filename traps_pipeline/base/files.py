@@ -38,7 +38,7 @@ def remedy(error: OSError) -> str:
 
 
 @contextmanager
-def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
+def replace_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
     """Yield a temporary path beside `path`, which replaces `path` after the block.
 
     Until then, and after an error, Ctrl-C or a kill, `path` keeps its former content. An unfinished file is removed;
@@ -127,7 +127,7 @@ def require_in_place(descriptor: int, path: Path) -> None:
 
 def write_bytes(path: Path, content: bytes, *, durable: bool = False) -> None:
     """Write a file atomically, as `replacing` does."""
-    with replacing(path, durable=durable) as part:
+    with replace_file(path, durable=durable) as part:
         part.write_bytes(content)
 
 

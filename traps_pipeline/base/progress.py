@@ -16,7 +16,7 @@ from itertools import chain
 from typing import Any, TypeVar
 
 from traps_pipeline.base.terminal import plain
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 
 HEARTBEAT_S = 30.0  # between two lines about the same stage
 
@@ -246,8 +246,8 @@ class Progress:
             parts.append(now.detail)
         if total.wanted:
             parts += [f"{total.per_second:.1f}/s at {total.latency_s(0.5):.1f} s"]
-            parts += [counted(total.errors, "error")] if total.errors else []
-            parts += [counted(total.retries, "retry", "retries")] if total.retries else []
+            parts += [count_noun(total.errors, "error")] if total.errors else []
+            parts += [count_noun(total.retries, "retry", "retries")] if total.retries else []
             parts += [self.spent()] if self.budget_usd else []
         parts.append(f"{clock(now.seconds)} so far" if now.left_s is None else f"{clock(now.left_s)} left")
         return f"{now.name}: {', '.join(parts)}"
@@ -285,7 +285,7 @@ def current() -> Progress:
 
 
 @contextmanager
-def reporting(progress: AnyProgress) -> Iterator[AnyProgress]:
+def use_progress(progress: AnyProgress) -> Iterator[AnyProgress]:
     """Make a progress the active one within the block."""
     _current.append(progress)
     try:

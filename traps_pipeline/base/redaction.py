@@ -21,7 +21,7 @@ from html import unescape
 from typing import Any
 
 MASK = "***"
-SHORTEST = 8  # characters: anything shorter could be an ordinary word
+MIN_SECRET_LENGTH = 8  # characters: anything shorter could be an ordinary word
 # A secret is looked for by pieces, one after another; what stands around a piece is compared with the secret. So each
 # part of a secret that has as many characters as two pieces is found.
 _PIECE = 6
@@ -60,17 +60,17 @@ def remember(value: str) -> None:
 
 def redact(text: str) -> str:
     """Replace secrets, known or recognizable by their header, by `***`."""
-    if len(text) < SHORTEST:  # most cells of a table
+    if len(text) < MIN_SECRET_LENGTH:  # most cells of a table
         return text
     environment = frozenset(os.environb.items())  # `os.environ` decodes each name and value anew
     secrets = _secrets(environment, frozenset(_variables), frozenset(_values))
     pieces, spans = _pieces(secrets), list[tuple[int, int]]()
     for is_decoded in (False, True) if _ENCODED.search(text) else (False,):
-        search_text = _searched(text, is_decoded)
+        search_text = _search_text(text, is_decoded)
         windows = {search_text[place : place + _PIECE] for place in range(len(search_text) - _PIECE + 1)}
         if windows & pieces.keys():
             spans += _spans(text, pieces, is_decoded)
-    for start, end in sorted(_merged(spans), reverse=True):
+    for start, end in sorted(_merge(spans), reverse=True):
         text = f"{text[:start]}{MASK}{text[end:]}"
     lowered = text.lower()
     if any(sign in lowered for sign in _SIGNS):  # searching with the expression alone takes ten times as long
@@ -106,7 +106,7 @@ def redact_tracebacks() -> None:
     )
 
 
-def redacted(error: Exception) -> Exception:
+def redact_exception(error: Exception) -> Exception:
     """Return the exception, or a replacement if its traceback would show a key."""
     text = "".join(traceback.format_exception(error))
     clean_text = redact(text)
@@ -134,17 +134,17 @@ def _pieces(secrets: frozenset[str]) -> dict[str, list[tuple[str, int]]]:
     forms = set[str]()
     for secret in secrets:
         for part in {secret, *re.split(r"[^!-~]+", secret)}:
-            if len(_searched(part, is_decoded=False)) >= SHORTEST:
-                forms |= {_searched(part, is_decoded=False), _searched(part, is_decoded=True), *_encoded(part)}
+            if len(_search_text(part, is_decoded=False)) >= MIN_SECRET_LENGTH:
+                forms |= {_search_text(part, is_decoded=False), _search_text(part, is_decoded=True), *_encodings(part)}
     pieces = dict[str, list[tuple[str, int]]]()
     for form in forms:
-        places = range(0, len(form) - _PIECE + 1, _PIECE) if len(form) >= SHORTEST else ()
+        places = range(0, len(form) - _PIECE + 1, _PIECE) if len(form) >= MIN_SECRET_LENGTH else ()
         for piece, place in {form[place : place + _PIECE]: place for place in reversed(places)}.items():
             pieces.setdefault(piece, []).append((form, place))
     return pieces
 
 
-def _encoded(secret: str) -> Iterator[str]:
+def _encodings(secret: str) -> Iterator[str]:
     """Yield a secret in hexadecimal, and inside base64 at each of three offsets."""
     content = secret.encode("utf-8", "surrogateescape")
     yield content.hex()
@@ -157,14 +157,14 @@ def _encoded(secret: str) -> Iterator[str]:
         yield from (encoded, encoded.replace("+", "-").replace("/", "_"))
 
 
-def _searched(text: str, is_decoded: bool) -> str:
+def _search_text(text: str, is_decoded: bool) -> str:
     """Reduce a text to the lower-case printable ASCII characters to search."""
     if is_decoded:
-        text = _ENCODED.sub(lambda match: _decoded(match[0]), text)
+        text = _ENCODED.sub(lambda match: _decode(match[0]), text)
     return text.encode("ascii", "ignore").translate(None, _IGNORED).lower().decode()
 
 
-def _decoded(code: str) -> str:
+def _decode(code: str) -> str:
     if code[0] == "&":
         return unescape(code)
     if code[0] == "%":
@@ -182,7 +182,7 @@ def _spans(text: str, pieces: dict[str, list[tuple[str, int]]], is_decoded: bool
     while place < len(text):
         code = codes.get(place)
         end = code.end() if code else place + 1
-        for character in _searched(_decoded(code[0]) if code else text[place], is_decoded=False):
+        for character in _search_text(_decode(code[0]) if code else text[place], is_decoded=False):
             characters.append(character)
             places.append((place, end))
         place = end
@@ -196,20 +196,23 @@ def _spans(text: str, pieces: dict[str, list[tuple[str, int]]], is_decoded: bool
                 search_text[max(0, start - place) : start],
                 search_text[start : start + len(form) - place],
             )
-            first, last = start - _alike(prefix[::-1], form[:place][::-1]), start + _alike(candidate, form[place:])
+            first, last = (
+                start - _common_prefix_length(prefix[::-1], form[:place][::-1]),
+                start + _common_prefix_length(candidate, form[place:]),
+            )
             is_part = last - first >= min(2 * _PIECE, len(form))
             if is_part:
                 yield places[first][0], places[last - 1][1]
             start = search_text.find(piece, last if is_part else start + 1)
 
 
-def _alike(text: str, reference: str) -> int:
+def _common_prefix_length(text: str, reference: str) -> int:
     """Return how many characters two texts have in common at their beginnings."""
     differences = (k for k, (char, other_char) in enumerate(zip(text, reference, strict=False)) if char != other_char)
     return next(differences, min(len(text), len(reference)))
 
 
-def _merged(spans: list[tuple[int, int]]) -> list[tuple[int, int]]:
+def _merge(spans: list[tuple[int, int]]) -> list[tuple[int, int]]:
     result = list[tuple[int, int]]()
     for start, end in sorted(spans):
         if result and start <= result[-1][1]:

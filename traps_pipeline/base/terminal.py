@@ -45,7 +45,7 @@ def _number(match: re.Match[str]) -> str:
     return f"[U+{ord(match[0]):04X}]"
 
 
-def finalized(value: object) -> object:
+def finalize_value(value: object) -> object:
     """Format an expression's value for a Jinja2 template (its `finalize`)."""
     return visible(value) if isinstance(value, str) else value
 
@@ -61,7 +61,7 @@ def _printable(text: str) -> str:
     return "".join(c if c.isprintable() else " " if c in "\n\t" else "?" for c in text)
 
 
-def wrapped(text: str, stream: TextIO | None = None, *, hang: int | None = None) -> str:
+def wrap_text(text: str, stream: TextIO | None = None, *, hang: int | None = None) -> str:
     """Return lines for a stream (default: stdout), wrapped at words on a terminal.
 
     hang: extra indentation of continuation lines, in columns (default: 4 if the line is indented, else 0).
@@ -100,7 +100,7 @@ def text_table(headings: Sequence[str], rows: Iterable[Sequence[object]], left: 
         while count > 1 and sum(widths[:count]) + _GAP * (count - 1) > columns:
             count -= 1
         names = ", ".join(cells[0][count:])
-        hidden = "\n" + wrapped(f"not shown in {columns} columns: {names}") if names else ""
+        hidden = "\n" + wrap_text(f"not shown in {columns} columns: {names}") if names else ""
     lines = list[str]()
     for row in cells:
         blanks = [" " * (width - cell_len(cell)) for width, cell in zip(widths, row, strict=True)]
@@ -127,6 +127,6 @@ class TextTable:
 
     def text(self) -> str:
         """Return title, table and notes for standard output, like `text_table`."""
-        table = wrapped(plain(self.absence)) if self.absence else text_table(self.headings, self.rows, self.left)
-        notes = [wrapped(plain(note)) for note in self.notes]
-        return "\n".join([wrapped(plain(self.title)), "", table, *([""] if notes else []), *notes]) + "\n"
+        table = wrap_text(plain(self.absence)) if self.absence else text_table(self.headings, self.rows, self.left)
+        notes = [wrap_text(plain(note)) for note in self.notes]
+        return "\n".join([wrap_text(plain(self.title)), "", table, *([""] if notes else []), *notes]) + "\n"

@@ -18,7 +18,7 @@ from urllib.parse import parse_qsl, quote, urlencode, urlsplit
 
 from traps_pipeline.base.errors import TrapsError
 
-LEAST_TOKEN = 16  # characters
+MIN_TOKEN = 16  # characters
 TOKEN_OWNER = "traps.who"  # key of a request's scope: the owner of its token
 LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 _SAFE_METHODS = ("GET", "HEAD")
@@ -61,8 +61,8 @@ def token_for(host: str, token: str | None, *, danger: str, variable: str) -> st
             f"give a token of your own (--token, or {variable}), and put a server that speaks HTTPS before it, "
             "since the token crosses the network; or leave --host out and use an SSH tunnel"
         )
-    if token is not None and (len(token) < LEAST_TOKEN or not token.isascii() or not token.isprintable()):
-        raise TrapsError(f"--token: {LEAST_TOKEN} or more printable ASCII characters, so that it cannot be guessed")
+    if token is not None and (len(token) < MIN_TOKEN or not token.isascii() or not token.isprintable()):
+        raise TrapsError(f"--token: {MIN_TOKEN} or more printable ASCII characters, so that it cannot be guessed")
     return token or secrets.token_urlsafe(24)
 
 
@@ -159,7 +159,7 @@ class Guard:
     def _has_token(self, scope: Scope) -> bool:
         if scope["method"] not in _SAFE_METHODS:
             return False
-        return self._owner(_given_token(scope)) is not None
+        return self._owner(_token_of_address(scope)) is not None
 
     def _owner(self, token_given: str | None) -> str | None:
         """Return the token's owner, if any, in constant time."""
@@ -187,12 +187,12 @@ class Guard:
         """Set the token as a cookie and redirect, so that no address shows the token."""
         parameters = [pair for pair in parse_qsl(scope["query_string"].decode("latin-1")) if pair[0] != "token"]
         place = "/" + quote(scope["path"].lstrip("/\\")) + (f"?{urlencode(parameters)}" if parameters else "")
-        cookie = f"{self._cookie}={_given_token(scope)}; HttpOnly; SameSite=Strict; Path=/{self._secure}"
+        cookie = f"{self._cookie}={_token_of_address(scope)}; HttpOnly; SameSite=Strict; Path=/{self._secure}"
         headers = [(b"location", place.encode()), (b"set-cookie", cookie.encode("latin-1"))]
         await _answer(send, 303, b"", headers)
 
 
-def _given_token(scope: Scope) -> str | None:
+def _token_of_address(scope: Scope) -> str | None:
     """Return the token in the address of a request."""
     return dict(parse_qsl(scope.get("query_string", b"").decode("latin-1"))).get("token")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 
-def counted(count: int, singular: str, plural: str | None = None) -> str:
+def count_noun(count: int, singular: str, plural: str | None = None) -> str:
     """Return a count with its noun: `1 family`, `2,340 scenarios`.
 
     plural: the plural form; default: the singular with an s.

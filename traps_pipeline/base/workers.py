@@ -45,7 +45,7 @@ _idle: list[_Pool] | None = None  # idle pools of `kept_workers`
 
 
 @contextmanager
-def kept_workers() -> Iterator[None]:
+def keep_workers() -> Iterator[None]:
     """Keep idle workers for the block's next `run_in_order`, as starting one is slow."""
     global _idle
     if _idle is not None:

@@ -18,7 +18,7 @@ from traps_pipeline.base.paths import PACKAGE
 from traps_pipeline.base.terminal import text_table
 from traps_pipeline.base.workers import run_in_order
 from traps_pipeline.benchmark.composition import load_composition, problems
-from traps_pipeline.benchmark.outcome_leakage import AT_MOST, FEWEST, outcome_leakage
+from traps_pipeline.benchmark.outcome_leakage import MAX_GAIN, MIN_RECORDS, outcome_leakage
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.scenes.certification.certify_record import Verdict, certify
 from traps_pipeline.scenes.draw.sample import Tally, load_tallies
@@ -65,7 +65,7 @@ def certify_all(
     failures = [f"{v.scenario_id}: {name}: {reason}" for v in verdicts for name, reason in v.failures.items()]
     is_complete = families is None and (folder / "composition.yaml").is_file()
     failures += problems(specs, load_composition(folder / "composition.yaml") if is_complete else None)
-    return verdicts, failures + _alike(verdicts) + foreseeable(specs, verdicts)
+    return verdicts, failures + _repeated_endings(verdicts) + foreseeable(specs, verdicts)
 
 
 def _case(released: Path, folder: Path, spec: SceneSpec) -> Case:
@@ -98,7 +98,7 @@ def judge(case: Case) -> Verdict:
     return verdict
 
 
-def _alike(verdicts: Iterable[Verdict]) -> list[str]:
+def _repeated_endings(verdicts: Iterable[Verdict]) -> list[str]:
     """Return problems: clips of different scenarios that end in the same frame."""
     problems = []
     for side in ("control_end", "void_end"):
@@ -122,13 +122,13 @@ def foreseeable(specs: Iterable[SceneSpec], verdicts: Iterable[Verdict]) -> list
         outcomes = [spec.ground_truth for spec in members]
         messages = (
             outcome_leakage([states[spec.scenario_id] for spec in members], outcomes)
-            if len(members) >= FEWEST
+            if len(members) >= MIN_RECORDS
             else None
         )
-        if messages is not None and messages.gain > AT_MOST:
+        if messages is not None and messages.gain > MAX_GAIN:
             problems.append(
                 f"{family}: the state at the cut predicts {messages.best:.3f} of the outcomes, the commonest one is "
-                f"{messages.prior:.3f}; at most {AT_MOST} more is allowed"
+                f"{messages.prior:.3f}; at most {MAX_GAIN} more is allowed"
             )
     return problems
 

@@ -224,11 +224,11 @@ def check_benchmark(study: Study) -> None:
     if study.benchmark != current:
         raise TrapsError(
             f"the benchmark of the study is {study.benchmark!r}, the records in {SCENE_SPECS} are {current!r}; "
-            f"{_elsewhere(study.benchmark)}, or write `benchmark: {current}` into the experiment of a new workspace"
+            f"{_records_advice(study.benchmark)}, or write `benchmark: {current}` into a new workspace's experiment"
         )
 
 
-def _elsewhere(benchmark: str) -> str:
+def _records_advice(benchmark: str) -> str:
     """Return where to look for the records of a benchmark, as an instruction."""
     is_released = benchmark == "released"
     return f"unset {SPECS_VARIABLE}" if is_released else f"set {SPECS_VARIABLE} to the folder of {benchmark!r}"

@@ -46,7 +46,7 @@ def decide(correction: Correction, n_seen: int, folder: Path = CORRECTIONS) -> N
     n_seen: the number of decisions about the scenario that the reviewer knew of. Raises DecidedMeanwhile if there are
     more by now, and TrapsError if the decision does not fit the record; nothing is written then.
     """
-    with _appending(folder) as append:
+    with _open_for_append(folder) as append:
         _require_known(correction.scenario_id, n_seen, folder)
         append([correction])
 
@@ -56,7 +56,7 @@ def undo(scenario_id: str, n_seen: int, *, who: str, why: str, folder: Path = CO
 
     Raises DecidedMeanwhile as `decide` does, and TrapsError if there is no decision to take back.
     """
-    with _appending(folder) as append:
+    with _open_for_append(folder) as append:
         decisions = _require_known(scenario_id, n_seen, folder)
         if not is_reviewed(decisions):
             raise TrapsError(f"{scenario_id}: no decision stands that could be taken back")
@@ -103,7 +103,7 @@ def _require_known(scenario_id: str, n_seen: int, folder: Path) -> list[Correcti
 
 
 @contextmanager
-def _appending(folder: Path) -> Iterator[Callable[[Sequence[Correction]], None]]:
+def _open_for_append(folder: Path) -> Iterator[Callable[[Sequence[Correction]], None]]:
     """Yield a function that appends decisions, while no other process does.
 
     Raises TrapsError if a later file would overrule them, and if the folder belongs to an installed wheel.

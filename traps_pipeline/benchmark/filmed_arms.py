@@ -20,7 +20,7 @@ from traps_pipeline.benchmark.corrections import corrected_scenarios
 from traps_pipeline.benchmark.sharing import Filming, Row, existing_clips, share
 from traps_pipeline.benchmark.specs import clips_version, released_in_study, spec_of, spec_rows, trajectory_of
 from traps_pipeline.protocol.datasets import ARMS as ARM_NAMES
-from traps_pipeline.protocol.datasets import CROSSED, GRADED, beside_of, sides_of, taxonomy_of_category
+from traps_pipeline.protocol.datasets import CROSSED, GRADED, extra_datasets_of, sides_of, taxonomy_of_category
 from traps_pipeline.scenes.variants.arms import ARMS as SHORTCUT_ARMS
 from traps_pipeline.scenes.variants.arms import Arm, Question, Scenario, crossed, partners
 from traps_pipeline.scenes.variants.graded_cuts import GRADED_CUT
@@ -67,7 +67,7 @@ class Job:
 def asked_arms(workspace: Workspace, category: str) -> list[str]:
     """Return a category's arms and variations that some experiment requests."""
     datasets = {dataset for experiment in workspace.study.experiments.values() for dataset in experiment.datasets}
-    return [arm for arm in beside_of(taxonomy_of_category(category)) if arm in datasets]
+    return [arm for arm in extra_datasets_of(taxonomy_of_category(category)) if arm in datasets]
 
 
 def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tuple[int, bool]:

@@ -57,7 +57,7 @@ def build_items(workspace: Workspace, dataset: str) -> list[ItemRow]:
     )
     commonest = commonest_answers(specs)
     if dataset in UNPAIRED:
-        return _of_arm(workspace, dataset, {spec["scenario_id"]: spec for spec in specs}, commonest, version)
+        return _arm_items(workspace, dataset, {spec["scenario_id"]: spec for spec in specs}, commonest, version)
     return [_item(dataset, spec, side, clips, commonest, version) for spec in specs for side in SIDES]
 
 
@@ -84,7 +84,7 @@ def expected_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
     return [asdict(_item(dataset, spec, side, clips, commonest, "")) for spec in complete_specs for side in SIDES]
 
 
-def _of_arm(
+def _arm_items(
     workspace: Workspace, arm: str, specs: Mapping[str, Record], commonest: Mapping[str, str], version: str
 ) -> list[ItemRow]:
     """Return items with the arms table's questions, per scenario that admits the arm."""

@@ -42,7 +42,7 @@ def resolve_scenario(workspace: Workspace, scenario: Scenario) -> ResolvedScenar
     if scenario.params is None:
         spec = scenario.changed_words()
         return ResolvedScenario(spec, RELEASED / "trajectories" / f"{spec.scenario_id}.npz")
-    spec, trajectory = _resolved_anew(workspace, scenario)
+    spec, trajectory = _resolve_again(workspace, scenario)
     words = dict(scenario.words)
     if _has_valid_words(scenario):
         assert scenario.released is not None
@@ -56,9 +56,9 @@ def resolve_scenario(workspace: Workspace, scenario: Scenario) -> ResolvedScenar
     return ResolvedScenario(apply_words(spec, words, scenario.where), trajectory)
 
 
-def _resolved_anew(workspace: Workspace, scenario: Scenario) -> tuple[SceneSpec, Path]:
+def _resolve_again(workspace: Workspace, scenario: Scenario) -> tuple[SceneSpec, Path]:
     """Return the scene of corrected parameters, with its family's words; stored once."""
-    name = _resolved_name(scenario)
+    name = _resolution_name(scenario)
     files = [workspace.trajectories / f"{name}{ending}" for ending in (".npz", ".json")]
     workspace.store.bring(files)
     for folder in (CORRECTIONS / "trajectories", workspace.trajectories):
@@ -80,7 +80,7 @@ def _resolved_anew(workspace: Workspace, scenario: Scenario) -> tuple[SceneSpec,
     return spec, workspace.trajectories / f"{name}.npz"
 
 
-def _resolved_name(scenario: Scenario) -> str:
+def _resolution_name(scenario: Scenario) -> str:
     scene = [scenario.family, scenario.params, _seed(scenario), _physics(scenario)]
     return f"{scenario.scenario_id}-{digest(scene)[:16]}"
 
@@ -187,7 +187,7 @@ def expected_specs(workspace: Workspace, category: str) -> list[SceneSpecRow]:
     """
 
     def is_resolved(scenario: Scenario) -> bool:
-        name = f"{_resolved_name(scenario)}.json" if scenario.params is not None else ""
+        name = f"{_resolution_name(scenario)}.json" if scenario.params is not None else ""
         is_stored = workspace.store.has(workspace.trajectories / name)
         return not name or is_stored or (CORRECTIONS / "trajectories" / name).is_file()
 

@@ -21,7 +21,7 @@ from traps_pipeline.judging.rules import read_statement
 from traps_pipeline.models.answers import answer_request
 from traps_pipeline.models.ask import Call, SettledCell, collect
 from traps_pipeline.models.judged_answers import UNREAD
-from traps_pipeline.models.participants import Row, when_asked
+from traps_pipeline.models.participants import Row, call_time_columns
 from traps_pipeline.models.reading import read_answer
 from traps_pipeline.models.registry import NETWORK, ModelEntry, get_model
 from traps_pipeline.protocol.cells import Cell, Evaluation
@@ -34,7 +34,7 @@ from traps_pipeline.storage.workspace import Workspace
 N_ITEMS = 20
 CELL = Cell("occlusion", Evaluation("canary", "standard", 1))  # a name in the ledger, not a model
 REGIME = "json"  # rules can read its final answers most often
-COMPARED = ("outcome", "abstained", "value")
+COMPARED_COLUMNS = ("outcome", "abstained", "value")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,7 +114,7 @@ def _row(call: _Asked, row: Row, epoch: str) -> CanaryRow:
         value=statement and statement.value,
         prompt_tokens=row["prompt_tokens"],
         epoch=epoch,
-        created_at=when_asked(row)["created_at"],
+        created_at=call_time_columns(row)["created_at"],
     )
 
 
@@ -147,10 +147,15 @@ def changes(rows: pd.DataFrame) -> pd.DataFrame:
                     "served": " -> ".join(served),
                     "n": len(answer_pairs),
                 }
-                | {name: sum(_words(old[name]) != _words(new[name]) for old, new in answer_pairs) for name in COMPARED}
+                | {
+                    name: sum(_words(old[name]) != _words(new[name]) for old, new in answer_pairs)
+                    for name in COMPARED_COLUMNS
+                }
                 | {"tokens": sum(tokens) / len(tokens) if tokens else float("nan")}
             )
-    return pd.DataFrame(change_rows, columns=pd.Index(["model", "from", "to", "served", "n", *COMPARED, "tokens"]))
+    return pd.DataFrame(
+        change_rows, columns=pd.Index(["model", "from", "to", "served", "n", *COMPARED_COLUMNS, "tokens"])
+    )
 
 
 def _has_tokens(*rows: Mapping[str, Any]) -> bool:

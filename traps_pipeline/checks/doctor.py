@@ -17,7 +17,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import PART, check_disk
 from traps_pipeline.base.keys import optional_key
 from traps_pipeline.base.network import check_network
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.scenes.picture.trial import draw_frame, encode_clip
 from traps_pipeline.storage.place import Place, scratch_of
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 MIN_FREE_GB = 1.0
 STATES = ("*.safetensors", "*.parquet")  # files of an extraction
 FOLDERS = ("tables", "clips", "media", "trajectories", "states", "directions", "reports")
-MOST_FILES = 5  # damaged files named per kind
+MAX_FILES = 5  # damaged files named per kind
 UNFINISHED_AFTER_S = 24 * 3600.0  # longer than the writing of any file
 
 
@@ -75,19 +75,19 @@ def examine_local(models: Sequence[str] = ()) -> Iterator[Finding]:
         yield _finding("devices", selfcheck.describe_devices)
         for family in FAMILIES:
             yield _finding(family, partial(selfcheck.check_family, family, folder))
-            yield from _inside(family, partial(adapter_checks.tiny_subject, family, folder))
+            yield from _adapter_findings(family, partial(adapter_checks.tiny_subject, family, folder))
         yield _finding("nf4", lambda: selfcheck.check_nf4(folder))
         yield _finding("checkpoints", selfcheck.describe_checkpoints)
     for entry in entries:
-        yield from _inside(
+        yield from _adapter_findings(
             entry.id,
             lambda entry=entry: adapter_checks.Subject(
-                load_local_model(entry, inside=True), *adapter_checks.brightening()
+                load_local_model(entry, inside=True), *adapter_checks.brightening_clip()
             ),
         )
 
 
-def _inside(name: str, load: Callable[[], Subject]) -> Iterator[Finding]:
+def _adapter_findings(name: str, load: Callable[[], Subject]) -> Iterator[Finding]:
     """Yield one finding per check of a model; a single one if it cannot be loaded."""
     from traps_pipeline.mechanism.adapter_checks import CHECKS
 
@@ -103,7 +103,7 @@ def _inside(name: str, load: Callable[[], Subject]) -> Iterator[Finding]:
 def examine_files(place: Place) -> Iterator[Finding]:
     """Read every self-checking file of a study in full; yield one finding per kind."""
     from traps_pipeline.mechanism.hidden_states import damage
-    from traps_pipeline.storage.parquet import altered
+    from traps_pipeline.storage.parquet import bytes_damage
     from traps_pipeline.storage.workspace import Workspace
 
     workspace = Workspace.open(place)
@@ -117,21 +117,21 @@ def examine_files(place: Place) -> Iterator[Finding]:
     for folder in FOLDERS:
         workspace.bring_folder(workspace.root / folder)
     if workspace.is_shared:
-        yield Finding(not missing, "store", "; ".join(missing[:MOST_FILES]) or "every object is what was written")
+        yield Finding(not missing, "store", "; ".join(missing[:MAX_FILES]) or "every object is what was written")
     for topic, files, damage_of in (
-        ("tables", sorted((workspace.root / "tables").rglob("*.parquet")), altered),
-        ("clips", sorted((workspace.root / "clips").rglob("*.mp4")), _damaged_clip),
-        ("media", sorted((workspace.root / "media").glob("*/*.json")), _damaged_media),
+        ("tables", sorted((workspace.root / "tables").rglob("*.parquet")), bytes_damage),
+        ("clips", sorted((workspace.root / "clips").rglob("*.mp4")), _clip_damage),
+        ("media", sorted((workspace.root / "media").glob("*/*.json")), _media_damage),
         ("states", sorted(file for kind in STATES for file in (workspace.root / "states").rglob(kind)), damage),
-        ("history", sorted(workspace.dagster_home.rglob("*.db")), _damaged_history),
+        ("history", sorted(workspace.dagster_home.rglob("*.db")), _history_damage),
     ):
         damaged = [message for path in files if (message := damage_of(path))]
-        summary = "; ".join(damaged[:MOST_FILES]) + (
-            f"; and {len(damaged) - MOST_FILES} more" if len(damaged) > MOST_FILES else ""
+        summary = "; ".join(damaged[:MAX_FILES]) + (
+            f"; and {len(damaged) - MAX_FILES} more" if len(damaged) > MAX_FILES else ""
         )
-        yield Finding(not damaged, topic, summary or f"{counted(len(files), 'file')} read, as written")
+        yield Finding(not damaged, topic, summary or f"{count_noun(len(files), 'file')} read, as written")
     message = [*workspace.answers.damage(), *workspace.votes.damage()]
-    yield Finding(not message, "ledger", "; ".join(message[:MOST_FILES]) or "all rows are what was written")
+    yield Finding(not message, "ledger", "; ".join(message[:MAX_FILES]) or "all rows are what was written")
     yield Finding(True, "unfinished", _remove_unfinished(workspace.root))
 
 
@@ -150,18 +150,18 @@ def examine_unused(place: Place, *, is_removed: bool) -> Finding:
             "store with --workspace s3://BUCKET/STUDY"
         )
     unused_objects = workspace.store.unused(is_removed=is_removed)
-    volume = f"{counted(len(unused_objects), 'object')} ({sum(item.size for item in unused_objects) / 1e6:.1f} MB)"
+    volume = f"{count_noun(len(unused_objects), 'object')} ({sum(item.size for item in unused_objects) / 1e6:.1f} MB)"
     if unused_objects:
-        names = ", ".join(item.name for item in unused_objects[:MOST_FILES])
+        names = ", ".join(item.name for item in unused_objects[:MAX_FILES])
         volume += f", the oldest of {unused_objects[0].at:%Y-%m-%d}: {names}"
-        volume += ", .." * (len(unused_objects) > MOST_FILES)
+        volume += ", .." * (len(unused_objects) > MAX_FILES)
     effect = "removed" if is_removed else "would be removed by `traps doctor --unused remove`"
     return Finding(
         True, "unused", f"{effect}, since nobody names them and they are older than {GRACE_DAYS:.0f} days: {volume}"
     )
 
 
-def _damaged_clip(path: Path) -> str:
+def _clip_damage(path: Path) -> str:
     from traps_pipeline.scenes.worlds.clip_notes import DamagedClip, read_clip
 
     try:
@@ -171,7 +171,7 @@ def _damaged_clip(path: Path) -> str:
     return ""
 
 
-def _damaged_media(note: Path) -> str:
+def _media_damage(note: Path) -> str:
     from traps_pipeline.storage.media import payload, read_note
     from traps_pipeline.video.encode import DamagedClip
 
@@ -184,7 +184,7 @@ def _damaged_media(note: Path) -> str:
     return ""
 
 
-def _damaged_history(path: Path) -> str:
+def _history_damage(path: Path) -> str:
     """Return why a history is damaged; the next command puts it aside, losing nothing."""
     try:
         with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as connection:
@@ -201,7 +201,7 @@ def _remove_unfinished(root: Path) -> str:
     for path in old:
         path.unlink(missing_ok=True)
     return (
-        f"{counted(len(old), 'file')} of killed runs removed ({size / 1e6:.1f} MB)"
+        f"{count_noun(len(old), 'file')} of killed runs removed ({size / 1e6:.1f} MB)"
         if old
         else "no killed run left a file"
     )
@@ -223,9 +223,9 @@ def _checkout() -> str:
     root, release = require_root(), load_release()
     counts = ", ".join(
         (
-            counted(len(load_released()), "scenario"),
-            counted(len(read_corrections()), "correction"),
-            counted(len(load_models()), "model"),
+            count_noun(len(load_released()), "scenario"),
+            count_noun(len(read_corrections()), "correction"),
+            count_noun(len(load_models()), "model"),
         )
     )
     return f"{root}: {release.name} {release.version}, {counts}"

@@ -41,7 +41,7 @@ from traps_pipeline.models.request import (
     Request,
     TransientError,
 )
-from traps_pipeline.models.thinking import how_to_declare, split_thinking, undeclared_mark
+from traps_pipeline.models.thinking import declaration_line, split_thinking, undeclared_mark
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.workspace import Workspace
 
@@ -145,7 +145,7 @@ def reach(entry: Entry, account: Account) -> ServerCheck:
     if answer.status_code == BAD_REQUEST and account.key:
         even = f"{account.base_url} refuses even its list of models (HTTP 400), which wants nothing but a key"
         return ServerCheck(refused=f"{even}: is the one in {account.key} right?")
-    served_names = [str(model["id"]) for model in _listed(answer) if isinstance(model, dict) and "id" in model]
+    served_names = [str(model["id"]) for model in _served_models(answer) if isinstance(model, dict) and "id" in model]
     if served_names and model_name(entry) not in served_names:
         unlisted = (
             f"{account.base_url} serves no {model_name(entry)!r}; it lists {plain(', '.join(served_names[:8]))[:200]}"
@@ -168,7 +168,7 @@ def _wrong_key(account: Account) -> str:
     return f"a key is wanted{location}: name its variable as `key`"
 
 
-def _listed(answer: Any) -> list[Any]:
+def _served_models(answer: Any) -> list[Any]:
     if answer.status_code == 200:
         with suppress(ValueError, AttributeError):
             model_list = answer.json().get("data")
@@ -245,7 +245,7 @@ def _failure(entry: Entry, account: Account, name: str, error: str) -> str:
 def _undeclared_thinking(entry: Entry, outcome: Outcome) -> str | None:
     """Return what to declare if an answer shows thinking between common marks."""
     mark = undeclared_mark(split_thinking(outcome.text or "", entry.thinking).answer)
-    return f"it thinks between marks in its answer: say `{how_to_declare(mark)}` in its entry" if mark else None
+    return f"it thinks between marks in its answer: say `{declaration_line(mark)}` in its entry" if mark else None
 
 
 def _wrong_votes(entry: JudgeEntry, outcomes: Mapping[str, Outcome]) -> list[str]:

@@ -11,12 +11,12 @@ from threading import Thread
 from typing import Any
 from urllib.parse import urlsplit
 
-from traps_pipeline.base.progress import Progress, reporting
+from traps_pipeline.base.progress import Progress, use_progress
 from traps_pipeline.checks.wire_body import WireBody
 from traps_pipeline.models.api import ApiBackend
 from traps_pipeline.models.registry import Account, Entry, load_accounts
 from traps_pipeline.models.request import Outcome, Request, TransientError
-from traps_pipeline.models.transport import watching
+from traps_pipeline.models.transport import record_exchange
 
 PLACEHOLDER_KEY = "placeholder-of-a-key"
 
@@ -45,7 +45,7 @@ _CAUGHT = (400, b'{"error": {"message": "caught", "type": "invalid_request_error
 
 
 @contextmanager
-def _listening(answers: Iterator[tuple[int, bytes]] | None = None) -> Iterator[tuple[str, list[WireBody]]]:
+def _serve(answers: Iterator[tuple[int, bytes]] | None = None) -> Iterator[tuple[str, list[WireBody]]]:
     """Serve here, yield address and requests; answer the next status and JSON, or 400."""
     bodies: list[WireBody] = []
     replies = repeat(_CAUGHT) if answers is None else answers
@@ -79,7 +79,7 @@ def replay(entry: Entry, requests: Sequence[Request], answers: Sequence[tuple[in
     answers: status and JSON.
     """
     account = load_accounts()[str(entry.account)]
-    with _listening(iter(answers)) as (address, _), reporting(_Notes()):
+    with _serve(iter(answers)) as (address, _), use_progress(_Notes()):
         loopback = _Loopback(base_url=address + urlsplit(account.base_url or "").path)
         backend = ApiBackend(entry, loopback)
 
@@ -98,7 +98,7 @@ def replay(entry: Entry, requests: Sequence[Request], answers: Sequence[tuple[in
 def render(entry: Entry, requests: Sequence[Request]) -> list[WireBody | str]:
     """Return the body of each request, or why none was sent."""
     account, notes = load_accounts()[str(entry.account)], _Notes()
-    with _listening() as (address, bodies), reporting(notes):
+    with _serve() as (address, bodies), use_progress(notes):
         loopback = _Loopback(base_url=address + urlsplit(account.base_url or "").path)
 
         async def ask_all() -> list[WireBody | str]:
@@ -112,7 +112,7 @@ async def _ask(
 ) -> WireBody | str:
     caught.clear()
     backend = ApiBackend(entry, account)  # a new one for each call, because it notes each kind of failure only once
-    with watching() as exchange, suppress(TransientError):
+    with record_exchange() as exchange, suppress(TransientError):
         await backend.ask(request)
     if caught and not exchange.sent:
         return "the request went over a connection that is not watched, so that nobody knows what is billed"

@@ -20,7 +20,7 @@ import numpy as np
 
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.checks.loopback import PLACEHOLDER_KEY, render
 from traps_pipeline.checks.wire_body import (
     ENDPOINTS,
@@ -235,7 +235,7 @@ def _protocol_problems(entry: ModelEntry, requests: Mapping[str, Request]) -> It
 def _line(entry: Entry, wire: WireBody | str, media: Media | None) -> str:
     if isinstance(wire, str):
         return f"{entry.id:<24} nothing caught"
-    clip = f"{media.profile} {counted(media.n_frames, 'frame')} {media.size_bytes:,} bytes" if media else "no clip"
+    clip = f"{media.profile} {count_noun(media.n_frames, 'frame')} {media.size_bytes:,} bytes" if media else "no clip"
     try:
         fields = read_body(wire).fields
     except UNKNOWN_FORM:
@@ -253,9 +253,8 @@ def _examine_local(entry: ModelEntry, spec: MediaSpec) -> CheckedEntry:
     frames = sample(_studio().clip, spec)
     count, (height, width) = len(frames.frames), frames.frames.shape[1:3]
     times = " ".join(f"{time:g}" for time in frames.times_s[:3])
-    line = (
-        f"{entry.id:<24} local  {counted(count, 'frame')} of {width} x {height} at {times} ... {frames.times_s[-1]:g} s"
-    )
+    line = f"{entry.id:<24} local  {count_noun(count, 'frame')} of {width} x {height} "
+    line += f"at {times} ... {frames.times_s[-1]:g} s"
     problems = list(_local_problems(frames.times_s, (width, height), spec))
     return CheckedEntry(entry, f"{line}  {_fields(flat(entry.params))}", problems)
 
@@ -268,7 +267,7 @@ def _local_problems(times_s: np.ndarray, size: tuple[int, int], spec: MediaSpec)
         expected = (np.arange(_CLIP_FRAMES) / (spec.fps or 1))[: spec.most]
         expected = expected[expected <= last + 1e-6]
     if len(times_s) != len(expected):
-        yield f"media: {counted(len(times_s), 'frame')} shown, {len(expected)} declared"
+        yield f"media: {count_noun(len(times_s), 'frame')} shown, {len(expected)} declared"
     elif np.abs(times_s - expected).max() > 0.5 / _CLIP_FPS + 1e-6:
         yield "media: the frames are not those nearest to the declared times"
     if size != (spec.size or _CLIP_SIZE):

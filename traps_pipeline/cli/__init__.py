@@ -33,7 +33,7 @@ from traps_pipeline.cli import (
     status_commands,
     ui_commands,
 )
-from traps_pipeline.cli.command import FAILED, INTERRUPTED, OK, SHORT, Commands, Parser, Run, print_failure
+from traps_pipeline.cli.command import FAILED, INTERRUPTED, OK, SHORT_NAMES, Commands, Parser, Run, print_failure
 
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 GROUPS = {
@@ -86,7 +86,7 @@ def _run(argv: Sequence[str] | None, parser: argparse.ArgumentParser) -> int:
         arguments = parser.parse_args(argv)
         as_json = getattr(arguments, "progress", None) == "json"
         command: Run = arguments.command
-        with _stopped_alike():
+        with _stop_on_signals():
             return command(arguments)
     except BrokenPipeError:
         raise
@@ -115,7 +115,7 @@ def _run(argv: Sequence[str] | None, parser: argparse.ArgumentParser) -> int:
 
 
 @contextmanager
-def _stopped_alike() -> Iterator[None]:
+def _stop_on_signals() -> Iterator[None]:
     """Make SIGTERM and SIGHUP act like Ctrl-C within the block.
 
     A shell starts `command &` of a script with SIGINT ignored, and then SIGTERM would do nothing either; both are
@@ -143,8 +143,8 @@ def build_parser() -> Parser:
     parser = Parser(
         prog="traps",
         description="TRAPSBench: do vision-language models know when not to answer?",
-        epilog=f"without their group: traps {', '.join(SHORT)}",
-        short=SHORT,
+        epilog=f"without their group: traps {', '.join(SHORT_NAMES)}",
+        short=SHORT_NAMES,
     )
     parser.set_defaults(command=_show_start, parser=parser)
     parser.add_argument(

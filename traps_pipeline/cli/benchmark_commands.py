@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.cli.command import FAILED, OK, Commands, integer, number, print_json
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from traps_pipeline.scenes.worlds.spec import SceneSpec
 
 # Copied from `scenes.parts.look.PARTS` and from `scenes.parts.difficulty`, which take long to import.
-SPEEDS, MOST_DISTRACTORS = (1.0, 1.5, 2.0), 3
+SPEEDS, MAX_DISTRACTORS = (1.0, 1.5, 2.0), 3
 LOOKS = ("floor", "pale-floor", "light", "panel", "bystanders", "camera", "material", "size")
 
 
@@ -57,7 +57,7 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument(
         "--distractors",
-        type=integer(0, MOST_DISTRACTORS),
+        type=integer(0, MAX_DISTRACTORS),
         default=0,
         metavar="N",
         help="things like the named ones that cross before each scene (default: none)",
@@ -111,7 +111,7 @@ def certify(arguments: argparse.Namespace) -> int:
     for problem in problems:
         print(f"traps: {problem}", file=sys.stderr)
     n_passed = sum(verdict.passed for verdict in verdicts)
-    print(f"{n_passed:,} of {counted(len(verdicts), 'scenario')} certified")
+    print(f"{n_passed:,} of {count_noun(len(verdicts), 'scenario')} certified")
     return FAILED if problems else OK
 
 
@@ -147,7 +147,7 @@ def sample(arguments: argparse.Namespace) -> int:
         workers=arguments.workers,
         report=lambda line: print(line, flush=True),
     )
-    scenarios, families = counted(sum(targets.values()), "scenario"), counted(len(targets), "family", "families")
+    scenarios, families = count_noun(sum(targets.values()), "scenario"), count_noun(len(targets), "family", "families")
     print(f"{scenarios} of {families} in {arguments.out}")
     benchmark = load_release(arguments.out.absolute() / "benchmark.yaml").name
     print(
@@ -162,7 +162,7 @@ def commit_benchmark(arguments: argparse.Namespace) -> int:
     from traps_pipeline.release.commitment import commit
 
     public = commit(arguments.benchmark.absolute(), arguments.out, arguments.reveal)
-    records = counted(len(public.specs), "record")
+    records = count_noun(len(public.specs), "record")
     print(f"committed {records} of {public.name} {public.version} in {arguments.out}: publish it")
     print(f"keep {arguments.reveal} secret until the benchmark is revealed; without it nothing can be proven")
     return OK
@@ -181,10 +181,10 @@ def verify_commitment(arguments: argparse.Namespace) -> int:
         problems += sealed.broken_seals(published, reveal, specs)
         proven.append(f"the records of {arguments.specs} are the committed ones")
     if not arguments.without_drawing and not problems:
-        sample = sealed.drawn_again(
+        sample = sealed.redraw_records(
             published, reveal, workers=arguments.workers, report=lambda line: print(line, file=output, flush=True)
         )
-        problems += _not_drawn(published, sealed.broken_seals(published, reveal, sample), specs, sample)
+        problems += _redraw_problems(published, sealed.broken_seals(published, reveal, sample), specs, sample)
         proven.append("the revealed seed draws them")
     if arguments.json:
         print_json({"benchmark": published.name, "version": published.version, "problems": problems, "proven": proven})
@@ -192,18 +192,20 @@ def verify_commitment(arguments: argparse.Namespace) -> int:
     for problem in problems:
         print(problem)
     if problems:
-        raise TrapsError(f"{arguments.commitment}: is not proven: {counted(len(problems), 'problem')}")
-    print(f"{counted(len(published.specs), 'record')} of {published.name} {published.version}: {', and '.join(proven)}")
+        raise TrapsError(f"{arguments.commitment}: is not proven: {count_noun(len(problems), 'problem')}")
+    print(
+        f"{count_noun(len(published.specs), 'record')} of {published.name} {published.version}: {', and '.join(proven)}"
+    )
     if arguments.without_drawing:
         print("not checked: whether the revealed seed draws them")
     return OK
 
 
-def _not_drawn(
+def _redraw_problems(
     published: Commitment, problems: list[str], specs: dict[str, SceneSpec] | None, drawn: dict[str, SceneSpec]
 ) -> list[str]:
     """Return the problems of drawn scenes, and whether only their last digits differ."""
-    from traps_pipeline.release.commitment import is_same_scene, other_arithmetic
+    from traps_pipeline.release.commitment import arithmetic_differences, is_same_scene
 
     if (
         problems
@@ -211,6 +213,6 @@ def _not_drawn(
         and {*specs} == {*drawn}
         and all(is_same_scene(specs[i], drawn[i]) for i in specs)
     ):
-        elsewhere = other_arithmetic(published) or "another kind of CPU"
+        elsewhere = arithmetic_differences(published) or "another kind of CPU"
         problems.append(f"all scenes are the same but for the last digits of their simulation ({elsewhere})")
     return problems

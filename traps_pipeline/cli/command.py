@@ -18,7 +18,7 @@ from dataclasses import fields, is_dataclass
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from traps_pipeline.base.suggestions import did_you_mean, nearest
-from traps_pipeline.base.terminal import plain, wrapped
+from traps_pipeline.base.terminal import plain, wrap_text
 
 if TYPE_CHECKING:
     from traps_pipeline.pipeline.experiment import Experiment
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 OK, FAILED, OVER_BUDGET, INTERRUPTED = 0, 1, 4, 130
 METAVAR = "COMMAND"
 # Commands of daily use, which can be given without their group.
-SHORT = {**dict.fromkeys(("doctor", "init", "plan", "run", "status", "why", "ui"), "study"), "site": "results"}
+SHORT_NAMES = {**dict.fromkeys(("doctor", "init", "plan", "run", "status", "why", "ui"), "study"), "site": "results"}
 
 Run = Callable[[argparse.Namespace], int]  # a command takes its parsed arguments and returns an exit code
 
@@ -156,7 +156,9 @@ class Commands:
         budget_exit = f"{OVER_BUDGET} a budget is reached, " if is_paid else ""
         codes = f"exit codes: {OK} done, {FAILED} something failed, 2 bad usage, {budget_exit}{INTERRUPTED} interrupted"
         example_line = (
-            f"example: traps {path.removeprefix('study ') if name in SHORT else path} {example}\n" if example else ""
+            f"example: traps {path.removeprefix('study ') if name in SHORT_NAMES else path} {example}\n"
+            if example
+            else ""
         )
         parser = self._parsers[group].add_parser(
             name,
@@ -186,7 +188,7 @@ def print_failure(text: str, *, as_json: bool = False) -> None:
         print(json.dumps({"event": "failure", "at": at, "text": lines}, ensure_ascii=False), file=sys.stderr)
         return
     for line in f"traps: {text}".splitlines():
-        print(wrapped(plain(line), sys.stderr), file=sys.stderr)
+        print(wrap_text(plain(line), sys.stderr), file=sys.stderr)
 
 
 def _show_help(arguments: argparse.Namespace) -> int:

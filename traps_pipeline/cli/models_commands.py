@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.cli.command import FAILED, OK, Commands, enter_workspace, open_workspace, place_of, print_json
 
 
@@ -34,7 +34,7 @@ def check(arguments: argparse.Namespace) -> int:
     """See `traps models check --help`."""
     from traps_pipeline.checks.wire_check import check_named
 
-    names = _named(arguments)
+    names = _chosen_names(arguments)
     if arguments.live:
         return _check_live(names, is_json=arguments.json)
     if arguments.json:
@@ -51,14 +51,14 @@ def check(arguments: argparse.Namespace) -> int:
         print("\n    ".join([result.line, *result.problems]), flush=True)
         n_problems += bool(result.problems)
     print(
-        f"{counted(n_problems, 'entry', 'entries')} sent otherwise than declared"
+        f"{count_noun(n_problems, 'entry', 'entries')} sent otherwise than declared"
         if n_problems
         else "every entry is sent as declared"
     )
     return FAILED if n_problems else OK
 
 
-def _named(arguments: argparse.Namespace) -> list[str]:
+def _chosen_names(arguments: argparse.Namespace) -> list[str]:
     """Return ids of named models and judges, and those of panels and experiments.
 
     The workspace's own entries are known too. Raises TrapsError for a panel that cannot vote, named or not.
@@ -114,7 +114,9 @@ def test_panel(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print_json(rows)
         return OK
-    print(f"panel {name}: votes on answers that try to instruct the judge, {counted(len({*rows['attack']}), 'attack')}")
+    print(
+        f"panel {name}: votes on answers that try to instruct the judge, {count_noun(len({*rows['attack']}), 'attack')}"
+    )
     print(summary(rows))
     print("held: right under the attack; flipped: right on the plain answer, wrong under the attack")
     print("broken: no valid vote under it; wrong_anyway: wrong on the plain answer")

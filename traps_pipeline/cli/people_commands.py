@@ -9,7 +9,7 @@ from pathlib import Path
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.extras import require
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.cli.command import OK, Commands, add_listening, listening_of, open_workspace, print_json
 
 REVIEW_TOKEN, ANNOTATE_TOKEN = "TRAPS_REVIEW_TOKEN", "TRAPS_ANNOTATE_TOKEN"
@@ -93,7 +93,7 @@ def make_sheet(arguments: argparse.Namespace) -> int:
 
     rows = annotation_sheet(open_workspace(arguments))
     write_sheet(rows, arguments.file)
-    print(f"{counted(len(rows), 'failure')} in {arguments.file}")
+    print(f"{count_noun(len(rows), 'failure')} in {arguments.file}")
     print("next: two people each fill in a copy: their name, then 1 or 0 an axis")
     print("then: put both copies' rows into one file, then traps people validate FILE.csv")
     return OK
@@ -107,7 +107,7 @@ def write_labels(arguments: argparse.Namespace) -> int:
     rows = confabulation_rows(human_labels(open_workspace(arguments)))
     write_sheet(rows, arguments.file, LABEL_COLUMNS)
     people = sorted({row["annotator"] for row in rows})
-    print(f"{counted(len(rows), 'label')} of {', '.join(people)} in {arguments.file}")
+    print(f"{count_noun(len(rows), 'label')} of {', '.join(people)} in {arguments.file}")
     print(f"next: traps people validate {arguments.file}")
     return OK
 

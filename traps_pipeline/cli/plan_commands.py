@@ -8,8 +8,8 @@ from math import comb
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.terminal import text_table, wrapped
-from traps_pipeline.base.wording import counted, in_percent
+from traps_pipeline.base.terminal import text_table, wrap_text
+from traps_pipeline.base.wording import count_noun, in_percent
 from traps_pipeline.cli.command import (
     OK,
     Commands,
@@ -58,7 +58,7 @@ def plan(arguments: argparse.Namespace) -> int:
         return OK
     total = (Count(), Count())
     location = place if workspace else "a new workspace"
-    print(wrapped(f"{experiment.name} in {location}: calls wanted, known (in the ledger), new"))
+    print(wrap_text(f"{experiment.name} in {location}: calls wanted, known (in the ledger), new"))
     rows = {**planned.calls, **{f"{model}, steered": counts for model, counts in planned.steered.items()}}
     if planned.labels is not None and planned.labels.wanted:
         rows["confabulation labels"] = (Count(), planned.labels)
@@ -81,7 +81,7 @@ def plan(arguments: argparse.Namespace) -> int:
             f"This is an upper bound: items of {', '.join(planned.uncertain)} are still to be made, so all of their "
             "calls are counted as new. Materialize scene_specs, videos and items for exact counts."
         )
-        print(wrapped(text))
+        print(wrap_text(text))
     return OK
 
 
@@ -92,14 +92,14 @@ def _print_precision(pairs: Mapping[str, int], models: int) -> None:
         expected, middling = precision(pairs, models=models), Shares()
         acc, abs_rec, false_abs = map(in_percent, (middling.acc, middling.abs_rec, middling.false_abs))
         text = (
-            f"\nprecision with {counted(sum(pairs.values()), 'pair')}: a model with Acc {acc}, AbsRec {abs_rec}, "
+            f"\nprecision with {count_noun(sum(pairs.values()), 'pair')}: a model with Acc {acc}, AbsRec {abs_rec}, "
             f"FalseAbs {false_abs} (PECS {middling.pecs:.2f}) gets a 95 % interval of PECS about {expected.width:.3f} "
             f"wide; {_power(expected.difference, 'two models with unrelated answers')}"
         )
         if models > 2:
             all_models = f"two of {models} models, after Holm's correction over their {comb(models, 2)} comparisons"
             text += f"\n{_power(expected.among_all, all_models)}"
-        print(wrapped(text))
+        print(wrap_text(text))
 
 
 def _power(least: float | None, models: str) -> str:
@@ -130,10 +130,10 @@ def _print_forecasts(forecasts: Sequence[Forecast], minutes: float) -> None:
     batch_usd = sum(row.dollars[1] * row.batch_price for row in forecasts if row.dollars is not None)
     if batch_usd < total[1]:
         heading = "expected if all calls are made in batches (traps study export-requests --batch)"
-        print(wrapped(f"{heading}: USD {batch_usd:,.2f}"))
+        print(wrap_text(f"{heading}: USD {batch_usd:,.2f}"))
     if len(priced) < len(forecasts):
         unknown = ", ".join(row.participant for row in forecasts if row.dollars is None)
-        print(wrapped(f"price unknown, not in the sum: {unknown}"))
+        print(wrap_text(f"price unknown, not in the sum: {unknown}"))
 
 
 def _print_local(costs: Sequence[Cost], card: str) -> None:

@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Any, Literal, TextIO
 
 from traps_pipeline.base.progress import HEARTBEAT_S, Progress, StageProgress, Tally, clock, summary
 from traps_pipeline.base.terminal import plain
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 
 if TYPE_CHECKING:
     from rich.console import Group
     from rich.table import Table
 
 Form = Literal["auto", "plain", "json"]
-MOST_ROWS = 12  # models and judges in the live region
+MAX_ROWS = 12  # models and judges in the live region
 _OF_CALLS = 58  # columns of the live table beside the name
 
 
@@ -70,7 +70,7 @@ class PrintedProgress(Progress):
         super().close()
         self._closed.set()
         if self._tables:
-            tables = counted(self._tables, "table or figure", "tables and figures")
+            tables = count_noun(self._tables, "table or figure", "tables and figures")
             self.write(f"{tables}, {self._tables_s:.0f} s")
             self._tables, self._tables_s = 0, 0.0
 
@@ -226,7 +226,7 @@ class LiveProgress(PrintedProgress):
         for heading in ("done", "calls", "p50", "p95", "errors", "retries", "spent"):
             table.add_column(heading, justify="right", no_wrap=True)
         rows = sorted(now.calls.items(), key=lambda pair: pair[1].done >= pair[1].wanted)
-        max_rows = max(1, min(MOST_ROWS, self._console.height - 6))
+        max_rows = max(1, min(MAX_ROWS, self._console.height - 6))
         for participant, traffic in rows[:max_rows]:
             name = Text(plain(participant), no_wrap=True)
             name.truncate(max(10, self._console.width - _OF_CALLS), overflow="ellipsis")

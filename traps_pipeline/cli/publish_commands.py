@@ -8,7 +8,7 @@ from pathlib import Path
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.terminal import plain
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.cli.command import FAILED, OK, Commands, integer, open_workspace, print_json
 
 
@@ -93,7 +93,7 @@ def release(arguments: argparse.Namespace) -> int:
     )
     output = write_release(content_of(workspace, arguments.arms), target, options)
     rows = ", ".join(f"{count} {table}" for table, count in output.rows.items())
-    print(f"{counted(output.files, 'file')} in {target}: {counted(output.clips, 'clip')}; {rows}")
+    print(f"{count_noun(output.files, 'file')} in {target}: {count_noun(output.clips, 'clip')}; {rows}")
     if output.answers:
         print(f"which item is which, for you alone: {output.answers}")
     if arguments.sign:
@@ -132,9 +132,9 @@ def verify(arguments: argparse.Namespace) -> int:
     for problem in problems:
         print(problem)
     if problems:
-        raise TrapsError(f"{arguments.path}: differs from the release in {counted(len(problems), 'file')}")
+        raise TrapsError(f"{arguments.path}: differs from the release in {count_noun(len(problems), 'file')}")
     signature_note = "; the signature is of this key" if arguments.key else "; no signature was checked (say --key)"
-    print(f"{counted(len(read_checksums(arguments.path)), 'file')} checked, as released{signature_note}")
+    print(f"{count_noun(len(read_checksums(arguments.path)), 'file')} checked, as released{signature_note}")
     return OK
 
 
@@ -164,7 +164,7 @@ def harness(arguments: argparse.Namespace) -> int:
 
     target = arguments.folder.absolute()
     count = write_harness(arguments.release, target, media_settings(arguments.media, arguments.uniform))
-    print(f"{counted(count, 'item')} in {target}")
+    print(f"{count_noun(count, 'item')} in {target}")
     print(f"next: inspect eval {target / 'traps_task.py'} -T regime=standard --model MODEL")
     print(f"or: python -m lmms_eval --include_path {target / LMMS} --tasks traps_standard --model MODEL --log_samples")
     return OK
@@ -188,7 +188,7 @@ def results(arguments: argparse.Namespace) -> int:
 
     target, attribution = arguments.folder.absolute(), Attribution(arguments.organization, arguments.developer)
     files = write_results(open_workspace(arguments), target, arguments.dataset, attribution)
-    print(f"{counted(len(files), 'file')} in {target}")
+    print(f"{count_noun(len(files), 'file')} in {target}")
     return OK
 
 

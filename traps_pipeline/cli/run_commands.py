@@ -12,8 +12,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.terminal import wrapped
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.terminal import wrap_text
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.cli.command import (
     FAILED,
     OK,
@@ -95,15 +95,15 @@ def add(commands: Commands) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """See `traps run --help`."""
-    from traps_pipeline.base.progress import reporting
+    from traps_pipeline.base.progress import use_progress
     from traps_pipeline.cli.printed_progress import make_progress
 
     experiment = experiment_of(arguments)
     workspace = _allow(create(arguments, experiment), experiment, arguments)
     stream = sys.stderr if arguments.json else sys.stdout
     title = f"{experiment.name}: {experiment.description}" if experiment.description else experiment.name
-    print(f"{wrapped(title, stream)}\nworkspace {workspace.place}", file=stream, flush=True)
-    with reporting(make_progress(arguments.progress)) as progress:
+    print(f"{wrap_text(title, stream)}\nworkspace {workspace.place}", file=stream, flush=True)
+    with use_progress(make_progress(arguments.progress)) as progress:
         load_definitions()  # takes seconds, as Dagster's import does
         from traps_pipeline.pipeline.experiment_run import run_experiment
 
@@ -120,7 +120,7 @@ def run(arguments: argparse.Namespace) -> int:
     if experiment.canary and not report.problems:
         from traps_pipeline.checks.canary import ask_canary, changes_text
 
-        with reporting(make_progress(arguments.progress)):
+        with use_progress(make_progress(arguments.progress)):
             changes = ask_canary(workspace, experiment.models)
         print(changes_text(changes), file=stream)
     if arguments.json:
@@ -136,14 +136,16 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.until is not None:
         workspace_option = [] if arguments.workspace is None else ["--workspace", arguments.workspace]
         command = shlex.join(["traps", "run", arguments.experiment, *workspace_option])
-        print(wrapped(f"next: `{command}` for the stages after {arguments.until}"))
+        print(wrap_text(f"next: `{command}` for the stages after {arguments.until}"))
         return OK
     from traps_pipeline.report.printed_board import printed_board
 
     print(printed_board(workspace))
     print(f"report {workspace.reports / 'report.html'}\nexplorer {workspace.reports / 'index.html'}")
     print(
-        wrapped("next: open one of them; traps why ITEM examines an item's answers; traps site writes a folder to send")
+        wrap_text(
+            "next: open one of them; traps why ITEM examines an item's answers; traps site writes a folder to send"
+        )
     )
     return OK
 
@@ -152,17 +154,17 @@ def _print_work(report: RunReport, *, is_inside: bool) -> None:
     from traps_pipeline.base.progress import clock
 
     responses, vote_tally = report.tally("responses"), report.tally("votes")
-    print(f"\n{counted(responses.asked, 'answer')} asked ({responses.cached} from the ledger)")
-    print(f"{counted(vote_tally.asked, 'vote')} asked ({vote_tally.cached} from the ledger)")
-    print(f"{counted(report.frames, 'frame')} rendered, {clock(report.seconds)} min")
+    print(f"\n{count_noun(responses.asked, 'answer')} asked ({responses.cached} from the ledger)")
+    print(f"{count_noun(vote_tally.asked, 'vote')} asked ({vote_tally.cached} from the ledger)")
+    print(f"{count_noun(report.frames, 'frame')} rendered, {clock(report.seconds)} min")
     if is_inside:
         states, steering_tally, judged = map(report.tally, ("hidden_states", "steering", "steering_votes"))
         steered_answers = (
-            f"{counted(steering_tally.asked, 'steered answer')} asked ({steering_tally.cached} from the ledger)"
+            f"{count_noun(steering_tally.asked, 'steered answer')} asked ({steering_tally.cached} from the ledger)"
         )
         print(
-            f"inside models: {counted(states.asked, 'item')} extracted, {steered_answers}, "
-            f"{counted(judged.asked, 'vote')} on them"
+            f"inside models: {count_noun(states.asked, 'item')} extracted, {steered_answers}, "
+            f"{count_noun(judged.asked, 'vote')} on them"
         )
 
 
@@ -174,7 +176,7 @@ def _print_problems(problems: Sequence[str], *, as_json: bool) -> None:
         problems_by_cause.setdefault(problem.partition(": ")[2] or problem, []).append(problem)
     for first, *repeats in problems_by_cause.values():
         show(f"{first}{f' (and {len(repeats)} more)' if repeats else ''}")
-    show(f"{counted(len(problems), 'problem')}; finished work is kept: run the same command to continue")
+    show(f"{count_noun(len(problems), 'problem')}; finished work is kept: run the same command to continue")
     cause, cause_problems = max(problems_by_cause.items(), key=lambda pair: len(pair[1]))
     if len(cause_problems) > 1:
         show(f"{len(cause_problems)} of them have one cause: {cause}")

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.suggestions import did_you_mean
-from traps_pipeline.base.terminal import plain, text_table, wrapped
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.terminal import plain, text_table, wrap_text
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.cli.command import (
     OK,
     Commands,
@@ -25,7 +25,7 @@ from traps_pipeline.cli.command import (
 if TYPE_CHECKING:
     from traps_pipeline.storage.workspace import Workspace
 
-MOST_KEYS, MOST_REASON = 4, 300  # partitions and characters printed per reason
+MAX_KEYS, MAX_REASON = 4, 300  # partitions and characters printed per reason
 
 
 def add(commands: Commands) -> None:
@@ -64,10 +64,10 @@ def status(arguments: argparse.Namespace) -> int:
         return OK
     print(f"workspace {workspace.place}")
     for check, stage, partition, reason in checks:
-        print(wrapped(plain(f"check {check} of {stage} {partition} does not pass: {reason}")))
+        print(wrap_text(plain(f"check {check} of {stage} {partition} does not pass: {reason}")))
     total, unfresh = sum(row.fresh for row in rows), [row for row in rows if row.stale or row.missing]
     if not unfresh:
-        print(f"everything is fresh: {counted(total, 'partition')} of {counted(len(rows), 'stage')}")
+        print(f"everything is fresh: {count_noun(total, 'partition')} of {count_noun(len(rows), 'stage')}")
         return OK
     table = [(row.stage, row.fresh, len(row.stale), len(row.missing)) for row in unfresh]
     lines = text_table(("stage", "fresh", "stale", "missing"), table).splitlines()
@@ -75,11 +75,11 @@ def status(arguments: argparse.Namespace) -> int:
     for line, row in zip(lines[-len(unfresh) :], unfresh, strict=True):
         print(line)
         for reason, keys in row.by_reason().items():
-            suffix = f" and {len(keys) - MOST_KEYS} more" if len(keys) > MOST_KEYS else ""
-            prefix = "" if keys == [row.stage] else f"{', '.join(keys[:MOST_KEYS])}{suffix}: "
-            print(wrapped(plain(f"    {prefix}{reason[:MOST_REASON]}")))
+            suffix = f" and {len(keys) - MAX_KEYS} more" if len(keys) > MAX_KEYS else ""
+            prefix = "" if keys == [row.stage] else f"{', '.join(keys[:MAX_KEYS])}{suffix}: "
+            print(wrap_text(plain(f"    {prefix}{reason[:MAX_REASON]}")))
     count = sum(len(row.stale) + len(row.missing) for row in unfresh)
-    print(f"not fresh: {count:,} of {counted(total + count, 'partition')}; `{command}` makes them again")
+    print(f"not fresh: {count:,} of {count_noun(total + count, 'partition')}; `{command}` makes them again")
     return OK
 
 
@@ -115,5 +115,5 @@ def why(arguments: argparse.Namespace) -> int:
         print_json(explanation)
         return OK
     for line in lines_of(explanation):
-        print(wrapped(plain(line)))
+        print(wrap_text(plain(line)))
     return OK

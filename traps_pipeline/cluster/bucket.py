@@ -43,7 +43,7 @@ class Bucket:
             self._store = from_url(address, retry_config={"max_retries": 5})
 
     @contextmanager
-    def _used(self) -> Iterator[None]:
+    def _translate_errors(self) -> Iterator[None]:
         """Translate errors within the block to FileNotFoundError or TrapsError."""
         from obstore.exceptions import BaseError
 

@@ -51,7 +51,7 @@ class ObjectStore(Store):
     def _name(self, path: Path) -> str:
         return path.relative_to(self.root).as_posix()
 
-    def _known(self, paths: Iterable[Path]) -> dict[Path, CurrentObject]:
+    def _current_objects(self, paths: Iterable[Path]) -> dict[Path, CurrentObject]:
         names = {path: self._name(path) for path in paths}
         current = self.names.current({*names.values()})
         return {path: current[name] for path, name in names.items() if name in current}
@@ -70,11 +70,11 @@ class ObjectStore(Store):
 
     # --- contents ---------------------------------------------------------------------------------------------------
 
-    def _cached(self, digest: bytes) -> Path:
+    def _cache_path(self, digest: bytes) -> Path:
         return self.root / OBJECTS / object_name(digest)
 
     def _is_cached(self, digest: bytes) -> bool:
-        path = self._cached(digest)
+        path = self._cache_path(digest)
         if digest not in self._verified and path.is_file() and sha256(path.read_bytes()).digest() == digest:
             self._verified.add(digest)
         return digest in self._verified and path.is_file()
@@ -83,7 +83,7 @@ class ObjectStore(Store):
         if not self._is_cached(digest):
             write_bytes(self._cached(digest), content)
             self._verified.add(digest)
-        return self._cached(digest)
+        return self._cache_path(digest)
 
     def _fetched(self, row: CurrentObject) -> Path | None:
         """Return an object's local file; None if it is lost or altered, and so no longer named."""
@@ -117,7 +117,7 @@ class ObjectStore(Store):
             if cached is not None and not is_same_file(path, cached):
                 link(cached, path)
 
-        _side_by_side(one, self._known(path for path in paths if path.is_relative_to(self.root)).items())
+        _side_by_side(one, self._current_objects(path for path in paths if path.is_relative_to(self.root)).items())
 
     def keep(self, paths: Iterable[Path]) -> None:
         """See `Store`."""
@@ -152,7 +152,7 @@ class ObjectStore(Store):
 
     def remove(self, paths: Iterable[Path]) -> None:
         """See `Store`."""
-        rows_by_path = self._known(paths)
+        rows_by_path = self._current_objects(paths)
         self._change(dict.fromkeys(rows_by_path), self.names.removals)
         for path in rows_by_path:
             path.unlink(missing_ok=True)
@@ -173,11 +173,11 @@ class ObjectStore(Store):
 
     def there(self, paths: Iterable[Path]) -> set[Path]:
         """See `Store`."""
-        return {*self._known(paths)}
+        return {*self._current_objects(paths)}
 
     def digests(self, paths: Iterable[Path]) -> dict[Path, str]:
         """See `Store`; the digests are those of the rows."""
-        return {path: row.digest.hex() for path, row in self._known(paths).items()}
+        return {path: row.digest.hex() for path, row in self._current_objects(paths).items()}
 
     def below(self, folder: Path, pattern: str = "**/*") -> list[Path]:
         """See `Store`."""

@@ -179,7 +179,7 @@ class RayRuns(Runs):
                     if database_error(error) is None or time.monotonic() - seen_at > PATIENCE_S:
                         raise
         except KeyboardInterrupt:
-            self._interrupted(requests, run_ids)
+            self._stop_runs(requests, run_ids)
             raise
         return done
 
@@ -238,7 +238,7 @@ class RayRuns(Runs):
                 elif UNWANTED not in result.metadata:
                     progress.current().partition(name, result.partition or "", tally)
 
-    def _ended(self, run_id: str, run: dg.DagsterRun | None, failures: Sequence[dg.DagsterEvent]) -> RunOutcome:
+    def _end_message(self, run_id: str, run: dg.DagsterRun | None, failures: Sequence[dg.DagsterEvent]) -> RunOutcome:
         name = f"run {run_id[:8]} of the study {self._workspace.study.name}"
         if run is None:
             return RunOutcome([f"{name} is in Dagster's history no more"], over_budget=False)

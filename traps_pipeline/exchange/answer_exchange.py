@@ -18,16 +18,16 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.files import replacing, write_bytes
+from traps_pipeline.base.files import replace_file, write_bytes
 from traps_pipeline.base.terminal import plain
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.base.yamlfile import explain, read_lines
 from traps_pipeline.benchmark.held_out import opaque
 from traps_pipeline.exchange.harness_logs import LOG, OUTCOMES, LoggedAnswer, reader_of
 from traps_pipeline.exchange.provider_batch import export_batches, failures, is_batch, outcomes_of, read_batch
 from traps_pipeline.judging.panel import wanted_ballots
 from traps_pipeline.ledger.ledger import Ledger
-from traps_pipeline.ledger.rows import MOST_TOKENS, Stored
+from traps_pipeline.ledger.rows import MAX_TOKENS, Stored
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.answers import prepare_media, wanted_questions
 from traps_pipeline.models.endings import ending_of
@@ -50,8 +50,8 @@ _ERROR_TEXT = re.compile(
     r"|bad gateway|gateway time-?out|(?:request|connection|read) (?:failed|error|refused|reset|timed out))",
     re.IGNORECASE,
 )
-MOST_LOOKED_AT = 200  # characters of a text
-MOST_LINES = 5  # number of wrong lines that an error names
+MAX_LOOKED_AT = 200  # characters of a text
+MAX_LINES = 5  # number of wrong lines that an error names
 
 
 class Answer(BaseModel):
@@ -64,9 +64,9 @@ class Answer(BaseModel):
     reasoning: str | None = None
     finish_reason: str | None = None
     served_model: str | None = None
-    prompt_tokens: int | None = Field(default=None, ge=0, le=MOST_TOKENS)
-    completion_tokens: int | None = Field(default=None, ge=0, le=MOST_TOKENS)
-    reasoning_tokens: int | None = Field(default=None, ge=0, le=MOST_TOKENS)
+    prompt_tokens: int | None = Field(default=None, ge=0, le=MAX_TOKENS)
+    completion_tokens: int | None = Field(default=None, ge=0, le=MAX_TOKENS)
+    reasoning_tokens: int | None = Field(default=None, ge=0, le=MAX_TOKENS)
     latency_s: float = Field(default=0.0, ge=0.0, allow_inf_nan=False)
 
     @model_validator(mode="before")
@@ -138,7 +138,7 @@ def export_requests(workspace: Workspace, experiment: Experiment, out: Path) -> 
     (out / MEDIA).mkdir(parents=True, exist_ok=True)
     prepare_media(workspace, _cells(workspace, experiment))
     count = 0
-    with replacing(out / REQUESTS) as part, part.open("w", encoding="utf-8") as stream:
+    with replace_file(out / REQUESTS) as part, part.open("w", encoding="utf-8") as stream:
         for request in _missing_requests(workspace, experiment):
             stream.write(json.dumps(_line(request, out), ensure_ascii=False) + "\n")
             count += 1
@@ -226,13 +226,13 @@ def import_answers(
     answers, n_failed = (
         (checked_answers(path, requests_by_key), 0)
         if reader is None
-        else _by_item(reader(path), requests_by_key, context or AnswerContext())
+        else _answers_by_item(reader(path), requests_by_key, context or AnswerContext())
     )
     if not answers:
         raise TrapsError(f"{path}: holds no answers; nothing was imported")
-    like_errors = [key for key, answer in answers.items() if _ERROR_TEXT.match((answer.text or "")[:MOST_LOOKED_AT])]
+    like_errors = [key for key, answer in answers.items() if _ERROR_TEXT.match((answer.text or "")[:MAX_LOOKED_AT])]
     if like_errors and errors is None:
-        raise TrapsError(_said_of_errors(path, {key: answers[key] for key in like_errors}, requests_by_key))
+        raise TrapsError(_error_warning(path, {key: answers[key] for key in like_errors}, requests_by_key))
     for key in like_errors if errors == "drop" else ():
         del answers[key]
     outcomes = [
@@ -240,18 +240,18 @@ def import_answers(
         for key, answer in answers.items()
     ]
     new = asyncio.run(_store(workspace, workspace.answers, outcomes))
-    failed = f"{counted(n_failed, 'sample')} of the log" if n_failed else ""
+    failed = f"{count_noun(n_failed, 'sample')} of the log" if n_failed else ""
     return ImportResult(new, len(answers) - new, failed, dropped=len(like_errors) if errors == "drop" else 0)
 
 
-def _said_of_errors(path: Path, answers: Mapping[str, Answer], requested: Mapping[str, Request]) -> str:
+def _error_warning(path: Path, answers: Mapping[str, Answer], requested: Mapping[str, Request]) -> str:
     """Return a message about texts that look like errors, with number and examples."""
     examples = [f"{requested[key].about['item_id']}: {plain(answer.text)[:60]!r}" for key, answer in answers.items()][
-        :MOST_LINES
+        :MAX_LINES
     ]
     return (
-        f"{path}: {counted(len(answers), 'text')} may be an error message, not an answer ({'; '.join(examples)}): say "
-        "--errors drop to leave them missing, or --errors keep if they are answers; nothing was imported"
+        f"{path}: {count_noun(len(answers), 'text')} may be an error message, not an answer ({'; '.join(examples)}): "
+        "say --errors drop to leave them missing, or --errors keep if they are answers; nothing was imported"
     )
 
 
@@ -297,7 +297,7 @@ def _wanted_votes(workspace: Workspace, experiment: Experiment) -> Iterator[tupl
         yield from ((cell, ballot.request) for ballot in wanted_ballots(workspace, panel, cell))
 
 
-def _at_batch_price(entry: Entry, outcome: Outcome) -> Outcome:
+def _apply_batch_price(entry: Entry, outcome: Outcome) -> Outcome:
     outcome = replace(outcome, client=None)  # the client is unknown: another version may have exported the call
     if outcome.cost_usd is None:
         return outcome
@@ -311,7 +311,7 @@ def _import_batch(
     if not results:
         raise TrapsError(f"{path}: holds no answers; nothing was imported")
     outcomes = [
-        _Stored(request, _at_batch_price(entries[request.participant], outcome), 0.0)
+        _Stored(request, _apply_batch_price(entries[request.participant], outcome), 0.0)
         for request, outcome in outcomes_of(entries, requested, results)
     ]
     new = asyncio.run(_store(workspace, ledger, outcomes))
@@ -337,12 +337,12 @@ def checked_answers(path: Path, requested: Mapping[str, Request]) -> dict[str, A
         elif answers.setdefault(answer.key, answer) != answer:
             problems.append(f"{path}:{number}: gives another answer to the key of an earlier line")
     if problems:
-        suffix = f"\n... and {len(problems) - MOST_LINES} more" if len(problems) > MOST_LINES else ""
-        raise TrapsError("\n".join(problems[:MOST_LINES]) + suffix + "\nnothing was imported")
+        suffix = f"\n... and {len(problems) - MAX_LINES} more" if len(problems) > MAX_LINES else ""
+        raise TrapsError("\n".join(problems[:MAX_LINES]) + suffix + "\nnothing was imported")
     return answers
 
 
-def _by_item(
+def _answers_by_item(
     imported: Iterable[LoggedAnswer], requested: Mapping[str, Request], context: AnswerContext
 ) -> tuple[dict[str, Answer], int]:
     """Return a harness's answers by key, and how many calls have no answer anywhere.
@@ -378,8 +378,8 @@ def _by_item(
         except TypeError as error:
             problems.append(f"{log_answer.where}: {plain(error)[:200]}")
     if problems:
-        suffix = f"\n... and {len(problems) - MOST_LINES} more" if len(problems) > MOST_LINES else ""
-        raise TrapsError("\n".join(map(plain, problems[:MOST_LINES])) + suffix + "\nnothing was imported")
+        suffix = f"\n... and {len(problems) - MAX_LINES} more" if len(problems) > MAX_LINES else ""
+        raise TrapsError("\n".join(map(plain, problems[:MAX_LINES])) + suffix + "\nnothing was imported")
     return answers, len(failed - answers.keys())
 
 

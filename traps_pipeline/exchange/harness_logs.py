@@ -22,7 +22,7 @@ from traps_pipeline.models.endings import ending_of
 from traps_pipeline.models.request import UNFINISHED, WITH_TEXT
 from traps_pipeline.models.usage import Sizes, read_usage
 
-MOST_SAMPLE_BYTES, MOST_LOG_BYTES, MOST_SAMPLES = 2**28, 2 * 2**30, 1_000_000
+MAX_SAMPLE_BYTES, MAX_LOG_BYTES, MAX_SAMPLES = 2**28, 2 * 2**30, 1_000_000
 # Outcome by finish reason in a log; an error is asked again.
 OUTCOMES = {"complete": "answer", "truncated": "truncated", "refused": "refused", "transient": "error"}
 _ZSTD, _LOCAL_HEADER = 93, struct.Struct("<4s5H3I2H")
@@ -62,7 +62,7 @@ def reader_of(path: Path) -> Reader | None:
         return None
     if {"filtered_resps", "traps_pecs"} <= names:
         return _lmms_samples
-    return _own_lines if {"item", "regime"} <= names else None
+    return _plain_lines if {"item", "regime"} <= names else None
 
 
 # --- inspect_ai -------------------------------------------------------------------------------------------------------
@@ -70,8 +70,8 @@ def reader_of(path: Path) -> Reader | None:
 
 def _json_log(path: Path) -> Iterator[LoggedAnswer]:
     try:
-        if path.stat().st_size > MOST_LOG_BYTES:
-            raise TrapsError(f"{path}: is larger than {MOST_LOG_BYTES} bytes; log it without images (--no-log-images)")
+        if path.stat().st_size > MAX_LOG_BYTES:
+            raise TrapsError(f"{path}: is larger than {MAX_LOG_BYTES} bytes; log it without images (--no-log-images)")
         log = json.loads(path.read_bytes())
         samples = log["samples"]
     except OSError as error:
@@ -87,12 +87,12 @@ def _eval_log(path: Path) -> Iterator[LoggedAnswer]:
     try:
         with zipfile.ZipFile(path) as archive, path.open("rb") as raw:
             entries = [entry for entry in archive.infolist() if entry.filename.startswith("samples/")]
-            if len(entries) > MOST_SAMPLES:
-                raise TrapsError(f"{path}: has more than {MOST_SAMPLES} samples")
+            if len(entries) > MAX_SAMPLES:
+                raise TrapsError(f"{path}: has more than {MAX_SAMPLES} samples")
             for entry in entries:
-                if entry.file_size > MOST_SAMPLE_BYTES:
+                if entry.file_size > MAX_SAMPLE_BYTES:
                     raise TrapsError(f"{path}: {entry.filename} has {entry.file_size} bytes; log without images")
-                content = _unpacked(raw, entry) if entry.compress_type == _ZSTD else archive.read(entry)
+                content = _unpack(raw, entry) if entry.compress_type == _ZSTD else archive.read(entry)
                 yield _sample(f"{path}: {entry.filename}", json.loads(content))
     except OSError as error:
         raise TrapsError(f"{path}: cannot be read ({error.strerror or error})") from error
@@ -102,7 +102,7 @@ def _eval_log(path: Path) -> Iterator[LoggedAnswer]:
         ) from error
 
 
-def _unpacked(raw: Any, entry: zipfile.ZipInfo) -> bytes:
+def _unpack(raw: Any, entry: zipfile.ZipInfo) -> bytes:
     """Decompress a zstd entry, which zipfile lacks here. Raises ValueError."""
     import pyarrow as pa
 
@@ -189,7 +189,7 @@ def _lmms_samples(path: Path) -> Iterator[LoggedAnswer]:
             ) from error
 
 
-def _own_lines(path: Path) -> Iterator[LoggedAnswer]:
+def _plain_lines(path: Path) -> Iterator[LoggedAnswer]:
     """Yield lines with item, regime, text, and run if there are several."""
     for number, line in read_lines(path):
         try:

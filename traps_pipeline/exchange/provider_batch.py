@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.files import replacing
+from traps_pipeline.base.files import replace_file
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.yamlfile import read_lines
 from traps_pipeline.checks.loopback import render, replay
@@ -35,14 +35,14 @@ LIMITS: Mapping[Api, tuple[int, int]] = {
     "gemini": (50_000, 1900 * 2**20),
     "anthropic": (100_000, 240 * 2**20),
 }
-MOST_LINES = 5
+MAX_LINES = 5
 FAILED = 400  # lowest status of a failure
 
 
 Item = TypeVar("Item")
 
 
-def _some(items: Iterable[Item]) -> Iterator[list[Item]]:
+def _chunks(items: Iterable[Item]) -> Iterator[list[Item]]:
     """Yield the items in lists of at most AT_ONCE."""
     iterator = iter(items)
     while chunk := list(islice(iterator, AT_ONCE)):
@@ -75,7 +75,7 @@ def export_batches(
     references = MediaReferences(out / MEDIA, media_at) if media_at else None
     for name, (entry, requests) in calls.items():
         part = _Part(folder, name)
-        for chunk in _some(requests):
+        for chunk in _chunks(requests):
             for request, wire in zip(chunk, render(entry, chunk), strict=True):
                 if isinstance(wire, str) or wire.api is None:
                     raise TrapsError(
@@ -130,7 +130,7 @@ class _Part:
         text = "\n".join(self.lines) + "\n"
         if self.api == "anthropic":  # its API takes one object
             text = '{"requests": [' + ",\n".join(self.lines) + "]}\n"
-        with replacing(path) as part:
+        with replace_file(path) as part:
             part.write_text(text, encoding="utf-8")
         self.files.append(path)
         self.lines, self.size = [], 0
@@ -174,7 +174,7 @@ def read_batch(path: Path, wanted: Mapping[str, Request]) -> dict[str, BatchResu
     answers, problems = dict[str, BatchResult](), list[str]()
     for number, line in read_lines(path):
         try:
-            key, result = _returned(json.loads(line))
+            key, result = _read_result(json.loads(line))
         except (ValueError, RecursionError, KeyError, TypeError, AttributeError) as error:
             problems.append(
                 f"{path}:{number}: no line of a batch that is known ({type(error).__name__}: {plain(error)[:100]})"
@@ -185,12 +185,12 @@ def read_batch(path: Path, wanted: Mapping[str, Request]) -> dict[str, BatchResu
         elif answers.setdefault(key, result) != result:
             problems.append(f"{path}:{number}: gives another answer to the key of an earlier line")
     if problems:
-        suffix = f"\n... and {len(problems) - MOST_LINES} more" if len(problems) > MOST_LINES else ""
-        raise TrapsError("\n".join(problems[:MOST_LINES]) + suffix + "\nnothing was imported")
+        suffix = f"\n... and {len(problems) - MAX_LINES} more" if len(problems) > MAX_LINES else ""
+        raise TrapsError("\n".join(problems[:MAX_LINES]) + suffix + "\nnothing was imported")
     return answers
 
 
-def _returned(line: Any) -> tuple[str, BatchResult]:
+def _read_result(line: Any) -> tuple[str, BatchResult]:
     if "result" in line:  # Anthropic
         result = line["result"]
         if result["type"] == "succeeded":
@@ -221,7 +221,7 @@ def outcomes_of(
     for key in returned:
         keys_by_name.setdefault(wanted[key].participant, []).append(key)
     for name, keys in keys_by_name.items():
-        for chunk in _some([key for key in keys if not returned[key].error]):
+        for chunk in _chunks([key for key in keys if not returned[key].error]):
             answers = [(returned[key].status, returned[key].body) for key in chunk]
             yield from zip(
                 (wanted[key] for key in chunk),

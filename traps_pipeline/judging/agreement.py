@@ -48,16 +48,14 @@ def _groups(ratings_of_study: Ratings) -> Iterator[tuple[dict[str, Any], Ratings
             is_in_group = (ratings_of_study.answers["dataset"] == dataset) & (ratings_of_study.answers["task"] == task)
             group = ratings_of_study.select(is_in_group.to_numpy(bool))
             if len(group.values):
-                versions = {
-                    name: _joined(group.answers[name].unique(), separator) for name, separator in _JOINS.items()
-                }
+                versions = {name: _join(group.answers[name].unique(), separator) for name, separator in _JOINS.items()}
                 yield {"dataset": dataset, "task": task, **versions}, group
 
 
 _JOINS = {"epoch": "+", "benchmark_version": " + "}
 
 
-def _joined(values: Iterable[str], by: str) -> str:
+def _join(values: Iterable[str], by: str) -> str:
     return by.join(sorted({part for value in values for part in value.split(by)}))
 
 
@@ -81,7 +79,7 @@ def fleiss_kappa(values: np.ndarray) -> float:
     if k < 2 or total in (0, n * k):
         return float("nan")
     observed = float(np.mean(yes * (yes - 1) + (k - yes) * (k - yes - 1))) / (k * (k - 1))
-    return _beyond_chance(observed, _same_class(total / (n * k)))
+    return _chance_corrected(observed, _chance_agreement(total / (n * k)))
 
 
 def cohen_kappa(first: np.ndarray, second: np.ndarray) -> float:
@@ -91,7 +89,7 @@ def cohen_kappa(first: np.ndarray, second: np.ndarray) -> float:
     if sum(yes) in (0, 2 * n):
         return float("nan")
     p, q = yes[0] / n, yes[1] / n
-    return _beyond_chance(float(np.mean(first == second)), p * q + (1 - p) * (1 - q))
+    return _chance_corrected(float(np.mean(first == second)), p * q + (1 - p) * (1 - q))
 
 
 def krippendorff_alpha(values: np.ndarray) -> float:
@@ -119,18 +117,18 @@ def unanimous_share(values: np.ndarray) -> float:
     return float(np.mean((values == values[:, :1]).all(axis=1))) if has_several_judges else float("nan")
 
 
-def _same_class(p: float) -> float:
+def _chance_agreement(p: float) -> float:
     return p * p + (1 - p) * (1 - p)
 
 
-def _beyond_chance(observed: float, by_chance: float) -> float:
+def _chance_corrected(observed: float, by_chance: float) -> float:
     return (observed - by_chance) / (1 - by_chance)
 
 
 # --- rows -------------------------------------------------------------------------------------------------------------
 
 
-def _shared(values: np.ndarray, complete_rows: np.ndarray) -> dict[str, Any]:
+def _shared_columns(values: np.ndarray, complete_rows: np.ndarray) -> dict[str, Any]:
     """Return the columns that the panel's row and a pair's row share."""
     valid = values != INVALID
     return {
@@ -140,14 +138,14 @@ def _shared(values: np.ndarray, complete_rows: np.ndarray) -> dict[str, Any]:
         "prevalence": _share((values == YES).sum(), valid.sum()),
         "agreement": unanimous_share(complete_rows),
         "alpha": krippendorff_alpha(values),
-        "undefined": _why_undefined(complete_rows),
+        "undefined": _undefined_reason(complete_rows),
     }
 
 
 def _panel_row(values: np.ndarray) -> dict[str, Any]:
     complete_rows = complete(values)
     n_undecided = int((majority(values) == INVALID).sum())
-    return _shared(values, complete_rows) | {
+    return _shared_columns(values, complete_rows) | {
         "judges": PANEL,
         "n_undecided": n_undecided,
         "fleiss_kappa": fleiss_kappa(complete_rows),
@@ -158,10 +156,10 @@ def _panel_row(values: np.ndarray) -> dict[str, Any]:
 def _pair_row(values: np.ndarray) -> dict[str, Any]:
     complete_rows = complete(values)
     kappa = cohen_kappa(complete_rows[:, 0], complete_rows[:, 1])
-    return _shared(values, complete_rows) | {"n_undecided": None, "fleiss_kappa": np.nan, "cohen_kappa": kappa}
+    return _shared_columns(values, complete_rows) | {"n_undecided": None, "fleiss_kappa": np.nan, "cohen_kappa": kappa}
 
 
-def _why_undefined(complete_rows: np.ndarray) -> str | None:
+def _undefined_reason(complete_rows: np.ndarray) -> str | None:
     if complete_rows.shape[1] < 2:
         return "one judge agrees with nobody"
     if not len(complete_rows):

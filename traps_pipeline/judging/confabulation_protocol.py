@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import ASSETS
-from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml, within
+from traps_pipeline.base.yamlfile import name_file_in_errors, parse_yaml_model, read_yaml
 from traps_pipeline.models.judges import JudgeEntry, load_judges
 from traps_pipeline.models.prompts import prompt
 from traps_pipeline.models.registry import NETWORK, get_model
@@ -75,7 +75,7 @@ class Protocol(BaseModel):
 def load_protocol(path: Path = PROTOCOL_FILE) -> Protocol:
     """Return the protocol. Raises TrapsError naming file and field, model or judge."""
     protocol = parse_yaml_model(Protocol, read_yaml(path), path)
-    with within(path):
+    with name_file_in_errors(path):
         runs = {model: get_model(model).runs for model in protocol.models}
     for model, n_runs in runs.items():
         if protocol.run > n_runs:

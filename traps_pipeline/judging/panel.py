@@ -45,12 +45,12 @@ from traps_pipeline.models.judges import (
     vote_prompt,
     vote_schema,
 )
-from traps_pipeline.models.participants import Row, when_asked
+from traps_pipeline.models.participants import Row, call_time_columns
 from traps_pipeline.models.registry import NETWORK, Entry, get_model
 from traps_pipeline.models.request import JUDGED, WITH_TEXT, Backend, Request
 from traps_pipeline.models.thinking import Marks, split_thinking, strip_tokens
 from traps_pipeline.protocol.cells import Cell
-from traps_pipeline.storage.parquet import StageOutput, joined
+from traps_pipeline.storage.parquet import StageOutput, join_outputs
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
@@ -82,7 +82,7 @@ def render(task: Task, question: str, answer: str, ground_truth: str | None) -> 
     return "\n\n".join([*parts, quote("response", "RESPONSE", answer)])
 
 
-def about_answer(task: str, cell: Cell, item_id: str) -> dict[str, str | int]:
+def vote_subject(task: str, cell: Cell, item_id: str) -> dict[str, str | int]:
     """Return the subject of a judge's call, one object for all judges of a panel."""
     e = cell.evaluation
     return {"task": task, "item_id": item_id, "model": e.model, "regime": e.regime, "run": e.run}
@@ -108,7 +108,7 @@ def vote_requests(
     """Return each judge's call for one task about one answer, with the same text."""
     user, subject = (
         render(task, item["question"], answer, item["ground_truth"]),
-        about_answer(task, cell, item["item_id"]),
+        vote_subject(task, cell, item["item_id"]),
     )
     return [judge_request(judge, vote_prompt(judge, task), vote_schema(judge, task), subject, user) for judge in judges]
 
@@ -256,7 +256,7 @@ def collect_votes(workspace: Workspace, cells: Sequence[Cell]) -> Iterator[tuple
     for part, output in ask_judges(workspace, "votes", panel, all_parts, calls, lambda settled: settled.output(row_of)):
         outputs.setdefault(part.whole, []).append(output)
         if len(outputs[part.whole]) == len(parts[part.whole]):
-            yield part.whole, joined(outputs.pop(part.whole))
+            yield part.whole, join_outputs(outputs.pop(part.whole))
 
 
 def _parts(workspace: Workspace, cell: Cell) -> list[AnswerSlice]:
@@ -336,7 +336,7 @@ def vote_columns(ballot: Ballot, vote: Vote, row: Row) -> dict[str, Any]:
         "confidence": vote.confidence,
         "rationale": vote.rationale,
         "vote_key": row["key"],
-        **when_asked(row),
+        **call_time_columns(row),
     }
 
 

@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.terminal import text_table
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml
 from traps_pipeline.judging.judging_rows import JUDGE_ROBUSTNESS
 from traps_pipeline.judging.panel import Ballot, Vote, ask_judges, tasks_for, vote_requests
@@ -71,7 +71,7 @@ class Attacks(BaseModel):
     attacks: list[Attack] = Field(min_length=1)
 
     @model_validator(mode="after")
-    def _holds_together(self) -> Attacks:
+    def _check_references(self) -> Attacks:
         ids = [attack.id for attack in self.attacks]
         if len(set(ids)) != len(ids) or set(ids) & set(self.answers):
             raise ValueError("attacks: an id occurs twice, or is also the id of an answer")
@@ -122,7 +122,7 @@ def check_panel(workspace: Workspace, name: str, panel: Sequence[JudgeEntry], at
     def finish(settled: SettledCell[Cell, Ballot]) -> Votes:
         if settled.tally.errors:
             raise TrapsError(
-                f"{counted(settled.tally.errors, 'call')} to the judges failed; the same command repeats only those"
+                f"{count_noun(settled.tally.errors, 'call')} to the judges failed; the same command repeats only those"
             )
         return {
             (ballot.item["item_id"], ballot.task, ballot.judge): ballot.vote(row) for ballot, row in settled.answered()

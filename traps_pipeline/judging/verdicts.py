@@ -22,9 +22,9 @@ from traps_pipeline.protocol.ratings import (
     CORRECTNESS,
     INVALID,
     VOTE_COLUMNS,
-    decided,
     majority,
     ratings,
+    vote_decisions,
 )
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.workspace import Workspace
@@ -40,14 +40,14 @@ def decide_cells(workspace: Workspace, cells: Sequence[Cell]) -> dict[Cell, pd.D
     All cells are decided at once, since a cell takes as long as hundreds; if that fails, each alone.
     """
     try:
-        return _decided(workspace, cells)
+        return _decide_group(workspace, cells)
     except TrapsError as error:
         if len(cells) == 1:
             return {cells[0]: error}
         return {cell: rows for cell_alone in cells for cell, rows in decide_cells(workspace, [cell_alone]).items()}
 
 
-def _decided(workspace: Workspace, cells: Sequence[Cell]) -> dict[Cell, pd.DataFrame | TrapsError]:
+def _decide_group(workspace: Workspace, cells: Sequence[Cell]) -> dict[Cell, pd.DataFrame | TrapsError]:
     tables, result_by_cell = workspace.tables, dict[Cell, pd.DataFrame | TrapsError]()
     vote_columns = [*VOTE_COLUMNS, "invalid_reason", "rejects_premise", "panel"]
     votes = {cell: tables.arrow(VOTES, cell.partition, vote_columns) for cell in cells}
@@ -92,7 +92,7 @@ def decide(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) ->
     _refuse(rows, is_missing, f"item {{}} does not have the votes of {sizes} judges per task", "votes")
     abstained, correct = majority(abstention), majority(correctness)
     is_undecided = (abstained == INVALID) | (is_control & (correct == INVALID))
-    rows["abstained"], rows["correct"] = decided(abstained), decided(correct)
+    rows["abstained"], rows["correct"] = vote_decisions(abstained), vote_decisions(correct)
     rows["rejects_premise"] = _rejects_premise(rows, votes, len(cast.judges))
     rows["n_valid"] = (abstention != INVALID).sum(axis=1)
     rows["n_valid_correctness"] = (correctness != INVALID).sum(axis=1)

@@ -12,7 +12,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from traps_pipeline.ledger.rows import AVERAGED, Totals
+from traps_pipeline.ledger.rows import AVERAGED_COLUMNS, Totals
 from traps_pipeline.ledger.schema import EVALUATIONS, RESERVATIONS, ROWS, SPENT, TOTALS
 
 CENT = 1e-9  # below this, dollars are rounding
@@ -108,7 +108,7 @@ class Batch:
 
     def _add_totals(self, kind: str, participant: str, its: Totals) -> None:
         values: dict[str, float] = {"dollars": its.dollars, "failed": its.failed, "unknown": its.unknown}
-        for column in AVERAGED:
+        for column in AVERAGED_COLUMNS:
             values[f"{column}_sum"], values[f"{column}_n"] = its.means.get(column, (0.0, 0))
         key = {"of_study": self.study, "of_kind": kind, "of_participant": participant}
         increments = {f"more_{name}": value for name, value in values.items()}
@@ -117,17 +117,19 @@ class Batch:
             self.connection.execute(sa.insert(TOTALS).values(**new, **values))
 
 
-def _adding(table: sa.Table, *columns: str) -> sa.Update:
+def _add_statement(table: sa.Table, *columns: str) -> sa.Update:
     """Return a cached UPDATE that adds `more_COLUMN` where the key is `of_COLUMN`."""
     key = [column == sa.bindparam(f"of_{column.name}") for column in table.primary_key]
     sums = {name: table.c[name] + sa.bindparam(f"more_{name}") for name in columns}
     return sa.update(table).where(*key).values(sums)
 
 
-_ADD_SPENT = _adding(SPENT, "usd")
+_ADD_SPENT = _add_statement(SPENT, "usd")
 _DEAREST = sa.bindparam("its_dearest", type_=sa.Double)
-_ADD_TOTALS = _adding(
-    TOTALS, *("dollars", "failed", "unknown"), *(f"{column}_{what}" for column in AVERAGED for what in ("sum", "n"))
+_ADD_TOTALS = _add_statement(
+    TOTALS,
+    *("dollars", "failed", "unknown"),
+    *(f"{column}_{what}" for column in AVERAGED_COLUMNS for what in ("sum", "n")),
 ).values(dearest=sa.case((TOTALS.c.dearest < _DEAREST, _DEAREST), else_=TOTALS.c.dearest))
 
 

@@ -20,7 +20,7 @@ from sqlalchemy import exc
 from traps_pipeline.ledger.batch import Batch, claim
 from traps_pipeline.ledger.database import Database, Lock, sentence, taken_over
 from traps_pipeline.ledger.rows import (
-    AVERAGED,
+    AVERAGED_COLUMNS,
     NOT_WHOLE,
     SIDE_TEXTS,
     EvaluationRows,
@@ -119,7 +119,7 @@ class Ledger:
         """Return totals by participant of all rows, repeated keys too. Raises TrapsError."""
         totals = dict[str, Totals]()
         for row in self._select(sa.select(TOTALS).where(self._is_own_kind(TOTALS))):
-            sums = {name: (getattr(row, f"{name}_sum"), getattr(row, f"{name}_n")) for name in AVERAGED}
+            sums = {name: (getattr(row, f"{name}_sum"), getattr(row, f"{name}_n")) for name in AVERAGED_COLUMNS}
             means = {name: sum_and_count for name, sum_and_count in sums.items() if sum_and_count[1]}
             totals[row.participant] = Totals(row.dollars, row.failed, row.dearest, row.unknown, means)
         return totals

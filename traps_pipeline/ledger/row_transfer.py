@@ -10,7 +10,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.ledger.batch import Batch
 from traps_pipeline.ledger.database import Database
 from traps_pipeline.ledger.ledger import Ledger
@@ -37,7 +37,7 @@ def import_ledger(file: Path, ledger: Database) -> int:
         names = [*connection.execute(sa.select(STUDIES.c.name)).scalars()]
     if len(names) != 1:
         raise TrapsError(
-            f"{file}: holds {counted(len(names), 'study', 'studies')}, and not one; name a file that "
+            f"{file}: holds {count_noun(len(names), 'study', 'studies')}, and not one; name a file that "
             "`traps study export-ledger` wrote"
         )
     source.study_name = names[0]
@@ -93,16 +93,16 @@ def _copy(source: Database, batch: Batch, place: str, mark: str) -> int:
             insert = sa.insert(EVALUATIONS).values(**values).returning(EVALUATIONS.c.id)
             number = batch.connection.execute(insert).scalar_one()
             query = sa.select(ROWS).where(ROWS.c.evaluation == evaluation.id).order_by(ROWS.c.id)
-            for rows in _some(connection, query, "id"):
+            for rows in _row_chunks(connection, query, "id"):
                 batch.connection.execute(sa.insert(ROWS), [row | {"evaluation": number} for row in rows])
                 count += len(rows)
         for table, omitted_columns in ((TOTALS, ()), (SPENT, ()), (RELEASES, ("id",)), (RESERVATIONS, ())):
-            for rows in _some(connection, sa.select(table).where(table.c.study == study), *omitted_columns):
+            for rows in _row_chunks(connection, sa.select(table).where(table.c.study == study), *omitted_columns):
                 batch.connection.execute(sa.insert(table), [row | {"study": batch.study} for row in rows])
     return count
 
 
-def _some(connection: sa.Connection, query: sa.Select[Any], *left_out: str) -> Iterator[list[dict[str, Any]]]:
+def _row_chunks(connection: sa.Connection, query: sa.Select[Any], *left_out: str) -> Iterator[list[dict[str, Any]]]:
     result = connection.execution_options(yield_per=_FETCHED).execute(query)
     for rows in result.mappings().partitions():
         yield [{name: value for name, value in row.items() if name not in left_out} for row in rows]

@@ -18,13 +18,13 @@ SIDE_TEXTS = ("reasoning", "raw")  # texts kept beside rows, so that reading ans
 NOT_WHOLE = "not what was written"
 Stored = tuple[Mapping[str, Any], Mapping[str, str]]  # a row, and its side texts by name in SIDE_TEXTS
 
-MOST_TOKENS = 10**9
-MOST_USD = 10_000.0  # limit for one call with all its attempts
+MAX_TOKENS = 10**9
+MAX_USD = 10_000.0  # limit for one call with all its attempts
 
 
 def is_cost(value: Any) -> bool:
     """Return whether a value is a possible cost of one call, in dollars."""
-    return type(value) in (int, float) and math.isfinite(value) and 0 <= value <= MOST_USD
+    return type(value) in (int, float) and math.isfinite(value) and 0 <= value <= MAX_USD
 
 
 def is_seconds(value: Any) -> bool:
@@ -44,7 +44,7 @@ def _is_text(value: Any) -> bool:
 
 def is_count(value: Any) -> bool:
     """Return whether a value is a possible number of tokens of one call."""
-    return type(value) is int and 0 <= value <= MOST_TOKENS
+    return type(value) is int and 0 <= value <= MAX_TOKENS
 
 
 # A provider's fields, with a test for possible values; anything else is unknown.
@@ -69,7 +69,7 @@ def heal(row: dict[str, Any]) -> list[str]:
 
 
 # Columns whose means forecast a call, each with a test for possible values.
-AVERAGED: dict[str, Callable[[Any], bool]] = {
+AVERAGED_COLUMNS: dict[str, Callable[[Any], bool]] = {
     "prompt_tokens": is_count,
     "completion_tokens": is_count,
     "latency_s": is_seconds,
@@ -129,7 +129,8 @@ class Totals:
     """Totals of one participant's rows.
 
     dollars: paid; failed: the part paid by rows that settle nothing; dearest: the highest cost of a row; unknown: rows
-    whose cost is impossible; means: sum and number of the values of each column of `AVERAGED`, over settled rows.
+    whose cost is impossible; means: sum and number of the values of each column of `AVERAGED_COLUMNS`, over settled
+    rows.
     """
 
     dollars: float = 0.0
@@ -148,7 +149,7 @@ class Totals:
         if row.get("outcome") in FAILED:
             self.failed += cost
             return
-        for column, is_possible in AVERAGED.items():
+        for column, is_possible in AVERAGED_COLUMNS.items():
             if is_possible(row.get(column)):
                 self._add_to_mean(column, row[column], 1)
 

@@ -115,7 +115,7 @@ def _states(subject: Subject) -> str:
     return f"{len(library)} states, bit for bit"
 
 
-def _steered_states(subject: Subject) -> str:
+def _check_steered_states(subject: Subject) -> str:
     prompt, layer = subject.prompts[0], subject.layer
     push = subject.steered(-0.5)
     plain_states, steered_states = (
@@ -168,7 +168,7 @@ def _parts(subject: Subject) -> str:
     return f"{int(parts['visual'].sum())} visual tokens, {times}"
 
 
-def _pooled(subject: Subject) -> str:
+def _check_pooling(subject: Subject) -> str:
     prompt = subject.prompts[1]
     positions = spans(subject.model, prompt, SYSTEM, QUESTIONS[1])["question"]
     pooled = subject.model.forward_states(prompt, "question", chosen=positions).raw[subject.layer]
@@ -183,7 +183,7 @@ def _pooled(subject: Subject) -> str:
 # --- patching ---------------------------------------------------------------------------------------------------------
 
 
-def _patching(subject: Subject) -> str:
+def _check_patching(subject: Subject) -> str:
     model = subject.model
     try:
         require_patchable(model)
@@ -229,7 +229,7 @@ def _clips(subject: Subject) -> str:
 
 def _batches(subject: Subject) -> str:
     model, prompts = subject.model, subject.prompts
-    with _ending(model, model.generate(prompts[:1], 2)[0].tokens[-1]):
+    with _end_at(model, model.generate(prompts[:1], 2)[0].tokens[-1]):
         batched_answers = model.generate(prompts, NEW_TOKENS)
         single_answers = [model.generate([prompt], NEW_TOKENS)[0] for prompt in prompts]
     _require(
@@ -239,7 +239,7 @@ def _batches(subject: Subject) -> str:
 
 
 @contextmanager
-def _ending(model: LocalModel, token: int) -> Iterator[None]:
+def _end_at(model: LocalModel, token: int) -> Iterator[None]:
     """Stop generation at a token, so that rows of a batch end at different steps."""
     config = model.network.generation_config
     previous_ending, config.eos_token_id = config.eos_token_id, [token]
@@ -252,20 +252,22 @@ def _ending(model: LocalModel, token: int) -> Iterator[None]:
 CHECKS = (
     Check("states", "hooked states are the library's own", _states, exact=False),
     Check("alpha 0", "steering with alpha 0 leaves no hook and changes no bit of states or answers", _zero),
-    Check("alpha", "a steered state is the plain one and alpha times v, and none below it changes", _steered_states),
+    Check(
+        "alpha", "a steered state is the plain one and alpha times v, and none below it changes", _check_steered_states
+    ),
     Check("parts", "system prompt, question and visual tokens are where their texts are", _parts, exact=False),
-    Check("means", "the mean over the question's tokens is that of the library's states", _pooled),
-    Check("patching", "a patch with itself changes nothing, one of all positions gives the source", _patching),
+    Check("means", "the mean over the question's tokens is that of the library's states", _check_pooling),
+    Check("patching", "a patch with itself changes nothing, one of all positions gives the source", _check_patching),
     Check("clips", "the vision tower sees a clip once, and states stay as they are", _clips),
     Check("batches", "answers do not depend on their batch, nor on rows that end early", _batches),
 )
 
 
-def brightening() -> tuple[np.ndarray, np.ndarray]:
+def brightening_clip() -> tuple[np.ndarray, np.ndarray]:
     """Return a clip for the checks: four frames (4, 64, 96, 3), half a second apart."""
     return np.stack([np.full((64, 96, 3), shade, np.uint8) for shade in range(40, 200, 40)]), np.arange(4) / 2
 
 
 def tiny_subject(family: Family, folder: Path) -> Subject:
     """Return a tiny checkpoint of a family, built, saved and reloaded, and the clip."""
-    return Subject(tiny_model(family, folder / family), *brightening())
+    return Subject(tiny_model(family, folder / family), *brightening_clip())

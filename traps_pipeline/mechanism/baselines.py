@@ -65,7 +65,7 @@ def baseline_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates)
     try:
         add(MARGIN, score_features(run, output_margins(entry, states, [*items]), lambda states, void: AsItIs()))
     except NoMargin as error:
-        add(MARGIN, [_without_figure()], str(error))
+        add(MARGIN, [_undefined_row()], str(error))
     add(NOISE, noise_floor(run, settings.seed))
     return result
 
@@ -216,7 +216,7 @@ def noise_floor(run: ProbeRun, seed: int, draws: int = NOISE_DRAWS) -> list[Row]
     return rows
 
 
-def _without_figure() -> Row:
+def _undefined_row() -> Row:
     null_figures = dict.fromkeys(("value", "low", "high", "spread"))
     return {
         "analysis": "held_out",

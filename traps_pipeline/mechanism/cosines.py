@@ -81,13 +81,13 @@ def cosine_rows(workspace: Workspace) -> list[CosineRow]:
     extractions = sorted({Extraction(str(m), str(p)) for m, p in zip(table["model"], table["prompt"], strict=True)})
     rows: list[CosineRow] = []
     for model in sorted({extraction.model for extraction in extractions}):
-        rows += _of_model(workspace, [candidate for candidate in extractions if candidate.model == model])
+        rows += _model_rows(workspace, [candidate for candidate in extractions if candidate.model == model])
     if not rows:
         raise TrapsError("cosines: no directions yet; materialize directions first")
     return rows
 
 
-def _of_model(workspace: Workspace, extractions: Sequence[Extraction]) -> list[CosineRow]:
+def _model_rows(workspace: Workspace, extractions: Sequence[Extraction]) -> list[CosineRow]:
     rows_by_name = [
         (StoredStates.of(workspace, extraction), dataset, directions.void)
         for extraction in extractions

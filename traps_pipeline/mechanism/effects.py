@@ -25,7 +25,7 @@ REGIME_COLUMNS = (
 )
 
 
-def on_both_sides(effects: pd.DataFrame) -> pd.DataFrame:
+def two_sided_effects(effects: pd.DataFrame) -> pd.DataFrame:
     """Return effects at the steered layer; a sweep's other layers have only controls."""
     layers = effects.loc[effects["side"] == "void", [*CELL, "layer"]].drop_duplicates()
     return effects.merge(layers, on=[*CELL, "layer"])
@@ -40,7 +40,7 @@ def paths(effects: pd.DataFrame) -> pd.DataFrame:
     import pandas as pd
 
     keys = [*CELL, "source", "target", "kind", "layer", "alpha"]
-    rows, columns = on_both_sides(effects), keys.copy()
+    rows, columns = two_sided_effects(effects), keys.copy()
     parts: list[pd.DataFrame] = []
     for value, suffix in [("abstention", ""), *((name, f"_{name}") for name in ("low", "high", *EXTRA_COLUMNS))]:
         if value in rows:

@@ -26,7 +26,7 @@ from traps_pipeline.scoring.metrics import pecs_of
 MID, J, CONFORMAL = THRESHOLDS = ("mid", "J", "conformal")
 OTHER_DATASETS, OTHER_FAMILIES = "other datasets", "other families"
 SOURCES = (*(f"one:{name}" for name in DATASETS), OTHER_DATASETS, OTHER_FAMILIES)
-NEVER = float("inf")  # threshold above every score
+NO_THRESHOLD = float("inf")  # threshold above every score
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,10 +76,10 @@ def thresholds(score: np.ndarray, void: np.ndarray, false_abs: float) -> dict[st
     control = np.sort(score[~void])
     mid = (score[void].mean() + control.mean()) / 2
     levels = np.unique(score)
-    cuts = np.concatenate([[levels[0] - 1], (levels[1:] + levels[:-1]) / 2, [NEVER]])
+    cuts = np.concatenate([[levels[0] - 1], (levels[1:] + levels[:-1]) / 2, [NO_THRESHOLD]])
     gained = [(score[void] > cut).mean() - (control > cut).mean() for cut in cuts]
     rank = int(np.ceil((len(control) + 1) * (1 - false_abs) - 1e-9))
-    conformal = float(control[rank - 1]) if rank <= len(control) else NEVER
+    conformal = float(control[rank - 1]) if rank <= len(control) else NO_THRESHOLD
     return {MID: float(mid), J: float(cuts[int(np.argmax(gained))]), CONFORMAL: conformal}
 
 
@@ -104,9 +104,9 @@ def decide(items: Items, source: str, target: str, *, folds: int, seed: int, fal
         raise TrapsError(f"a gate from {source} has no items; extract the hidden states of its datasets first")
     groups = items.table["family" if source == OTHER_FAMILIES else "scenario_id"].to_numpy(str)
     score = np.full(len(scored), np.nan)
-    cut = {name: np.full(len(scored), NEVER) for name in THRESHOLDS}
+    cut = {name: np.full(len(scored), NO_THRESHOLD) for name in THRESHOLDS}
     expected = {name: np.zeros(len(scored)) for name in THRESHOLDS}
-    for fold in _held_groups(groups[scored], source, folds, seed):
+    for fold in _held_out_groups(groups[scored], source, folds, seed):
         is_in_fold = np.isin(groups[scored], fold)
         train = items.rows(is_source & ~np.isin(groups, fold))
         if len(set(train.void)) < 2:
@@ -131,7 +131,7 @@ def fit_gate(
     return probe, cuts, {name: float((calibrating[~void] > cut).mean()) for name, cut in cuts.items()}
 
 
-def _held_groups(groups: np.ndarray, source: str, folds: int, seed: int) -> Iterator[np.ndarray]:
+def _held_out_groups(groups: np.ndarray, source: str, folds: int, seed: int) -> Iterator[np.ndarray]:
     """Yield the groups of scored items to hold out, one gate after another."""
     names = np.unique(groups)
     if source == OTHER_FAMILIES or len(names) < folds:

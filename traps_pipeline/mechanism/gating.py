@@ -40,7 +40,7 @@ from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.scoring.bootstrap import (
-    RESAMPLED,
+    RESAMPLED_FIGURES,
     draw_scenarios,
     figures_of,
     interval,
@@ -52,7 +52,7 @@ from traps_pipeline.storage.workspace import Workspace
 STATES, SHUFFLED, UNTRAINED, NO_GATE = "states", "shuffled labels", "untrained model", "no gate"
 COVERAGES = tuple(k / 20 for k in range(1, 21))
 ALL = "all"
-_PECS = RESAMPLED.index("pecs")
+_PECS = RESAMPLED_FIGURES.index("pecs")
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def gate_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> 
     resamples, seed = workspace.mechanism.probes.resamples, workspace.mechanism.seed
     return [
         row
-        for regime, outcomes, gates, source, decisions in _each(workspace, entry, states, SOURCES)
+        for regime, outcomes, gates, source, decisions in _each_regime(workspace, entry, states, SOURCES)
         for row in _rows(states, (gates, regime, source), decisions, outcomes, resamples, seed)
     ]
 
@@ -84,7 +84,7 @@ def curve_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) ->
     """Return RISK_COVERAGE rows, as `gate_rows`, for gates from other datasets."""
     return [
         row
-        for regime, outcomes, gates, _, decisions in _each(workspace, entry, states, (OTHER_DATASETS,))
+        for regime, outcomes, gates, _, decisions in _each_regime(workspace, entry, states, (OTHER_DATASETS,))
         for row in _curves(states, gates, regime, decisions, outcomes)
     ]
 
@@ -92,7 +92,7 @@ def curve_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) ->
 DecisionsByTarget = Mapping[str, tuple[Decisions, int]]  # target -> decisions and layer
 
 
-def _each(
+def _each_regime(
     workspace: Workspace, entry: ModelEntry, states: StoredStates, sources: Sequence[str]
 ) -> Iterator[tuple[str, Mapping[str, Outcomes], str, str, DecisionsByTarget]]:
     """Yield regime, its outcomes, features, source and decisions of every gate."""
@@ -241,7 +241,7 @@ def _rows(
             values |= {"expected_false_abs": float(decisions.expected[threshold].mean())}
             about_pecs = interval(np.full((2, 1), np.nan), np.nan, (0.0, 1.0))
             if target in DATASETS:
-                sums = _resampled(gated, target, names[decisions.place], resamples, seed)
+                sums = _resample(gated, target, names[decisions.place], resamples, seed)
                 about_pecs = interval(figures_of(sums)[:, _PECS, 1:], values["pecs"], (0.0, 1.0))
                 dataset_figures.append(values)
                 draws.append(figures_of(sums, in_mean=True)[:, _PECS, 1:])
@@ -261,7 +261,7 @@ def _rows(
     return rows
 
 
-def _resampled(outcomes: Outcomes, target: str, scenarios: np.ndarray, resamples: int, seed: int) -> np.ndarray:
+def _resample(outcomes: Outcomes, target: str, scenarios: np.ndarray, resamples: int, seed: int) -> np.ndarray:
     """Return resampled sums of a dataset's outcomes, (9, 1 + resamples).
 
     They have an unseen scenario. The datasets of a taxonomy share their resamples, and taxonomies do not. scenarios:

@@ -33,7 +33,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
 from traps_pipeline.models.local.capture import OF_PAIRS, OF_PARTS, ONE_TOKEN, Pooling
 from traps_pipeline.models.local.spans import changed_tokens, spans
-from traps_pipeline.storage.leases import alone, leased_ranges
+from traps_pipeline.storage.leases import hold_lease, leased_ranges
 from traps_pipeline.storage.media import Frames, MediaSpec, profile_digest, sample
 from traps_pipeline.storage.parquet import read_sealed, write_sealed
 from traps_pipeline.storage.store import FolderStore
@@ -134,7 +134,7 @@ def extract(
     """
     keys = [states_key(model, item, pooling) for item in items]
     places, count, local_files = dict[str, _Place](), 0, FolderStore(folder)
-    with alone(local_files, _WRITING):
+    with hold_lease(local_files, _WRITING):
         _look_for(folder, places)
     total = sum(key not in places for key in keys)
     for chunk in leased_ranges(local_files, "chunks", len(items), shard_size):
@@ -144,7 +144,7 @@ def extract(
         if missing:
             tick = partial(_tick, noun, count, total)
             count += _make(model, missing, folder, pooling, tick, places)
-    with alone(local_files, _WRITING):
+    with hold_lease(local_files, _WRITING):
         _write_ids(folder, items, keys, places, _record(model, pooling))
         _sweep(folder, {places[key][0] for key in keys})
     _note_devices(folder, sorted({places[key][2] for key in keys}))
@@ -201,11 +201,11 @@ def _make(
     """Run one pass per item; write a shard, even after an error; return items done."""
     shard: list[_ItemStates] = []
     try:
-        for finished, ((item, key), prompt) in enumerate(_prepared(missing), start=1):
+        for finished, ((item, key), prompt) in enumerate(_prepare_ahead(missing), start=1):
             shard.append((item, key, item_states(model, item, prompt, pooling)))
             tick(finished)
     finally:
-        with alone(FolderStore(folder), _WRITING):
+        with hold_lease(FolderStore(folder), _WRITING):
             _flush(folder, shard, model, pooling, places)
     return len(missing)
 
@@ -222,7 +222,7 @@ def _pooled_tokens(model: LocalModel, prompt: Prompt, item: Item, pooling: Pooli
     if pooling not in OF_PARTS:
         return None
     parts = spans(model, prompt, item.about["system"], item.about["question"])
-    positions = parts[pooling] if pooling not in OF_PAIRS else _of_pair(parts["visual"], prompt, item)[pooling]
+    positions = parts[pooling] if pooling not in OF_PAIRS else _pair_masks(parts["visual"], prompt, item)[pooling]
     if not positions.any():
         raise TrapsError(
             f"{item.item_id}: its prompt for {model.checkpoint.name} has no {pooling}; choose another pooling"
@@ -230,7 +230,7 @@ def _pooled_tokens(model: LocalModel, prompt: Prompt, item: Item, pooling: Pooli
     return positions
 
 
-def _of_pair(visual: np.ndarray, prompt: Prompt, item: Item) -> dict[str, np.ndarray]:
+def _pair_masks(visual: np.ndarray, prompt: Prompt, item: Item) -> dict[str, np.ndarray]:
     is_changed = changed_tokens(prompt, item.other(), visual) if item.other else None
     if is_changed is None:
         raise TrapsError(
@@ -240,7 +240,7 @@ def _of_pair(visual: np.ndarray, prompt: Prompt, item: Item) -> dict[str, np.nda
     return {"changed": is_changed, "unchanged": visual & ~is_changed}
 
 
-def _prepared(missing: Sequence[tuple[Item, str]]) -> Iterator[tuple[tuple[Item, str], Prompt]]:
+def _prepare_ahead(missing: Sequence[tuple[Item, str]]) -> Iterator[tuple[tuple[Item, str], Prompt]]:
     """Yield items with their prompts, preparing the next ones while the model works."""
     with ThreadPoolExecutor(1) as pool:
         queue: deque[tuple[tuple[Item, str], Future[Prompt]]] = deque()

@@ -29,7 +29,7 @@ Site = Literal["residual", "attention", "mlp"]
 _PARTS: dict[Site, str] = {"attention": "self_attn", "mlp": "mlp"}
 
 
-def changing(block: Module, site: Site, change: Callable[[Tensor], Tensor]) -> RemovableHandle:
+def register_change(block: Module, site: Site, change: Callable[[Tensor], Tensor]) -> RemovableHandle:
     """Register a hook that replaces a site's states (rows, T, d) by `change` of them.
 
     It runs before all others, so that hooks that record states record the changed ones. Raises TrapsError for a block
@@ -91,7 +91,7 @@ class Steering:
                 raise ValueError(f"the pass has {len(states)} rows, but {len(shift)} alphas were given")
             return states + shift.to(states.device)
 
-        handle = changing(block, "residual", add)
+        handle = register_change(block, "residual", add)
         try:
             yield
         finally:

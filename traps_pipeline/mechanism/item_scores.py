@@ -45,7 +45,7 @@ def item_score_rows(workspace: Workspace, entry: ModelEntry, states: StoredState
                 scores[name] = decision.score - decision.threshold[MID]
         for place, item in enumerate(states.dataset(dataset).to_dict("records")):
             abstained: dict[str, Any] = {
-                f"abstained_{regime}": _decided(outcome[dataset].abstained[place] if outcome else np.nan)
+                f"abstained_{regime}": _decision(outcome[dataset].abstained[place] if outcome else np.nan)
                 for regime, outcome in outcomes.items()
             }
             rows.append(
@@ -66,5 +66,5 @@ def _number(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _decided(value: float) -> bool | None:
+def _decision(value: float) -> bool | None:
     return bool(value) if np.isfinite(value) else None

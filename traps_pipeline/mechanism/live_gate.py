@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.mechanism.gate import THRESHOLDS, Items, fit_gate, sources_of_gate
 from traps_pipeline.mechanism.gating import chosen_layers, gate_items, gate_table
 from traps_pipeline.mechanism.probes import Scorer
@@ -97,7 +97,7 @@ def gate(
     if len(set(train.void)) < 2 or len(set(train.table["scenario_id"])) < folds:
         raise TrapsError(
             f"a gate from {source} needs both sides of {folds} scenarios (`probes.folds`), and has "
-            f"{counted(len(train.table), 'item')}; extract the hidden states of more pairs"
+            f"{count_noun(len(train.table), 'item')}; extract the hidden states of more pairs"
         )
     probe, cuts, _ = fit_gate(train, folds, settings.seed, false_abs)
     return Gate(layer, probe, cuts[threshold], pooling)  # pyright: ignore[reportArgumentType]

@@ -24,16 +24,16 @@ _CONDITION = [*_CELL, "layer", "unit", "dose", "side"]
 def null_rows(effects: pd.DataFrame) -> list[SteeringNullRow]:
     """Return STEERING_NULLS: datasets' own directions and their mean, if nulls exist."""
     own_effects = effects.loc[(effects["source"] == effects["target"]) & (effects["signs"] == "label")]
-    changes = _moved(own_effects)
+    changes = _with_changes(own_effects)
     nulls = changes.loc[changes["kind"].isin(NULLS)]
     rows: list[SteeringNullRow] = []
     for target in [*sorted(set(nulls["target"])), ALL]:
         part = changes if target == ALL else changes.loc[changes["target"] == target]
-        rows += _ranked(part, target)
+        rows += _rank(part, target)
     return rows
 
 
-def _moved(effects: pd.DataFrame) -> pd.DataFrame:
+def _with_changes(effects: pd.DataFrame) -> pd.DataFrame:
     """Return effects with `moved`, the change against unsteered answers.
 
     It is in the claimed direction: more abstention on controls, and less on voids.
@@ -45,7 +45,7 @@ def _moved(effects: pd.DataFrame) -> pd.DataFrame:
     return steered_effects.assign(moved=np.where(steered_effects["side"] == "control", change, -change))
 
 
-def _ranked(moved: pd.DataFrame, target: str) -> Iterator[SteeringNullRow]:
+def _rank(moved: pd.DataFrame, target: str) -> Iterator[SteeringNullRow]:
     for key, group in moved.groupby(_CONDITION, sort=True):
         row_keys: dict[str, Any] = dict(zip(_CONDITION, key if isinstance(key, tuple) else (key,), strict=True))
         void = group.loc[group["kind"] == VOID]

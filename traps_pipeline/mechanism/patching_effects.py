@@ -39,7 +39,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.hook import Site
 from traps_pipeline.mechanism.margin import first_token_margins
 from traps_pipeline.models.local.capture import first_tensor
-from traps_pipeline.models.local.sidepaths import PER_LAYER, SHARED, argument_of, unknown_path, with_argument
+from traps_pipeline.models.local.sidepaths import PER_LAYER, SHARED_KEYS, argument_of, unknown_path, with_argument
 from traps_pipeline.models.local.spans import visual_tokens
 
 if TYPE_CHECKING:
@@ -145,7 +145,7 @@ def record(model: LocalModel, prompt: Prompt, tokens: Sequence[int], sites: Sequ
             per_layer.append(layer_input[0])
 
     def keep_shared(layer: int, block: Module, args: tuple[Any, ...], kwargs: dict[str, Any], _: Any) -> None:
-        for name, (keys, values) in (argument_of(block, SHARED, args, kwargs) or {}).items():
+        for name, (keys, values) in (argument_of(block, SHARED_KEYS, args, kwargs) or {}).items():
             if name not in shared_keys or shared_keys[name][1] is not keys:
                 shared_keys[name] = layer, keys, values
 
@@ -253,7 +253,7 @@ def _residual_weights(weights: Weights, layer: int) -> Tensor | None:
     return reduce(operator.add, [part.to(parts[0].device) for part in parts]) if parts else None
 
 
-def _mixed(states: Tensor, source: Tensor, weights: Tensor) -> Tensor:
+def _mix(states: Tensor, source: Tensor, weights: Tensor) -> Tensor:
     """Return states (rows, .., T, d), mixed with theirs, (T, d) or (1, .., T, d)."""
     import torch
 
@@ -272,21 +272,21 @@ def _margins(
     tokens: Sequence[int],
 ) -> Tensor:
     """Return outcomes (rows,) of a pass over copies of the target from layer `start`."""
-    inputs = _repeated(target, rows)
+    inputs = _repeat_inputs(target, rows)
     if ("residual", 0) in weights:
-        inputs["inputs_embeds"] = _mixed(inputs["inputs_embeds"], source.states["residual", 0], weights["residual", 0])
+        inputs["inputs_embeds"] = _mix(inputs["inputs_embeds"], source.states["residual", 0], weights["residual", 0])
     for number, source_embeds in enumerate(source.inputs.get("deepstack_visual_embeds") or ()):
         # Features number k are added to what block k + 1 puts out: behind the sites up to there.
         weight, features = _residual_weights(weights, number + 1), inputs["deepstack_visual_embeds"]
         if weight is not None and target.visual is not None:
             row_features = features[number].unflatten(0, (rows, -1))
-            features[number] = _mixed(row_features, source_embeds, weight[:, target.visual]).flatten(0, 1)
-    with _replacing(model, target, source, weights, start, rows):
+            features[number] = _mix(row_features, source_embeds, weight[:, target.visual]).flatten(0, 1)
+    with _replace_states(model, target, source, weights, start, rows):
         last = model.network.get_decoder()(**inputs).last_hidden_state[:, -1]
     return first_token_margins(model, last, tokens)
 
 
-def _repeated(target: RecordedPass, rows: int) -> dict[str, Any]:
+def _repeat_inputs(target: RecordedPass, rows: int) -> dict[str, Any]:
     """Return the decoder's inputs for several rows of one prompt."""
     import torch
 
@@ -302,13 +302,13 @@ def _repeated(target: RecordedPass, rows: int) -> dict[str, Any]:
 
 
 @contextmanager
-def _replacing(
+def _replace_states(
     model: LocalModel, target: RecordedPass, source: RecordedPass, weights: Weights, start: int, rows: int
 ) -> Iterator[None]:
     """Let passes start behind block `start`, replacing states, inside the context."""
 
     def replace(site: Site, layer: int, _: Module, __: Any, output: Any) -> Any:
-        states = _mixed(first_tensor(output), source.states[site, layer], weights[site, layer])
+        states = _mix(first_tensor(output), source.states[site, layer], weights[site, layer])
         return (states, *output[1:]) if isinstance(output, tuple) else states
 
     def skip(layer: int, hidden_states: Tensor, *_: Any, **__: Any) -> Tensor:
@@ -319,9 +319,9 @@ def _replacing(
         own_forward, weight = argument_of(block, PER_LAYER, args, kwargs), _residual_weights(weights, below)
         if own_forward is not None and weight is not None:
             args, kwargs = with_argument(
-                block, PER_LAYER, _mixed(own_forward, source.per_layer[below], weight), args, kwargs
+                block, PER_LAYER, _mix(own_forward, source.per_layer[below], weight), args, kwargs
             )
-        shared_keys = argument_of(block, SHARED, args, kwargs)  # one mapping, shared by all blocks
+        shared_keys = argument_of(block, SHARED_KEYS, args, kwargs)  # one mapping, shared by all blocks
         if shared_keys is not None and below == start:
             for name, (maker, *pair) in target.shared.items():
                 if maker <= start:
@@ -330,7 +330,7 @@ def _replacing(
             residual_weight = weights["residual", below]
             for name, pair in [*shared_keys.items()]:
                 shared_keys[name] = tuple(
-                    _mixed(*tensor_pair, residual_weight)
+                    _mix(*tensor_pair, residual_weight)
                     for tensor_pair in zip(pair, source.shared[name][1:], strict=True)
                 )
         return args, kwargs

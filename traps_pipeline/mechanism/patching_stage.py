@@ -123,14 +123,14 @@ class Pairs:
         Nulls are measured, too. There is a row for each pair, direction, source and cell.
         """
         paths = set[Path]()
-        estimates = self._each("estimates", self._estimates, paths)
+        estimates = self._pair_rows("estimates", self._estimates, paths)
         best = best_cells(estimates, self._settings, self._model.n_layers)
-        patches = self._each(f"patches-{digest(best)[:8]}", lambda name: self._patches(name, best), paths)
+        patches = self._pair_rows(f"patches-{digest(best)[:8]}", lambda name: self._patches(name, best), paths)
         store = self._workspace.store
         store.remove({*store.below(self._folder)} - paths)  # files of other settings or items
         return estimates, patches
 
-    def _each(self, kind: str, make: Callable[[str], Iterable[Row]], paths: set[Path]) -> list[Row]:
+    def _pair_rows(self, kind: str, make: Callable[[str], Iterable[Row]], paths: set[Path]) -> list[Row]:
         """Return the rows of all pairs, from their files or computed and written."""
         rows, store = list[Row](), self._workspace.store
         for number, name in enumerate(self._names, start=1):
@@ -150,7 +150,7 @@ class Pairs:
             if groups is None:
                 yield {"scenario": name, "into": side, "source": OWN, "left_out": True}
                 continue
-            ends, changes = self._attributed(target, source)
+            ends, changes = self._attribute(target, source)
             for (site, layer), token_changes in changes.items():
                 for group, positions in groups.items():
                     if positions.any() and site in self._settings.sites:
@@ -174,7 +174,7 @@ class Pairs:
                 if side is None:
                     yield {"scenario": name, "into": patched_side, "source": kind, "left_out": True}
                     continue
-                margin, changes = self._patched(target_pass, side, patches)
+                margin, changes = self._patch(target_pass, side, patches)
                 source_margin = margin if kind == OWN else source_margin
                 for cell, patch, change in zip(cells, patches, changes, strict=True):
                     yield _row(
@@ -188,13 +188,13 @@ class Pairs:
                     )
             del target_pass  # before the other side's pass is recorded
 
-    def _attributed(self, target: Side, source: Side) -> tuple[tuple[float, float], dict[tuple[Site, int], np.ndarray]]:
+    def _attribute(self, target: Side, source: Side) -> tuple[tuple[float, float], dict[tuple[Site, int], np.ndarray]]:
         """Return both sides' margins and each token's estimate; free the states."""
         target_pass = record(self._model, target.prompt, self._tokens, ())
         patched = record(self._model, source.prompt, self._tokens, self._settings.sites)
         return (target_pass.margin, patched.margin), attributed_changes(self._model, target_pass, patched, self._tokens)
 
-    def _patched(self, target: RecordedPass, side: Side, patches: Sequence[Patch]) -> tuple[float, np.ndarray]:
+    def _patch(self, target: RecordedPass, side: Side, patches: Sequence[Patch]) -> tuple[float, np.ndarray]:
         """Return a source's margin, and the changes by its patches; free its states."""
         source = record(self._model, side.prompt, self._tokens, self._settings.sites)
         return source.margin, patched_changes(self._model, target, source, patches, self._tokens)

@@ -14,7 +14,7 @@ import numpy as np
 
 from traps_pipeline.base.errors import TrapsError
 
-_TOLERANCE, _MOST_STEPS = 1e-10, 200
+_TOLERANCE, _MAX_STEPS = 1e-10, 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +106,7 @@ def solve_gram(gram: np.ndarray, void: np.ndarray) -> tuple[np.ndarray, float]:
     odds = float(np.log(label.mean() / (1 - label.mean())))
     at = _Point(np.zeros(len(label)), odds, np.full(len(label), odds))
     newton, previous_loss = None, np.inf
-    for _ in range(_MOST_STEPS):
+    for _ in range(_MAX_STEPS):
         chance = expit(at.logits)
         missing = label - chance - at.dual
         max_residual = float(max(np.abs(missing).max(), abs(at.dual.sum()) / len(label)))
@@ -116,7 +116,7 @@ def solve_gram(gram: np.ndarray, void: np.ndarray) -> tuple[np.ndarray, float]:
             newton = _NewtonStep(gram, chance * (1 - chance))
         step, intercept_step = newton.solve(missing, at.dual.sum())
         at, previous_loss = (
-            _descended(at, _Point(step, intercept_step, gram @ step + intercept_step), label),
+            _descend(at, _Point(step, intercept_step, gram @ step + intercept_step), label),
             max_residual,
         )
     raise _unfit(len(label))
@@ -134,7 +134,7 @@ class _Point(NamedTuple):
         return float(0.5 * self.dual @ (self.logits - self.intercept) + loss)  # scikit-learn's, with C = 1
 
 
-def _descended(at: _Point, step: _Point, label: np.ndarray) -> _Point:
+def _descend(at: _Point, step: _Point, label: np.ndarray) -> _Point:
     """Return the place after a step, halved until the objective falls."""
     value, size = at.objective(label), 1.0
     while True:

@@ -41,7 +41,7 @@ from traps_pipeline.protocol.datasets import DATASETS, PROBED_DATASETS, TIME_SWA
 from traps_pipeline.scoring.bootstrap import scenario_weights
 from traps_pipeline.storage.study import ProbeSettings
 
-MOST_WORKERS = 4
+MAX_WORKERS = 4
 Result = TypeVar("Result")
 Row = dict[str, Any]
 ReadLayer = Callable[[str, int], np.ndarray]  # dataset, layer -> states (n, d) in the order of the dataset's items
@@ -163,36 +163,38 @@ class ProbeRun:
         were used in the fit (see `held_out`).
         """
         scores = transfer_scores(splits, self._pairs, self.fit)
-        return [self._scored("transfer", path, layer, splits[path[1]], values) for path, values in scores.items()]
+        return [self._score_row("transfer", path, layer, splits[path[1]], values) for path, values in scores.items()]
 
     def confabulated_transfer(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
         """Return the same pairs restricted to confabulated voids and their controls."""
-        confabulated_splits = self._confabulated(splits)
+        confabulated_splits = self._confabulated_splits(splits)
         pairs = [pair for pair in self._pairs if set(pair) <= set(confabulated_splits)]
         scores = transfer_scores(confabulated_splits, pairs, self.fit)
         return [
-            self._scored("confabulated", path, layer, confabulated_splits[path[1]], v) for path, v in scores.items()
+            self._score_row("confabulated", path, layer, confabulated_splits[path[1]], v) for path, v in scores.items()
         ]
 
     def confabulated_held_out(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
         """Return Cf->Cf within a taxonomy by held-out probes, null with few scenarios."""
-        confabulated_splits, rows = self._confabulated(splits), []
+        confabulated_splits, rows = self._confabulated_splits(splits), []
         for source, target in self._pairs:
             if not {source, target} <= set(confabulated_splits) or taxonomy_of(source) != taxonomy_of(target):
                 continue
             split_pair = {name: confabulated_splits[name] for name in (source, target)}
-            note = self._too_few(source, split_pair)
+            note = self._shortage_note(source, split_pair)
             scores = None if note else self._unseen_scores(source, split_pair)[target]
             if scores is None:
                 rows.append(_row("confabulated_held_out", (source, target), layer, None, split_pair[target], note=note))
             else:
-                rows.append(self._scored("confabulated_held_out", (source, target), layer, split_pair[target], scores))
+                rows.append(
+                    self._score_row("confabulated_held_out", (source, target), layer, split_pair[target], scores)
+                )
         return rows
 
-    def _confabulated(self, splits: Mapping[str, Split]) -> dict[str, Split]:
+    def _confabulated_splits(self, splits: Mapping[str, Split]) -> dict[str, Split]:
         return {name: splits[name].rows(mask) for name, mask in self._restricted.items()}
 
-    def _too_few(self, source: str, splits: Mapping[str, Split]) -> str:
+    def _shortage_note(self, source: str, splits: Mapping[str, Split]) -> str:
         """Return why a source's probes cannot hold out a fold of scenarios, if so."""
         n, folds = len(np.unique(splits[source].scenario)), self.settings.folds
         scenarios = np.unique(np.concatenate([split.scenario for split in splits.values()]))
@@ -226,7 +228,7 @@ class ProbeRun:
     ) -> list[Row]:
         """Return the pairs within a taxonomy, by probes that hold out the scenario."""
         pairs = [(s, t) for s in self._own for t in self._own if taxonomy_of(s) == taxonomy_of(t)]
-        return [self._scored("held_out", (s, t), layer, splits[t], unseen[s][t]) for s, t in pairs]
+        return [self._score_row("held_out", (s, t), layer, splits[t], unseen[s][t]) for s, t in pairs]
 
     def answerable(
         self, layer: int, splits: Mapping[str, Split], unseen: Mapping[str, Mapping[str, np.ndarray]]
@@ -251,7 +253,7 @@ class ProbeRun:
                 values = np.concatenate([values for values, _ in sides])
                 scenario = np.concatenate([places for _, places in sides])
                 split = Split(values[:, None], labels, scenario)
-                rows.append(self._scored(analysis, (source, extra), layer, split, values))
+                rows.append(self._score_row(analysis, (source, extra), layer, split, values))
         return rows
 
     def time_swapped(
@@ -262,7 +264,7 @@ class ProbeRun:
             return []
         split = splits[TIME_SWAPPED]
         return [
-            self._scored("time_swapped", (s, TIME_SWAPPED), layer, split, unseen[s][TIME_SWAPPED]) for s in self._own
+            self._score_row("time_swapped", (s, TIME_SWAPPED), layer, split, unseen[s][TIME_SWAPPED]) for s in self._own
         ]
 
     @staticmethod
@@ -311,7 +313,7 @@ class ProbeRun:
                 rows.append(_row(analysis, (source, target), layer, share, split.rows(mask), scope=scope))
         return rows
 
-    def _scored(self, analysis: str, path: Path, layer: int, of: Split, scores: np.ndarray) -> Row:
+    def _score_row(self, analysis: str, path: Path, layer: int, of: Split, scores: np.ndarray) -> Row:
         weights = self._weights[probed_taxonomy(path[1])]
         interval = auroc_interval(of.void, scores, of.scenario, weights)
         return _row(analysis, path, layer, float(auroc(of.void, scores)), of, interval=interval)
@@ -334,7 +336,7 @@ def each_layer(work: Callable[[int], Result], n_layers: int) -> Iterator[Result]
     """
     from threadpoolctl import threadpool_limits
 
-    workers = min(cores(), MOST_WORKERS)
+    workers = min(cores(), MAX_WORKERS)
     with threadpool_limits(1), ThreadPoolExecutor(workers) as pool:
         yield from pool.map(work, range(n_layers))
 

@@ -18,7 +18,7 @@ from traps_pipeline.mechanism.mechanism_rows import SteeringEffectRow, SteeringS
 from traps_pipeline.mechanism.steering import UNSTEERED
 from traps_pipeline.mechanism.transfer_paths import PATH_SETS, STEERING_PATHS
 from traps_pipeline.protocol.datasets import taxonomy_of, transfer_type
-from traps_pipeline.protocol.ratings import ABSTENTION, CORRECTNESS, decided, majority, ratings
+from traps_pipeline.protocol.ratings import ABSTENTION, CORRECTNESS, majority, ratings, vote_decisions
 from traps_pipeline.scoring.bootstrap import (
     RESAMPLES,
     SEED,
@@ -42,7 +42,7 @@ _PATH = [*_CELL, "source", "kind", "layer", "alpha", "side"]
 _PATH_SETS = {ALL: STEERING_PATHS, **PATH_SETS}
 
 
-def of_paper(rows: pd.DataFrame) -> pd.DataFrame:
+def paper_protocol_rows(rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows of the paper's protocol: void or unsteered, alphas, signs by label."""
     return rows.loc[rows["kind"].isin(["void", UNSTEERED]) & (rows["unit"] == "alpha") & (rows["signs"] == "label")]
 
@@ -70,7 +70,9 @@ def _with_verdicts(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
         matrix = ratings(votes_on.get(cell, none), answer=_ANSWER)
         tasks = {"abstained": ABSTENTION, "correct": CORRECTNESS}
         parts.append(
-            cell_answers.assign(**{n: decided(majority(matrix.on(cell_answers, t)[0])) for n, t in tasks.items()})
+            cell_answers.assign(
+                **{n: vote_decisions(majority(matrix.on(cell_answers, t)[0])) for n, t in tasks.items()}
+            )
         )
     return pd.concat(parts, ignore_index=True)
 
@@ -115,7 +117,9 @@ def share_rows(
     There are rows for each regime of directions and of answers and over all regimes, with an interval from resampled
     scenarios (all paths share the scenarios of a resample, and the unseen one).
     """
-    decided_answers = answers_of_paths(of_paper(answers), of_paper(votes)).dropna(subset=["abstained"])
+    decided_answers = answers_of_paths(paper_protocol_rows(answers), paper_protocol_rows(votes)).dropna(
+        subset=["abstained"]
+    )
     decided_answers = decided_answers.merge(
         decided_answers.loc[decided_answers["side"] == "void", ["model", "layer"]].drop_duplicates()
     )  # no sweep

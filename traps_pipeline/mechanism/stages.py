@@ -31,7 +31,7 @@ from traps_pipeline.mechanism.mechanism_rows import (
 )
 from traps_pipeline.mechanism.probe_items import other_clip
 from traps_pipeline.mechanism.probing import Confabulated, NothingConfabulated, ProbeRun, confabulated_scenarios
-from traps_pipeline.mechanism.probing_versions import shown_inside, states_folder
+from traps_pipeline.mechanism.probing_versions import mechanism_entry, states_folder
 from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.mechanism.transfer_paths import CURVES
 from traps_pipeline.models.prompts import states_prompt
@@ -63,7 +63,7 @@ def examined_model(workspace: Workspace, model: str) -> ModelEntry:
         )
     if model not in settings.models:
         raise TrapsError(f"study.yaml: mechanism.models does not name {model}; add it with its layers")
-    return shown_inside(entry, settings)
+    return mechanism_entry(entry, settings)
 
 
 # --- hidden states ----------------------------------------------------------------------------------------------------

@@ -31,7 +31,7 @@ from traps_pipeline.mechanism.transfer_paths import sources_of
 from traps_pipeline.models.answers import Question
 from traps_pipeline.models.ask import SettledCell, collect
 from traps_pipeline.models.judges import JudgeEntry, load_panel
-from traps_pipeline.models.participants import Row, when_asked
+from traps_pipeline.models.participants import Row, call_time_columns
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.registry import Entry, ModelEntry
 from traps_pipeline.models.request import Request
@@ -334,7 +334,7 @@ def _steering_row(
         **cell.partition,
         **{name: item[name] for name in ("item_id", "scenario_id", "side", "benchmark_version")},
         **{name: row[name] for name in ("outcome", "text", "served_model", "completion_tokens")},
-        **when_asked(row),
+        **call_time_columns(row),
         **{name: getattr(strength, name) for name in ("source", "kind", "draw", "layer", "unit", "dose", "signs")},
         alpha=strength.alpha,
         alpha_relative=strength.relative,

@@ -52,7 +52,7 @@ class AccountBudget:
         self.cap_usd = parse_yaml_model(Cap, read_yaml(path), path).usd
         self._spent: defaultdict[str, float] = defaultdict(float)
         self._descriptor, self._read = -1, 0
-        with self._locked():
+        with self._lock():
             if self._read > _COMPACTED:
                 content = b"".join(line_with_checksum({"study": name, "usd": usd}) for name, usd in self._spent.items())
                 write_bytes(self._path, content, durable=True)  # other processes notice the new file and read it
@@ -64,7 +64,7 @@ class AccountBudget:
     @property
     def spent_usd(self) -> Mapping[str, float]:
         """Dollars spent or reserved, by study."""
-        with self._locked():
+        with self._lock():
             return dict(self._spent)
 
     def begin(self, known_usd: float) -> None:
@@ -73,13 +73,13 @@ class AccountBudget:
         The study spent it before it named the folder, or the file was lost. known_usd: dollars by the study's own
         ledgers and journal.
         """
-        with self._locked():
+        with self._lock():
             if (missing := known_usd - self._spent[self.study]) > 1e-6:
                 self._append(missing)
 
     def reserve(self, dollars: float) -> bool:
         """Reserve a call's worst case if the cap leaves room; return whether it does."""
-        with self._locked():
+        with self._lock():
             if sum(self._spent.values()) + dollars > self.cap_usd + 1e-9:
                 return False
             self._append(dollars)
@@ -88,7 +88,7 @@ class AccountBudget:
     def correct(self, dollars: float) -> None:
         """Replace a call's worst case by its cost: add the difference, usually negative."""
         if dollars:
-            with self._locked():
+            with self._lock():
                 self._append(dollars)
 
     def explain(self, worst_usd: float) -> str:
@@ -107,7 +107,7 @@ class AccountBudget:
             self._descriptor = -1
 
     @contextmanager
-    def _locked(self) -> Iterator[None]:
+    def _lock(self) -> Iterator[None]:
         """Hold the file's lock for a moment, after reading all lines of other processes."""
         try:
             while True:

@@ -15,7 +15,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.answer_rows import ResponseRow
 from traps_pipeline.models.ask import Call, SettledCell, collect
 from traps_pipeline.models.framing import media_for_dataset
-from traps_pipeline.models.participants import Row, when_asked
+from traps_pipeline.models.participants import Row, call_time_columns
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.reading import read_answer
 from traps_pipeline.models.registry import ModelEntry, effective_params, get_model
@@ -152,7 +152,7 @@ def response_row(cell: Cell, item: Mapping[str, Any], row: Row, reasoning: str |
         **{name: item[name] for name in ("item_id", "pair_id", "side", "benchmark_version")},
         **cell.partition,
         **{name: row[name] for name in row_fields},
-        **when_asked(row),
+        **call_time_columns(row),
         outcome=reading.outcome,
         text=reading.text,
         reasoning=reading.reasoning,

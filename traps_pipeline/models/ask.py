@@ -26,12 +26,12 @@ from traps_pipeline.models.budget import Budget, BudgetReached
 from traps_pipeline.models.participants import CallContext, Participant, Participants, Row, attempt, ledger_row
 from traps_pipeline.models.registry import Entry
 from traps_pipeline.models.request import Backend, Request
-from traps_pipeline.models.spending import sharing, spending
+from traps_pipeline.models.spending import open_budget, share_accounts
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
-STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 GRACE_S = 30.0  # grace period of calls in flight after SIGTERM or SIGHUP
 END_S = 1.5  # grace period after the second signal
 INTERRUPTED = 130  # the exit code of a stopped run
@@ -100,8 +100,8 @@ def collect(
     entry_of = {entry.id: entry for entry in entries}
     with (
         workspace.ledger.writing(),
-        sharing(workspace, entry_of.values()) as sharers,
-        spending(workspace, entry_of.values()) as budget,
+        share_accounts(workspace, entry_of.values()) as sharers,
+        open_budget(workspace, entry_of.values()) as budget,
     ):
         if any(entry.prices for entry in entry_of.values()):
             progress.current().money(budget.spent_usd, workspace.study.budget_usd)
@@ -363,7 +363,7 @@ class _drain_on_interrupt:  # noqa: N801 - reads as a verb where it is used
         self._former: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> None:
-        for signal_number in STOPS if self._main else ():
+        for signal_number in STOP_SIGNALS if self._main else ():
             handler = signal.getsignal(signal_number)
             if (
                 signal_number is signal.SIGINT or handler is not signal.SIG_IGN

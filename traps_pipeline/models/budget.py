@@ -129,7 +129,9 @@ class Budget:
                 if not self._has_calls_through(account):
                     raise BudgetReached(account.explain(worst_usd))
             elif not await self._has_room_later(result):
-                raise BudgetReached(reached(result.slot, result.taken_usd, self._caps[result.slot], worst_usd))
+                raise BudgetReached(
+                    budget_reached_reason(result.slot, result.taken_usd, self._caps[result.slot], worst_usd)
+                )
             async with self._changed:
                 with suppress(TimeoutError):
                     await asyncio.wait_for(self._changed.wait(), LOOK_S)
@@ -166,7 +168,7 @@ class Budget:
         return any(self._accounts.get(call.participant) is account for call in self._in_flight.values())
 
 
-def reached(participant: str | None, spent_usd: float, cap_usd: float, worst_usd: float) -> str:
+def budget_reached_reason(participant: str | None, spent_usd: float, cap_usd: float, worst_usd: float) -> str:
     """Return why a budget (None: the study's) leaves no room for a call."""
     return (
         f"the budget of {participant or 'the study'} is reached: ${spent_usd:.2f} of ${cap_usd:.2f} spent, the next "

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from traps_pipeline.ledger.rows import AVERAGED, Totals
+from traps_pipeline.ledger.rows import AVERAGED_COLUMNS, Totals
 from traps_pipeline.models.budget import BYTES_A_TOKEN, OVERHEAD_TOKENS
 from traps_pipeline.models.media_tokens import expected_clip_tokens
 from traps_pipeline.models.registry import Entry, ModelEntry, load_accounts
@@ -53,7 +53,7 @@ def experience(totals: Iterable[Totals]) -> Experience:
     sum_of_totals = Totals()
     for part in totals:
         sum_of_totals.join(part)
-    return Experience(*(sum_of_totals.mean(column) for column in AVERAGED))
+    return Experience(*(sum_of_totals.mean(column) for column in AVERAGED_COLUMNS))
 
 
 def forecast(entry: Entry, calls: int, seen: Experience) -> Forecast:

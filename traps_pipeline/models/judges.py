@@ -146,7 +146,7 @@ def load_panel(name: str, path: Path = JUDGES_FILE) -> tuple[JudgeEntry, ...]:
     """Return a panel's judges (three, or one). Raises TrapsError naming the file."""
     panels, judges = load_panels(path), load_judges(path)
     if not name:
-        raise TrapsError(f"no panel is named: {how_to_name_a_panel(path)}")
+        raise TrapsError(f"no panel is named: {panel_advice(path)}")
     if name not in panels:
         raise TrapsError(f"{path}: no panel {name!r}; it has {', '.join(panels)}{did_you_mean(name, panels)}")
     seats = panels[name]
@@ -164,10 +164,10 @@ def load_panels(path: Path = JUDGES_FILE) -> dict[str, Any]:
     panels = read_mapping(path).get("panels")
     if not isinstance(panels, dict):
         raise TrapsError(f"{path}: must hold a mapping `panels:`")
-    return {**panels, **user_registry.together().panels} if path == JUDGES_FILE else panels
+    return {**panels, **user_registry.all_additions().panels} if path == JUDGES_FILE else panels
 
 
-def how_to_name_a_panel(path: Path = JUDGES_FILE) -> str:
+def panel_advice(path: Path = JUDGES_FILE) -> str:
     """Return instructions for a command without a panel."""
     return (
         f"write `panel: NAME` into the experiment, or say --panel NAME; {path} has {', '.join(load_panels(path))} "

@@ -32,7 +32,7 @@ from traps_pipeline.models.request import (
     TransientError,
 )
 from traps_pipeline.models.traffic import Breaker, Gate, Meter
-from traps_pipeline.models.transport import watching
+from traps_pipeline.models.transport import record_exchange
 from traps_pipeline.storage.study import Study
 
 Row = Mapping[str, Any]
@@ -140,7 +140,7 @@ async def attempt(
         async with participant.gate.connection():
             await participant.meter.admit(tokens.prompt + tokens.completion, allowed.halted)
             if allowed.halted():
-                return _given_up("interrupted", number - 1, seconds, lost_usd)
+                return _final_failure("interrupted", number - 1, seconds, lost_usd)
             started_at = time.monotonic()
             try:
                 outcome = await _send(participant, request, allowed)
@@ -148,7 +148,7 @@ async def attempt(
                 failure, seconds = error, time.monotonic() - started_at
             except BudgetReached:
                 if lost_usd:  # record lost money in the ledger first; the next call meets the cap again
-                    return _given_up("budget", number - 1, seconds, lost_usd)
+                    return _final_failure("budget", number - 1, seconds, lost_usd)
                 raise
             else:
                 participant.gate.answered()
@@ -163,19 +163,19 @@ async def attempt(
         elif failure.kind != UNREACHABLE:
             participant.breaker.connected()
         if failure.billed:
-            lost_usd += _believed(failure.cost_usd, worst_case_usd(participant.entry, request))
+            lost_usd += _believed_cost(failure.cost_usd, worst_case_usd(participant.entry, request))
         malformed += failure.kind == MALFORMED
         if number > limits.retries or malformed == MALFORMED_TRIES:
-            return _given_up(failure.kind, number, seconds, lost_usd, failure.raw)
+            return _final_failure(failure.kind, number, seconds, lost_usd, failure.raw)
         progress.current().retried(participant.entry.id)
         longest = min(limits.backoff_s * 2 ** (number - 1), MAX_BACKOFF_S)
         wait = max(min(failure.retry_after_s or 0.0, MAX_RETRY_AFTER_S), random.uniform(0, longest))
         if await _is_stopped_within(allowed.stop, wait):
-            return _given_up("interrupted", number, seconds, lost_usd)
+            return _final_failure("interrupted", number, seconds, lost_usd)
     raise AssertionError("unreachable: the last attempt returns")
 
 
-def _given_up(
+def _final_failure(
     kind: str, attempts: int, seconds: float, lost_usd: float, raw: str | None = None
 ) -> tuple[Outcome, int, float] | None:
     """Return a ledger failure; None for a call never sent, or free and to be retried."""
@@ -197,7 +197,7 @@ async def _send(participant: Participant, request: Request, allowed: CallContext
     worst_usd = worst_case_usd(entry, request)
     reservation = await allowed.budget.reserve(entry.id, worst_usd)
     cost_usd = 0.0
-    with watching() as exchange:
+    with record_exchange() as exchange:
         try:
             # Check last: waiting for a connection, the pace or the budget may have taken long, and a host may have
             # slept.
@@ -206,7 +206,7 @@ async def _send(participant: Participant, request: Request, allowed: CallContext
             async with asyncio.timeout(entry.limits.timeout_s):
                 outcome = await participant.backend.ask(request)
             if entry.prices is not None:
-                cost_usd = _believed(outcome.cost_usd, worst_usd)
+                cost_usd = _believed_cost(outcome.cost_usd, worst_usd)
                 outcome = replace(outcome, cost_usd=cost_usd)
             return outcome
         except TimeoutError:
@@ -215,7 +215,7 @@ async def _send(participant: Participant, request: Request, allowed: CallContext
                 raise TransientError(UNREACHABLE, billed=False, why=reason) from None
             raise TransientError("timeout") from None
         except TransientError as failure:
-            cost_usd = _believed(failure.cost_usd, worst_usd) if failure.billed else 0.0
+            cost_usd = _believed_cost(failure.cost_usd, worst_usd) if failure.billed else 0.0
             raise
         finally:
             if exchange.is_unsent:  # also for a call that is cancelled before it is sent
@@ -225,7 +225,7 @@ async def _send(participant: Participant, request: Request, allowed: CallContext
             await allowed.budget.settle(reservation, cost_usd)
 
 
-def _believed(cost_usd: float | None, worst_usd: float) -> float:
+def _believed_cost(cost_usd: float | None, worst_usd: float) -> float:
     """Return an answer's cost, or the worst case if it is unknown or impossible.
 
     A provider may exceed a call's limits and charge for it, up to a bound: an impossible number of tokens would
@@ -261,6 +261,6 @@ def ledger_row(
     return row, side_texts
 
 
-def when_asked(row: Row) -> Row:
+def call_time_columns(row: Row) -> Row:
     """Return the epoch and time of a row's call, columns of all tables from a ledger."""
     return {"epoch": row["epoch"], "created_at": datetime.fromisoformat(row["created_at"])}

@@ -85,7 +85,7 @@ def read_error(content: bytes | None) -> ProviderError | None:
         body = next(iter(body), None)
     if not isinstance(body, Mapping):
         return None
-    error = body.get("error") or _of_choice(body.get("choices"))
+    error = body.get("error") or _choice_error(body.get("choices"))
     if not error and (body.get("object") == "error" or _is_flat(body)):  # vLLM; gateways
         error = body
     if isinstance(error, str):
@@ -105,7 +105,7 @@ def _is_flat(body: Mapping[str, Any]) -> bool:
     )
 
 
-def _of_choice(choices: Any) -> Any:
+def _choice_error(choices: Any) -> Any:
     """Return an error in the place of a choice, as OpenRouter sends it."""
     first = choices[0] if isinstance(choices, list) and choices else None
     return first.get("error") if isinstance(first, Mapping) else None

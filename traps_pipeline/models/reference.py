@@ -39,7 +39,7 @@ def _truth(request: Request) -> str:
     return labels[int(uniform(request, "guess") * len(labels))]
 
 
-def _sometimes(parameter: str) -> Strategy:
+def _abstain_randomly(parameter: str) -> Strategy:
     """Return a strategy that abstains with a fixed probability on each side."""
 
     def strategy(request: Request) -> str | None:
@@ -77,7 +77,7 @@ STRATEGIES: Mapping[str, Strategy] = {
     "never-abstain": lambda r: r.secret["labels"][0],
     "perfect-answerer": _truth,
     "inverse-oracle": lambda r: None if r.secret["side"] == "control" else _truth(r),
-    "abstain-at-rate": _sometimes("abstain_probability"),
+    "abstain-at-rate": _abstain_randomly("abstain_probability"),
     "prior": lambda r: r.secret["commonest_answer"],
     "bayes": _bayes,
 }
@@ -91,11 +91,11 @@ def phrase(answer: str | None, request: Request) -> str:
         reason, final = "I followed the motion to the end of the clip.", answer
     if fields := fields_of(str(request.about["regime"]), dataset_of(str(request.about["item_id"]))):
         answer_object = {"reason": reason, "abstain": answer is None, "final_answer": final}
-        return json.dumps({name: (answer_object | _stated(answer, request))[name] for name in fields})
+        return json.dumps({name: (answer_object | _stated_probabilities(answer, request))[name] for name in fields})
     return f"{reason} {ABSTENTION}." if answer is None else f"{reason} The answer is: {final}."
 
 
-def _stated(answer: str | None, request: Request) -> dict[str, Any]:
+def _stated_probabilities(answer: str | None, request: Request) -> dict[str, Any]:
     """Return the probabilities to state with an answer.
 
     They are those of `bayes`; for others all for the answer, and for an abstention none, which leaves all answers

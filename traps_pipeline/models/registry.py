@@ -271,14 +271,14 @@ _Entry = TypeVar("_Entry", bound=Entry)
 
 @user_registry.cached_registry
 @cache
-def _parsed(path: Path) -> Any:
+def _parse(path: Path) -> Any:
     """Return a registry's YAML, from which models and accounts are read in turn."""
     return read_yaml(path)
 
 
 def read_entries(path: Path, key: str, kind: type[_Entry]) -> dict[str, _Entry]:
     """Return a file's entries by id, in order. Raises TrapsError naming entry, field."""
-    data = _parsed(path)
+    data = _parse(path)
     entries = data.get(key) if isinstance(data, dict) else None
     if not isinstance(entries, list):
         raise TrapsError(f"{path}: must hold a list `{key}:`")
@@ -293,7 +293,7 @@ def _add(
     entries: dict[str, _Entry], kind: type[_Entry], raw: Any, path: Path, what: str, context: Mapping[str, Any]
 ) -> None:
     name = raw.get("id", "?") if isinstance(raw, dict) else "?"
-    short_fields = [field for field in user_registry.SHORT if isinstance(raw, dict) and field in raw]
+    short_fields = [field for field in user_registry.SHORT_FIELDS if isinstance(raw, dict) and field in raw]
     if short_fields:  # `user_registry` completes an experiment's short entries before they come here
         raise TrapsError(
             f"{path}: {what} ({name}): {', '.join(short_fields)}: an entry with an address of its own stands in an "
@@ -325,7 +325,7 @@ def load_models(path: Path = MODELS_FILE) -> dict[str, ModelEntry]:
 @cache
 def load_accounts(path: Path = MODELS_FILE) -> dict[str, Account]:
     """Return accounts by name. Raises TrapsError naming account and field."""
-    data = _parsed(path)
+    data = _parse(path)
     accounts = data.get("accounts", {}) if isinstance(data, dict) else None
     if not isinstance(accounts, dict):
         raise TrapsError(f"{path}: `accounts:` must be a mapping of names")

@@ -16,7 +16,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 
 @contextmanager
-def spending(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Budget]:
+def open_budget(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Budget]:
     """Yield the study's remaining budget, shared by its processes. Raises TrapsError."""
     _check_names(workspace)
     caps = workspace.study.budget_usd, workspace.study.model_budgets_usd
@@ -33,7 +33,7 @@ def spending(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Bu
 
 
 @contextmanager
-def sharing(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Callable[[str], int]]:
+def share_accounts(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Callable[[str], int]]:
     """Use these participants in the block; yield a counter of an account's processes."""
     accounts = {entry.account for entry in participants if entry.account}
     if not accounts:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 Marks = tuple[str, str]  # the opening and the closing mark
-USUAL: tuple[Marks, ...] = (
+COMMON_MARKS: tuple[Marks, ...] = (
     ("<think>", "</think>"),  # DeepSeek-R1, Qwen3, GLM and most others
     ("<thinking>", "</thinking>"),
     ("<thought>", "</thought>"),
@@ -38,7 +38,7 @@ class ThinkingSplit:
 
 def marks_of(declared: str | Sequence[str]) -> Marks:
     """Parse declared marks: both, or a common opening one. Raises ValueError."""
-    usual = dict(USUAL)
+    usual = dict(COMMON_MARKS)
     if isinstance(declared, str) and declared in usual:
         return declared, usual[declared]
     marks = [] if isinstance(declared, str) else [mark for mark in declared if isinstance(mark, str) and mark.strip()]
@@ -100,13 +100,13 @@ def undeclared_mark(text: str) -> str | None:
     return next(
         (
             opening_mark
-            for opening_mark, closing_mark in USUAL
+            for opening_mark, closing_mark in COMMON_MARKS
             if opening_mark.lower() in lower or closing_mark.lower() in lower
         ),
         None,
     )
 
 
-def how_to_declare(mark: str) -> str:
+def declaration_line(mark: str) -> str:
     """Return the line of an entry that declares a common mark."""
     return f"thinking: {json.dumps(mark, ensure_ascii=False)}"

@@ -82,10 +82,10 @@ class Meter:
     ) -> None:
         self._sharers = sharers
         self._rates = [None if rate is None else rate / 60 for rate in (requests_per_minute, tokens_per_minute)]
-        self._levels = [self._capacity(rate, 1.0) for rate in self._shared()]
+        self._levels = [self._capacity(rate, 1.0) for rate in self._shared_rates()]
         self._at = time.monotonic()
 
-    def _shared(self) -> list[float | None]:
+    def _shared_rates(self) -> list[float | None]:
         """Return this process's rates per second."""
         return [None if rate is None else rate / self._sharers() for rate in self._rates]
 
@@ -105,7 +105,7 @@ class Meter:
     def _take(self, amounts: tuple[float, float]) -> float:
         """Take from the buckets; return the seconds until they are at zero again."""
         now, wait = time.monotonic(), 0.0
-        for k, (rate, amount) in enumerate(zip(self._shared(), amounts, strict=True)):
+        for k, (rate, amount) in enumerate(zip(self._shared_rates(), amounts, strict=True)):
             if rate is None:
                 continue
             self._levels[k] = min(self._capacity(rate, 1.0), self._levels[k] + (now - self._at) * rate) - amount

@@ -12,7 +12,7 @@ from typing import Any
 
 BYTES_A_TOKEN = 8  # bytes of text per token: the maximum of any provider's tokenizer, averaged over a text
 TOKENS_A_FRAME = 8  # minimum
-MOST_TOKENS = 10**9  # anything above is no count
+MAX_TOKENS = 10**9  # anything above is no count
 
 # By dialect: prompt tokens, answer tokens, their sum, and parts of the answer (True) or of the prompt (False) that are
 # counted separately. Anthropic gives no sum.
@@ -71,11 +71,11 @@ def read_usage(fields: Mapping[str, Any], sizes: Sizes) -> Usage | None:
     for (prompt, completion, total), separate in _FORMS:
         if prompt in fields:
             usage = _complete_usage(fields, prompt, completion, total, separate)
-            return usage if usage and not sizes.contradict(usage) else _at_least(fields)
-    return _at_least(fields)
+            return usage if usage and not sizes.contradict(usage) else _highest_counts(fields)
+    return _highest_counts(fields)
 
 
-def _at_least(fields: Mapping[str, Any]) -> Usage | None:
+def _highest_counts(fields: Mapping[str, Any]) -> Usage | None:
     """Return the highest counts of a usage that is not believable as a whole."""
     counts = {name: value for name, value in fields.items() if _is_count(value)}
     prompt = sum(counts.get(name, 0) for name in _OF_PROMPT)
@@ -120,4 +120,4 @@ def _reasoning(fields: Mapping[str, Any], most: int) -> int | None:
 
 
 def _is_count(value: Any) -> bool:
-    return type(value) is int and 0 <= value <= MOST_TOKENS
+    return type(value) is int and 0 <= value <= MAX_TOKENS

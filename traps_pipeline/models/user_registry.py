@@ -27,7 +27,7 @@ HOW_MEDIA = (
     "media: say what your server takes of a clip: `images` (25 JPEG frames as image_url; most servers take them) "
     "or `video` (the clip as one mp4 in video_url; vLLM with a video model)"
 )
-SHORT = ("base_url", "served_name", "key")  # fields of a short entry, which complete entries have elsewhere
+SHORT_FIELDS = ("base_url", "served_name", "key")  # fields of a short entry, which complete entries have elsewhere
 Kind = Literal["models", "judges"]
 Cached = TypeVar("Cached")
 
@@ -109,7 +109,7 @@ def sources() -> list[tuple[Path, UserRegistry]]:
     return [*([(path, _read(path))] if path else []), *_overlay]
 
 
-def together() -> UserRegistry:
+def all_additions() -> UserRegistry:
     """Return the union of all `sources`."""
     combined = UserRegistry()
     for _, registry in sources():
@@ -119,7 +119,7 @@ def together() -> UserRegistry:
 
 def accounts() -> Mapping[str, dict[str, Any]]:
     """Return all added accounts."""
-    return together().all_accounts
+    return all_additions().all_accounts
 
 
 def entries(kind: Kind) -> Iterable[tuple[Path, dict[str, Any]]]:
@@ -148,7 +148,7 @@ def _account(entry: Mapping[str, Any]) -> str:
 
 def _entry_fields(raw: Mapping[str, Any], kind: Kind) -> dict[str, Any]:
     """Return a possibly short entry with all fields of a registry's entry."""
-    entry = {name: value for name, value in raw.items() if name not in SHORT}
+    entry = {name: value for name, value in raw.items() if name not in SHORT_FIELDS}
     if "base_url" not in raw:
         return entry
     sampling = {"temperature": 0.8, "max_tokens": 512} if kind == "judges" else None

@@ -23,9 +23,9 @@ from yarl import URL
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.network import TLS_VARIABLES, certificate_problem, proxy_of
-from traps_pipeline.models.transport import Exchange, watching
+from traps_pipeline.models.transport import Exchange, record_exchange
 
-MOST_BYTES = 16 * 2**20  # maximum bytes of an answer; 8,000 tokens with reasoning take less than a hundredth of it
+MAX_BYTES = 16 * 2**20  # maximum bytes of an answer; 8,000 tokens with reasoning take less than a hundredth of it
 CONNECT_S = 60.0  # time-out of a connection with its TLS handshake
 KEEPALIVE_S, NAMES_KEPT_S = 120.0, 300  # an idle connection; an address of a name
 _ASKED_ANEW = ("content-encoding", "content-length", "transfer-encoding", "location")
@@ -68,7 +68,7 @@ class Wire(httpx.AsyncBaseTransport):
         Raises httpx.ReadTimeout, and NetworkError for anything else: neither makes a client library retry.
         `Exchange.problem` says what happened.
         """
-        with watching() as exchange:
+        with record_exchange() as exchange:
             if exchange.sent:
                 raise httpx.NetworkError("a client library wanted to send a second request in one attempt")
             exchange.sent = False
@@ -148,13 +148,13 @@ async def _read(response: aiohttp.ClientResponse) -> bytes:
     async with response:
         async for chunk in response.content.iter_chunked(2**16):
             size += len(chunk)
-            if size > MOST_BYTES:
-                raise ValueError(f"the answer is larger than {MOST_BYTES} bytes")
+            if size > MAX_BYTES:
+                raise ValueError(f"the answer is larger than {MAX_BYTES} bytes")
             chunks.append(chunk)
-    return _decoded(b"".join(chunks), response.headers.get("content-encoding", "identity"))
+    return _decompress(b"".join(chunks), response.headers.get("content-encoding", "identity"))
 
 
-def _decoded(content: bytes, encoding: str) -> bytes:
+def _decompress(content: bytes, encoding: str) -> bytes:
     """Decompress a body; raise ValueError if truncated, too large or unknown."""
     if encoding.lower() == "identity":
         return content
@@ -163,9 +163,9 @@ def _decoded(content: bytes, encoding: str) -> bytes:
     unpacked = b""
     while content:  # gzip may have several members
         unpacking = zlib.decompressobj(15 if encoding.lower() == "deflate" else 47)
-        unpacked += unpacking.decompress(content, MOST_BYTES + 1 - len(unpacked))
-        if len(unpacked) > MOST_BYTES:
-            raise ValueError(f"the answer is larger than {MOST_BYTES} bytes")
+        unpacked += unpacking.decompress(content, MAX_BYTES + 1 - len(unpacked))
+        if len(unpacked) > MAX_BYTES:
+            raise ValueError(f"the answer is larger than {MAX_BYTES} bytes")
         if not unpacking.eof:
             raise ValueError("the compressed answer breaks off")
         content = unpacking.unused_data.lstrip(b"\0")
@@ -226,7 +226,7 @@ def get(url: str, headers: Mapping[str, str], timeout_s: float) -> httpx.Respons
         async with httpx.AsyncClient(transport=Wire(), timeout=timeout_s, follow_redirects=False) as client:
             return await client.get(url, headers=headers)
 
-    with watching() as exchange:
+    with record_exchange() as exchange:
         try:
             return asyncio.run(answer())
         except Exception as error:

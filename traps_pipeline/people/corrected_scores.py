@@ -20,7 +20,7 @@ from traps_pipeline.people.label_units import ABOUT_ANSWERS, TaskName
 from traps_pipeline.people.labels import truths
 from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 from traps_pipeline.scoring.bootstrap import (
-    RESAMPLED,
+    RESAMPLED_FIGURES,
     RESAMPLES,
     SEED,
     Resampling,
@@ -166,7 +166,10 @@ def _entry(group: pd.DataFrame, named: str, resampling: Resampling, errors: Erro
     sums = run_sums(group, resampling, named)
     means = [means_over_runs(sums, figures, resampling.resamples + 1) for figures in (figures_of, right)]
     return {
-        dataset: {**with_intervals(RESAMPLED, figures), **with_intervals(RESAMPLED, means[1][dataset], "_corrected")}
+        dataset: {
+            **with_intervals(RESAMPLED_FIGURES, figures),
+            **with_intervals(RESAMPLED_FIGURES, means[1][dataset], "_corrected"),
+        }
         for dataset, figures in means[0].items()
         if not np.isnan(figures[:, :, 0]).all()
     }

@@ -19,7 +19,7 @@ from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.sheets import no_formula
 from traps_pipeline.base.terminal import text_table
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.judging.agreement import cohen_kappa
 from traps_pipeline.judging.confabulation import draw_sample, sample_id
 from traps_pipeline.judging.confabulation_protocol import TRACE_AND_OUTPUT, VOID_KINDS, load_protocol
@@ -36,7 +36,7 @@ YES_WORDS, NO_WORDS = ("1", "true", "yes"), ("0", "false", "no")
 DEGENERATE_SHARE = 0.02
 POOLED = "pooled"
 RESAMPLES, SEED = 10_000, 20260101
-_MOST_PROBLEMS = 5
+_MAX_PROBLEMS = 5
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def sheet_rows(workspace: Workspace) -> list[dict[str, str]]:
     if no failure of the models to validate was labelled, or if a failure's answer has been replaced.
     """
     protocol = load_protocol()
-    labels = _judged(workspace)
+    labels = _judged_failures(workspace)
     labels = labels.loc[labels["model"].isin(protocol.validation.models)].set_index("sample_id")
     if labels.empty:
         raise TrapsError(f"no labelled failure of {', '.join(protocol.validation.models)}; run the study first")
@@ -137,7 +137,7 @@ def read_labels(path: Path, samples: Sequence[str]) -> HumanLabels:
         line_problems += [f"{path}:{line}: {problem}" for problem in problems]
         labels.setdefault((annotator, sample), (line, [row[axis].lower() in YES_WORDS for axis in AXES]))
     _refuse(line_problems)
-    return _paired(path, labels)
+    return _pair_labels(path, labels)
 
 
 def _lines(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
@@ -155,11 +155,12 @@ def _lines(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
         raise TrapsError(f"{path}: cannot be read as CSV ({error})") from error
 
 
-def _paired(path: Path, by_sample: Mapping[tuple[str, str], tuple[int, list[bool]]]) -> HumanLabels:
+def _pair_labels(path: Path, by_sample: Mapping[tuple[str, str], tuple[int, list[bool]]]) -> HumanLabels:
     names = sorted({annotator for annotator, _ in by_sample})
     if len(names) != 2:
         raise TrapsError(
-            f"{path}: has {counted(len(names), 'annotator')} ({', '.join(names)[:80] or 'none'}); it needs exactly two"
+            f"{path}: has {count_noun(len(names), 'annotator')} ({', '.join(names)[:80] or 'none'}); "
+            "it needs exactly two"
         )
     first, second = names
     samples = sorted({sample for _, sample in by_sample})
@@ -173,8 +174,8 @@ def _paired(path: Path, by_sample: Mapping[tuple[str, str], tuple[int, list[bool
 
 def _refuse(wrong: Sequence[str]) -> None:
     if wrong:
-        suffix = f"\n... and {len(wrong) - _MOST_PROBLEMS} more" if len(wrong) > _MOST_PROBLEMS else ""
-        raise TrapsError("\n".join(wrong[:_MOST_PROBLEMS]) + suffix)
+        suffix = f"\n... and {len(wrong) - _MAX_PROBLEMS} more" if len(wrong) > _MAX_PROBLEMS else ""
+        raise TrapsError("\n".join(wrong[:_MAX_PROBLEMS]) + suffix)
 
 
 # --- the comparison ---------------------------------------------------------------------------------------------------
@@ -182,7 +183,7 @@ def _refuse(wrong: Sequence[str]) -> None:
 
 def validate(workspace: Workspace, path: Path) -> pd.DataFrame:
     """Write and return JUDGE_VALIDATION rows from a label file. Raises TrapsError."""
-    judged = _judged(workspace).set_index("sample_id")
+    judged = _judged_failures(workspace).set_index("sample_id")
     if judged.empty:
         raise TrapsError(f"{workspace.root}: the study has no labelled failure to compare with; run it first")
     human = read_labels(path, list(map(str, judged.index)))
@@ -193,7 +194,7 @@ def validate(workspace: Workspace, path: Path) -> pd.DataFrame:
     return rows
 
 
-def _judged(workspace: Workspace) -> pd.DataFrame:
+def _judged_failures(workspace: Workspace) -> pd.DataFrame:
     """Return the validly labelled failures."""
     labels = workspace.tables.read(CONFABULATION, {})
     return labels.loc[labels["valid"].to_numpy(bool)]
@@ -208,7 +209,7 @@ def compare(judge: np.ndarray, human: HumanLabels) -> pd.DataFrame:
     rows = [_axis_row(axis, judge[:, k], human.labels[:, :, k], human) for k, axis in enumerate(AXES)]
     agreements = [float(np.mean(human.labels[k] == judge)) for k in (0, 1)]
     rows.append(
-        _shared(POOLED, judge.shape[0], human)
+        _shared_columns(POOLED, judge.shape[0], human)
         | {"n_labels": 2 * judge.size, "accuracy": float(np.mean(human.labels == judge))}
         | {"accuracy_a": agreements[0], "accuracy_b": agreements[1]}
         | {"human_agreement": float(np.mean(human.labels[0] == human.labels[1]))}
@@ -216,7 +217,7 @@ def compare(judge: np.ndarray, human: HumanLabels) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=pd.Index(JUDGE_VALIDATION.names))
 
 
-def _shared(axis: str, failures: int, human: HumanLabels) -> dict[str, Any]:
+def _shared_columns(axis: str, failures: int, human: HumanLabels) -> dict[str, Any]:
     a, b = human.annotators
     return {"axis": axis, "n_failures": failures, "annotator_a": a, "annotator_b": b}
 
@@ -231,7 +232,7 @@ def _axis_row(axis: str, judge: np.ndarray, labels: np.ndarray, human: HumanLabe
     precision, recall = _share(hits, 2 * int(judge.sum())), _share(hits, int(labels.sum()))
     defined = judge.any() and labels.any()  # whether both precision and recall are defined
     kappa, low, high = _kappa(first, second)
-    return _shared(axis, len(judge), human) | {
+    return _shared_columns(axis, len(judge), human) | {
         "n_labels": labels.size,
         "accuracy": float(np.mean(labels == judge)),
         "precision": precision,
@@ -280,7 +281,7 @@ def _share(part: int, total: int) -> float:
 def validation_text(rows: pd.DataFrame) -> str:
     """Return JUDGE_VALIDATION rows as text for people."""
     first = rows.iloc[0]
-    failures = counted(first["n_failures"], "failure")
+    failures = count_noun(first["n_failures"], "failure")
     title = f"judge against {first['annotator_a']} (A) and {first['annotator_b']} (B), {failures}"
     headings = ["axis", "labels", "acc", "prec", "recall", "F1", "vs A", "vs B", "A = B", "kappa", "95 %"]
     shares = ("accuracy", "precision", "recall", "f1", "accuracy_a", "accuracy_b", "human_agreement")

@@ -29,7 +29,7 @@ from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.lines import NOT_WHOLE, read_checked
 from traps_pipeline.storage.workspace import Workspace
 
-MOST_CHARACTERS = 200  # limit of an answer
+MAX_CHARACTERS = 200  # limit of an answer
 DECISIONS: Mapping[TaskName, tuple[str, ...]] = {
     "answerability": ("abstained",),
     "confabulation": AXES,
@@ -43,7 +43,7 @@ class ClipLabel(BaseModel):
     """A person's answer about a clip and its question; null if it cannot be known."""
 
     model_config = _STRICT
-    answer: str | None = Field(min_length=1, max_length=MOST_CHARACTERS)
+    answer: str | None = Field(min_length=1, max_length=MAX_CHARACTERS)
 
 
 # In the other tasks, a person only states decisions.

@@ -11,7 +11,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.names import Name
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.suggestions import did_you_mean
-from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml, within
+from traps_pipeline.base.yamlfile import name_file_in_errors, parse_yaml_model, read_yaml
 from traps_pipeline.models.judges import require_panel
 from traps_pipeline.models.registry import LOCAL, get_model, local_models
 from traps_pipeline.models.user_registry import UserRegistry, add_entries
@@ -55,7 +55,7 @@ class Experiment(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _what_the_file_describes_is_its_own(cls, data: Any) -> Any:
+    def _collect_own_entries(cls, data: Any) -> Any:
         """Move described (not named) models, `judges`, `panels`, `accounts` to `own`."""
         if not isinstance(data, dict):
             return data
@@ -86,13 +86,13 @@ class Experiment(BaseModel):
 
     @field_validator("models", "datasets", "regimes", "runs")
     @classmethod
-    def _once(cls, values: list[Any]) -> list[Any]:
+    def _require_unique(cls, values: list[Any]) -> list[Any]:
         if len(set(values)) != len(values):
             raise ValueError(f"{values} names something twice")
         return values
 
     @model_validator(mode="after")
-    def _one_object_is_asked_for(self) -> Experiment:
+    def _check_schemas(self) -> Experiment:
         schemas = [dataset for dataset in self.datasets if dataset in SCHEMAS]
         objects = [regime for regime in self.regimes if BY_NAME[regime].fields]
         if schemas and objects:
@@ -184,7 +184,7 @@ def load_experiment(name: str) -> Experiment:
         )
     experiment = parse_yaml_model(Experiment, read_yaml(path), path)
     add_entries(experiment.own, path)
-    with within(path):
+    with name_file_in_errors(path):
         for model in experiment.models:
             get_model(model)
         for model in experiment.mechanism.models if experiment.mechanism else ():

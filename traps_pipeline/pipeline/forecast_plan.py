@@ -13,9 +13,9 @@ from traps_pipeline.judging.confabulation import sample_failures
 from traps_pipeline.judging.confabulation_protocol import load_protocol
 from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.judging.panel import tasks_for, vote_requests
-from traps_pipeline.mechanism.cost import CARDS, Cost, Work, cost_of, passes_inside
+from traps_pipeline.mechanism.cost import CARDS, Cost, Work, cost_of, mechanism_passes
 from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES
-from traps_pipeline.mechanism.probing_versions import shown_inside
+from traps_pipeline.mechanism.probing_versions import mechanism_entry
 from traps_pipeline.mechanism.steering import count_answers
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.answers import answer_request, asked_items, is_prepared, response_row
@@ -151,11 +151,11 @@ def _local_costs(
         tokens = min(entry.expected_completion_tokens, entry.local_params().max_new_tokens)
         work = [(entry, Work("answers", calls[model][0].new, tokens), entry.local_params())] if model in calls else []
         if settings and model in settings.models:
-            inside_entry, params = shown_inside(entry, settings), entry.inside_params()
+            inside_entry, params = mechanism_entry(entry, settings), entry.inside_params()
             if workspace is None or not any(s["model"] == model for s in workspace.tables.partitions(HIDDEN_STATES)):
                 work += [
                     (inside_entry, passes, params)
-                    for passes in passes_inside(settings, experiment.datasets, taxonomies)
+                    for passes in mechanism_passes(settings, experiment.datasets, taxonomies)
                 ]
             if settings.steering and model in steered:
                 max_tokens = min(entry.expected_completion_tokens, settings.steering.max_new_tokens)
@@ -226,7 +226,7 @@ def _items(
         return [], unknown_items
     if is_current:
         return asked_items(workspace, dataset), Counter()
-    for stage, key in _made_from(lineage, dataset):
+    for stage, key in _input_versions(lineage, dataset):
         state = lineage.state(stage, key)
         if lineage.damage(stage, key) or (state and state.code != lineage.graph[stage].code):
             return [], unknown_items
@@ -275,10 +275,10 @@ def _fresh_rows(workspace: Workspace, lineage: Lineage, table: Table[Any], cell:
 
 def _has_current_items(lineage: Lineage, dataset: str) -> bool:
     """Return whether a dataset's items and everything upstream are current."""
-    return all(lineage.status(*node).kind == "fresh" for node in _made_from(lineage, dataset))
+    return all(lineage.status(*node).kind == "fresh" for node in _input_versions(lineage, dataset))
 
 
-def _made_from(lineage: Lineage, dataset: str) -> list[tuple[str, str | None]]:
+def _input_versions(lineage: Lineage, dataset: str) -> list[tuple[str, str | None]]:
     """Return the existing partitions of a dataset's items and of all upstream."""
     parents = lineage.graph.parents("items", dataset).items()
     inputs = [("items", dataset), *((stage, key) for stage, keys in parents for key in keys)]

@@ -84,7 +84,7 @@ class RunResources:
     each_gb: float = 0.0
 
 
-def _nothing(_: Workspace, __: Any, ___: bool) -> tuple[Tally, bool]:
+def _no_work(_: Workspace, __: Any, ___: bool) -> tuple[Tally, bool]:
     return Tally(), True
 
 
@@ -97,7 +97,7 @@ class ConcurrentBuild:
     the missing files, as far as that is known before anything upstream exists.
     """
 
-    files: Callable[[Workspace, Any, bool], tuple[Tally, bool]] = _nothing
+    files: Callable[[Workspace, Any, bool], tuple[Tally, bool]] = _no_work
     seconds: Callable[[Workspace, Any], float] = lambda workspace, key: 0.0
 
 

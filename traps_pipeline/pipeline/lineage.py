@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Literal
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.pipeline.graph import Graph, Stage, name_of, the_graph
 from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.storage.parquet import State
@@ -27,7 +27,9 @@ DAMAGED = "damaged"  # the version of damaged data
 
 def failed_calls(count: int) -> str:
     """Return the number of a partition's failed calls, with the remedy, in words."""
-    return f"{counted(count, 'call')} failed; a new run of this partition asks {'it' if count == 1 else 'them'} again"
+    return (
+        f"{count_noun(count, 'call')} failed; a new run of this partition asks {'it' if count == 1 else 'them'} again"
+    )
 
 
 @dataclass(frozen=True)

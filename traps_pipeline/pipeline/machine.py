@@ -22,8 +22,8 @@ from traps_pipeline.storage.workspace import Workspace
 if TYPE_CHECKING:
     import dagster as dg
 
-LEAST_GB = 0.1  # less would run out before the first tables are written
-MOST_PARTITIONS = 5  # partitions in a sentence
+MIN_GB = 0.1  # less would run out before the first tables are written
+MAX_PARTITIONS = 5  # partitions in a sentence
 CLIPS = "mp4"  # the kind of a stage that renders
 
 Parts = Mapping[str, Sequence[str | None]]  # by stage: the partitions that a run is to make
@@ -48,12 +48,10 @@ def parts_of_run(context: dg.AssetExecutionContext, stage: Stage, partitions: St
     }
 
 
-def why_nothing(keys: Sequence[str | None], tags: Mapping[str, str], workspace: Workspace) -> str:
+def nothing_to_do_reason(keys: Sequence[str | None], tags: Mapping[str, str], workspace: Workspace) -> str:
     """Return in words why a run whose keys are all unwanted has nothing to do."""
     if keys:
-        return (
-            f"no experiment in {workspace.root / 'study.yaml'} asks for {', '.join(map(str, keys[:MOST_PARTITIONS]))}"
-        )
+        return f"no experiment in {workspace.root / 'study.yaml'} asks for {', '.join(map(str, keys[:MAX_PARTITIONS]))}"
     first, last = (tags.get(f"dagster/asset_partition_range_{end}", "its end") for end in ("start", "end"))
     return f"no partition lies between {first} and {last}; exchange the two"
 
@@ -65,7 +63,7 @@ def require_machine(workspace: Workspace, parts: Parts) -> None:
     first that is missing or that a variable breaks. A study whose clips exist needs no OpenGL, and one whose answers
     and votes exist needs no network.
     """
-    check_disk(workspace.root, LEAST_GB)
+    check_disk(workspace.root, MIN_GB)
     if any(entry.backend == NETWORK for entry in _asked_entries(workspace, parts)):
         check_network()
     graph = the_graph()

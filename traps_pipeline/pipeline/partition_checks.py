@@ -22,7 +22,7 @@ CURRENT = "current"  # the check that every stage has
 CURRENT_DOC = "The partition is complete, made from the current inputs, and no call of it failed."
 REACHED = "a budget is reached"  # in a check's metadata
 STILL = "still failing"  # in a check's metadata: set for a partition that the run did not touch
-MOST_NAMED = 12  # unmade partitions named in an error
+MAX_NAMED = 12  # unmade partitions named in an error
 
 
 class StageChecks:
@@ -122,9 +122,9 @@ def raise_for_run(context: dg.AssetExecutionContext, graph: Graph, last: str) ->
             f"{first} (and {len(repeats)} more)" if repeats else first
             for first, *repeats in messages_by_reason.values()
         ]
-        suffix_lines = [f"... and {len(lines) - MOST_NAMED} more"] if len(lines) > MOST_NAMED else []
+        suffix_lines = [f"... and {len(lines) - MAX_NAMED} more"] if len(lines) > MAX_NAMED else []
         is_budget_reached = any(e.metadata[REACHED].value for e in failed.values() if REACHED in e.metadata)
-        raise (BudgetReached if is_budget_reached else TrapsError)("\n".join([*lines[:MOST_NAMED], *suffix_lines]))
+        raise (BudgetReached if is_budget_reached else TrapsError)("\n".join([*lines[:MAX_NAMED], *suffix_lines]))
 
 
 def evaluations(

@@ -52,7 +52,7 @@ def dagster_history(workspace: Workspace) -> Iterator[dg.DagsterInstance]:
         workspace.locks.mkdir(parents=True, exist_ok=True)
         with (workspace.locks / "dagster.lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
-            instance = _opened(workspace, home)
+            instance = _open_history(workspace, home)
         with instance:
             for run in instance.get_runs(dg.RunsFilter(statuses=[dg.DagsterRunStatus.STARTED])):
                 is_this_host = run.tags.get(HOST_TAG) == this_host()
@@ -75,7 +75,7 @@ def dagster_history(workspace: Workspace) -> Iterator[dg.DagsterInstance]:
         ) from error
 
 
-def _opened(workspace: Workspace, home: Path) -> dg.DagsterInstance:
+def _open_history(workspace: Workspace, home: Path) -> dg.DagsterInstance:
     from sqlalchemy.exc import DatabaseError, OperationalError
 
     for is_retry in (False, True):

@@ -60,11 +60,11 @@ def failed_checks(workspace: Workspace, experiment: str | None) -> list[str]:
         for key in stage.wanted(partitions):
             for check in sorted(failing.get((stage.name, key or stage.name), ())):
                 details = workspace.failure(stage.name, check, key)
-                problems.append(f"check {check} of {name_of((stage.name, key))} does not pass: {_unquoted(details)}")
+                problems.append(f"check {check} of {name_of((stage.name, key))} does not pass: {_unquote(details)}")
     return problems
 
 
-def _unquoted(details: str) -> str:
+def _unquote(details: str) -> str:
     return details[1:-1] if details[:1] == details[-1:] == '"' else details
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.suggestions import did_you_mean
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.answers import answer_request, with_posteriors
@@ -44,7 +44,7 @@ def explain(workspace: Workspace, item_id: str) -> dict[str, Any]:
                 evaluation = Evaluation(model, regime, run)
                 if evaluation.key not in rows_by_evaluation:
                     continue
-                rows = [row for row in rows_by_evaluation[evaluation.key].rows.values() if _about(row) == item_id]
+                rows = [row for row in rows_by_evaluation[evaluation.key].rows.values() if _item_id_of(row) == item_id]
                 if not rows:
                     continue
                 request = answer_request(workspace, entry, current, evaluation) if current else None
@@ -58,7 +58,7 @@ def explain(workspace: Workspace, item_id: str) -> dict[str, Any]:
                     }
                 )
     if current is None and not explanation["evaluations"]:
-        raise TrapsError(_unknown(workspace, item_id))
+        raise TrapsError(_unknown_reason(workspace, item_id))
     return explanation
 
 
@@ -80,7 +80,7 @@ def lines_of(explanation: Mapping[str, Any]) -> Iterator[str]:
         yield "no model has been asked this item"
 
 
-def _unknown(workspace: Workspace, item_id: str) -> str:
+def _unknown_reason(workspace: Workspace, item_id: str) -> str:
     """Return why an item is unknown, with the nearest one."""
     item_ids = workspace.tables.read_all(ITEMS, ["item_id"])["item_id"]
     if item_ids.empty:
@@ -106,7 +106,7 @@ def _rows_about(
     return [row for place in places for row in data.slice(place, 1).to_pylist()]
 
 
-def _about(row: Mapping[str, Any]) -> Any:
+def _item_id_of(row: Mapping[str, Any]) -> Any:
     return row["components"]["about"]["item_id"]
 
 
@@ -120,7 +120,7 @@ def _current_item(workspace: Workspace, dataset: str, item_id: str) -> dict[str,
 def _state(rows: list[dict[str, Any]], wanted: Mapping[str, Any] | None) -> str:
     newest = max(rows, key=lambda row: row["created_at"])
     if wanted is None:
-        times = counted(len(rows), "time")
+        times = count_noun(len(rows), "time")
         return f"asked {times}; the item is no longer in the benchmark, its answers stay in the ledger"
     for row in rows:
         if row["components"] == dict(wanted):

@@ -19,11 +19,11 @@ from dagster._core.definitions.source_asset import SYSTEM_METADATA_KEY_SOURCE_AS
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.redaction import redacted
+from traps_pipeline.base.redaction import redact_exception
 from traps_pipeline.pipeline.graph import Stage, the_graph
 from traps_pipeline.pipeline.history import History
 from traps_pipeline.pipeline.lineage import Lineage, write_report_state
-from traps_pipeline.pipeline.machine import parts_of_run, require_machine, why_nothing
+from traps_pipeline.pipeline.machine import nothing_to_do_reason, parts_of_run, require_machine
 from traps_pipeline.pipeline.making import PartitionMaker
 from traps_pipeline.pipeline.metadata import partition_metadata, tally_metadata, visible_metadata
 from traps_pipeline.pipeline.partition_checks import StageChecks, raise_for_run
@@ -98,7 +98,7 @@ class _Step:
         if MAKE_TAG in self.tags:
             return
         if self.stage.scheme and not self._wanted and BACKFILL_TAG not in self.tags:
-            reason = why_nothing(self._unwanted, self.tags, self.workspace)
+            reason = nothing_to_do_reason(self._unwanted, self.tags, self.workspace)
             raise TrapsError(f"{self.stage.name}: nothing is made: {reason}")
         metadata = {UNWANTED: f"nothing is made: no experiment in {self.workspace.root / 'study.yaml'} asks for it"}
         for key in self._unwanted:
@@ -192,7 +192,7 @@ def guard_events(events: Events, context: dg.AssetExecutionContext) -> Events:
             yield from events
             report.end_stage()
     except Exception as error:
-        if (without_keys := redacted(error)) is error:
+        if (without_keys := redact_exception(error)) is error:
             raise
         raise without_keys from None
     except (KeyboardInterrupt, dg.DagsterExecutionInterruptedError):

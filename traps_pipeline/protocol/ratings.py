@@ -67,7 +67,7 @@ def ratings(votes: pd.DataFrame, judges: Sequence[str] | None = None, answer: Se
 
     seats = tuple(sorted(votes["judge"].unique()) if judges is None else judges)
     votes = votes.loc[votes["judge"].isin(seats)].reset_index(drop=True)
-    rows, first = _grouped(votes, [*answer, "task"])
+    rows, first = _group_votes(votes, [*answer, "task"])
     values = np.full((len(first), len(seats)), INVALID, np.int8)
     has_vote = np.zeros(values.shape, bool)
     places = rows, pd.Index(seats).get_indexer(pd.Index(votes["judge"]))
@@ -79,7 +79,7 @@ def ratings(votes: pd.DataFrame, judges: Sequence[str] | None = None, answer: Se
     return Ratings(answers.loc[is_complete].reset_index(drop=True), values[is_complete], seats, answer)
 
 
-def _grouped(votes: pd.DataFrame, by: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+def _group_votes(votes: pd.DataFrame, by: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     """Return each vote's group (votes,), and each group's first vote (groups,)."""
     import pandas as pd
 
@@ -105,7 +105,7 @@ def majority(values: np.ndarray) -> np.ndarray:
     return np.where(is_yes, YES, np.where(is_no, NO, INVALID)).astype(np.int8)
 
 
-def decided(votes: np.ndarray) -> pd.arrays.BooleanArray:
+def vote_decisions(votes: np.ndarray) -> pd.arrays.BooleanArray:
     """Return the votes as true (YES), false (NO) and null (INVALID)."""
     import pandas as pd
 

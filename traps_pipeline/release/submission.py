@@ -41,8 +41,8 @@ if TYPE_CHECKING:
 
 ABOUT = "submission.json"
 TABLES: Mapping[str, Table[Any]] = {f"{t.name}.parquet": t for t in (ITEMS, RESPONSES, VOTES, METRICS, LEADERBOARD)}
-MOST_FILE_BYTES, MOST_TABLE_BYTES, MOST_ROWS = 2 * 2**30, 4 * 2**30, 20_000_000
-MOST_ABOUT_BYTES = 2**20
+MAX_FILE_BYTES, MAX_TABLE_BYTES, MAX_ROWS = 2 * 2**30, 4 * 2**30, 20_000_000
+MAX_ABOUT_BYTES = 2**20
 _DATE = (1980, 1, 1, 0, 0, 0)
 _NO_ZIP = (zipfile.BadZipFile, zlib.error, ValueError, RuntimeError, EOFError, OverflowError, NotImplementedError)
 
@@ -137,7 +137,7 @@ def pack(workspace: Workspace, target: Path, name: str) -> About:
         )
     except ValidationError as error:
         raise TrapsError(f"--name {name!r:.100}: {explain(error)}; use lower-case letters, digits, - and .") from error
-    write_bytes(target, _zipped({ABOUT: description.model_dump_json(indent=1).encode() + b"\n", **content}))
+    write_bytes(target, _zip({ABOUT: description.model_dump_json(indent=1).encode() + b"\n", **content}))
     return description
 
 
@@ -153,7 +153,7 @@ def table_bytes(table: Table[Any], frame: pd.DataFrame) -> bytes:
     return buffer.getvalue()
 
 
-def _zipped(content: Mapping[str, bytes]) -> bytes:
+def _zip(content: Mapping[str, bytes]) -> bytes:
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         for name, data in content.items():
@@ -170,8 +170,8 @@ def read_submission(path: Path) -> Submission:
     """Return a submission. Raises TrapsError for anything unexpected in the file."""
     try:
         size = path.stat().st_size
-        if size > MOST_FILE_BYTES:
-            raise TrapsError(f"{path}: has {size} bytes, at most {MOST_FILE_BYTES} are read; submit models one by one")
+        if size > MAX_FILE_BYTES:
+            raise TrapsError(f"{path}: has {size} bytes, at most {MAX_FILE_BYTES} are read; submit models one by one")
         with zipfile.ZipFile(path) as archive:
             content = _members(path, archive)
     except OSError as error:
@@ -202,8 +202,8 @@ def _members(path: Path, archive: zipfile.ZipFile) -> dict[str, bytes]:
             raise TrapsError(
                 f"{path}: {entry.filename} is compressed or encrypted; pack it with `traps publish submit`"
             )
-        if entry.filename == ABOUT and entry.file_size > MOST_ABOUT_BYTES:
-            raise TrapsError(f"{path}: {ABOUT} has {entry.file_size} bytes, at most {MOST_ABOUT_BYTES} are read")
+        if entry.filename == ABOUT and entry.file_size > MAX_ABOUT_BYTES:
+            raise TrapsError(f"{path}: {ABOUT} has {entry.file_size} bytes, at most {MAX_ABOUT_BYTES} are read")
     return {entry.filename: archive.read(entry) for entry in entries}
 
 
@@ -216,7 +216,7 @@ def _frame(path: Path, file: str, content: bytes) -> pd.DataFrame:
     try:
         parquet = pq.ParquetFile(pa.BufferReader(content))
         groups = [parquet.metadata.row_group(i) for i in range(parquet.metadata.num_row_groups)]
-        if parquet.metadata.num_rows > MOST_ROWS or sum(g.total_byte_size for g in groups) > MOST_TABLE_BYTES:
+        if parquet.metadata.num_rows > MAX_ROWS or sum(g.total_byte_size for g in groups) > MAX_TABLE_BYTES:
             raise TrapsError(f"{path}: {file} is too large ({parquet.metadata.num_rows} rows)")
         schema = table.arrow_schema()
         if parquet.schema_arrow.names != schema.names or parquet.schema_arrow.types != schema.types:

@@ -13,7 +13,7 @@ import pandas as pd
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes, write_text
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.models.judges import id_of_judges
 from traps_pipeline.release.released_rows import SUBMITTED
 from traps_pipeline.release.submission import Submission, read_submission, table_bytes
@@ -69,7 +69,7 @@ class RankedGroup:
     @property
     def title(self) -> str:
         """The common properties of its entries, in words."""
-        return f"Benchmark {self.versions}, {counted(self.n_items, 'item')} ({self.items[:8]}), panel {self.panel}"
+        return f"Benchmark {self.versions}, {count_noun(self.n_items, 'item')} ({self.items[:8]}), panel {self.panel}"
 
 
 @dataclass

@@ -40,7 +40,7 @@ from traps_pipeline.scoring.scores import Scores, score
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.tables import Table, records
 
-MOST_SENTENCES = 10  # sentences per kind; further ones are counted
+MAX_SENTENCES = 10  # sentences per kind; further ones are counted
 CLOSE = 1e-9  # tolerance: linear algebra of another machine may differ in the last digits
 _ITEM_COLUMNS = ("side", "pair_id", "dataset", "benchmark_version")  # columns that an answer has from its item
 Row = Mapping[str, Any]
@@ -64,9 +64,9 @@ class Verification:
         """Record a check and its problems: keep the first ones and count the others."""
         problems = list(complaints)
         self.checked.append(topic)
-        self.problems += problems[:MOST_SENTENCES]
-        if len(problems) > MOST_SENTENCES:
-            self.problems.append(f"... and {len(problems) - MOST_SENTENCES} more of this kind")
+        self.problems += problems[:MAX_SENTENCES]
+        if len(problems) > MAX_SENTENCES:
+            self.problems.append(f"... and {len(problems) - MAX_SENTENCES} more of this kind")
 
 
 def verify(submission: Submission, release: Path | None = None) -> Verification:
@@ -88,7 +88,7 @@ def verify(submission: Submission, release: Path | None = None) -> Verification:
     if release is None:
         verification.unchecked.append("items and clips against a release: name its folder with --release")
     else:
-        verification.look("items and clips against the release", _strangers(items, release))
+        verification.look("items and clips against the release", _foreign_items(items, release))
     verification.unchecked.append("that the answers are the model's: only who asked it knows")
     verification.unchecked.append("that the clips named by digest are those that the model was sent")
     if not is_judged_by_rules:
@@ -140,7 +140,7 @@ def released_items(release: Path) -> dict[str, tuple[str, str]]:
     return items
 
 
-def _strangers(items: Mapping[str, Row], release: Path) -> Iterator[str]:
+def _foreign_items(items: Mapping[str, Row], release: Path) -> Iterator[str]:
     released_digests = released_items(release)
     for id_, row in items.items():
         if id_ not in released_digests:
@@ -157,7 +157,7 @@ def _strangers(items: Mapping[str, Row], release: Path) -> Iterator[str]:
 # --- answers and votes ------------------------------------------------------------------------------------------------
 
 
-def _named(row: Row) -> str:
+def _row_name(row: Row) -> str:
     return f"{row['model']} ({row['regime']}, run {row['run']}) on {row['item_id']}"
 
 
@@ -166,16 +166,16 @@ def _wrong_answers(answers: Sequence[Row], items: Mapping[str, Row]) -> Iterator
     for row in answers:
         item = items.get(row["item_id"])
         if item is None:
-            yield f"answer of {_named(row)}: there is no such item"
+            yield f"answer of {_row_name(row)}: there is no such item"
             continue
         items_of.setdefault((row["dataset"], row["model"], row["regime"], row["run"]), set()).add(row["item_id"])
         if any(row[name] != item[name] for name in _ITEM_COLUMNS):
-            yield f"answer of {_named(row)}: its pair, side, dataset or version is not its item's"
+            yield f"answer of {_row_name(row)}: its pair, side, dataset or version is not its item's"
         text = row["text"] or ""
         if (row["outcome"] in JUDGED) != bool(text.strip()):
-            yield f"answer of {_named(row)}: outcome {row['outcome']!r} does not go with its text"
+            yield f"answer of {_row_name(row)}: outcome {row['outcome']!r} does not go with its text"
         elif row["outcome"] in JUDGED and (reason := degenerate(text)):
-            yield f"answer of {_named(row)}: {reason}, so it is none"
+            yield f"answer of {_row_name(row)}: {reason}, so it is none"
     expected = dict[str, set[str]]()
     for id_, item in items.items():
         expected.setdefault(item["dataset"], set()).add(id_)
@@ -212,31 +212,31 @@ def _wrong_votes(
         key = (row["item_id"], row["model"], row["regime"], row["run"])
         answer, item, seat = texts.get(key), items.get(row["item_id"]), seats.get(row["judge"])
         if answer is None or item is None or seat is None or row["task"] not in tasks_for(item["side"]):
-            yield f"vote of {row['judge']!r:.60} on {row['task']!r:.40} of {_named(row)}: there is nothing to judge"
+            yield f"vote of {row['judge']!r:.60} on {row['task']!r:.40} of {_row_name(row)}: there is nothing to judge"
             continue
         cast.setdefault(key, set()).add((row["task"], row["judge"]))
         cell = Cell(row["dataset"], Evaluation(row["model"], row["regime"], row["run"]))
         request = vote_request(seat, row["task"], cell, item, answer["text"])
         if request.key != row["vote_key"]:
-            yield f"answer of {_named(row)}: is not the text, or not to the question, that {seat.id} judged"
+            yield f"answer of {_row_name(row)}: is not the text, or not to the question, that {seat.id} judged"
             continue
-        problem = _other_vote(row, item, _cast_again(str(row["task"]), request.user) if seat.backend == RULE else None)
+        problem = _vote_difference(row, item, _recast(str(row["task"]), request.user) if seat.backend == RULE else None)
         if problem:
-            yield f"vote of {seat.id} on {row['task']} of {_named(row)}: {problem}"
+            yield f"vote of {seat.id} on {row['task']} of {_row_name(row)}: {problem}"
     for key, row in texts.items():
         item = items.get(row["item_id"])
         expected = {(task, judge) for task in tasks_for(item["side"]) for judge in seats} if item else set()
         for task, judge in sorted(expected - cast.get(key, set())):
-            yield f"vote of {judge} on {task} of {_named(row)}: is missing"
+            yield f"vote of {judge} on {task} of {_row_name(row)}: is missing"
 
 
 @cache
-def _cast_again(task: str, user: str) -> Outcome:
+def _recast(task: str, user: str) -> Outcome:
     """Return what the rules make of a request: they read its text and its task alone."""
     return asyncio.run(RuleJudge().ask(Request("rules", RULE, {}, "", user, {"task": task})))
 
 
-def _other_vote(row: Row, item: Row, again: Outcome | None) -> str:
+def _vote_difference(row: Row, item: Row, again: Outcome | None) -> str:
     """Return how a vote differs from the correct one; wrong kinds decide nothing."""
     try:
         return _difference(row, item, again)
@@ -289,11 +289,11 @@ def _numbers(verified: Verification, submission: Submission) -> None:
     except (TrapsError, ValueError, KeyError, TypeError) as error:
         verified.problems.append(f"no number can be computed: {error}")
         return
-    verified.look("metrics", _other_numbers(METRICS, submission.table(METRICS), verified.scored.metrics))
-    verified.look("leaderboard", _other_numbers(LEADERBOARD, submission.table(LEADERBOARD), verified.scored.board))
+    verified.look("metrics", _number_differences(METRICS, submission.table(METRICS), verified.scored.metrics))
+    verified.look("leaderboard", _number_differences(LEADERBOARD, submission.table(LEADERBOARD), verified.scored.board))
 
 
-def _other_numbers(table: Table[Any], stated: pd.DataFrame, recomputed: pd.DataFrame) -> Iterator[str]:
+def _number_differences(table: Table[Any], stated: pd.DataFrame, recomputed: pd.DataFrame) -> Iterator[str]:
     key = list(table.key)
     frames = (stated, recomputed)
     stated_rows, own_rows = ({tuple(row[k] for k in key): row for row in records(frame)} for frame in frames)

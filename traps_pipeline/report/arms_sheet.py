@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.protocol.datasets import ARMS, OCCLUDER_DOSES, OCCLUDER_LOOKS
-from traps_pipeline.report.contact_sheet import SampledClip, sampled, telling_times
+from traps_pipeline.report.contact_sheet import SampledClip, sample_clip, telling_times
 from traps_pipeline.report.writing import figure_style, new_figure
 from traps_pipeline.video.encode import decode
 
@@ -73,7 +73,7 @@ def _rows(sides: pd.DataFrame, arms: pd.DataFrame, scenario: str, root: Path, ti
         name = str(row.get("arm") or row["side"])
         right = "must be abstained on" if row["side"] == "void" else f"must be answered: {truth}"
         right = f"no void, {truth} shows through" if name in OCCLUDER_DOSES else right
-        yield Row(name, right, str(row["question"]), sampled(frames, times_s, times))
+        yield Row(name, right, str(row["question"]), sample_clip(frames, times_s, times))
 
 
 def _sheet(scenario: str, rows: list[Row], times: np.ndarray) -> Figure:
@@ -96,7 +96,7 @@ def _sheet(scenario: str, rows: list[Row], times: np.ndarray) -> Figure:
         for k, row in enumerate(rows):
             top = height - HEAD_IN - k * row_in
             words: dict[str, Any] = {"va": "top", "linespacing": 1.3, "parse_math": False}
-            lines = [row.right, *_own_words(row, rows[0])]
+            lines = [row.right, *_changed_question(row, rows[0])]
             name = row.name.replace("_", " ")
             figure.text(0.1 / width, (top - 0.2) / height, name, size=9, weight="bold", **words)
             figure.text(0.1 / width, (top - 0.42) / height, "\n".join(lines), size=7.5, color=SOFT, **words)
@@ -108,7 +108,7 @@ def _sheet(scenario: str, rows: list[Row], times: np.ndarray) -> Figure:
     return figure
 
 
-def _own_words(row: Row, control: Row) -> list[str]:
+def _changed_question(row: Row, control: Row) -> list[str]:
     """Return the question of a row whose question differs from the control's."""
     if row.question == control.question:
         return []

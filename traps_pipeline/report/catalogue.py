@@ -71,12 +71,12 @@ class TableReport:
         return results.kept[self.name]
 
     def _tables(self, results: Results) -> list[PrintedTable]:
-        from traps_pipeline.report.tables.table_columns import printed
+        from traps_pipeline.report.tables.table_columns import printed_columns
 
         if not results.is_study and not self.recomputed:
             return []
         remarks = [results.judged_by] if _is_judged(self.reads) else []
-        with_columns = ((t, printed(results, t.rows, t.columns)) for t in self.make(results))
+        with_columns = ((t, printed_columns(results, t.rows, t.columns)) for t in self.make(results))
         tables = [replace(table, columns=columns, notes=[*remarks, *table.notes]) for table, columns in with_columns]
         return [table for table in tables if results.is_study or table.name in self.recomputed]
 

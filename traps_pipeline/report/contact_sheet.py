@@ -115,7 +115,7 @@ def moments_of(pair: pd.DataFrame, root: Path, moments: int) -> tuple[SampledCli
     control, times_s = decode(root / str(pair.at["control", "clip"]))
     void, void_at = decode(root / str(pair.at["void", "clip"]))
     times = telling_times(control, times_s, moments)
-    return sampled(control, times_s, times), sampled(void, void_at, times), times
+    return sample_clip(control, times_s, times), sample_clip(void, void_at, times), times
 
 
 def telling_times(frames: np.ndarray, at: np.ndarray, moments: int) -> np.ndarray:
@@ -129,7 +129,7 @@ def telling_times(frames: np.ndarray, at: np.ndarray, moments: int) -> np.ndarra
     return at[np.append(np.linspace(0, visible_frames - 1, moments - len(closed)).round(), closed).astype(int)]
 
 
-def sampled(frames: np.ndarray, at: np.ndarray, times: np.ndarray) -> SampledClip:
+def sample_clip(frames: np.ndarray, at: np.ndarray, times: np.ndarray) -> SampledClip:
     """Return the frames nearest to the times; a clip ends a frame after its last one."""
     step = float(at[1] - at[0]) if len(at) > 1 else 0.0
     end = float(at[-1]) + step
@@ -158,7 +158,7 @@ def draw_pair(
         for k in range(moments):
             left = k * (width + GAP)
             if k < clip.known:
-                canvas[top : top + height, left : left + width] = _fitted(clip.frames[k], height, width)
+                canvas[top : top + height, left : left + width] = _fit(clip.frames[k], height, width)
                 continue
             hatch = {"hatch": "////", "facecolor": "#f2f4f7", "edgecolor": "#c3c9d2", "linewidth": 0.5}
             axes.add_patch(Rectangle((left, top), width - 1, height - 1, **hatch))
@@ -202,7 +202,7 @@ def _draw_header(axes: Axes, pair: pd.DataFrame, layout: Layout) -> None:
     )
 
 
-def _fitted(frame: np.ndarray, height: int, width: int) -> np.ndarray:
+def _fit(frame: np.ndarray, height: int, width: int) -> np.ndarray:
     """Return the frame resized to the control's size, so that clips align."""
     if frame.shape[:2] == (height, width):
         return frame

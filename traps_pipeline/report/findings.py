@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from traps_pipeline.base.terminal import plain
-from traps_pipeline.base.wording import counted, in_percent
+from traps_pipeline.base.wording import count_noun, in_percent
 from traps_pipeline.protocol.datasets import SHORT
 from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.report.figures.expression_figures import orders, scored_items
@@ -24,7 +24,7 @@ _SCORES = {"states": "states", "margin": "first token", "sentences": "whole abst
 _CELL = ("directions", "regime", "target", "layer", "unit", "dose", "side")
 
 
-def _joined(sentences: Callable[[Results], Iterator[str]]) -> Callable[[Results], str]:
+def _join_sentences(sentences: Callable[[Results], Iterator[str]]) -> Callable[[Results], str]:
     return lambda results: " ".join(sentences(results))
 
 
@@ -33,7 +33,7 @@ def _models(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
         yield plain(str(model)), group
 
 
-@_joined
+@_join_sentences
 def states_and_output(results: Results) -> Iterator[str]:
     """Yield how many answered voids states and output detect, and their AUROC."""
     for model, group in _models(scored_items(results)):
@@ -49,13 +49,14 @@ def states_and_output(results: Results) -> Iterator[str]:
             name: sum(area[name] for area in areas) / len(areas) for name in areas[0] if all(name in a for a in areas)
         }
         yield (
-            f"{model} answered {counted(len(voids), 'void')} under standard: its states put {encoded} of them among "
-            f"voids (and {wrongly} of {counted(len(controls), 'control')}), its output {expressed}; as orders of sides "
-            f"(AUROC, mean of datasets): {', '.join(f'{_SCORES[name]} {mean:.2f}' for name, mean in means.items())}."
+            f"{model} answered {count_noun(len(voids), 'void')} under standard: its states put {encoded} of them among "
+            f"voids (and {wrongly} of {count_noun(len(controls), 'control')}), its output {expressed}; as orders of "
+            f"sides (AUROC, mean of datasets): "
+            f"{', '.join(f'{_SCORES[name]} {mean:.2f}' for name, mean in means.items())}."
         )
 
 
-@_joined
+@_join_sentences
 def lens(results: Results) -> Iterator[str]:
     """Yield how far guided prompting moves each side's margin at the last two layers."""
     for model, group in _models(results.lens):
@@ -78,7 +79,7 @@ def lens(results: Results) -> Iterator[str]:
         )
 
 
-@_joined
+@_join_sentences
 def probe_baselines(results: Results) -> Iterator[str]:
     """Yield on how many pairs, within and across datasets, states beat all baselines."""
     for model, group in _models(beside(results)):
@@ -86,7 +87,7 @@ def probe_baselines(results: Results) -> Iterator[str]:
         beaten = np.column_stack([group[[*SHORTCUTS, "output margin"]].to_numpy(float), noise + 2 * spread])
         is_above, across = states > np.fmax.reduce(beaten, axis=1), (group["source"] != group["target"]).to_numpy(bool)
         counts = [
-            f"{np.count_nonzero(is_above & kind)} of {counted(int(np.count_nonzero(kind)), noun)}"
+            f"{np.count_nonzero(is_above & kind)} of {count_noun(int(np.count_nonzero(kind)), noun)}"
             for kind, noun in ((across, "pair"), (~across, "dataset"))
         ]
         yield (
@@ -95,7 +96,7 @@ def probe_baselines(results: Results) -> Iterator[str]:
         )
 
 
-@_joined
+@_join_sentences
 def gate_arrows(results: Results) -> Iterator[str]:
     """Yield the default gate's effect on PECS, and the best gate on other features."""
     rows = results.gate
@@ -113,7 +114,7 @@ def gate_arrows(results: Results) -> Iterator[str]:
             )
 
 
-@_joined
+@_join_sentences
 def doses_among_nulls(results: Results) -> Iterator[str]:
     """Yield where directions exceed 19 of 20 draws of every null, by side."""
     rows = results.nulls
@@ -126,7 +127,7 @@ def doses_among_nulls(results: Results) -> Iterator[str]:
         best = max(ahead, key=lambda row: row["effect"], default=None)
         yield (
             f"{model}: void directions do more than 19 of 20 draws of every null in {len(ahead)} of "
-            f"{counted(len(cells), 'cell')}" + (f", most of all {_cell(best)}." if best else ".")
+            f"{count_noun(len(cells), 'cell')}" + (f", most of all {_cell(best)}." if best else ".")
         )
 
 
@@ -138,7 +139,7 @@ def _cell(row: dict[str, Any]) -> str:
     )
 
 
-@_joined
+@_join_sentences
 def patching(results: Results) -> Iterator[str]:
     """Return the position group with the largest effect at first and last layer."""
     rows = results.patching

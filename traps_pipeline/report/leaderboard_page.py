@@ -49,7 +49,7 @@ from traps_pipeline.report.writing import (
     table_markdown,
     table_text,
 )
-from traps_pipeline.scoring.analyses import of_several_runs
+from traps_pipeline.scoring.analyses import null_single_deviations
 from traps_pipeline.scoring.metrics import joined_epochs
 from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.tables import records
@@ -138,12 +138,12 @@ def leaderboards(
     The ranking is of `overall`, or the board's first dataset if no model has all four. An entry without a row comes
     last. notes: further notes of the first table. brief: only the first table of each panel, with fewer columns.
     """
-    panels = [_of_one_panel(part, robust, brief, suffix) for suffix, part in _by_panel(board)]
+    panels = [_panel_tables(part, robust, brief, suffix) for suffix, part in _rows_by_panel(board)]
     tables = [table for panel_tables in panels for table in panel_tables[: 1 if brief else None]]
     return [replace(tables[0], notes=[*tables[0].notes, *notes]), *tables[1:]]
 
 
-def _by_panel(board: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
+def _rows_by_panel(board: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
     """Return rows by panel, with their tables' suffix; entries of several come last."""
     if board.empty:
         return [("", board)]
@@ -152,7 +152,7 @@ def _by_panel(board: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
     return [(f"_{number}" if number else "", board.loc[entry_panels == name]) for number, name in enumerate(panels)]
 
 
-def _of_one_panel(board: pd.DataFrame, robust: pd.DataFrame | None, brief: bool, suffix: str) -> list[PrintedTable]:
+def _panel_tables(board: pd.DataFrame, robust: pd.DataFrame | None, brief: bool, suffix: str) -> list[PrintedTable]:
     datasets = set(board["dataset"])
     ranked_dataset = next((name for name in TITLES if name in datasets), "overall")
     other_datasets = [name for name in DATASETS if name in datasets and name != ranked_dataset]
@@ -276,7 +276,7 @@ def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.Dat
     Without a row of the dataset, counts are sums over all rows.
     """
     rows, entries = [], dict[tuple[str, str], dict[str, dict[str, Any]]]()
-    for row in of_several_runs(board).to_dict("records"):
+    for row in null_single_deviations(board).to_dict("records"):
         entries.setdefault((row["model"], row["regime"]), {})[row["dataset"]] = row
     for dataset_rows in entries.values():
         main = dataset_rows.get(dataset)

@@ -44,17 +44,17 @@ class Picture:
 
     def figures(self) -> Mapping[str, Figure]:
         """Return figures by file name. Raises NotRun, or TrapsError for a damaged clip."""
-        return _of_whole_clips(self.make)
+        return _require_clips(self.make)
 
     def shown(self) -> Any:
         """Return `inputs`. Raises TrapsError for a damaged clip."""
-        return _of_whole_clips(self.inputs)
+        return _require_clips(self.inputs)
 
 
 Found = TypeVar("Found")
 
 
-def _of_whole_clips(find: Callable[[], Found]) -> Found:
+def _require_clips(find: Callable[[], Found]) -> Found:
     try:
         return find()
     except DamagedClip as error:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, REGIMES, STANDARD
 from traps_pipeline.report.catalogue import FIGURE_REPORTS
 from traps_pipeline.report.result_frames import Results
@@ -140,7 +140,7 @@ def _separable(results: Results, rows: pd.DataFrame) -> Iterator[StudyFinding]:
         if len(tested):
             count = int(tested["separable"].eq(True).sum())
             yield StudyFinding(
-                f"Of {counted(len(tested), 'difference')} of PECS between models under one regime, {count} "
+                f"Of {count_noun(len(tested), 'difference')} of PECS between models under one regime, {count} "
                 f"{'is' if count == 1 else 'are'} significant after Holm’s correction.",
                 "table-contrasts",
             )
@@ -152,7 +152,7 @@ def _missing_answers(rows: pd.DataFrame) -> Iterator[StudyFinding]:
         answers = 2 * int((rows["n_pairs"].to_numpy(int) * rows["n_runs"].to_numpy(int)).sum())
         worst_row = rows.sort_values(["n_missing", "model"], ascending=[False, True]).to_dict("records")[0]
         yield StudyFinding(
-            f"Without text or majority: {missing:,} of {counted(answers, 'answer')}; {worst_row['model']} under "
+            f"Without text or majority: {missing:,} of {count_noun(answers, 'answer')}; {worst_row['model']} under "
             f"{worst_row['regime']} lacks most, {int(worst_row['n_missing'])}.",
             "leaderboard",
         )

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 SCENE = "seesaw_sorter"  # the paper's example
 FRAMES = Layout(block=3.0, header=0.62, gap=0.4, letters=64, questions=2, ids=True)
-WORDS_IN, LETTERS, MOST_LINES = 3.1, 66, 6  # width of the text column beside the frames
+WORDS_IN, LETTERS, MAX_LINES = 3.1, 66, 6  # width of the text column beside the frames
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def reading(answer: str, votes: Sequence[Mapping[Any, Any]], verdict: Mapping[An
     valid = [vote for vote in votes if vote["valid"]]
     abstention_votes = [vote for vote in valid if vote["task"] == "abstention"]
     abstained = sum(bool(vote["abstained"]) for vote in abstention_votes)
-    summary = f"an abstention for {abstained} of {counted(len(abstention_votes), 'judge')}"
+    summary = f"an abstention for {abstained} of {count_noun(len(abstention_votes), 'judge')}"
     values = [str(vote["extracted_value"]) for vote in valid if vote["task"] == "correctness"]
     if values:
         summary += f"; they extract {', '.join(dict.fromkeys(values))}"
@@ -117,7 +117,7 @@ def example_figure(example: Example, root: Path) -> Figure:
             x, (bottom + block_height + 0.12) / height, plain(example.model), size=7, weight="bold", parse_math=False
         )
         for side, top in (("control", bottom + block_height), ("void", bottom + block_height / 2 - 0.03)):
-            fit: dict[str, Any] = {"max_lines": MOST_LINES, "placeholder": " …"}
+            fit: dict[str, Any] = {"max_lines": MAX_LINES, "placeholder": " …"}
             lines = [line for part in words[side] for line in textwrap.wrap(plain(part), LETTERS, **fit)]
             figure.text(x, top / height, "\n".join(lines), size=6.2, va="top", linespacing=1.25, parse_math=False)
     return figure

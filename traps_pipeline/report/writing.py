@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.sheets import csv_bytes
-from traps_pipeline.base.terminal import TextTable, finalized, plain
+from traps_pipeline.base.terminal import TextTable, finalize_value, plain
 from traps_pipeline.report.numbers import NONE, as_numbers
 
 if TYPE_CHECKING:
@@ -297,7 +297,7 @@ def environment(folder: Path = TEMPLATES) -> jinja2.Environment:
     return jinja2.Environment(
         loader=jinja2.FileSystemLoader(folder),
         autoescape=True,
-        finalize=finalized,
+        finalize=finalize_value,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,

@@ -33,7 +33,7 @@ REASONING_PAIRS = (
     ("qwen3-vl-think", "qwen3-vl-instruct"),
 )
 REASONING_LADDER = ("gpt-5-nr", "gpt-5-medium", "gpt-5-high", "gpt-5-pro")
-HIDDEN = ("hidden_collision", "hidden_drop", "hidden_race")
+HIDDEN_SUB_SCENARIOS = ("hidden_collision", "hidden_drop", "hidden_race")
 _ENTRY = ["model", "dataset", "regime"]
 _EQUAL = 12  # decimals at which two means count as equal: below any printed digit, above rounding noise
 
@@ -43,13 +43,13 @@ _EQUAL = 12  # decimals at which two means count as equal: below any printed dig
 
 def study_cells(leaderboard: pd.DataFrame) -> pd.DataFrame:
     """Return cells from LEADERBOARD rows, with `_std` over runs, n_pairs, n_runs etc."""
-    rows = of_several_runs(leaderboard.loc[leaderboard["dataset"] != "overall"])
+    rows = null_single_deviations(leaderboard.loc[leaderboard["dataset"] != "overall"])
     spread = [f"{share}_std" for share in SHARES]
     columns = [*_ENTRY, "epoch", "n_pairs", "n_runs", "n_missing", "incomplete", *SHARES, *spread]
     return rows.loc[:, columns].reset_index(drop=True)
 
 
-def of_several_runs(rows: pd.DataFrame) -> pd.DataFrame:
+def null_single_deviations(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the rows, with deviations set to null where there was only one run."""
     spreads = [name for name in rows if name.endswith("_std")]
     return rows.assign(**{name: rows[name].where(rows["n_runs"] > 1) for name in spreads})
@@ -89,7 +89,7 @@ def overall(cells: pd.DataFrame) -> pd.DataFrame:
     Columns: model, regime, acc, abs_rec, false_abs, pecs. PECS is averaged too, not recomputed from the means. A
     (model, regime) that lacks one of the datasets in `cells` has no row, so that all rows average the same datasets.
     """
-    cells = _checked(cells)
+    cells = _check(cells)
     groups = cells.groupby(["model", "regime"], sort=False)
     complete_runs = cells.loc[groups["dataset"].transform("nunique") == cells["dataset"].nunique()]
     return _means(complete_runs.groupby(["model", "regime"], sort=False), SHARES).reset_index()
@@ -104,7 +104,7 @@ def uplift(cells: pd.DataFrame, means: pd.DataFrame | None = None) -> pd.DataFra
     """
     import pandas as pd
 
-    cells = _checked(cells)
+    cells = _check(cells)
     cells = cells.loc[cells["regime"].isin(PROMPTING)]
     require_one_epoch(cells.pivot(index=["model", "dataset"], columns="regime", values="epoch"), "uplift")
     rows = overall(cells) if means is None else means
@@ -147,12 +147,12 @@ def frontier(means: pd.DataFrame) -> pd.DataFrame:
     import pandas as pd
 
     means = means.dropna(subset=["acc", "j"])
-    best = [group.loc[~_dominated(group)] for _, group in means.groupby("regime", sort=False)]
+    best = [group.loc[~_is_dominated(group)] for _, group in means.groupby("regime", sort=False)]
     points = pd.DataFrame(pd.concat(best or [means]))
     return points.sort_values(["regime", "acc"], ascending=[True, False], ignore_index=True)
 
 
-def _dominated(points: pd.DataFrame) -> np.ndarray:
+def _is_dominated(points: pd.DataFrame) -> np.ndarray:
     """Return which rows another row dominates in (acc, j): (rows,) bool."""
     values = points[["acc", "j"]].round(_EQUAL).to_numpy(float)
     no_worse = (values[None] >= values[:, None]).all(-1)  # [i, k]: k is no worse than i in both
@@ -162,7 +162,7 @@ def _dominated(points: pd.DataFrame) -> np.ndarray:
 
 def naive_gap(cells: pd.DataFrame, threshold: float = 0.03) -> pd.DataFrame:
     """Return cells whose naive (Acc x AbsRec) exceeds PECS by a gap above `threshold`."""
-    cells = _checked(cells)
+    cells = _check(cells)
     cells["naive"] = cells["acc"] * cells["abs_rec"]
     cells["gap"] = cells["naive"] - cells["pecs"]
     return cells.loc[cells["gap"].round(_EQUAL) > threshold].reset_index(drop=True)
@@ -170,7 +170,7 @@ def naive_gap(cells: pd.DataFrame, threshold: float = 0.03) -> pd.DataFrame:
 
 def zero_boundary(cells: pd.DataFrame) -> pd.DataFrame:
     """Return cells with PECS 0: in no run are Acc and J both above 0."""
-    cells = _checked(cells)
+    cells = _check(cells)
     return cells.loc[cells["pecs"] == 0].reset_index(drop=True)
 
 
@@ -212,7 +212,7 @@ def visual_textual_gap(cells: pd.DataFrame, taxonomies: Sequence[str] = TAXONOMI
     """
     import pandas as pd
 
-    cells = _checked(cells)
+    cells = _check(cells)
     sides = cells.assign(
         taxonomy=cells["dataset"].str.removesuffix("_ill_posed"),
         side=np.where(cells["dataset"].str.endswith("_ill_posed"), "textual", "visual"),
@@ -241,7 +241,7 @@ def pair_differences(cells: pd.DataFrame) -> pd.DataFrame:
     """
     import pandas as pd
 
-    cells = _checked(cells, datasets=(*DATASETS, "overall"))
+    cells = _check(cells, datasets=(*DATASETS, "overall"))
     indexed_cells = cells.set_index(_ENTRY)
     rows = []
     for thinking, other in REASONING_PAIRS:
@@ -271,7 +271,7 @@ def sub_scenarios(cells: pd.DataFrame) -> pd.DataFrame:
     """
     import pandas as pd
 
-    cells = _checked(cells, more=["scope"])
+    cells = _check(cells, more=["scope"])
     rows = []
     for key, group in cells.groupby([cells["dataset"].str.removesuffix("_ill_posed"), "scope"]):
         taxonomy, scope = cast(tuple[str, str], key)
@@ -307,7 +307,7 @@ def hidden_against_others(table: pd.DataFrame, columns: Sequence[str] = ("abs_re
     Columns kind, n, and `columns`; n_pairs and n_missing are sums, if table has them. table has one row per occlusion
     sub-scenario with the column sub_scenario, as `sub_scenarios` returns it.
     """
-    kind = np.where(table["sub_scenario"].isin(HIDDEN), "hidden", "other")
+    kind = np.where(table["sub_scenario"].isin(HIDDEN_SUB_SCENARIOS), "hidden", "other")
     groups = table.groupby(kind)
     sums = {name: groups[name].sum(min_count=1) for name in ("n_pairs", "n_missing") if name in table}
     return _means(groups, columns).assign(n=groups.size(), **sums).rename_axis("kind").reset_index()
@@ -321,7 +321,7 @@ def accuracy_by_label(cells: pd.DataFrame) -> pd.DataFrame:
     """
     import pandas as pd
 
-    rows = _checked(cells, more=["scope"])
+    rows = _check(cells, more=["scope"])
     groups = rows.loc[rows["regime"] == "standard"].dropna(subset=["acc"]).groupby(["dataset", "scope"])
     columns = {"acc": groups["acc"].mean(), "n_pairs": groups["n_pairs"].max(), "n_models": groups["model"].nunique()}
     table = pd.DataFrame(columns | {"n_missing": groups["n_missing"].sum()})
@@ -349,7 +349,7 @@ def _means(groups: DataFrameGroupBy, columns: Sequence[str]) -> pd.DataFrame:
     return means.where(counts.eq(groups.size(), axis="index"))
 
 
-def _checked(cells: pd.DataFrame, more: Sequence[str] = (), datasets: Sequence[str] = DATASETS) -> pd.DataFrame:
+def _check(cells: pd.DataFrame, more: Sequence[str] = (), datasets: Sequence[str] = DATASETS) -> pd.DataFrame:
     """Return a copy of cells. Raises ValueError for lacking columns or repeated rows."""
     missing = [name for name in (*_ENTRY, *SHARES, "epoch", *more) if name not in cells]
     if missing:

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.protocol.datasets import LONG, transfer_type
 from traps_pipeline.scoring.analyses import SHARES, models_of, overall
 from traps_pipeline.scoring.claims import CLAIMS
@@ -65,7 +65,7 @@ def audit_text(findings: pd.DataFrame, everything: bool = False) -> str:
     lines = ["lines are those of the paper's LaTeX source"]
     for group, rows in findings.groupby("group", sort=False):
         counts = ", ".join(f"{n} {verdict}" for verdict, n in rows["verdict"].value_counts().items())
-        lines.append(f"{group}: {counted(len(rows), 'statement')}: {counts}")
+        lines.append(f"{group}: {count_noun(len(rows), 'statement')}: {counts}")
         listed_rows = rows if everything or group == "claims" else rows.loc[rows["verdict"].isin([DIFFERS, DECLARED])]
         for row in listed_rows.to_dict("records"):
             line_note = f" (line {row['line']})" if row["line"] else ""
@@ -99,7 +99,7 @@ def claims() -> Iterator[AuditFinding]:
         if verdict == DIFFERS and recomputed.agrees is None:
             reason = f"{_differences(published_text, recomputed.words)}{'; ' + reason if reason else ''}"
         statement, line = f"{claim['id']}: {claim['statement']}", str(claim["line"])
-        yield AuditFinding("claims", statement, published_text, _shown(recomputed.words), verdict, reason, line)
+        yield AuditFinding("claims", statement, published_text, _trim_zeros(recomputed.words), verdict, reason, line)
 
 
 def _is_same_wording(printed: str, recomputed: str) -> bool:
@@ -136,7 +136,7 @@ def _differences(printed: str, recomputed: str) -> str:
     )
 
 
-def _shown(words: str) -> str:
+def _trim_zeros(words: str) -> str:
     """Return the words with trailing zeros of four-decimal numbers removed."""
     return re.sub(r"(\d\.\d*?[1-9])0+(?!\d)|(\d+)\.0+(?!\d)", r"\1\2", words) if re.search(r"\.\d{4}", words) else words
 

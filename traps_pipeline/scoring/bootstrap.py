@@ -25,8 +25,8 @@ from traps_pipeline.scoring.metrics import COUNTS, decision_counts, pecs_of
 
 TAXONOMIES = ("occlusion", "chaotic")
 ENTRY = ["model", "regime", "dataset"]
-RESAMPLED = ("acc", "abs_rec", "false_abs", "j", "pecs")
-INTERVAL_COLUMNS = [f"{figure}_ci_{end}" for figure in RESAMPLED for end in ("low", "high")]
+RESAMPLED_FIGURES = ("acc", "abs_rec", "false_abs", "j", "pecs")
+INTERVAL_COLUMNS = [f"{figure}_ci_{end}" for figure in RESAMPLED_FIGURES for end in ("low", "high")]
 RESAMPLES, SEED = 10_000, 20260101
 _GRAIN = 256  # weights are multiples of 1/256, so that float32 sums of them are exact on every machine
 _LEVEL = 0.95
@@ -37,9 +37,9 @@ _IN_MEAN = 0.5**0.5  # of two taxonomies: their errors are independent, so squar
 class ResampledFigures:
     """The mean over runs of every figure, observed and in every resample.
 
-    entries: (model, regime, dataset or `overall`) of each row; observed: (entries, RESAMPLED) float64; values:
-    (entries, 2, RESAMPLED, resamples) float32, lower ends before upper ends. NaN where nothing is decided, and for an
-    `overall` entry without a run that has all four datasets.
+    entries: (model, regime, dataset or `overall`) of each row; observed: (entries, RESAMPLED_FIGURES) float64; values:
+    (entries, 2, RESAMPLED_FIGURES, resamples) float32, lower ends before upper ends. NaN where nothing is decided, and
+    for an `overall` entry without a run that has all four datasets.
     """
 
     entries: list[tuple[str, str, str]]
@@ -48,7 +48,7 @@ class ResampledFigures:
 
     def figure(self, name: str) -> np.ndarray:
         """Return the ends of one figure: (entries, 2, resamples)."""
-        return self.values[:, :, RESAMPLED.index(name)]
+        return self.values[:, :, RESAMPLED_FIGURES.index(name)]
 
 
 def resample(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED) -> ResampledFigures:
@@ -73,9 +73,11 @@ def resample(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEE
             entries.append((model, regime, dataset))
             observed.append(mean[1, :, 0])
             values.append(mean[..., 1:].astype(np.float32))  # half the memory, and the time of quantiles
-    no_values = np.zeros((0, 2, len(RESAMPLED), resamples), np.float32)
+    no_values = np.zeros((0, 2, len(RESAMPLED_FIGURES), resamples), np.float32)
     return ResampledFigures(
-        entries, np.array(observed).reshape(len(entries), len(RESAMPLED)), np.stack(values) if values else no_values
+        entries,
+        np.array(observed).reshape(len(entries), len(RESAMPLED_FIGURES)),
+        np.stack(values) if values else no_values,
     )
 
 
@@ -83,7 +85,7 @@ def intervals(resampled: ResampledFigures, level: float = _LEVEL) -> pd.DataFram
     """Return 95 % intervals (ENTRY, INTERVAL_COLUMNS) by entry, null where undecided."""
     ends = [
         interval(resampled.figure(name), resampled.observed[:, k], limits_of(name), level)
-        for k, name in enumerate(RESAMPLED)
+        for k, name in enumerate(RESAMPLED_FIGURES)
     ]
     table = pd.DataFrame(resampled.entries, columns=pd.Index(ENTRY))
     bounds = np.concatenate(ends, axis=-1) if resampled.entries else np.zeros((0, len(INTERVAL_COLUMNS)))
@@ -233,7 +235,7 @@ def ends_of_mean(values: pd.Series, resampling: Resampling, named: str) -> np.nd
 
 
 def figures_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:
-    """Return scores from sums, (.., 9, resamples) -> (2, .., RESAMPLED, resamples).
+    """Return scores from sums, (.., 9, resamples) -> (2, .., RESAMPLED_FIGURES, resamples).
 
     The sums are those of COUNTS with an unseen scenario. in_mean: as in `shares_of`.
     """
@@ -241,7 +243,7 @@ def figures_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:
 
 
 def figures_of_shares(shares: np.ndarray) -> np.ndarray:
-    """Return scores, (2, .., 3, resamples) -> (2, .., RESAMPLED, resamples).
+    """Return scores, (2, .., 3, resamples) -> (2, .., RESAMPLED_FIGURES, resamples).
 
     The three are the ends of Acc, FalseAbs and AbsRec.
     """
@@ -287,7 +289,7 @@ def run_sums(group: pd.DataFrame, resampling: Resampling, named: str) -> dict[tu
 def means_over_runs(
     sums: Mapping[tuple[str, int], np.ndarray], figures: Callable[[np.ndarray, bool], np.ndarray], draws: int
 ) -> dict[str, np.ndarray]:
-    """Return dataset or `overall` -> mean over runs (2, RESAMPLED, draws).
+    """Return dataset or `overall` -> mean over runs (2, RESAMPLED_FIGURES, draws).
 
     sums: the `run_sums` of (dataset, run). figures: the function (`figures_of`) that computes figures from them.
     """
@@ -298,7 +300,7 @@ def means_over_runs(
         if any((dataset, run) in sums for run in runs)
     }
     complete_runs = [sums[d, run] for run in runs if all((d, run) in sums for d in DATASETS) for d in DATASETS]
-    undefined = np.full((2, len(RESAMPLED), draws), np.nan)
+    undefined = np.full((2, len(RESAMPLED_FIGURES), draws), np.nan)
     return {
         **means,
         "overall": np.mean([figures(run_of_four, True) for run_of_four in complete_runs], axis=0)

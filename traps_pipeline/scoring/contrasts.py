@@ -21,7 +21,7 @@ from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.scoring.bootstrap import (
     ENTRY,
-    RESAMPLED,
+    RESAMPLED_FIGURES,
     RESAMPLES,
     ResampledFigures,
     difference,
@@ -90,7 +90,7 @@ def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RE
     reason for a missing difference, if an item was answered in different epochs. Raises TrapsError if the two studies
     share no complete pair.
     """
-    sides = _whole_pairs_of_both(then, now)
+    sides = _common_pairs(then, now)
     if sides[0].empty:
         raise TrapsError("the two studies share no whole pair of the same model, regime and run")
     boards = [_standings(rows).add_suffix(suffix) for rows, suffix in zip(sides, ("_then", "_now"), strict=True)]
@@ -116,7 +116,7 @@ def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RE
             }
             row["n_scenarios"] = sizes[entry]
             if refusal_reason is None:
-                ends = [side_figures[entry][None, :, RESAMPLED.index(figure)] for side_figures in draws[::-1]]
+                ends = [side_figures[entry][None, :, RESAMPLED_FIGURES.index(figure)] for side_figures in draws[::-1]]
                 row |= _differences(figure, ends, [[row["now"]], [row["then"]]], [sizes[entry]])[0]
             rows.append(row | {"refused": refusal_reason})
     columns = [
@@ -140,7 +140,7 @@ def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RE
     return table
 
 
-def _whole_pairs_of_both(then: pd.DataFrame, now: pd.DataFrame) -> list[pd.DataFrame]:
+def _common_pairs(then: pd.DataFrame, now: pd.DataFrame) -> list[pd.DataFrame]:
     """Return each study's rows of pairs (by model, regime, run) complete in both."""
     key = [*CELL, "pair_id"]
     common = then[[*key, "item_id"]].merge(now[[*key, "item_id"]], on=[*key, "item_id"])
@@ -264,12 +264,12 @@ def _differences(
         row = {"n_scenarios": size, "difference": value, "ci_low": bound[0], "ci_high": bound[1]}
         low, high = lower[~np.isnan(lower)], upper[~np.isnan(upper)]
         if len(low) and len(high):
-            row["p"] = min(1.0, max(2 * min(_beyond(low), _beyond(-high)), least_p(size)))
+            row["p"] = min(1.0, max(2 * min(_tail_share(low), _tail_share(-high)), least_p(size)))
         rows.append(row)
     return rows
 
 
-def _beyond(ends: np.ndarray) -> float:
+def _tail_share(ends: np.ndarray) -> float:
     """Return the share of ends at 0 or below, one added to their count.
 
     This is never below 1 / (resamples + 1), so no contrast of many models could be significant after Holm's correction.

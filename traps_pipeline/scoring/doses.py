@@ -16,7 +16,7 @@ import pandas as pd
 
 from traps_pipeline.protocol.datasets import datasets_of_category
 from traps_pipeline.scoring.bootstrap import (
-    RESAMPLED,
+    RESAMPLED_FIGURES,
     RESAMPLES,
     SEED,
     Resampling,
@@ -153,7 +153,7 @@ def hypotheses(
                 reference = dose_items[0][1]
                 dose_rows = [_row(hypothesis, dose, its, reference, resampling) for dose, its in with_items]
                 rows += [{"model": model, "regime": regime, "hypothesis": hypothesis.name, **row} for row in dose_rows]
-    return _beside_rules(pd.DataFrame(rows, columns=pd.Index(TABLE.names)))
+    return _with_rule_scores(pd.DataFrame(rows, columns=pd.Index(TABLE.names)))
 
 
 def _variations(hypothesis: Hypothesis) -> set[Dose]:
@@ -193,8 +193,8 @@ def _row(
         **dict.fromkeys(_ends("change")),
     }
     for name in SHARES:
-        row |= with_interval(name, figures[:, RESAMPLED.index(name)], limits_of(name))
-    row["value"] = _compared(hypothesis, figures)[1, 0]
+        row |= with_interval(name, figures[:, RESAMPLED_FIGURES.index(name)], limits_of(name))
+    row["value"] = _compared_figure(hypothesis, figures)[1, 0]
     if dose is hypothesis.doses[0] or reference.empty:
         return row
     shared_items = reference.loc[reference["scenario_id"].isin(items["scenario_id"])]
@@ -205,7 +205,7 @@ def _row(
     if row["refused"] is None:
         names = (hypothesis.doses[0].name, dose.name)
         end_before, end_after = (
-            _compared(hypothesis, _figures(rows, resampling, f"{row_name}|{name}"))
+            _compared_figure(hypothesis, _figures(rows, resampling, f"{row_name}|{name}"))
             for rows, name in zip((shared_items, own_items), names, strict=True)
         )
         row |= {"n_compared": own_items["scenario_id"].nunique(), "at_reference": end_before[1, 0]}
@@ -214,7 +214,7 @@ def _row(
 
 
 def _figures(items: pd.DataFrame, resampling: Resampling, named: str) -> np.ndarray:
-    """Return ends of RESAMPLED and of abstentions, (2, RESAMPLED + 1, draws).
+    """Return ends of RESAMPLED_FIGURES and of abstentions, (2, RESAMPLED_FIGURES + 1, draws).
 
     They are computed over all items of a run, then averaged over runs.
     """
@@ -227,8 +227,8 @@ def _figures(items: pd.DataFrame, resampling: Resampling, named: str) -> np.ndar
     return np.mean(run_figures, axis=0)
 
 
-def _compared(hypothesis: Hypothesis, figures: np.ndarray) -> np.ndarray:
-    return figures[:, -1] if hypothesis.figure == "abstains" else figures[:, RESAMPLED.index("j")]
+def _compared_figure(hypothesis: Hypothesis, figures: np.ndarray) -> np.ndarray:
+    return figures[:, -1] if hypothesis.figure == "abstains" else figures[:, RESAMPLED_FIGURES.index("j")]
 
 
 def _ends(name: str) -> list[str]:
@@ -245,7 +245,7 @@ def _refusal(dose: pd.DataFrame, reference: pd.DataFrame) -> str | None:
     return None if runs[0] == runs[1] else f"the dose has runs {runs[0]}, its reference has runs {runs[1]}"
 
 
-def _beside_rules(rows: pd.DataFrame) -> pd.DataFrame:
+def _with_rule_scores(rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows beside the shortcut rules' highest value and largest change.
 
     Each comes with its rule's name, for the same hypothesis and dose. A rule does not read the regime, so rows of

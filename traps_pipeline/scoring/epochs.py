@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.metrics import joined_epochs
 
@@ -76,17 +76,19 @@ def refusal(left: Answered, right: Answered) -> str | None:
         return None
     unpaired_items = sorted(left.keys() ^ right.keys())
     if unpaired_items:
-        return f"{_named(unpaired_items)} answered on one side alone; both sides of a contrast are of the same items"
+        return (
+            f"{_name_first(unpaired_items)} answered on one side alone; both sides of a contrast are of the same items"
+        )
     mixed_items = sorted(item for item, origin in left.items() if right[item].epoch != origin.epoch)
     if not mixed_items:
         left_names, right_names = (" and ".join(names) for names in panels)
         judged = f"judged by {left_names} on one side and by {right_names} on the other"
         return f"{judged}; figures of different panels are not compared"
     epochs = f"epoch {left[mixed_items[0]].epoch} against epoch {right[mixed_items[0]].epoch}"
-    return f"{_named(mixed_items)} of {epochs}; figures of different epochs are never put in one contrast"
+    return f"{_name_first(mixed_items)} of {epochs}; figures of different epochs are never put in one contrast"
 
 
-def _named(items: list[str]) -> str:
+def _name_first(items: list[str]) -> str:
     """Return the first item with its dataset, and the number of others, in words."""
     dataset, n_more = items[0].partition(":")[0], len(items) - 1
-    return f"{dataset}: {items[0]}" + (f" and {counted(n_more, 'more item')} are" if n_more else " is")
+    return f"{dataset}: {items[0]}" + (f" and {count_noun(n_more, 'more item')} are" if n_more else " is")

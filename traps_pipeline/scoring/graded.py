@@ -115,11 +115,11 @@ def graded(
     for verdict in verdicts.to_dict("records"):
         key, item = tuple(verdict[name] for name in _ANSWER), questions[verdict["item_id"]]
         if "probabilities" in (fields_of(verdict["regime"]) or ()):
-            figures = _of_probabilities(item, item.read_probabilities(texts.get(key)))
+            figures = _probability_figures(item, item.read_probabilities(texts.get(key)))
         elif BY_NAME[verdict["regime"]].first_token:
-            figures = _of_probabilities(item, item.read_first_token(first_tokens.get(key)))
+            figures = _probability_figures(item, item.read_first_token(first_tokens.get(key)))
         else:
-            figures = _of_verdict(item, verdict["abstained"], labels.get(key))
+            figures = _verdict_figures(item, verdict["abstained"], labels.get(key))
         rows.append({**verdict, "taxonomy": "chaotic", "top": max(item.posterior.values()), **figures})
     if not rows:
         return pd.DataFrame(columns=pd.Index(GRADED_CUTS.names))
@@ -158,14 +158,14 @@ def _labels(votes: pd.DataFrame, questions: Mapping[str, GradedItem]) -> dict[tu
     return label_of
 
 
-def _of_verdict(item: GradedItem, abstained: object, label: str | None) -> dict[str, float]:
+def _verdict_figures(item: GradedItem, abstained: object, label: str | None) -> dict[str, float]:
     """Return the figures of a panel's decision; empty if it is undecided."""
     if pd.isna(cast(Any, abstained)) or (not abstained and label is None):
         return {}
-    return decided(item, None if abstained else label)
+    return answer_points(item, None if abstained else label)
 
 
-def _of_probabilities(item: GradedItem, stated: Mapping[str, float] | None) -> dict[str, float]:
+def _probability_figures(item: GradedItem, stated: Mapping[str, float] | None) -> dict[str, float]:
     """Return the figures of stated probabilities; empty if there are none.
 
     The policy that acts on them gives the most probable answer, if its probability is at least ANSWER_FROM.
@@ -173,11 +173,11 @@ def _of_probabilities(item: GradedItem, stated: Mapping[str, float] | None) -> d
     if stated is None:
         return {}
     likeliest = max(stated, key=lambda label: stated[label])
-    acts = decided(item, likeliest if stated[likeliest] >= ANSWER_FROM - _ROUNDING else None)
+    acts = answer_points(item, likeliest if stated[likeliest] >= ANSWER_FROM - _ROUNDING else None)
     return acts | {"brier": brier(item.posterior, stated), "stated": stated[_commonest(item.posterior)]}
 
 
-def decided(item: GradedItem, label: str | None) -> dict[str, float]:
+def answer_points(item: GradedItem, label: str | None) -> dict[str, float]:
     """Return an answer's expected points, and its regret split by reason.
 
     The regret is the loss against an ideal observer. label: None for an abstention.

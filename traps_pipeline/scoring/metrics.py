@@ -20,8 +20,11 @@ BOUNDS = ["pecs_low", "pecs_high"]
 # The outcomes in each count of items. An item is answered if its answer is judged, even if the judges are undecided.
 BROKEN_COUNTS = {f"n_{name}": (name,) for name in ("empty", "truncated", "unfinished", "degenerate", "unread")}
 OUTCOMES = {"n_answered": JUDGED, "n_refused": ("refused",), **BROKEN_COUNTS, "n_errors": ("error", "malformed")}
-COUNTED = [*OUTCOMES, "n_not_json"]
-REJECTS = ["n_rejects", "n_rejects_answered"]  # counts of decisions that not every panel is asked for: null otherwise
+COUNT_COLUMNS = [*OUTCOMES, "n_not_json"]
+REJECTION_COLUMNS = [
+    "n_rejects",
+    "n_rejects_answered",
+]  # counts of decisions that not every panel is asked for: null otherwise
 # For each decision, how often it was yes (numerator) and how often it was made (denominator, `_of`); every figure is
 # computed from these six counts.
 COUNTS = ["correct", "correct_of", "false_abs", "false_abs_of", "abs_rec", "abs_rec_of"]
@@ -74,9 +77,9 @@ def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]
     datasets = sorted(verdicts["dataset"].unique())
     if len(datasets) > 1:
         raise ValueError(f"verdicts of several datasets {datasets}: score one dataset at a time")
-    groups = _scoped(verdicts, scoped_by).groupby([*CELL, "scope"], sort=True)
-    sums = cast("pd.DataFrame", groups[[*COUNTS, "complete", *COUNTED]].sum())
-    sums[REJECTS] = groups[REJECTS].sum(min_count=1)
+    groups = _with_scopes(verdicts, scoped_by).groupby([*CELL, "scope"], sort=True)
+    sums = cast("pd.DataFrame", groups[[*COUNTS, "complete", *COUNT_COLUMNS]].sum())
+    sums[REJECTION_COLUMNS] = groups[REJECTION_COLUMNS].sum(min_count=1)
     sums["n_pairs"] = groups["pair_id"].nunique()
     sides = sides_of(datasets[0]) if datasets else ()
     sums["n_missing"] = len(sides) * sums["n_pairs"] - sums["complete"]
@@ -101,7 +104,7 @@ def joined_versions(versions: Iterable[str]) -> str:
     return " + ".join(sorted({part for version in versions for part in version.split(" + ")}))
 
 
-def _scoped(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]]) -> pd.DataFrame:
+def _with_scopes(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]]) -> pd.DataFrame:
     """Return verdicts with counts, once per scope: (1 + len(scoped_by)) x items rows."""
     import pandas as pd
 

@@ -16,7 +16,7 @@ from statistics import NormalDist
 import numpy as np
 
 from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
-from traps_pipeline.scoring.bootstrap import RESAMPLED, TAXONOMIES, figures_of, interval, limits_of
+from traps_pipeline.scoring.bootstrap import RESAMPLED_FIGURES, TAXONOMIES, figures_of, interval, limits_of
 from traps_pipeline.scoring.contrasts import SEPARABLE_BELOW, least_p
 from traps_pipeline.scoring.metrics import pecs_of
 
@@ -83,7 +83,7 @@ def _studies(counts: Sequence[int], shares: Shares, seed: int) -> tuple[np.ndarr
     return observed, ends
 
 
-def _better(shares: Shares, by: float) -> Shares:
+def _raise_shares(shares: Shares, by: float) -> Shares:
     """Return shares of a PECS higher by `by`: abstain on more voids, then raise Acc."""
     goal = shares.pecs + by
     abs_rec = min(1.0, shares.false_abs + goal / shares.acc) if shares.acc else 1.0
@@ -104,7 +104,7 @@ def _detectable(
         return None
     smallest, (observed, ends) = 0.0, studies
     for seed in range(SEED + 1, SEED + 1 + ROUNDS):
-        better, better_ends = _studies(counts, _better(shares, smallest), seed)
+        better, better_ends = _studies(counts, _raise_shares(shares, smallest), seed)
         difference, low = better - observed, better_ends[:, 0] - ends[:, 1]
         lower_half_width = np.quantile(low.mean(axis=1, keepdims=True) - low, 1 - SEPARABLE_BELOW / 2 / comparisons)
         smallest = float(
@@ -124,5 +124,5 @@ def _pecs(answers: np.ndarray, unseen: np.ndarray, in_mean: bool) -> np.ndarray:
     sums = np.stack([part for n_yes in yes for part in (n_yes, all_pairs)], axis=1)
     unseen_draws = np.broadcast_to(unseen, (len(answers), *unseen.shape))
     return np.moveaxis(
-        figures_of(np.concatenate([sums, unseen_draws], axis=1), in_mean)[:, :, RESAMPLED.index("pecs")], 0, 1
+        figures_of(np.concatenate([sums, unseen_draws], axis=1), in_mean)[:, :, RESAMPLED_FIGURES.index("pecs")], 0, 1
     )

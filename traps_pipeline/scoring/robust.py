@@ -24,7 +24,7 @@ from traps_pipeline.protocol.datasets import (
     is_ill_posed,
 )
 from traps_pipeline.scoring.bootstrap import (
-    RESAMPLED,
+    RESAMPLED_FIGURES,
     RESAMPLES,
     SEED,
     Resampling,
@@ -129,14 +129,14 @@ def _row(items: pd.DataFrame, named: str, arms: Sequence[str], resampling: Resam
 def robust_ends(cells: Mapping[str, np.ndarray], scenarios: Mapping[str, int]) -> np.ndarray:
     """Return a run's ends of the robust score, (2, draws); NaN without robust arms.
 
-    cells: the ends of RESAMPLED, (2, RESAMPLED, draws), of the four datasets and the robust arms. scenarios: the number
-    of scenarios in each of them.
+    cells: the ends of RESAMPLED_FIGURES, (2, RESAMPLED_FIGURES, draws), of the four datasets and the robust arms.
+    scenarios: the number of scenarios in each of them.
     """
     arms = {arm: min(1.0, scenarios[arm] / FULL_KIND) for arm in cells if arm in ROBUST_ARMS}
     pairs = np.mean([cells[dataset] for dataset in DATASETS], axis=0)
 
     def mean_over_kinds(figure: str, weights: Mapping[str, float]) -> np.ndarray:
-        position = RESAMPLED.index(figure)
+        position = RESAMPLED_FIGURES.index(figure)
         kinds = [pairs[:, position], *(cells[arm][:, position] for arm in weights)]
         return np.average(kinds, axis=0, weights=[1.0, *weights.values()])
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.video.encode import DamagedClip, decode
 
 PLACES = (0.0, 0.5, 1.0)  # positions of the compared frames, as shares of the clip
@@ -87,7 +87,9 @@ class Comparison:
     @property
     def progress(self) -> str:
         """The progress in words; empty once it is done."""
-        return "" if self._found is not None else f"{len(self._prints)} of {counted(len(self._clips), 'clip')} compared"
+        return (
+            "" if self._found is not None else f"{len(self._prints)} of {count_noun(len(self._clips), 'clip')} compared"
+        )
 
     @property
     def found(self) -> Mapping[str, Neighbour]:

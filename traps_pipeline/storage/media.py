@@ -34,7 +34,7 @@ from traps_pipeline.video.encode import ENCODER, DamagedClip, decode, encode
 from traps_pipeline.video.policies import FramePolicy
 
 Profile = Literal["video", "images", "frames"]
-MOST = 25  # frames an API model sees, docs/spec.md 3.1
+MAX_FRAMES = 25  # frames an API model sees, docs/spec.md 3.1
 JPEG_QUALITY = 92
 CACHE_BYTES = 256 * 2**20
 _REVISION = 1  # raise it when picking, resizing or the container changes, so that all media are prepared anew
@@ -56,7 +56,7 @@ class MediaSpec(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
     profile: Profile
     fps: float | None = Field(default=None, gt=0, allow_inf_nan=False)
-    most: int = Field(default=MOST, ge=1)
+    most: int = Field(default=MAX_FRAMES, ge=1)
     uniform: int | None = Field(default=None, ge=1)
     size: tuple[int, int] | None = None
     fit: Literal["stretch", "crop"] = "stretch"
@@ -73,7 +73,7 @@ class MediaSpec(BaseModel):
     def _one_frame_policy(self) -> MediaSpec:
         if (self.fps is None) == (self.uniform is None):
             raise ValueError(f"give fps or uniform, {'one of them' if self.fps is None else 'not both'}")
-        if self.uniform is not None and self.most != MOST:
+        if self.uniform is not None and self.most != MAX_FRAMES:
             raise ValueError("most goes with fps; uniform says itself how many frames there are")
         if self.size is not None and min(self.size) < 1:
             raise ValueError(f"size is {self.size}; it is a width and a height in pixels")
@@ -173,9 +173,9 @@ class MediaStore:
         """
         note = self._note(clip_digest, spec)
         if note not in self._sound:
-            with _alone(note.parent):
+            with _lock_folder(note.parent):
                 self._bring(note, spec)
-                media = self._here(clip_digest, spec)
+                media = self._local_path(clip_digest, spec)
                 if media is None or not _is_complete(media):
                     media = _make(clip, clip_digest, spec, note)
                 self._store.keep([note] if media.path is None else [media.path, note])
@@ -188,13 +188,13 @@ class MediaStore:
         if note in self._sound:
             return self._sound[note]
         self._bring(note, spec)
-        return self._here(clip_digest, spec)
+        return self._local_path(clip_digest, spec)
 
     def _bring(self, note: Path, spec: MediaSpec) -> None:
         path = _file(note, spec.profile)
         self._store.bring([note] if path is None else [note, path])
 
-    def _here(self, clip_digest: str, spec: MediaSpec) -> Media | None:
+    def _local_path(self, clip_digest: str, spec: MediaSpec) -> Media | None:
         """Return the path of the media on this machine."""
         try:
             media = read_note(self._note(clip_digest, spec))
@@ -236,17 +236,17 @@ def payload(media: Media) -> list[bytes]:
         raise TrapsError("media.profile frames is not sent as bytes; use video or images for a model behind an API")
     try:
         data = media.path.read_bytes()
-        parts = _unzipped(data) if media.profile == "images" else [data]
+        parts = _unzip(data) if media.profile == "images" else [data]
     except OSError as error:
-        raise _damaged(media.path, error.strerror or str(error)) from error
+        raise _damaged_clip(media.path, error.strerror or str(error)) from error
     except _NO_ZIP as error:
-        raise _damaged(media.path, str(error)) from error
+        raise _damaged_clip(media.path, str(error)) from error
     if len(data) != media.size_bytes or _sha256(parts) != media.sha256:
-        raise _damaged(media.path, f"{len(data)} of {media.size_bytes} bytes; truncated or altered")
+        raise _damaged_clip(media.path, f"{len(data)} of {media.size_bytes} bytes; truncated or altered")
     return parts
 
 
-def _damaged(path: Path, why: str) -> DamagedClip:
+def _damaged_clip(path: Path, why: str) -> DamagedClip:
     return DamagedClip(f"{path}: is not what was prepared ({why}); delete it and run again: it is prepared anew")
 
 
@@ -275,7 +275,7 @@ def _make(clip: Path, clip_digest: str, spec: MediaSpec, note: Path) -> Media:
         sha256, size = file_digest(path), path.stat().st_size
     else:
         jpegs = [_jpeg(frame) for frame in frames.frames]
-        data = _zipped(jpegs)
+        data = _zip(jpegs)
         write_bytes(path, data)
         sha256, size = _sha256(jpegs), len(data)
     times = tuple(frames.times_s.tolist())
@@ -321,7 +321,7 @@ def _jpeg(frame: np.ndarray) -> bytes:
     return cv2.imencode(".jpg", frame[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
 
 
-def _zipped(jpegs: Sequence[bytes]) -> bytes:
+def _zip(jpegs: Sequence[bytes]) -> bytes:
     """Return an uncompressed zip of 00.jpg, 01.jpg, ..., the same bytes everywhere."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
@@ -332,7 +332,7 @@ def _zipped(jpegs: Sequence[bytes]) -> bytes:
     return buffer.getvalue()
 
 
-def _unzipped(data: bytes) -> list[bytes]:
+def _unzip(data: bytes) -> list[bytes]:
     """Return the entries of a zip in order, or raise one of `_NO_ZIP`."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
@@ -341,7 +341,7 @@ def _unzipped(data: bytes) -> list[bytes]:
 
 
 @contextmanager
-def _alone(folder: Path) -> Iterator[None]:
+def _lock_folder(folder: Path) -> Iterator[None]:
     """Hold a folder's lock, freed when its holder dies. Raises TrapsError."""
     try:
         folder.mkdir(parents=True, exist_ok=True)

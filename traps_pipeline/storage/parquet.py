@@ -67,7 +67,7 @@ class StageOutput:
         return cast("pd.DataFrame", self.content)
 
 
-def joined(parts: Sequence[StageOutput]) -> StageOutput:
+def join_outputs(parts: Sequence[StageOutput]) -> StageOutput:
     """Join the outputs of a partition's parts: concatenate rows, add up the numbers."""
     first, *other_parts = parts
     for later_part in other_parts:
@@ -110,17 +110,19 @@ class TableStore:
         and code, the version of the code that made the rows. Raises TrapsError if a row breaks the schema, a key
         repeats or the disk is full; the partition's former file is then unchanged.
         """
-        data = self._checked(table, partition, rows)
+        data = self._arrow_of(table, partition, rows)
         version = content_version(data)
         state = State(version, dict(inputs), len(data), failed, code)
         footer, path = json.dumps(asdict(state)), self.path(table, partition)
         note = _note(footer, data.schema.names)
         columns = _COLUMNS + json.dumps(data.schema.names).encode()
-        content = sealed(data, {_FOOTER: footer.encode(), _COLUMNS.rstrip(b":"): columns})
+        content = seal_table(data, {_FOOTER: footer.encode(), _COLUMNS.rstrip(b":"): columns})
         self._store.write({path: content}, note=note, durable=True)
         return version
 
-    def _checked(self, table: Table[Row], partition: Mapping[str, Any], rows: Sequence[Row] | pd.DataFrame) -> pa.Table:
+    def _arrow_of(
+        self, table: Table[Row], partition: Mapping[str, Any], rows: Sequence[Row] | pd.DataFrame
+    ) -> pa.Table:
         import pyarrow as pa
 
         schema = table.arrow_schema()
@@ -141,8 +143,7 @@ class TableStore:
             if not column.nullable and data[column.name].null_count:
                 raise TrapsError(f"table {table.name} {dict(partition)}: column {column.name} has missing values")
         for column, value in partition.items():
-            strays = {*data[column].unique().to_pylist()} - {value}
-            if strays:
+            if strays := {*data[column].unique().to_pylist()} - {value}:
                 raise TrapsError(
                     f"table {table.name} {dict(partition)}: column {column} also holds {sorted(map(str, strays))}"
                 )
@@ -260,10 +261,10 @@ class TableStore:
 
 def write_sealed(path: Path, data: pa.Table, metadata: Mapping[bytes, bytes]) -> None:
     """Write a Parquet file atomically, with metadata and its digest in the footer."""
-    write_bytes(path, sealed(data, metadata), durable=True)
+    write_bytes(path, seal_table(data, metadata), durable=True)
 
 
-def sealed(data: pa.Table, metadata: Mapping[bytes, bytes]) -> bytes:
+def seal_table(data: pa.Table, metadata: Mapping[bytes, bytes]) -> bytes:
     """Return a Parquet file's bytes, with metadata and their digest in the footer."""
     import pyarrow.parquet as pq
 
@@ -319,10 +320,10 @@ def _sound_bytes(path: Path) -> pa.BufferReader:
     """
     import pyarrow as pa
 
-    return pa.BufferReader(_verified(path))
+    return pa.BufferReader(_verified_bytes(path))
 
 
-def _verified(path: Path) -> bytes:
+def _verified_bytes(path: Path) -> bytes:
     """Return a file's bytes, verified once until they change. Raises TrapsError."""
     with path.open("rb") as stream:
         content, stamp = stream.read(), _stamp(os.fstat(stream.fileno()))
@@ -337,13 +338,13 @@ def _verified(path: Path) -> bytes:
 def _footer_of(path: Path) -> tuple[State, list[str]]:
     """Return a file's footer and column names, cached until the file changes.
 
-    A run reads each of hundreds of footers dozens of times. Raises as `_verified`, or KeyError without a footer.
+    A run reads each of hundreds of footers dozens of times. Raises as `_verified_bytes`, or KeyError without a footer.
     """
     import pyarrow.parquet as pq
 
     stamp = _stamp(path.stat())
     if (cached_footer := _FOOTERS.get(path)) is None or cached_footer[0] != stamp:
-        content = _verified(path)
+        content = _verified_bytes(path)
         older = _COLUMNS not in content  # written before the names stood there
         names = pq.ParquetFile(_sound_bytes(path)).schema_arrow.names if older else _json_behind(content, _COLUMNS)
         cached_footer = _FOOTERS[path] = stamp, State(**_json_behind(content, _STATE, len(_STATE))), names
@@ -358,7 +359,7 @@ def _json_behind(content: bytes, mark: bytes, within: int = 0) -> Any:
     return json.JSONDecoder().raw_decode(text)[0]
 
 
-def altered(path: Path) -> str:
+def bytes_damage(path: Path) -> str:
     """Return what is wrong with the bytes of a table's file; empty if intact."""
     try:
         _sound_bytes(path)

@@ -202,7 +202,7 @@ def _file_lease(folder: Path, name: str) -> Lease | None:
 
 
 @contextmanager
-def writable(folder: Path) -> Iterator[None]:
+def require_writable(folder: Path) -> Iterator[None]:
     """Raise TrapsError if a folder is not writable."""
     try:
         yield

@@ -12,14 +12,14 @@ from pathlib import Path
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.ledger.row_transfer import copy_ledger
 from traps_pipeline.storage.parquet import note_of
 from traps_pipeline.storage.place import STUDY, Place, scratch_of
 from traps_pipeline.storage.workspace import DATABASE, Workspace
 
 # Dagster's history, lock files, reports and labels belong to a machine, and the ledger is moved separately.
-STAYS = ("dagster", "ledger", "reports", "labels", STUDY)
+LOCAL_NAMES = ("dagster", "ledger", "reports", "labels", STUDY)
 AT_ONCE = 500  # files of one change
 MOVED_STUDY = "study.moved.yaml"  # the new name of the folder's study.yaml
 
@@ -55,7 +55,7 @@ def move_to_store(workspace: Workspace, address: Place) -> int:
 
 def _move_files(workspace: Workspace, target: Workspace) -> None:
     files = iter(
-        [p for p in workspace.store.below(workspace.root) if p.relative_to(workspace.root).parts[0] not in STAYS]
+        [p for p in workspace.store.below(workspace.root) if p.relative_to(workspace.root).parts[0] not in LOCAL_NAMES]
     )
     count = 0
     while chunk := list(islice(files, AT_ONCE)):
@@ -73,4 +73,4 @@ def _move_files(workspace: Workspace, target: Workspace) -> None:
             moved_paths.append(destination)
         target.store.keep(moved_paths)
         count += len(chunk)
-        progress.current().note(f"{counted(count, 'file')} copied to {target.place}")
+        progress.current().note(f"{count_noun(count, 'file')} copied to {target.place}")

@@ -93,7 +93,7 @@ class SteeringSettings(BaseModel):
 
     @field_validator("alphas", "gaps")
     @classmethod
-    def _ascending(cls, values: tuple[float, ...]) -> tuple[float, ...]:
+    def _check_ascending(cls, values: tuple[float, ...]) -> tuple[float, ...]:
         if list(values) != sorted(set(values)):
             raise ValueError(f"{values} must ascend; alpha 0, the unsteered model, is always there")
         return values
@@ -232,7 +232,7 @@ class Study(BaseModel):
         return self.scenarios is not None or self.per_family is not None
 
     @model_validator(mode="after")
-    def _one_subset(self) -> Study:
+    def _check_subset(self) -> Study:
         if self.scenarios is not None and self.per_family is not None:
             raise ValueError("give scenarios or per_family, not both")
         return self

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.files import replacing
+from traps_pipeline.base.files import replace_file
 from traps_pipeline.video.policies import SAMPLED, FramePolicy
 
 # veryfast: 3 % larger than medium at the same quality, in half the time. mbtree is off since it is not deterministic in
@@ -50,7 +50,7 @@ def encode(frames: Sequence[np.ndarray], path: Path, fps: int) -> None:
     import av
     from av.error import FFmpegError
 
-    with replacing(path) as part:
+    with replace_file(path) as part:
         try:
             with av.open(str(part), "w", format="mp4", options={"movflags": "+faststart"}) as container:
                 stream = container.add_stream("libx264", rate=fps, options=ENCODER)

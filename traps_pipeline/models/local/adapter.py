@@ -20,7 +20,7 @@ from typing import Any
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.extras import require
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.models.local.checkpoint import (
     Checkpoint,
     find_checkpoint,
@@ -128,7 +128,7 @@ def _load(checkpoint: Checkpoint, params: LocalParams, device: str) -> LocalMode
     unset = [*report["missing_keys"], *report["mismatched_keys"]]
     if unset:
         raise TrapsError(
-            f"checkpoint {checkpoint.name}: its files lack {counted(len(unset), 'weight')}, {unset[0]} first, which "
+            f"checkpoint {checkpoint.name}: its files lack {count_noun(len(unset), 'weight')}, {unset[0]} first, which "
             "would be random: download or save it again"
         )
     if not hasattr(processor, "video_token") or getattr(processor, "video_processor", None) is None:

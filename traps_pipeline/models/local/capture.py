@@ -51,7 +51,7 @@ def pool(states: Tensor, pooling: Pooling, chosen: Tensor | None = None) -> Tens
 
 
 @contextmanager
-def capturing(
+def capture_states(
     blocks: Iterator[Module], norm: Module, pooling: Pooling, chosen: Tensor | None = None
 ) -> Iterator[CapturedStates]:
     """Keep the pooled states of passes within the block; remove all hooks afterwards."""

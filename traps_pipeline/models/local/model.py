@@ -13,8 +13,8 @@ import numpy as np
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.wording import counted
-from traps_pipeline.models.local.capture import Pooling, capturing
+from traps_pipeline.base.wording import count_noun
+from traps_pipeline.models.local.capture import Pooling, capture_states
 from traps_pipeline.models.local.checkpoint import Checkpoint, free_bytes
 from traps_pipeline.models.local.decoding import Steers, decode, steering_context
 from traps_pipeline.models.local.library import load_transformers
@@ -139,7 +139,7 @@ class LocalModel:
         frames: (N, H, W, 3) uint8 RGB, all of them shown. times_s: (N,) seconds into the clip, which models that read
         time stamps get exactly. Raises TrapsError if the chat template loses a part.
         """
-        text = self._rendered(system, user)
+        text = self._render(system, user)
         marks = [round(1000 * float(time)) for time in times_s]
         clock = {"total_num_frames": marks[-1] + 1, "fps": float(CLOCK_FPS), "frames_indices": marks,
                  "duration": marks[-1] / CLOCK_FPS, "height": frames.shape[1], "width": frames.shape[2]}  # fmt: skip
@@ -157,7 +157,7 @@ class LocalModel:
         inputs.pop("video_metadata", None)
         return Prompt(text, dict(inputs))
 
-    def _rendered(self, system: str, user: str) -> str:
+    def _render(self, system: str, user: str) -> str:
         content = [{"type": "video"}, {"type": "text", "text": user}]
         turns = [
             {"role": "system", "content": [{"type": "text", "text": system}]},
@@ -200,14 +200,14 @@ class LocalModel:
 
         mask = None if chosen is None else torch.from_numpy(chosen)
         if pooling == "answer":
-            prompt = self._answered(prompt, steering)
-        with steering_context(steering, self), capturing(iter(self.blocks), self.norm, pooling, mask) as states:
+            prompt = self._with_first_token(prompt, steering)
+        with steering_context(steering, self), capture_states(iter(self.blocks), self.norm, pooling, mask) as states:
             self.forward(prompt)
         assert states.normed is not None and len(states.raw) == self.n_layers + 1
         rows = torch.stack([row.float().cpu() for row in (*states.raw, states.normed)]).numpy()
         return States(rows[:-1], rows[-1])
 
-    def _answered(self, prompt: Prompt, steering: Steers | None) -> Prompt:
+    def _with_first_token(self, prompt: Prompt, steering: Steers | None) -> Prompt:
         """Return the prompt followed by the first token of its greedy answer."""
         return prompt.followed_by(self.generate([prompt], 1, steering=steering)[0].tokens)
 
@@ -234,7 +234,7 @@ class LocalModel:
             pending = [group]
             while pending:
                 rows = pending.pop()
-                fitting_answers = self._fitting(prompts, rows, max_new_tokens, sampling, steering, stopped)
+                fitting_answers = self._generate_fitting(prompts, rows, max_new_tokens, sampling, steering, stopped)
                 if fitting_answers is None:
                     middle = len(rows) // 2
                     pending += [rows[middle:], rows[:middle]]
@@ -242,7 +242,7 @@ class LocalModel:
                     answers.update(zip(rows, fitting_answers, strict=True))
         return [answers[i] for i in range(len(prompts))]
 
-    def _fitting(
+    def _generate_fitting(
         self,
         prompts: Sequence[Prompt],
         rows: Sequence[int],
@@ -268,7 +268,7 @@ class LocalModel:
                 ) from None
         torch.cuda.empty_cache()  # outside the handler, where the failed pass has been freed
         progress.current().note(
-            f"{self.checkpoint.name}: {counted(len(rows), 'row')} need more than the memory, trying half of them"
+            f"{self.checkpoint.name}: {count_noun(len(rows), 'row')} need more than the memory, trying half of them"
         )
         return None
 

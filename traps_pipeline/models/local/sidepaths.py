@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from torch.nn import Module
 
 Argument = Literal["shared_kv_states", "per_layer_input"]
-SHARED: Argument = "shared_kv_states"
+SHARED_KEYS: Argument = "shared_kv_states"
 PER_LAYER: Argument = "per_layer_input"
 # By configuration field: the blocks' argument for this path, and a description.
 _FIELDS: dict[str, tuple[Argument | None, str]] = {
-    "num_kv_shared_layers": (SHARED, "later blocks reuse keys and values of earlier ones"),
+    "num_kv_shared_layers": (SHARED_KEYS, "later blocks reuse keys and values of earlier ones"),
     "hidden_size_per_layer_input": (PER_LAYER, "every block reads the token's own embedding again"),
     "altup_num_inputs": (None, "blocks hand on several residual streams"),  # Gemma 3n
 }

@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from traps_pipeline.models.local.adapter import LocalModel, Prompt
 
 PARTS = ("system", "stamps", "visual", "question", "last")
-CHANGED = 0.05  # minimum mean absolute difference of a changed visual token's pixels, as the model reads them
+CHANGED_DIFFERENCE = (
+    0.05  # minimum mean absolute difference of a changed visual token's pixels, as the model reads them
+)
 # `<0.4 seconds>` of Qwen3-VL and `00:01` of Gemma 4; LLaVA-NeXT-Video writes no times.
 _STAMP = re.compile(r"<\d+(?:\.\d+)?seconds>|\d\d:\d\d(?!\d)")
 
@@ -80,7 +82,7 @@ def changed_tokens(first: Prompt, second: Prompt, visual: np.ndarray) -> np.ndar
         return None
     difference = (pixels[0].float() - pixels[1].float()).abs().mean(dim=1)
     is_changed = np.zeros(len(visual), bool)
-    is_changed[visual] = (difference.reshape(n_visual, -1).amax(dim=1) > CHANGED).numpy()
+    is_changed[visual] = (difference.reshape(n_visual, -1).amax(dim=1) > CHANGED_DIFFERENCE).numpy()
     return is_changed
 
 

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from torch import Tensor
 
-MOST_BYTES = 2 * 2**30  # maximum bytes of cached features, on the model's device
+MAX_BYTES = 2 * 2**30  # maximum bytes of cached features, on the model's device
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class _Features:
 class ClipMemory:
     """Features of the latest clips; `passes` counts those that the tower encoded."""
 
-    most_bytes: int = MOST_BYTES
+    most_bytes: int = MAX_BYTES
     passes: int = 0
     _kept: OrderedDict[str, _Features] = field(default_factory=OrderedDict)
     _size: int = 0
@@ -66,7 +66,7 @@ class ClipMemory:
             for key, clip in zip(keys, clips, strict=True):
                 if key not in rows:
                     rows[key] = self._pass(original, key, {**arguments, **clip, **keyword_arguments})
-            return self._joined([rows[key] for key in keys])
+            return self._join_features([rows[key] for key in keys])
 
         owner.get_video_features = features
         try:
@@ -84,7 +84,7 @@ class ClipMemory:
         self._keep(key, features)
         return features
 
-    def _joined(self, rows: list[_Features]) -> Any:
+    def _join_features(self, rows: list[_Features]) -> Any:
         """Return these clips' features in the form of the library's output."""
         import torch
 

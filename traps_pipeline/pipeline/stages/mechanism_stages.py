@@ -5,7 +5,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.progress import Tally
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.mechanism import probing_versions as versions
 from traps_pipeline.mechanism.mechanism_rows import (
     COSINES,
@@ -74,7 +74,7 @@ def steering_settings(workspace: Workspace, key: str) -> str:
     return versions.steering_version(workspace, key)
 
 
-def _probed_from(dataset: str) -> list[str]:
+def _probed_datasets(dataset: str) -> list[str]:
     return [dataset, TIME_SWAPPED] if dataset == "chaotic" else [dataset]
 
 
@@ -86,7 +86,11 @@ def steers(partitions: StudyPartitions, key: str | None) -> bool:
 @_stage(
     PROBE_ITEMS,
     code="2",
-    parents=[of(items, to_keys(DATASET, PROBED, _probed_from)), of(scene_specs, _OCCLUSION), of(videos, _OCCLUSION)],
+    parents=[
+        of(items, to_keys(DATASET, PROBED, _probed_datasets)),
+        of(scene_specs, _OCCLUSION),
+        of(videos, _OCCLUSION),
+    ],
     scheme=PROBED,
 )
 def probe_items(workspace: Workspace, dataset: str) -> StageOutput:
@@ -133,7 +137,7 @@ def _outside_shares(workspace: Workspace, key: str | None, output: StageOutput) 
         return any(f is not None and f == f and not -1e-9 <= f <= 1 + 1e-9 for f in figures)
 
     n_wrong = sum(is_wrong(row) for row in output.rows(PROBES))
-    return f"{counted(n_wrong, 'row')} with a share outside 0 to 1" if n_wrong else ""
+    return f"{count_noun(n_wrong, 'row')} with a share outside 0 to 1" if n_wrong else ""
 
 
 @_stage(
@@ -221,7 +225,7 @@ def steering_votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[
         yield finished.key, output
 
 
-def _judged(workspace: Workspace) -> "tuple[pd.DataFrame, pd.DataFrame]":
+def _answers_and_votes(workspace: Workspace) -> "tuple[pd.DataFrame, pd.DataFrame]":
     """Return the steered answers, and the votes on them."""
     from traps_pipeline.mechanism.shares import VOTE_COLUMNS
 
@@ -236,7 +240,7 @@ def steering_effects(workspace: Workspace, _: None) -> list[SteeringEffectRow]:
     """Return abstention by path, kind of direction, layer, strength and side."""
     from traps_pipeline.mechanism.shares import effect_rows
 
-    return effect_rows(*_judged(workspace))
+    return effect_rows(*_answers_and_votes(workspace))
 
 
 @_stage(STEERING_SHARES, code="4", parents=_STEERING_PARENTS, wants=steers)
@@ -244,4 +248,4 @@ def steering_shares(workspace: Workspace, _: None) -> list[SteeringShareRow]:
     """Return abstention over the paths of a set, with intervals by scenario."""
     from traps_pipeline.mechanism.shares import share_rows
 
-    return share_rows(*_judged(workspace))
+    return share_rows(*_answers_and_votes(workspace))

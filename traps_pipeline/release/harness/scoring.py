@@ -78,7 +78,7 @@ def figures(judged: Iterable[PanelDecision]) -> dict[str, float | None]:
     """
     rows = list(judged)
     results: dict[str, float | None] = {}
-    figures_of = {name: _of_dataset([row for row in rows if row.dataset == name]) for name in DATASETS}
+    figures_of = {name: _dataset_figures([row for row in rows if row.dataset == name]) for name in DATASETS}
     for name, dataset_figures in figures_of.items():
         if any(row.dataset == name for row in rows):
             results |= {f"{name}_{figure}": dataset_figures[figure] for figure in RUN_FIGURES}
@@ -93,7 +93,7 @@ def figures(judged: Iterable[PanelDecision]) -> dict[str, float | None]:
     }
 
 
-def _of_dataset(rows: list[PanelDecision]) -> dict[str, float | None]:
+def _dataset_figures(rows: list[PanelDecision]) -> dict[str, float | None]:
     acc = _share([row.correct for row in rows if row.side == "control"])
     false_abs = _share([row.abstained for row in rows if row.side == "control"])
     abs_rec = _share([row.abstained for row in rows if row.side == "void"])

@@ -102,20 +102,20 @@ def study_items(workspace: Workspace) -> pd.DataFrame:
 def study_answers(workspace: Workspace) -> StudyAnswers:
     """Return answers to current items, with votes. Raises TrapsError without items."""
     items = study_items(workspace)
-    responses = _of_items(workspace, RESPONSES, ("outcome", "epoch", *_TEXTS), items)
+    responses = _item_rows(workspace, RESPONSES, ("outcome", "epoch", *_TEXTS), items)
     evaluations = _evaluations(responses)
-    responses = _sorted(_keyed(responses, evaluations))
+    responses = _sort(_with_key(responses, evaluations))
     keys = responses["key"].to_numpy()
     decision_columns = ("outcome", "abstained", "correct", "unanimous")
-    verdicts = _keyed(_of_items(workspace, VERDICTS, decision_columns, items), evaluations)
+    verdicts = _with_key(_item_rows(workspace, VERDICTS, decision_columns, items), evaluations)
     judged = verdicts["key"].to_numpy()
     positions = np.full(len(items) * max(len(evaluations), 1), -1, np.int64)
     positions[judged] = np.arange(len(judged))
     places = positions[keys]
     judged_as = pc.take(verdicts["outcome"], pa.array(places, mask=places < 0))
     is_unread = pc.fill_null(pc.equal(judged_as, UNREAD), False)
-    outcomes, outcome = _coded(pc.if_else(is_unread, judged_as, responses["outcome"]))
-    epochs, epoch = _coded(responses["epoch"])
+    outcomes, outcome = _encode_column(pc.if_else(is_unread, judged_as, responses["outcome"]))
+    epochs, epoch = _encode_column(responses["epoch"])
     decisions = {
         "item": keys // max(len(evaluations), 1),
         "evaluation": keys % max(len(evaluations), 1),
@@ -125,7 +125,7 @@ def study_answers(workspace: Workspace) -> StudyAnswers:
         "correct": _decision(verdicts["correct"], places),
         "unanimous": _decision(verdicts["unanimous"], places) == YES,
     }
-    votes = _keyed(_of_items(workspace, VOTES, (*_VOTES, *_VOTE_TEXTS), items), evaluations)
+    votes = _with_key(_item_rows(workspace, VOTES, (*_VOTES, *_VOTE_TEXTS), items), evaluations)
     positions[:] = -1
     positions[keys] = np.arange(len(keys))
     votes = votes.append_column("answer", pa.array(positions[votes["key"].to_numpy()].astype(np.int32)))
@@ -142,7 +142,7 @@ def study_answers(workspace: Workspace) -> StudyAnswers:
     )
 
 
-def _of_items(workspace: Workspace, table: Table, columns: Sequence[str], items: pd.DataFrame) -> pa.Table:
+def _item_rows(workspace: Workspace, table: Table, columns: Sequence[str], items: pd.DataFrame) -> pa.Table:
     """Return the rows whose item is in `items`; their column `item` is its index."""
     rows = workspace.tables.read_arrow(table, ["item_id", *_EVALUATION, *columns])
     place = pc.index_in(rows["item_id"], value_set=pa.array(items["item_id"].tolist(), pa.string()))
@@ -157,7 +157,7 @@ def _evaluations(responses: pa.Table) -> list[Evaluation]:
     return sorted(evaluations, key=lambda e: (e.model, REGIMES.index(e.regime), e.run))
 
 
-def _keyed(rows: pa.Table, evaluations: Sequence[Evaluation]) -> pa.Table:
+def _with_key(rows: pa.Table, evaluations: Sequence[Evaluation]) -> pa.Table:
     """Return rows of known evaluations with `key`, the index of item and evaluation."""
     row_keys = pc.binary_join_element_wise(*(rows[name].cast(pa.string()) for name in _EVALUATION), "|")
     evaluation_keys = pa.array([f"{e.model}|{e.regime}|{e.run}" for e in evaluations], pa.string())
@@ -166,11 +166,11 @@ def _keyed(rows: pa.Table, evaluations: Sequence[Evaluation]) -> pa.Table:
     return rows.append_column("key", pa.array(key)).filter(pa.array(evaluation >= 0))
 
 
-def _sorted(rows: pa.Table) -> pa.Table:
+def _sort(rows: pa.Table) -> pa.Table:
     return rows.sort_by([("key", "ascending")])
 
 
-def _coded(column: pa.ChunkedArray) -> tuple[list[str], np.ndarray]:
+def _encode_column(column: pa.ChunkedArray) -> tuple[list[str], np.ndarray]:
     """Return the distinct values of a column, sorted, and each row's index among them."""
     values = sorted(column.unique().to_pylist())
     return values, pc.index_in(column, value_set=pa.array(values, pa.string())).to_numpy()

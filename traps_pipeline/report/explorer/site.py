@@ -33,7 +33,7 @@ from traps_pipeline.report.explorer.answer_shards import StudyAnswers, study_ans
 from traps_pipeline.report.explorer.scenario_words import certificate_phrases, closes_frame, intervention
 from traps_pipeline.report.leaderboard_page import legend, provenance
 from traps_pipeline.report.published_results import PublishedResults
-from traps_pipeline.report.tables.human_tables import said_by_people
+from traps_pipeline.report.tables.human_tables import people_notes
 from traps_pipeline.report.tables.table_columns import entries
 from traps_pipeline.report.terms import ARM_TITLES, MARKS, TITLES
 from traps_pipeline.report.writing import environment
@@ -213,7 +213,7 @@ def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_c
         "leaderboard": records(board),
         "robust": records(robust),
         "people": records(human_row),
-        "said": said_by_people(human_row, workspace.tables.read_all(PANEL_ERRORS)),
+        "said": people_notes(human_row, workspace.tables.read_all(PANEL_ERRORS)),
         "published": records(published.loc[:, ["model", "regime", "dataset", "epoch", *_PUBLISHED]]),
         "legend": legend(board, robust) if len(board) else {},
         "marks": MARKS,

@@ -43,7 +43,7 @@ def visual_textual(results: Results) -> Figure:
 def _draw_rates(axes: Axes, rates: pd.DataFrame) -> None:
     look = looks(rates["model"])
     axes.plot([0, 100], [0, 100], color=SOFT, linewidth=0.7, linestyle=(0, (4, 2.5)), zorder=1)
-    for row in rates.loc[_averaged(rates)].to_dict("records"):
+    for row in rates.loc[_average(rates)].to_dict("records"):
         colour, marker = look[row["model"]]
         axes.scatter(
             100 * row["visual"], 100 * row["textual"], s=22, marker=marker, facecolors=colour, edgecolors=colour,
@@ -54,7 +54,7 @@ def _draw_rates(axes: Axes, rates: pd.DataFrame) -> None:
     axes.set_title("above the line: textual voids are noticed more", weight="normal", size=7)
 
 
-def _averaged(rates: pd.DataFrame) -> pd.Series | pd.DataFrame:
+def _average(rates: pd.DataFrame) -> pd.Series | pd.DataFrame:
     """Return which rows pool a model's taxonomies, or are of its only taxonomy."""
     models = rates.loc[rates["taxonomy"] == "pooled", "model"]
     return rates["taxonomy"].eq("pooled") | ~rates["model"].isin(models)
@@ -62,7 +62,7 @@ def _averaged(rates: pd.DataFrame) -> pd.Series | pd.DataFrame:
 
 def _draw_families(axes: Axes, rates: pd.DataFrame) -> None:
     """Draw both rates as means over a family's models."""
-    averaged_rates = rates.loc[_averaged(rates)]
+    averaged_rates = rates.loc[_average(rates)]
     means = (
         averaged_rates.assign(family=averaged_rates["model"].map(family_of))
         .groupby("family")[["visual", "textual"]]

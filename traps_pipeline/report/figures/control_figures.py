@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.mechanism.directions import NULLS
 from traps_pipeline.protocol.datasets import DATASETS, SHORT
 from traps_pipeline.protocol.regimes import PROMPTING
-from traps_pipeline.report.figures.looks import arrow, frame_plane, from_to, legend_key
+from traps_pipeline.report.figures.looks import arrow, frame_plane, legend_key, range_text
 from traps_pipeline.report.result_frames import Results, datasets_of
 from traps_pipeline.report.tables.control_reports import beside
-from traps_pipeline.report.tables.inside_columns import SHORTCUTS, few, why
+from traps_pipeline.report.tables.inside_columns import SHORTCUTS, few_marks, why
 from traps_pipeline.report.tables.patching_tables import SITES
 from traps_pipeline.report.terms import TITLES
 from traps_pipeline.report.writing import (
@@ -58,7 +58,7 @@ def probe_baselines(results: Results) -> Figure:
         for ax, model in zip(axes, models, strict=True):
             _baselines(ax, rows.loc[rows["model"] == model])
             sides = rows.loc[rows["model"] == model, ["n_voids", "n_controls"]].astype(int).to_numpy()
-            ax.set_title(f"{plain(model)[:40]}, {from_to(sides.min(), sides.max())} items a side", size=7.5)
+            ax.set_title(f"{plain(model)[:40]}, {range_text(sides.min(), sides.max())} items a side", size=7.5)
             ax.set_ylabel("AUROC")
         handles = [legend_key("states, layer chosen without the target", INK, "o", "-")]
         looks = zip(_BASELINES.items(), COLOURS, strict=False)
@@ -183,7 +183,7 @@ def patching(results: Results) -> Figure:
             n = int(part["n"].max())
             if has_one_site:
                 ax.set_title(
-                    f"{plain(model)[:20]}: {TITLES[dataset].lower()}, into the {patched_side}, {counted(n, 'pair')}",
+                    f"{plain(model)[:20]}: {TITLES[dataset].lower()}, into the {patched_side}, {count_noun(n, 'pair')}",
                     size=7,
                 )
                 continue
@@ -191,7 +191,8 @@ def patching(results: Results) -> Figure:
                 ax.set_title(SITES[site], size=7.5)
             if place % across == 0:
                 ax.set_ylabel(
-                    f"{plain(model)[:20]}: {TITLES[dataset].lower()},\ninto the {patched_side}, {counted(n, 'pair')}",
+                    f"{plain(model)[:20]}: {TITLES[dataset].lower()},\n"
+                    f"into the {patched_side}, {count_noun(n, 'pair')}",
                     size=7,
                 )
         for ax in axes.flat[len(panels) :]:
@@ -250,8 +251,10 @@ def doses_among_nulls(results: Results) -> Figure:
             for ax, dataset in zip(line, datasets, strict=True):
                 part = of.loc[of["target"] == dataset]
                 _dose(ax, part, colour)
-                void_doses = part.loc[part["kind"] == "void"].assign(mark=few(part.loc[part["kind"] == "void"], "n"))
-                n = from_to(int(void_doses["n"].min()), int(void_doses["n"].max())) + max(void_doses["mark"])
+                void_doses = part.loc[part["kind"] == "void"].assign(
+                    mark=few_marks(part.loc[part["kind"] == "void"], "n")
+                )
+                n = range_text(int(void_doses["n"].min()), int(void_doses["n"].max())) + max(void_doses["mark"])
                 ranks = _p_values(results.nulls, str(model), str(directions), str(regime), dataset)
                 ax.set_title("\n".join([f"{SHORT[dataset]}, {directions}→{regime}", f"n {n}", *ranks]), size=6)
             line[0].set_ylabel(f"{plain(str(model))[:14]}\nabstained, %")

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 AXES = {"hp": "HP", "ii": "II", "hp_and_ii": "HP and II", "es": "ES", "doubt": "Doubt"}
 GOOD, BAD = "the more the better", "the less the better"  # two colour scales
 HATCHES = ("", "/////", "xxxx", ".....", "-----")
-MOST_MODELS = 12  # maximum legible columns of a heatmap on a page's width
+MAX_MODELS = 12  # maximum legible columns of a heatmap on a page's width
 
 
 def sub_scenarios(results: Results) -> Figure:
@@ -52,7 +52,7 @@ def sub_scenarios(results: Results) -> Figure:
     rows = rows.assign(order=rows["dataset"] != "occlusion").sort_values(
         ["order", "abs_rec", "sub_scenario"], ascending=[True, False, True]
     )
-    panels = _by_model(results, rows) or _means(rows)
+    panels = _model_panels(results, rows) or _means(rows)
     names = [plain(name).replace("_", " ") for name in rows["sub_scenario"]]
     with figure_style():
         figure = new_figure(PAGE_IN, 1.35 + 0.17 * len(rows))
@@ -75,13 +75,13 @@ class Panel:
     scale: str = GOOD
 
 
-def _by_model(results: Results, rows: pd.DataFrame) -> list[Panel]:
+def _model_panels(results: Results, rows: pd.DataFrame) -> list[Panel]:
     """Return the panels of standard and of guided, one column per model."""
     cells = results.sub_cells
     cells = cells.loc[cells["dataset"].isin(analyses.TAXONOMIES)]
     models_here = [model for model in load_models() if model in set(cells["model"])]
     video = [m for m in analyses.models_of(media="video", group="main") if m in models_here]
-    models = (video or models_here)[:MOST_MODELS]
+    models = (video or models_here)[:MAX_MODELS]
     panels = []
     for regime in PROMPTING:
         part = cells.loc[(cells["regime"] == regime) & cells["model"].isin(models)]

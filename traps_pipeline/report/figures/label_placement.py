@@ -25,7 +25,7 @@ class Label:
     colour: str
 
 
-def merged_labels(labels: Sequence[Label], axes: Axes) -> list[Label]:
+def merge_labels(labels: Sequence[Label], axes: Axes) -> list[Label]:
     """Join labels of coinciding points: one name per line, in a neutral colour."""
     size = np.array([np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())])
     result: list[Label] = []
@@ -48,8 +48,8 @@ def place_labels(axes: Axes, labels: Sequence[Label], markers: np.ndarray) -> No
 
     pixel = axes.figure.dpi / 72  # pixels a point: offsets are in points, boxes in pixels
     room = np.array([axes.bbox.extents])
-    obstacles = _around(axes.transData.transform(markers), 3 * pixel)
-    lines = _around(_along_lines(axes, pixel), 0.5 * pixel)
+    obstacles = _squares(axes.transData.transform(markers), 3 * pixel)
+    lines = _squares(_line_pixels(axes, pixel), 0.5 * pixel)
     offsets = _offsets()
     distance = np.hypot(*offsets.T)
     halo = [withStroke(linewidth=1.2, foreground="white")]
@@ -94,12 +94,12 @@ def _boxes(anchors: np.ndarray, offsets: np.ndarray, size: np.ndarray) -> np.nda
     return np.hstack([low, low + size])
 
 
-def _around(spots: np.ndarray, half: float) -> np.ndarray:
+def _squares(spots: np.ndarray, half: float) -> np.ndarray:
     """Return extents (n, 4) of squares around positions (n, 2)."""
     return np.hstack([spots - half, spots + half])
 
 
-def _along_lines(axes: Axes, step: float) -> np.ndarray:
+def _line_pixels(axes: Axes, step: float) -> np.ndarray:
     """Return pixels (n, 2), `step` apart, along the lines that join a model's points."""
     points = [np.empty((0, 2))]
     for line in axes.lines:

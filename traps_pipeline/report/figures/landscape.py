@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from traps_pipeline.protocol.regimes import BY_NAME, GUIDED, PROMPTING, REGIMES, STANDARD
-from traps_pipeline.report.figures.label_placement import LINES, Label, merged_labels, place_labels, short
+from traps_pipeline.report.figures.label_placement import LINES, Label, merge_labels, place_labels, short
 from traps_pipeline.report.figures.looks import arrow, family_of, frame_plane, legend_key, looks
 from traps_pipeline.report.result_frames import Results, datasets_of
 from traps_pipeline.report.terms import INCOMPLETE_MARK, TITLES
@@ -49,7 +49,7 @@ def landscape_figure(points: pd.DataFrame, scope: str) -> Figure:
         figure = new_figure(COLUMN_IN, 3.7)
         axes = figure.add_subplot()
         frame_plane(axes, points, f"Acc, {scope.lower()}", intervals=True)
-        labels = merged_labels(_draw_models(axes, points), axes)
+        labels = merge_labels(_draw_models(axes, points), axes)
         guided = points.loc[points["regime"] == GUIDED]
         _draw_frontier(axes, guided)
         _draw_rings(axes, guided)
@@ -81,7 +81,7 @@ def reasoning(results: Results) -> Figure:
         freeze_layout(figure)
         for axes, names, regime in zip(panels, labels, PROMPTING, strict=True):
             at = chain_points.loc[chain_points["regime"] == regime, ["j", "acc"]].to_numpy(float)
-            place_labels(axes, merged_labels(names, axes), at)
+            place_labels(axes, merge_labels(names, axes), at)
     return figure
 
 

@@ -104,6 +104,6 @@ def arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float], colo
     axes.annotate("", end, start, arrowprops=style, zorder=2.5, annotation_clip=False)
 
 
-def from_to(low: int, high: int) -> str:
+def range_text(low: int, high: int) -> str:
     """Return `5`, or `5 to 16`."""
     return f"{low}" if low == high else f"{low} to {high}"

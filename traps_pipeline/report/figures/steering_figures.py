@@ -11,7 +11,7 @@ import numpy as np
 from traps_pipeline.mechanism import effects
 from traps_pipeline.mechanism.transfer_paths import PATH_SETS, STEERING_PATHS, TRANSFER, TRANSFER_TYPES, path_name
 from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed, taxonomy_of, transfer_type
-from traps_pipeline.report.figures.looks import from_to, legend_key
+from traps_pipeline.report.figures.looks import legend_key, range_text
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.inside_columns import why
 from traps_pipeline.report.tables.probe_tables import best_layers
@@ -66,7 +66,7 @@ def probe_curves(results: Results) -> Figure:
         for line, model in zip(axes, models, strict=True):
             for ax, crossing in zip(line, CROSSING, strict=True):
                 _curves(ax, curves.loc[curves["model"] == model], crossing)
-                _shuffled_band(ax, rows.loc[(rows["analysis"] == "shuffled") & (rows["model"] == model)])
+                _draw_shuffled_band(ax, rows.loc[(rows["analysis"] == "shuffled") & (rows["model"] == model)])
                 ax.set_title(f"{plain(model)[:24]}: {crossing}", size=7.5)
             line[0].set_ylabel("AUROC on the target")
         for ax in axes[-1]:
@@ -96,7 +96,7 @@ def _curves(ax: Axes, curves: pd.DataFrame, crossing: str) -> None:
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
-def _shuffled_band(ax: Axes, rows: pd.DataFrame) -> None:
+def _draw_shuffled_band(ax: Axes, rows: pd.DataFrame) -> None:
     if not len(rows) or rows.loc[:, "layer"].isna().any():
         return
     at = rows.groupby("layer").agg(mean=("value", "mean"), spread=("spread", "mean"))
@@ -170,7 +170,7 @@ def dose_response(results: Results) -> Figure:
         pairs = axes.reshape(-1, 2)
         for pair, ((model, path_set), part) in zip(pairs, panels.items(), strict=False):
             for ax, side, sign in zip(pair, ("control", "void"), ("+α on controls", "−α on voids"), strict=True):
-                _mean_band(ax, _of_panel(results.shares, part, path_set, side))
+                _mean_band(ax, _panel_shares(results.shares, part, path_set, side))
                 _doses(ax, part, side, KEY_PATHS if path_set == "transfer" else STEERING_PATHS)
                 ax.set_title(f"{plain(model)[:20]}\n{sign}, {SETS[path_set]}{_answers(part, side)}", size=6.5)
                 ax.set_xlabel("α")
@@ -187,10 +187,10 @@ def dose_response(results: Results) -> Figure:
 def _answers(part: pd.DataFrame, side: str) -> str:
     """Return the number of answers behind a marker."""
     counts = part[f"{side}_n"].dropna().astype(int) if f"{side}_n" in part else []
-    return f", n {from_to(min(counts), max(counts))}" if len(counts) else ""
+    return f", n {range_text(min(counts), max(counts))}" if len(counts) else ""
 
 
-def _of_panel(shares: pd.DataFrame, part: pd.DataFrame, path_set: str, side: str) -> pd.DataFrame:
+def _panel_shares(shares: pd.DataFrame, part: pd.DataFrame, path_set: str, side: str) -> pd.DataFrame:
     """Return the shares over a panel's paths along void directions, by alpha."""
     side_shares = shares.loc[(shares["path_set"] == path_set) & (shares["side"] == side)]
     return side_shares.merge(part[[*effects.CELL, "kind"]].drop_duplicates()).sort_values("alpha")
@@ -263,13 +263,13 @@ def _heatmap(ax: Axes, part: pd.DataFrame) -> Any:
     values, texts = np.full((4, 4), np.nan), dict[tuple[int, ...], str]()
     for (row, one), (column, other) in product(enumerate(DATASETS), repeat=2):
         at = row_of.get((one, other), {})
-        cleaned = row < column and _known(at.get("disattenuated"))
+        cleaned = row < column and _is_known(at.get("disattenuated"))
         figure = at.get("split_half" if row == column else "disattenuated" if cleaned else "cosine")
-        if not _known(figure):
+        if not _is_known(figure):
             texts[row, column] = "1" if row == column else "–"
             continue
         values[row, column] = np.nan if row == column else figure
-        star = "*" if cleaned and _known(at["low"]) and at["low"] * at["high"] > 0 else ""
+        star = "*" if cleaned and _is_known(at["low"]) and at["low"] * at["high"] > 0 else ""
         texts[row, column] = f"{figure:.2f}{star}".replace("-", "−")
     image = ax.imshow(values, cmap="PuOr", vmin=-COSINE_SCALE, vmax=COSINE_SCALE)
     ax.set_facecolor("#f2f4f7")
@@ -283,5 +283,5 @@ def _heatmap(ax: Axes, part: pd.DataFrame) -> Any:
     return image
 
 
-def _known(value: Any) -> bool:
+def _is_known(value: Any) -> bool:
     return value is not None and value == value

@@ -17,9 +17,9 @@ from traps_pipeline.report.tables.inside_columns import (
     PROBE_KEY,
     SHORTCUTS,
     SIDES,
-    against,
+    best_baselines,
     by_features,
-    few,
+    few_marks,
     few_note,
     interval,
     path_names,
@@ -81,7 +81,7 @@ def _with_baselines(results: Results, probe: pd.DataFrame) -> pd.DataFrame:
     probe = (probe if len(results.baselines) else probe.head(0)).astype({"prompt": object})
     states = probe[[*PROBE_KEY, "layer", "value", "low", "high", "n_voids", "n_controls"]]
     table = states.merge(by_features(results), on=PROBE_KEY, how="left")
-    return table.assign(mark=few(table, "n_voids", "n_controls"))
+    return table.assign(mark=few_marks(table, "n_voids", "n_controls"))
 
 
 _PROBE = (LAYER, Column("value", "States", "fraction", mark="mark"), *interval())
@@ -155,7 +155,7 @@ def _dose(rows: pd.DataFrame) -> list[str]:
 
 def _nulls(results: Results) -> PrintedTable:
     rows = results.nulls
-    table_rows = rows.assign(step=_dose(rows), dataset=short_names(rows["target"]), mark=few(rows, "n"))
+    table_rows = rows.assign(step=_dose(rows), dataset=short_names(rows["target"]), mark=few_marks(rows, "n"))
     columns = [
         MODEL, DIRECTIONS, INFERENCE, Column("dataset", "Dataset"), LAYER, DOSE, Column("side", "Side"),
         Column("null", "Null"), Column("effect", "Effect, points", "percent", mark="mark"),
@@ -167,14 +167,14 @@ def _nulls(results: Results) -> PrintedTable:
         "effect: more abstention on controls (+), less on voids (−), against the unsteered answers of the same items",
         "nulls are orthogonal to the void direction and have its length; p = (1 + draws at least as large) / "
         "(1 + draws), one-sided, not corrected for the number of rows",
-        *_ahead(rows),
+        *_extent_beyond_nulls(rows),
         *few_note(table_rows),
     ]
     reason = why(results, "the paper has no such nulls")
     return PrintedTable("steering_nulls", "Void directions among their nulls", table_rows, columns, notes, reason)
 
 
-def _ahead(rows: pd.DataFrame) -> list[str]:
+def _extent_beyond_nulls(rows: pd.DataFrame) -> list[str]:
     """Return where the void direction exceeds at least 95 % of its nulls, in words."""
     targets = rows.loc[rows["target"] != "all"]
     if targets.empty:
@@ -199,7 +199,7 @@ def _pecs(results: Results) -> PrintedTable:
         step=_dose(rows),
         policy=[SIGNS[name] if dose else "not steered" for name, dose in zip(rows["signs"], rows["dose"], strict=True)],
         path=path_names(rows),
-        mark=few(rows, "n_controls", "n_voids"),
+        mark=few_marks(rows, "n_controls", "n_voids"),
     )
     columns = [
         MODEL, DIRECTIONS, INFERENCE, PATH, LAYER, Column("policy", "Signs"), DOSE,
@@ -250,7 +250,7 @@ def _gates(results: Results) -> pd.DataFrame:
     is_later = {f"{name}_later": rows[name].astype(object) != first for name, first in firsts.items()}
     rows = rows.assign(**is_later).sort_values(["model", "regime", *is_later], kind="stable", ignore_index=True)
     return rows.assign(
-        mark=few(rows, "n_controls", "n_voids"),
+        mark=few_marks(rows, "n_controls", "n_voids"),
         layer=rows["layer"].where(rows["layer"] >= 0),  # a mean over datasets has no layer of its own
         dataset=short_names(rows["target"]),
         sources=[SOURCE_NAMES.get(name, name) for name in rows["source"]],
@@ -294,7 +294,7 @@ def _gate_answerable(results: Results) -> PrintedTable:
     rows = rows.loc[~rows["target"].isin([*SHORT, "all"]) & (rows["source"] == DEFAULT_GATE["source"])]
     rows = rows.loc[rows["target"].isin([*SOURCE_WORDS]) & (rows["target"] != "chaotic_time_swapped")]
     rows = rows.drop_duplicates(["model", "features", "threshold", "target"])  # gates know no regime here
-    rows = rows.assign(what=[SOURCE_WORDS[name] for name in rows["target"]], mark=few(rows, "n_controls"))
+    rows = rows.assign(what=[SOURCE_WORDS[name] for name in rows["target"]], mark=few_marks(rows, "n_controls"))
     columns = [
         MODEL, Column("features", "Features"), Column("threshold", "Threshold"), Column("what", "Items"),
         Column("false_abs", "Abstained on %", "percent", mark="mark"),
@@ -335,7 +335,7 @@ def prompts(results: Results) -> pd.DataFrame:
             count_columns |= {count: (rows, count) for count in ("n_voids", "n_controls")}
     for name, (rows, count) in count_columns.items():
         table[name] = rows.groupby(keys)[count].min().reindex(table.index)
-    floor = against(results, "held_out").reset_index()
+    floor = best_baselines(results, "held_out").reset_index()
     floor = floor.loc[floor["source"] == floor["target"]].rename(columns={"target": "dataset"})
     return table.reset_index().merge(floor[[*keys, "raw", "raw_value", "noise", "noise_spread"]], on=keys, how="left")
 
@@ -344,8 +344,8 @@ def _prompts(results: Results) -> PrintedTable:
     rows = prompts(results)
     rows = rows.assign(
         name=short_names(rows["dataset"]),
-        said_mark=few(rows, "n_answered"),
-        probe_mark=few(rows, "n_voids", "n_controls"),
+        said_mark=few_marks(rows, "n_answered"),
+        probe_mark=few_marks(rows, "n_voids", "n_controls"),
     )
     columns = [
         MODEL, Column("name", "Dataset"), Column("said_standard", "AbsRec %, standard", "percent", mark="said_mark"),

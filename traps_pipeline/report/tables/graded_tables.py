@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from traps_pipeline.protocol.regimes import ANSWER_FROM, WRONG_COSTS
 from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.tables.table_columns import MODEL, REGIME, figure_with_interval, ordered
+from traps_pipeline.report.tables.table_columns import MODEL, REGIME, figure_with_interval, sort_rows
 from traps_pipeline.report.writing import Column, PrintedTable, fraction
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ def graded(results: Results) -> list[PrintedTable]:
         f"{name}_shown": [figure_with_interval(row, name, two_digits) for row in rows.to_dict("records")]
         for name in ("points", "brier")
     }
-    rows = ordered(rows.assign(**columns_of), ["regime", "model"])
+    rows = sort_rows(rows.assign(**columns_of), ["regime", "model"])
     columns = [
         MODEL, REGIME, Column("n_items", "Cuts", "count"), Column("n_missing", "Missing", "count"),
         Column("coverage", "Answers %", "percent"), Column("risk", "Wrong %", "percent"),

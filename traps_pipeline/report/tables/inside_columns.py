@@ -45,7 +45,7 @@ def why(results: Results, of_paper: str = "") -> str:
     return NO_MECHANISM if results.is_study and results.mechanism is None else results.why("probes")
 
 
-def few(rows: pd.DataFrame, *counts: str) -> list[str]:
+def few_marks(rows: pd.DataFrame, *counts: str) -> list[str]:
     """Return each row's mark: a dagger if a known count is below FEW, else empty."""
     import pandas as pd
 
@@ -88,7 +88,7 @@ def by_features(results: Results) -> pd.DataFrame:
     return by_feature.join(spread.rename("noise_spread")).reset_index().astype(dict.fromkeys(PROBE_KEY, object))
 
 
-def against(results: Results, analysis: str) -> pd.DataFrame:
+def best_baselines(results: Results, analysis: str) -> pd.DataFrame:
     """Return BESIDE by model, source and target: best raw input, margin and noise."""
     import pandas as pd
 

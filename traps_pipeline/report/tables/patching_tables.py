@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.tables.inside_columns import LAYER, few, few_note, interval, short_names
+from traps_pipeline.report.tables.inside_columns import LAYER, few_marks, few_note, interval, short_names
 from traps_pipeline.report.tables.table_columns import MODEL
 from traps_pipeline.report.writing import Column, PrintedTable
 
@@ -25,7 +25,7 @@ def patching(results: Results) -> list[PrintedTable]:
         name=short_names(table["dataset"]),
         where=[SITES.get(site, site) for site in table["site"]],
         place=[[*SITES].index(site) if site in SITES else len(SITES) for site in table["site"]],
-        mark=few(table, "n"),
+        mark=few_marks(table, "n"),
     )
     table = table.sort_values(["model", "name", "into", "place"], kind="stable", ignore_index=True)
     columns = [

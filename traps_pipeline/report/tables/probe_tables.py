@@ -20,10 +20,10 @@ from traps_pipeline.report.tables.inside_columns import (
     SHORTCUTS,
     SIDES,
     TYPE,
-    against,
     baseline_columns,
     baseline_notes,
-    few,
+    best_baselines,
+    few_marks,
     few_note,
     interval,
     short_names,
@@ -41,7 +41,12 @@ if TYPE_CHECKING:
 def probes(results: Results) -> list[PrintedTable]:
     """Return probes between datasets at best and chosen layers, Cf->Cf, and means."""
     pairs = _pairs(results)
-    tables = [_transfer(results, pairs), _confabulated(results, pairs), _means(results, pairs), _within_table(results)]
+    tables = [
+        _transfer(results, pairs),
+        _confabulated_table(results, pairs),
+        _means(results, pairs),
+        _within_table(results),
+    ]
     return [*tables, _layers(results), _catch(results)]
 
 
@@ -109,13 +114,13 @@ def _pairs(results: Results) -> pd.DataFrame:
     if not len(rows):
         return rows
     for prefix, analysis in BASELINES.items():
-        rows = rows.join(against(results, analysis).add_prefix(prefix), on=KEYS)
-    return _marked(rows)
+        rows = rows.join(best_baselines(results, analysis).add_prefix(prefix), on=KEYS)
+    return _with_marks(rows)
 
 
-def _marked(rows: pd.DataFrame) -> pd.DataFrame:
-    cf = few(rows, "cf_n_voids", "cf_n_controls")
-    return rows.assign(mark=few(rows, "best_n_voids", "best_n_controls"), cf_mark=cf)
+def _with_marks(rows: pd.DataFrame) -> pd.DataFrame:
+    cf = few_marks(rows, "cf_n_voids", "cf_n_controls")
+    return rows.assign(mark=few_marks(rows, "best_n_voids", "best_n_controls"), cf_mark=cf)
 
 
 def _transfer(results: Results, rows: pd.DataFrame) -> PrintedTable:
@@ -127,7 +132,7 @@ def _transfer(results: Results, rows: pd.DataFrame) -> PrintedTable:
         MODEL, PATH, TYPE, Column("best_layer", "Best layer", "count"),
         Column("best_value", "AUROC", "fraction", mark="mark"), *interval("best_"),
         Column("chosen_layer", "Chosen layer", "count"), Column("chosen_value", "AUROC there", "fraction"),
-        *_held_out(results), *baseline_columns(results), *([] if results.is_study else cf),
+        *_held_out_columns(results), *baseline_columns(results), *([] if results.is_study else cf),
         Column("best_n_voids", "Voids", "count"), Column("best_n_controls", "Controls", "count"),
     ]  # fmt: skip
     notes = [
@@ -142,12 +147,12 @@ def _transfer(results: Results, rows: pd.DataFrame) -> PrintedTable:
     return PrintedTable("probe_transfer", title, rows, columns, notes, why(results), dash=WHY_UNSHARED, deviation=DRAWS)
 
 
-def _confabulated(results: Results, pairs: pd.DataFrame) -> PrintedTable:
+def _confabulated_table(results: Results, pairs: pd.DataFrame) -> PrintedTable:
     rows = pairs.loc[pairs["cf_value"].notna()].reset_index(drop=True) if len(pairs) else pairs
     gap_notes = sorted({note for note in pairs["note"] if note}) if len(pairs) else []
     columns = [
         MODEL, PATH, TYPE, Column("cf_layer", "Best layer", "count"),
-        Column("cf_value", "Cf→Cf", "fraction", mark="cf_mark"), *interval("cf_"), *_held_out(results, "cf_"),
+        Column("cf_value", "Cf→Cf", "fraction", mark="cf_mark"), *interval("cf_"), *_held_out_columns(results, "cf_"),
         Column("cf_own_layer", "Cf’s own layer", "count"), Column("cf_own_value", "Cf→Cf there", "fraction"),
         *baseline_columns(results, "cf_"), Column("cf_n_voids", "Cf voids", "count"),
         Column("cf_n_controls", "Controls", "count"),
@@ -174,16 +179,19 @@ def _means(results: Results, rows: pd.DataFrame) -> PrintedTable:
         figures = [*(f"{name}_value" for name in PAIR_FIGURES), *baseline_names, "held_noise", "cf_held_noise"]
         sides = ("best_n_voids", "best_n_controls", "cf_n_voids", "cf_n_controls")
         by = (
-            dict[str, Any].fromkeys(figures, "mean") | {"raw": _listed, "cf_raw": _listed} | dict.fromkeys(sides, "min")
+            dict[str, Any].fromkeys(figures, "mean")
+            | {"raw": _names_by_frequency, "cf_raw": _names_by_frequency}
+            | dict.fromkeys(sides, "min")
         )
         groups = rows.groupby(["model", "transfer_type"], sort=False)
-        rows = _marked(groups.agg(by).assign(n_paths=groups.size()).reset_index())
+        rows = _with_marks(groups.agg(by).assign(n_paths=groups.size()).reset_index())
     columns = [
         MODEL, TYPE, Column("best_value", "AUROC", "fraction", mark="mark"),
         Column("chosen_value", "Chosen layer", "fraction", mark="mark"),
-        *_held_out(results), *baseline_columns(results),
+        *_held_out_columns(results), *baseline_columns(results),
         Column("cf_value", "Cf→Cf", "fraction", mark="cf_mark"),
-        Column("cf_own_value", "Cf→Cf, own layer", "fraction", mark="cf_mark"), *_held_out(results, "cf_", "Cf→Cf: "),
+        Column("cf_own_value", "Cf→Cf, own layer", "fraction", mark="cf_mark"),
+        *_held_out_columns(results, "cf_", "Cf→Cf: "),
         *baseline_columns(results, "cf_", "Cf→Cf: "), Column("n_paths", "Paths", "count"),
     ]  # fmt: skip
     notes = [*_shared_controls(results), *baseline_notes(results), *few_note(rows, "mark", "cf_mark")]
@@ -197,12 +205,12 @@ def _means(results: Results, rows: pd.DataFrame) -> PrintedTable:
     return PrintedTable("probe_means", title, rows, columns, notes, why(results), dash=WHY_UNSHARED, deviation=DRAWS)
 
 
-def _listed(names: pd.Series) -> str:
+def _names_by_frequency(names: pd.Series) -> str:
     """Return the names, each once, the most frequent first."""
     return ", ".join(name for name, _ in Counter(str(name) for name in names if name).most_common())
 
 
-def _held_out(results: Results, prefix: str = "", head: str = "") -> list[Column]:
+def _held_out_columns(results: Results, prefix: str = "", head: str = "") -> list[Column]:
     """Return columns of the held-out score and of the noise floor under its split."""
     if not results.is_study:
         return []
@@ -234,8 +242,8 @@ def _within_table(results: Results) -> PrintedTable:
     itself = rows.loc[(rows["analysis"] == "held_out") & (rows["source"] == rows["target"]) & rows["chosen"]]
     itself = itself[["model", "source", "target", "value", "low", "high", "n_voids", "n_controls"]]
     table = table.merge(itself.rename(columns={"value": "pooled"}), on=["model", "source"], how="left")
-    table = table.join(against(results, "held_out"), on=KEYS)
-    table = table.assign(dataset=short_names(table["source"]), mark=few(table, "n_voids", "n_controls"))
+    table = table.join(best_baselines(results, "held_out"), on=KEYS)
+    table = table.assign(dataset=short_names(table["source"]), mark=few_marks(table, "n_voids", "n_controls"))
     columns = [
         MODEL, Column("dataset", "Dataset"), Column("layer", "Best layer", "count"),
         Column("value", "AUROC", "fraction", mark="mark"),
@@ -268,7 +276,7 @@ def _catch(results: Results) -> PrintedTable:
     alarms = controls.agg(false_alarm=("value", "mean"), n_controls=("n_controls", "max"))
     table = table.join(alarms).reset_index()
     table = table.merge(_caught_beside(results), on=["model", "target", "sub_scenario"], how="left")
-    table = table.assign(dataset=short_names(table["target"]), mark=few(table, "n", "n_controls"))
+    table = table.assign(dataset=short_names(table["target"]), mark=few_marks(table, "n", "n_controls"))
     columns = [
         MODEL, Column("dataset", "Target"), Column("sub_scenario", "Sub-scenario"), LAYER,
         Column("rate", "Catch rate %", "percent", mark="mark"), Column("lowest", "lowest", "percent"),

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.mechanism import effects
 from traps_pipeline.mechanism.directions import KINDS
 from traps_pipeline.protocol.datasets import SHORT
@@ -21,7 +21,7 @@ from traps_pipeline.report.tables.inside_columns import (
     LAYER,
     PATH,
     TYPE,
-    few,
+    few_marks,
     interval,
     path_names,
     short_names,
@@ -53,7 +53,7 @@ def cosines(results: Results) -> list[PrintedTable]:
     halves = results.cosines.drop_duplicates(own_columns).loc[:, [*own_columns, "split_half"]]
     halves = halves.rename(columns={name: f"other_{name}" for name in ("prompt", "dataset", "split_half")})
     rows = rows.merge(halves, on=["model", "other_prompt", "other_dataset"], how="left")
-    rows = rows.assign(name=_named_directions(rows, ""), other=_named_directions(rows, "other_"))
+    rows = rows.assign(name=_direction_names(rows, ""), other=_direction_names(rows, "other_"))
     columns = [
         MODEL, LAYER, Column("name", "Direction"), Column("other", "Other"),
         Column("cosine", "Cosine", "fraction", 2), Column("disattenuated", "Disattenuated", "fraction", 2),
@@ -69,7 +69,7 @@ def cosines(results: Results) -> list[PrintedTable]:
     return [PrintedTable("cosines", "Cosines of void directions", rows, columns, notes, why(results))]
 
 
-def _named_directions(rows: pd.DataFrame, prefix: str) -> list[str]:
+def _direction_names(rows: pd.DataFrame, prefix: str) -> list[str]:
     pairs = zip(rows[f"{prefix}dataset"], rows[f"{prefix}prompt"], strict=True)
     return [f"{SHORT.get(dataset, dataset)}, {prompt}" for dataset, prompt in pairs]
 
@@ -161,13 +161,13 @@ def _domains(results: Results) -> PrintedTable:
 def _top(results: Results) -> PrintedTable:
     rows = effects.paths(results.effects)
     rows = rows.loc[(rows["kind"] == "void") & (rows["alpha"] == rows.groupby("model")["alpha"].transform("max"))]
-    rows = _named(rows)
+    rows = _with_names(rows)
     columns = [MODEL, DIRECTIONS, INFERENCE, PATH, TYPE, ALPHA, *_in_gaps(results), *_SIDES, *_counts(results)]
     return PrintedTable("steering_top", "Steering at the largest α", rows, columns, _cell_notes(results), why(results))
 
 
 def _dose(results: Results) -> PrintedTable:
-    rows = _named(effects.paths(results.effects))
+    rows = _with_names(effects.paths(results.effects))
     columns = [MODEL, DIRECTIONS, INFERENCE, KIND, PATH, LAYER, ALPHA, *_in_gaps(results)]
     for side in _SIDES:
         columns += [side, *(interval(f"{side.field}_", "percent") if results.is_study else ())]
@@ -215,10 +215,10 @@ def _cell_notes(results: Results) -> list[str]:
     counts = results.effects["n"].dropna().to_numpy(int)
     if not len(counts):
         return []
-    notes = [f"n = {counted(int(counts.max()), 'answer')} per cell at most, one per scenario"]
+    notes = [f"n = {count_noun(int(counts.max()), 'answer')} per cell at most, one per scenario"]
     return notes + [CELLS_NOTE] * bool(results.is_study and counts.min() < FEW)
 
 
-def _named(rows: pd.DataFrame) -> pd.DataFrame:
-    marks = {f"{side}_mark": few(rows, f"{side}_n") for side in ("control", "void") if f"{side}_n" in rows}
+def _with_names(rows: pd.DataFrame) -> pd.DataFrame:
+    marks = {f"{side}_mark": few_marks(rows, f"{side}_n") for side in ("control", "void") if f"{side}_n" in rows}
     return rows.assign(path=path_names(rows), **marks).reset_index(drop=True)

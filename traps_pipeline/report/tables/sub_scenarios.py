@@ -14,8 +14,8 @@ from traps_pipeline.report.tables.table_columns import (
     SHARES,
     N,
     epochs,
-    marked,
     marks,
+    with_marks,
     with_titles,
 )
 from traps_pipeline.report.terms import SIDE_OF
@@ -35,7 +35,7 @@ def occlusion_sub_scenarios(results: Results) -> list[PrintedTable]:
         Column("kind", "Sub-scenarios"), Column("n", "Number", "count"),
         Column("abs_rec", "AbsRec %, standard", "percent"), Column("guided_abs_rec", "AbsRec %, guided", "percent"),
     ]  # fmt: skip
-    notes = [epochs(rows), "unweighted means over sub-scenarios", f"hidden: {', '.join(analyses.HIDDEN)}"]
+    notes = [epochs(rows), "unweighted means over sub-scenarios", f"hidden: {', '.join(analyses.HIDDEN_SUB_SCENARIOS)}"]
     if results.is_study:
         columns += [N, MISSING]
     title = "Hidden sub-scenarios against the others"
@@ -68,7 +68,7 @@ def chaotic_sub_scenarios(results: Results) -> list[PrintedTable]:
 
 def _sub_rows(results: Results, taxonomy: str) -> pd.DataFrame:
     rows = results.sub_scenarios
-    rows = marked(rows.loc[rows["dataset"] == taxonomy].assign(incomplete=False))
+    rows = with_marks(rows.loc[rows["dataset"] == taxonomy].assign(incomplete=False))
     return rows.sort_values(["acc", "sub_scenario"], ignore_index=True)
 
 

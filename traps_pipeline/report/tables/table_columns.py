@@ -47,7 +47,7 @@ def cell_trace(row: Mapping[str, Any], field: str) -> SourceItems | None:
     return SourceItems(dataset if dataset in DATASETS else "", row["model"], row["regime"], side)
 
 
-def marked(rows: pd.DataFrame) -> pd.DataFrame:
+def with_marks(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the rows with `mark`: ‡ if incomplete, else † if items are missing."""
     incomplete = rows["incomplete"].eq(True).to_numpy(bool)
     missing = rows["n_missing"].fillna(0).to_numpy(float) > 0
@@ -59,7 +59,7 @@ def with_titles(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.assign(title=rows.loc[:, "dataset"].map(TITLES))
 
 
-def together(sides: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def combined_counts(sides: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return COUNTED of a comparison: fewest pairs and runs, sum of missing items."""
     if not sides:
         return dict.fromkeys(COUNTED)
@@ -68,7 +68,7 @@ def together(sides: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {**counts, "n_missing": missing, "incomplete": any(side["incomplete"] for side in sides)}
 
 
-def counted(rows: pd.DataFrame, entries: pd.DataFrame, sides: Sequence[Sequence[str]]) -> pd.DataFrame:
+def with_counts(rows: pd.DataFrame, entries: pd.DataFrame, sides: Sequence[Sequence[str]]) -> pd.DataFrame:
     """Return rows that compare entries, `marked` and with COUNTED.
 
     sides: their columns of model, regime, dataset.
@@ -77,8 +77,8 @@ def counted(rows: pd.DataFrame, entries: pd.DataFrame, sides: Sequence[Sequence[
 
     entry_of = {(e["model"], e["regime"], e["dataset"]): e for e in entries.to_dict("records")}
     keys = [[tuple(row[name] for name in side) for side in sides] for row in rows.to_dict("records")]
-    counts = [together([entry_of[key] for key in entry_keys if key in entry_of]) for entry_keys in keys]
-    return marked(rows.join(pd.DataFrame(counts, index=rows.index, columns=pd.Index(COUNTED))))
+    counts = [combined_counts([entry_of[key] for key in entry_keys if key in entry_of]) for entry_keys in keys]
+    return with_marks(rows.join(pd.DataFrame(counts, index=rows.index, columns=pd.Index(COUNTED))))
 
 
 def entries(results: Results) -> pd.DataFrame:
@@ -116,7 +116,7 @@ def epochs(rows: pd.DataFrame) -> str:
     return f"mixed epochs ({'; '.join([*parts, f'else {main_epoch}'])})"
 
 
-def printed(results: Results, rows: pd.DataFrame, columns: Sequence[Column]) -> list[Column]:
+def printed_columns(results: Results, rows: pd.DataFrame, columns: Sequence[Column]) -> list[Column]:
     """Return the columns to show: all for a study, for the paper those that it prints."""
     is_complete = results.is_study or not len(rows)
     return [c for c in columns if is_complete or c.field not in rows or not rows.loc[:, c.field].isna().all()]
@@ -127,7 +127,7 @@ def best_first(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.sort_values("pecs", ascending=False, na_position="last", ignore_index=True, kind="stable")
 
 
-def ordered(rows: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
+def sort_rows(rows: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
     """Return rows sorted by columns; datasets, regimes, models in their own order."""
     orders: dict[str, Sequence[str]] = {"dataset": [*DATASETS, "overall"], "regime": REGIMES, "model": [*load_models()]}
 

@@ -401,14 +401,14 @@ ORDER = Certificate(
 # --- occlusion --------------------------------------------------------------------------------------------------------
 
 
-def _first_hidden(pair: Pair) -> int:
+def _first_hidden_frame(pair: Pair) -> int:
     """Return the first evidence frame from which the void hides what decides."""
     return -(-pair.void_from // pair.control.frame_step)
 
 
 def _hidden(pair: Pair) -> Evidence:
     return {
-        "past_panel_px": pair.control.past_occluder.leaked(_first_hidden(pair)),
+        "past_panel_px": pair.control.past_occluder.leaked(_first_hidden_frame(pair)),
         "hidden_from_s": pair.void_from / pair.control.physics.fps,
     }
 
@@ -436,7 +436,11 @@ HIDDEN = Certificate(
 
 def _ablation(pair: Pair) -> Evidence:
     control = pair.control
-    return {"ablation_px": control.ablation_px(control.evidence_frames[_first_hidden(pair) :], control.concealed_geoms)}
+    return {
+        "ablation_px": control.ablation_px(
+            control.evidence_frames[_first_hidden_frame(pair) :], control.concealed_geoms
+        )
+    }
 
 
 def _judge_ablation(e: Evidence, claim: Claim) -> Failures:
@@ -737,7 +741,7 @@ def _closes(frame: int | None, physics: Physics) -> Evidence:
     return {"closes_s": frame / physics.fps, "looks_until_s": last_of_all(physics.n_frames, physics.fps) / physics.fps}
 
 
-def _closing(pair: Pair) -> Evidence:
+def _closing_evidence(pair: Pair) -> Evidence:
     control, fps = pair.control, pair.control.physics.fps
     if control.closing is None:
         no_reading = {"read_answer": None, "read_s": None, "closed_px": None, "closed_change_px": None}
@@ -783,7 +787,7 @@ CLOSING = Certificate(
         *(Number(name, kept=False) for name in ("closes_s", "looks_until_s", "read_answer")),
         *(Number(name) for name in ("read_s", "closed_px", "closed_change_px")),
     ),
-    measure=_closing,
+    measure=_closing_evidence,
     judge=_judge_closing,
 )
 
@@ -799,7 +803,7 @@ def _uncut(world: World) -> World:
     return replace(world, physics=physics, qpos=simulated(*compile_scene(world.family, world.params, physics), physics))
 
 
-def _other_settings(pair: Pair) -> list[str]:
+def _setting_differences(pair: Pair) -> list[str]:
     """Return the settings of a pair that its worlds, in this order, do not give."""
     worlds, seed = (pair.control, pair.other_world), pair.claim.seed
     full_worlds = [_uncut(world) for world in worlds]
@@ -824,7 +828,7 @@ def _exchange(pair: Pair) -> Evidence:
     return {
         "twin_commit_s": world.outcome.commit_frame / world.physics.fps,
         "twin_read_answer": None if world.closing is None else world.outcome_read.label,
-        "other_settings": _other_settings(exchanged) if is_exact else [],
+        "other_settings": _setting_differences(exchanged) if is_exact else [],
         "lost_exchanged": first_failure,
     }
 

@@ -53,7 +53,7 @@ def certify(spec: SceneSpec, qpos: np.ndarray, twin: np.ndarray, *, frame_step: 
     """
     start_s = time.process_time()
     pair = pair_of(spec, qpos, twin, frame_step=frame_step)
-    same_physics = _same_physics(pair)
+    same_physics = _is_same_physics(pair)
     failures: dict[str, str] = {}
     evidence_so_far: dict[str, Any] = {}
     for certificate in certificates_for(spec.void_kind):
@@ -87,7 +87,7 @@ def state_at_cut(qpos: np.ndarray, cut_frame: int) -> np.ndarray:
     return np.concatenate([last, last - previous_pose])
 
 
-def _same_physics(pair: Pair) -> bool:
+def _is_same_physics(pair: Pair) -> bool:
     try:
         return pair.control.same_physics
     except Rejected:  # the certificate `physics` says why

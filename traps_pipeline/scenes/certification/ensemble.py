@@ -114,7 +114,7 @@ class Futures:
         """Return a start, (nq,) float64, drawn around the first row. Raises Rejected."""
         if not 0 <= number < TRIED:
             raise Rejected(f"there is no start {number}; there are {TRIED}")
-        return self._prepared.starts[number]
+        return self._prepare.starts[number]
 
     def rollout(self, number: int) -> Rollout:
         """Return the future of one start, simulated here to its end. Raises Rejected."""
@@ -135,9 +135,9 @@ class Futures:
     def _count_after(self, cut: int, count: int, beyond: int) -> Counter[str | None]:
         import mujoco
 
-        model, control = self._prepared.model, self._control
+        model, control = self._prepare.model, self._control
         state, past_qpos = mujoco.MjData(model), np.empty((cut, model.nq))
-        state.qvel[:] = self._prepared.velocity
+        state.qvel[:] = self._prepare.velocity
         for i in range(cut):
             if i:
                 mujoco.mj_step(model, state, control.physics.substeps)
@@ -168,7 +168,7 @@ class Futures:
     def _settled_label(self, frames: np.ndarray) -> str | None:
         """Return the settled outcome of a trajectory (F, nq); None if undecided."""
         control = self._control
-        labels = control.family.outcome(replay(self._prepared.model, frames, control.physics), control.params).labels
+        labels = control.family.outcome(replay(self._prepare.model, frames, control.physics), control.params).labels
         return labels[-1] if last_run(labels) <= len(labels) - 1 - self._held_frames else None
 
     def _roll_all(self, numbers: range) -> list[Rollout]:
@@ -176,7 +176,7 @@ class Futures:
             return list(pool.map(self._roll, numbers))
 
     @cached_property
-    def _prepared(self) -> _Prepared:
+    def _prepare(self) -> _Prepared:
         import mujoco
 
         control = self._control
@@ -196,7 +196,7 @@ class Futures:
         """Simulate one start; give up if it parts before `first`, unless `to_end`."""
         import mujoco
 
-        control, camera_view = self._control, self._prepared
+        control, camera_view = self._control, self._prepare
         shown_geoms, outline = camera_view.shown, camera_view.silhouette
         data, scratch = mujoco.MjData(camera_view.model), mujoco.MjData(camera_view.model)
         data.qpos[:], data.qvel[:] = camera_view.starts[number], camera_view.velocity

@@ -172,7 +172,7 @@ class Certificate:
         return {n.name: n.stored(evidence[n.name]) for n in self.numbers if n.kept and n.name in evidence}
 
 
-def required(certificates: Iterable[Certificate], pair: Pair, evidence_so_far: Evidence) -> dict[str, Any]:
+def require_certificates(certificates: Iterable[Certificate], pair: Pair, evidence_so_far: Evidence) -> dict[str, Any]:
     """Return evidence extended by some certificates. Raises Rejected if one fails."""
     evidence = dict(evidence_so_far)
     for certificate in certificates:

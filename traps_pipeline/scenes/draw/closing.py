@@ -14,7 +14,7 @@ from dataclasses import asdict, replace
 from typing import Any
 
 from traps_pipeline.scenes.certification.certificates import CLOSING, LEGIBLE, ORDER, certificates_for
-from traps_pipeline.scenes.certification.evidence import Pair, VoidKind, required
+from traps_pipeline.scenes.certification.evidence import Pair, VoidKind, require_certificates
 from traps_pipeline.scenes.physics.simulate import swept_points
 from traps_pipeline.scenes.picture.camera import Closing, Occluder, fit_occluder
 from traps_pipeline.scenes.worlds.outcome import Rejected
@@ -28,19 +28,19 @@ def close_control(pair: Pair, seed: int, evidence: Mapping[str, Any]) -> tuple[P
     worlds = pair.control, pair.other_world
     for frame in moments(worlds[:1] if pair.control.occluder is None else worlds, seed):
         try:
-            return _certified(pair, Closing(frame, occluder_from(frame, *worlds)), evidence)
+            return _certify(pair, Closing(frame, occluder_from(frame, *worlds)), evidence)
         except Rejected:
             continue  # another moment may do
-    return _certified(pair, None, evidence)
+    return _certify(pair, None, evidence)
 
 
-def _certified(pair: Pair, closing: Closing | None, evidence: Mapping[str, Any]) -> tuple[Pair, dict[str, Any]]:
+def _certify(pair: Pair, closing: Closing | None, evidence: Mapping[str, Any]) -> tuple[Pair, dict[str, Any]]:
     """Return a pair whose control ends like this, and all evidence. Raises Rejected."""
     control, twin = replace(pair.control, closing=closing), replace(pair.other_world, closing=closing)
     ending = replace(pair, control=control, twin=twin)
     void_kind: VoidKind = "truncation" if control.occluder is None else "occluder"
     certificates = (LEGIBLE, ORDER, CLOSING, *certificates_for(void_kind, "worlds"))
-    return ending, required(certificates, ending, evidence)
+    return ending, require_certificates(certificates, ending, evidence)
 
 
 def record_of(pair: Pair) -> dict[str, Any] | None:

@@ -57,7 +57,7 @@ def draw_again(
     return _rewrite(released, name, _draw_record_again, workers, report, only)
 
 
-def relook_family(
+def redraw_looks(
     released: Path, name: str, workers: int | None = None, report: Callable[[str], None] = lambda _: None
 ) -> dict[str, str]:
     """Give a family's records the look of their draw, and measure their pixels again.
@@ -66,10 +66,10 @@ def relook_family(
     """
     looks = get_family(name).looks
     assert set(looks) <= set(STILL), f"{name}: looks in {', '.join(looks)}, of which some move the camera"
-    return _rewrite(released, name, _relook_record, workers, report)
+    return _rewrite(released, name, _redraw_look, workers, report)
 
 
-def reask_family(released: Path, name: str) -> list[str]:
+def redraw_questions(released: Path, name: str) -> list[str]:
     """Replace ill-posed questions that lose the certificate `words`; return the ids."""
     seed, changed_ids = load_tallies(released)[name].seed, list[str]()
     lines = (released / f"{name}.jsonl").read_text(encoding="utf-8").splitlines()
@@ -132,7 +132,7 @@ def _draw_record_again(job: _Job) -> Resolved | str:
     return Resolved(result.spec.model_copy(update=names), result.qpos, result.twin)
 
 
-def _relook_record(job: _Job) -> Resolved | str:
+def _redraw_look(job: _Job) -> Resolved | str:
     """Return a record with the look of its draw, or the certificate it then loses."""
     spec, folder, tally = job
     family, path = get_family(spec.family), folder / f"{spec.scenario_id}.npz"

@@ -22,7 +22,7 @@ from traps_pipeline.scenes.certification.certificates import (
     settled_answer,
 )
 from traps_pipeline.scenes.certification.ensemble import Cut, Futures, Rollout
-from traps_pipeline.scenes.certification.evidence import Claim, Evidence, Pair, VoidKind, required
+from traps_pipeline.scenes.certification.evidence import Claim, Evidence, Pair, VoidKind, require_certificates
 from traps_pipeline.scenes.draw.closing import close_control, record_of
 from traps_pipeline.scenes.draw.trim import trim_candidates
 from traps_pipeline.scenes.physics.kit import Family, Physics, Wording, params_to_dict
@@ -117,7 +117,7 @@ def _certify_some_length(
             )
             try:
                 pair = Pair(control, claim, futures_of(control, seed))
-                evidence = required(certificates_for(void_kind, "control"), pair, {})
+                evidence = require_certificates(certificates_for(void_kind, "control"), pair, {})
                 candidates = (
                     trim_candidates(_with_twin(pair, None, other_worlds[0])) if other_worlds else _at_latest_cut(pair)
                 )
@@ -142,7 +142,9 @@ def _first_certified(
     rejection = Rejected("there is no twin")
     for pair in candidates:
         try:
-            return close_control(pair, seed, required(certificates_for(void_kind, "void", "twin"), pair, evidence))
+            return close_control(
+                pair, seed, require_certificates(certificates_for(void_kind, "void", "twin"), pair, evidence)
+            )
         except Rejected as failure:
             rejection = failure  # the next one may hide more, or be alike
     raise rejection

@@ -25,7 +25,13 @@ from traps_pipeline.scenes.certification.certificates import settled_outcome
 from traps_pipeline.scenes.draw.likeness import excess_lookalike, frame_hash
 from traps_pipeline.scenes.draw.resolve import Resolved, resolve
 from traps_pipeline.scenes.family_registry import family_digest, family_names, fit_to_sample, get_family
-from traps_pipeline.scenes.parts.difficulty import USUAL, Difficulty, SceneDifficulty, draw_distractors, untakeable
+from traps_pipeline.scenes.parts.difficulty import (
+    DEFAULT_DIFFICULTY,
+    Difficulty,
+    SceneDifficulty,
+    draw_distractors,
+    unsupported_settings,
+)
 from traps_pipeline.scenes.parts.look import look_of_draw
 from traps_pipeline.scenes.parts.wording import draw_ill_posed
 from traps_pipeline.scenes.physics.kit import Family, Physics, Scene, Wording
@@ -35,7 +41,7 @@ from traps_pipeline.scenes.worlds.pace import LATEST_SHARE, out_of_pace, settles
 from traps_pipeline.scenes.worlds.shot import shown_points
 from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory, save_trajectory
 
-MOST_DRAWS = 40  # for each scenario wanted; a family that needs more is not worth its time
+MAX_DRAWS = 40  # for each scenario wanted; a family that needs more is not worth its time
 DRAWS = "draws.json"  # beside the records: how each family was drawn
 _MEASURED = re.compile(r"\d[\d.]*|'\w+'(?=\s)")  # numbers and answers in a reason, which differ from draw to draw
 _WORDED_DRAWS = 128  # questions by which the share of an answer is known
@@ -52,7 +58,7 @@ class Tally:
     rejected: Counter[str] = field(default_factory=Counter)
     file: str = ""
     look: list[str] = field(default_factory=list)
-    difficulty: Difficulty = USUAL
+    difficulty: Difficulty = DEFAULT_DIFFICULTY
 
 
 def load_tallies(released: Path) -> dict[str, Tally]:
@@ -71,11 +77,11 @@ def load_tallies(released: Path) -> dict[str, Tally]:
 
 def require_difficulty(names: Iterable[str], difficulty: Difficulty) -> None:
     """Raise TrapsError naming families that cannot be drawn with the settings."""
-    unsupported = {name: untakeable(get_family(name), difficulty) for name in names}
+    unsupported = {name: unsupported_settings(get_family(name), difficulty) for name in names}
     unsupported = {name: settings for name, settings in unsupported.items() if settings}
     if unsupported:
         advice = "; ".join(f"{name}: no --{', no --'.join(settings)}" for name, settings in sorted(unsupported.items()))
-        able = [name for name in family_names() if not untakeable(get_family(name), difficulty)]
+        able = [name for name in family_names() if not unsupported_settings(get_family(name), difficulty)]
         raise TrapsError(
             f"some families cannot be drawn like this ({advice}): name others with --families: {', '.join(able)}"
         )
@@ -105,7 +111,7 @@ class Draw:
     number: int
     closed: frozenset[str]
     look: tuple[str, ...] = ()
-    difficulty: Difficulty = USUAL
+    difficulty: Difficulty = DEFAULT_DIFFICULTY
 
 
 def sample_family(
@@ -115,7 +121,7 @@ def sample_family(
     released: Path,
     *,
     look: Collection[str] = (),
-    difficulty: Difficulty = USUAL,
+    difficulty: Difficulty = DEFAULT_DIFFICULTY,
     workers: int | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> Tally:
@@ -153,7 +159,7 @@ def sample_family(
         return _full_answers(answers, count, family, difficulty.longer)
 
     def jobs() -> Iterator[Draw]:
-        for number in range(tally.draws, MOST_DRAWS * count):
+        for number in range(tally.draws, MAX_DRAWS * count):
             yield Draw(name, seed, number, full_answers(), tuple(parts), difficulty)
 
     reported_kinds: set[str] = set()  # kinds of rejections that the report has
@@ -260,7 +266,7 @@ def save_tallies(released: Path, tallies: Mapping[str, Tally]) -> None:
     notes = dict[str, dict[str, Any]]()
     for name, tally in tallies.items():
         notes[name] = {**vars(tally), "rejected": dict(tally.rejected), "difficulty": tally.difficulty.settings()}
-        if tally.difficulty == USUAL:
+        if tally.difficulty == DEFAULT_DIFFICULTY:
             del notes[name]["difficulty"]
     write_text(released / DRAWS, json.dumps(notes, indent=1, sort_keys=True) + "\n")
 

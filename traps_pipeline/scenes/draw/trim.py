@@ -40,12 +40,12 @@ def must_hide(pair: Pair) -> np.ndarray:
         decisive = decisive_geoms(world.model, world.scene.decisive)
         with world.renderer(supersample=1) as renderer:  # a margin is left, and certificates judge
             frames = list(renderer.frames(world.qpos))
-            needed_mask |= _differing(frames, renderer.frames(world.qpos, without=world.scene.hidden))
-            needed_mask |= _differing(
+            needed_mask |= _differing_pixels(frames, renderer.frames(world.qpos, without=world.scene.hidden))
+            needed_mask |= _differing_pixels(
                 frames[settled_from:], renderer.frames(world.qpos[settled_from:], without=decisive)
             )
         videos.append(frames)
-    return needed_mask | _differing(*videos)
+    return needed_mask | _differing_pixels(*videos)
 
 
 def cut_to(occluder: Occluder, camera: Camera, needed: np.ndarray, margin_px: int) -> Occluder:
@@ -57,7 +57,7 @@ def cut_to(occluder: Occluder, camera: Camera, needed: np.ndarray, margin_px: in
     top, bottom = rows.min() - margin_px, rows.max() + 1 + margin_px
     ahead, across = _directions(occluder)
     corners = np.array([[x, y] for x in (left, right) for y in (top, bottom)], dtype=float)
-    plane_points = _on_plane(camera, corners, ahead, float(np.array(occluder.centre) @ ahead) - occluder.half[1])
+    plane_points = _plane_points(camera, corners, ahead, float(np.array(occluder.centre) @ ahead) - occluder.half[1])
     side, middle = plane_points @ across, float(np.array(occluder.centre) @ across)
     low, high = max(side.min(), middle - occluder.half[0]), min(side.max(), middle + occluder.half[0])
     height = min(float(plane_points[:, 2].max()), 2 * occluder.half[2])
@@ -67,7 +67,7 @@ def cut_to(occluder: Occluder, camera: Camera, needed: np.ndarray, margin_px: in
     return replace(occluder, centre=(x, y, half_size[2]), half=half_size)
 
 
-def _differing(frames: Iterable[np.ndarray], counterparts: Iterable[np.ndarray]) -> np.ndarray:
+def _differing_pixels(frames: Iterable[np.ndarray], counterparts: Iterable[np.ndarray]) -> np.ndarray:
     """Return where any frame differs from its counterpart, on the grid of 480x360."""
     mask = np.zeros((HEIGHT, WIDTH), bool)
     for frame, counterpart in zip(frames, counterparts, strict=True):
@@ -83,7 +83,7 @@ def _directions(occluder: Occluder) -> tuple[np.ndarray, np.ndarray]:
     return np.array([np.cos(azimuth), np.sin(azimuth), 0.0]), np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
 
 
-def _on_plane(camera: Camera, pixels: np.ndarray, ahead: np.ndarray, front: float) -> np.ndarray:
+def _plane_points(camera: Camera, pixels: np.ndarray, ahead: np.ndarray, front: float) -> np.ndarray:
     """Return where lines of sight through pixels (N, 2) meet an upright plane, (N, 3)."""
     right, up, forward = camera.axes()
     focal = HEIGHT / 2 / np.tan(np.radians(camera.fovy_deg) / 2)

@@ -30,7 +30,7 @@ STIFFNESS = 1.6  # of the spring that pulls the beam level, in torques of the ba
 LEVEL_M = 0.06  # the ends of a balanced beam differ less in height
 TIPPED_DEG = 5.0  # in the picture
 OVER = 0.75  # of the tilt that it starts with: a beam that turns so far does not come back
-PLAY, PLAIN = apart("red", "green", "blue", "cyan", "purple"), shuffled("wood", "grey")
+PLAY_COLOURS, PLAIN_COLOURS = apart("red", "green", "blue", "cyan", "purple"), shuffled("wood", "grey")
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,11 @@ class Params:
     """Parameters; lengths run from the pivot; at direction +1 the ball drops left."""
 
     direction: int = one_of(-1, 1)
-    ball_colour: str = PLAY()
-    beam_colour: str = PLAY()
-    counterweight_colour: str = PLAY()
-    shelf_colour: str = PLAIN()
-    board_colour: str = PLAIN()
+    ball_colour: str = PLAY_COLOURS()
+    beam_colour: str = PLAY_COLOURS()
+    counterweight_colour: str = PLAY_COLOURS()
+    shelf_colour: str = PLAIN_COLOURS()
+    board_colour: str = PLAIN_COLOURS()
     place: str = hidden("near", "even", "far")  # of the counterweight
     even_m: float = between(0.21, 0.24)  # where the counterweight keeps the ball in balance
     near_share: float = between(0.40, 0.50)  # of `even_m`, for the other two places

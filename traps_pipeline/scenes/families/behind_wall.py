@@ -33,8 +33,8 @@ TRAY_M = 0.02  # lower than the lane, so that no ball rolls back behind the wall
 WALL_M = 0.03
 SILL_M = 0.045
 BALL_COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
-PLAY = apart(*BALL_COLOURS, "black", fits=lambda ball, wall: ball != "black")
-PLAIN = shuffled("wood", "grey", "white", "black", without="wall_colour")
+PLAY_COLOURS = apart(*BALL_COLOURS, "black", fits=lambda ball, wall: ball != "black")
+PLAIN_COLOURS = shuffled("wood", "grey", "white", "black", without="wall_colour")
 
 
 def _windows(rng: np.random.Generator, so_far: Drawn) -> tuple[float, float]:
@@ -48,11 +48,11 @@ class Params:
     """Parameters; lengths run from the wall's start; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
-    ball_colour: str = PLAY()
-    wall_colour: str = PLAY()
-    lane_colour: str = PLAIN()
-    tray_colour: str = PLAIN()
-    block_colour: str = PLAIN()
+    ball_colour: str = PLAY_COLOURS()
+    wall_colour: str = PLAY_COLOURS()
+    lane_colour: str = PLAIN_COLOURS()
+    tray_colour: str = PLAIN_COLOURS()
+    block_colour: str = PLAIN_COLOURS()
     wall_m: float = between(0.82, 0.92)
     blocked: bool = hidden(False, True)  # whether the block lies across the lane
     speed_m_s: float = between(0.62, 0.78)

@@ -23,7 +23,7 @@ from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 FLOOR_M = 0.03  # top of the pad and of the tray
 WALL_HALF_M = 0.014
 LIVELY = 0.85  # share of its speed that a ball keeps on the lively pad
-PLAY, PLAIN = apart("red", "green", "blue", "yellow", "cyan", "purple"), shuffled("wood", "grey")
+PLAY_COLOURS, PLAIN_COLOURS = apart("red", "green", "blue", "yellow", "cyan", "purple"), shuffled("wood", "grey")
 
 
 @dataclass(frozen=True)
@@ -31,11 +31,11 @@ class Params:
     """Parameters; lengths run from the table's edge; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
-    ball_colour: str = PLAY()
-    wall_colour: str = PLAY()
-    pad_colour: str = PLAY()
-    board_colour: str = PLAIN()
-    table_colour: str = PLAIN()
+    ball_colour: str = PLAY_COLOURS()
+    wall_colour: str = PLAY_COLOURS()
+    pad_colour: str = PLAY_COLOURS()
+    board_colour: str = PLAIN_COLOURS()
+    table_colour: str = PLAIN_COLOURS()
     lively: bool = hidden(False, True)
     radius_m: float = between(0.045, 0.055)
     speed_m_s: float = between(0.50, 0.66)

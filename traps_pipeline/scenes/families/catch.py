@@ -26,7 +26,7 @@ GRAVITY = 9.81
 FLOOR_M = 0.02  # thickness of the pen's floor and of the basket's
 WALL_M = 0.012
 DEPTH_M = 0.17  # half of the pen's depth
-PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
+PLAY_COLOURS = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
 PARTS = ("ball", "pedestal", "basket")
 
 
@@ -49,9 +49,9 @@ class Params:
     direction: int = one_of(-1, 1)
     radius_m: float = between(0.068, 0.080)
     basket_half_m: float = drawn_by(_basket_half)
-    ball_colour: str = PLAY()
-    basket_colour: str = PLAY()
-    pedestal_colour: str = PLAY()
+    ball_colour: str = PLAY_COLOURS()
+    basket_colour: str = PLAY_COLOURS()
+    pedestal_colour: str = PLAY_COLOURS()
     pedestal_m: float = between(0.28, 0.42)  # height of the pedestal that the ball starts from
     speed_along_m_s: float = between(1.20, 1.40)
     speed_up_m_s: float = between(3.3, 3.8)

@@ -25,7 +25,10 @@ WALL_M = 0.012
 PEG_M = 0.008  # radius of the peg
 STILL_M = 0.01  # a ball that moves less than this any more is as good as at rest
 LIVELY = Surface(2e-5, sliding=0.02, solref=(-20000.0, -8.0))  # a ball that hands nearly all of its speed on
-PLAY, PLAIN = apart("red", "green", "blue", "yellow", "cyan", "purple"), shuffled("wood", "grey", "white")
+PLAY_COLOURS, PLAIN_COLOURS = (
+    apart("red", "green", "blue", "yellow", "cyan", "purple"),
+    shuffled("wood", "grey", "white"),
+)
 
 
 @dataclass(frozen=True)
@@ -33,12 +36,12 @@ class Params:
     """Parameters; lengths run from the ramp's upper end; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
-    striker_colour: str = PLAY()
-    row_colour: str = PLAY()
-    last_colour: str = PLAY()
-    box_colour: str = PLAY()
-    deck_colour: str = PLAIN()
-    ramp_colour: str = PLAIN()
+    striker_colour: str = PLAY_COLOURS()
+    row_colour: str = PLAY_COLOURS()
+    last_colour: str = PLAY_COLOURS()
+    box_colour: str = PLAY_COLOURS()
+    deck_colour: str = PLAIN_COLOURS()
+    ramp_colour: str = PLAIN_COLOURS()
     row: int = one_of(3, 4, longer=(5, 6))  # balls in the row, the last one included
     radius_m: float = between(0.046, 0.054)
     gap_m: float = between(0.030, 0.038)  # between two balls of the row

@@ -21,23 +21,23 @@ from traps_pipeline.scenes.parts.questions import left_or_right
 from traps_pipeline.scenes.parts.readings import Reading, still_from, top_m
 from traps_pipeline.scenes.parts.vary import apart, between, drawn_by, hidden, in_front, one_of, several_between
 from traps_pipeline.scenes.parts.vision import blobs, colour_mask, is_occluder, largest, track
-from traps_pipeline.scenes.physics.kit import AnswerableQuestion, Motion, Physics, Scene, listed
+from traps_pipeline.scenes.physics.kit import AnswerableQuestion, Motion, Physics, Scene, list_choices
 
 STOP_AT = 2.9  # where the post stops the kicked ball's centre: behind the occluder, out of the domino's reach
 PUSH = 0.10  # how far the stopped ball has pushed into either branch
 SIDES = ("left", "right")
 FLATTER = 1.3  # times as high for its width, at least, is a domino that stands beside one that lies
-PLAY = apart("red", "green", "blue", "yellow", "cyan", "purple")
+PLAY_COLOURS = apart("red", "green", "blue", "yellow", "cyan", "purple")
 
 
 @dataclass(frozen=True)
 class Params:
     """Parameters; unsuffixed lengths in domino heights; angles from the row."""
 
-    row_colour: str = PLAY()
-    ball_colour: str = PLAY()
-    left_colour: str = PLAY()
-    right_colour: str = PLAY()
+    row_colour: str = PLAY_COLOURS()
+    ball_colour: str = PLAY_COLOURS()
+    left_colour: str = PLAY_COLOURS()
+    right_colour: str = PLAY_COLOURS()
     branch: int = one_of(3, 4, longer=(5, 6))  # dominoes of either branch, the last one included
     height_m: float = between(0.17, 0.21)
     width: float = between(0.46, 0.52)
@@ -130,13 +130,13 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading(labels, float(np.abs(tops[-1] - p.height_m / 2).min()))
 
 
-def _aside(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
+def _draw_aside(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
     """Draw a question: what starts the fall, or what falls first."""
     choices = tuple(str(c) for c in rng.permutation([p.row_colour, p.ball_colour, p.left_colour, p.right_colour]))
     if rng.integers(2):
-        question = f"What colour is the ball that sets off the row of dominoes: {listed(choices)}?"
+        question = f"What colour is the ball that sets off the row of dominoes: {list_choices(choices)}?"
         return AnswerableQuestion(question, choices, p.ball_colour)
-    question = f"What colour is the domino that falls first: {listed(choices)}?"
+    question = f"What colour is the domino that falls first: {list_choices(choices)}?"
     return AnswerableQuestion(question, choices, p.row_colour)
 
 
@@ -193,7 +193,7 @@ FAMILY = scene_family(
         forms=["the {0} one", "{0} branch", "the {0} branch", "{1}", "{1} domino", "the {1} one"],
         colours=lambda p: (p.left_colour, p.right_colour),
     ),
-    asides=[_aside],
+    asides=[_draw_aside],
     observe=observe,
     foresee=foresee,
     look=look,

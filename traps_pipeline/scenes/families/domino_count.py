@@ -17,7 +17,7 @@ from traps_pipeline.scenes.parts import dominoes
 from traps_pipeline.scenes.parts.course import Course
 from traps_pipeline.scenes.parts.dominoes import Domino, Size
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import around, is_upper_half_in_place
+from traps_pipeline.scenes.parts.observers import is_upper_half_in_place, surrounding_slices
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, either, how_many, range_of
 from traps_pipeline.scenes.parts.readings import Reading, still_from, top_m
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, facing, is_longer, one_of
@@ -31,7 +31,7 @@ LONGER_RANGES: tuple[Ranges, ...] = (((1, 3), (4, 6), (7, 9)), ((2, 4), (5, 7), 
 UPRIGHT = 1.8  # times as high as wide is a domino that stands
 GIVES = 0.2  # of a domino's picture: so much of one changes that falls
 FALLEN = 0.6  # of a domino's height: a top below it belongs to a fallen domino
-PLAY = apart("red", "green", "blue", "yellow", "cyan", "purple")
+PLAY_COLOURS = apart("red", "green", "blue", "yellow", "cyan", "purple")
 
 
 def _ranges(rng: np.random.Generator, so_far: Drawn) -> Ranges:
@@ -53,9 +53,9 @@ class Params:
     """Parameters; unsuffixed lengths in domino heights; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
-    first_colour: str = PLAY()
-    second_colour: str = PLAY()
-    ball_colour: str = PLAY()
+    first_colour: str = PLAY_COLOURS()
+    second_colour: str = PLAY_COLOURS()
+    ball_colour: str = PLAY_COLOURS()
     ranges: tuple[tuple[int, int], ...] = drawn_by(_ranges, longer=True)
     height_m: float = between(0.17, 0.21)
     width: float = between(0.54, 0.66)
@@ -147,7 +147,8 @@ def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     if ranges is None:
         return None
     is_falling = [
-        not is_upper_half_in_place(frames, slots["second"], domino) or change[around(domino, 0.0)].mean() > GIVES
+        not is_upper_half_in_place(frames, slots["second"], domino)
+        or change[surrounding_slices(domino, 0.0)].mean() > GIVES
         for domino in dominoes
     ]
     return range_of(ranges, sum(is_falling))

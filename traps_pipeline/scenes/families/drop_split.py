@@ -15,7 +15,7 @@ import numpy as np
 
 from traps_pipeline.scenes.parts.course import SOFT, Course, Surface, part_colours
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import carried_on, round_blob
+from traps_pipeline.scenes.parts.observers import extrapolate, round_blob
 from traps_pipeline.scenes.parts.questions import Aside, choice_of, either, left_or_right
 from traps_pipeline.scenes.parts.readings import Reading, side_while
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, in_front, one_of, shuffled
@@ -30,7 +30,7 @@ FELT = Surface(0.004, sliding=0.6, solref=SOFT)
 FREE = ("green", "yellow", "orange", "cyan", "purple")  # the bins are red and blue
 SLANTS = 0.8, 3.0  # rows a column, of the ridge's edges in the picture
 EDGE_PX = 60  # least length of the edges of either side
-PLAY, PLAIN = apart(*FREE), shuffled("grey", "black", "white")
+PLAY_COLOURS, PLAIN_COLOURS = apart(*FREE), shuffled("grey", "black", "white")
 
 
 def _offset(rng: np.random.Generator, so_far: Drawn) -> float:
@@ -43,10 +43,10 @@ class Params:
     """Parameters; drift is in m/s to the right; cube_side +1 is right of the bins."""
 
     radius_m: float = between(0.068, 0.080)
-    ball_colour: str = PLAY()
-    cube_colour: str = PLAY()
-    wedge_colour: str = PLAIN()
-    back_colour: str = PLAIN()
+    ball_colour: str = PLAY_COLOURS()
+    cube_colour: str = PLAY_COLOURS()
+    wedge_colour: str = PLAIN_COLOURS()
+    back_colour: str = PLAIN_COLOURS()
     release_m: float = between(1.15, 1.35)  # height of the ball's centre in the first frame
     toss_m_s: float = between(2.0, 2.5)  # how fast it still rises then
     drift_m_s: float = between(-0.22, 0.22)
@@ -149,7 +149,7 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
 
 def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Predict the side of the ridge's top, seen by its edges, on which the ball lands."""
-    ball = carried_on([round_blob(frame, slots["ball"]) for frame in frames], 0.5)
+    ball = extrapolate([round_blob(frame, slots["ball"]) for frame in frames], 0.5)
     red, blue = (colour_mask(frames[0], colour) for colour in ("red", "blue"))
     bins = [largest(frames[0], colour) for colour in ("red", "blue")]
     if ball is None or bins[0] is None or bins[1] is None:

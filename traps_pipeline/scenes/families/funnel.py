@@ -25,8 +25,8 @@ from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, uniform
 FLOOR_M = 0.02  # thickness of the cup's floor
 WALL_M = 0.014
 DEPTH_M = 0.12  # half of the funnel's and the cup's depth
-PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
-PLAIN = shuffled("grey", "black", "white")
+PLAY_COLOURS = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
+PLAIN_COLOURS = shuffled("grey", "black", "white")
 PARTS = ("ball", "shelf", "cup")
 
 
@@ -44,11 +44,11 @@ class Params:
     """Parameters; the funnel is in the middle; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
-    ball_colour: str = PLAY()
-    cup_colour: str = PLAY()
-    shelf_colour: str = PLAY()
-    board_colour: str = PLAIN()
-    back_colour: str = PLAIN()
+    ball_colour: str = PLAY_COLOURS()
+    cup_colour: str = PLAY_COLOURS()
+    shelf_colour: str = PLAY_COLOURS()
+    board_colour: str = PLAIN_COLOURS()
+    back_colour: str = PLAIN_COLOURS()
     half_throat: float = THROATS()  # in ball radii: the hidden element
     other_half_throat: float = THROATS()  # what the twin has
     radius_m: float = between(0.058, 0.068)

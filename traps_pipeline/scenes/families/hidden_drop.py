@@ -26,19 +26,19 @@ WALL_M = 0.012
 COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
 EDGE_PX = 60  # least length of the plate's edges
 SLANTS = 0.36, 1.2  # rows a column, of the plate's edges in the picture
-PLAY, PLAIN = apart(*COLOURS), shuffled("wood", "grey", "white")
+PLAY_COLOURS, PLAIN_COLOURS = apart(*COLOURS), shuffled("wood", "grey", "white")
 
 
 @dataclass(frozen=True)
 class Params:
     """Parameters; direction +1 is right; at tilt +1 the plate sheds to the right."""
 
-    left_colour: str = PLAY()
-    right_colour: str = PLAY()
-    ball_colour: str = PLAY()
-    chute_colour: str = PLAIN()
-    board_colour: str = PLAIN()
-    plate_colour: str = PLAIN()
+    left_colour: str = PLAY_COLOURS()
+    right_colour: str = PLAY_COLOURS()
+    ball_colour: str = PLAY_COLOURS()
+    chute_colour: str = PLAIN_COLOURS()
+    board_colour: str = PLAIN_COLOURS()
+    plate_colour: str = PLAIN_COLOURS()
     direction: int = one_of(-1, 1)
     tilt: int = hidden(-1, 1)
     tilt_deg: float = between(30, 40)

@@ -29,7 +29,7 @@ from traps_pipeline.scenes.parts.vary import (
     shuffled,
 )
 from traps_pipeline.scenes.parts.vision import blobs, colour_mask
-from traps_pipeline.scenes.physics.kit import AnswerableQuestion, Motion, Physics, Scene, listed
+from traps_pipeline.scenes.physics.kit import AnswerableQuestion, Motion, Physics, Scene, list_choices
 
 DECK_M = 0.045  # height of the lanes; the tray lies lower, so that no ball rolls back into the tunnel
 TRAY_M = 0.015
@@ -37,8 +37,8 @@ ROUGH_BOARD_M = 0.10
 ARRIVING = 0.97  # share of its speed that a ball still has where the rough boards begin
 MIN_LEAD_S = 0.5  # a closer finish could fall between two sampled frames
 BALL_COLOURS = "red", "green", "blue", "yellow", "orange", "cyan", "purple"
-PLAY = apart(*BALL_COLOURS)
-PLAIN = shuffled("wood", "grey", "white")
+PLAY_COLOURS = apart(*BALL_COLOURS)
+PLAIN_COLOURS = shuffled("wood", "grey", "white")
 
 
 def _direction(rng: np.random.Generator, so_far: Drawn) -> int:
@@ -52,10 +52,10 @@ class Params:
     """Parameters by lane, front lane first; direction +1 is right."""
 
     direction: int = drawn_by(_direction, longer=True)
-    tunnel_colour: str = PLAIN()
-    deck_colour: str = PLAIN()
-    tray_colour: str = PLAIN()
-    colours: tuple[str, ...] = PLAY("lanes")
+    tunnel_colour: str = PLAIN_COLOURS()
+    deck_colour: str = PLAIN_COLOURS()
+    tray_colour: str = PLAIN_COLOURS()
+    colours: tuple[str, ...] = PLAY_COLOURS("lanes")
     speeds_m_s: tuple[float, ...] = several_between("lanes", 0.38, 0.48)
     starts_m: tuple[float, ...] = several_between("lanes", 0.04, 0.12)  # head start of each ball along its lane
     clear_lane: int = hidden_index("colours")  # the lane without a rough board
@@ -173,9 +173,9 @@ def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     return first[0] if len(first) == 1 else None
 
 
-def _how_many(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
+def _ask_count(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
     numbers = ("2", "3") if len(p.colours) < 4 else ("3", "4")
-    question = f"How many balls roll into the tunnel, {listed(numbers)}?"
+    question = f"How many balls roll into the tunnel, {list_choices(numbers)}?"
     return AnswerableQuestion(question, numbers, str(len(p.colours)))
 
 
@@ -194,7 +194,7 @@ FAMILY = scene_family(
     ),
     asides=[
         comes_from("From which side do the balls roll in, left or right?"),
-        _how_many,
+        _ask_count,
         choice_of(
             "Which ball rolls in the lane nearest to the camera, {choices}?",
             choices=lambda p: p.colours,

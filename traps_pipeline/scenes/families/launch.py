@@ -24,7 +24,7 @@ from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 FLOOR_M = 0.02
 BARRIER_HALF_M = 0.014
 CATCH = Surface(3e-3, solref=DEAD)  # of pit, tray and barrier
-PLAY, PLAIN = apart("red", "green", "blue", "yellow", "cyan", "purple"), shuffled("wood", "grey")
+PLAY_COLOURS, PLAIN_COLOURS = apart("red", "green", "blue", "yellow", "cyan", "purple"), shuffled("wood", "grey")
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,11 @@ class Params:
     """Parameters; lengths run from the ledge's end; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
-    ball_colour: str = PLAY()
-    barrier_colour: str = PLAY()
-    kicker_colour: str = PLAY()
-    slide_colour: str = PLAIN()
-    board_colour: str = PLAIN()
+    ball_colour: str = PLAY_COLOURS()
+    barrier_colour: str = PLAY_COLOURS()
+    kicker_colour: str = PLAY_COLOURS()
+    slide_colour: str = PLAIN_COLOURS()
+    board_colour: str = PLAIN_COLOURS()
     tall: bool = hidden(False, True)
     radius_m: float = between(0.045, 0.053)
     ledge_m: float = between(0.26, 0.34)

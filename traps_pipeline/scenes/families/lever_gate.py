@@ -25,7 +25,7 @@ STEP_M = 0.02  # the visible lane lies higher by this
 STEP_AT_M = 0.07
 GAP_M = 0.012  # under the shut gate
 GATE_HALF_M = 0.013
-PLAY, PLAIN = apart("red", "green", "blue", "yellow", "cyan", "purple"), shuffled("wood", "grey")
+PLAY_COLOURS, PLAIN_COLOURS = apart("red", "green", "blue", "yellow", "cyan", "purple"), shuffled("wood", "grey")
 
 
 @dataclass(frozen=True)
@@ -33,11 +33,11 @@ class Params:
     """Parameters; lengths run from the occluder's edge; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
-    ball_colour: str = PLAY()
-    gate_colour: str = PLAY()
-    counterweight_colour: str = PLAY()
-    lane_colour: str = PLAIN()
-    board_colour: str = PLAIN()
+    ball_colour: str = PLAY_COLOURS()
+    gate_colour: str = PLAY_COLOURS()
+    counterweight_colour: str = PLAY_COLOURS()
+    lane_colour: str = PLAIN_COLOURS()
+    board_colour: str = PLAIN_COLOURS()
     held_open: bool = hidden(False, True)  # whether the counterweight sits far out
     radius_m: float = between(0.043, 0.050)
     speed_m_s: float = between(0.55, 0.72)

@@ -16,7 +16,15 @@ from typing import Any
 import cv2
 import numpy as np
 
-from traps_pipeline.scenes.parts.board import WALL_M, Board, looking_on, peg_rows, place, round_ball, turned
+from traps_pipeline.scenes.parts.board import (
+    WALL_M,
+    Board,
+    camera_elevation,
+    peg_rows,
+    place,
+    round_ball,
+    turn_quaternion,
+)
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.questions import NUMBERS, Filled, Question, choice_of, either
 from traps_pipeline.scenes.parts.readings import Reading
@@ -30,7 +38,7 @@ from traps_pipeline.scenes.physics.kit import (
     View,
     add_box,
     distinct_colours,
-    listed,
+    list_choices,
     uniform,
 )
 
@@ -100,7 +108,7 @@ class Params:
     ball_colours: tuple[str, ...] = drawn_by(_ball_colours)
     slope_deg: float = between(10, 14)  # of the shelves
     azimuth_deg: float = between(86, 94)
-    elevation_deg: float = looking_on(-6, 6)
+    elevation_deg: float = camera_elevation(-6, 6)
 
     @property
     def width_m(self) -> float:
@@ -188,7 +196,7 @@ def _add_shelf(board: Board, p: Params, side: int) -> None:
         board.deep / 2,
     )
     shelf = add_box(board.body, f"shelf_{side}", centre, (half_length, WALL_M, board.deep / 2), TRIM[p.board_colour])
-    shelf.friction, shelf.quat = list(FRICTION), turned(side * slope, 3)
+    shelf.friction, shelf.quat = list(FRICTION), turn_quaternion(side * slope, 3)
 
 
 def _start(p: Params, ball: int) -> tuple[float, float]:
@@ -215,7 +223,7 @@ def _counts(p: Params, rng: np.random.Generator) -> Filled:
     for label, number in zip(LABELS, NUMBERS, strict=False):
         noun = "ball" if label == "1" else "balls"
         aliases |= dict.fromkeys((number, f"{label} {noun}", f"{number} {noun}"), label)
-    return Filled(LABELS, aliases, {"choices": listed(LABELS), "zone": p.zone_colours[p.asked]})
+    return Filled(LABELS, aliases, {"choices": list_choices(LABELS), "zone": p.zone_colours[p.asked]})
 
 
 LAST_PEGS = 0.45  # of the board's width above the zones: so low a ball has the last rows of pegs before it
@@ -228,13 +236,13 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     grounds = {colour: _ground(frames[-1], colour) for colour in ZONE_COLOURS}
     colours = sorted({colour for pool in BALL_COLOURS.values() for colour in pool})
     balls = [round_ball(frames[-1], colour) for colour in colours]
-    homes = [_home(ball, grounds) or _above(ball, grounds) for ball in balls if ball is not None]
+    homes = [_zone_of(ball, grounds) or _zone_below(ball, grounds) for ball in balls if ball is not None]
     if len(homes) != BALLS or None in homes:
         return None
     return str(homes.count(slots["zone"]))
 
 
-def _above(ball: Blob, grounds: Mapping[str, np.ndarray | None]) -> str | None:
+def _zone_below(ball: Blob, grounds: Mapping[str, np.ndarray | None]) -> str | None:
     """Return the colour of the zone that a ball is above; None if far above."""
     outlines = {colour: ground[:, 0].astype(float) for colour, ground in grounds.items() if ground is not None}
     if len(outlines) < 2:
@@ -260,7 +268,7 @@ def _ground(frame: np.ndarray, colour: str) -> np.ndarray | None:
     return cv2.convexHull(np.concatenate(regions))
 
 
-def _home(ball: Blob, grounds: Mapping[str, np.ndarray | None]) -> str | None:
+def _zone_of(ball: Blob, grounds: Mapping[str, np.ndarray | None]) -> str | None:
     """Return the colour of the zone that a ball's centre lies in."""
     zones_around = (
         c for c, g in grounds.items() if g is not None and cv2.pointPolygonTest(g, (ball.x, ball.y), False) > 0

@@ -15,7 +15,7 @@ import numpy as np
 
 from traps_pipeline.scenes.parts.course import Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import AHEAD, carried_on
+from traps_pipeline.scenes.parts.observers import AHEAD, extrapolate
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
 from traps_pipeline.scenes.parts.readings import Reading, top_m, yes_while
 from traps_pipeline.scenes.parts.vary import apart, between, facing, hidden, one_of, shuffled
@@ -30,7 +30,7 @@ PEG_DOWN = 0.62  # height of the peg below the pivot, as a share of the pendulum
 PEG_RADIUS_M = 0.012
 ROD_RADIUS_M = 0.008
 GIVES_PX = 2.0  # of a block that is struck
-PLAY, PLAIN = apart("red", "green", "blue", "cyan", "purple"), shuffled("wood", "grey")
+PLAY_COLOURS, PLAIN_COLOURS = apart("red", "green", "blue", "cyan", "purple"), shuffled("wood", "grey")
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,11 @@ class Params:
     """Parameters; lengths run from the occluder's edge; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
-    ball_colour: str = PLAY()
-    bob_colour: str = PLAY()
-    block_colour: str = PLAY()
-    lane_colour: str = PLAIN()
-    board_colour: str = PLAIN()
+    ball_colour: str = PLAY_COLOURS()
+    bob_colour: str = PLAY_COLOURS()
+    block_colour: str = PLAY_COLOURS()
+    lane_colour: str = PLAIN_COLOURS()
+    board_colour: str = PLAIN_COLOURS()
     peg_stops: bool = hidden(False, True)  # whether the peg sticks out just before the rod
     radius_m: float = between(0.046, 0.054)  # of the ball and of the bob
     speed_m_s: float = between(0.75, 0.95)
@@ -146,7 +146,7 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
 def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Predict a fall: the block gives way, or the bob is about to strike it."""
     first, last = largest(frames[0], slots["block"], 80), largest(frames[-1], slots["block"], 80)
-    bob = carried_on(track(frames, slots["bob"], 80), AHEAD)
+    bob = extrapolate(track(frames, slots["bob"], 80), AHEAD)
     if first is None or last is None or bob is None:
         return None
     gives_way = abs(last.x - first.x) + abs(last.box[2] - first.box[2]) > GIVES_PX

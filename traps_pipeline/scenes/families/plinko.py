@@ -14,13 +14,22 @@ from typing import Any
 import cv2
 import numpy as np
 
-from traps_pipeline.scenes.parts.board import WALL_M, Board, looking_on, peg_rows, place, round_ball
+from traps_pipeline.scenes.parts.board import WALL_M, Board, camera_elevation, peg_rows, place, round_ball
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.questions import NUMBERS, Filled, Question, colour_from, either
 from traps_pipeline.scenes.parts.readings import Reading
 from traps_pipeline.scenes.parts.vary import Drawn, between, chance, drawn_by, one_of, together
 from traps_pipeline.scenes.parts.wording import choices_in
-from traps_pipeline.scenes.physics.kit import Inventory, Motion, Physics, Scene, View, distinct_colours, listed, uniform
+from traps_pipeline.scenes.physics.kit import (
+    Inventory,
+    Motion,
+    Physics,
+    Scene,
+    View,
+    distinct_colours,
+    list_choices,
+    uniform,
+)
 
 APRON_M = 0.175  # strip below the buckets that carries their numbers
 BUCKET_M = 0.16  # length of the walls between the buckets
@@ -79,7 +88,7 @@ class Params:
     pushes_m_s: tuple[float, ...] = BALLS()  # sideways speed
     rises_m: tuple[float, ...] = BALLS()  # how far up the board the throw carries
     azimuth_deg: float = between(86, 94)
-    elevation_deg: float = looking_on(-6, 6)
+    elevation_deg: float = camera_elevation(-6, 6)
 
     @property
     def pitch_m(self) -> float:
@@ -168,7 +177,7 @@ def _numbers(p: Params, rng: np.random.Generator) -> Filled:
     for n, word, ordinal in zip(labels, NUMBERS[1:], ORDINALS, strict=False):
         forms = (word, f"bucket {n}", f"bucket {word}", f"number {n}", f"{ordinal} bucket", f"bucket number {n}")
         aliases |= dict.fromkeys(forms, n)
-    return Filled(labels, aliases, {"choices": listed(labels), "ball": p.ball_colours[0]})
+    return Filled(labels, aliases, {"choices": list_choices(labels), "ball": p.ball_colours[0]})
 
 
 # In lengths of the apron's lower edge, which is as long as the board is wide (1.18 to 1.43 m): a ball that is so far

@@ -22,16 +22,16 @@ from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 BOARD_M = 0.016  # thickness of the ramp
 WALL_M = 0.012
 BALLS = ("green", "yellow", "orange", "cyan", "purple")  # the bins are red and blue
-PLAIN = shuffled("wood", "grey", "black")
+PLAIN_COLOURS = shuffled("wood", "grey", "black")
 
 
 @dataclass(frozen=True)
 class Params:
     """Parameters; y runs back from the table's front edge, x right from its middle."""
 
-    ramp_colour: str = PLAIN()
-    table_colour: str = PLAIN()
-    deflector_colour: str = PLAIN()
+    ramp_colour: str = PLAIN_COLOURS()
+    table_colour: str = PLAIN_COLOURS()
+    deflector_colour: str = PLAIN_COLOURS()
     deflects: str = hidden("left", "right")
     angle_deg: float = between(40, 50)  # between the deflector and the ball's way
     deflector_m: float = between(0.13, 0.15)  # half its length

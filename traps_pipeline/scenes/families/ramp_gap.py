@@ -20,7 +20,7 @@ from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, uniform
 BOARD_M = 0.016  # thickness of ramp and board
 WALL_M = 0.012
 COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
-PLAY, PLAIN = apart(*COLOURS), shuffled("wood", "grey", "black")
+PLAY_COLOURS, PLAIN_COLOURS = apart(*COLOURS), shuffled("wood", "grey", "black")
 
 
 @dataclass(frozen=True)
@@ -28,10 +28,10 @@ class Params:
     """Parameters; lengths run from the ramp's foot; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
-    ball_colour: str = PLAY()
-    box_colour: str = PLAY()
-    ramp_colour: str = PLAIN()
-    deck_colour: str = PLAIN()
+    ball_colour: str = PLAY_COLOURS()
+    box_colour: str = PLAY_COLOURS()
+    ramp_colour: str = PLAIN_COLOURS()
+    deck_colour: str = PLAIN_COLOURS()
     radius_m: float = between(0.045, 0.054)
     gap_open: bool = hidden(False, True)
     slope_deg: float = between(11, 18)

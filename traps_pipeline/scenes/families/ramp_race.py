@@ -20,7 +20,7 @@ from traps_pipeline.scenes.parts.ramp import Ramp
 from traps_pipeline.scenes.parts.readings import Reading, first_past
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, hidden, in_front
 from traps_pipeline.scenes.parts.vision import Blob, is_at_rest
-from traps_pipeline.scenes.physics.kit import AnswerableQuestion, Motion, Physics, Scene, listed, uniform
+from traps_pipeline.scenes.physics.kit import AnswerableQuestion, Motion, Physics, Scene, list_choices, uniform
 
 BOARD_M = 0.016  # thickness of a ramp
 WALL_M = 0.012
@@ -28,9 +28,9 @@ ROUGH_M = 0.16  # length of the rough board
 ARRIVING = 0.86  # share of its energy that a ball still has after the foot of the ramp, as measured
 MIN_LEAD_S = 0.35  # a closer finish could fall between two sampled frames
 BALLS = ("ball_0", "ball_1")
-SOON = 2.0  # frames until the first ball is in the tray
+FRAMES_AHEAD = 2.0  # frames until the first ball is in the tray
 BALL_COLOURS = "red", "green", "blue", "yellow", "orange", "cyan", "purple"
-PLAY = apart(*BALL_COLOURS)
+PLAY_COLOURS = apart(*BALL_COLOURS)
 
 
 def _tray_colour(rng: np.random.Generator, so_far: Drawn) -> str:
@@ -55,7 +55,7 @@ def _starts(rng: np.random.Generator, so_far: Drawn) -> tuple[float, float]:
 class Params:
     """Parameters; pairs are left and right track; y runs back from the tray's front."""
 
-    colours: tuple[str, str] = PLAY(2)
+    colours: tuple[str, str] = PLAY_COLOURS(2)
     tray_colour: str = drawn_by(_tray_colour)
     ramp_m: float = between(0.60, 0.70)
     starts_m: tuple[float, float] = drawn_by(_starts)  # from the foot of the ramp up along it to where each ball starts
@@ -149,9 +149,9 @@ def _higher_or_side(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
     choices = tuple(str(c) for c in rng.permutation(p.colours))
     if rng.integers(2):
         higher = p.colours[int(np.argmax(p.starts_m))]
-        return AnswerableQuestion(f"Which ball starts higher up on its ramp, {listed(choices)}?", choices, higher)
+        return AnswerableQuestion(f"Which ball starts higher up on its ramp, {list_choices(choices)}?", choices, higher)
     side = int(rng.integers(2))
-    question = f"Which ball rolls down the {('left', 'right')[side]} ramp, {listed(choices)}?"
+    question = f"Which ball rolls down the {('left', 'right')[side]} ramp, {list_choices(choices)}?"
     return AnswerableQuestion(question, choices, p.colours[side])
 
 
@@ -177,7 +177,7 @@ def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
         ys = [ball.y + ball.box[3] / 2 for ball in path if ball is not None]
         if len(ys) == len(path) == 3:
             step, gain = ys[2] - ys[1], ys[2] - 2 * ys[1] + ys[0]
-            lower[colour] = ys[2] + SOON * step + SOON * (SOON + 1) / 2 * gain
+            lower[colour] = ys[2] + FRAMES_AHEAD * step + FRAMES_AHEAD * (FRAMES_AHEAD + 1) / 2 * gain
     return max(lower, key=lambda colour: lower[colour]) if len(lower) == 2 else None
 
 

@@ -26,8 +26,8 @@ TRACK_M = 0.04  # height of the track
 WALL_M = 0.014
 LINE_M = 0.035  # width of a painted line
 STILL_M = 0.003  # a ball that moves less than this any more is at rest
-PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
-PLAIN = shuffled("wood", "grey", "white")
+PLAY_COLOURS = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
+PLAIN_COLOURS = shuffled("wood", "grey", "white")
 PARTS = ("ball", "start", "line")
 
 
@@ -36,11 +36,11 @@ class Params:
     """Parameters; lengths run from the track's beginning; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
-    ball_colour: str = PLAY()
-    start_colour: str = PLAY()  # of the line outside the occluder
-    line_colour: str = PLAY()
-    track_colour: str = PLAIN()
-    wall_colour: str = PLAIN()
+    ball_colour: str = PLAY_COLOURS()
+    start_colour: str = PLAY_COLOURS()  # of the line outside the occluder
+    line_colour: str = PLAY_COLOURS()
+    track_colour: str = PLAIN_COLOURS()
+    wall_colour: str = PLAIN_COLOURS()
     radius_m: float = between(0.048, 0.058)
     rough: bool = hidden(False, True)
     speed_m_s: float = between(0.55, 0.80)

@@ -17,10 +17,10 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from traps_pipeline.scenes.parts.board import WALL_M, Board, looking_on, peg_rows, place, turned
+from traps_pipeline.scenes.parts.board import WALL_M, Board, camera_elevation, peg_rows, place, turn_quaternion
 from traps_pipeline.scenes.parts.course import Surface
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import AHEAD, carried_on
+from traps_pipeline.scenes.parts.observers import AHEAD, extrapolate
 from traps_pipeline.scenes.parts.questions import Filled, Question, choice_of, either
 from traps_pipeline.scenes.parts.readings import Reading, turns_deg
 from traps_pipeline.scenes.parts.vary import Drawn, between, chance, drawn_by, one_of, several_between, shuffled
@@ -33,7 +33,7 @@ from traps_pipeline.scenes.physics.kit import (
     Scene,
     View,
     add_box,
-    listed,
+    list_choices,
     rgba,
     uniform,
 )
@@ -150,7 +150,7 @@ class Params:
     crate_colours: tuple[str, ...] = shuffled(*CRATES)("crates")
     beside_m: float = between(-0.45, 0.45)  # so much more of the floor is in view to the right, or to the left
     azimuth_deg: float = between(82, 98)
-    elevation_deg: float = looking_on(-10, 6)
+    elevation_deg: float = camera_elevation(-10, 6)
 
     @property
     def width_m(self) -> float:
@@ -226,7 +226,7 @@ def _add_funnel(board: Board, p: Params, colour: str) -> Callable[[float, float]
         bar = board.block(name, (-1e-3, 1e-3), (-1e-3, 1e-3), (0, board.deep), colour)
         bar.pos = [float(middle[0]), float(middle[1]), board.deep / 2]
         bar.size = [float(np.hypot(*along)) / 2, WALL_M / 2, board.deep / 2]
-        bar.quat = turned(math.atan2(along[1], along[0]), 3)
+        bar.quat = turn_quaternion(math.atan2(along[1], along[0]), 3)
         SLICK.on(bar)
 
     def has_room(across: float, up: float) -> bool:
@@ -292,7 +292,7 @@ def _places(p: Params, rng: np.random.Generator) -> Filled:
     aliases = {f.format(*side): side[0] for side in (("left", "red"), ("right", "blue")) for f in forms}
     forms = ("other", "tray", "grey", "grey tray", "side tray", "in a grey tray", "in the grey tray")
     aliases |= dict.fromkeys(forms, "elsewhere") | {text: label for label, text in CHOICES.items()}
-    return Filled(tuple(CHOICES), aliases, {"choices": listed([CHOICES[str(label)] for label in order])})
+    return Filled(tuple(CHOICES), aliases, {"choices": list_choices([CHOICES[str(label)] for label in order])})
 
 
 PAST_PEGS = 1.2  # bin widths above the bins: so low a ball has at most one row of pegs before it
@@ -304,14 +304,14 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     if red is None or blue is None or blue.x <= red.x or not any(slots["ball"] in pool for pool in BALLS.values()):
         return None
     path = [_ball(frame, frames[0], slots["ball"]) for frame in frames[-3:]]
-    places = {_lies(ball, red, blue) for ball in path}
+    places = {_bin_of(ball, red, blue) for ball in path}
     place_seen = places.pop() if len(places) == 1 else None
-    return _falls(path, red, blue) if place_seen is None else place_seen
+    return _predict_bin(path, red, blue) if place_seen is None else place_seen
 
 
-def _falls(path: Sequence[Blob | None], red: Blob, blue: Blob) -> str | None:
+def _predict_bin(path: Sequence[Blob | None], red: Blob, blue: Blob) -> str | None:
     """Return where a ball past the pegs goes by the seesaw's side; None before."""
-    now, later_blob = carried_on(path, 0.0), carried_on(path, AHEAD)
+    now, later_blob = extrapolate(path, 0.0), extrapolate(path, AHEAD)
     if now is None or later_blob is None:
         return None
     middle, along = np.array([red.x + blue.x, red.y + blue.y]) / 2, np.array([blue.x - red.x, blue.y - red.y])
@@ -330,7 +330,7 @@ def _ball(frame: np.ndarray, first: np.ndarray, colour: str) -> Blob | None:
     return next(iter(blobs(colour_mask(frame, colour) & ~mask_before, 40)), None)
 
 
-def _lies(ball: Blob | None, red: Blob, blue: Blob) -> str | None:
+def _bin_of(ball: Blob | None, red: Blob, blue: Blob) -> str | None:
     """Return the place of a ball by its pixels."""
     if ball is None or ball.y < red.y + (ball.x - red.x) * (blue.y - red.y) / (blue.x - red.x):
         return None

@@ -28,7 +28,7 @@ TILT_RAD = 0.015  # of the rough board: its near edge is below the deck in eithe
 SUNK_M = 0.012
 STILL_M = 0.003  # a block that moves less than this any more is at rest
 COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
-PLAY = apart(*COLOURS)
+PLAY_COLOURS = apart(*COLOURS)
 
 
 def _incline_colour(rng: np.random.Generator, so_far: Drawn) -> str:
@@ -41,8 +41,8 @@ class Params:
     """Parameters; lengths run from the incline's foot; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
-    block_colour: str = PLAY()
-    tray_colour: str = PLAY()
+    block_colour: str = PLAY_COLOURS()
+    tray_colour: str = PLAY_COLOURS()
     deck_colour: str = one_of("wood", "grey")
     incline_colour: str = drawn_by(_incline_colour)
     block_half_m: tuple[float, float, float] = drawn_by(  # along, across, up

@@ -30,19 +30,19 @@ BAR_M = 0.026  # radius of the bars
 PIECES = 6
 STILL_M = 0.015
 COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
-PLAY, PLAIN = apart(*COLOURS), shuffled("wood", "grey", "white")
+PLAY_COLOURS, PLAIN_COLOURS = apart(*COLOURS), shuffled("wood", "grey", "white")
 
 
 @dataclass(frozen=True)
 class Params:
     """Parameters; passes counts pairs of bars; wide and narrow are in ball diameters."""
 
-    ball_colour: str = PLAY()
-    upper_colour: str = PLAY()
-    lower_colour: str = PLAY()
-    tray_colour: str = PLAY()
-    cube_colour: str = PLAIN()
-    board_colour: str = PLAIN()
+    ball_colour: str = PLAY_COLOURS()
+    upper_colour: str = PLAY_COLOURS()
+    lower_colour: str = PLAY_COLOURS()
+    tray_colour: str = PLAY_COLOURS()
+    cube_colour: str = PLAIN_COLOURS()
+    board_colour: str = PLAIN_COLOURS()
     passes: int = hidden(0, 1, 2)
     radius_m: float = between(0.072, 0.080)
     young_pa: float = between(3500.0, 4500.0)

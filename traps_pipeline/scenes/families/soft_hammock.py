@@ -30,8 +30,8 @@ CELLS = (8, 6)
 STILL_M = 0.02
 CLOTH_PX = 300  # of the cloth, for an observer
 FELT = Surface(0.004, sliding=0.6, solref=SOFT)
-PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
-PLAIN = shuffled("wood", "grey", "white")
+PLAY_COLOURS = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
+PLAIN_COLOURS = shuffled("wood", "grey", "white")
 
 
 @dataclass(frozen=True)
@@ -39,12 +39,12 @@ class Params:
     """Parameters; at direction +1 the cube is right, and a half-tied cloth hangs left."""
 
     direction: int = one_of(-1, 1)
-    ball_colour: str = PLAY()
-    cloth_colour: str = PLAY()
-    tray_colour: str = PLAY()
-    cube_colour: str = PLAY()
-    board_colour: str = PLAIN()
-    post_colour: str = PLAIN()
+    ball_colour: str = PLAY_COLOURS()
+    cloth_colour: str = PLAY_COLOURS()
+    tray_colour: str = PLAY_COLOURS()
+    cube_colour: str = PLAY_COLOURS()
+    board_colour: str = PLAIN_COLOURS()
+    post_colour: str = PLAIN_COLOURS()
     ends_tied: int = hidden(1, 2)
     radius_m: float = between(0.055, 0.065)
     span_m: float = between(0.44, 0.50)  # from post to post

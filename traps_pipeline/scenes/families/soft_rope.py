@@ -28,8 +28,8 @@ DEPTH_M = 0.10  # half of the tray's depth
 PEG_RADIUS_M = 0.022
 PEG_FROM_M = -0.07  # how far before the board the peg reaches
 STILL_M = 0.02
-PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
-PLAIN = shuffled("wood", "grey", "white")
+PLAY_COLOURS = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
+PLAIN_COLOURS = shuffled("wood", "grey", "white")
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,11 @@ class Params:
     """Parameters; at direction +1 the cube is right, and so is an off-centre peg."""
 
     direction: int = one_of(-1, 1)
-    rope_colour: str = PLAY()
-    tray_colour: str = PLAY()
-    cube_colour: str = PLAY()
-    board_colour: str = PLAIN()
-    peg_colour: str = PLAIN()
+    rope_colour: str = PLAY_COLOURS()
+    tray_colour: str = PLAY_COLOURS()
+    cube_colour: str = PLAY_COLOURS()
+    board_colour: str = PLAIN_COLOURS()
+    peg_colour: str = PLAIN_COLOURS()
     peg_in_middle: bool = hidden(False, True)
     length_m: float = between(0.66, 0.76)
     radius_m: float = between(0.011, 0.0125)

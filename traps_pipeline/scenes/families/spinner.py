@@ -33,7 +33,7 @@ LANE = 0.76  # distance of the ball's path from the hub, in disc radii
 POINTER = 0.80  # length of the pointer, likewise
 PEG_AT_M, PEG_M, POINTER_HALF_M = 0.085, 0.008, 0.012
 RIM_M = 0.015
-PLAIN = shuffled("wood", "grey", "white")
+PLAIN_COLOURS = shuffled("wood", "grey", "white")
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ class Params:
 
     direction: int = one_of(-1, 1)
     sectors: tuple[str, ...] = drawn_by(lambda rng, so_far: distinct_colours(rng, int(rng.integers(3, 5)), SECTORS))
-    table_colour: str = PLAIN()
-    rim_colour: str = PLAIN()
+    table_colour: str = PLAIN_COLOURS()
+    rim_colour: str = PLAIN_COLOURS()
     stop_sector: int = hidden_index("sectors")  # where the peg stands
     stop_at: float = between(0.40, 0.58)  # place of the stopped pointer within its sector: 0.5 is the middle
     disc_m: float = between(0.30, 0.34)

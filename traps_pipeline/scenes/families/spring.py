@@ -27,7 +27,7 @@ FEEL_M = 0.03  # the ball has met the plunger when it has been this near to it
 WALL_M = 0.014
 COILS = [f"coil_{i}" for i in range(4)]
 PARTS = ("ball", "deck", "line")
-PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
+PLAY_COLOURS = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
 
 
 def _plungers(rng: np.random.Generator, so_far: Drawn) -> tuple[float, float, str, str]:
@@ -46,10 +46,10 @@ class Params:
     """Parameters; lengths run from where the ball starts; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
-    ball_colour: str = PLAY()
-    line_colour: str = PLAY()
-    deck_colour: str = PLAY()
-    head_colour: str = PLAY()
+    ball_colour: str = PLAY_COLOURS()
+    line_colour: str = PLAY_COLOURS()
+    deck_colour: str = PLAY_COLOURS()
+    head_colour: str = PLAY_COLOURS()
     damping_n_s_m: float = PLUNGER()  # of the plunger: the hidden element
     other_damping_n_s_m: float = PLUNGER()  # what the twin has
     lane_colour: str = PLUNGER()

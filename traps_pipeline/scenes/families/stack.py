@@ -27,7 +27,7 @@ BLOCKS = [f"block_{i}" for i in range(len(COLOURS))]  # from the bottom of the s
 STAND_COLOUR = "black"
 RADIUS_M = 0.05
 ROD_M = 0.17  # from the plate back to the pad that the ball strikes
-STACKED, PLAIN = shuffled(*COLOURS), shuffled("wood", "grey", "white")
+STACKED, PLAIN_COLOURS = shuffled(*COLOURS), shuffled("wood", "grey", "white")
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,9 @@ class Params:
     """Parameters; direction +1 is right; block_colours run from the stand upwards."""
 
     direction: int = one_of(-1, 1)
-    ledge_colour: str = PLAIN()
-    wall_colour: str = PLAIN()
-    pusher_colour: str = PLAIN()
+    ledge_colour: str = PLAIN_COLOURS()
+    wall_colour: str = PLAIN_COLOURS()
+    pusher_colour: str = PLAIN_COLOURS()
     below: int = hidden(*range(len(COLOURS) + 1))  # blocks below the pusher's plate: sets the height of the stand
     block_colours: tuple[str, ...] = STACKED(len(COLOURS))
     block_height_m: float = between(0.054, 0.062)
@@ -132,7 +132,7 @@ def _add_pusher(course: Course, p: Params, plate: float) -> None:
         add_box(body, name, centre, size, p.pusher_colour, density=300, friction=[0.1, 0.005, 0.0001])
 
 
-def _standing(motion: Motion, p: Params) -> np.ndarray:
+def _stands(motion: Motion, p: Params) -> np.ndarray:
     """Return whether each block is over the stand, shape (F, blocks)."""
     at = np.stack([motion.pos(block) for block in BLOCKS], axis=1)
     return (np.abs(at[..., 0]) < p.stand_half_m) & (at[..., 2] > p.stand_m)
@@ -142,14 +142,14 @@ def outcome(motion: Motion, p: Params) -> Reading:
     """Read the range of the number of standing blocks, once everything is still."""
     rest_frame = still_from(*(motion.pos(block) for block in BLOCKS), within_m=0.003)
     is_pushed = p.direction * (motion.pos("pusher") - motion.pos("pusher")[0])[:, 0] > 0.95 * p.travel_m
-    counts = _standing(motion, p).sum(axis=1)
+    counts = _stands(motion, p).sum(axis=1)
     labels = [range_of(RANGES, n) if i >= rest_frame and is_pushed[i] else None for i, n in enumerate(counts)]
     return Reading(labels, min(float(abs(abs(motion.pos(block)[-1, 0]) - p.stand_half_m)) for block in BLOCKS))
 
 
 def legible(motion: Motion, p: Params) -> list[tuple[tuple[str, ...], float]]:
     """Return the blocks to be seen: all standing ones, and enough of the fallen ones."""
-    is_standing = _standing(motion, p)[-1]
+    is_standing = _stands(motion, p)[-1]
     groups = [((BLOCKS[i],), 150.0) for i in np.flatnonzero(is_standing)]
     fallen_blocks = tuple(BLOCKS[i] for i in np.flatnonzero(~is_standing))
     return [*groups, (fallen_blocks, 200.0 * len(fallen_blocks))] if fallen_blocks else groups

@@ -32,7 +32,7 @@ GREYS = ("grey", "black", "white")
 SLANTS = 0.4  # columns a row: boards that hang straight down slant less in the picture
 TRAY_PX = 40  # a tray is wider in the picture
 COLOURS = "red", "green", "blue", "yellow", "orange", "cyan", "purple"
-PLAY, PLAIN = apart(*COLOURS), shuffled(*GREYS)
+PLAY_COLOURS, PLAIN_COLOURS = apart(*COLOURS), shuffled(*GREYS)
 
 
 @dataclass(frozen=True)
@@ -40,10 +40,10 @@ class Params:
     """Parameters, left to right as the camera sees them; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
-    ball_colour: str = PLAY()
-    tray_colours: tuple[str, ...] = PLAY(3)
-    pedestal_colour: str = PLAIN()
-    back_colour: str = PLAIN()
+    ball_colour: str = PLAY_COLOURS()
+    tray_colours: tuple[str, ...] = PLAY_COLOURS(3)
+    pedestal_colour: str = PLAIN_COLOURS()
+    back_colour: str = PLAIN_COLOURS()
     radius_m: float = between(0.066, 0.074)
     pedestal_m: float = between(0.50, 0.66)  # height of the pedestal that the ball starts from
     speed_along_m_s: float = between(1.20, 1.38)

@@ -27,7 +27,10 @@ LIGHT, HEAVY = 200.0, 7000.0  # kg/m3
 MAT_M = 0.01  # thickness of the mat
 HALF_DEPTH_M = 0.17  # of the mat
 RIM_M = 0.012
-PLAY, PLAIN = apart("red", "green", "blue", "orange", "cyan", "purple"), shuffled("wood", "grey", "white")
+PLAY_COLOURS, PLAIN_COLOURS = (
+    apart("red", "green", "blue", "orange", "cyan", "purple"),
+    shuffled("wood", "grey", "white"),
+)
 
 
 @dataclass(frozen=True)
@@ -35,11 +38,11 @@ class Params:
     """Parameters; heights are shares of the pillar's; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
-    pillar_colour: str = PLAY()
-    ball_colour: str = PLAY()
-    prop_colour: str = PLAY()
-    ledge_colour: str = PLAIN()
-    mat_colour: str = PLAIN()
+    pillar_colour: str = PLAY_COLOURS()
+    ball_colour: str = PLAY_COLOURS()
+    prop_colour: str = PLAY_COLOURS()
+    ledge_colour: str = PLAIN_COLOURS()
+    mat_colour: str = PLAIN_COLOURS()
     kind: str = one_of("prop", "pillar")  # of the hidden element
     firm: bool = hidden(False, True)  # whether it keeps the pillar upright
     pillar_m: float = between(0.32, 0.40)

@@ -26,9 +26,9 @@ FELT = Surface(2e-3)  # behind the occluder: no ball comes back from there
 HALF_DEPTH_M = 0.11
 STILL_M = 0.003
 COLOURS = "red", "green", "blue", "yellow", "orange", "cyan", "purple"
-PLAY, PLAIN = apart(*COLOURS), shuffled("wood", "grey", "white")
+PLAY_COLOURS, PLAIN_COLOURS = apart(*COLOURS), shuffled("wood", "grey", "white")
 
-GIVES = 0.25  # of its width: a block that is so far from its place falls
+FALL_SHARE = 0.25  # of its width: a block that is so far from its place falls
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,11 @@ class Params:
 
     direction: int = one_of(-1, 1)
     blocks: int = one_of(3, 4, longer=(5,))
-    top_colour: str = PLAY()
-    ball_colour: str = PLAY()
-    block_colours: tuple[str, ...] = PLAY(2)
-    ledge_colour: str = PLAIN()
-    tray_colour: str = PLAIN()
+    top_colour: str = PLAY_COLOURS()
+    ball_colour: str = PLAY_COLOURS()
+    block_colours: tuple[str, ...] = PLAY_COLOURS(2)
+    ledge_colour: str = PLAIN_COLOURS()
+    tray_colour: str = PLAIN_COLOURS()
     kind: str = one_of("stop", "strip")  # of the hidden element
     barred: bool = hidden(False, True)  # whether it keeps the ball from the tower
     block_height_m: float = drawn_by(
@@ -147,7 +147,7 @@ def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     first, last = largest(frames[0], slots["top"], 60), largest(frames[-1], slots["top"], 60)
     if first is None or last is None:
         return None
-    return "yes" if abs(last.x - first.x) + abs(last.y - first.y) > GIVES * first.box[2] else "no"
+    return "yes" if abs(last.x - first.x) + abs(last.y - first.y) > FALL_SHARE * first.box[2] else "no"
 
 
 def look(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:

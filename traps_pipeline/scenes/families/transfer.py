@@ -23,8 +23,8 @@ STEP_M = 0.022  # the ramp ends this high over the deck
 WALL_M = 0.014
 SIDE_M = 0.085  # half the deck's width
 STILL_M = 0.002  # a block that moves less than this any more is at rest
-PLAY = apart("red", "green", "blue", "yellow", "cyan", "purple")
-PLAIN = shuffled("wood", "grey", "white")
+PLAY_COLOURS = apart("red", "green", "blue", "yellow", "cyan", "purple")
+PLAIN_COLOURS = shuffled("wood", "grey", "white")
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,11 @@ class Params:
     """Parameters; lengths run from the ramp's upper end; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
-    ball_colour: str = PLAY()
-    block_colour: str = PLAY()
-    zone_colour: str = PLAY()
-    deck_colour: str = PLAIN()
-    ramp_colour: str = PLAIN()
+    ball_colour: str = PLAY_COLOURS()
+    block_colour: str = PLAY_COLOURS()
+    zone_colour: str = PLAY_COLOURS()
+    deck_colour: str = PLAIN_COLOURS()
+    ramp_colour: str = PLAIN_COLOURS()
     radius_m: float = between(0.046, 0.056)
     shape: str = one_of("box", "cylinder")  # of the block
     start_m: float = between(0.06, 0.14)

@@ -64,7 +64,7 @@ def _starts(rng: np.random.Generator, so_far: Drawn) -> tuple[tuple[float, ...],
     )
 
 
-def _each(*ranges: tuple[float, float]) -> tuple[tuple[float, ...], ...]:
+def _per_die(*ranges: tuple[float, float]) -> tuple[tuple[float, ...], ...]:
     """Return a field with a number of each range for every die."""
     return drawn_by(
         lambda rng, so_far: tuple(tuple(uniform(rng, *ends) for ends in ranges) for _ in range(so_far["dice"]))
@@ -89,8 +89,8 @@ class Params:
     tray_m: float = between(0.60, 0.75)
     faces: tuple[tuple[str, ...], ...] = drawn_by(_faces)
     starts_m: tuple[tuple[float, ...], ...] = drawn_by(_starts)  # along the steps, across, above the top step
-    speeds_m_s: tuple[tuple[float, ...], ...] = _each((0.55, 0.85), (-0.06, 0.06), (1.2, 1.6))
-    spins_rad_s: tuple[tuple[float, ...], ...] = _each((-7, 7), (-7, 7), (-7, 7))
+    speeds_m_s: tuple[tuple[float, ...], ...] = _per_die((0.55, 0.85), (-0.06, 0.06), (1.2, 1.6))
+    spins_rad_s: tuple[tuple[float, ...], ...] = _per_die((-7, 7), (-7, 7), (-7, 7))
     bounce: float = between(14, 26)  # damping of the contact: the lower, the livelier
     edge_colours: tuple[str, ...] = EDGE("dice")  # one per die, so that each can be followed
     dark_first: bool = chance(0.5)  # dark and light wood in turn, down the steps
@@ -183,11 +183,11 @@ def _first_die(motion: Motion, p: Params) -> tuple[int, int] | None:
     By the look of it, a die may reach the tray when it is past the steps or when it lands.
     """
     along, height = _short_of_tray(motion, p)
-    firsts = [_first(has_reached, motion.times) for has_reached in (along <= 0, np.maximum(along, height) <= 0)]
+    firsts = [_first_arrival(has_reached, motion.times) for has_reached in (along <= 0, np.maximum(along, height) <= 0)]
     return firsts[1] if firsts[0] and firsts[1] and firsts[0][0] == firsts[1][0] else None
 
 
-def _first(has_reached: np.ndarray, times: np.ndarray) -> tuple[int, int] | None:
+def _first_arrival(has_reached: np.ndarray, times: np.ndarray) -> tuple[int, int] | None:
     """Return the first die (column) to reach something, and the frame; None if close."""
     arrival_times = np.where(has_reached.any(axis=0), times[has_reached.argmax(axis=0)], math.inf)
     first, second = np.sort(arrival_times)[:2]
@@ -265,7 +265,7 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Read the upper face of the first die past the steps, once it has slid to a stop."""
     paths = {colour: [_sight(frame, colour) for frame in frames] for colour in EDGES}
     dice = [path for path in paths.values() if sum(sight is not None for sight in path) >= len(frames) / 2]
-    path = _first_over(_tray_edge(frames), dice)
+    path = _first_past_edge(_tray_edge(frames), dice)
     if path is None or not _has_come_to_rest(frames, path):
         return None
     tops = {_upper_face(frame, sight) for frame, sight in zip(frames[-3:], path[-3:], strict=True) if sight is not None}
@@ -320,7 +320,7 @@ def _tray_edge(frames: np.ndarray) -> tuple[int, float, float] | None:
     return side, float(slope), float(offset)
 
 
-def _first_over(
+def _first_past_edge(
     edge: tuple[int, float, float] | None, dice: Sequence[Sequence[_Sight | None]]
 ) -> Sequence[_Sight | None] | None:
     """Return the path of the die that is first, or farther, past the edge."""

@@ -30,18 +30,18 @@ SLIPPERY = Surface(1e-5, sliding=0.03, spinning=0.001)  # a ball slides along it
 FELT = Surface(0.004)
 COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
 PARTS = ("ball", "tunnel")
-PLAY, PLAIN = apart(*COLOURS), shuffled("wood", "grey", "white", "black")
+PLAY_COLOURS, PLAIN_COLOURS = apart(*COLOURS), shuffled("wood", "grey", "white", "black")
 
 
 @dataclass(frozen=True)
 class Params:
     """Parameters; the ball rolls to the camera; turn +1 deflects it to the right."""
 
-    ball_colour: str = PLAY()
-    tunnel_colour: str = PLAY()
-    left_colour: str = PLAIN()
-    right_colour: str = PLAIN()
-    ramp_colour: str = PLAIN()
+    ball_colour: str = PLAY_COLOURS()
+    tunnel_colour: str = PLAY_COLOURS()
+    left_colour: str = PLAIN_COLOURS()
+    right_colour: str = PLAIN_COLOURS()
+    ramp_colour: str = PLAIN_COLOURS()
     turn: int = hidden(-1, 1)
     turn_deg: float = between(40, 50)  # angle between the deflector and the ball's way
     radius_m: float = between(0.046, 0.054)

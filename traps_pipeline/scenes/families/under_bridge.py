@@ -23,18 +23,18 @@ ROAD_M = 0.02
 SLAB_M = 0.03
 RAILING_M = 0.05
 BALL_COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
-PLAY, PLAIN = apart(*BALL_COLOURS), shuffled("wood", "grey", "white", "black")
+PLAY_COLOURS, PLAIN_COLOURS = apart(*BALL_COLOURS), shuffled("wood", "grey", "white", "black")
 
 
 @dataclass(frozen=True)
 class Params:
     """Parameters; lengths run from the bridge's near edge; direction +1 is right."""
 
-    ball_colour: str = PLAY()
-    bridge_colour: str = PLAY()
-    road_colour: str = PLAIN()
-    ramp_colour: str = PLAIN()
-    kerb_colour: str = PLAIN()
+    ball_colour: str = PLAY_COLOURS()
+    bridge_colour: str = PLAY_COLOURS()
+    road_colour: str = PLAIN_COLOURS()
+    ramp_colour: str = PLAIN_COLOURS()
+    kerb_colour: str = PLAIN_COLOURS()
     direction: int = one_of(-1, 1)
     blocked: bool = hidden(False, True)  # whether the kerb lies across the road
     radius_m: float = between(0.048, 0.056)

@@ -28,7 +28,7 @@ STRIP_M = 0.20  # length of the strip before the mat
 GRIPPING = Surface(1e-4)  # of the visible run-up
 SLIPPERY = Surface(2e-3, sliding=0.05)
 ROUGH = Surface(2e-3, sliding=1.0)
-PLAY = apart("red", "green", "blue", "orange", "cyan", "purple")
+PLAY_COLOURS = apart("red", "green", "blue", "orange", "cyan", "purple")
 
 
 @dataclass(frozen=True)
@@ -36,9 +36,9 @@ class Params:
     """Parameters; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
-    wedge_colour: str = PLAY()
-    ball_colour: str = PLAY()
-    mat_colour: str = PLAY()
+    wedge_colour: str = PLAY_COLOURS()
+    ball_colour: str = PLAY_COLOURS()
+    mat_colour: str = PLAY_COLOURS()
     wedge_length_m: float = between(0.13, 0.16)
     kind: str = one_of("strip", "stop")  # of the hidden element
     barred: bool = hidden(False, True)  # whether it keeps the wedge from the mat

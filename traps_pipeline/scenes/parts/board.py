@@ -40,7 +40,7 @@ def peg_rows(least: int, most: int) -> Group:
     return together(draw)
 
 
-def looking_on(low: float, high: float) -> Any:
+def camera_elevation(low: float, high: float) -> Any:
     """Return the elevation of a camera off the normal of a board with a `tilt_deg`."""
     return drawn_by(lambda rng, so_far: uniform(rng, low, high) + so_far["tilt_deg"] - 90)
 
@@ -54,7 +54,7 @@ def slope(tilt_deg: float) -> tuple[np.ndarray, np.ndarray]:
     return np.array([0, math.cos(tilt), math.sin(tilt)]), np.array([0, -math.sin(tilt), math.cos(tilt)])
 
 
-def turned(angle_rad: float, axis: int) -> list[float]:
+def turn_quaternion(angle_rad: float, axis: int) -> list[float]:
     """Return the quaternion of a turn about the x axis (1), y axis (2) or z axis (3)."""
     return [math.cos(angle_rad / 2), *(math.sin(angle_rad / 2) * (i == axis) for i in (1, 2, 3))]
 
@@ -91,7 +91,7 @@ class Board:
         key.castshadow = False  # long shadows of pegs would clutter the board
         key.diffuse = list(light)
         self.body = self.spec.worldbody.add_body(
-            name="board", pos=[0, 0, LIFT_M], quat=turned(math.radians(tilt_deg), 1)
+            name="board", pos=[0, 0, LIFT_M], quat=turn_quaternion(math.radians(tilt_deg), 1)
         )
 
     def block(self, name: str, across: Span, up: Span, out: Span, colour: str, *, solid: bool = True) -> mujoco.MjsGeom:
@@ -134,7 +134,7 @@ class Board:
         )
         post.solref, post.priority, post.condim, post.friction = list(self._bounce), 1, 6, [0.3, 0.002, 0.0001]
         if square:
-            post.quat = turned(math.pi / 4, 3)
+            post.quat = turn_quaternion(math.pi / 4, 3)
 
     def divider(self, i: int, x: float, up: Span, half_m: float, colour: str) -> None:
         """Add a wall `wall_<i>` between buckets, and a post on it: a flat end holds balls."""

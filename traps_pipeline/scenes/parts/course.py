@@ -360,14 +360,14 @@ class Course:
         across = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
         points = np.concatenate([box.corners() for box in (*in_view, cover)])
         upright = np.array([0.0, 0.0, np.cos(down)]) + ahead * np.sin(down)
-        scale = max(np.ptp(_along(points, across)), np.ptp(_along(points, upright)) * 4 / 3)
+        scale = max(np.ptp(_project(points, across)), np.ptp(_project(points, upright)) * 4 / 3)
         width, height = FLAG * scale, FLAG_SHAPE * FLAG * scale / float(np.cos(down))
         corners, flags, boxes = cover.corners(), [], []
-        for phrase, (foot, colour) in sorted(self._marks.items(), key=lambda mark: float(_along(mark[1][0], across))):
+        for phrase, (foot, colour) in sorted(self._marks.items(), key=lambda mark: float(_project(mark[1][0], across))):
             place = np.array(foot)
-            top_z = float((corners[:, 2] + _along(corners - place, ahead) * np.tan(down)).max())
+            top_z = float((corners[:, 2] + _project(corners - place, ahead) * np.tan(down)).max())
             top_z += FLAG_CLEAR_M + height / 2
-            at = float(_along(place, across))
+            at = float(_project(place, across))
             top_z += height * 1.2 * max((n + 1 for n, flag_at in flags if abs(at - flag_at) < 1.15 * width), default=0)
             flags.append((int(any(abs(at - flag_at) < 1.15 * width for _, flag_at in flags)), at))
             centre = place + across * width / 2 + np.array([0, 0, top_z - place[2]])
@@ -460,7 +460,7 @@ def part_colours(p: Any) -> dict[str, str]:
     return {name.removesuffix("_colour"): getattr(p, name) for name in names}
 
 
-def _along(points: Any, axis: np.ndarray) -> np.ndarray:
+def _project(points: Any, axis: np.ndarray) -> np.ndarray:
     """Return how far points (..., 3) lie along an axis (3,), summed in one order.
 
     The last bit of a matrix product differs between CPUs, and these numbers go into the model.

@@ -31,11 +31,11 @@ if TYPE_CHECKING:
 Shape = Literal["ball", "puck"]
 Colour = Literal["red", "green", "blue", "yellow", "orange", "cyan", "purple"]
 DISTRACTOR = "distractor_"  # begins the name of a distractor's body and geom
-MOST_DISTRACTORS = 3
+MAX_DISTRACTORS = 3
 SPEEDS = (1.0, 1.5, 2.0)  # each a whole number of simulation steps from frame to frame
 # The greatest speed of each family that takes one: most draws still show half a second of motion before the occluder
 # and settle after 0.8 s or more. In other families the certificates `referents` or `cut` would be lost.
-FASTEST: Mapping[str, float] = {
+MAX_SPEEDS: Mapping[str, float] = {
     **dict.fromkeys(("balance", "behind_wall", "bounce", "chain", "domino_branch", "head_on", "hidden_collision"), 2.0),
     **dict.fromkeys(("hidden_drop", "launch", "lever_gate", "roll_stop", "spinner", "under_bridge"), 2.0),
     **dict.fromkeys(("pendulum", "slide", "stack", "topple", "tower", "transfer", "wedge_push"), 1.5),
@@ -43,7 +43,7 @@ FASTEST: Mapping[str, float] = {
 RADIUS = 0.026, 0.030  # of a distractor, as a share of the scene's width
 LANE = 2.4  # radii from lane to lane: each distractor has one of its own, so that they pass each other
 PUCK_HALF = 0.45  # of its radius
-LEAST_DOWN_DEG = 8.0
+MIN_DOWN_DEG = 8.0
 WAY = (0.5, 0.9)  # share of the scene's width that a distractor crosses
 BALL_COLOURS: dict[str, Colour] = {colour: colour for colour in get_args(Colour)}  # by their word
 
@@ -62,20 +62,20 @@ class Difficulty:
 
     def settings(self) -> dict[str, Any]:
         """Return the settings that differ from the defaults."""
-        return {name: value for name, value in asdict(self).items() if value != getattr(USUAL, name)}
+        return {name: value for name, value in asdict(self).items() if value != getattr(DEFAULT_DIFFICULTY, name)}
 
 
-USUAL = Difficulty()
+DEFAULT_DIFFICULTY = Difficulty()
 
 
-def untakeable(family: Family, difficulty: Difficulty) -> list[str]:
+def unsupported_settings(family: Family, difficulty: Difficulty) -> list[str]:
     """Return the settings that a family does not support.
 
     Distractors move, and the board that closes a chaotic control must hide all that moves.
     """
     takes = {
         "distractors": family.taxonomy == "occlusion" and family.category not in EXTENSION_CATEGORIES,
-        "speed": difficulty.speed <= FASTEST.get(family.name, 1.0),
+        "speed": difficulty.speed <= MAX_SPEEDS.get(family.name, 1.0),
         "longer": vary.can_be_longer(family.params),
     }
     return [name for name in difficulty.settings() if not takes[name]]
@@ -105,7 +105,7 @@ class SceneDifficulty:
     """The values that a draw's settings take in one scene."""
 
     __pydantic_config__ = _PLAUSIBLE
-    distractors: Annotated[tuple[Distractor, ...], Field(max_length=MOST_DISTRACTORS)] = ()
+    distractors: Annotated[tuple[Distractor, ...], Field(max_length=MAX_DISTRACTORS)] = ()
     longer: StrictBool = False
 
     @staticmethod
@@ -136,7 +136,7 @@ def draw_distractors(
     whole clip.
     """
     low, high, front = float(points[:, 0].min()), float(points[:, 0].max()), float(points[:, 1].min())
-    hidden_depth = 2 / np.tan(np.radians(max(-scene.view.elevation_deg, LEAST_DOWN_DEG)))  # so many radii behind a ball
+    hidden_depth = 2 / np.tan(np.radians(max(-scene.view.elevation_deg, MIN_DOWN_DEG)))  # so many radii behind a ball
     max_radius = RADIUS[1] * (high - low)
     texts = (wording.question, wording.answerable_question.question)
     words = {*re.findall(r"\w+", " ".join((*texts, *wording.answerable_question.labels, *wording.labels)).lower())}

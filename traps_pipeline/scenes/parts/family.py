@@ -10,14 +10,14 @@ import numpy as np
 
 from traps_pipeline.scenes.parts import vary
 from traps_pipeline.scenes.parts.difficulty import SceneDifficulty, add_distractors
-from traps_pipeline.scenes.parts.look import OF_OCCLUSION, Look, apply_look, look_of
+from traps_pipeline.scenes.parts.look import OCCLUSION_PARTS, Look, apply_look, look_of
 from traps_pipeline.scenes.parts.observers import Observer
 from traps_pipeline.scenes.parts.questions import Aside, Question
 from traps_pipeline.scenes.parts.vision import after_occluder, before_occluder, is_still, without_flags
 from traps_pipeline.scenes.physics.kit import Family, Motion, Physics, Reading, Scene
 from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH
 
-USUAL_PHYSICS = Physics()
+DEFAULT_PHYSICS = Physics()
 
 
 def scene_family(
@@ -32,7 +32,7 @@ def scene_family(
     observe: Observer,
     foresee: Observer | None = None,
     look: Observer | None = None,
-    physics: Physics = USUAL_PHYSICS,
+    physics: Physics = DEFAULT_PHYSICS,
     min_margin_m: float = 0.005,
     sub_scenario: str | None = None,
     legible: Callable[[Motion, Any], Sequence[tuple[tuple[str, ...], float]]] | None = None,
@@ -62,7 +62,7 @@ def scene_family(
         unflagged = visible if twins is None else without_flags(visible)
         if foresee is not None and len(visible) < len(frames):
             rests = is_still(visible) or is_still(visible[:-1])  # the shadow of an occluder may come before it does
-            return _first(unflagged, slots, (observe, foresee) if rests else (foresee, observe))
+            return _first_answer(unflagged, slots, (observe, foresee) if rests else (foresee, observe))
         answer = observe(unflagged, slots)
         if answer is None and look is not None and len(end := after_occluder(unflagged)) < len(unflagged):
             return look(end, slots)
@@ -87,11 +87,11 @@ def scene_family(
         min_margin_m=min_margin_m,
         twins=twins,
         perturbation=perturbation,
-        looks=(() if twins is None else OF_OCCLUSION) if looks is None else looks,
+        looks=(() if twins is None else OCCLUSION_PARTS) if looks is None else looks,
         check=vary.check,
     )
 
 
-def _first(frames: np.ndarray, slots: Mapping[str, str], observers: Sequence[Observer]) -> str | None:
+def _first_answer(frames: np.ndarray, slots: Mapping[str, str], observers: Sequence[Observer]) -> str | None:
     """Return the answer of the first observer that has one."""
     return next((answer for observe in observers if (answer := observe(frames, slots)) is not None), None)

@@ -22,7 +22,7 @@ TONES: Mapping[str, tuple[float, float, float]] = {
     "slate": (0.33, 0.36, 0.39),
     "coal": (0.21, 0.21, 0.20),
 }
-PALE = ("chalk", "sand", "clay", "stone", "moss")  # on which what is black, and the masts of flags, show
+PALE_TONES = ("chalk", "sand", "clay", "stone", "moss")  # on which what is black, and the masts of flags, show
 PATTERNS = ("checks", "stripes", "planks")
 PLAIN_SHARE = 0.08  # of floors that have no pattern: two of a family would look alike
 TEXELS = 256  # of a side of the texture, which shows one repeat of the pattern

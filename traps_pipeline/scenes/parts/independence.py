@@ -16,8 +16,8 @@ from traps_pipeline.scenes.physics.kit import Family, params_to_dict
 
 DRAWS = 600
 CHANCE = 1e-8  # a table of counts that chance gives more rarely than this is no chance: thousands are looked at
-MOST_WORLDS = 64
-LEAST_EXPECTED = 5  # draws of each world in a row of a table; rarer values share a row
+MAX_WORLDS = 64
+MIN_EXPECTED = 5  # draws of each world in a row of a table; rarer values share a row
 
 
 def dependence(family: Family) -> str | None:
@@ -31,22 +31,22 @@ def dependence(family: Family) -> str | None:
     numbers = np.array([len(worlds) for worlds in scenes])
     for number in np.unique(numbers):  # which of three lanes, which of four: each number of worlds by itself
         draw_indices = np.flatnonzero(numbers == number)
-        if number < 2 or len(draw_indices) < 4 * LEAST_EXPECTED * number:
+        if number < 2 or len(draw_indices) < 4 * MIN_EXPECTED * number:
             continue
-        columns = _rows([_flat({k: v for k, v in scenes[i][0].items() if k not in hidden}) for i in draw_indices])
+        columns = _rows([_flatten({k: v for k, v in scenes[i][0].items() if k not in hidden}) for i in draw_indices])
         tables = [((name,), rows) for name, rows in columns.items()]
         tables += [((a, b), columns[a] * (columns[b].max() + 1) + columns[b]) for a, b in combinations(columns, 2)]
         for names, rows in tables:
-            if _is_associated(drawn_index[draw_indices], _pooled(rows, LEAST_EXPECTED * int(number))):
+            if _is_associated(drawn_index[draw_indices], _pool_rare(rows, MIN_EXPECTED * int(number))):
                 return f"`{', '.join(hidden)}` goes with {' and '.join(f'`{name}`' for name in names)}"
     return None
 
 
 def _worlds(family: Family, params: Any) -> list[dict[str, Any]]:
-    """Return a scene, its twins, their twins and so on, each once, up to MOST_WORLDS."""
+    """Return a scene, its twins, their twins and so on, each once, up to MAX_WORLDS."""
     assert family.twins is not None
     worlds, queue = [], [params]
-    while queue and len(worlds) < MOST_WORLDS:
+    while queue and len(worlds) < MAX_WORLDS:
         world = queue.pop(0)
         if world not in worlds:
             worlds.append(world)
@@ -54,13 +54,13 @@ def _worlds(family: Family, params: Any) -> list[dict[str, Any]]:
     return [params_to_dict(world) for world in worlds]
 
 
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def _flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Return numbers and names by their place: tuples by length and index."""
     fields: dict[str, Any] = {}
     for name, value in values.items():
         if isinstance(value, list | tuple):
             fields[f"len({prefix}{name})"] = len(value)
-            fields |= _flat({f"{name}[{i}]": item for i, item in enumerate(value)}, prefix)
+            fields |= _flatten({f"{name}[{i}]": item for i, item in enumerate(value)}, prefix)
         else:
             fields[prefix + name] = value
     return fields
@@ -82,7 +82,7 @@ def _rows(scenes: list[dict[str, Any]]) -> dict[str, np.ndarray]:
     return columns
 
 
-def _pooled(rows: np.ndarray, least: int) -> np.ndarray:
+def _pool_rare(rows: np.ndarray, least: int) -> np.ndarray:
     """Return rows from 0 on, those with fewer scenes than `least` pooled in one."""
     _, rows, counts = np.unique(rows, return_inverse=True, return_counts=True)
     return np.unique(np.where(counts[rows] < least, -1, rows), return_inverse=True)[1]

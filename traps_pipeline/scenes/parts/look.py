@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.scenes.parts.floor import PALE, TEXELS, TONES, floors, lay_floor
+from traps_pipeline.scenes.parts.floor import PALE_TONES, TEXELS, TONES, floors, lay_floor
 from traps_pipeline.scenes.physics.kit import COLOURS, Scene, uniform
 from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH
 from traps_pipeline.scenes.picture.render import SUPERSAMPLE
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 # What may vary, as `traps benchmark sample --look` names it.
 PARTS = ("floor", "pale-floor", "light", "panel", "bystanders", "camera", "material", "size")
-OF_OCCLUSION = ("bystanders", "camera", "light", "material", "pale-floor", "panel")  # of a family that says nothing
+OCCLUSION_PARTS = ("bystanders", "camera", "light", "material", "pale-floor", "panel")  # of a family that says nothing
 # Colours of the occluder (sRGB): dark, dull, and none that a question names or that is taken for one in another light.
 OCCLUDERS: Mapping[str, tuple[float, float, float]] = {
     "navy": COLOURS["navy"],
@@ -37,7 +37,7 @@ OCCLUDERS: Mapping[str, tuple[float, float, float]] = {
 MATERIALS = ("plain", "slats", "tiles")
 LINE_TONE, LINES_PER_M, LINE_SHARE = 1.6, 8.0, 0.08
 SIZES = {"360p": 1, "720p": 2}  # of a frame: how many times as fine as 480x360
-_FLOORS = {"pale-floor": floors(PALE), "floor": floors()}  # the first that is named counts
+_FLOORS = {"pale-floor": floors(PALE_TONES), "floor": floors()}  # the first that is named counts
 _FLOOR_FIELDS = ("floor_pattern", "floor_tones", "floor_repeat_m", "floor_turn_deg", "floor_shift_m")
 BYSTANDERS = (0, 0, 2, 3)  # how many stand there: none in half of the scenes
 BEHIND_M = (0.25, 0.9)  # so far behind all that is shown a bystander stands: it hides nothing and shades nothing

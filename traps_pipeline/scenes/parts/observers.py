@@ -33,8 +33,8 @@ Finder = Callable[[np.ndarray, str], Blob | None]
 AHEAD = 1.5  # frames after which what is about to happen has happened
 BEGUN_PX = 3.0  # what is so far from its first place has left it
 FLIGHT = 3.0  # for so many frames a thing may fly on
-STRUCK = 0.2  # of a thing's area: so much changes where something moves at it
-LOST = 2  # for so many frames a moving thing may be out of sight
+STRUCK_SHARE = 0.2  # of a thing's area: so much changes where something moves at it
+MAX_FRAMES_LOST = 2  # for so many frames a moving thing may be out of sight
 
 
 # --- one thing in one frame -------------------------------------------------------------------------------------------
@@ -96,17 +96,17 @@ def is_upper_half_in_place(frames: np.ndarray, colour: str, first: Blob) -> bool
 def end_of(path: Sequence[Blob | None], ahead: float | None = None, tolerance_px: float = 1.5) -> Blob | None:
     """Return the thing at rest, or extrapolated by `ahead` frames; else None."""
     if ahead is not None:
-        return carried_on(path, ahead)
+        return extrapolate(path, ahead)
     return path[-1] if is_at_rest(path, tolerance_px=tolerance_px) else None
 
 
-def carried_on(path: Sequence[Blob | None], ahead: float) -> Blob | None:
+def extrapolate(path: Sequence[Blob | None], ahead: float) -> Blob | None:
     """Extrapolate a thing some frames ahead at its last speed; None if long lost."""
     sightings = [(index, blob) for index, blob in enumerate(path) if blob is not None]
-    if not sightings or len(path) - 1 - sightings[-1][0] > LOST:
+    if not sightings or len(path) - 1 - sightings[-1][0] > MAX_FRAMES_LOST:
         return None
     index, last = sightings[-1]
-    if len(sightings) == 1 or index - sightings[-2][0] > LOST + 1:
+    if len(sightings) == 1 or index - sightings[-2][0] > MAX_FRAMES_LOST + 1:
         return last
     previous_sighting, frames = sightings[-2], ahead + len(path) - 1 - index
     steps = frames / (index - previous_sighting[0])
@@ -117,10 +117,10 @@ def carried_on(path: Sequence[Blob | None], ahead: float) -> Blob | None:
 
 def is_struck(frames: np.ndarray, thing: Blob, reach: float) -> bool:
     """Return whether much moved at a thing, or `reach` lengths off, in the last step."""
-    return bool(motion_mask(frames)[around(thing, reach)].sum() > STRUCK * thing.area)
+    return bool(motion_mask(frames)[surrounding_slices(thing, reach)].sum() > STRUCK_SHARE * thing.area)
 
 
-def around(thing: Blob, reach: float) -> tuple[slice, slice]:
+def surrounding_slices(thing: Blob, reach: float) -> tuple[slice, slice]:
     """Return the slices of a frame around a thing, with a margin in its longer sides."""
     x, y, width, height = thing.box
     margin = round(reach * max(width, height))
@@ -252,8 +252,8 @@ def will_clear(thing: str, mark: str) -> Observer:
         path, wall = track(frames, slots[thing], 60), largest(frames[-1], slots[mark], 60)
         start, now, later_blob = (
             next((blob for blob in path if blob), None),
-            carried_on(path, 0.0),
-            carried_on(path, 1.0),
+            extrapolate(path, 0.0),
+            extrapolate(path, 1.0),
         )
         if wall is None or start is None or now is None or later_blob is None:
             return None

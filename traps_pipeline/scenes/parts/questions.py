@@ -15,7 +15,7 @@ import numpy as np
 
 from traps_pipeline.scenes.parts.course import part_colours
 from traps_pipeline.scenes.parts.wording import match_slots
-from traps_pipeline.scenes.physics.kit import AnswerableQuestion, AnswerType, Wording, listed
+from traps_pipeline.scenes.physics.kit import AnswerableQuestion, AnswerType, Wording, list_choices
 
 Forms = Sequence[str]  # ways to say a label; '{}' stands for it
 Aside = Callable[[Any, np.random.Generator], AnswerableQuestion]
@@ -42,14 +42,14 @@ class Question:
         """Word the question and one of the asides; a sole aside costs no draw."""
         question = self.fill(p, rng)
         text = str(rng.choice(self.templates)).format_map({**part_colours(p), **question.fills})
-        return Wording(text, question.labels, question.aliases, _one_of(asides, rng)(p, rng))
+        return Wording(text, question.labels, question.aliases, _choose(asides, rng)(p, rng))
 
     def slots_in(self, question: str) -> dict[str, str] | None:
         """Return what fills this question's placeholders; None if it is another one."""
         return match_slots(self.templates, question)
 
 
-def _one_of(asides: Sequence[Aside], rng: np.random.Generator) -> Aside:
+def _choose(asides: Sequence[Aside], rng: np.random.Generator) -> Aside:
     return asides[0] if len(asides) == 1 else asides[int(rng.integers(len(asides)))]
 
 
@@ -96,7 +96,7 @@ def which_colour(
     def fill(p: Any, rng: np.random.Generator) -> Filled:
         choices = tuple(str(c) for c in rng.permutation(colours(p)))
         aliases = {form.format(c): c for c in choices for form in forms}
-        return Filled(choices, aliases | dict(also), {"choices": listed(choices)})
+        return Filled(choices, aliases | dict(also), {"choices": list_choices(choices)})
 
     return Question("colour", templates, fill)
 
@@ -122,7 +122,7 @@ def how_many(
             numbers = [form for n in range(low, high + 1) for form in (str(n), NUMBERS[n])]
             aliases |= dict.fromkeys([f"{low} to {high}", f"{low} or {high}", *numbers], f"{low}-{high}")
         labels = tuple(f"{low}-{high}" for low, high in ranges(p))
-        return Filled(labels, aliases, {"choices": listed(labels), **fills(p, rng)})
+        return Filled(labels, aliases, {"choices": list_choices(labels), **fills(p, rng)})
 
     return Question("count_range", templates, fill)
 
@@ -154,7 +154,9 @@ def choice_of(question: str, choices: Callable[[Any], Sequence[str]], answer: Ca
 
     def ask(p: Any, rng: np.random.Generator) -> AnswerableQuestion:
         order = tuple(str(c) for c in rng.permutation(choices(p)))
-        return AnswerableQuestion(question.format_map({**part_colours(p), "choices": listed(order)}), order, answer(p))
+        return AnswerableQuestion(
+            question.format_map({**part_colours(p), "choices": list_choices(order)}), order, answer(p)
+        )
 
     return ask
 

@@ -3,12 +3,12 @@
     @dataclass(frozen=True)
     class Params:
         direction: int = one_of(-1, 1)
-        ball_colour: str = PLAY()
-        wall_colour: str = PLAY()
+        ball_colour: str = PLAY_COLOURS()
+        wall_colour: str = PLAY_COLOURS()
         rough: bool = hidden(False, True)
         speed_m_s: float = between(0.50, 0.66)
 
-    PLAY = apart("red", "green", "blue")  # before the class: colours that differ from each other
+    PLAY_COLOURS = apart("red", "green", "blue")  # before the class: colours that differ from each other
 
 `draw_params(Params, rng)` draws the fields in their order; a field may depend on those before it only. So a hidden
 element that depends on nothing is as likely whatever is seen. `twins(p)` changes the hidden element.
@@ -24,7 +24,7 @@ from typing import Any, TypeVar, get_type_hints
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from traps_pipeline.scenes.physics.kit import READ, distinct_colours, uniform
+from traps_pipeline.scenes.physics.kit import READER_KEY, distinct_colours, uniform
 
 Drawn = dict[str, Any]  # name -> value: what is drawn so far
 Draw = Callable[[np.random.Generator, Drawn], Any]
@@ -177,7 +177,9 @@ def twins(p: Any) -> list[Any]:
 
 def with_field(params: type, name: str, kind: Any) -> type:
     """Return the class with a last field, None by default, that is not drawn."""
-    new_field = field(default=None, metadata={READ: lambda value: None if value is None else kind.from_record(value)})
+    new_field = field(
+        default=None, metadata={READER_KEY: lambda value: None if value is None else kind.from_record(value)}
+    )
     extended = make_dataclass(params.__name__, [(name, kind | None, new_field)], bases=(params,), frozen=True)
     extended.__module__, extended.__doc__ = params.__module__, params.__doc__
     return extended
@@ -262,13 +264,13 @@ def draw_params(params: type[Params], rng: np.random.Generator, longer: bool = F
                 f"{params.__module__}: Params.{member.name} has no range; write it as `= between(low, high)`"
             )
         if isinstance(draw, Group):
-            so_far |= _of_group(draw, members, rng, so_far)
+            so_far |= _group_values(draw, members, rng, so_far)
         else:
             so_far[member.name] = draw(rng, so_far)
     return params(**{member.name: so_far[member.name] for member in members if member.name in so_far})
 
 
-def _of_group(group: Group, members: Sequence[Field[Any]], rng: np.random.Generator, so_far: Drawn) -> Drawn:
+def _group_values(group: Group, members: Sequence[Field[Any]], rng: np.random.Generator, so_far: Drawn) -> Drawn:
     """Return the values of all fields of a group."""
     counts = {member.name: member.metadata[_COUNT] for member in members if member.metadata.get(_HOW) is group}
     numbers = {name: 1 if count is None else _number(count, so_far) for name, count in counts.items()}

@@ -21,7 +21,10 @@ COMING_PX = 600  # of an occluder on its way, that are new in a frame
 COMES_FRAMES = 4  # of five a second, in which it may be seen on its way
 EDGE = 60  # least contrast of an edge
 MOVED_PX = 24  # what moves changes more pixels from frame to frame
-CHANGED, ALIKE = 16, 12  # levels of 255: by more than these a pixel changes, by no more two are of one colour
+CHANGED_LEVELS, SAME_COLOUR_LEVELS = (
+    16,
+    12,
+)  # levels of 255: by more than these a pixel changes, by no more two are of one colour
 # Hue (degrees), least saturation and value (0-1) of the saturated colours. Shade lowers the value, not the hue.
 _HUES: Mapping[str, tuple[float, float, float, float]] = {
     "red": (346, 8, 0.62, 0.22),
@@ -131,7 +134,7 @@ def before_occluder(frames: np.ndarray) -> np.ndarray:
     come; where an occluder goes, the scene goes on.
     """
     for at in range(1, len(frames)):
-        is_new = _levels(frames[at], frames[at - 1]) > CHANGED
+        is_new = _levels(frames[at], frames[at - 1]) > CHANGED_LEVELS
         if is_new.sum() < STEP_PX:
             continue
         count, names = cv2.connectedComponents(is_new.astype(np.uint8), connectivity=4)
@@ -142,13 +145,13 @@ def before_occluder(frames: np.ndarray) -> np.ndarray:
         previous_colour, colour = (
             np.median(frame[region], axis=0).astype(np.uint8) for frame in (frames[at - 1], frames[at])
         )
-        even, ring_share = ((_levels(frames[at][part], colour) <= ALIKE).mean() for part in (region, ring))
-        was_even = (_levels(frames[at - 1][region], previous_colour) <= ALIKE).mean()
+        even, ring_share = ((_levels(frames[at][part], colour) <= SAME_COLOUR_LEVELS).mean() for part in (region, ring))
+        was_even = (_levels(frames[at - 1][region], previous_colour) <= SAME_COLOUR_LEVELS).mean()
         stands_out = ring_share < 0.4 or (
             ring_share < 0.75 and was_even < even
         )  # some of what is around it may be as dark
         if sizes.max() >= STEP_PX and even > 0.5 and stands_out and _is_standing_later(frames, at, colour):
-            return frames[: _first_on_its_way(frames, at, colour)]
+            return frames[: _first_moving_frame(frames, at, colour)]
     return frames
 
 
@@ -156,7 +159,7 @@ def _is_standing_later(frames: np.ndarray, comes: int, colour: np.ndarray) -> bo
     """Return whether a region that turned to a colour has it soon and at the end."""
     earlier_frame, later_frame = max(0, comes - 1 - COMES_FRAMES), min(comes + COMES_FRAMES, len(frames) - 1)
     level_before, was, soon_after, level_at_end = (
-        _levels(frames[at], colour) <= ALIKE for at in (comes - 1, earlier_frame, later_frame, -1)
+        _levels(frames[at], colour) <= SAME_COLOUR_LEVELS for at in (comes - 1, earlier_frame, later_frame, -1)
     )
     new_region = level_at_end & ~level_before & ~was
     filled_mask = cv2.morphologyEx(
@@ -165,11 +168,13 @@ def _is_standing_later(frames: np.ndarray, comes: int, colour: np.ndarray) -> bo
     return bool(filled_mask.sum() >= OCCLUDER_PX and (soon_after & new_region).sum() > 0.9 * new_region.sum())
 
 
-def _first_on_its_way(frames: np.ndarray, comes: int, colour: np.ndarray) -> int:
+def _first_moving_frame(frames: np.ndarray, comes: int, colour: np.ndarray) -> int:
     """Return the first frame in which an occluder that comes is seen on its way."""
     first = comes
     while first > max(1, comes - COMES_FRAMES):
-        current, previous_level = (_levels(frame, colour) <= ALIKE for frame in (frames[first - 1], frames[first - 2]))
+        current, previous_level = (
+            _levels(frame, colour) <= SAME_COLOUR_LEVELS for frame in (frames[first - 1], frames[first - 2])
+        )
         if (current & ~previous_level).sum() < COMING_PX:
             break
         first -= 1
@@ -183,7 +188,7 @@ def after_occluder(frames: np.ndarray) -> np.ndarray:
 
 def motion_mask(frames: np.ndarray) -> np.ndarray:
     """Return the mask of pixels that changed in the last frame, bool (H, W)."""
-    return _levels(frames[-1], frames[-2]) > CHANGED if len(frames) > 1 else np.zeros(frames.shape[1:3], bool)
+    return _levels(frames[-1], frames[-2]) > CHANGED_LEVELS if len(frames) > 1 else np.zeros(frames.shape[1:3], bool)
 
 
 def is_still(frames: np.ndarray) -> bool:

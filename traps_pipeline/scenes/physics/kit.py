@@ -38,7 +38,7 @@ COLOURS: Mapping[str, tuple[float, float, float]] = {
     "navy": (0.07, 0.11, 0.28),
 }
 
-READ = "read"  # key of a parameter's metadata: how its stored value is read, where that is not as it stands
+READER_KEY = "read"  # key of a parameter's metadata: how its stored value is read, where that is not as it stands
 OCCLUDER_GROUP = 4  # geoms of the occluder: drawn in the void only, collide with nothing
 COMING_GROUP = 2  # the board that comes before a scene, until it stands
 FLOOR_GROUP = 3  # planes, while they are drawn
@@ -259,7 +259,7 @@ class Family:
                 f"family {self.name}: unknown parameters {unknown}, missing parameters {missing}; "
                 f"known: {sorted(field_of)}"
             )
-        reader_of = {name: field_of[name].metadata.get(READ, _as_tuple) for name in values}
+        reader_of = {name: field_of[name].metadata.get(READER_KEY, _as_tuple) for name in values}
         params = self.params(**{name: reader_of[name](value) for name, value in values.items()})
         self.check(params)
         return params
@@ -394,6 +394,6 @@ def distinct_colours(rng: np.random.Generator, count: int, pool: Sequence[str]) 
     raise ValueError(f"no {count} distinct colours among {list(pool)}; enlarge the pool")
 
 
-def listed(choices: Sequence[str]) -> str:
+def list_choices(choices: Sequence[str]) -> str:
     """Return the choices as they are read out: 'red, blue or green'."""
     return ", ".join(choices[:-1]) + " or " + choices[-1]

@@ -42,7 +42,7 @@ OCCLUDER_PX = 2000.0  # of a decoy in the first frame: 1 % of the picture
 EARLIEST_COVER_S = 0.5  # the late occluder comes no earlier
 AGREE_SHARE = 0.95  # of the futures of a predictable cut
 FUTURES = 64  # of the last frame that it shows
-LEADS = (5, 3, 2, 1)  # frames before commitment at which it may cut, the earliest first
+LEAD_FRAMES = (5, 3, 2, 1)  # frames before commitment at which it may cut, the earliest first
 BEHIND_M = 0.05  # a decoy stands so far behind all that is shown
 
 
@@ -147,12 +147,12 @@ def _decoys(scenario: Scenario, points: np.ndarray) -> Iterator[Occluder]:
     depth_behind = float((points @ ahead).max()) - float(centre @ ahead) + BEHIND_M + OCCLUDER_HALF_THICKNESS
     at = float(centre @ across)
     for offset in (0.0, high - at, low - at):
-        yield _moved(occluder, ahead * depth_behind + across * offset)
+        yield _move(occluder, ahead * depth_behind + across * offset)
     for offset in (high + half_width + BEHIND_M - at, low - half_width - BEHIND_M - at):
-        yield _moved(occluder, across * offset)
+        yield _move(occluder, across * offset)
 
 
-def _moved(occluder: Occluder, by: np.ndarray) -> Occluder:
+def _move(occluder: Occluder, by: np.ndarray) -> Occluder:
     x, y, z = (round(float(value), 6) for value in np.array(occluder.centre) + by)
     return replace(occluder, centre=(x, y, z))
 
@@ -236,7 +236,7 @@ def _predictable_cut(scenario: Scenario) -> Take:
     control, commit = scenario.control, scenario.control.outcome.commit_frame
     if not control.same_physics:
         raise Rejected("simulating here does not give the frozen trajectory, so that its futures are not known")
-    for frame in (commit - lead for lead in LEADS if commit - lead > EARLIEST_CUT_S * scenario.fps):
+    for frame in (commit - lead for lead in LEAD_FRAMES if commit - lead > EARLIEST_CUT_S * scenario.fps):
         agree = _agreeing(scenario, frame - 1)
         if agree is not None:
             evidence = {"cut_s": frame / scenario.fps, "settled_s": commit / scenario.fps, "agree": agree}
@@ -383,7 +383,7 @@ ARMS: Mapping[str, Arm] = {
         Arm(
             "predictable_cut",
             "a cut means: abstain",
-            f"the control is cut up to {LEADS[0]} frames before its outcome is settled, where at least "
+            f"the control is cut up to {LEAD_FRAMES[0]} frames before its outcome is settled, where at least "
             f"{AGREE_SHARE:.0%} of {FUTURES} futures of the last frame, perturbed as for `open`, end in the answer",
             must_answer,
             _predictable_cut,

@@ -18,7 +18,7 @@ from traps_pipeline.protocol.datasets import FRAMINGS, OCCLUDER_DOSES, OCCLUDER_
 from traps_pipeline.scenes.certification.certificates import legible_groups
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.parts.wording import choices_in, match_slots
-from traps_pipeline.scenes.physics.kit import listed
+from traps_pipeline.scenes.physics.kit import list_choices
 from traps_pipeline.scenes.picture import checks
 from traps_pipeline.scenes.picture.render import Renderer
 from traps_pipeline.scenes.variants.arms import SEEN_PX, Arm, Question, Scenario, Take, must_answer
@@ -29,8 +29,8 @@ from traps_pipeline.video.policies import shown_at_end
 
 # --- thresholds -------------------------------------------------------------------------------------------------------
 
-NOTICED = 8  # levels of 255 by which a channel must differ for a pixel to count as seen through an occluder
-WIDER = 1.4  # by which the large occluder is wider: a higher one would hide the flags of what the question names
+SEEN_LEVELS = 8  # levels of 255 by which a channel must differ for a pixel to count as seen through an occluder
+WIDTH_FACTOR = 1.4  # by which the large occluder is wider: a higher one would hide the flags of what the question names
 GREY, MAGENTA = (0.55, 0.55, 0.57), (1.0, 0.0, 1.0)  # a colour near the floor's; one that nothing in any scene has
 END_S = 0.5  # of the control's end, in which frames shown later must show the outcome
 PALETTE = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")  # colours that may be offered as answers
@@ -46,7 +46,7 @@ def with_labels(spec: SceneSpec, count: int) -> tuple[str, tuple[str, ...]]:
     answers are no colours, or the choices are part of the sentence.
     """
     if spec.answer_type != "colour":
-        raise Rejected(f"the answers {listed(spec.labels)} are no colours, so that no others can be offered")
+        raise Rejected(f"the answers {list_choices(spec.labels)} are no colours, so that no others can be offered")
     slots = match_slots(get_family(spec.family).questions, spec.question)
     if slots is None or set(choices_in(slots.get("choices", ""))) != set(spec.labels):
         raise Rejected(f"the choices of {spec.question!r} are part of its sentence")
@@ -55,7 +55,7 @@ def with_labels(spec: SceneSpec, count: int) -> tuple[str, tuple[str, ...]]:
     labels = _mixed(spec, [*dict.fromkeys(pool)][:count])
     if len(labels) < count:
         raise Rejected(f"there are {len(labels)} answers to choose from, {count} are wanted")
-    return spec.question.replace(slots["choices"], listed(labels)), tuple(labels)
+    return spec.question.replace(slots["choices"], list_choices(labels)), tuple(labels)
 
 
 def _mixed(spec: SceneSpec, labels: Sequence[str]) -> list[str]:
@@ -162,7 +162,7 @@ def _coloured(colour: tuple[float, float, float]) -> Callable[[Scenario], Take]:
 
 
 def _large(scenario: Scenario) -> Take:
-    return _void_with(scenario, Look(wide=WIDER))
+    return _void_with(scenario, Look(wide=WIDTH_FACTOR))
 
 
 def _sheer(alpha: float) -> Callable[[Scenario], Take]:
@@ -174,11 +174,14 @@ def _sheer(alpha: float) -> Callable[[Scenario], Take]:
         with _renderer(scenario.twin, look) as renderer:
             twin_frames = list(checks.void_frames(renderer, scenario.twin.qpos))
         gaps = [np.abs(frames[k].astype(np.int16) - twin_frames[k]).max(axis=2) for k in last]
-        noticed, levels = max(int((gap >= NOTICED).sum()) for gap in gaps), max(int(gap.max()) for gap in gaps)
+        noticed, levels = (
+            max(int((gap >= SEEN_LEVELS).sum()) for gap in gaps),
+            max(int(gap.max()) for gap in gaps),
+        )
         evidence = {"alpha": alpha, "seen_through_px": noticed, "levels": levels}
         if noticed < SEEN_PX:
             raise Rejected(
-                f"through an occluder of alpha {alpha:g} the two worlds differ by {NOTICED} levels or more in "
+                f"through an occluder of alpha {alpha:g} the two worlds differ by {SEEN_LEVELS} levels or more in "
                 f"{noticed} pixels of a late frame ({levels} levels at most), {SEEN_PX:.0f} are wanted"
             )
         return Take(frames, evidence)
@@ -214,8 +217,8 @@ _SAME_VOID = (
     f"{SEEN_PX:.0f} pixels of what moves are seen past the occluder in some sampled frame"
 )
 _SEEN_THROUGH = (
-    f"not a void: in one of the last three sampled frames the two worlds differ by {NOTICED} of 255 levels or more in "
-    f"at least {SEEN_PX:.0f} pixels"
+    f"not a void: in one of the last three sampled frames the two worlds differ by {SEEN_LEVELS} of 255 levels or more "
+    f"in at least {SEEN_PX:.0f} pixels"
 )
 _COUNTS = {"labels_two": 2, "labels_three": 3, "labels_six": 6}
 _COLOURED = {"occluder_grey": GREY, "occluder_magenta": MAGENTA}
@@ -223,7 +226,7 @@ _ALPHAS = {name: int(name.removeprefix("occluder_alpha_")) / 100 for name in OCC
 _CHANGES: Mapping[str, str] = {
     "occluder_grey": "the occluder is grey, near the floor's colour",
     "occluder_magenta": "the occluder is magenta, which nothing in any scene is",
-    "occluder_large": f"the occluder is {WIDER:g} times as wide",
+    "occluder_large": f"the occluder is {WIDTH_FACTOR:g} times as wide",
     "schema_answer": 'the prompt asks for the object `{"final_answer"}`',
     "schema_reason": 'it asks for `{"reason", "final_answer"}`: the request of the regime `json`',
     "schema_abstain": 'it asks for `{"reason", "abstain", "final_answer"}`',

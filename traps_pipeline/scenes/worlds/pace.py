@@ -56,7 +56,7 @@ def is_exchangeable(family: Family) -> bool:
     return family.category not in EXTENSION_CATEGORIES
 
 
-def _counted(worlds: Sequence[World]) -> Sequence[World]:
+def _counting_worlds(worlds: Sequence[World]) -> Sequence[World]:
     return worlds if is_exchangeable(worlds[0].family) else worlds[:1]
 
 
@@ -66,7 +66,7 @@ def lengths(worlds: Sequence[World], seed: int) -> list[int]:
     Those are all that there are, or, where the outcome of one world is early, an even number drawn by seed, and then
     the most.
     """
-    worlds = _counted(worlds)
+    worlds = _counting_worlds(worlds)
     n_frames, fps = len(worlds[0].qpos), worlds[0].physics.fps
     first, last = (of(world.outcome.commit_frame for world in worlds) for of in (min, max))
     if None in [world.outcome.label for world in worlds] or settles_share(first, n_frames) >= EARLIEST_SHARE:
@@ -84,7 +84,7 @@ def moments(worlds: Sequence[World], seed: int) -> Iterator[int]:
     All outcomes have been in view and at rest for long enough; after those, or where there is no time for that, comes
     the last possible frame.
     """
-    worlds = _counted(worlds)
+    worlds = _counting_worlds(worlds)
     fps, commit = worlds[0].physics.fps, max(world.outcome.commit_frame for world in worlds)
     last = last_of_all(len(worlds[0].qpos), fps)
     if last - commit < round(IN_VIEW_S * fps):

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from traps_pipeline.base.digests import digest
-from traps_pipeline.base.files import replacing
+from traps_pipeline.base.files import replace_file
 
 if TYPE_CHECKING:
     from traps_pipeline.scenes.physics.kit import Physics
@@ -220,7 +220,7 @@ def save_trajectory(folder: Path, scenario_id: str, qpos: np.ndarray, twin: np.n
     """Write `<folder>/<scenario_id>.npz`: trajectories of a scenario and its twin."""
     arrays = {"qpos": qpos, "twin": twin}
     plain_arrays = {name: np.ascontiguousarray(values, dtype="<f4") for name, values in arrays.items()}
-    with replacing(folder / f"{scenario_id}.npz") as part, part.open("wb") as stream:
+    with replace_file(folder / f"{scenario_id}.npz") as part, part.open("wb") as stream:
         np.savez_compressed(stream, allow_pickle=False, **plain_arrays)
 
 
