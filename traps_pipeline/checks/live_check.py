@@ -51,6 +51,7 @@ BAD_REQUEST = 400
 COLOURS = {"red": (200, 30, 30), "blue": (30, 30, 200)}
 QUESTION = "The whole picture has one colour and then another: which two colours does the clip show?"
 _FPS, _SIZE, _FRAMES = 10, (120, 160), 50
+_NO_SCHEMA = "say `json_schema: false` and `waivers: {json_schema: WHY}`"
 _JUDGED = (("I don't know.", True, False), ("The ball rolls down the ramp. The answer is: left.", False, True))
 _ITEM: Mapping[str, Any] = {
     "item_id": "preflight",
@@ -234,7 +235,7 @@ def _failure(entry: Entry, account: Account, name: str, error: str) -> str:
         case "rate_limited":
             return f"{location} takes no call now; what it said stands above: wait, or raise the limit or quota there"
         case _ if name == "schema":
-            return f"it refuses structured output ({error}): say `json_schema: false` and why under waivers"
+            return f"it refuses structured output ({error}): {_NO_SCHEMA}"
         case _:
             return (
                 f"{name}: it refuses what the entry declares ({error}); what it said stands above. "
@@ -281,8 +282,7 @@ def _wrong_answers(entry: ModelEntry, outcomes: Mapping[str, Outcome]) -> list[s
             messages.append(f"its answer is {plain(text)[:40]!r}, which {degenerate(text)}")
         elif reading.is_json is False and reading.outcome == "answer":
             messages.append(
-                "it ignores the schema (its answer in the JSON regime is no such object): say `json_schema: false` and "
-                "why under waivers"
+                f"it ignores the schema (its answer in the JSON regime is no such object): {_NO_SCHEMA}"
             )
     return messages
 
