@@ -281,9 +281,7 @@ def _wrong_answers(entry: ModelEntry, outcomes: Mapping[str, Outcome]) -> list[s
         if reading.outcome == "degenerate":
             messages.append(f"its answer is {plain(text)[:40]!r}, which {degenerate(text)}")
         elif reading.is_json is False and reading.outcome == "answer":
-            messages.append(
-                f"it ignores the schema (its answer in the JSON regime is no such object): {_NO_SCHEMA}"
-            )
+            messages.append(f"it ignores the schema (its answer in the JSON regime is no such object): {_NO_SCHEMA}")
     return messages
 
 

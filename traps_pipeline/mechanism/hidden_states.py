@@ -287,7 +287,7 @@ def _shards(folder: Path, seen: Container[str]) -> Iterator[tuple[str, pd.DataFr
     for path in sorted(path for path in folder.glob("shard-*.parquet") if path.stem not in seen):
         try:
             table = read_sealed(path).to_pandas()
-            rows = _sound_rows(path.with_suffix(".safetensors"))
+            rows = _count_sound_rows(path.with_suffix(".safetensors"))
         except (OSError, ValueError, TrapsError) as error:
             progress.current().note(f"{path}: damaged ({error}); its items are extracted again")
             continue
@@ -347,7 +347,7 @@ def _tensor(file: Path, name: str) -> np.ndarray:
         ) from error
 
 
-def _sound_rows(file: Path) -> int:
+def _count_sound_rows(file: Path) -> int:
     """Return how many items a shard holds, or raise TrapsError if it is damaged."""
     from safetensors import SafetensorError, safe_open
 
@@ -365,7 +365,7 @@ def _sound_rows(file: Path) -> int:
 def damage(file: Path) -> str:
     """Return what is wrong with a file of an extraction; empty if nothing is."""
     try:
-        _sound_rows(file) if file.suffix == ".safetensors" else read_sealed(file)
+        _count_sound_rows(file) if file.suffix == ".safetensors" else read_sealed(file)
     except (OSError, ValueError, TrapsError) as error:
         return str(error) if str(file) in str(error) else f"{file}: cannot be read ({error})"
     return ""

@@ -77,7 +77,7 @@ def corrected(
         model, regime = cast(tuple[str, str], key)
         for dataset, figures in _entry(group, f"{model}|{regime}", resampling, errors).items():
             entry = {"model": model, "regime": regime, "dataset": dataset, "panel": panel}
-            rows.append(entry | {"n_runs": _runs(group, dataset)} | figures)
+            rows.append(entry | {"n_runs": _count_runs(group, dataset)} | figures)
     return pd.DataFrame(rows, columns=pd.Index(CORRECTED.names))
 
 
@@ -175,7 +175,7 @@ def _entry(group: pd.DataFrame, named: str, resampling: Resampling, errors: Erro
     }
 
 
-def _runs(group: pd.DataFrame, dataset: str) -> int:
+def _count_runs(group: pd.DataFrame, dataset: str) -> int:
     """Return how many runs are behind a dataset's row (`overall`: with all four)."""
     if dataset != "overall":
         return len(set(group["run"][group["dataset"] == dataset]))

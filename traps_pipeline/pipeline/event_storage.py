@@ -58,7 +58,7 @@ def _transaction(engine: db.Engine) -> Iterator[db.Connection]:
         raise unwritable from None
 
 
-def _changes(connection: db.Connection) -> int:
+def _count_changes(connection: db.Connection) -> int:
     """Return how many rows this connection has changed since it was opened."""
     return connection.connection.driver_connection.total_changes  # pyright: ignore[reportOptionalMemberAccess]
 
@@ -86,9 +86,9 @@ class _EventStorage(SqliteEventLogStorage):
                 self._initialized_dbs.add(shard)
             engine = self._engine(shard)
             with _transaction(engine) as connection:
-                n_changes = _changes(connection)
+                n_changes = _count_changes(connection)
                 yield connection
-                is_changed = _changes(connection) != n_changes
+                is_changed = _count_changes(connection) != n_changes
             if is_changed:
                 with contextlib.suppress(FileNotFoundError):
                     os.utime(self.path_for_shard(shard))

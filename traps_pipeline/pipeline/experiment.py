@@ -134,8 +134,8 @@ class Experiment(BaseModel):
             )
         if panel is None and study is not None and study.panel and self.panel not in (None, study.panel):
             raise TrapsError(
-                f"study.yaml: panel is {study.panel!r}, experiment {self.name} has {self.panel!r}; edit one of them, or "
-                "name another --workspace"
+                f"study.yaml: panel is {study.panel!r}, experiment {self.name} has {self.panel!r}; "
+                "edit one of them, or name another --workspace"
             )
         panel_name = panel or (base.panel if study else self.panel) or self.panel or ""
         is_judged_by_rules = judged_by_rules or bool(self.judged_by_rules) or base.judged_by_rules
@@ -147,7 +147,9 @@ class Experiment(BaseModel):
         for name in ("panel", "epoch"):
             old, new = getattr(study, name), getattr(self, name)
             if new is not None and new != old:
-                raise TrapsError(f"{path}: {name} is {old!r}, experiment {self.name} has {new!r}; edit one of them, or name another --workspace")
+                raise TrapsError(
+                    f"{path}: {name} is {old!r}, experiment {self.name} has {new!r}; edit one of them, or name another --workspace"
+                )
         if self.mechanism is not None and study.mechanism not in (None, self.mechanism):
             raise TrapsError(
                 f"{path}: its `mechanism` differs from that of experiment {self.name}; edit one of them, or remove it "

@@ -208,7 +208,7 @@ def _count_calls(
         if workspace is None or lineage is None:
             continue
         # A fresh cell of current items is complete: skip building its keys and reading its ledger.
-        fresh_answers, cast = (_fresh_rows(workspace, lineage, table, cell) for table in (RESPONSES, VOTES))
+        fresh_answers, cast = (_count_fresh_rows(workspace, lineage, table, cell) for table in (RESPONSES, VOTES))
         if fresh_answers is not None and cast is not None and cell.dataset in current:
             answers.add(fresh_answers, fresh_answers)
             votes.add(cast, cast)
@@ -267,7 +267,7 @@ def _count_cell(
     votes.add(len(ballots) + n_new, len(workspace.votes.read(folder, ballots).settled))
 
 
-def _fresh_rows(workspace: Workspace, lineage: Lineage, table: Table[Any], cell: Cell) -> int | None:
+def _count_fresh_rows(workspace: Workspace, lineage: Lineage, table: Table[Any], cell: Cell) -> int | None:
     """Return the number of rows of a cell's table; None unless it is fresh."""
     state = workspace.tables.state(table, cell.partition)
     return state.rows if state and lineage.status(table.name, cell.key).kind == "fresh" else None

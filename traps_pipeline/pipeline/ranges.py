@@ -83,9 +83,9 @@ def cut(scheme: Partitioning | None, keys: Sequence[str | None], most: int) -> l
     is_wanted = np.zeros((len(grid.rows), len(grid.columns)), bool)
     for row, column in grid.cells(keys):
         is_wanted[row, column] = True
-    heads = np.array([name.partition("__")[0] for name in grid.columns])
-    is_by_model = most < len({*heads[is_wanted.any(axis=0)]})
-    return [grid.range(*corners) for corners in _parts(is_wanted, heads, 0, 0, most, by_model=is_by_model)]
+    model_names = np.array([name.partition("__")[0] for name in grid.columns])
+    is_by_model = most < len({*model_names[is_wanted.any(axis=0)]})
+    return [grid.range(*corners) for corners in _parts(is_wanted, model_names, 0, 0, most, by_model=is_by_model)]
 
 
 def _parts(

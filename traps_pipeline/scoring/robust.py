@@ -108,7 +108,7 @@ def _row(items: pd.DataFrame, named: str, arms: Sequence[str], resampling: Resam
     row: dict[str, Any] = {
         "n_runs": len(runs),
         "n_items": max(rows["item_id"].nunique() for rows in runs.values()),
-        "n_missing": _missing_decisions(items),
+        "n_missing": _count_missing(items),
         "n_conjunction": max(n for _, n in conjunctions),
         "epoch": joined_epochs(items["epoch"]),
         "panel": joined_epochs(items["panel"]),
@@ -178,7 +178,7 @@ def _conjunction(items: pd.DataFrame, resampling: Resampling, named: str) -> tup
     return ends_of_mean(decided_scenarios, resampling, named), len(decided_scenarios)
 
 
-def _missing_decisions(items: pd.DataFrame) -> int:
+def _count_missing(items: pd.DataFrame) -> int:
     """Return the number of items, over runs, that lack a decision of their side."""
     control = items["side"] == "control"
     is_decided = np.where(control, items["correct_of"] & items["false_abs_of"], items["abs_rec_of"])

@@ -172,7 +172,7 @@ def dose_response(results: Results) -> Figure:
             for ax, side, sign in zip(pair, ("control", "void"), ("+α on controls", "−α on voids"), strict=True):
                 _mean_band(ax, _panel_shares(results.shares, part, path_set, side))
                 _doses(ax, part, side, KEY_PATHS if path_set == "transfer" else STEERING_PATHS)
-                ax.set_title(f"{plain(model)[:20]}\n{sign}, {SETS[path_set]}{_answers(part, side)}", size=6.5)
+                ax.set_title(f"{plain(model)[:20]}\n{sign}, {SETS[path_set]}{_count_answers(part, side)}", size=6.5)
                 ax.set_xlabel("α")
         for ax in pairs[len(panels) :].flat:
             ax.set_axis_off()
@@ -184,7 +184,7 @@ def dose_response(results: Results) -> Figure:
     return figure
 
 
-def _answers(part: pd.DataFrame, side: str) -> str:
+def _count_answers(part: pd.DataFrame, side: str) -> str:
     """Return the number of answers behind a marker."""
     counts = part[f"{side}_n"].dropna().astype(int) if f"{side}_n" in part else []
     return f", n {range_text(min(counts), max(counts))}" if len(counts) else ""

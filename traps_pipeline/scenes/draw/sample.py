@@ -277,12 +277,12 @@ def record_line(spec: SceneSpec) -> str:
 
 
 def _full_answers(answers: Counter[str], count: int, family: Family, longer: bool = False) -> frozenset[str]:
-    choices = _choices(family, longer)
+    choices = _mean_choices(family, longer)
     return frozenset(answer for answer, n in answers.items() if n >= answer_quota(count, choices[answer]))
 
 
 @cache
-def _choices(family: Family, longer: bool = False) -> Mapping[str, float]:
+def _mean_choices(family: Family, longer: bool = False) -> Mapping[str, float]:
     """Return how many choices each answer competes with, on average over many draws."""
     rng = np.random.default_rng(0)
     choices_by_draw = [family.word(family.draw(rng, longer), rng).labels for _ in range(_WORDED_DRAWS)]

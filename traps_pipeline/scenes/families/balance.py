@@ -66,24 +66,24 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build shelf, beam, and the board that carries the beam and catches shadows."""
     course = Course(physics, p.direction)
-    r, side = p.radius_m, 1.7 * p.radius_m
+    r, half_width = p.radius_m, 1.7 * p.radius_m
     sin, cos = np.sin(np.radians(p.tilt_deg)), np.cos(np.radians(p.tilt_deg))
     drop_at = float(p.arm_m * cos - (BEAM_HALF_M + r) * sin)  # before the pivot, over the cup of the raised arm
     z = float(p.pivot_z_m + (p.half_beam_m * sin + (BEAM_HALF_M + CUP_M) * cos) + 0.03)  # the shelf clears that cup
     edge, stop = -drop_at - r - DROP_SLACK_M, -drop_at + r + DROP_SLACK_M
     occluder_at, end, high = -p.half_beam_m - 0.03, p.half_beam_m + 0.03, z + 2 * r + 0.02
-    start, depth_span, wall_span = occluder_at - p.run_m, (-side, side), (z, z + 0.3 * r)
+    start, depth_span, wall_span = occluder_at - p.run_m, (-half_width, half_width), (z, z + 0.3 * r)
 
     course.block("table", (start, occluder_at), depth_span, (0, z), p.shelf_colour)
     course.block("shelf", (occluder_at, edge), depth_span, (z - 0.012, z), p.shelf_colour)
-    course.block("shelf_front", (start, edge), (-side, -side + 0.012), wall_span, p.board_colour)
-    course.block("shelf_back", (start, edge), (side - 0.012, side), wall_span, p.board_colour)
-    backstop_box = (stop, stop + 0.012), (-0.6 * side, side), (z - 0.01, z + 1.5 * r)
+    course.block("shelf_front", (start, edge), (-half_width, -half_width + 0.012), wall_span, p.board_colour)
+    course.block("shelf_back", (start, edge), (half_width - 0.012, half_width), wall_span, p.board_colour)
+    backstop_box = (stop, stop + 0.012), (-0.6 * half_width, half_width), (z - 0.01, z + 1.5 * r)
     backstop = course.block("backstop", *backstop_box, p.shelf_colour)
     backstop.priority, backstop.solref = 1, list(DEAD)
-    course.block("board", (occluder_at, end), (side, side + 0.015), (0, high), p.board_colour)
-    course.block("base", (-p.half_beam_m, p.half_beam_m), (-side - 0.02, side), (0, 0.025), "black")
-    axle = (-0.016, 0.016), (-0.05, side), (p.pivot_z_m - 0.016, p.pivot_z_m + 0.016)
+    course.block("board", (occluder_at, end), (half_width, half_width + 0.015), (0, high), p.board_colour)
+    course.block("base", (-p.half_beam_m, p.half_beam_m), (-half_width - 0.02, half_width), (0, 0.025), "black")
+    axle = (-0.016, 0.016), (-0.05, half_width), (p.pivot_z_m - 0.016, p.pivot_z_m + 0.016)
     course.block("axle", *axle, "white", solid=False)
     _add_beam(course, p)
     at = (start + 1.2 * r, 0, z + r)
@@ -93,7 +93,7 @@ def build(p: Params, physics: Physics) -> Scene:
         p,
         decisive=["beam"],
         hidden=["counterweight"],
-        cover=course.box((occluder_at, end), (-side - 0.02, side + 0.03), (0, high + 0.02), right=0.02),
+        cover=course.box((occluder_at, end), (-half_width - 0.02, half_width + 0.03), (0, high + 0.02), right=0.02),
         in_view=[course.box((start, end), depth_span, (0, high))],
         things=[f"{p.ball_colour} ball", f"{p.beam_colour} beam", "shelf", "counterweight", "cup"],
         also=["board", "base"],

@@ -72,17 +72,21 @@ def build(p: Params, physics: Physics) -> Scene:
     """Build a lane, a wall with windows and merlons before it, and a tray at its end."""
     course = Course(physics, p.direction)
     r, rail, front = p.radius_m, 0.012, -1.35 * p.radius_m - WALL_M
-    side, far_end = 1.25 * r, p.wall_m + p.tray_m
-    second, depth_span, rim = p.windows_m[1], (-side, side), TRAY_M + 0.6 * r
+    half_width, far_end = 1.25 * r, p.wall_m + p.tray_m
+    second, depth_span, rim = p.windows_m[1], (-half_width, half_width), TRAY_M + 0.6 * r
     bed = (second - 2.5 * r, second + 1.5 * r)  # rough: a ball that bounces off the block stays there
 
     course.block("lane_in", (-p.run_m, bed[0]), depth_span, (0, DECK_M), p.lane_colour, Surface(1e-4))
     course.block("lane_bed", bed, depth_span, (0, DECK_M), p.lane_colour, Surface(0.003))
     course.block("lane_out", (bed[1], p.wall_m), depth_span, (0, DECK_M), p.lane_colour, Surface(1e-4))
     course.block("tray", (p.wall_m, far_end), depth_span, (0, TRAY_M), p.tray_colour, Surface(0.004))
-    course.sides("tray", (p.wall_m, far_end), side, rail, (0, rim), p.tray_colour)
+    course.sides("tray", (p.wall_m, far_end), half_width, rail, (0, rim), p.tray_colour)
     course.block(
-        "tray_end", (far_end, far_end + rail), (-side - rail, side + rail), (0, TRAY_M + 1.5 * r), p.tray_colour
+        "tray_end",
+        (far_end, far_end + rail),
+        (-half_width - rail, half_width + rail),
+        (0, TRAY_M + 1.5 * r),
+        p.tray_colour,
     )
     _add_wall(course, p, (front, front + WALL_M))
     stop = second + 1.1 * r  # where the block's face is: the ball rests in the window

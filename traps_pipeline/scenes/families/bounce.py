@@ -57,20 +57,20 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build a table, then pad, wall and tray before a board that catches the shadows."""
     course = Course(physics, p.direction)
-    r, side, rim, top = p.radius_m, 1.7 * p.radius_m, 0.012, FLOOR_M + p.drop_m
+    r, half_width, rim, top = p.radius_m, 1.7 * p.radius_m, 0.012, FLOOR_M + p.drop_m
     near_face, far_face, end = p.wall_at_m - WALL_HALF_M, p.wall_at_m + WALL_HALF_M, p.wall_at_m + p.tray_m
-    depth_span, floor, wall_span = (-side, side), (0, FLOOR_M), (0, FLOOR_M + p.wall_m)
+    depth_span, floor, wall_span = (-half_width, half_width), (0, FLOOR_M), (0, FLOOR_M + p.wall_m)
     pad = Surface(1e-3, solref=(-50000.0, -22.0) if p.lively else DEAD, priority=2)
 
     course.block("table", (-p.table_m, 0), depth_span, (0, top), p.table_colour)
-    for i, y in enumerate((-side, side - rim)):
+    for i, y in enumerate((-half_width, half_width - rim)):
         course.block(f"table_rail_{i}", (-p.table_m, 0), (y, y + rim), (top, top + 0.3 * r), p.board_colour)
     course.block("pad", (0, near_face), depth_span, floor, p.pad_colour, pad)
     course.block("wall", (near_face, far_face), depth_span, wall_span, p.wall_colour)
     course.block("tray", (far_face, end), depth_span, floor, p.tray_colour, Surface(2e-3, solref=DEAD))
-    course.block("front_rail", (0, end), (-side - rim, -side), (0, FLOOR_M + 0.3 * r), p.table_colour)
-    course.block("end", (end, end + 0.02), (-side - rim, side), wall_span, p.table_colour)
-    course.block("board", (0, end + 0.02), (side, side + 0.015), (0, top), p.board_colour)
+    course.block("front_rail", (0, end), (-half_width - rim, -half_width), (0, FLOOR_M + 0.3 * r), p.table_colour)
+    course.block("end", (end, end + 0.02), (-half_width - rim, half_width), wall_span, p.table_colour)
+    course.block("board", (0, end + 0.02), (half_width, half_width + 0.015), (0, top), p.board_colour)
     course.ball("ball", (-p.table_m + 1.3 * r, 0, top + r), r, p.ball_colour, speed=p.speed_m_s)
     course.mark("wall", "wall")
     return course.scene(
@@ -78,7 +78,7 @@ def build(p: Params, physics: Physics) -> Scene:
         decisive=["ball"],
         hidden=["pad"],
         # The occluder begins a little beyond the edge: a ball just hidden has left the table.
-        cover=course.box((0.03, end + 0.02), (-side - rim, side + 0.03), (0, top + 0.02), right=0.02),
+        cover=course.box((0.03, end + 0.02), (-half_width - rim, half_width + 0.03), (0, top + 0.02), right=0.02),
         in_view=[course.box((-p.table_m, end), depth_span, (0, top))],
         things=[f"{p.ball_colour} ball", f"{p.wall_colour} wall", "table", "tray", f"{p.pad_colour} pad"],
         also=["board"],

@@ -76,18 +76,18 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build ramp, step, deck with the row between low rims, and sunken box."""
     course = Course(physics, p.direction)
-    r, side, end = p.radius_m, 1.35 * p.radius_m, p.box_at_m + p.box_m
-    depth_span, outer = (-side, side), (-side - WALL_M, side + WALL_M)
+    r, half_width, end = p.radius_m, 1.35 * p.radius_m, p.box_at_m + p.box_m
+    depth_span, outer = (-half_width, half_width), (-half_width - WALL_M, half_width + WALL_M)
     deck_span, box_span = (p.ramp_m, p.box_at_m), (p.box_at_m, end)
 
     ramp = SteppedRamp(p.ramp_m, p.slope_deg, DECK_M + STEP_M)
-    Surface(2e-5, priority=2).on(ramp.add(course, side, p.ramp_colour))
+    Surface(2e-5, priority=2).on(ramp.add(course, half_width, p.ramp_colour))
     LIVELY.on(course.ball("striker", ramp.at(p.start_m, r), r, p.striker_colour))
     course.block("deck", deck_span, depth_span, (0, DECK_M), p.deck_colour, Surface(1.5e-3, sliding=0.4, priority=2))
     course.block(
         "box_floor", box_span, depth_span, (0, BOX_FLOOR_M), p.box_colour, Surface(2e-3, sliding=0.4, priority=2)
     )
-    for name, across in (("rim_front", (outer[0], -side)), ("rim_back", (side, outer[1]))):
+    for name, across in (("rim_front", (outer[0], -half_width)), ("rim_back", (half_width, outer[1]))):
         course.block(name, deck_span, across, (0, DECK_M + 0.25 * r), p.ramp_colour)
         course.block(f"box_{name}", box_span, across, (0, DECK_M), p.box_colour)
     wall = course.block("box_end", (end, end + WALL_M), outer, (0, DECK_M + r), p.box_colour)
@@ -96,7 +96,7 @@ def build(p: Params, physics: Physics) -> Scene:
         colour = p.last_colour if name == "last" else p.row_colour
         LIVELY.on(course.ball(name, (along, 0, DECK_M + r), r, colour))
     peg_at = p.balls_m[p.peg_after] + r + p.gap_m / 2
-    peg_offset, peg_half_height = 0.0 if p.blocked else side + WALL_M + 2 * PEG_M, (DECK_M + 1.9 * r) / 2
+    peg_offset, peg_half_height = 0.0 if p.blocked else half_width + WALL_M + 2 * PEG_M, (DECK_M + 1.9 * r) / 2
     course.post(
         "peg", (peg_at, peg_offset, peg_half_height), PEG_M, peg_half_height, "black"
     ).priority = 3  # dead: the ball stops at it

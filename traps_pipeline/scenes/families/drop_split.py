@@ -27,10 +27,10 @@ FLOOR_M = 0.02  # thickness of the bins' floors
 WALL_M = 0.014
 DEPTH_M = 0.15  # half of the bins' depth
 FELT = Surface(0.004, sliding=0.6, solref=SOFT)
-FREE = ("green", "yellow", "orange", "cyan", "purple")  # the bins are red and blue
+FREE_COLOURS = ("green", "yellow", "orange", "cyan", "purple")  # the bins are red and blue
 SLANTS = 0.8, 3.0  # rows a column, of the ridge's edges in the picture
 EDGE_PX = 60  # least length of the edges of either side
-PLAY_COLOURS, PLAIN_COLOURS = apart(*FREE), shuffled("grey", "black", "white")
+PLAY_COLOURS, PLAIN_COLOURS = apart(*FREE_COLOURS), shuffled("grey", "black", "white")
 
 
 def _offset(rng: np.random.Generator, so_far: Drawn) -> float:
@@ -126,7 +126,7 @@ def _ask_colour(part: str, question: str) -> Aside:
 
     def ask(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
         colours = [p.ball_colour, p.cube_colour]
-        third = next(str(c) for c in rng.permutation(FREE) if c not in colours)
+        third = next(str(c) for c in rng.permutation(FREE_COLOURS) if c not in colours)
         return choice_of(question, lambda p: [*colours, third], lambda p: part_colours(p)[part])(p, rng)
 
     return ask

@@ -101,8 +101,8 @@ def build(p: Params, physics: Physics) -> Scene:
         back=p.cup_m,
         front=FLOOR_M + 0.4 * r,
     )
-    side, wall_at = rim + 0.03, rim + 0.03 + 0.12  # shadows fall to the right: the wall is there to catch them
-    wall = (-side, wall_at) if p.direction > 0 else (-wall_at, side)
+    wall_inside, wall_at = rim + 0.03, rim + 0.03 + 0.12  # shadows fall to the right: the wall is there to catch them
+    wall = (-wall_inside, wall_at) if p.direction > 0 else (-wall_at, wall_inside)
     course.block("back", wall, (DEPTH_M, DEPTH_M + WALL_M), (0, mouth), p.back_colour)
     for name, sign in (("near", -1), ("far", 1)):
         # The faces of the boards, not their middles, meet the throat's width.

@@ -56,21 +56,21 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build two ramps, steps, and a deck whose two boards differ only in friction."""
     course = Course(physics)
-    r, half_deck, side, high = p.radius_m, p.half_deck_m, 1.7 * p.radius_m, DECK_M + 2 * p.radius_m
-    depth_span, deck_span, board_at = (-side, side), (0, DECK_M), half_deck - 0.10
+    r, half_deck, half_width, high = p.radius_m, p.half_deck_m, 1.7 * p.radius_m, DECK_M + 2 * p.radius_m
+    depth_span, deck_span, board_at = (-half_width, half_width), (0, DECK_M), half_deck - 0.10
     for i, name in enumerate(SIDES):
         outwards = course.towards((-1, 1)[i])
         board = Surface(_roughness(p), priority=2) if outwards.direction == p.rough_side else FELT
         outwards.block(f"deck_{name}", (LINE_M, board_at - BOARD_M), depth_span, deck_span, p.deck_colour, FELT)
         outwards.block(f"board_{name}", (board_at - BOARD_M, board_at), depth_span, deck_span, "wood", board)
         outwards.block(f"entry_{name}", (board_at, half_deck), depth_span, deck_span, p.deck_colour, FELT)
-        _add_ramp(outwards, p, name, side)
+        _add_ramp(outwards, p, name, half_width)
         at = _ramp_point(p, p.ramp_m - p.starts_m[i], r)
         LIVELY.on(outwards.ball(f"ball_{name}", at, r, p.colours[i]))
     course.block("line", (-LINE_M, LINE_M), depth_span, deck_span, "black", FELT)
-    course.sides("rim", (-half_deck, half_deck), side, WALL_M, (0, DECK_M + 0.2 * r), p.ramp_colour)
+    course.sides("rim", (-half_deck, half_deck), half_width, WALL_M, (0, DECK_M + 0.2 * r), p.ramp_colour)
 
-    across = (-side - WALL_M - 0.02, side + WALL_M + 0.5 * high)
+    across = (-half_width - WALL_M - 0.02, half_width + WALL_M + 0.5 * high)
     course.mark("line", "line")
     return course.scene(
         p,

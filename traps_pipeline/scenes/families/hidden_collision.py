@@ -58,17 +58,17 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build a flat track with rails; each lane is closed where no ball enters."""
     course = Course(physics, p.direction)
-    r, half_middle, side = p.radius_m, p.middle_m / 2, 2 * HALF_PITCH * p.radius_m
+    r, half_middle, half_width = p.radius_m, p.middle_m / 2, 2 * HALF_PITCH * p.radius_m
     end, switch_at, length = half_middle + p.run_m, -half_middle + p.switch_m, float(np.hypot(*SWITCH)) * r
-    track, outer, up = (-end, end), (-side - WALL_M, side + WALL_M), (DECK_M, DECK_M + 1.1 * r)
+    track, outer, up = (-end, end), (-half_width - WALL_M, half_width + WALL_M), (DECK_M, DECK_M + 1.1 * r)
 
-    course.block("deck", track, (-side, side), (0, DECK_M), p.deck_colour)
-    course.block("wall_front", track, (outer[0], -side), (0, DECK_M + 0.5 * r), p.rail_colour)
-    course.block("wall_back", track, (side, outer[1]), (0, up[1]), p.rail_colour)
+    course.block("deck", track, (-half_width, half_width), (0, DECK_M), p.deck_colour)
+    course.block("wall_front", track, (outer[0], -half_width), (0, DECK_M + 0.5 * r), p.rail_colour)
+    course.block("wall_back", track, (half_width, outer[1]), (0, up[1]), p.rail_colour)
     course.block("rail_in", (-end, switch_at - 0.3 * r), (-0.004, 0.004), up, p.rail_colour)
     course.block("rail_out", (switch_at + length + 0.3 * r, end), (-0.004, 0.004), up, p.rail_colour)
     for name, at, lane in (("stop_near", -half_middle, p.lanes[0]), ("stop_far", half_middle - 0.02, p.lanes[1])):
-        course.block(name, (at, at + 0.02), (-side, 0) if lane > 0 else (0, side), up, p.rail_colour)
+        course.block(name, (at, at + 0.02), (-half_width, 0) if lane > 0 else (0, half_width), up, p.rail_colour)
     _add_switch(course, p, switch_at, length)
     for i, (start, speed) in enumerate(((1.5 * r - end, p.speeds_m_s[0]), (end - 1.5 * r, -p.speeds_m_s[1]))):
         at = (start, p.lanes[i] * HALF_PITCH * r, DECK_M + r)

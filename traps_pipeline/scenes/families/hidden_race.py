@@ -83,15 +83,15 @@ def build(p: Params, physics: Physics) -> Scene:
     """Build deck with rails, opaque tunnel, sunken tray."""
     course = Course(physics, p.direction)
     lanes, r, pitch, wall = len(p.colours), p.radius_m, 2.8 * p.radius_m, 0.012
-    side, roof, rim, end = lanes * pitch / 2, DECK_M + 2.6 * r, TRAY_M + 0.9 * r, p.exit_m + p.tray_m
-    depth_span, outer, tunnel = (-side, side), (-side - wall, side + wall), (p.run_m, p.exit_m)
+    half_width, roof, rim, end = lanes * pitch / 2, DECK_M + 2.6 * r, TRAY_M + 0.9 * r, p.exit_m + p.tray_m
+    depth_span, outer, tunnel = (-half_width, half_width), (-half_width - wall, half_width + wall), (p.run_m, p.exit_m)
     rough_at = p.run_m + p.mouth_m + 2 * r + 0.04  # no ball feels it before it is wholly behind the occluder
     rough_end = rough_at + ROUGH_BOARD_M
 
     course.block("deck_in", (-0.03, rough_at), depth_span, (0, DECK_M), p.deck_colour)
     course.block("deck_out", (rough_end, p.exit_m), depth_span, (0, DECK_M), p.deck_colour)
     for i in range(lanes + 1):
-        y = -side + i * pitch
+        y = -half_width + i * pitch
         across, up = (y - 0.004, y + 0.004), (DECK_M, DECK_M + 0.4 * r)
         course.block(f"rail_{i}", (-0.03, p.exit_m), across, up, p.tunnel_colour)
     for i, ball in enumerate(p.balls):
@@ -99,15 +99,15 @@ def build(p: Params, physics: Physics) -> Scene:
         board = Surface(2e-5 if i == p.clear_lane else _roughness(p, i, physics))
         course.block(f"board_{i}", (rough_at, rough_end), (y - pitch / 2, y + pitch / 2), (0, DECK_M), "black", board)
         course.ball(ball, (p.starts_m[i], y, DECK_M + r), r, p.colours[i], speed=p.speeds_m_s[i])
-    course.sides("tunnel", tunnel, side, wall, (0, roof), p.tunnel_colour)
+    course.sides("tunnel", tunnel, half_width, wall, (0, roof), p.tunnel_colour)
     course.block("tunnel_roof", tunnel, outer, (roof, roof + wall), p.tunnel_colour)
     surface = Surface(4e-4)  # the balls come to rest in view
     course.block("tray", (p.exit_m, end), depth_span, (0, TRAY_M), p.tray_colour, surface)
-    course.sides("tray", (p.exit_m, end), side, wall, (0, rim), p.tunnel_colour)
+    course.sides("tray", (p.exit_m, end), half_width, wall, (0, rim), p.tunnel_colour)
     course.block("tray_end", (end, end + wall), outer, (0, rim), p.tunnel_colour)
 
     along, up = (p.run_m + p.mouth_m, end + wall), (0, roof + wall)
-    across = (-side - wall - 0.02, side + wall + SHADOW_BACK * roof)
+    across = (-half_width - wall - 0.02, half_width + wall + SHADOW_BACK * roof)
     return course.scene(
         p,
         decisive=p.balls,

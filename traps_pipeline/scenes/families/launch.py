@@ -66,30 +66,30 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build ledge, slide, kicker, pit, barrier and tray before a board for shadows."""
     course = Course(physics, p.direction)
-    r, side, rim = p.radius_m, 1.6 * p.radius_m, 0.012
+    r, half_width, rim = p.radius_m, 1.6 * p.radius_m, 0.012
     (_, top), (lip, lip_z) = p.way[0], p.way[-1]
     barrier, end = lip + p.barrier_at_m, lip + p.barrier_at_m + p.tray_m
     near_face, far_face = barrier - BARRIER_HALF_M, barrier + BARRIER_HALF_M
-    depth_span, high, cut = (-side, side), p.tall_barrier_m + 0.03, 0.55 * p.slide_m
+    depth_span, high, cut = (-half_width, half_width), p.tall_barrier_m + 0.03, 0.55 * p.slide_m
 
     course.block("ledge", (-p.ledge_m, 0), depth_span, (0, top), p.slide_colour)
     for i, (a, b) in enumerate(pairwise(p.way)):
-        course.plank(f"slide_{i}", a, b, side, p.kicker_colour)
+        course.plank(f"slide_{i}", a, b, half_width, p.kicker_colour)
     course.block("kicker", (lip - 0.05, lip), depth_span, (0, lip_z - 0.05), p.kicker_colour)
     course.block("pit", (lip, near_face), depth_span, (0, FLOOR_M), p.tray_colour, CATCH)
     height = p.tall_barrier_m if p.tall else p.low_barrier_m
     course.block("barrier", (near_face, far_face), depth_span, (0, height), p.barrier_colour, CATCH)
     course.block("tray", (far_face, end), depth_span, (0, FLOOR_M), p.tray_colour, CATCH)
-    course.block("end", (end, end + 0.02), (-side - rim, side), (0, 0.20), p.slide_colour, CATCH)
-    course.block("front_rail", (lip, end), (-side - rim, -side), (0, FLOOR_M + 0.3 * r), p.slide_colour)
-    course.block("board", (cut, end + 0.02), (side, side + 0.015), (0, high), p.board_colour)
+    course.block("end", (end, end + 0.02), (-half_width - rim, half_width), (0, 0.20), p.slide_colour, CATCH)
+    course.block("front_rail", (lip, end), (-half_width - rim, -half_width), (0, FLOOR_M + 0.3 * r), p.slide_colour)
+    course.block("board", (cut, end + 0.02), (half_width, half_width + 0.015), (0, high), p.board_colour)
     course.ball("ball", (-p.ledge_m + 1.2 * r, 0, top + r), r, p.ball_colour, speed=p.speed_m_s)
     course.mark("barrier", "barrier")
     return course.scene(
         p,
         decisive=["ball"],
         hidden=["barrier"],
-        cover=course.box((cut, end + 0.02), (-side - rim, side + 0.03), (0, high + 0.03), right=0.02),
+        cover=course.box((cut, end + 0.02), (-half_width - rim, half_width + 0.03), (0, high + 0.03), right=0.02),
         in_view=[course.box((-p.ledge_m, end), depth_span, (0, high))],
         things=[f"{p.ball_colour} ball", f"{p.barrier_colour} barrier", "slide", "tray", f"{p.kicker_colour} kicker"],
         also=["ramp", "board"],

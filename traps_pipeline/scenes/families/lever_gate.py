@@ -61,29 +61,29 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build a lane with a step before a board that carries the lever."""
     course = Course(physics, p.direction)
-    r, side, rim, top, (pivot, pivot_z) = p.radius_m, 1.7 * p.radius_m, 0.012, FLOOR_M + STEP_M, p.pivot_m
+    r, half_width, rim, top, (pivot, pivot_z) = p.radius_m, 1.7 * p.radius_m, 0.012, FLOOR_M + STEP_M, p.pivot_m
     end = p.gate_at_m + 2 * p.arm_m + p.tail_m
     high = pivot_z + p.arm_m * float(np.sin(np.radians(p.swing_deg))) + 0.06
-    depth_span, front = (-side, side), (-side - rim, -side)
+    depth_span, front = (-half_width, half_width), (-half_width - rim, -half_width)
 
     course.block("lane_in", (-p.run_m, STEP_AT_M), depth_span, (0, top), p.lane_colour)
     surface = Surface(1e-3)  # the ball comes to rest on it
     course.block("lane", (STEP_AT_M, end), depth_span, (0, FLOOR_M), p.lane_colour, surface)
     course.block("front_in", (-p.run_m, STEP_AT_M), front, (0, top + 0.3 * r), p.board_colour)
-    course.block("back_in", (-p.run_m, 0), (side, side + rim), (0, top + 0.3 * r), p.board_colour)
+    course.block("back_in", (-p.run_m, 0), (half_width, half_width + rim), (0, top + 0.3 * r), p.board_colour)
     course.block("front", (STEP_AT_M, end), front, (0, FLOOR_M + 0.3 * r), p.board_colour)
-    course.block("end", (end, end + 0.02), (-side - rim, side), (0, FLOOR_M + 1.6 * r), p.board_colour)
-    course.block("board", (0, end + 0.02), (side, side + 0.015), (0, high), p.board_colour)
-    axle = (pivot - 0.012, pivot + 0.012), (-0.03, side), (pivot_z - 0.012, pivot_z + 0.012)
+    course.block("end", (end, end + 0.02), (-half_width - rim, half_width), (0, FLOOR_M + 1.6 * r), p.board_colour)
+    course.block("board", (0, end + 0.02), (half_width, half_width + 0.015), (0, high), p.board_colour)
+    axle = (pivot - 0.012, pivot + 0.012), (-0.03, half_width), (pivot_z - 0.012, pivot_z + 0.012)
     course.block("axle", *axle, "grey", solid=False)
-    _add_lever(course, p, side)
+    _add_lever(course, p, half_width)
     course.ball("ball", (-p.run_m + 1.2 * r, 0, top + r), r, p.ball_colour, speed=p.speed_m_s)
-    course.mark("gate", (p.gate_at_m, side), p.gate_colour)  # below its place on the lever, open or shut
+    course.mark("gate", (p.gate_at_m, half_width), p.gate_colour)  # below its place on the lever, open or shut
     return course.scene(
         p,
         decisive=["ball"],
         hidden=["counterweight", "beam", "gate"],
-        cover=course.box((0, end + 0.02), (-side - rim, side + 0.03), (0, high + 0.02), right=0.02),
+        cover=course.box((0, end + 0.02), (-half_width - rim, half_width + 0.03), (0, high + 0.02), right=0.02),
         in_view=[course.box((-p.run_m, end), depth_span, (0, high))],
         things=[f"{p.ball_colour} ball", f"{p.gate_colour} gate", f"{p.lever_colour} lever", "counterweight"],
         also=["lane", "board"],

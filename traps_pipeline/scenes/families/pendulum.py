@@ -78,33 +78,37 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build a raised lane, floor and block before a board with pendulum and peg."""
     course = Course(physics, p.direction)
-    r, side, rim, high = p.radius_m, 1.6 * p.radius_m, 0.012, p.pivot_z_m + 0.05
-    depth_span, top = (-side, side), FLOOR_M + p.lane_m
+    r, half_width, rim, high = p.radius_m, 1.6 * p.radius_m, 0.012, p.pivot_z_m + 0.05
+    depth_span, top = (-half_width, half_width), FLOOR_M + p.lane_m
     end = p.block_at_m + p.block_height_m + 0.14  # the fallen block has room before it
     lip = p.pivot_at_m - 2 * r + 0.80 * r  # the ball touches it a little after it has touched the bob
 
     course.block("lane_in", (-p.run_m, STEP_AT_M), depth_span, (0, top + STEP_M), p.lane_colour)
     course.block("lane", (STEP_AT_M, lip + 0.008), depth_span, (0, top), p.lane_colour, Surface(3e-4))
     course.block("lip", (lip, lip + 0.008), depth_span, (top, top + 0.25 * r), p.board_colour)
-    course.block("front_in", (-p.run_m, STEP_AT_M), (-side - rim, -side), (0, top + STEP_M + 0.3 * r), p.board_colour)
-    course.block("back_in", (-p.run_m, 0), (side, side + rim), (0, top + STEP_M + 0.3 * r), p.board_colour)
-    course.block("front", (STEP_AT_M, lip + 0.008), (-side - rim, -side), (0, top + 0.3 * r), p.board_colour)
-    course.block("floor_board", (lip + 0.008, end), (-side - rim, side), (0, FLOOR_M), p.lane_colour)
-    course.block("end", (end, end + 0.02), (-side - rim, side), (0, FLOOR_M + 0.06), p.board_colour)
-    course.block("board", (0, end + 0.02), (side, side + 0.015), (0, high), p.board_colour)
-    _add_pendulum(course, p, side)
+    course.block(
+        "front_in", (-p.run_m, STEP_AT_M), (-half_width - rim, -half_width), (0, top + STEP_M + 0.3 * r), p.board_colour
+    )
+    course.block("back_in", (-p.run_m, 0), (half_width, half_width + rim), (0, top + STEP_M + 0.3 * r), p.board_colour)
+    course.block(
+        "front", (STEP_AT_M, lip + 0.008), (-half_width - rim, -half_width), (0, top + 0.3 * r), p.board_colour
+    )
+    course.block("floor_board", (lip + 0.008, end), (-half_width - rim, half_width), (0, FLOOR_M), p.lane_colour)
+    course.block("end", (end, end + 0.02), (-half_width - rim, half_width), (0, FLOOR_M + 0.06), p.board_colour)
+    course.block("board", (0, end + 0.02), (half_width, half_width + 0.015), (0, high), p.board_colour)
+    _add_pendulum(course, p, half_width)
     peg_z = p.pivot_z_m - PEG_DOWN * p.length_m
-    course.rod("peg", (p.peg_at_m, -0.04, peg_z), (p.peg_at_m, side, peg_z), PEG_RADIUS_M, "yellow")
-    half_size = (p.block_half_m, 0.6 * side, p.block_height_m / 2)
+    course.rod("peg", (p.peg_at_m, -0.04, peg_z), (p.peg_at_m, half_width, peg_z), PEG_RADIUS_M, "yellow")
+    half_size = (p.block_half_m, 0.6 * half_width, p.block_height_m / 2)
     course.free_box("block", (p.block_at_m, 0, FLOOR_M + p.block_height_m / 2), half_size, p.block_colour, density=400)
     course.ball("ball", (-p.run_m + 1.2 * r, 0, top + STEP_M + r), r, p.ball_colour, speed=p.speed_m_s)
-    course.mark("bob", (p.pivot_at_m, side), p.bob_colour)
+    course.mark("bob", (p.pivot_at_m, half_width), p.bob_colour)
     course.mark("block", "block")
     return course.scene(
         p,
         decisive=["block"],
         hidden=["peg"],
-        cover=course.box((0, end + 0.02), (-side - rim, side + 0.03), (0, high + 0.02), right=0.02),
+        cover=course.box((0, end + 0.02), (-half_width - rim, half_width + 0.03), (0, high + 0.02), right=0.02),
         in_view=[course.box((-p.run_m, end), depth_span, (0, high))],
         things=[f"{p.ball_colour} ball", f"{p.block_colour} block", f"{p.bob_colour} pendulum bob", "pendulum"],
         also=["lane", "board", "peg", "rod"],

@@ -201,11 +201,11 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     height = float(along[1] * offset[0] - along[0] * offset[1]) / float(along @ along)
     if not (0 < share < 1 and 0 < height < LAST_PEGS):
         return None
-    buckets = len(choices_in(slots["choices"])) if "choices" in slots else _digits(last, edge)
+    buckets = len(choices_in(slots["choices"])) if "choices" in slots else _count_digits(last, edge)
     return str(int(share * buckets) + 1) if buckets else None
 
 
-def _digits(frame: np.ndarray, edge: tuple[np.ndarray, np.ndarray]) -> int:
+def _count_digits(frame: np.ndarray, edge: tuple[np.ndarray, np.ndarray]) -> int:
     """Count the digits on the apron, one a bucket, by the gaps between their ink."""
     left, right = edge
     along = right - left

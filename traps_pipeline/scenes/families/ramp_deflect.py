@@ -52,7 +52,7 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build table with front and back wall, deflector, two bins, and a ramp behind."""
     course = Course(physics)
-    r, top, half_width, rim, side = (
+    r, top, half_width, rim, half_ramp = (
         p.radius_m,
         p.table_m,
         p.half_width_m,
@@ -62,7 +62,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
     course.block("table", (-half_width, half_width), (0, p.depth_m), (0, top), p.table_colour)
     front = course.block("wall_front", (-half_width, half_width), (-WALL_M, 0), (0, rim), p.table_colour)
-    for name, x in (("left", (-half_width, p.ramp_x_m - side)), ("right", (p.ramp_x_m + side, half_width))):
+    for name, x in (("left", (-half_width, p.ramp_x_m - half_ramp)), ("right", (p.ramp_x_m + half_ramp, half_width))):
         course.block(f"wall_{name}", x, (p.depth_m, p.depth_m + WALL_M), (0, rim), p.table_colour)
     turn = np.radians(90 + p.angle_deg if p.deflects == "left" else 90 - p.angle_deg) / 2
     centre = (p.ramp_x_m, p.deflector_m * float(np.cos(np.radians(p.angle_deg))) + 0.02, top + 0.9 * r)
@@ -75,10 +75,10 @@ def build(p: Params, physics: Physics) -> Scene:
 
     ramp = Ramp(p.slope_deg, top, p.depth_m, towards_camera=True, middle_m=p.ramp_x_m)
     middle = p.ramp_m / 2
-    ramp.board(course, "ramp", middle, -BOARD_M / 2, (middle, side, BOARD_M / 2), p.ramp_colour)
-    for name, x in (("left", -side), ("right", side)):
+    ramp.board(course, "ramp", middle, -BOARD_M / 2, (middle, half_ramp, BOARD_M / 2), p.ramp_colour)
+    for name, x in (("left", -half_ramp), ("right", half_ramp)):
         ramp.board(course, f"rail_{name}", middle, 0, (middle, 0.005, 0.4 * r), p.ramp_colour, aside=x)
-    ramp.support(course, "support", p.ramp_m - 0.05, BOARD_M, 0.8 * side, p.ramp_colour)
+    ramp.support(course, "support", p.ramp_m - 0.05, BOARD_M, 0.8 * half_ramp, p.ramp_colour)
     course.ball("ball", ramp.at(p.ramp_m - p.start_m, r), r, p.ball_colour)
 
     high, outer_x = top + 2 * r + 0.01, half_width + p.bin_m + WALL_M
@@ -92,7 +92,7 @@ def build(p: Params, physics: Physics) -> Scene:
         cover=course.box((-outer_x, outer_x), (-WALL_M - 0.01, p.depth_m), (0, high), right=0.02),
         in_view=[
             course.box((-outer_x, outer_x), (-WALL_M, p.depth_m), (0, high)),
-            course.box((p.ramp_x_m - side, p.ramp_x_m + side), (back, back), (0, highest)),
+            course.box((p.ramp_x_m - half_ramp, p.ramp_x_m + half_ramp), (back, back), (0, highest)),
         ],
         things=[f"{p.ball_colour} ball", "red bin", "blue bin", "ramp", "table"],
         also=["board", "wall"],

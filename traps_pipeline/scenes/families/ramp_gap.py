@@ -62,25 +62,25 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build ramp with rails and support, deck in two parts with a gap, and box."""
     course = Course(physics, p.direction)
-    r, side, gap, end = p.radius_m, 1.7 * p.radius_m, p.gap_span, p.deck_end_m + p.box_m
-    depth_span, deck, box = (-side, side), (0, p.deck_m), (p.deck_end_m, end)
+    r, half_width, gap, end = p.radius_m, 1.7 * p.radius_m, p.gap_span, p.deck_end_m + p.box_m
+    depth_span, deck, box = (-half_width, half_width), (0, p.deck_m), (p.deck_end_m, end)
     ramp, middle = Ramp(p.slope_deg, p.deck_m), p.ramp_m / 2
 
-    ramp.board(course, "ramp", middle, -BOARD_M / 2, (middle, side, BOARD_M / 2), p.ramp_colour)
-    for name, y in (("front", -side), ("back", side)):
+    ramp.board(course, "ramp", middle, -BOARD_M / 2, (middle, half_width, BOARD_M / 2), p.ramp_colour)
+    for name, y in (("front", -half_width), ("back", half_width)):
         ramp.board(course, f"rail_{name}", middle, 0, (middle, 0.005, 0.4 * r), p.ramp_colour, aside=y)
-    ramp.support(course, "support", p.ramp_m - 0.05, BOARD_M, 0.8 * side, p.deck_colour)
+    ramp.support(course, "support", p.ramp_m - 0.05, BOARD_M, 0.8 * half_width, p.deck_colour)
     course.ball("ball", ramp.at(p.ramp_m - p.start_m, r), r, p.ball_colour)
     course.block("deck_in", (-0.01, gap[0]), depth_span, deck, p.deck_colour)
     course.block("deck_out", (gap[1], p.deck_end_m), depth_span, deck, p.deck_colour)
     top = BOARD_M if p.gap_open else p.deck_m
     course.block("board", gap, depth_span, (top - BOARD_M, top), p.deck_colour).friction = [0.8, 0.005, 0.002]
-    for name, y in (("front", -side), ("back", side)):
+    for name, y in (("front", -half_width), ("back", half_width)):
         course.block(f"pit_{name}", gap, (y - 0.005, y + 0.005), (0, 0.022), p.deck_colour)
     course.block("box_floor", box, depth_span, (0, WALL_M), p.box_colour).friction = [0.8, 0.005, 0.004]
-    course.block("box_front", box, (-side - WALL_M, -side), (0, 0.035), p.box_colour)
-    course.block("box_back", box, (side, side + WALL_M), (0, 0.09), p.box_colour)
-    outer = (-side - WALL_M, side + WALL_M)
+    course.block("box_front", box, (-half_width - WALL_M, -half_width), (0, 0.035), p.box_colour)
+    course.block("box_back", box, (half_width, half_width + WALL_M), (0, 0.09), p.box_colour)
+    outer = (-half_width - WALL_M, half_width + WALL_M)
     course.block("box_end", (end, end + WALL_M), outer, (0, p.deck_m + 0.03), p.box_colour)
 
     high, along = p.deck_m + 2 * r + 0.01, (p.mouth_m, end + WALL_M)

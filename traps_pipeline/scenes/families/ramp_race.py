@@ -76,28 +76,30 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build two tracks towards the front, a ramp behind each, and one tray."""
     course = Course(physics)
-    r, side, track = p.radius_m, 1.5 * p.radius_m, (0, p.track_m)
+    r, half_track, track = p.radius_m, 1.5 * p.radius_m, (0, p.track_m)
     rough = (p.tray_m + p.after_m, p.tray_m + p.after_m + ROUGH_M)
     foot = rough[1] + p.lead_m
     mat_colour = next(c for c in ("black", "wood", "grey") if c not in p.track_colours)
     half_up, tracks = p.ramp_m / 2, (-p.apart_m / 2, p.apart_m / 2)
     ramps = [Ramp(p.slope_deg, p.track_m, foot, towards_camera=True, middle_m=x) for x in tracks]
     for i, (x, ramp) in enumerate(zip(tracks, ramps, strict=True)):
-        across, colour = (x - side, x + side), p.track_colours[i]
+        across, colour = (x - half_track, x + half_track), p.track_colours[i]
         course.block(f"track_out_{i}", across, (p.tray_m, rough[0]), track, colour)
         mat, rolling_friction = (mat_colour, _roughness(p, i, physics)) if i == p.rough_track else (colour, 2e-5)
         course.block(f"board_{i}", across, rough, track, mat).friction = [4.0, 0.005, rolling_friction]
         course.block(f"track_in_{i}", across, (rough[1], foot + 0.01), track, colour)
         for k in (-1, 1):
-            rail = (x + k * side - 0.004, x + k * side + 0.004)
+            rail = (x + k * half_track - 0.004, x + k * half_track + 0.004)
             course.block(f"rail_{i}_{k}", rail, (p.tray_m, foot), (0, p.track_m + 0.01), colour)
-        ramp.board(course, f"ramp_{i}", half_up, -BOARD_M / 2, (half_up, side, BOARD_M / 2), colour)
+        ramp.board(course, f"ramp_{i}", half_up, -BOARD_M / 2, (half_up, half_track, BOARD_M / 2), colour)
         for k in (-1, 1):
-            ramp.board(course, f"ramp_rail_{i}_{k}", half_up, 0, (half_up, 0.005, 0.4 * r), colour, aside=k * side)
-        ramp.support(course, f"support_{i}", p.ramp_m - 0.05, BOARD_M, 0.8 * side, colour)
+            ramp.board(
+                course, f"ramp_rail_{i}_{k}", half_up, 0, (half_up, 0.005, 0.4 * r), colour, aside=k * half_track
+            )
+        ramp.support(course, f"support_{i}", p.ramp_m - 0.05, BOARD_M, 0.8 * half_track, colour)
         course.ball(BALLS[i], ramp.at(p.starts_m[i], r), r, p.colours[i])
 
-    half_width = p.apart_m / 2 + side + 0.02
+    half_width = p.apart_m / 2 + half_track + 0.02
     outer, tray_depth, rim = (-half_width - WALL_M, half_width + WALL_M), (0, p.tray_m), (0, p.track_m + 0.01)
     course.block("tray_floor", (-half_width, half_width), tray_depth, (0, WALL_M), p.tray_colour).friction = [
         0.8,

@@ -65,8 +65,8 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build track with kerbs, patch, two lines and end wall."""
     course = Course(physics, p.direction)
-    r, side, end = p.radius_m, p.half_width_m, p.line_m + p.felt_m
-    depth_span, outer, track = (-side, side), (-side - WALL_M, side + WALL_M), (0, TRACK_M)
+    r, half_width, end = p.radius_m, p.half_width_m, p.line_m + p.felt_m
+    depth_span, outer, track = (-half_width, half_width), (-half_width - WALL_M, half_width + WALL_M), (0, TRACK_M)
     patch = (p.run_m + p.lead_m, p.run_m + p.lead_m + p.patch_m)
     rolling_friction = brake(r, p.speed_m_s**2, p.stop_share * p.patch_m, physics) if p.rough else 2e-5
 
@@ -78,7 +78,7 @@ def build(p: Params, physics: Physics) -> Scene:
     for name, middle, colour in (("start_line", 0.6 * p.run_m, p.start_colour), ("line", p.line_m, p.line_colour)):
         line_span = (middle - LINE_M / 2, middle + LINE_M / 2)
         course.block(name, line_span, depth_span, (0, TRACK_M + 0.001), colour, solid=False)
-    course.sides("kerb", (-0.02, end), side, WALL_M, (0, TRACK_M + 0.012), p.wall_colour)
+    course.sides("kerb", (-0.02, end), half_width, WALL_M, (0, TRACK_M + 0.012), p.wall_colour)
     course.block("end_wall", (end, end + WALL_M), outer, (0, TRACK_M + 2 * r), p.wall_colour)
     course.ball("ball", (0.05, 0, TRACK_M + r), r, p.ball_colour, speed=p.speed_m_s)
 

@@ -79,25 +79,29 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build deck, incline with its support and block, the board in the deck, and tray."""
     course = Course(physics, p.direction)
-    side, deck_end, end = p.block_half_m[1] + 0.04, p.deck_end_m, p.deck_end_m + p.tray_m
-    depth_span, outer, tray = (-side, side), (-side - WALL_M, side + WALL_M), (p.deck_end_m, end)
+    half_width, deck_end, end = p.block_half_m[1] + 0.04, p.deck_end_m, p.deck_end_m + p.tray_m
+    depth_span, outer, tray = (
+        (-half_width, half_width),
+        (-half_width - WALL_M, half_width + WALL_M),
+        (p.deck_end_m, end),
+    )
 
     deck = course.block("deck", (-OVERLAP_M, deck_end), depth_span, (0, p.deck_m), p.deck_colour)
     ramp = Ramp(p.slope_deg, p.deck_m)
-    half_size = ((p.incline_m + OVERLAP_M / 2) / 2, side, INCLINE_M / 2)
+    half_size = ((p.incline_m + OVERLAP_M / 2) / 2, half_width, INCLINE_M / 2)
     middle = (p.incline_m - OVERLAP_M / 2) / 2
     incline = ramp.board(course, "incline", middle, -INCLINE_M / 2, half_size, p.incline_colour)
     for geom in (deck, incline):
         geom.friction, geom.priority = [p.deck_friction, 0.001, 0.0001], 1
-    ramp.support(course, "support", p.incline_m - 0.05, INCLINE_M, 0.8 * side, p.deck_colour)
+    ramp.support(course, "support", p.incline_m - 0.05, INCLINE_M, 0.8 * half_width, p.deck_colour)
     start = ramp.at(p.incline_m - p.start_m, p.block_half_m[2])
     block = course.free_box("block", start, p.block_half_m, p.block_colour, density=600)
     turn = ramp.slope_rad / 2
     block.quat = [float(np.cos(turn)), 0.0, p.direction * float(np.sin(turn)), 0.0]
-    _add_board(course, p, side)
+    _add_board(course, p, half_width)
     course.block("tray_floor", tray, depth_span, (0, WALL_M), p.tray_colour)
-    course.block("tray_front", tray, (outer[0], -side), (0, 0.03), p.tray_colour)
-    course.block("tray_back", tray, (side, outer[1]), (0, 0.07), p.tray_colour)
+    course.block("tray_front", tray, (outer[0], -half_width), (0, 0.03), p.tray_colour)
+    course.block("tray_back", tray, (half_width, outer[1]), (0, 0.07), p.tray_colour)
     course.block("tray_end", (end, end + WALL_M), outer, (0, p.deck_m + 0.02), p.tray_colour)
 
     high, along = p.deck_m + 2 * max(p.block_half_m) + 0.01, (p.mouth_m, end + WALL_M)

@@ -62,11 +62,13 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build two pairs of posts with the cloth, the tray, a board behind, and a cube."""
     course = Course(physics, p.direction, FELT)
-    end, side, high = p.span_m / 2 + 0.06, p.deep_m / 2 + 0.03, p.post_m + 0.02
-    outer, back = end + WALL_M, side + WALL_M
-    course.tray("tray", (-end, end), (-side, side), (0, FLOOR_M), p.tray_colour, wall=WALL_M, near=0.10, far=0.10)
-    course.block("tray_front", (-outer, outer), (-back, -side), (0, 0.06), p.tray_colour)
-    course.block("board", (-outer, outer), (side, back), (0, high), p.board_colour)
+    end, half_width, high = p.span_m / 2 + 0.06, p.deep_m / 2 + 0.03, p.post_m + 0.02
+    outer, back = end + WALL_M, half_width + WALL_M
+    course.tray(
+        "tray", (-end, end), (-half_width, half_width), (0, FLOOR_M), p.tray_colour, wall=WALL_M, near=0.10, far=0.10
+    )
+    course.block("tray_front", (-outer, outer), (-back, -half_width), (0, 0.06), p.tray_colour)
+    course.block("board", (-outer, outer), (half_width, back), (0, high), p.board_colour)
     for end_name, along_sign in (("near", -1), ("far", 1)):
         for side_name, across_sign in (("front", -1), ("back", 1)):
             at = (along_sign * (p.span_m / 2 + POST_M), across_sign * p.deep_m / 2, high / 2)
@@ -79,8 +81,8 @@ def build(p: Params, physics: Physics) -> Scene:
     size, tied_ends = (p.span_m, p.deep_m), (-1, 1) if p.ends_tied == 2 else (-1,)
     hammock(course, "cloth", (0, 0, p.post_m), size, CELLS, p.cloth_colour, sag=p.sag_m, tied=tied_ends)
     course.ball("ball", (0, 0, p.release_m), p.radius_m, p.ball_colour, thrown=(p.drift_m_s, p.toss_m_s), density=350)
-    course.mark("cloth", (0.55 * end, side), p.cloth_colour)
-    course.mark("tray", (-0.55 * end, side), p.tray_colour)
+    course.mark("cloth", (0.55 * end, half_width), p.cloth_colour)
+    course.mark("tray", (-0.55 * end, half_width), p.tray_colour)
     return course.scene(
         p,
         decisive=["ball"],

@@ -65,15 +65,15 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build spinner, pointer, peg and ball; the hub is at the origin."""
     course = Course(physics, p.direction)
-    r, lane, side = p.radius_m, -LANE * p.disc_m, p.disc_m + 0.025
-    start, end, rim = -side - p.run_m, side + 0.12, (0, TABLE_M + 0.035)
-    depth_span, outer, floor = (-side, side), (-side - RIM_M, side + RIM_M), (0, TABLE_M)
+    r, lane, half_width = p.radius_m, -LANE * p.disc_m, p.disc_m + 0.025
+    start, end, rim = -half_width - p.run_m, half_width + 0.12, (0, TABLE_M + 0.035)
+    depth_span, outer, floor = (-half_width, half_width), (-half_width - RIM_M, half_width + RIM_M), (0, TABLE_M)
 
     gripping = Surface(1e-4)
-    course.block("lane", (start - 0.07, -side), (lane - 1.5 * r, lane + 1.5 * r), floor, p.table_colour, gripping)
+    course.block("lane", (start - 0.07, -half_width), (lane - 1.5 * r, lane + 1.5 * r), floor, p.table_colour, gripping)
     course.block("table", depth_span, depth_span, floor, p.table_colour, gripping)
-    course.block("tray", (side, end), depth_span, floor, p.table_colour, Surface(4e-3))
-    course.sides("rim", (-side, end), side, RIM_M, rim, p.rim_colour)
+    course.block("tray", (half_width, end), depth_span, floor, p.table_colour, Surface(4e-3))
+    course.sides("rim", (-half_width, end), half_width, RIM_M, rim, p.rim_colour)
     course.block("rim_end", (end, end + RIM_M), outer, (0, TABLE_M + 0.06), p.rim_colour)
     for i, colour in enumerate(p.sectors):  # thin, and nothing touches them
         angles = np.linspace(FIRST_DEG + i * p.sector_deg, FIRST_DEG + (i + 1) * p.sector_deg, 13)
@@ -89,7 +89,7 @@ def build(p: Params, physics: Physics) -> Scene:
     at = (start, lane, TABLE_M + r)
     course.ball("ball", at, r, p.ball_colour, speed=p.speed_m_s, rolling=1e-4, sliding=0.1, density=2500)
 
-    span = (-side, end + RIM_M)
+    span = (-half_width, end + RIM_M)
     course.mark("pointer", (0.0, 0.0), POINTER_COLOUR)
     for i, colour in enumerate(p.sectors):
         course.mark(f"{colour} sector", _place(p.disc_m, FIRST_DEG + (i + 0.5) * p.sector_deg), colour)
@@ -97,7 +97,7 @@ def build(p: Params, physics: Physics) -> Scene:
         p,
         decisive=["pointer"],
         hidden=["peg"],
-        cover=course.box(span, (-side - 0.02, side + 0.03), (0, 0.10), right=0.03),
+        cover=course.box(span, (-half_width - 0.02, half_width + 0.03), (0, 0.10), right=0.03),
         in_view=[course.box(span, outer, (0, 0.09))],
         things=[f"{p.ball_colour} ball", "black pointer", "spinner", *(f"{c} sector" for c in p.sectors)],
         also=["table", "rim", "peg"],

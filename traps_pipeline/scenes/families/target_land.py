@@ -72,21 +72,25 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build pedestal, three trays with a high back, and two boards over them."""
     course = Course(physics, surface=Surface(0.006, sliding=0.5, solref=SOFT))
-    r, side, start = p.radius_m, 1.5 * p.tray_m, -p.direction * p.range_m
-    depth_span, outer, foot = (-DEPTH_M, DEPTH_M), (-side - WALL_M, side + WALL_M), (start - 0.08, start + 0.08)
+    r, half_width, start = p.radius_m, 1.5 * p.tray_m, -p.direction * p.range_m
+    depth_span, outer, foot = (
+        (-DEPTH_M, DEPTH_M),
+        (-half_width - WALL_M, half_width + WALL_M),
+        (start - 0.08, start + 0.08),
+    )
     course.block("pedestal", foot, (-0.08, 0.08), (0, p.pedestal_m), p.pedestal_colour)
     throw = (p.direction * p.speed_along_m_s, p.speed_up_m_s)
     course.ball("ball", (start, 0, p.start_m), r, p.ball_colour, thrown=throw, rolling=0.0002)
     for i, colour in enumerate(p.tray_colours):
-        ends = (i * p.tray_m - side, (i + 1) * p.tray_m - side)
+        ends = (i * p.tray_m - half_width, (i + 1) * p.tray_m - half_width)
         course.block(f"tray_{i}", ends, depth_span, (0, FLOOR_M), colour)
         course.block(f"front_{i}", ends, (-DEPTH_M - WALL_M, -DEPTH_M), (0, FLOOR_M + 0.3 * r), colour)
         course.block(f"rear_{i}", ends, (DEPTH_M - WALL_M, DEPTH_M), (0, DIVIDER_M), colour)
     for i in (1, 2):
-        x = i * p.tray_m - side
+        x = i * p.tray_m - half_width
         course.block(f"divider_{i}", (x - WALL_M / 2, x + WALL_M / 2), depth_span, (0, DIVIDER_M), p.back_colour)
-    course.block("end_left", (outer[0], -side), depth_span, (0, END_M), p.back_colour)
-    course.block("end_right", (side, outer[1]), depth_span, (0, END_M), p.back_colour)
+    course.block("end_left", (outer[0], -half_width), depth_span, (0, END_M), p.back_colour)
+    course.block("end_right", (half_width, outer[1]), depth_span, (0, END_M), p.back_colour)
     course.block("back", outer, (DEPTH_M, DEPTH_M + WALL_M), (0, p.mouth_m), p.back_colour)
     angle, half_size = p.slant * radians(p.slant_deg), (0.006, DEPTH_M - 0.03, p.board_m / 2)
     for i, hinge in enumerate((-p.gap * r / 2, p.gap * r / 2)):

@@ -112,28 +112,28 @@ def build(p: Params, physics: Physics) -> Scene:
     course = Course(physics, p.direction)
     # The edges keep their colour in shade.
     course.spec.add_material(name="bright", emission=0.5, specular=0.0, shininess=0.0)
-    side, end, high = p.width_m / 2, p.run_m + p.tray_m, p.floor_m(0)
-    front, back = (-side - WALL_M, -side), (side, side + WALL_M)
+    half_width, end, high = p.width_m / 2, p.run_m + p.tray_m, p.floor_m(0)
+    front, back = (-half_width - WALL_M, -half_width), (half_width, half_width + WALL_M)
     treads = [(i * p.step_m, (i + 1) * p.step_m) for i in range(p.steps)]
 
     for i, along in enumerate(treads):
-        step = course.block(f"step_{i}", along, (-side, side), (0, p.floor_m(i)), "wood")
+        step = course.block(f"step_{i}", along, (-half_width, half_width), (0, p.floor_m(i)), "wood")
         if i % 2 != p.dark_first:
             step.rgba = DARK_WOOD
-    course.block("tray", (p.run_m, end), (-side, side), (0, TRAY_M), "grey")
+    course.block("tray", (p.run_m, end), (-half_width, half_width), (0, TRAY_M), "grey")
     rim = TRAY_M + 1.6 * p.half_m  # low, so that it hides and shades no die; glass stands on it
-    course.block("tray_end", (end, end + WALL_M), (-side, side), (0, rim), "wood")
+    course.block("tray_end", (end, end + WALL_M), (-half_width, half_width), (0, rim), "wood")
     course.block("tray_front", (p.run_m, end + WALL_M), front, (0, rim), "wood")
     course.block("wall_back", (-WALL_M, end + WALL_M), back, (0, high + 2 * p.half_m), "wood")
     for i, along in enumerate(treads):  # a low front wall that follows the steps, so that it hides nothing
         course.block(f"front_{i}", along, front, (0, p.floor_m(i) + 0.5 * p.half_m), "wood")
     full_width = (-WALL_M, end + WALL_M)
     panes = {"front": (full_width, front), "back": (full_width, back)}
-    panes |= {"top": ((-WALL_M, 0), (-side, side)), "end": ((end, end + WALL_M), (-side, side))}
+    panes |= {"top": ((-WALL_M, 0), (-half_width, half_width)), "end": ((end, end + WALL_M), (-half_width, half_width))}
     for name, (along, across) in panes.items():
         glass = course.block(f"fence_{name}", along, across, (0, high + 1.0), "white")
         glass.rgba = [1, 1, 1, 0]  # nothing leaves the steps; a drawn pane would tint the faces: its edges are drawn
-    _add_glass_edges(course, (0, end), side, (TRAY_M, high + 1.0))
+    _add_glass_edges(course, (0, end), half_width, (TRAY_M, high + 1.0))
     for i in range(len(p.faces)):
         _add_die(course, p, i)
     dice = [f"die_{i}" for i in range(len(p.faces))]
@@ -146,7 +146,7 @@ def build(p: Params, physics: Physics) -> Scene:
     )
     throws = [(p.direction * along, across, up) for along, across, up in p.speeds_m_s]
     velocity = {d: (*v, *w) for d, v, w in zip(dice, throws, p.spins_rad_s, strict=True)}
-    return replace(scene, velocity=velocity, rest=course.box((p.run_m, end), (-side, side), (0, rim)))
+    return replace(scene, velocity=velocity, rest=course.box((p.run_m, end), (-half_width, half_width), (0, rim)))
 
 
 def _add_glass_edges(course: Course, along: tuple[float, float], side: float, up: tuple[float, float]) -> None:

@@ -66,8 +66,8 @@ def build(p: Params, physics: Physics) -> Scene:
     course.block("fork_floor", fork, (0, depth), (0, FLOOR_M), p.tunnel_colour)
     course.block("fork_roof", fork, (-WALL_M, depth + WALL_M), (roof, roof + WALL_M), p.tunnel_colour)
     course.block("fork_front", fork, front_span, (0, roof), p.tunnel_colour, SLIPPERY)
-    for name, side, colour in (("left", -1, p.left_colour), ("right", 1, p.right_colour)):
-        way_out, tray, high = course.towards(side), (half_width, end), (0, TRAY_M + 1.2 * r)
+    for name, outer_wall, colour in (("left", -1, p.left_colour), ("right", 1, p.right_colour)):
+        way_out, tray, high = course.towards(outer_wall), (half_width, end), (0, TRAY_M + 1.2 * r)
         way_out.block(f"fork_back_{name}", (bore, half_width), back_span, (0, roof), p.tunnel_colour)
         way_out.block(f"tray_{name}", tray, (-WALL_M, depth), (0, TRAY_M), colour, FELT)
         way_out.block(f"tray_end_{name}", (end, end + WALL_M), (-WALL_M, depth), high, colour)
@@ -82,10 +82,10 @@ def build(p: Params, physics: Physics) -> Scene:
     start = ramp.at(p.covered_m + p.open_m - p.start_m, r)
     course.ball("ball", start, r, p.ball_colour, rolling=1e-4)
 
-    side, across = end + WALL_M, (-2 * WALL_M - 0.01, depth + 2 * WALL_M)
-    cover = course.box((-side - 0.01, side), across, (0, roof + WALL_M), right=SHADOW_RIGHT * 0.15)
-    for name, side, colour in (("left", -1, p.left_colour), ("right", 1, p.right_colour)):
-        course.mark(f"{name} exit", (side * half_width, depth), colour)
+    outer_wall, across = end + WALL_M, (-2 * WALL_M - 0.01, depth + 2 * WALL_M)
+    cover = course.box((-outer_wall - 0.01, outer_wall), across, (0, roof + WALL_M), right=SHADOW_RIGHT * 0.15)
+    for name, outer_wall, colour in (("left", -1, p.left_colour), ("right", 1, p.right_colour)):
+        course.mark(f"{name} exit", (outer_wall * half_width, depth), colour)
     return course.scene(
         p,
         decisive=["ball"],

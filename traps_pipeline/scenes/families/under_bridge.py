@@ -55,8 +55,8 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build a ramp, a road with an end wall, and a bridge on four legs across it."""
     course = Course(physics, p.direction)
-    r, end, side = p.radius_m, p.bridge_m + p.beyond_m, 1.6 * p.radius_m
-    depth_span, road = (-side, side), (0, ROAD_M)
+    r, end, half_width = p.radius_m, p.bridge_m + p.beyond_m, 1.6 * p.radius_m
+    depth_span, road = (-half_width, half_width), (0, ROAD_M)
     stop = 0.62 * p.bridge_m + r  # where the kerb's face is: the ball rests in the middle of the bridge
     bed = (stop - 3.5 * r, stop)  # rough: a ball that bounces off the kerb stays there
 
@@ -64,11 +64,15 @@ def build(p: Params, physics: Physics) -> Scene:
     course.block("road_bed", bed, depth_span, road, p.road_colour, Surface(0.003))
     course.block("road_out", (bed[1], end), depth_span, road, p.road_colour, Surface(0.004))
     course.block("end_wall", (end, end + 0.015), depth_span, (0, ROAD_M + 1.4 * r), p.road_colour)
-    start = _add_ramp(course, p, side)
+    start = _add_ramp(course, p, half_width)
     _add_bridge(course, p)
     along, across, up = (stop, stop + 0.04), depth_span, (ROAD_M, ROAD_M + 0.9 * r)
     if not p.blocked:
-        along, across, up = (stop + 0.02 - side, stop + 0.02 + side), (side, side + 0.04), (0, 0.9 * r)
+        along, across, up = (
+            (stop + 0.02 - half_width, stop + 0.02 + half_width),
+            (half_width, half_width + 0.04),
+            (0, 0.9 * r),
+        )
     course.block("kerb", along, across, up, p.kerb_colour, Surface(0.001, sliding=0.2))
     course.ball("ball", start, r, p.ball_colour, rolling=1e-4)
 
@@ -78,7 +82,7 @@ def build(p: Params, physics: Physics) -> Scene:
         p,
         decisive=["ball"],
         hidden=["kerb"],
-        cover=course.cover((p.mouth_m, end + 0.015), (front, side + 0.04), high),
+        cover=course.cover((p.mouth_m, end + 0.015), (front, half_width + 0.04), high),
         in_view=[
             course.box((-(p.flat_m + p.ramp_m), end), depth_span, (0, high)),
             course.box((0, p.bridge_m), (front, -front), (0, top)),
@@ -112,11 +116,11 @@ def _add_ramp(course: Course, p: Params, side: float) -> Vec3:
 
 def _add_bridge(course: Course, p: Params) -> None:
     """Add a humped deck of planks on four legs, with a railing on either edge."""
-    side, post, pitch, colour = p.span_m / 2, 0.014, p.span_m / p.planks, p.bridge_colour
+    half_span, post, pitch, colour = p.span_m / 2, 0.014, p.span_m / p.planks, p.bridge_colour
     edges = ((0, 2 * post), (p.bridge_m - 2 * post, p.bridge_m))
     for k in range(p.planks):
-        y = -side + (k + 0.5) * pitch
-        z = p.height_m + p.hump_m * (1 - (y / side) ** 2)
+        y = -half_span + (k + 0.5) * pitch
+        z = p.height_m + p.hump_m * (1 - (y / half_span) ** 2)
         rail = z + SLAB_M + RAILING_M
         course.block(f"plank_{k}", (0, p.bridge_m), (y - 0.47 * pitch, y + 0.47 * pitch), (z, z + SLAB_M), colour)
         for i, along in enumerate(edges):

@@ -55,7 +55,10 @@ def between(low: float, high: float) -> Any:
 
 
 def several_between(count: Count, low: float, high: float) -> Any:
-    """Return a field: a tuple of `count` (a number or a drawn field) floats in bounds."""
+    """Return a field: a tuple of floats between two bounds.
+
+    count: their number, or the drawn field that holds it.
+    """
     return drawn_by(
         lambda rng, so_far: tuple(uniform(rng, low, high) for _ in range(_number(count, so_far))), range=(low, high)
     )

@@ -237,14 +237,14 @@ def _predictable_cut(scenario: Scenario) -> Take:
     if not control.same_physics:
         raise Rejected("simulating here does not give the frozen trajectory, so that its futures are not known")
     for frame in (commit - lead for lead in LEAD_FRAMES if commit - lead > EARLIEST_CUT_S * scenario.fps):
-        agree = _agreeing(scenario, frame - 1)
+        agree = _count_agreeing(scenario, frame - 1)
         if agree is not None:
             evidence = {"cut_s": frame / scenario.fps, "settled_s": commit / scenario.fps, "agree": agree}
             return Take(scenario.control_frames[:frame], evidence | {"futures": FUTURES})
     raise Rejected("no cut before the outcome is settled leaves it nearly certain")
 
 
-def _agreeing(scenario: Scenario, frame: int) -> int | None:
+def _count_agreeing(scenario: Scenario, frame: int) -> int | None:
     """Return how many perturbed futures of a frame end in the answer; None if too few."""
     import mujoco
 
