@@ -22,8 +22,8 @@ from traps_pipeline.scenes.draw.likeness import (
 )
 from traps_pipeline.scenes.draw.redraw import draw_again
 from traps_pipeline.scenes.draw.sample import (
-    _mean_choices,
     _full_answers,
+    _mean_choices,
     answer_quota,
     load_tallies,
     rejection_kind,

@@ -148,7 +148,8 @@ class Experiment(BaseModel):
             old, new = getattr(study, name), getattr(self, name)
             if new is not None and new != old:
                 raise TrapsError(
-                    f"{path}: {name} is {old!r}, experiment {self.name} has {new!r}; edit one of them, or name another --workspace"
+                    f"{path}: {name} is {old!r}, experiment {self.name} has {new!r}; "
+                    "edit one of them, or name another --workspace"
                 )
         if self.mechanism is not None and study.mechanism not in (None, self.mechanism):
             raise TrapsError(
