@@ -17,7 +17,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import PACKAGE
 from traps_pipeline.benchmark.corrections import corrected_scenarios
-from traps_pipeline.benchmark.sharing import Filming, Row, existing_clips, share
+from traps_pipeline.benchmark.sharing import RenderWork, Row, existing_clips, share
 from traps_pipeline.benchmark.specs import clips_version, released_in_study, spec_of, spec_rows, trajectory_of
 from traps_pipeline.protocol.datasets import ARMS as ARM_NAMES
 from traps_pipeline.protocol.datasets import CROSSED, GRADED, extra_datasets_of, sides_of, taxonomy_of_category
@@ -50,8 +50,8 @@ class ArmResult:
         """Return the stored result if it is of this record and this code, else None."""
         if not path.is_file():
             return None
-        finding = ArmResult(**json.loads(path.read_text(encoding="utf-8")))
-        return finding if finding.of == of else None
+        result = ArmResult(**json.loads(path.read_text(encoding="utf-8")))
+        return result if result.of == of else None
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tupl
     def tick(finished: int) -> None:
         progress.current().tick("arms", f"{category}, scenarios", finished, len(specs))
 
-    filming = Filming(f"arms/{category}", missing, files, job, film)
+    filming = RenderWork(f"arms/{category}", missing, files, job, film)
     return share(workspace.store, specs, filming, tick, wait=wait)
 
 

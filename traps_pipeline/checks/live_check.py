@@ -23,7 +23,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.network import check_network, is_loopback
 from traps_pipeline.base.redaction import redact
 from traps_pipeline.base.terminal import plain
-from traps_pipeline.checks.wire_check import Studio, model_name, question
+from traps_pipeline.checks.wire_check import SyntheticClip, model_name, question
 from traps_pipeline.judging.panel import parse_vote, vote_request
 from traps_pipeline.models.ask import Call, SettledCell, collect
 from traps_pipeline.models.backends import make_backend
@@ -80,9 +80,9 @@ class LiveResult:
 
 
 @cache
-def _studio() -> Studio:
+def _studio() -> SyntheticClip:
     halves = [np.full((*_SIZE, 3), colour, np.uint8) for colour in COLOURS.values()]
-    return Studio([halves[2 * k // _FRAMES] for k in range(_FRAMES)], _FPS)
+    return SyntheticClip([halves[2 * k // _FRAMES] for k in range(_FRAMES)], _FPS)
 
 
 def requests_of(entry: Entry) -> dict[str, Request]:
@@ -125,7 +125,7 @@ class ServerCheck:
     refused: str = ""
 
 
-def reach(entry: Entry, account: Account) -> ServerCheck:
+def check_server(entry: Entry, account: Account) -> ServerCheck:
     """Check the key, the address, and the server's own list of models if it has one."""
     from traps_pipeline.models.wire import get
 
@@ -317,7 +317,7 @@ def check_live(entries: Iterable[Entry]) -> list[LiveResult]:
 
     async def one(entry: Entry) -> LiveResult:
         account = account_of(entry)
-        server_check = await asyncio.to_thread(reach, entry, account)
+        server_check = await asyncio.to_thread(check_server, entry, account)
         if server_check.problem:
             return LiveResult(entry, [server_check.problem])
         backend = make_backend(entry)
@@ -348,7 +348,7 @@ def preflight(workspace: Workspace, models: Sequence[Entry], judges: Sequence[En
     for entry in entries:
         check_money(workspace.study, entry)
     accounts = {entry.id: account_of(entry) for entry in entries}
-    server_checks = {entry.id: reach(entry, accounts[entry.id]) for entry in entries}
+    server_checks = {entry.id: check_server(entry, accounts[entry.id]) for entry in entries}
     quick = {
         entry.id: entry.model_copy(
             update={"limits": entry.limits.model_copy(update={"retries": 1, "timeout_s": TIMEOUT_S / 2})}

@@ -50,7 +50,7 @@ def _serve(answers: Iterator[tuple[int, bytes]] | None = None) -> Iterator[tuple
     bodies: list[WireBody] = []
     replies = repeat(_CAUGHT) if answers is None else answers
 
-    class Catcher(BaseHTTPRequestHandler):
+    class RequestRecorder(BaseHTTPRequestHandler):
         def do_POST(self) -> None:
             raw = self.rfile.read(int(self.headers.get("content-length") or 0))
             bodies.append(WireBody(self.command, self.path, dict(self.headers), raw))
@@ -64,7 +64,7 @@ def _serve(answers: Iterator[tuple[int, bytes]] | None = None) -> Iterator[tuple
         def log_message(self, format: str, *args: Any) -> None:
             pass
 
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Catcher)
+    server = ThreadingHTTPServer(("127.0.0.1", 0), RequestRecorder)
     Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
     try:
         yield f"http://127.0.0.1:{server.server_port}", bodies

@@ -53,7 +53,7 @@ _PROTOCOL_FRAMES = 25  # 5 a second of the clip's 5 s, docs/spec.md 3.1
 # --- the question that is asked ---------------------------------------------------------------------------------------
 
 
-class Studio:
+class SyntheticClip:
     """A synthetic clip, in a folder that exists until this process ends."""
 
     def __init__(self, frames: Sequence[np.ndarray], fps: int) -> None:
@@ -68,7 +68,7 @@ class Studio:
 
 
 @cache
-def _studio() -> Studio:
+def _studio() -> SyntheticClip:
     """Render a square that moves over a gradient."""
     width, height = _CLIP_SIZE
     ground = np.linspace(60, 200, width, dtype=np.uint8)[None, :, None].repeat(height, axis=0).repeat(3, axis=2)
@@ -77,7 +77,7 @@ def _studio() -> Studio:
         frame = ground.copy()
         frame[150:210, 8 * i : 8 * i + 60] = (220, 40, 40)
         frames.append(frame)
-    return Studio(frames, _CLIP_FPS)
+    return SyntheticClip(frames, _CLIP_FPS)
 
 
 def requests_of(entry: Entry) -> dict[str, Request]:

@@ -22,7 +22,7 @@ from traps_pipeline.base.terminal import plain, wrap_text
 
 if TYPE_CHECKING:
     from traps_pipeline.pipeline.experiment import Experiment
-    from traps_pipeline.servers.server import Listening
+    from traps_pipeline.servers.server import ServerSettings
     from traps_pipeline.storage.place import Place
     from traps_pipeline.storage.workspace import Workspace
 
@@ -229,21 +229,21 @@ def add_listening(parser: argparse.ArgumentParser, *, port: int, variable: str) 
 
 def listening_of(
     arguments: argparse.Namespace, command: str, variable: str, *, danger: str, people: Sequence[str] = ()
-) -> Listening:
+) -> ServerSettings:
     """Return address and token (or tokens by person) of a command that serves pages.
 
     danger: what everybody who reaches the address could do. Raises TrapsError.
     """
     from traps_pipeline.base.keys import optional_key
     from traps_pipeline.base.webguard import personal_tokens, public_name, token_for
-    from traps_pipeline.servers.server import Listening
+    from traps_pipeline.servers.server import ServerSettings
 
     if arguments.behind:
         public_name(arguments.behind)
     token_or_tokens = arguments.token or optional_key(variable)
     token = token_for(arguments.host, token_or_tokens, danger=danger, variable=variable)
     tokens = personal_tokens(token, people) if people else token
-    return Listening(arguments.host, arguments.port, tokens, f"traps {command}", arguments.behind)
+    return ServerSettings(arguments.host, arguments.port, tokens, f"traps {command}", arguments.behind)
 
 
 def place_of(arguments: argparse.Namespace) -> Place:

@@ -186,10 +186,10 @@ def _print_problems(problems: Sequence[str], *, as_json: bool) -> None:
 def _open_runs(arguments: argparse.Namespace, instance: DagsterInstance, workspace: Workspace) -> Iterator[Runs]:
     """Open the executor of runs, here or on a cluster. Raises TrapsError without one."""
     from traps_pipeline.definitions import defs
-    from traps_pipeline.pipeline.runs import RunsHere
+    from traps_pipeline.pipeline.runs import LocalRuns
 
     if not arguments.cluster:
-        yield RunsHere(instance, defs.resolve_implicit_global_asset_job_def())
+        yield LocalRuns(instance, defs.resolve_implicit_global_asset_job_def())
         return
     from traps_pipeline.storage.several_hosts import several_hosts
 

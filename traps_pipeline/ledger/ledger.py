@@ -28,8 +28,8 @@ from traps_pipeline.ledger.rows import (
     Totals,
     digest_of,
     encode_row,
-    heal,
     participant_of,
+    replace_impossible,
     settles,
 )
 from traps_pipeline.ledger.schema import EVALUATIONS, ROWS, STUDIES, TOTALS
@@ -158,7 +158,7 @@ class Ledger:
             rows.notes[self._place(entry)] = f"{NOT_WHOLE}: it is not believed; its answer is asked again"
             return
         row = json.loads(entry.content)
-        if healed_fields := heal(row):
+        if healed_fields := replace_impossible(row):
             rows.notes[self._place(entry)] = f"{', '.join(healed_fields)}: no possible value, counted as unknown"
         rows.add(row)
 

@@ -55,7 +55,7 @@ _CHECKS: dict[str, Callable[[Any], bool]] = {
 }
 
 
-def heal(row: dict[str, Any]) -> list[str]:
+def replace_impossible(row: dict[str, Any]) -> list[str]:
     """Replace impossible values by None, in place; return the names of these fields."""
     fields = []
     for name, is_possible in _CHECKS.items():

@@ -63,14 +63,14 @@ def baseline_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates)
         progress.current().tick("probe_baselines", f"of {states.extraction.key}", number + 1, len(raw) + 2)
         add(name, score_features(run, features))
     try:
-        add(MARGIN, score_features(run, output_margins(entry, states, [*items]), lambda states, void: AsItIs()))
+        add(MARGIN, score_features(run, output_margins(entry, states, [*items]), lambda states, void: IdentityScorer()))
     except NoMargin as error:
         add(MARGIN, [_undefined_row()], str(error))
     add(NOISE, noise_floor(run, settings.seed))
     return result
 
 
-class AsItIs:
+class IdentityScorer:
     """A score without a fit: the only column of the features, larger for void."""
 
     def scores(self, states: np.ndarray) -> np.ndarray:

@@ -31,7 +31,7 @@ from traps_pipeline.models.request import (
     Request,
     TransientError,
 )
-from traps_pipeline.models.traffic import Breaker, Gate, Meter
+from traps_pipeline.models.traffic import CircuitBreaker, ConnectionLimit, RateLimiter
 from traps_pipeline.models.transport import record_exchange
 from traps_pipeline.storage.study import Study
 
@@ -48,9 +48,9 @@ class Participant:
 
     backend: Backend
     entry: Entry
-    gate: Gate
-    meter: Meter
-    breaker: Breaker
+    gate: ConnectionLimit
+    meter: RateLimiter
+    breaker: CircuitBreaker
 
 
 def allow_connections(count: int) -> None:
@@ -86,7 +86,7 @@ class Participants:
         self._entries, self._make, self._study = entries, make, study
         self._accounts = load_accounts() if accounts is None else accounts
         self._made: dict[str, Participant] = {}
-        self._meters: dict[str | None, Meter] = {}
+        self._meters: dict[str | None, RateLimiter] = {}
         self._connections = 0
 
     def __getitem__(self, name: str) -> Participant:
@@ -98,16 +98,16 @@ class Participants:
                 allow_connections(self._connections)
             account = self._accounts.get(entry.account or "")
             address = account.base_url if account else None
-            gate, breaker = Gate(entry.limits.concurrency), Breaker(name, address)
+            gate, breaker = ConnectionLimit(entry.limits.concurrency), CircuitBreaker(name, address)
             breaker.check()
             self._made[name] = Participant(self._make(entry), entry, gate, self._meter(entry.account), breaker)
         return self._made[name]
 
-    def _meter(self, account: str | None) -> Meter:
+    def _meter(self, account: str | None) -> RateLimiter:
         if account not in self._meters:
             limits = Account() if account is None else self._accounts[account]
             sharers = partial(self._sharers, account or "")
-            self._meters[account] = Meter(limits.requests_per_minute, limits.tokens_per_minute, sharers)
+            self._meters[account] = RateLimiter(limits.requests_per_minute, limits.tokens_per_minute, sharers)
         return self._meters[account]
 
 

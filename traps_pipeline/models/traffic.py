@@ -20,7 +20,7 @@ LOOK_S = 0.2  # how often a waiting call checks whether it is still wanted
 BURST_S = 2.0  # burst size, in seconds of the rate
 
 
-class Gate:
+class ConnectionLimit:
     """A participant's connection limit, halved on a 429, raised by rounds of answers."""
 
     def __init__(self, most: int) -> None:
@@ -68,7 +68,7 @@ class Gate:
                     break
 
 
-class Meter:
+class RateLimiter:
     """An account's rate limiter: token buckets for calls and for tokens per minute.
 
     sharers: the number of processes that use the account at this moment; each gets an equal part of the rate.
@@ -131,7 +131,7 @@ def remembering_stops() -> Iterator[None]:
         _stopped.pop()
 
 
-class Breaker:
+class CircuitBreaker:
     """A circuit breaker for one participant."""
 
     def __init__(self, participant: str, address: str | None = None) -> None:

@@ -30,7 +30,7 @@ from traps_pipeline.pipeline.machine import require_machine, wanted_parts
 from traps_pipeline.pipeline.partition_checks import CURRENT
 from traps_pipeline.pipeline.ranges import batches
 from traps_pipeline.pipeline.run import materialize_stale, pending_in
-from traps_pipeline.pipeline.runs import RunsHere, range_tags
+from traps_pipeline.pipeline.runs import LocalRuns, range_tags
 from traps_pipeline.pipeline.schemes import study_here
 from traps_pipeline.pipeline.selection import failed_checks
 from traps_pipeline.pipeline.step import MAKE_TAG, OUTDATED, STALE
@@ -84,7 +84,7 @@ def _job(name: str, doc: str, stages: Sequence[Stage]) -> Any:
         study_workspace, names = workspace.open(), [stage.name for stage in stages]
         require_machine(study_workspace, wanted_parts(study_workspace, names))
         every_asset = context.repository_def.get_implicit_global_asset_job_def()
-        runs = RunsHere(context.instance, every_asset, parent=context.run, log=context.log.info)
+        runs = LocalRuns(context.instance, every_asset, parent=context.run, log=context.log.info)
         outcome = materialize_stale(context.instance, runs, study_workspace, names)
         if runs.finished:
             context.add_output_metadata({"runs": dg.MetadataValue.table([dg.TableRecord(r) for r in runs.finished])})

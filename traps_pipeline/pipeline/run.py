@@ -30,7 +30,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 
 @dataclass
-class WalkResult:
+class MaterializationResult:
     """The problems of `materialize_stale`, whether a budget ended it, and its seconds."""
 
     problems: list[str] = field(default_factory=list)
@@ -151,12 +151,12 @@ def materialize_stale(
     stages: Collection[str],
     *,
     experiment: str | None = None,
-) -> WalkResult:
+) -> MaterializationResult:
     """Materialize missing or stale partitions of these stages, or of one experiment.
 
     KeyboardInterrupt propagates.
     """
-    outcome, started_at, graph = WalkResult(), time.monotonic(), the_graph()
+    outcome, started_at, graph = MaterializationResult(), time.monotonic(), the_graph()
     history, partitions = History(instance, graph), StudyPartitions(workspace, experiment)
     tags = {MAKE_TAG: STALE} | ({EXPERIMENT_TAG: experiment} if experiment else {})
     with remembering_stops():

@@ -82,7 +82,7 @@ def study_file(workspace: Workspace, relative: str) -> Path:
 
 
 @dataclass(frozen=True)
-class Listening:
+class ServerSettings:
     """A server's address, tokens and command.
 
     tokens: one token, or several tokens with the person of each. behind: the address of an HTTPS proxy in front, if
@@ -103,7 +103,7 @@ class Listening:
         return {person: f"{base}/?token={quote(token)}" for token, person in tokens.items()}
 
 
-def serve(app: FastAPI, listening: Listening) -> None:
+def serve(app: FastAPI, listening: ServerSettings) -> None:
     """Serve an app behind the guard until Ctrl-C, and print addresses with tokens."""
     import uvicorn
 

@@ -82,7 +82,7 @@ def build(p: Params, physics: Physics) -> Scene:
     course.ball("ball", ramp.at(p.ramp_m - p.start_m, r), r, p.ball_colour)
 
     high, outer_x = top + 2 * r + 0.01, half_width + p.bin_m + WALL_M
-    _, back, highest = ramp.at(p.ramp_m)
+    _, back, ramp_top = ramp.at(p.ramp_m)
     for name in ("left", "right"):
         course.mark(f"{name} bin", f"bin_{name}")
     return course.scene(
@@ -92,7 +92,7 @@ def build(p: Params, physics: Physics) -> Scene:
         cover=course.box((-outer_x, outer_x), (-WALL_M - 0.01, p.depth_m), (0, high), right=0.02),
         in_view=[
             course.box((-outer_x, outer_x), (-WALL_M, p.depth_m), (0, high)),
-            course.box((p.ramp_x_m - half_ramp, p.ramp_x_m + half_ramp), (back, back), (0, highest)),
+            course.box((p.ramp_x_m - half_ramp, p.ramp_x_m + half_ramp), (back, back), (0, ramp_top)),
         ],
         things=[f"{p.ball_colour} ball", "red bin", "blue bin", "ramp", "table"],
         also=["board", "wall"],

@@ -47,10 +47,10 @@ BEHIND_M = (0.25, 0.9)  # so far behind all that is shown a bystander stands: it
 class Look:
     """The look of a scene; a field that is None or empty changes nothing.
 
-    floor_*: `parts.floor`. light_turn_deg: turn of the key light about the vertical; light: what its brightness is
-    multiplied by, RGB. panel: a name of `OCCLUDERS`. bystanders: (across, behind, half width, half height) in metres,
-    from the middle of the back edge of what is shown, and a tone each. orbit_deg: camera, around and up. material: of
-    the occluder, of `MATERIALS`. size: of a frame, of `SIZES`.
+    floor_*: see `parts.floor`. light_turn_deg: turn of the key light about the vertical; light: factors of its
+    brightness, RGB. panel: a name of `OCCLUDERS`. bystanders: (across, behind, half width, half height) in metres,
+    from the middle of the back edge of what is shown, and a tone each. orbit_deg: turn of the camera, around and up.
+    material: the occluder's, a name of `MATERIALS`. size: the frame's, a name of `SIZES`.
     """
 
     floor_pattern: str | None = None
