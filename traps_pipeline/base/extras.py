@@ -56,5 +56,5 @@ def sentence_of(error: ModuleNotFoundError) -> str | None:
 
 
 def _sentence(name: ExtraName, absent: list[str]) -> str:
-    are = "is" if len(absent) == 1 else "are"
-    return f"{EXTRAS[name].purpose} needs {' and '.join(absent)}, which {are} not installed: `{install_line(name)}`"
+    verb = "is" if len(absent) == 1 else "are"
+    return f"{EXTRAS[name].purpose} needs {' and '.join(absent)}, which {verb} not installed: `{install_line(name)}`"

@@ -31,8 +31,8 @@ class Proxy:
     @property
     def address(self) -> str:
         """Scheme, host and port, without the name and password that the URL may hold."""
-        scheme, _, rest = self.url.partition("://")
-        return f"{scheme}://{rest.rpartition('@')[2].partition('/')[0]}"
+        scheme, _, authority = self.url.partition("://")
+        return f"{scheme}://{authority.rpartition('@')[2].partition('/')[0]}"
 
     @property
     def problem(self) -> str | None:

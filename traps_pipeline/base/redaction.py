@@ -72,8 +72,8 @@ def redact(text: str) -> str:
             spans += _spans(text, pieces, is_decoded)
     for start, end in sorted(_merge(spans), reverse=True):
         text = f"{text[:start]}{MASK}{text[end:]}"
-    lowered = text.lower()
-    if any(sign in lowered for sign in _SIGNS):  # searching with the expression alone takes ten times as long
+    lower_text = text.lower()
+    if any(sign in lower_text for sign in _SIGNS):  # searching with the expression alone takes ten times as long
         text = _UNKNOWN.sub(lambda match: f"{match[1] or match[2]}{MASK}", text)
     return text
 
@@ -149,12 +149,12 @@ def _encodings(secret: str) -> Iterator[str]:
     content = secret.encode("utf-8", "surrogateescape")
     yield content.hex()
     for prefix_length, skip_length in ((0, 0), (1, 2), (2, 3)):
-        encoded = (
+        encodings = (
             b64encode(bytes(prefix_length) + content)
             .decode()[skip_length : (prefix_length + len(content)) * 8 // 6]
             .lower()
         )
-        yield from (encoded, encoded.replace("+", "-").replace("/", "_"))
+        yield from (encodings, encodings.replace("+", "-").replace("/", "_"))
 
 
 def _search_text(text: str, is_decoded: bool) -> str:

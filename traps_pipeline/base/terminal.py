@@ -91,11 +91,11 @@ def text_table(headings: Sequence[str], rows: Iterable[Sequence[object]], left: 
     """
     from rich.cells import cell_len
 
-    styled = sys.stdout.isatty()
+    is_styled = sys.stdout.isatty()
     cells = [[plain(heading) for heading in headings], *([_printable(str(cell)) for cell in row] for row in rows)]
     widths = [max(map(cell_len, column)) for column in zip(*cells, strict=True)]
     count, hidden = len(headings), ""
-    if styled:
+    if is_styled:
         columns = shutil.get_terminal_size().columns
         while count > 1 and sum(widths[:count]) + _GAP * (count - 1) > columns:
             count -= 1
@@ -106,7 +106,7 @@ def text_table(headings: Sequence[str], rows: Iterable[Sequence[object]], left: 
         blanks = [" " * (width - cell_len(cell)) for width, cell in zip(widths, row, strict=True)]
         aligned = [c + b if k in left else b + c for k, (c, b) in enumerate(zip(row, blanks, strict=True))]
         lines.append((" " * _GAP).join(aligned[:count]).rstrip())
-    if styled:
+    if is_styled:
         lines[:1] = [f"\x1b[1m{lines[0]}\x1b[0m", "─" * (sum(widths[:count]) + _GAP * (count - 1))]
     return redact("\n".join(lines) + hidden)
 

@@ -55,8 +55,8 @@ def keep_workers() -> Iterator[None]:
     try:
         yield
     finally:
-        idle, _idle = _idle, None
-        for pool in idle:
+        idle_pool, _idle = _idle, None
+        for pool in idle_pool:
             pool.end()
 
 

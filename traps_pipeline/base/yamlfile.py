@@ -197,8 +197,8 @@ def _finite(text: str) -> float:
 
 def _depth(line: str) -> int:
     """Return the nesting depth of brackets outside strings (must be fast)."""
-    outside = _STRINGS.sub("", line) if "\\" in line else "".join(line.split('"')[::2])
-    brackets = outside.encode().translate(None, _NO_BRACKETS)
+    unquoted = _STRINGS.sub("", line) if "\\" in line else "".join(line.split('"')[::2])
+    brackets = unquoted.encode().translate(None, _NO_BRACKETS)
     return max(accumulate(map(_STEPS.__getitem__, brackets)), default=0)
 
 

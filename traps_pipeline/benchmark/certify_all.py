@@ -56,12 +56,10 @@ def certify_all(
         for case in cases:
             case.verdict.unlink(missing_ok=True)
     verdicts = []
-    for finished, (_, verdict) in enumerate(run_in_order(judge, cases, workers), start=1):
+    for count, (_, verdict) in enumerate(run_in_order(judge, cases, workers), start=1):
         verdicts.append(verdict)
-        if not verdict.passed or finished % 20 == 0 or finished == len(cases):
-            report(
-                f"{finished} of {len(cases)} examined: {verdict.scenario_id} {'passes' if verdict.passed else 'FAILS'}"
-            )
+        if not verdict.passed or count % 20 == 0 or count == len(cases):
+            report(f"{count} of {len(cases)} examined: {verdict.scenario_id} {'passes' if verdict.passed else 'FAILS'}")
     failures = [f"{v.scenario_id}: {name}: {reason}" for v in verdicts for name, reason in v.failures.items()]
     is_complete = families is None and (folder / "composition.yaml").is_file()
     failures += problems(specs, load_composition(folder / "composition.yaml") if is_complete else None)

@@ -109,10 +109,10 @@ def _open_for_append(folder: Path) -> Iterator[Callable[[Sequence[Correction]], 
     Raises TrapsError if a later file would overrule them, and if the folder belongs to an installed wheel.
     """
     require_own_corrections(folder).mkdir(parents=True, exist_ok=True)
-    overruling = sorted(path.name for path in folder.glob("*.jsonl") if path.name > FILE)
-    if overruling:
+    later_files = sorted(path.name for path in folder.glob("*.jsonl") if path.name > FILE)
+    if later_files:
         raise TrapsError(
-            f"{folder / overruling[0]}: is read after {FILE}, to which reviews are appended, and would overrule them; "
+            f"{folder / later_files[0]}: is read after {FILE}, to which reviews are appended, and would overrule them; "
             f"rename it to a name that comes before {FILE}"
         )
     path = folder / FILE

@@ -93,8 +93,8 @@ def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tupl
     def tick(finished: int) -> None:
         progress.current().tick("arms", f"{category}, scenarios", finished, len(specs))
 
-    filming = RenderWork(f"arms/{category}", missing, files, job, film)
-    return share(workspace.store, specs, filming, tick, wait=wait)
+    render_work = RenderWork(f"arms/{category}", missing, files, job, film)
+    return share(workspace.store, specs, render_work, tick, wait=wait)
 
 
 def seconds_left(workspace: Workspace, category: str) -> float:
@@ -131,10 +131,8 @@ def _is_missing(row: Row, clips: Mapping[str, Path], existing: set[Path]) -> boo
     """Return whether the study lacks files of these arms of a scenario."""
     spec = spec_of(row)
     for arm, clip in clips.items():
-        finding = (
-            ArmResult.read(_finding_of(clip), _record_digest(spec, arm)) if _finding_of(clip) in existing else None
-        )
-        if finding is None or (finding.frames and not {clip, note_of(clip)} <= existing):
+        result = ArmResult.read(_finding_of(clip), _record_digest(spec, arm)) if _finding_of(clip) in existing else None
+        if result is None or (result.frames and not {clip, note_of(clip)} <= existing):
             return True
     return False
 
@@ -179,8 +177,8 @@ def _record_digest(spec: SceneSpec, arm: str) -> str:
 
 def _is_made(spec: SceneSpec, arm: str, clip: Path) -> bool:
     """Return whether an arm and its clip, if any, are complete. Raises DamagedClip."""
-    finding = ArmResult.read(_finding_of(clip), _record_digest(spec, arm))
-    return finding is not None and (not finding.frames or read_clip(clip) is not None)
+    result = ArmResult.read(_finding_of(clip), _record_digest(spec, arm))
+    return result is not None and (not result.frames or read_clip(clip) is not None)
 
 
 def film(job: Job) -> int:
@@ -191,13 +189,13 @@ def film(job: Job) -> int:
         try:
             variant = arm_of(job.spec, arm)
             variant.ask(job.spec)
-            take = variant.film(scenario)
-            if take.frames:
-                frame_count += save_clip(clip, take.frames, scenario.fps)
-            finding = ArmResult(record_digest, None, take.evidence, len(take.frames))
+            arm_clip = variant.film(scenario)
+            if arm_clip.frames:
+                frame_count += save_clip(clip, arm_clip.frames, scenario.fps)
+            result = ArmResult(record_digest, None, arm_clip.evidence, len(arm_clip.frames))
         except Rejected as rejection:
-            finding = ArmResult(record_digest, str(rejection), {})
-        write_text(_finding_of(clip), json.dumps(asdict(finding)))
+            result = ArmResult(record_digest, str(rejection), {})
+        write_text(_finding_of(clip), json.dumps(asdict(result)))
     return frame_count
 
 
@@ -211,8 +209,8 @@ def _rows(
 ) -> Iterator[ArmRow]:
     spec = spec_of(row)
     path = workspace.clip(spec.scenario_id, arm, row["scene_hash"])
-    finding, clip = ArmResult.read(_finding_of(path), _record_digest(spec, arm)), clips.get(path)
-    if finding is None or (finding.frames and clip is None):
+    result, clip = ArmResult.read(_finding_of(path), _record_digest(spec, arm)), clips.get(path)
+    if result is None or (result.frames and clip is None):
         raise TrapsError(f"{path}: was not filmed; run again")
     empty = ArmRow(
         scenario_id=spec.scenario_id,
@@ -222,8 +220,8 @@ def _rows(
         question=spec.question,
         labels=list(spec.labels),
         ground_truth=None,
-        refused=finding.refused,
-        evidence=json.dumps(finding.evidence),
+        refused=result.refused,
+        evidence=json.dumps(result.evidence),
         clip=None,
         media_digest=None,
         n_frames=None,
@@ -231,7 +229,7 @@ def _rows(
         scene_hash=row["scene_hash"],
         benchmark_version=version,
     )
-    if finding.refused is not None:
+    if result.refused is not None:
         yield replace(empty, ground_truth=None)
         return
     for question in arm_of(spec, arm).ask(spec):

@@ -135,7 +135,7 @@ def changes(rows: pd.DataFrame) -> pd.DataFrame:
                 for item, row in epochs[epoch].items()
                 if item in epochs[previous_epoch]
             ]
-            served = dict.fromkeys(
+            served_models = dict.fromkeys(
                 str(side["served_model"]) for k in (0, 1) for side in (pair[k] for pair in answer_pairs)
             )
             tokens = [new["prompt_tokens"] - old["prompt_tokens"] for old, new in answer_pairs if _has_tokens(old, new)]
@@ -144,7 +144,7 @@ def changes(rows: pd.DataFrame) -> pd.DataFrame:
                     "model": model,
                     "from": previous_epoch,
                     "to": epoch,
-                    "served": " -> ".join(served),
+                    "served": " -> ".join(served_models),
                     "n": len(answer_pairs),
                 }
                 | {

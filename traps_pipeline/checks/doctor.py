@@ -108,8 +108,10 @@ def examine_files(place: Place) -> Iterator[Finding]:
 
     workspace = Workspace.open(place)
     store, missing = workspace.store, list[str]()
-    remote = [store.below(workspace.root / folder) for folder in FOLDERS] if workspace.is_shared else []
-    for path in (path for folder_paths in remote for path in folder_paths):  # fetched, and compared with their digests
+    remote_paths = [store.below(workspace.root / folder) for folder in FOLDERS] if workspace.is_shared else []
+    for path in (
+        path for folder_paths in remote_paths for path in folder_paths
+    ):  # fetched, and compared with their digests
         try:
             store.here(path)
         except TrapsError as error:
@@ -125,11 +127,11 @@ def examine_files(place: Place) -> Iterator[Finding]:
         ("states", sorted(file for kind in STATES for file in (workspace.root / "states").rglob(kind)), damage),
         ("history", sorted(workspace.dagster_home.rglob("*.db")), _history_damage),
     ):
-        damaged = [message for path in files if (message := damage_of(path))]
-        summary = "; ".join(damaged[:MAX_FILES]) + (
-            f"; and {len(damaged) - MAX_FILES} more" if len(damaged) > MAX_FILES else ""
+        messages = [message for path in files if (message := damage_of(path))]
+        summary = "; ".join(messages[:MAX_FILES]) + (
+            f"; and {len(messages) - MAX_FILES} more" if len(messages) > MAX_FILES else ""
         )
-        yield Finding(not damaged, topic, summary or f"{count_noun(len(files), 'file')} read, as written")
+        yield Finding(not messages, topic, summary or f"{count_noun(len(files), 'file')} read, as written")
     message = [*workspace.answers.damage(), *workspace.votes.damage()]
     yield Finding(not message, "ledger", "; ".join(message[:MAX_FILES]) or "all rows are what was written")
     yield Finding(True, "unfinished", _remove_unfinished(workspace.root))
@@ -234,8 +236,8 @@ def _checkout() -> str:
 def _clip_cache() -> str:
     from traps_pipeline.scenes.worlds.clip_cache import VARIABLE, ClipCache
 
-    rendered = ClipCache.of_user()
-    return "off" if rendered is None else f"{rendered.describe()}; {VARIABLE} sets its GB, or off"
+    clip_cache = ClipCache.of_user()
+    return "off" if clip_cache is None else f"{clip_cache.describe()}; {VARIABLE} sets its GB, or off"
 
 
 def _workspace(place: Place) -> str:

@@ -144,14 +144,14 @@ def check_server(entry: Entry, account: Account) -> ServerCheck:
     if answer.status_code in (401, 403):
         return ServerCheck(_wrong_key(account))
     if answer.status_code == BAD_REQUEST and account.key:
-        even = f"{account.base_url} refuses even its list of models (HTTP 400), which wants nothing but a key"
-        return ServerCheck(refused=f"{even}: is the one in {account.key} right?")
+        list_problem = f"{account.base_url} refuses even its list of models (HTTP 400), which wants nothing but a key"
+        return ServerCheck(refused=f"{list_problem}: is the one in {account.key} right?")
     served_names = [str(model["id"]) for model in _served_models(answer) if isinstance(model, dict) and "id" in model]
     if served_names and model_name(entry) not in served_names:
-        unlisted = (
+        name_problem = (
             f"{account.base_url} serves no {model_name(entry)!r}; it lists {plain(', '.join(served_names[:8]))[:200]}"
         )
-        return ServerCheck(unlisted=unlisted)
+        return ServerCheck(unlisted=name_problem)
     return ServerCheck()
 
 
@@ -182,8 +182,10 @@ def findings(
 ) -> LiveResult:
     """Return an entry's problems and notes, from outcomes of `requests_of`."""
     problems, notes, server_check = list[str](), list[str](), reached or ServerCheck()
-    answering = {(outcome.served_model or "").partition("@")[0] for outcome in outcomes.values()}  # @VERSION may follow
-    if server_check.unlisted and model_name(entry) not in answering:
+    answering_models = {
+        (outcome.served_model or "").partition("@")[0] for outcome in outcomes.values()
+    }  # @VERSION may follow
+    if server_check.unlisted and model_name(entry) not in answering_models:
         return LiveResult(entry, [server_check.unlisted])
     if server_check.unlisted:
         notes.append(f"{server_check.unlisted}, and answers to that name: make sure that it is the model that you mean")
@@ -349,14 +351,14 @@ def preflight(workspace: Workspace, models: Sequence[Entry], judges: Sequence[En
         check_money(workspace.study, entry)
     accounts = {entry.id: account_of(entry) for entry in entries}
     server_checks = {entry.id: check_server(entry, accounts[entry.id]) for entry in entries}
-    quick = {
+    quick_entries = {
         entry.id: entry.model_copy(
             update={"limits": entry.limits.model_copy(update={"retries": 1, "timeout_s": TIMEOUT_S / 2})}
         )
         for entry in entries
         if not server_checks[entry.id].problem
     }
-    requests = {name: requests_of(entry) for name, entry in quick.items()}
+    requests = {name: requests_of(entry) for name, entry in quick_entries.items()}
     calls = [Call(request) for entry_requests in requests.values() for request in entry_requests.values()]
     outcomes: Mapping[str, Outcome] = {}
     if calls:
@@ -364,7 +366,9 @@ def preflight(workspace: Workspace, models: Sequence[Entry], judges: Sequence[En
         def finish(settled: SettledCell[Cell, Call]) -> Mapping[str, Outcome]:
             return {key: _outcome(row) for key, row in settled.rows.items()}
 
-        (outcomes,) = collect(workspace, "preflight", workspace.votes, quick.values(), [CELL], lambda _: calls, finish)
+        (outcomes,) = collect(
+            workspace, "preflight", workspace.votes, quick_entries.values(), [CELL], lambda _: calls, finish
+        )
     problems = []
     for entry in entries:
         if problem := server_checks[entry.id].problem:

@@ -128,9 +128,11 @@ def sample(arguments: argparse.Namespace) -> int:
     unknown = sorted(set(names) - set(family_names()))
     if unknown:
         raise TrapsError(f"unknown families {', '.join(unknown)}; known: {', '.join(family_names())}")
-    uncounted = [name for name in names if name not in counts]
-    if uncounted and not arguments.count:
-        raise TrapsError(f"composition.yaml has no number of scenarios for {', '.join(uncounted)}; say --count N")
+    names_without_count = [name for name in names if name not in counts]
+    if names_without_count and not arguments.count:
+        raise TrapsError(
+            f"composition.yaml has no number of scenarios for {', '.join(names_without_count)}; say --count N"
+        )
     targets = {name: arguments.count or max(1, round(counts[name] * arguments.scale)) for name in names}
     name = arguments.name or f"private-{arguments.seed}"
     try:
@@ -175,26 +177,26 @@ def verify_commitment(arguments: argparse.Namespace) -> int:
     published, reveal = sealed.read_commitment(arguments.commitment), sealed.read_reveal(arguments.reveal)
     if arguments.without_drawing and not arguments.specs:
         raise TrapsError("--without-drawing: leaves nothing to look at; name the revealed benchmark with --specs")
-    problems, proven, output = [], [], sys.stderr if arguments.json else sys.stdout
+    problems, proofs, output = [], [], sys.stderr if arguments.json else sys.stdout
     specs = sealed.revealed_specs(arguments.specs.absolute()) if arguments.specs else None
     if specs is not None:
         problems += sealed.broken_seals(published, reveal, specs)
-        proven.append(f"the records of {arguments.specs} are the committed ones")
+        proofs.append(f"the records of {arguments.specs} are the committed ones")
     if not arguments.without_drawing and not problems:
         sample = sealed.redraw_records(
             published, reveal, workers=arguments.workers, report=lambda line: print(line, file=output, flush=True)
         )
         problems += _redraw_problems(published, sealed.broken_seals(published, reveal, sample), specs, sample)
-        proven.append("the revealed seed draws them")
+        proofs.append("the revealed seed draws them")
     if arguments.json:
-        print_json({"benchmark": published.name, "version": published.version, "problems": problems, "proven": proven})
+        print_json({"benchmark": published.name, "version": published.version, "problems": problems, "proven": proofs})
         return FAILED if problems else OK
     for problem in problems:
         print(problem)
     if problems:
         raise TrapsError(f"{arguments.commitment}: is not proven: {count_noun(len(problems), 'problem')}")
     print(
-        f"{count_noun(len(published.specs), 'record')} of {published.name} {published.version}: {', and '.join(proven)}"
+        f"{count_noun(len(published.specs), 'record')} of {published.name} {published.version}: {', and '.join(proofs)}"
     )
     if arguments.without_drawing:
         print("not checked: whether the revealed seed draws them")
@@ -213,6 +215,6 @@ def _redraw_problems(
         and {*specs} == {*drawn}
         and all(is_same_scene(specs[i], drawn[i]) for i in specs)
     ):
-        elsewhere = arithmetic_differences(published) or "another kind of CPU"
-        problems.append(f"all scenes are the same but for the last digits of their simulation ({elsewhere})")
+        machine_difference = arithmetic_differences(published) or "another kind of CPU"
+        problems.append(f"all scenes are the same but for the last digits of their simulation ({machine_difference})")
     return problems

@@ -73,8 +73,8 @@ def import_given(arguments: argparse.Namespace) -> int:
 
     experiment = experiment_of(arguments)
     context = AnswerContext(arguments.model, arguments.run, arguments.key and held_out_key(arguments.key))
-    imported = import_answers(open_workspace(arguments), experiment, arguments.file, context, arguments.errors)
-    return _print_import(imported, arguments, "answer")
+    import_result = import_answers(open_workspace(arguments), experiment, arguments.file, context, arguments.errors)
+    return _print_import(import_result, arguments, "answer")
 
 
 def export_votes(arguments: argparse.Namespace) -> int:

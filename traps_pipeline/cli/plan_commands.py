@@ -52,16 +52,16 @@ def plan(arguments: argparse.Namespace) -> int:
     )
     if arguments.card not in CARDS:
         raise TrapsError(f"--card {arguments.card}: name one of {', '.join(CARDS)}")
-    planned = make_plan(workspace, experiment, study, arguments.card)
+    plan_counts = make_plan(workspace, experiment, study, arguments.card)
     if arguments.json:
-        print_json({"experiment": experiment.name, "workspace": str(place) if workspace else None, "plan": planned})
+        print_json({"experiment": experiment.name, "workspace": str(place) if workspace else None, "plan": plan_counts})
         return OK
     total = (Count(), Count())
     location = place if workspace else "a new workspace"
     print(wrap_text(f"{experiment.name} in {location}: calls wanted, known (in the ledger), new"))
-    rows = {**planned.calls, **{f"{model}, steered": counts for model, counts in planned.steered.items()}}
-    if planned.labels is not None and planned.labels.wanted:
-        rows["confabulation labels"] = (Count(), planned.labels)
+    rows = {**plan_counts.calls, **{f"{model}, steered": counts for model, counts in plan_counts.steered.items()}}
+    if plan_counts.labels is not None and plan_counts.labels.wanted:
+        rows["confabulation labels"] = (Count(), plan_counts.labels)
     for counts in rows.values():
         for sum_, count in zip(total, counts, strict=True):
             sum_.add(count.wanted, count.known)
@@ -71,15 +71,15 @@ def plan(arguments: argparse.Namespace) -> int:
         for name, counts in [*rows.items(), ("all", total)]
     ]
     print(text_table(headings, cells))
-    if planned.forecasts:
-        _print_forecasts(planned.forecasts, planned.minutes)
-    if planned.local:
-        _print_local(planned.local, arguments.card)
-    _print_precision(planned.pairs, len(planned.calls))
-    if planned.uncertain:
+    if plan_counts.forecasts:
+        _print_forecasts(plan_counts.forecasts, plan_counts.minutes)
+    if plan_counts.local:
+        _print_local(plan_counts.local, arguments.card)
+    _print_precision(plan_counts.pairs, len(plan_counts.calls))
+    if plan_counts.uncertain:
         text = (
-            f"This is an upper bound: items of {', '.join(planned.uncertain)} are still to be made, so all of their "
-            "calls are counted as new. Materialize scene_specs, videos and items for exact counts."
+            f"This is an upper bound: items of {', '.join(plan_counts.uncertain)} are still to be made, so all of "
+            "their calls are counted as new. Materialize scene_specs, videos and items for exact counts."
         )
         print(wrap_text(text))
     return OK
@@ -89,11 +89,11 @@ def _print_precision(pairs: Mapping[str, int], models: int) -> None:
     from traps_pipeline.scoring.power import Shares, precision
 
     if any(pairs.values()):
-        expected, middling = precision(pairs, models=models), Shares()
-        acc, abs_rec, false_abs = map(in_percent, (middling.acc, middling.abs_rec, middling.false_abs))
+        expected, example = precision(pairs, models=models), Shares()
+        acc, abs_rec, false_abs = map(in_percent, (example.acc, example.abs_rec, example.false_abs))
         text = (
             f"\nprecision with {count_noun(sum(pairs.values()), 'pair')}: a model with Acc {acc}, AbsRec {abs_rec}, "
-            f"FalseAbs {false_abs} (PECS {middling.pecs:.2f}) gets a 95 % interval of PECS about {expected.width:.3f} "
+            f"FalseAbs {false_abs} (PECS {example.pecs:.2f}) gets a 95 % interval of PECS about {expected.width:.3f} "
             f"wide; {_power(expected.difference, 'two models with unrelated answers')}"
         )
         if models > 2:
@@ -110,8 +110,8 @@ def _power(least: float | None, models: str) -> str:
 
 def _print_forecasts(forecasts: Sequence[Forecast], minutes: float) -> None:
     """Print tokens, dollars and minutes of new calls; sums omit unknown prices."""
-    priced = [row.dollars for row in forecasts if row.dollars is not None]
-    total = (sum(d[0] for d in priced), sum(d[1] for d in priced), sum(d[2] for d in priced))
+    known_dollars = [row.dollars for row in forecasts if row.dollars is not None]
+    total = (sum(d[0] for d in known_dollars), sum(d[1] for d in known_dollars), sum(d[2] for d in known_dollars))
     calls = sum(row.calls for row in forecasts)
     rows = [
         (
@@ -131,7 +131,7 @@ def _print_forecasts(forecasts: Sequence[Forecast], minutes: float) -> None:
     if batch_usd < total[1]:
         heading = "expected if all calls are made in batches (traps study export-requests --batch)"
         print(wrap_text(f"{heading}: USD {batch_usd:,.2f}"))
-    if len(priced) < len(forecasts):
+    if len(known_dollars) < len(forecasts):
         unknown = ", ".join(row.participant for row in forecasts if row.dollars is None)
         print(wrap_text(f"price unknown, not in the sum: {unknown}"))
 

@@ -213,9 +213,9 @@ class LiveProgress(PrintedProgress):
     def _heading(self, now: StageProgress) -> str:
         """Return the stage, partitions, times and money, within 80 columns."""
         counts = f"  {now.done:,} of {now.partitions:,} made" if now.partitions else ""
-        remaining = "" if now.left_s is None else f", {clock(now.left_s)} left"
+        time_left = "" if now.left_s is None else f", {clock(now.left_s)} left"
         money = f"  {self.spent()}" if self.budget_usd and now.calls else ""
-        return f"{now.name}{counts}  {clock(now.seconds)}{remaining}{money}"
+        return f"{now.name}{counts}  {clock(now.seconds)}{time_left}{money}"
 
     def _calls(self, now: StageProgress) -> Table:
         from rich.table import Table

@@ -170,16 +170,16 @@ def _print_work(report: RunReport, *, is_inside: bool) -> None:
 
 def _print_problems(problems: Sequence[str], *, as_json: bool) -> None:
     """Print each cause once, last the one behind most problems, to fix first."""
-    show = partial(print_failure, as_json=as_json)
+    print_line = partial(print_failure, as_json=as_json)
     problems_by_cause = dict[str, list[str]]()
     for problem in problems:
         problems_by_cause.setdefault(problem.partition(": ")[2] or problem, []).append(problem)
     for first, *repeats in problems_by_cause.values():
-        show(f"{first}{f' (and {len(repeats)} more)' if repeats else ''}")
-    show(f"{count_noun(len(problems), 'problem')}; finished work is kept: run the same command to continue")
+        print_line(f"{first}{f' (and {len(repeats)} more)' if repeats else ''}")
+    print_line(f"{count_noun(len(problems), 'problem')}; finished work is kept: run the same command to continue")
     cause, cause_problems = max(problems_by_cause.items(), key=lambda pair: len(pair[1]))
     if len(cause_problems) > 1:
-        show(f"{len(cause_problems)} of them have one cause: {cause}")
+        print_line(f"{len(cause_problems)} of them have one cause: {cause}")
 
 
 @contextmanager

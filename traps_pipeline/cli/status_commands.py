@@ -65,20 +65,20 @@ def status(arguments: argparse.Namespace) -> int:
     print(f"workspace {workspace.place}")
     for check, stage, partition, reason in checks:
         print(wrap_text(plain(f"check {check} of {stage} {partition} does not pass: {reason}")))
-    total, unfresh = sum(row.fresh for row in rows), [row for row in rows if row.stale or row.missing]
-    if not unfresh:
+    total, rows_to_make = sum(row.fresh for row in rows), [row for row in rows if row.stale or row.missing]
+    if not rows_to_make:
         print(f"everything is fresh: {count_noun(total, 'partition')} of {count_noun(len(rows), 'stage')}")
         return OK
-    table = [(row.stage, row.fresh, len(row.stale), len(row.missing)) for row in unfresh]
+    table = [(row.stage, row.fresh, len(row.stale), len(row.missing)) for row in rows_to_make]
     lines = text_table(("stage", "fresh", "stale", "missing"), table).splitlines()
-    print("\n".join(lines[: -len(unfresh)]))
-    for line, row in zip(lines[-len(unfresh) :], unfresh, strict=True):
+    print("\n".join(lines[: -len(rows_to_make)]))
+    for line, row in zip(lines[-len(rows_to_make) :], rows_to_make, strict=True):
         print(line)
         for reason, keys in row.by_reason().items():
             suffix = f" and {len(keys) - MAX_KEYS} more" if len(keys) > MAX_KEYS else ""
             prefix = "" if keys == [row.stage] else f"{', '.join(keys[:MAX_KEYS])}{suffix}: "
             print(wrap_text(plain(f"    {prefix}{reason[:MAX_REASON]}")))
-    count = sum(len(row.stale) + len(row.missing) for row in unfresh)
+    count = sum(len(row.stale) + len(row.missing) for row in rows_to_make)
     print(f"not fresh: {count:,} of {count_noun(total + count, 'partition')}; `{command}` makes them again")
     return OK
 

@@ -199,8 +199,8 @@ class ObjectStore(Store):
         """See `Store`."""
         cutoff = datetime.now(UTC) - timedelta(days=GRACE_DAYS if grace_days is None else grace_days)
         objects = {
-            bytes.fromhex(match[2]): UnusedObject(name, size, modified)
-            for name, size, modified in self.bucket.names()
+            bytes.fromhex(match[2]): UnusedObject(name, size, modified_at)
+            for name, size, modified_at in self.bucket.names()
             if (match := _OBJECT.fullmatch(name))
         }
         named = {row.digest for row in self.names.naming().values()}

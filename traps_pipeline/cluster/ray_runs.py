@@ -91,8 +91,8 @@ def require_cluster(workspace: Workspace, instance: dg.DagsterInstance) -> None:
         raise TrapsError(
             f"{prefix}{RAY} is not set: export {RAY}=http://HEAD:8265, the address of Ray's head for the study"
         )
-    beats = instance.get_daemon_heartbeats()
-    oldest = min(beats[name].timestamp if name in beats else 0.0 for name in DAEMONS)
+    heartbeats = instance.get_daemon_heartbeats()
+    oldest = min(heartbeats[name].timestamp if name in heartbeats else 0.0 for name in DAEMONS)
     if time.time() - oldest > ALIVE_S:
         raise TrapsError(
             f"{prefix}nobody takes runs from its queue; run `traps ui` on the head, with the same variables, and then "
@@ -173,7 +173,7 @@ class RayRuns(Runs):
             while requests or run_ids:
                 time.sleep(POLL_S)
                 try:
-                    self._look_at(requests, run_ids, done)
+                    self._look_at(requests, run_ids, outcomes)
                     seen_at = time.monotonic()
                 except Exception as error:
                     if database_error(error) is None or time.monotonic() - seen_at > PATIENCE_S:
@@ -181,7 +181,7 @@ class RayRuns(Runs):
         except KeyboardInterrupt:
             self._stop_runs(requests, run_ids)
             raise
-        return done
+        return outcomes
 
     def _look_at(self, requests: list[str], run_ids: list[str], done: list[RunOutcome]) -> None:
         """Report progress of runs; replace requests by runs, and add ended ones to `done`."""

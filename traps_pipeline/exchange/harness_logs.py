@@ -109,9 +109,9 @@ def _unpack(raw: Any, entry: zipfile.ZipInfo) -> bytes:
     raw.seek(entry.header_offset)
     header = _LOCAL_HEADER.unpack(raw.read(_LOCAL_HEADER.size))
     raw.seek(header[-2] + header[-1], 1)  # the name and the extra field
-    packed = raw.read(entry.compress_size)
+    packed_bytes = raw.read(entry.compress_size)
     try:
-        content = pa.decompress(packed, decompressed_size=entry.file_size, codec="zstd", asbytes=True)
+        content = pa.decompress(packed_bytes, decompressed_size=entry.file_size, codec="zstd", asbytes=True)
     except (pa.ArrowException, OSError) as error:
         raise ValueError(str(error)) from error
     if zlib.crc32(content) != entry.CRC:

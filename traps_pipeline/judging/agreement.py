@@ -78,8 +78,8 @@ def fleiss_kappa(values: np.ndarray) -> float:
     total = int(yes.sum())
     if k < 2 or total in (0, n * k):
         return float("nan")
-    observed = float(np.mean(yes * (yes - 1) + (k - yes) * (k - yes - 1))) / (k * (k - 1))
-    return _chance_corrected(observed, _chance_agreement(total / (n * k)))
+    observed_agreement = float(np.mean(yes * (yes - 1) + (k - yes) * (k - yes - 1))) / (k * (k - 1))
+    return _chance_corrected(observed_agreement, _chance_agreement(total / (n * k)))
 
 
 def cohen_kappa(first: np.ndarray, second: np.ndarray) -> float:
@@ -107,8 +107,8 @@ def krippendorff_alpha(values: np.ndarray) -> float:
     n, n_yes = int(valid.sum()), int(yes.sum())
     if n_yes in (0, n):
         return float("nan")
-    observed = float(np.sum(2 * yes * (valid - yes) / (valid - 1))) / n
-    return 1 - observed / (2 * n_yes * (n - n_yes) / (n * (n - 1)))
+    observed_disagreement = float(np.sum(2 * yes * (valid - yes) / (valid - 1))) / n
+    return 1 - observed_disagreement / (2 * n_yes * (n - n_yes) / (n * (n - 1)))
 
 
 def unanimous_share(values: np.ndarray) -> float:

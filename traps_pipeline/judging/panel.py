@@ -201,10 +201,10 @@ def parse_vote(task: Task, row: Row, item: Mapping[str, Any], thinking: Marks | 
     if isinstance(vote, AbstentionVote):
         details = {"confidence": vote.confidence, "rationale": vote.reasoning, "rejects_premise": vote.rejects_premise}
         return Vote(True, vote.abstained, **details)
-    extracted = None if vote.extracted_value is None else str(vote.extracted_value)
+    extracted_value = None if vote.extracted_value is None else str(vote.extracted_value)
     aliases = json.loads(item["aliases"])
-    correct = is_correct(extracted, item["ground_truth"], item["answer_type"], list(item["labels"]), aliases)
-    return Vote(True, correct, judge_correct=vote.correct, extracted_value=extracted, rationale=vote.reasoning)
+    correct = is_correct(extracted_value, item["ground_truth"], item["answer_type"], list(item["labels"]), aliases)
+    return Vote(True, correct, judge_correct=vote.correct, extracted_value=extracted_value, rationale=vote.reasoning)
 
 
 # --- the votes stage --------------------------------------------------------------------------------------------------

@@ -144,12 +144,12 @@ def robustness(name: str, judges: Sequence[str], attacks: Attacks, votes: Votes)
             for judge in (*judges, PANEL):
                 seats = judges if judge == PANEL else [judge]
                 texts = attack.answer, attack.id
-                clean, vote = (_majority_decision([votes[text, task, j] for j in seats]) for text in texts)
+                plain_vote, vote = (_majority_decision([votes[text, task, j] for j in seats]) for text in texts)
                 cast = votes[attack.id, task, judge] if judge != PANEL else None
                 rows.append(
                     row_keys
-                    | {"judge": judge, "expected": expected, "clean": clean, "vote": vote}
-                    | {"result": result(expected, clean, vote)}
+                    | {"judge": judge, "expected": expected, "clean": plain_vote, "vote": vote}
+                    | {"result": result(expected, plain_vote, vote)}
                     | {"invalid_reason": cast and cast.invalid_reason, "rationale": cast and cast.rationale}
                 )
     return pd.DataFrame(rows, columns=pd.Index(JUDGE_ROBUSTNESS.names))

@@ -124,9 +124,9 @@ def _in_text(text: str, question: str) -> Statement | None:
     wording, last = f" {_words(question)} ", len(sentences) - 1
     statements = dict[int, Statement | None]()
     for place, sentence in enumerate(sentences):
-        if announced := _ANNOUNCED.fullmatch(sentence):
+        if announcement := _ANNOUNCED.fullmatch(sentence):
             any_label = place == last == 1 and sentences[0] == _REFERENCE_REASON
-            statements[place] = _in_words(announced.group(1), question, any_label=any_label)
+            statements[place] = _in_words(announcement.group(1), question, any_label=any_label)
         elif last == 0:
             statements[place] = _in_words(sentence, question)
         elif _in_words(sentence, question) == ABSTENTION:
@@ -135,8 +135,8 @@ def _in_text(text: str, question: str) -> Statement | None:
                 w for w in earlier_words if _LABEL.fullmatch(w) or f" {w} or " in wording or f" or {w} " in wording
             ]
             statements[place] = None if choices else ABSTENTION
-    explained = last > 0 and statements.get(0, ABSTENTION) != ABSTENTION and _EXPLAINS.match(sentences[1])
-    agree = len({*statements.values()}) == 1 and (last in statements or explained)
+    is_explained = last > 0 and statements.get(0, ABSTENTION) != ABSTENTION and _EXPLAINS.match(sentences[1])
+    agree = len({*statements.values()}) == 1 and (last in statements or is_explained)
     return statements[min(statements)] if agree else None
 
 

@@ -113,8 +113,8 @@ def _rejects_premise(rows: pd.DataFrame, votes: pd.DataFrame, n_judges: int) -> 
         return pd.arrays.BooleanArray(np.zeros(len(rows), bool), np.ones(len(rows), bool))
     yes = marks.astype({"rejects_premise": "int64"}).groupby(ANSWER)["rejects_premise"].agg(["sum", "size"])
     counts = rows[ANSWER].merge(yes.reset_index(), on=ANSWER, how="left").fillna(0)
-    n_rejecting, accepts = counts["sum"].to_numpy(), (counts["size"] - counts["sum"]).to_numpy()
-    return pd.arrays.BooleanArray(n_rejecting > n_judges / 2, np.maximum(n_rejecting, accepts) <= n_judges / 2)
+    n_rejecting, n_accepting = counts["sum"].to_numpy(), (counts["size"] - counts["sum"]).to_numpy()
+    return pd.arrays.BooleanArray(n_rejecting > n_judges / 2, np.maximum(n_rejecting, n_accepting) <= n_judges / 2)
 
 
 def _unanimous(values: np.ndarray) -> np.ndarray:

@@ -133,9 +133,11 @@ class Money:
         return {session for session in _other_sessions(batch) if self._database.is_dead(session)}
 
     def _releasable(self, batch: Batch) -> dict[str, Releasable]:
-        dead = self._dead_sessions(batch)
+        dead_sessions = self._dead_sessions(batch)
         in_flight_usd, failed = defaultdict[str, float](float), defaultdict[str, float](float)
-        query = sa.select(RESERVATIONS).where(RESERVATIONS.c.study == batch.study, RESERVATIONS.c.session.in_(dead))
+        query = sa.select(RESERVATIONS).where(
+            RESERVATIONS.c.study == batch.study, RESERVATIONS.c.session.in_(dead_sessions)
+        )
         for row in batch.connection.execute(query):
             in_flight_usd[row.participant] += row.usd
         for row in batch.connection.execute(sa.select(TOTALS).where(TOTALS.c.study == batch.study)):

@@ -65,15 +65,17 @@ def copy_ledger(source: Database, target: Database, settle: Callable[[], None] =
         count = target.submit(lambda batch: _copy(source, batch, target.place, mark)).result()
         target.sync()
         settle()
-        unmark = sa.update(EVALUATIONS).where(EVALUATIONS.c.writer == mark).values(writer=None)
-        target.submit(lambda batch: batch.connection.execute(unmark)).result()
+        clear_mark = sa.update(EVALUATIONS).where(EVALUATIONS.c.writer == mark).values(writer=None)
+        target.submit(lambda batch: batch.connection.execute(clear_mark)).result()
     return count
 
 
 def _copy(source: Database, batch: Batch, place: str, mark: str) -> int:
     evaluations = sa.select(EVALUATIONS.c.id).where(EVALUATIONS.c.study == batch.study)
-    unmarked = evaluations.where(EVALUATIONS.c.writer.is_distinct_from(mark))
-    if batch.connection.execute(sa.select(ROWS.c.id).where(ROWS.c.evaluation.in_(unmarked)).limit(1)).first():
+    unmarked_evaluations = evaluations.where(EVALUATIONS.c.writer.is_distinct_from(mark))
+    if batch.connection.execute(
+        sa.select(ROWS.c.id).where(ROWS.c.evaluation.in_(unmarked_evaluations)).limit(1)
+    ).first():
         raise TrapsError(
             f"{place}: holds rows of this study already; import into a study that has none, or bring answers into it "
             "one by one with `traps study import-answers`"

@@ -136,18 +136,18 @@ def _check_steered_states(subject: Subject) -> str:
 def _zero(subject: Subject) -> str:
     import torch
 
-    model, none = subject.model, subject.steered(0.0, 0.0, 0.0)
+    model, zero_steering = subject.model, subject.steered(0.0, 0.0, 0.0)
 
     def hooks() -> int:
         return sum(len(module._forward_hooks) for module in model.network.modules())
 
     previous_hooks, plain_state = hooks(), model.forward(subject.prompts[0]).last_hidden_state
-    with none.applied(model):
+    with zero_steering.applied(model):
         _require(hooks() == previous_hooks, "steering with alpha 0 leaves a hook")
         _require(
             torch.equal(model.forward(subject.prompts[0]).last_hidden_state, plain_state), "alpha 0 changes states"
         )
-    answers = [model.generate(subject.prompts, NEW_TOKENS, steering=steering) for steering in (None, none)]
+    answers = [model.generate(subject.prompts, NEW_TOKENS, steering=steering) for steering in (None, zero_steering)]
     _require(answers[0] == answers[1], "alpha 0 changes answers")
     return "no bit changes"
 
@@ -171,10 +171,10 @@ def _parts(subject: Subject) -> str:
 def _check_pooling(subject: Subject) -> str:
     prompt = subject.prompts[1]
     positions = spans(subject.model, prompt, SYSTEM, QUESTIONS[1])["question"]
-    pooled = subject.model.forward_states(prompt, "question", chosen=positions).raw[subject.layer]
+    pooled_state = subject.model.forward_states(prompt, "question", chosen=positions).raw[subject.layer]
     mean_state = _library_states(subject, prompt)[subject.layer][positions].mean(dim=0).numpy()
     _require(
-        np.abs(pooled - mean_state).max() <= CLOSE * np.abs(mean_state).max(),
+        np.abs(pooled_state - mean_state).max() <= CLOSE * np.abs(mean_state).max(),
         "the mean over the question is another one",
     )
     return "equal"
@@ -193,12 +193,12 @@ def _check_patching(subject: Subject) -> str:
     other_prompt = model.prompt(SYSTEM, QUESTIONS[0], 255 - subject.frames, subject.times_s)
     target, source = (record(model, prompt, tokens) for prompt in (subject.prompts[0], other_prompt))
     all_tokens = np.ones(target.length, bool)
-    everywhere = [Patch("residual", layer, all_tokens) for layer in range(model.n_layers + 1)]
+    full_patches = [Patch("residual", layer, all_tokens) for layer in range(model.n_layers + 1)]
     sites = [Patch(site, layer, all_tokens) for site in SITES for layer in range(1, model.n_layers + 1)]
-    self_patched = patched_changes(model, target, target, [*everywhere, *sites], tokens)
+    self_patched = patched_changes(model, target, target, [*full_patches, *sites], tokens)
     _require(bool((self_patched == 0).all()), "a patch with itself changes the outcome")
     gap = source.margin - target.margin
-    deviations = np.abs(patched_changes(model, target, source, everywhere, tokens) / gap - 1)
+    deviations = np.abs(patched_changes(model, target, source, full_patches, tokens) / gap - 1)
     _require(
         bool(gap and deviations.max() <= CLOSE),
         f"patching all positions misses the source's outcome by {deviations.max():.1e}",
@@ -208,8 +208,8 @@ def _check_patching(subject: Subject) -> str:
         "shared keys and values": bool(target.shared),
         "per-layer inputs": bool(target.per_layer),
     }
-    also = ", ".join(name for name, is_different in side_paths.items() if is_different)
-    return "exactly 0, and 1" + (f" with {also}" if also else "")
+    path_names = ", ".join(name for name, is_different in side_paths.items() if is_different)
+    return "exactly 0, and 1" + (f" with {path_names}" if path_names else "")
 
 
 # --- faster ways ------------------------------------------------------------------------------------------------------

@@ -44,11 +44,11 @@ def cross_product(first: PairDifferences, second: PairDifferences, weights: np.n
     weights: (draws, scenarios), the count of each scenario.
     """
     products = first.values @ second.values.T
-    differ = (first.scenario[:, None] != second.scenario).astype(float)
+    is_other_scenario = (first.scenario[:, None] != second.scenario).astype(float)
     left_weights, right_weights = weights[:, first.scenario], weights[:, second.scenario]
     with np.errstate(invalid="ignore", divide="ignore"):
-        return ((left_weights @ (products * differ)) * right_weights).sum(axis=1) / (
-            (left_weights @ differ) * right_weights
+        return ((left_weights @ (products * is_other_scenario)) * right_weights).sum(axis=1) / (
+            (left_weights @ is_other_scenario) * right_weights
         ).sum(axis=1)
 
 
@@ -70,9 +70,11 @@ def split_half(of: PairDifferences, seed: Sequence[int]) -> float:
     rng = np.random.default_rng([*seed])
     first = np.stack([rng.permutation(np.arange(n) < n // 2) for _ in range(HALVINGS)]).astype(float)
     second = 1 - first
-    dot, one, two = (((a @ products) * b).sum(axis=1) for a, b in ((first, second), (first, first), (second, second)))
+    dot, first_norm, second_norm = (
+        ((a @ products) * b).sum(axis=1) for a, b in ((first, second), (first, first), (second, second))
+    )
     with np.errstate(invalid="ignore", divide="ignore"):
-        return float(np.mean(dot / np.sqrt(one * two)))
+        return float(np.mean(dot / np.sqrt(first_norm * second_norm)))
 
 
 def cosine_rows(workspace: Workspace) -> list[CosineRow]:

@@ -113,8 +113,8 @@ def sweep(effects: pd.DataFrame) -> pd.DataFrame:
     """
     rows = effects.loc[(effects["kind"] == "void") & (effects["side"] == "control")]
     rows = rows.loc[rows["source"] == rows["target"]]
-    grouped = rows.groupby([*CELL, "layer", "alpha"])["abstention"]
-    table = grouped.agg(control="mean", n_splits="count").reset_index()
+    groups = rows.groupby([*CELL, "layer", "alpha"])["abstention"]
+    table = groups.agg(control="mean", n_splits="count").reset_index()
     has_several_layers = table.groupby("model")["layer"].transform("nunique") > 1
     return table.loc[has_several_layers].reset_index(drop=True)
 

@@ -74,13 +74,13 @@ def thresholds(score: np.ndarray, void: np.ndarray, false_abs: float) -> dict[st
     gated.
     """
     control = np.sort(score[~void])
-    mid = (score[void].mean() + control.mean()) / 2
+    midpoint = (score[void].mean() + control.mean()) / 2
     levels = np.unique(score)
     cuts = np.concatenate([[levels[0] - 1], (levels[1:] + levels[:-1]) / 2, [NO_THRESHOLD]])
-    gained = [(score[void] > cut).mean() - (control > cut).mean() for cut in cuts]
+    j_of_cuts = [(score[void] > cut).mean() - (control > cut).mean() for cut in cuts]
     rank = int(np.ceil((len(control) + 1) * (1 - false_abs) - 1e-9))
     conformal = float(control[rank - 1]) if rank <= len(control) else NO_THRESHOLD
-    return {MID: float(mid), J: float(cuts[int(np.argmax(gained))]), CONFORMAL: conformal}
+    return {MID: float(midpoint), J: float(cuts[int(np.argmax(j_of_cuts))]), CONFORMAL: conformal}
 
 
 def sources_of_gate(source: str, target: str, datasets: Sequence[str] = DATASETS) -> list[str]:
@@ -98,24 +98,24 @@ def decide(items: Items, source: str, target: str, *, folds: int, seed: int, fal
     of unseen items too; items with the same prompt count once. Raises TrapsError for a source without items.
     """
     targets = items.table["dataset"].to_numpy(str)
-    scored = np.flatnonzero(targets == target)
+    target_rows = np.flatnonzero(targets == target)
     is_source = np.isin(targets, sources_of_gate(source, target))
     if not is_source.any():
         raise TrapsError(f"a gate from {source} has no items; extract the hidden states of its datasets first")
     groups = items.table["family" if source == OTHER_FAMILIES else "scenario_id"].to_numpy(str)
-    score = np.full(len(scored), np.nan)
-    cut = {name: np.full(len(scored), NO_THRESHOLD) for name in THRESHOLDS}
-    expected = {name: np.zeros(len(scored)) for name in THRESHOLDS}
-    for fold in _held_out_groups(groups[scored], source, folds, seed):
-        is_in_fold = np.isin(groups[scored], fold)
+    score = np.full(len(target_rows), np.nan)
+    cut = {name: np.full(len(target_rows), NO_THRESHOLD) for name in THRESHOLDS}
+    expected = {name: np.zeros(len(target_rows)) for name in THRESHOLDS}
+    for fold in _held_out_groups(groups[target_rows], source, folds, seed):
+        is_in_fold = np.isin(groups[target_rows], fold)
         train = items.rows(is_source & ~np.isin(groups, fold))
         if len(set(train.void)) < 2:
             continue
         probe, cuts, shares = fit_gate(train, folds, seed, false_abs)
-        score[is_in_fold] = probe.scores(items.features[scored[is_in_fold]])
+        score[is_in_fold] = probe.scores(items.features[target_rows[is_in_fold]])
         for name in THRESHOLDS:
             cut[name][is_in_fold], expected[name][is_in_fold] = cuts[name], shares[name]
-    return Decisions(scored, score, cut, expected)
+    return Decisions(target_rows, score, cut, expected)
 
 
 def fit_gate(
@@ -126,9 +126,9 @@ def fit_gate(
     train: both sides, in two scenarios or more.
     """
     probe = fit_probe(train.features, train.void)
-    calibrating, void = _own_scores(train, folds, seed)
-    cuts = thresholds(calibrating, void, false_abs)
-    return probe, cuts, {name: float((calibrating[~void] > cut).mean()) for name, cut in cuts.items()}
+    calibration_scores, void = _own_scores(train, folds, seed)
+    cuts = thresholds(calibration_scores, void, false_abs)
+    return probe, cuts, {name: float((calibration_scores[~void] > cut).mean()) for name, cut in cuts.items()}
 
 
 def _held_out_groups(groups: np.ndarray, source: str, folds: int, seed: int) -> Iterator[np.ndarray]:

@@ -232,8 +232,8 @@ def _rows(
         for target, (decisions, layer) in decided.items():
             outcome = outcomes[target]
             gate = decisions.score > decisions.threshold[threshold]
-            gated = outcome.gated(gate)
-            values = gated.figures()
+            gated_outcomes = outcome.gated(gate)
+            values = gated_outcomes.figures()
             if target not in DATASETS:  # what the gate alone would do to items that must be answered
                 values = dict.fromkeys(values, np.nan)
                 values["false_abs"] = float(gate[~outcome.void].mean()) if (~outcome.void).any() else np.nan
@@ -241,7 +241,7 @@ def _rows(
             values |= {"expected_false_abs": float(decisions.expected[threshold].mean())}
             about_pecs = interval(np.full((2, 1), np.nan), np.nan, (0.0, 1.0))
             if target in DATASETS:
-                sums = _resample(gated, target, names[decisions.place], resamples, seed)
+                sums = _resample(gated_outcomes, target, names[decisions.place], resamples, seed)
                 about_pecs = interval(figures_of(sums)[:, _PECS, 1:], values["pecs"], (0.0, 1.0))
                 dataset_figures.append(values)
                 draws.append(figures_of(sums, in_mean=True)[:, _PECS, 1:])
@@ -310,11 +310,13 @@ def _curves(
         return []
     score = np.concatenate([decided[name][0].score - decided[name][0].threshold[MID] for name in datasets])
     parts = [outcomes[name] for name in datasets]
-    pooled = Outcomes(*(np.concatenate([getattr(part, f) for part in parts]) for f in ("void", "correct", "abstained")))
-    points = [(features, *point) for point in risk_coverage(score, pooled, COVERAGES)]
+    pooled_outcomes = Outcomes(
+        *(np.concatenate([getattr(part, f) for part in parts]) for f in ("void", "correct", "abstained"))
+    )
+    points = [(features, *point) for point in risk_coverage(score, pooled_outcomes, COVERAGES)]
     if features == STATES:
-        n_answered = int((pooled.abstained == 0).sum())
-        risk_of_item = np.where(pooled.void, 1.0, 1 - pooled.correct)[pooled.abstained == 0]
+        n_answered = int((pooled_outcomes.abstained == 0).sum())
+        risk_of_item = np.where(pooled_outcomes.void, 1.0, 1 - pooled_outcomes.correct)[pooled_outcomes.abstained == 0]
         points.append(
             (NO_GATE, n_answered / len(score), float(np.nanmean(risk_of_item)) if n_answered else 0.0, n_answered)
         )

@@ -201,9 +201,9 @@ def _make(
     """Run one pass per item; write a shard, even after an error; return items done."""
     shard: list[_ItemStates] = []
     try:
-        for finished, ((item, key), prompt) in enumerate(_prepare_ahead(missing), start=1):
+        for n_finished, ((item, key), prompt) in enumerate(_prepare_ahead(missing), start=1):
             shard.append((item, key, item_states(model, item, prompt, pooling)))
-            tick(finished)
+            tick(n_finished)
     finally:
         with hold_lease(FolderStore(folder), _WRITING):
             _flush(folder, shard, model, pooling, places)

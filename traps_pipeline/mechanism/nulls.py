@@ -49,9 +49,9 @@ def _rank(moved: pd.DataFrame, target: str) -> Iterator[SteeringNullRow]:
     for key, group in moved.groupby(_CONDITION, sort=True):
         row_keys: dict[str, Any] = dict(zip(_CONDITION, key if isinstance(key, tuple) else (key,), strict=True))
         void = group.loc[group["kind"] == VOID]
-        for null in NULLS:
-            draws = group.loc[group["kind"] == null].groupby("draw")
-            same_targets = void.loc[void["target"].isin(set(group.loc[group["kind"] == null, "target"]))]
+        for null_kind in NULLS:
+            draws = group.loc[group["kind"] == null_kind].groupby("draw")
+            same_targets = void.loc[void["target"].isin(set(group.loc[group["kind"] == null_kind, "target"]))]
             values = draws["moved"].mean().dropna().to_numpy(float)  # leave out draws without a decided answer
             if not len(values) or same_targets["moved"].isna().any() or same_targets.empty:
                 continue
@@ -61,7 +61,7 @@ def _rank(moved: pd.DataFrame, target: str) -> Iterator[SteeringNullRow]:
             yield SteeringNullRow(
                 **row_keys,
                 target=target,
-                null=null,
+                null=null_kind,
                 effect=effect,
                 null_mean=float(values.mean()),
                 null_lowest=float(values.min()),

@@ -191,8 +191,10 @@ class Pairs:
     def _attribute(self, target: Side, source: Side) -> tuple[tuple[float, float], dict[tuple[Site, int], np.ndarray]]:
         """Return both sides' margins and each token's estimate; free the states."""
         target_pass = record(self._model, target.prompt, self._tokens, ())
-        patched = record(self._model, source.prompt, self._tokens, self._settings.sites)
-        return (target_pass.margin, patched.margin), attributed_changes(self._model, target_pass, patched, self._tokens)
+        source_pass = record(self._model, source.prompt, self._tokens, self._settings.sites)
+        return (target_pass.margin, source_pass.margin), attributed_changes(
+            self._model, target_pass, source_pass, self._tokens
+        )
 
     def _patch(self, target: RecordedPass, side: Side, patches: Sequence[Patch]) -> tuple[float, np.ndarray]:
         """Return a source's margin, and the changes by its patches; free its states."""
@@ -215,7 +217,7 @@ class Pairs:
         else:
             first = self._names.index(name)
             other_names = [*self._names[first + 1 :], *self._names[:first]]
-            candidates = [(other, other_side if kind == OTHER else into, "") for other in other_names]
+            candidates = [(other_name, other_side if kind == OTHER else into, "") for other_name in other_names]
         form = self._form(name, into)
         for candidate in candidates:
             if candidate[:2] in self._items and _has_same_form(form, self._form(*candidate)):
@@ -305,22 +307,24 @@ def summarize_effects(
         for row in rows:
             if "left_out" not in row:
                 rows_by_cell[row["into"], row["source"], row["site"], row["layer"], row["group"]].append(row)
-    estimated, patched = cells
-    known_keys = {key[:2] for key in (*estimated, *patched)}
+    estimated, measured_rows = cells
+    known_keys = {key[:2] for key in (*estimated, *measured_rows)}
     empty_cells = [(*key, "residual", 0, "all") for key in n_left_out if key not in known_keys]
-    for key in sorted({*estimated, *patched, *empty_cells}):
+    for key in sorted({*estimated, *measured_rows, *empty_cells}):
         side, source, site, layer, group = key
-        rows = patched.get(key) or estimated.get(key) or []
+        rows = measured_rows.get(key) or estimated.get(key) or []
         source_outcome, target, change = (
             np.array([row[name] for row in rows]) for name in ("before", "there", "change")
         )
         gap = float((target - source_outcome).sum()) if len(rows) else 0.0
-        attributed = sum(row["change"] for row in estimated.get(key, ()))
+        estimated_change = sum(row["change"] for row in estimated.get(key, ()))
         effect = (
-            effect_of(source_outcome, source_outcome + change, target, seed) if key in patched else (None, None, None)
+            effect_of(source_outcome, source_outcome + change, target, seed)
+            if key in measured_rows
+            else (None, None, None)
         )
         is_different = np.sign(source_outcome) != np.sign(target)
-        flipped = (np.sign(source_outcome + change) != np.sign(source_outcome)) & is_different
+        is_flipped = (np.sign(source_outcome + change) != np.sign(source_outcome)) & is_different
         yield PatchingRow(
             **extraction.partition,
             dataset=dataset,
@@ -329,11 +333,11 @@ def summarize_effects(
             site=site,
             layer=layer,
             group=group,
-            attributed=attributed / gap if key in estimated and gap else None,
+            attributed=estimated_change / gap if key in estimated and gap else None,
             effect=effect[0],
             low=effect[1],
             high=effect[2],
-            flips=float(flipped.sum() / is_different.sum()) if key in patched and is_different.any() else None,
+            flips=float(is_flipped.sum() / is_different.sum()) if key in measured_rows and is_different.any() else None,
             n_flippable=int(is_different.sum()),
             n=len(rows),
             n_left_out=n_left_out[side, source],

@@ -168,8 +168,8 @@ class _NewtonStep:
         """Return (I + W gram)^-1 right."""
         from scipy.linalg import cho_solve
 
-        scaled = self._root * (self._gram @ right)
-        return right - self._root * cho_solve((self._factor, False), scaled, check_finite=False)
+        scaled_product = self._root * (self._gram @ right)
+        return right - self._root * cho_solve((self._factor, False), scaled_product, check_finite=False)
 
     def solve(self, missing: np.ndarray, dual_sum: float) -> tuple[np.ndarray, float]:
         """Return steps of dual and intercept, after which the dual sums to 0."""
@@ -211,15 +211,15 @@ def auroc_interval(
     """
     void = np.asarray(void, bool)
     void_scores, control_scores = scores[void][:, None], scores[~void][None, :]
-    wins = (void_scores > control_scores).astype(np.float32) + np.float32(0.5) * (void_scores == control_scores)
+    win_weights = (void_scores > control_scores).astype(np.float32) + np.float32(0.5) * (void_scores == control_scores)
     times_void, times_control = weights[:, scenario[void]], weights[:, scenario[~void]]
-    won = ((times_void @ wins) * times_control).sum(axis=1, dtype=float)
+    won_weight = ((times_void @ win_weights) * times_control).sum(axis=1, dtype=float)
     pairs = times_void.sum(axis=1, dtype=float) * times_control.sum(axis=1, dtype=float)
     if not (pairs > 0).any():
         return np.nan, np.nan
-    low, high = np.quantile(won[pairs > 0] / pairs[pairs > 0], [(1 - level) / 2, (1 + level) / 2])
-    certain = ((1 - level) / 2) ** (1 / min(len(np.unique(scenario[side])) for side in (void, ~void)))
-    return min(float(low), certain), max(float(high), 1 - certain)
+    low, high = np.quantile(won_weight[pairs > 0] / pairs[pairs > 0], [(1 - level) / 2, (1 + level) / 2])
+    certain_share = ((1 - level) / 2) ** (1 / min(len(np.unique(scenario[side])) for side in (void, ~void)))
+    return min(float(low), certain_share), max(float(high), 1 - certain_share)
 
 
 # --- within a split ---------------------------------------------------------------------------------------------------

@@ -214,8 +214,8 @@ class ProbeRun:
         for name in self._own:
             split = splits[name]
             folds = scenario_folds(split.scenario, self.settings.folds, self.seed)
-            swapped = swapped_labels(split.void, split.scenario, self.settings.shuffles, self.seed)
-            areas = within_split(split, np.column_stack([split.void, swapped]), folds)
+            shuffled_labels = swapped_labels(split.void, split.scenario, self.settings.shuffles, self.seed)
+            areas = within_split(split, np.column_stack([split.void, shuffled_labels]), folds)
             shuffled_areas = areas[1:]
             rows.append(_row("within", (name, name), layer, areas[0], split))
             rows.append(
@@ -301,7 +301,7 @@ class ProbeRun:
         """
         splits, rows = splits or {name: self._split(name, layer) for name in self._own}, []
         for source, target in self._pairs:
-            assigned, split = nearest_centroid(splits[source], splits[target].states), splits[target]
+            is_assigned_void, split = nearest_centroid(splits[source], splits[target].states), splits[target]
             groups = self._of[target]["sub_scenario"].to_numpy(str)
             scopes = {"all": np.full(len(groups), True)}
             scopes |= {f"sub_scenario:{name}": groups == name for name in sorted(set(groups))}
@@ -309,7 +309,7 @@ class ProbeRun:
                 scopes.items(), (("centroid_void", True), ("centroid_control", False))
             ):
                 is_selected = mask & (split.void == side)
-                share = assigned[is_selected].mean() if is_selected.any() else None
+                share = is_assigned_void[is_selected].mean() if is_selected.any() else None
                 rows.append(_row(analysis, (source, target), layer, share, split.rows(mask), scope=scope))
         return rows
 

@@ -23,10 +23,10 @@ SAMPLING = ("do_sample", "temperature", "top_p", "max_new_tokens")
 
 def loaded_params(entry: ModelEntry) -> dict[str, Any]:
     """Return a local model's parameters that its states depend on, without sampling."""
-    inside, omitted = entry.inside_params(), (*SAMPLING, "nf4_skip")
-    params = {name: value for name, value in effective_params(entry, "standard").items() if name not in omitted}
-    nf4_skip = {"nf4_skip": [*inside.nf4_skip]} if inside.nf4_skip else {}
-    return params | {"quantisation": inside.quantisation} | nf4_skip
+    local_params, omitted_names = entry.inside_params(), (*SAMPLING, "nf4_skip")
+    params = {name: value for name, value in effective_params(entry, "standard").items() if name not in omitted_names}
+    nf4_skip = {"nf4_skip": [*local_params.nf4_skip]} if local_params.nf4_skip else {}
+    return params | {"quantisation": local_params.quantisation} | nf4_skip
 
 
 def mechanism_entry(entry: ModelEntry, settings: MechanismSettings) -> ModelEntry:

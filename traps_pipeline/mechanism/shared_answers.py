@@ -135,9 +135,9 @@ def make_meanwhile(
     tick: receives the chunks done and their number.
     """
     chunks, count = shared.chunks(wanted), 0
-    for finished, chunk in enumerate(reversed(chunks), start=1):
+    for n_finished, chunk in enumerate(reversed(chunks), start=1):
         count += shared.fill(chunk, lambda keys: {*ledger.read(evaluation, keys).settled}, make) or 0
-        tick(finished, len(chunks))
+        tick(n_finished, len(chunks))
         if not is_written(ledger, evaluation):
             break
     return count

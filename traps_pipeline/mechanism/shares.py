@@ -64,10 +64,10 @@ def _with_verdicts(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
     They are null without a text, votes or a majority, and `correct` on voids. Each cell is decided by itself: after a
     change of panel, a cell keeps votes of the old panel until the new votes are made.
     """
-    votes_on, none = dict(iter(votes.groupby(_CELL))), votes.head(0)
+    votes_on, no_votes = dict(iter(votes.groupby(_CELL))), votes.head(0)
     parts: list[pd.DataFrame] = []
     for cell, cell_answers in answers.groupby(_CELL, sort=False):
-        matrix = ratings(votes_on.get(cell, none), answer=_ANSWER)
+        matrix = ratings(votes_on.get(cell, no_votes), answer=_ANSWER)
         tasks = {"abstained": ABSTENTION, "correct": CORRECTNESS}
         parts.append(
             cell_answers.assign(

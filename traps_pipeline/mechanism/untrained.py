@@ -25,18 +25,18 @@ def untrained_model(entry: ModelEntry, seed: int) -> LocalModel:
     """Return the entry's network with random, unquantised weights: a second model."""
     import torch
 
-    trained = load_local_model(entry, inside=True)
+    trained_model = load_local_model(entry, inside=True)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         network = load_transformers().AutoModelForImageTextToText.from_config(
-            trained.network.config, dtype=trained.network.dtype
+            trained_model.network.config, dtype=trained_model.network.dtype
         )
     return LocalModel(
-        network.to(trained.inputs_device).eval().requires_grad_(False),
-        trained.processor,
-        trained.checkpoint,
-        trained.params,
-        trained.device,
+        network.to(trained_model.inputs_device).eval().requires_grad_(False),
+        trained_model.processor,
+        trained_model.checkpoint,
+        trained_model.params,
+        trained_model.device,
     )
 
 

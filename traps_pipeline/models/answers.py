@@ -80,8 +80,8 @@ def prepare_media(workspace: Workspace, cells: Sequence[Cell]) -> None:
         for item in items:
             jobs[item["media_digest"], repr(spec)] = (workspace.root / item["clip"], item["media_digest"], spec)
     with ThreadPoolExecutor(cores()) as pool:
-        for finished, _ in enumerate(pool.map(lambda job: workspace.media.prepare(*job), jobs.values()), start=1):
-            progress.current().tick("responses", "media to send", finished, len(jobs))
+        for n_finished, _ in enumerate(pool.map(lambda job: workspace.media.prepare(*job), jobs.values()), start=1):
+            progress.current().tick("responses", "media to send", n_finished, len(jobs))
 
 
 def wanted_questions(workspace: Workspace, cell: Cell) -> list[Question]:

@@ -255,18 +255,18 @@ class ApiBackend:
         status = (provider_error.status or UNKNOWN_ERROR) if exchange.is_answered else exchange.status
         assert status is not None
         is_explained = error is not None and not error.is_beside_answer
-        billed = exchange.is_billable(status, is_explained=is_explained)
+        is_billed = exchange.is_billable(status, is_explained=is_explained)
         origin = " (an error object in an HTTP 200)" if exchange.is_answered else ""
         origin += f" (through the proxy of {exchange.proxy})" if exchange.proxy else ""
         if provider_error.is_filtered and status not in TRANSIENT_STATUSES:
             self._tell(REFUSED_CONTENT, f"{provider_error}{origin}")
-            return Outcome("refused", error=REFUSED_CONTENT, cost_usd=None if billed else 0.0)
+            return Outcome("refused", error=REFUSED_CONTENT, cost_usd=None if is_billed else 0.0)
         kind = failure_kind(status, provider_error)
         is_final = kind.startswith("http_")
         self._tell(kind, f"{provider_error}{origin}", passes=not is_final)
         if is_final:
-            return Outcome("error", error=kind, cost_usd=None if billed else 0.0)
-        raise TransientError(kind, retry_after_s(exchange.headers, provider_error), billed=billed) from None
+            return Outcome("error", error=kind, cost_usd=None if is_billed else 0.0)
+        raise TransientError(kind, retry_after_s(exchange.headers, provider_error), billed=is_billed) from None
 
     def _quote_beginning(self, exchange: Exchange) -> str:
         """Return the beginning of an answer without an error object, for people."""
@@ -283,12 +283,12 @@ class ApiBackend:
         if kind not in self._told:
             self._told.add(kind)
             message = redact(" ".join(message.split())).removeprefix(f"{kind}: ")  # before it is cut
-            happened = _HAPPENED.get(kind, "a call failed")
+            event_text = _HAPPENED.get(kind, "a call failed")
             max_retries = self._entry.limits.retries if passes else 0
             retries = min(max_retries, 1) if kind == MALFORMED else max_retries
             retry_text = f"again, at most {count_noun(retries, 'time')}" if retries else "only once"
             retry_note = "" if passes is None else f"; a run tries such a call {retry_text}"
-            progress.current().note(f"{self._entry.id}: {happened}{retry_note} ({kind}: {plain(message)[:300]})")
+            progress.current().note(f"{self._entry.id}: {event_text}{retry_note} ({kind}: {plain(message)[:300]})")
 
 
 def failure_kind(status: int, reported: ProviderError) -> str:

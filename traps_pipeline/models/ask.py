@@ -134,14 +134,14 @@ class _Asking:
             return False
         request, name = queue.popleft(), participant.entry.id
         context = CallContext(self.work.budget, self.stop, self.halted, self.writer.require)
-        attempted = await attempt(participant, request, context)
-        if attempted is None:
+        attempt_result = await attempt(participant, request, context)
+        if attempt_result is None:
             return False
-        row, side_texts = ledger_row(request, *attempted, self.work.epoch)
+        row, side_texts = ledger_row(request, *attempt_result, self.work.epoch)
         await self.writer.write(row, side_texts, [reservation.id for reservation in context.paid_by])
         self.rows[request.key] = _Held(row)
         progress.current().called(name, not settles(row), row["latency_s"], row["cost_usd"] or 0.0)
-        participant.breaker.watch(attempted[0])
+        participant.breaker.watch(attempt_result[0])
         return True
 
     def halted(self) -> bool:
@@ -163,14 +163,14 @@ class _Asking:
         for request in self.missing:
             queues.setdefault(request.participant, deque()).append(request)
         queue_of = [(self.work.participants[name], queue) for name, queue in queues.items()]
-        syncing = asyncio.create_task(self.sync())
+        sync_task = asyncio.create_task(self.sync())
         try:
             async with asyncio.TaskGroup() as group:
                 for participant, queue in queue_of:
                     for _ in range(min(participant.entry.limits.concurrency, len(queue))):
                         group.create_task(self.worker(participant, queue))
         finally:
-            syncing.cancel()
+            sync_task.cancel()
         if self.problems:
             raise self.problems[0]
 
@@ -238,9 +238,9 @@ async def _settle_cell(
     new = Counter(request.participant for request in missing)
     counts = Counter(request.participant for request in requests.values())
     report.asking(work.stage, {name: (new[name], count - new[name]) for name, count in counts.items()})
-    asking = _Asking(work, its.writer, missing, stop)
-    await asking.run()
-    rows |= asking.rows
+    asker = _Asking(work, its.writer, missing, stop)
+    await asker.run()
+    rows |= asker.rows
     if stop.is_set() or len(rows) < len(requests):
         return None
     await its.writer.sync()
@@ -253,7 +253,7 @@ async def settle(
     work: Work[AnyCell, AnyCall, Any], cells: Sequence[AnyCell], stop: asyncio.Event
 ) -> AsyncIterator[SettledCell[AnyCell, AnyCall] | Exception]:
     """Settle all cells, models in parallel; a failing model yields its exception."""
-    finished: asyncio.Queue[SettledCell[AnyCell, AnyCall] | Exception | None] = asyncio.Queue()
+    results: asyncio.Queue[SettledCell[AnyCell, AnyCall] | Exception | None] = asyncio.Queue()
     turn = asyncio.Semaphore(1)  # a cell waits here with its rows until the one before it is written
 
     async def one_model(evaluations: Sequence[tuple[Evaluation, list[AnyCell]]]) -> None:
@@ -263,14 +263,14 @@ async def settle(
                     return
                 async for settled_cell in settle_evaluation(work, evaluation, evaluation_cells, stop):
                     await turn.acquire()
-                    finished.put_nowait(settled_cell)
+                    results.put_nowait(settled_cell)
                     del settled_cell
         except LockGivenUp:
             return
         except Exception as error:  # noqa: BLE001 - handed to the caller, who reports it and fails the run
-            finished.put_nowait(error)
+            results.put_nowait(error)
         finally:
-            finished.put_nowait(None)
+            results.put_nowait(None)
 
     ordered = sorted(cells, key=lambda cell: (cell.evaluation, cell.dataset))
     cells_by_evaluation = [(e, list(group)) for e, group in groupby(ordered, key=lambda cell: cell.evaluation)]
@@ -281,7 +281,7 @@ async def settle(
     try:
         open_tasks = len(tasks)
         while open_tasks:
-            settled_cell = await finished.get()
+            settled_cell = await results.get()
             if settled_cell is None:
                 open_tasks -= 1
             else:

@@ -178,15 +178,17 @@ def _anthropic(body: Json) -> Reply:
 
 def _gemini(body: Json) -> Reply:
     texts, feedback = _Texts(), body.get("promptFeedback")
-    blocked = feedback.get("blockReason") if isinstance(feedback, dict) else None
-    candidate = {} if blocked else _objects(body, "candidates")[0]
+    block_reason = feedback.get("blockReason") if isinstance(feedback, dict) else None
+    candidate = {} if block_reason else _objects(body, "candidates")[0]
     content = candidate.get("content")
     parts = content.get("parts") if isinstance(content, dict) else None
     for part in parts if isinstance(parts, list) else ():
         if isinstance(part, dict) and isinstance(part.get("text"), str):
             texts.add(part["text"], "reasoning" if part.get("thought") is True else "text")
-    reply = texts.reply(blocked or candidate.get("finishReason"), body.get("modelVersion"), body.get("usageMetadata"))
-    return reply if not blocked else replace(reply, ending="refused")  # nothing was generated, for any reason
+    reply = texts.reply(
+        block_reason or candidate.get("finishReason"), body.get("modelVersion"), body.get("usageMetadata")
+    )
+    return reply if not block_reason else replace(reply, ending="refused")  # nothing was generated, for any reason
 
 
 _READERS: Mapping[Dialect, Callable[[Json], Reply]] = {

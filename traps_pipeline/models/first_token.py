@@ -29,10 +29,10 @@ def stored_alternatives(alternatives: Mapping[str, float], regime: object) -> st
     """Return alternatives as stored, likeliest first; None if the regime uses none."""
     if not alternatives or regime not in BY_NAME or not BY_NAME[str(regime)].first_token:
         return None
-    likeliest = sorted(alternatives.items(), key=lambda one: -one[1])[
+    top_alternatives = sorted(alternatives.items(), key=lambda one: -one[1])[
         : MAX_ALTERNATIVES + 1
     ]  # the sampled token may be unlikely
-    return json.dumps({token: round(logprob, 6) for token, logprob in likeliest}, ensure_ascii=False)
+    return json.dumps({token: round(logprob, 6) for token, logprob in top_alternatives}, ensure_ascii=False)
 
 
 def _alternative(entry: Mapping[str, Any]) -> tuple[str, float] | None:

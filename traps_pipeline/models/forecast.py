@@ -68,9 +68,9 @@ def forecast(entry: Entry, calls: int, seen: Experience) -> Forecast:
         low, expected = cost(prompt, LOW_SHARE * completion), cost(prompt, completion)
         dollars = (calls * low, calls * expected, calls * max(expected, cost(most_prompt, entry.max_tokens)))
     account = load_accounts()[str(entry.account)]
-    paced = [calls / account.requests_per_minute] if account.requests_per_minute else [0.0]
+    paced_minutes = [calls / account.requests_per_minute] if account.requests_per_minute else [0.0]
     if account.tokens_per_minute:
-        paced.append(calls * (prompt + entry.max_tokens) / account.tokens_per_minute)
+        paced_minutes.append(calls * (prompt + entry.max_tokens) / account.tokens_per_minute)
     latency_s = seen.latency_s or entry.expected_latency_s or FIRST_TOKEN_S + completion / TOKENS_A_S
     waves = max(1.0, calls / entry.limits.concurrency) if calls else 0.0
     return Forecast(
@@ -79,9 +79,9 @@ def forecast(entry: Entry, calls: int, seen: Experience) -> Forecast:
         prompt_tokens=round(calls * prompt),
         completion_tokens=round(calls * completion),
         dollars=dollars,
-        minutes=max(waves * latency_s / 60, *paced),
+        minutes=max(waves * latency_s / 60, *paced_minutes),
         account=str(entry.account),
-        paced_minutes=max(paced),
+        paced_minutes=max(paced_minutes),
         batch_price=account.batch_price,
     )
 

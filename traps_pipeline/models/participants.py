@@ -56,15 +56,15 @@ class Participant:
 def allow_connections(count: int) -> None:
     """Increase the open-file limit for these connections. Raises TrapsError if denied."""
     n_needed = count + FILES
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if soft == resource.RLIM_INFINITY or soft >= n_needed:
+    soft_limit, hard_limit = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft_limit == resource.RLIM_INFINITY or soft_limit >= n_needed:
         return
-    if hard != resource.RLIM_INFINITY and hard < n_needed:
+    if hard_limit != resource.RLIM_INFINITY and hard_limit < n_needed:
         raise TrapsError(
-            f"{count} connections at once need {n_needed} open files, and this shell allows {hard}: raise that "
+            f"{count} connections at once need {n_needed} open files, and this shell allows {hard_limit}: raise that "
             f"(`ulimit -n {n_needed}`), or lower limits.concurrency of the models that are asked; nothing was sent"
         )
-    resource.setrlimit(resource.RLIMIT_NOFILE, (n_needed, hard))
+    resource.setrlimit(resource.RLIMIT_NOFILE, (n_needed, hard_limit))
 
 
 class Participants:
@@ -135,7 +135,7 @@ async def attempt(
     outcome's cost includes what earlier attempts may have cost. None if halted before anything was spent.
     """
     limits, tokens = participant.entry.limits, most_tokens(participant.entry, request)
-    lost_usd, seconds, malformed = 0.0, 0.0, 0
+    lost_usd, seconds, n_malformed = 0.0, 0.0, 0
     for number in range(1, limits.retries + 2):
         async with participant.gate.connection():
             await participant.meter.admit(tokens.prompt + tokens.completion, allowed.halted)
@@ -164,8 +164,8 @@ async def attempt(
             participant.breaker.connected()
         if failure.billed:
             lost_usd += _believed_cost(failure.cost_usd, worst_case_usd(participant.entry, request))
-        malformed += failure.kind == MALFORMED
-        if number > limits.retries or malformed == MALFORMED_TRIES:
+        n_malformed += failure.kind == MALFORMED
+        if number > limits.retries or n_malformed == MALFORMED_TRIES:
             return _final_failure(failure.kind, number, seconds, lost_usd, failure.raw)
         progress.current().retried(participant.entry.id)
         longest = min(limits.backoff_s * 2 ** (number - 1), MAX_BACKOFF_S)

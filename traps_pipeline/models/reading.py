@@ -67,10 +67,12 @@ def read_answer(
     fields = fields_of(regime, dataset)
     outcome, text = str(row["outcome"]), row["text"]
     if outcome == UNFINISHED:  # this version may know the reason
-        finish = row.get("finish_reason")
-        outcome = {"complete": JUDGED[0], "truncated": "truncated"}.get(ending_of(finish), UNFINISHED)
+        finish_reason = row.get("finish_reason")
+        outcome = {"complete": JUDGED[0], "truncated": "truncated"}.get(ending_of(finish_reason), UNFINISHED)
         if outcome == UNFINISHED:
-            return Reading(outcome, None, reasoning, why=f"ended for the unknown reason {str(finish)[:_MAX_REASON]!r}")
+            return Reading(
+                outcome, None, reasoning, why=f"ended for the unknown reason {str(finish_reason)[:_MAX_REASON]!r}"
+            )
     if outcome == "empty" and ending_of(row.get("finish_reason")) == "truncated":
         return Reading("truncated", None, reasoning, False if fields else None, "cut off before its answer began")
     if outcome not in WITH_TEXT or not isinstance(text, str):

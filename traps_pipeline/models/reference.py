@@ -55,8 +55,8 @@ def believed_probabilities(request: Request) -> dict[str, float]:
     deviation of the error of log-probabilities.
     """
     secret, noise = request.secret, request.params["noise"]
-    truth, even = {secret.get("ground_truth"): 1.0}, dict.fromkeys(secret["labels"], 1.0)
-    probabilities = secret.get("posterior") or (truth if secret["side"] == "control" else even)
+    truth, even_probabilities = {secret.get("ground_truth"): 1.0}, dict.fromkeys(secret["labels"], 1.0)
+    probabilities = secret.get("posterior") or (truth if secret["side"] == "control" else even_probabilities)
     weights = dict[str, float]()
     for label in secret["labels"]:
         error = NormalDist().inv_cdf(uniform(request, f"noise {label}") or _TINY) if noise else 0.0
@@ -66,9 +66,9 @@ def believed_probabilities(request: Request) -> dict[str, float]:
 
 def _bayes(request: Request) -> str | None:
     """Return the most probable answer, if its probability reaches `answers_from`."""
-    belief = believed_probabilities(request)
-    best = max(belief, key=lambda label: belief[label])
-    return best if belief[best] >= request.params["answers_from"] else None
+    probability_of = believed_probabilities(request)
+    best = max(probability_of, key=lambda label: probability_of[label])
+    return best if probability_of[best] >= request.params["answers_from"] else None
 
 
 STRATEGIES: Mapping[str, Strategy] = {
@@ -101,8 +101,8 @@ def _stated_probabilities(answer: str | None, request: Request) -> dict[str, Any
     They are those of `bayes`; for others all for the answer, and for an abstention none, which leaves all answers
     equal.
     """
-    belief = _belief(answer, request)
-    return {"probabilities": [{"answer": label, "probability": round(p, 4)} for label, p in belief.items()]}
+    probability_of = _belief(answer, request)
+    return {"probabilities": [{"answer": label, "probability": round(p, 4)} for label, p in probability_of.items()]}
 
 
 def _belief(answer: str | None, request: Request) -> dict[str, float]:
@@ -126,14 +126,14 @@ class ReferenceBackend:
         if misfortune is not None:
             return misfortune
         answer = STRATEGIES[request.params["strategy"]](request)
-        belief = {label: log(p) for label, p in _belief(answer, request).items() if p} or {ABSTENTION: 0.0}
+        logprob_of = {label: log(p) for label, p in _belief(answer, request).items() if p} or {ABSTENTION: 0.0}
         return Outcome(
             "answer",
             phrase(answer, request),
             finish_reason="stop",
             served_model=request.participant,
             cost_usd=0.0,
-            first_token=stored_alternatives(belief, request.about.get("regime")),
+            first_token=stored_alternatives(logprob_of, request.about.get("regime")),
         )
 
     def _misfortune(self, request: Request) -> Outcome | None:

@@ -38,12 +38,12 @@ class ThinkingSplit:
 
 def marks_of(declared: str | Sequence[str]) -> Marks:
     """Parse declared marks: both, or a common opening one. Raises ValueError."""
-    usual = dict(COMMON_MARKS)
-    if isinstance(declared, str) and declared in usual:
-        return declared, usual[declared]
+    closing_mark_of = dict(COMMON_MARKS)
+    if isinstance(declared, str) and declared in closing_mark_of:
+        return declared, closing_mark_of[declared]
     marks = [] if isinstance(declared, str) else [mark for mark in declared if isinstance(mark, str) and mark.strip()]
     if len(marks) != 2 or marks[0] == marks[1]:
-        known_marks = ", ".join(usual)
+        known_marks = ", ".join(closing_mark_of)
         raise ValueError(f"give what opens and what closes the thinking, [OPEN, CLOSE], or one of {known_marks}")
     return marks[0], marks[1]
 

@@ -99,8 +99,8 @@ class RateLimiter:
         The bucket may go below zero: later calls wait longer.
         """
         send_at = time.monotonic() + self._take((1.0, float(tokens)))
-        while (remaining := send_at - time.monotonic()) > 0 and not halted():
-            await asyncio.sleep(min(remaining, LOOK_S))
+        while (wait_s := send_at - time.monotonic()) > 0 and not halted():
+            await asyncio.sleep(min(wait_s, LOOK_S))
 
     def _take(self, amounts: tuple[float, float]) -> float:
         """Take from the buckets; return the seconds until they are at zero again."""

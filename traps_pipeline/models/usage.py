@@ -68,9 +68,9 @@ def read_usage(fields: Mapping[str, Any], sizes: Sizes) -> Usage | None:
 
     It is not believed if it is incomplete, impossible, or below our own count for prompt and text.
     """
-    for (prompt, completion, total), separate in _FORMS:
+    for (prompt, completion, total), extra_fields in _FORMS:
         if prompt in fields:
-            usage = _complete_usage(fields, prompt, completion, total, separate)
+            usage = _complete_usage(fields, prompt, completion, total, extra_fields)
             return usage if usage and not sizes.contradict(usage) else _highest_counts(fields)
     return _highest_counts(fields)
 

@@ -83,8 +83,8 @@ def cached_registry(cached: Cached) -> Cached:
 
 def clear_caches() -> None:
     """Clear the caches of the registries, so that they are read again."""
-    for clear in _clearers:
-        clear()
+    for clear_cache in _clearers:
+        clear_cache()
 
 
 def add_entries(own: UserRegistry, path: Path) -> None:
@@ -111,10 +111,10 @@ def sources() -> list[tuple[Path, UserRegistry]]:
 
 def all_additions() -> UserRegistry:
     """Return the union of all `sources`."""
-    combined = UserRegistry()
+    registry_union = UserRegistry()
     for _, registry in sources():
-        combined |= registry
-    return combined
+        registry_union |= registry
+    return registry_union
 
 
 def accounts() -> Mapping[str, dict[str, Any]]:
@@ -124,8 +124,8 @@ def accounts() -> Mapping[str, dict[str, Any]]:
 
 def entries(kind: Kind) -> Iterable[tuple[Path, dict[str, Any]]]:
     """Return the added models or judges, completed, each with its file."""
-    newest = {raw["id"]: (path, raw) for path, registry in sources() for raw in getattr(registry, kind)}
-    return ((path, _entry_fields(raw, kind)) for path, raw in newest.values())
+    newest_of = {raw["id"]: (path, raw) for path, registry in sources() for raw in getattr(registry, kind)}
+    return ((path, _entry_fields(raw, kind)) for path, raw in newest_of.values())
 
 
 def _read(path: Path) -> UserRegistry:

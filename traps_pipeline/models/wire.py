@@ -125,9 +125,9 @@ class Wire(httpx.AsyncBaseTransport):
 
     async def aclose(self) -> None:
         """Close the connections of the running loop, and of closed loops."""
-        running = self._sessions.pop(asyncio.get_running_loop(), None)
-        if running is not None:
-            await running.close()
+        own_session = self._sessions.pop(asyncio.get_running_loop(), None)
+        if own_session is not None:
+            await own_session.close()
         for session in [self._sessions.pop(loop) for loop in list(self._sessions) if loop.is_closed()]:
             _dispose(session)
 
@@ -160,16 +160,16 @@ def _decompress(content: bytes, encoding: str) -> bytes:
         return content
     if encoding.lower() not in ("gzip", "x-gzip", "deflate"):
         raise ValueError(f"the answer is encoded as {encoding[:40]!r}, which was not asked for")
-    unpacked = b""
+    plain_bytes = b""
     while content:  # gzip may have several members
         unpacking = zlib.decompressobj(15 if encoding.lower() == "deflate" else 47)
-        unpacked += unpacking.decompress(content, MAX_BYTES + 1 - len(unpacked))
-        if len(unpacked) > MAX_BYTES:
+        plain_bytes += unpacking.decompress(content, MAX_BYTES + 1 - len(plain_bytes))
+        if len(plain_bytes) > MAX_BYTES:
             raise ValueError(f"the answer is larger than {MAX_BYTES} bytes")
         if not unpacking.eof:
             raise ValueError("the compressed answer breaks off")
         content = unpacking.unused_data.lstrip(b"\0")
-    return unpacked
+    return plain_bytes
 
 
 def _explain(error: BaseException, url: httpx.URL, exchange: Exchange) -> str:
@@ -188,8 +188,8 @@ def _explain(error: BaseException, url: httpx.URL, exchange: Exchange) -> str:
 
 def cause_of(error: BaseException) -> str:
     """Return the message of an error's root cause, with advice about common ones."""
-    while (deeper := error.__cause__ or (None if error.__suppress_context__ else error.__context__)) is not None:
-        error = deeper
+    while (inner_error := error.__cause__ or (None if error.__suppress_context__ else error.__context__)) is not None:
+        error = inner_error
     if isinstance(error, ssl.SSLCertVerificationError):
         return (
             f"its certificate is not trusted ({error.verify_message}): have SSL_CERT_FILE name the file of the "

@@ -85,8 +85,8 @@ def _clips(workspace: Workspace) -> pd.DataFrame:
     items = workspace.tables.read_all(ITEMS, columns, dataset=DATASETS)
     verdicts = current_rows(workspace, VERDICTS, ["item_id", "n_valid", "unanimous"])
     judged = verdicts.loc[verdicts["n_valid"] > 0]
-    contested = (~judged["unanimous"].astype(bool)).groupby(judged["item_id"]).mean()
-    share = items["item_id"].map(contested).fillna(0.0)
+    contested_share = (~judged["unanimous"].astype(bool)).groupby(judged["item_id"]).mean()
+    share = items["item_id"].map(contested_share).fillna(0.0)
     return items.assign(
         unit=[
             _unit("answerability", item, hash_)
@@ -144,8 +144,8 @@ def sample(workspace: Workspace, task: TaskName) -> pd.DataFrame:
         return population.loc[population["unit"].isin(sorted(sample_ids))].reset_index(drop=True)
     protocol = annotation_protocol()
     size = getattr(protocol.sizes, task)
-    picked = [drawn_units(group, size, protocol) for _, group in population.groupby("group", sort=True)]
-    return pd.concat(picked, ignore_index=True)
+    unit_groups = [drawn_units(group, size, protocol) for _, group in population.groupby("group", sort=True)]
+    return pd.concat(unit_groups, ignore_index=True)
 
 
 def drawn_units(group: pd.DataFrame, size: int, protocol: AnnotationProtocol) -> pd.DataFrame:
@@ -157,8 +157,8 @@ def drawn_units(group: pd.DataFrame, size: int, protocol: AnnotationProtocol) ->
     order = [digest([protocol.seed, unit]) for unit in group["unit"]]
     ordered = group.iloc[np.argsort(order)]
     random_units = ordered.head(size - round(size * protocol.split_share))
-    remaining = ordered.loc[~ordered["unit"].isin(random_units["unit"])]
-    split_first = remaining.sort_values("split", ascending=False, kind="stable")
+    remaining_units = ordered.loc[~ordered["unit"].isin(random_units["unit"])]
+    split_first = remaining_units.sort_values("split", ascending=False, kind="stable")
     return pd.concat([random_units, split_first.head(size - len(random_units))])
 
 

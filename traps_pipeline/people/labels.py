@@ -212,8 +212,10 @@ def confabulation_rows(labels: pd.DataFrame) -> list[dict[str, str]]:
     are none.
     """
     task_labels = labels.loc[labels["task"] == "confabulation"]
-    everybody = task_labels.groupby("unit")["annotator"].transform("nunique") == task_labels["annotator"].nunique()
-    shared_labels = task_labels.loc[everybody.to_numpy(bool)]
+    is_labelled_by_all = (
+        task_labels.groupby("unit")["annotator"].transform("nunique") == task_labels["annotator"].nunique()
+    )
+    shared_labels = task_labels.loc[is_labelled_by_all.to_numpy(bool)]
     if shared_labels.empty:
         raise TrapsError("no failure is labelled by everybody yet; label some on the pages of `traps people annotate`")
     return [

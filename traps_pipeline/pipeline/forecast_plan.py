@@ -85,7 +85,7 @@ def make_plan(workspace: Workspace | None, experiment: Experiment, study: Study,
     study: the workspace's, or that of a new one, with the panel that judges. card: one of CARDS.
     """
     panel = load_panel(study.panel)
-    calls, uncertain = _count_calls(workspace, experiment, study)
+    calls, uncertain_datasets = _count_calls(workspace, experiment, study)
     steered_counts = _count_steered(workspace, experiment, study)
     local = [*_local_costs(workspace, experiment, study, card, calls, steered_counts)]
     votes = sum(count.new for _, count in [*calls.values(), *steered_counts.values()])
@@ -105,12 +105,12 @@ def make_plan(workspace: Workspace | None, experiment: Experiment, study: Study,
     ]
     judge = load_protocol().judge(study.panel)
     if judge is None:
-        return Plan(calls, uncertain, forecasts, None, steered_counts, pairs, local)
+        return Plan(calls, uncertain_datasets, forecasts, None, steered_counts, pairs, local)
     labels = _count_labels(workspace, experiment, judge)
     if labels.new:
         cost = forecast(judge, labels.new, Experience(prompt_tokens=LABEL_TOKENS))
         forecasts.append(replace(cost, participant="confabulation labels"))
-    return Plan(calls, uncertain, forecasts, labels, steered_counts, pairs, local)
+    return Plan(calls, uncertain_datasets, forecasts, labels, steered_counts, pairs, local)
 
 
 def _count_steered(workspace: Workspace | None, experiment: Experiment, study: Study) -> dict[str, tuple[Count, Count]]:

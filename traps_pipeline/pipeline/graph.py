@@ -189,14 +189,16 @@ class Graph:
         upstream = {name: {p for p in self.parents_of[name] if p in remaining} for name in remaining}
         result: list[list[Stage]] = []
         while remaining:
-            ready = [name for name in remaining if not upstream[name] & remaining.keys()]
-            if not ready:
+            ready_stages = [name for name in remaining if not upstream[name] & remaining.keys()]
+            if not ready_stages:
                 raise TrapsError(f"the graph has a circle among {', '.join(remaining)}")
-            first = min(ready, key=lambda name: GROUPS.index(remaining[name].group))
+            first = min(ready_stages, key=lambda name: GROUPS.index(remaining[name].group))
             scheme, block = remaining[first].scheme, list[Stage]()
-            while ready:
-                block += [remaining.pop(name) for name in ready if remaining[name].scheme is scheme]
-                ready = [n for n in remaining if remaining[n].scheme is scheme and not upstream[n] & remaining.keys()]
+            while ready_stages:
+                block += [remaining.pop(name) for name in ready_stages if remaining[name].scheme is scheme]
+                ready_stages = [
+                    n for n in remaining if remaining[n].scheme is scheme and not upstream[n] & remaining.keys()
+                ]
             result.append(block)
         return result
 

@@ -65,7 +65,7 @@ class Lineage:
             (parent, k)
             for parent, keys in self.graph.parents(stage, key).items()
             for k in keys
-            if (there := self._there(parent)) is None or k in there
+            if (parent_keys := self._there(parent)) is None or k in parent_keys
         ]
         versions = {name_of(node): self.version(*node) for node in nodes}
         return {name: version for name, version in versions.items() if version is not None}
@@ -146,8 +146,8 @@ class Lineage:
             return f"is not made; materialize {name} for this partition first"
         if current and status.outdated:
             return f"is not current: {status.outdated[0]}"
-        blocking = {check.name for check in self.graph[name].checks if check.blocks}
-        failed = [check for check in self._workspace.failed_checks(name, key) if check in blocking]
+        blocking_checks = {check.name for check in self.graph[name].checks if check.blocks}
+        failed = [check for check in self._workspace.failed_checks(name, key) if check in blocking_checks]
         return f"does not pass its check {failed[0]}" if failed else ""
 
     def _keys_there(self, name: str) -> Set[str] | None:

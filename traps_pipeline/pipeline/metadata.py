@@ -90,8 +90,8 @@ def preview(table: Table, output: StageOutput) -> dict[str, dg.TableMetadataValu
             "first rows": first.to_dict("records") if hasattr(content, "head") else [asdict(row) for row in first]
         }
     preview_rows = [row for rows in samples.values() for row in rows]
-    telling = [c.name for c in table.columns if _is_telling(c.type, [row.get(c.name) for row in preview_rows])]
-    names = [*table.key, *([rank_column] if rank_column else []), *telling]
+    shown_columns = [c.name for c in table.columns if _is_telling(c.type, [row.get(c.name) for row in preview_rows])]
+    names = [*table.key, *([rank_column] if rank_column else []), *shown_columns]
     names = [name for name in dict.fromkeys(names) if name not in table.partition_by]
     tables = {
         title: [dg.TableRecord({name: _plain(row.get(name)) for name in names}) for row in rows]

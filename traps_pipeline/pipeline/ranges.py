@@ -125,8 +125,8 @@ def _halves(sizes: np.ndarray, cuts: np.ndarray, better: set[int], count: int) -
     total = int(sizes.sum())
     first = np.cumsum(sizes)[cuts - 1]
     shares = np.clip(np.rint(count * first / total), 1, count - 1).astype(int)
-    largest = np.maximum(first / shares, (total - first) / (count - shares))
-    best = min(range(len(cuts)), key=lambda n: (largest[n], int(cuts[n]) not in better, abs(2 * first[n] - total)))
+    larger_load = np.maximum(first / shares, (total - first) / (count - shares))
+    best = min(range(len(cuts)), key=lambda n: (larger_load[n], int(cuts[n]) not in better, abs(2 * first[n] - total)))
     return int(cuts[best]), int(shares[best])
 
 
@@ -142,6 +142,6 @@ def shared_out(
         return cut(scheme, keys, 1) * count
     runs = dict.fromkeys(keys, 1)
     for _ in range(count - len(keys)):
-        neediest = max(keys, key=lambda key: seconds[key] / runs[key])
-        runs[neediest] += 1
+        busiest_key = max(keys, key=lambda key: seconds[key] / runs[key])
+        runs[busiest_key] += 1
     return [(key, key) for turn in range(max(runs.values())) for key in keys if runs[key] > turn]

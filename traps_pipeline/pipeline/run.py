@@ -46,13 +46,13 @@ def dagster_history(workspace: Workspace) -> Iterator[dg.DagsterInstance]:
     anew, and so does an unreadable one, which is kept beside it: the tables are authoritative. Raises TrapsError if the
     history cannot be read or written.
     """
-    home = Path(os.environ.get("DAGSTER_HOME") or workspace.dagster_home)
-    require_history_path(home)
+    dagster_home = Path(os.environ.get("DAGSTER_HOME") or workspace.dagster_home)
+    require_history_path(dagster_home)
     try:
         workspace.locks.mkdir(parents=True, exist_ok=True)
         with (workspace.locks / "dagster.lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
-            instance = _open_history(workspace, home)
+            instance = _open_history(workspace, dagster_home)
         with instance:
             for run in instance.get_runs(dg.RunsFilter(statuses=[dg.DagsterRunStatus.STARTED])):
                 is_this_host = run.tags.get(HOST_TAG) == this_host()
@@ -70,8 +70,8 @@ def dagster_history(workspace: Workspace) -> Iterator[dg.DagsterInstance]:
         else:
             raise
         raise TrapsError(
-            f"{home}: Dagster's history cannot be read or written ({reason}); {hint} and run the same command again: "
-            "tables are whole, no answer is lost"
+            f"{dagster_home}: Dagster's history cannot be read or written ({reason}); {hint} and run the same command "
+            "again: tables are whole, no answer is lost"
         ) from error
 
 

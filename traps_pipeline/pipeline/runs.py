@@ -156,7 +156,7 @@ def _chain(error: Any) -> list[Any]:
 def reason(error: Any) -> str:
     """Return a Dagster error's message: our own sentence, else its innermost cause."""
     chain = _chain(error)
-    readable = [link for link in chain if link.cls_name in _SENTENCES]
-    if not readable:
+    readable_links = [link for link in chain if link.cls_name in _SENTENCES]
+    if not readable_links:
         return chain[-1].message.strip() if chain else "the step failed"
-    return re.sub(rf"^\S*\b{readable[0].cls_name}: ", "", readable[0].message.strip())
+    return re.sub(rf"^\S*\b{readable_links[0].cls_name}: ", "", readable_links[0].message.strip())

@@ -114,9 +114,9 @@ def _read_note(workspace: Workspace) -> dict[str, Any]:
 
 def _history_state(workspace: Workspace) -> list[Any] | None:
     """Return path, sizes and times of Dagster's history; None if it is no local file."""
-    home = Path(os.environ.get("DAGSTER_HOME") or workspace.dagster_home)
-    index = home / _HISTORY
+    dagster_home = Path(os.environ.get("DAGSTER_HOME") or workspace.dagster_home)
+    index = dagster_home / _HISTORY
     if workspace.is_shared or not index.is_file():
         return None
     states = [path.stat() for path in (index, index.with_name(index.name + "-wal")) if path.exists()]
-    return [str(home.resolve()), *([state.st_size, state.st_mtime_ns] for state in states if state.st_size)]
+    return [str(dagster_home.resolve()), *([state.st_size, state.st_mtime_ns] for state in states if state.st_size)]

@@ -118,17 +118,17 @@ def _current_item(workspace: Workspace, dataset: str, item_id: str) -> dict[str,
 
 
 def _state(rows: list[dict[str, Any]], wanted: Mapping[str, Any] | None) -> str:
-    newest = max(rows, key=lambda row: row["created_at"])
+    newest_row = max(rows, key=lambda row: row["created_at"])
     if wanted is None:
         times = count_noun(len(rows), "time")
         return f"asked {times}; the item is no longer in the benchmark, its answers stay in the ledger"
     for row in rows:
         if row["components"] == dict(wanted):
             return f"answered {row['created_at'][:19]} ({row['outcome']}), key {row['key'][:12]}: still stands"
-    old = newest["components"]
+    old = newest_row["components"]
     changed_parts = [name for name in sorted(old.keys() | wanted.keys()) if old.get(name) != wanted.get(name)]
     parts = [f"{name}: {_short(old.get(name))} -> {_short(wanted.get(name))}" for name in changed_parts]
-    return f"will be asked again; changed since {newest['created_at'][:19]}: {'; '.join(parts)}"
+    return f"will be asked again; changed since {newest_row['created_at'][:19]}: {'; '.join(parts)}"
 
 
 def _short(value: Any) -> str:

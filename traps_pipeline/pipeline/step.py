@@ -157,12 +157,12 @@ class _Step:
 
     def tell_unmade(self) -> Iterator[dg.AssetCheckEvaluation]:
         """Report partitions that could not be built or fail a check, now or before."""
-        unbuilt = self._maker.unmade
-        if unbuilt:
+        reason_by_key = self._maker.unmade
+        if reason_by_key:
             end_if_resumed(self.context.instance, self.context.run.run_id, _ATTEMPTS[self.context.run.run_id])
-        for key, error in unbuilt.items():
+        for key, error in reason_by_key.items():
             yield from self.checks.of_unmade(key, error)
-        yield from self.checks.still_failing(self.lineage, {*self._inputs, *unbuilt} - self._maker.taken.keys())
+        yield from self.checks.still_failing(self.lineage, {*self._inputs, *reason_by_key} - self._maker.taken.keys())
 
     def hand_on(self, result: dg.MaterializeResult | None) -> Iterator[dg.Output | dg.MaterializeResult]:
         """Yield the result of an asset without partitions, or outputs that write no event.

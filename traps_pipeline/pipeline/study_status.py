@@ -39,9 +39,9 @@ def stage_statuses(workspace: Workspace, lineage: Lineage, experiment: str | Non
     partitions = StudyPartitions(workspace, experiment)
     for stage in lineage.graph.stages:
         statuses = {key or stage.name: lineage.status(stage.name, key) for key in stage.wanted(partitions)}
-        stale = {key: status.reasons for key, status in statuses.items() if status.kind == "stale"}
+        stale_reasons = {key: status.reasons for key, status in statuses.items() if status.kind == "stale"}
         missing = [key for key, status in statuses.items() if status.kind == "missing"]
-        yield StageStatus(stage.name, len(statuses) - len(stale) - len(missing), stale, missing)
+        yield StageStatus(stage.name, len(statuses) - len(stale_reasons) - len(missing), stale_reasons, missing)
 
 
 def failing_checks(workspace: Workspace) -> Iterator[tuple[str, str, str, str]]:

@@ -39,10 +39,10 @@ class StudyPartitions:
     def __init__(self, workspace: Workspace | None, experiment: str | None = None) -> None:
         self._workspace = workspace
         if workspace is None:
-            everything = Asked(
+            all_asked = Asked(
                 datasets=(*DATASETS, *UNPAIRED), models=tuple(load_models()), regimes=REGIMES, runs=(), mechanism=True
             )
-            self._asked: Sequence[Asked] = [everything]
+            self._asked: Sequence[Asked] = [all_asked]
         else:
             self._asked = [e for name, e in workspace.study.experiments.items() if experiment in (None, name)]
 

@@ -203,6 +203,6 @@ def identity_texts() -> dict[str, str]:
 
 def anonymize(text: str) -> str:
     """Return a text without the authors' identity, even across line breaks."""
-    for words, instead in identity_texts().items():
-        text = re.sub(r"\s+".join(map(re.escape, words.split())), instead, text)
+    for words, replacement in identity_texts().items():
+        text = re.sub(r"\s+".join(map(re.escape, words.split())), replacement, text)
     return text

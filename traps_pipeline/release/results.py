@@ -72,11 +72,11 @@ def write_results(workspace: Workspace, target: Path, dataset: str, who: Attribu
     files = []
     for model, rows in overall.groupby("model", sort=True):
         entries = [{str(k): v for k, v in row.items()} for row in rows.to_dict("records")]
-        when = max(times[str(model)])
-        hub = [_hub_entry(row, dataset, when) for row in entries]
+        evaluated_at = max(times[str(model)])
+        hub = [_hub_entry(row, dataset, evaluated_at) for row in entries]
         files.append(f"{HUB}/{model}.yaml")
         write_text(target / files[-1], yaml.safe_dump(hub, sort_keys=False, allow_unicode=True))
-        record = _every_eval_record(str(model), entries, dataset, who, when, release)
+        record = _every_eval_record(str(model), entries, dataset, who, evaluated_at, release)
         name = uuid.UUID(digest(record)[:32], version=4)  # in the form of the random ids that the collection asks for
         files.append(f"{EVER}/{release.name}/{who.developer_of(str(model))}/{model}/{name}.json")
         write_text(target / files[-1], json.dumps(record, indent=1, ensure_ascii=False) + "\n")

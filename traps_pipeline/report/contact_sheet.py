@@ -125,8 +125,10 @@ def telling_times(frames: np.ndarray, at: np.ndarray, moments: int) -> np.ndarra
     time is also included.
     """
     visible_frames = len(before_occluder(frames))
-    closed = [len(at) - 1] if visible_frames < len(at) and moments > 3 else []
-    return at[np.append(np.linspace(0, visible_frames - 1, moments - len(closed)).round(), closed).astype(int)]
+    closed_indices = [len(at) - 1] if visible_frames < len(at) and moments > 3 else []
+    return at[
+        np.append(np.linspace(0, visible_frames - 1, moments - len(closed_indices)).round(), closed_indices).astype(int)
+    ]
 
 
 def sample_clip(frames: np.ndarray, at: np.ndarray, times: np.ndarray) -> SampledClip:
@@ -181,8 +183,8 @@ def _draw_header(axes: Axes, pair: pd.DataFrame, layout: Layout) -> None:
     questions = (
         [question_of["control"]] if is_same else [f"{side}: {question}" for side, question in question_of.items()]
     )
-    fit = {"max_lines": layout.questions, "placeholder": " …"}
-    lines = [line for question in questions for line in textwrap.wrap(question, layout.letters, **fit)]
+    wrap_options = {"max_lines": layout.questions, "placeholder": " …"}
+    lines = [line for question in questions for line in textwrap.wrap(question, layout.letters, **wrap_options)]
     truth = pair.at["control", "ground_truth"]
     scenario, sub_scenario, dataset = (pair.at["control", c] for c in ("scenario_id", "sub_scenario", "dataset"))
     title = f"{sub_scenario} ({dataset})"

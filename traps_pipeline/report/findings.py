@@ -43,14 +43,14 @@ def states_and_output(results: Results) -> Iterator[str]:
             yield f"{model} answered no void under standard: nothing is encoded and not expressed."
             continue
         encoded, expressed = (int((voids[name] > 0).sum()) for name in ("own", "margin"))
-        wrongly = int((controls["own"] > 0).sum())
+        n_wrong = int((controls["own"] > 0).sum())
         areas = [orders(part) for _, part in group.groupby("dataset", sort=False, observed=True)]
         means = {
             name: sum(area[name] for area in areas) / len(areas) for name in areas[0] if all(name in a for a in areas)
         }
         yield (
             f"{model} answered {count_noun(len(voids), 'void')} under standard: its states put {encoded} of them among "
-            f"voids (and {wrongly} of {count_noun(len(controls), 'control')}), its output {expressed}; as orders of "
+            f"voids (and {n_wrong} of {count_noun(len(controls), 'control')}), its output {expressed}; as orders of "
             f"sides (AUROC, mean of datasets): "
             f"{', '.join(f'{_SCORES[name]} {mean:.2f}' for name, mean in means.items())}."
         )
@@ -84,8 +84,11 @@ def probe_baselines(results: Results) -> Iterator[str]:
     """Yield on how many pairs, within and across datasets, states beat all baselines."""
     for model, group in _models(beside(results)):
         states, noise, spread = (group[name].to_numpy(float) for name in ("value", "noise", "noise_spread"))
-        beaten = np.column_stack([group[[*SHORTCUTS, "output margin"]].to_numpy(float), noise + 2 * spread])
-        is_above, across = states > np.fmax.reduce(beaten, axis=1), (group["source"] != group["target"]).to_numpy(bool)
+        baseline_scores = np.column_stack([group[[*SHORTCUTS, "output margin"]].to_numpy(float), noise + 2 * spread])
+        is_above, across = (
+            states > np.fmax.reduce(baseline_scores, axis=1),
+            (group["source"] != group["target"]).to_numpy(bool),
+        )
         counts = [
             f"{np.count_nonzero(is_above & kind)} of {count_noun(int(np.count_nonzero(kind)), noun)}"
             for kind, noun in ((across, "pair"), (~across, "dataset"))

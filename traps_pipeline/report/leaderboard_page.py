@@ -279,17 +279,19 @@ def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.Dat
     for row in null_single_deviations(board).to_dict("records"):
         entries.setdefault((row["model"], row["regime"]), {})[row["dataset"]] = row
     for dataset_rows in entries.values():
-        main = dataset_rows.get(dataset)
-        counted_rows = list(dataset_rows.values()) if main is None else [main]
-        entry: dict[str, Any] = {name: counted_rows[0][name] for name in ("model", "regime")} | (main or {})
-        summed = ("n_pairs", "n_missing", "n_refused", "n_empty", "n_truncated", "n_unfinished", "n_degenerate")
-        entry |= {n: sum(row[n] for row in counted_rows) for n in (*summed, "n_unread", "n_not_json", "n_rejects")}
-        entry["mark"] = _mark(main) if main else ""
+        main_row = dataset_rows.get(dataset)
+        counted_rows = list(dataset_rows.values()) if main_row is None else [main_row]
+        entry: dict[str, Any] = {name: counted_rows[0][name] for name in ("model", "regime")} | (main_row or {})
+        summed_columns = ("n_pairs", "n_missing", "n_refused", "n_empty", "n_truncated", "n_unfinished", "n_degenerate")
+        entry |= {
+            n: sum(row[n] for row in counted_rows) for n in (*summed_columns, "n_unread", "n_not_json", "n_rejects")
+        }
+        entry["mark"] = _mark(main_row) if main_row else ""
         entry["n_mark"] = INCOMPLETE_MARK if any(row["incomplete"] for row in counted_rows) else ""
         entry["model_mark"] = BROKEN_MARK if any(row["is_broken"] for row in counted_rows) else ""
         entry["missing_mark"] = MISSING_MARK if entry["n_missing"] else ""
-        entry["ci"] = (main and interval(main)) or NONE
-        entry["bounds"] = _bounds(main) if main and main["n_missing"] else ""
+        entry["ci"] = (main_row and interval(main_row)) or NONE
+        entry["bounds"] = _bounds(main_row) if main_row and main_row["n_missing"] else ""
         for name in others:
             row = dataset_rows.get(name)
             entry |= {name: row["pecs"], f"{name}_mark": _mark(row)} if row else {}
@@ -320,6 +322,6 @@ def _bounds(row: Mapping[str, Any]) -> str:
 def _rank(entry: Mapping[str, Any]) -> tuple[bool, float, str, int]:
     """Return the sort key: best PECS first, nulls last, ties by model and regime."""
     pecs = float(entry.get("pecs", float("nan")))
-    null = pecs != pecs
+    is_null = pecs != pecs
     regimes = (*REGIMES, entry["regime"])
-    return null, 0.0 if null else -pecs, entry["model"], regimes.index(entry["regime"])
+    return is_null, 0.0 if is_null else -pecs, entry["model"], regimes.index(entry["regime"])

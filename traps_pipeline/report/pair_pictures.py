@@ -80,15 +80,15 @@ class PairPictures:
     def all(self) -> list[Picture]:
         """Return all pictures."""
         visual = self.items.loc[self.items["dataset"].isin(["occlusion", "chaotic"])] if len(self.items) else self.items
-        six = six_pairs(self.items) if len(self.items) else self.items
+        pair_items = six_pairs(self.items) if len(self.items) else self.items
         example = worked_example(self.workspace)
         inputs = [_as_json(example.pair), example.model, example.words] if example else []
         return [
             Picture("worked_example", "Worked example: a pair, the answers, the panel’s reading, the verdicts",
                     lambda: {"worked_example": self._example(example)},
                     ("items", "responses", "votes", "verdicts"), lambda: inputs),
-            Picture("six_pairs", "Six pairs: control above, void below", lambda: {"six_pairs": self._six(six)},
-                    ("items",), lambda: _as_json(six)),
+            Picture("six_pairs", "Six pairs: control above, void below", lambda: {"six_pairs": self._six(pair_items)},
+                    ("items",), lambda: _as_json(pair_items)),
             Picture("arms", "One scenario with its arms", self._arms, ("items", "arms"),
                     lambda: [_as_json(self.arms), _as_json(visual) if len(self.arms) else ""]),
             Picture("shortcuts", "How well one cue alone separates control from void (0.5 is chance)",

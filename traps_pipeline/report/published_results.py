@@ -49,8 +49,8 @@ def _rates(results: Results) -> pd.DataFrame:
         part[["visual", "textual"]] /= 100
         parts.append(part)
     means = {kind: (kind, "mean") for kind in ("visual", "textual")}
-    pooled = concat_frames(parts).groupby(["model", "epoch"], sort=False).agg(**means).reset_index()
-    table = concat_frames([*parts, pooled.assign(taxonomy="pooled")])
+    pooled_rates = concat_frames(parts).groupby(["model", "epoch"], sort=False).agg(**means).reset_index()
+    table = concat_frames([*parts, pooled_rates.assign(taxonomy="pooled")])
     table["gap"] = analyses.ratio(table["textual"], table["visual"])
     return table.reindex(columns=pd.Index(RATE_COLUMNS))
 
@@ -98,8 +98,8 @@ def _cosines(results: Results) -> pd.DataFrame:
     other_figures = other_figures.loc[other_figures["id"].str.fullmatch(r"cos-(gemma|llava)-\w+-\w+")]
     pairs = other_figures["id"].str.split("-", n=2).str[2].str.split("-", expand=True)
     other_figures = other_figures.assign(source=pairs[0], other=pairs[1], cosine=other_figures["value"].astype(float))
-    mirrored = other_figures.rename(columns={"source": "other", "other": "source"})
-    all_cosines = pd.concat([matrix, other_figures, mirrored], ignore_index=True)
+    mirrored_rows = other_figures.rename(columns={"source": "other", "other": "source"})
+    all_cosines = pd.concat([matrix, other_figures, mirrored_rows], ignore_index=True)
     all_cosines = _long(all_cosines).rename(columns={"source": "dataset", "other": "other_dataset"})
     return _as(
         COSINES, [all_cosines.assign(layer=_steered_layers(all_cosines), prompt="standard", other_prompt="standard")]

@@ -57,13 +57,17 @@ def _best(rows: pd.DataFrame) -> Iterator[StudyFinding]:
         part = rows.loc[rows["regime"] == regime].sort_values(["pecs", "model"], ascending=[False, True])
         first = part.to_dict("records")[0]
         figure = fraction(first["pecs"])
-        equal, worse = (
+        equal, worse_rows = (
             [*part.loc[part["pecs"].map(fraction).eq(figure) == is_equal, "model"]] for is_equal in (True, False)
         )
-        best = "have the highest PECS," if len(equal) > 1 else "has the highest PECS," if worse else "has a PECS of"
+        best = (
+            "have the highest PECS," if len(equal) > 1 else "has the highest PECS," if worse_rows else "has a PECS of"
+        )
         text = f"Under {regime}, {_names(equal)} {best} {figure} {interval(first)}".strip()
-        if worse:
-            text += f", before {worse[0]} with {fraction(part.loc[part['model'] == worse[0], 'pecs'].iloc[0])}"
+        if worse_rows:
+            text += (
+                f", before {worse_rows[0]} with {fraction(part.loc[part['model'] == worse_rows[0], 'pecs'].iloc[0])}"
+            )
         rank_range = ranks(first)
         if len(equal) == 1 and "–" in rank_range:
             text += f"; its rank may be {rank_range}, since contrasts do not separate it from others"
@@ -107,15 +111,17 @@ def _accuracy(rows: pd.DataFrame) -> Iterator[StudyFinding]:
 def _gaps(results: Results, rows: pd.DataFrame) -> Iterator[StudyFinding]:
     """Yield visual against textual voids, and how much PECS may come from shortcuts."""
     rates = results.rates
-    pooled = rates.loc[rates["taxonomy"].eq("pooled") & rates["model"].isin(rows["model"])] if len(rates) else rates
-    pooled = pooled.dropna(subset=["visual", "textual"])
-    if len(pooled):
-        textual, visual = (percent(pooled[name].to_numpy(float).mean()) for name in ("textual", "visual"))
-        subject = f"the {len(pooled)} models" if len(pooled) > 1 else str(pooled["model"].iloc[0])
+    pooled_rates = (
+        rates.loc[rates["taxonomy"].eq("pooled") & rates["model"].isin(rows["model"])] if len(rates) else rates
+    )
+    pooled_rates = pooled_rates.dropna(subset=["visual", "textual"])
+    if len(pooled_rates):
+        textual, visual = (percent(pooled_rates[name].to_numpy(float).mean()) for name in ("textual", "visual"))
+        subject = f"the {len(pooled_rates)} models" if len(pooled_rates) > 1 else str(pooled_rates["model"].iloc[0])
         yield StudyFinding(
-            f"Asked plainly, {subject} abstain{'' if len(pooled) > 1 else 's'} on {textual} % of the questions about "
-            f"something that no clip shows, and on {visual} % of the clips whose outcome is hidden or cut off"
-            f"{' (means)' if len(pooled) > 1 else ''}.",
+            f"Asked plainly, {subject} abstain{'' if len(pooled_rates) > 1 else 's'} on {textual} % of the questions "
+            f"about something that no clip shows, and on {visual} % of the clips whose outcome is hidden or cut off"
+            f"{' (means)' if len(pooled_rates) > 1 else ''}.",
             "figure-visual_textual",
         )
     robust = results.robust

@@ -171,9 +171,11 @@ class StudyResults(Results):
         if self.board.empty:
             return ""
         sentence = judged_by(_panel_rows(self, self.board)).rstrip(".")
-        unjudged = self.board.loc[self.board["panel"] != self.panel, "model"].unique()
+        other_models = self.board.loc[self.board["panel"] != self.panel, "model"].unique()
         return sentence + (
-            f"; left out: {count_noun(len(unjudged), 'model')} with figures of other panels" if len(unjudged) else ""
+            f"; left out: {count_noun(len(other_models), 'model')} with figures of other panels"
+            if len(other_models)
+            else ""
         )
 
     def rows(self, table: Table) -> pd.DataFrame:

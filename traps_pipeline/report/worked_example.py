@@ -117,7 +117,7 @@ def example_figure(example: Example, root: Path) -> Figure:
             x, (bottom + block_height + 0.12) / height, plain(example.model), size=7, weight="bold", parse_math=False
         )
         for side, top in (("control", bottom + block_height), ("void", bottom + block_height / 2 - 0.03)):
-            fit: dict[str, Any] = {"max_lines": MAX_LINES, "placeholder": " …"}
-            lines = [line for part in words[side] for line in textwrap.wrap(plain(part), LETTERS, **fit)]
+            wrap_options: dict[str, Any] = {"max_lines": MAX_LINES, "placeholder": " …"}
+            lines = [line for part in words[side] for line in textwrap.wrap(plain(part), LETTERS, **wrap_options)]
             figure.text(x, top / height, "\n".join(lines), size=6.2, va="top", linespacing=1.25, parse_math=False)
     return figure

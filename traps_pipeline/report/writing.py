@@ -250,8 +250,8 @@ def _with_marks(column: Column, records: Sequence[Mapping[str, Any]]) -> list[st
     """Return heading and cells of a marked column: numbers right, marks after them."""
     marks = ["", *(column.parts(row)[2] for row in records)]
     numbers = _without_marks(replace(column, mark=""), records)
-    number_width, widest = max(map(len, numbers)), max(map(len, marks))
-    return [f"{number:>{number_width}} {mark:{widest}}" for number, mark in zip(numbers, marks, strict=True)]
+    number_width, mark_width = max(map(len, numbers)), max(map(len, marks))
+    return [f"{number:>{number_width}} {mark:{mark_width}}" for number, mark in zip(numbers, marks, strict=True)]
 
 
 def table_latex(table: PrintedTable) -> str:
@@ -381,12 +381,12 @@ def freeze_layout(figure: Figure) -> None:
 
 def figure_bytes(figure: Figure, kind: str = "png") -> bytes:
     """Return the figure as a PDF, SVG, PNG or WebP file, the same on every call."""
-    undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": {"Software": None}}
+    no_dates = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": {"Software": None}}
     with figure_style():
         if figure.get_layout_engine() is not None:
             freeze_layout(figure)
         stream = io.BytesIO()
-        figure.savefig(stream, format=kind, metadata=undated.get(kind))  # pyright: ignore[reportArgumentType]
+        figure.savefig(stream, format=kind, metadata=no_dates.get(kind))  # pyright: ignore[reportArgumentType]
     return stream.getvalue()
 
 

@@ -56,9 +56,9 @@ def load_local_model(entry: ModelEntry, *, inside: bool = False) -> LocalModel:
     require_device(device)
     checkpoint = find_checkpoint(params)
     require_no_code(checkpoint)
-    loading = ("dtype", "quantisation", "nf4_skip", "attn_implementation", "template", "video")
+    loading_params = ("dtype", "quantisation", "nf4_skip", "attn_implementation", "template", "video")
     key = digest(
-        [checkpoint.digest, str(checkpoint.folder), device, params.model_dump(mode="json", include={*loading})]
+        [checkpoint.digest, str(checkpoint.folder), device, params.model_dump(mode="json", include={*loading_params})]
     )
     with _LOADING:
         if key not in _LOADED:
@@ -91,11 +91,11 @@ def require_device(device: str) -> None:
     """Raise TrapsError if this machine has no such device."""
     import torch
 
-    exists = device in ("cpu", SPREAD) or (device == "mps" and torch.backends.mps.is_available())
+    is_available = device in ("cpu", SPREAD) or (device == "mps" and torch.backends.mps.is_available())
     if device.startswith("cuda"):
         number = int(device.partition(":")[2] or 0)
-        exists = torch.cuda.is_available() and number < torch.cuda.device_count()
-    if not exists:
+        is_available = torch.cuda.is_available() and number < torch.cuda.device_count()
+    if not is_available:
         raise TrapsError(
             f"device {device}: torch {torch.__version__} finds none on this machine; run where there is one, or say "
             "`device: cpu` in the entry, which changes nothing but the speed in float32"

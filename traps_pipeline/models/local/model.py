@@ -283,8 +283,8 @@ class LocalModel:
             for token, logprob in first.items():  # several may have one text
                 name = self.processor.tokenizer.decode([token])
                 logprob_of[name] = float(np.logaddexp(logprob_of.get(name, -np.inf), logprob))
-        finish = "length" if end_index is None else "stop"
-        return GeneratedAnswer(text, prompt.n_tokens, len(own_tokens), finish, tuple(own_tokens), logprob_of)
+        finish_reason = "length" if end_index is None else "stop"
+        return GeneratedAnswer(text, prompt.n_tokens, len(own_tokens), finish_reason, tuple(own_tokens), logprob_of)
 
     def placed(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return inputs on the model's device, with pictures in its precision."""

@@ -54,8 +54,8 @@ def spans(model: LocalModel, prompt: Prompt, system: str, question: str) -> dict
                 "changes texts, so positions cannot be chosen by part"
             )
         masks[name] = tokens(place, place + len(plain_text)) & ~visual
-    between = int(np.flatnonzero(masks["system"])[-1]) + 1, int(np.flatnonzero(masks["question"])[0])
-    for first, last in _stamps(full_text, int(starts[between[0]]), int(starts[between[1]])):
+    search_span = int(np.flatnonzero(masks["system"])[-1]) + 1, int(np.flatnonzero(masks["question"])[0])
+    for first, last in _stamps(full_text, int(starts[search_span[0]]), int(starts[search_span[1]])):
         masks["stamps"] |= tokens(first, last) & ~visual
     masks["last"][-1] = True
     for name in PARTS[:-1]:

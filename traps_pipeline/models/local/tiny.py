@@ -28,7 +28,7 @@ Overrides = Mapping[str, Any]
 _HEADS = {"num_attention_heads": 4, "num_key_value_heads": 2, "head_dim": 16}
 _TEXT: dict[str, Any] = {"hidden_size": 64, "intermediate_size": 128, "num_hidden_layers": 4, **_HEADS}
 # Standard deviation of a random checkpoint's text weights, large enough for every prompt token to affect the answer.
-_SPREAD: dict[Family, float] = {"qwen3-vl": 0.2, "gemma-4": 0.02, "llava-next-video": 0.2}
+_WEIGHT_STD: dict[Family, float] = {"qwen3-vl": 0.2, "gemma-4": 0.02, "llava-next-video": 0.2}
 _VISION_SIZE = 32  # hidden size of the vision towers
 _STILL_PIXELS = 128 * 96  # pixels of an image: those of the pocket model's training frames
 
@@ -102,15 +102,15 @@ def build_tiny(
     import torch
 
     transformers = load_transformers()
-    wrapped = make_tokenizer(family, tokenizer)
+    fast_tokenizer = make_tokenizer(family, tokenizer)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        config = make_config(family, wrapped, {"initializer_range": _SPREAD[family], **(text or {})}, vision)
+        config = make_config(family, fast_tokenizer, {"initializer_range": _WEIGHT_STD[family], **(text or {})}, vision)
         model = transformers.AutoModelForImageTextToText.from_config(config)
-    model.generation_config.eos_token_id = wrapped.eos_token_id
-    model.generation_config.pad_token_id = wrapped.pad_token_id
+    model.generation_config.eos_token_id = fast_tokenizer.eos_token_id
+    model.generation_config.pad_token_id = fast_tokenizer.pad_token_id
     model.save_pretrained(folder)
-    make_processor(family, wrapped, video).save_pretrained(folder)
+    make_processor(family, fast_tokenizer, video).save_pretrained(folder)
     return folder
 
 
@@ -123,7 +123,7 @@ def make_tokenizer(family: Family, tokenizer: Tokenizer | None = None) -> Any:
     main_tokens = {
         name: special_tokens.pop(name) for name in ("pad_token", "eos_token", "bos_token") if name in special_tokens
     }
-    wrapped = transformers.PreTrainedTokenizerFast(
+    fast_tokenizer = transformers.PreTrainedTokenizerFast(
         tokenizer_object=base,
         padding_side="left",
         extra_special_tokens=special_tokens,
@@ -134,10 +134,10 @@ def make_tokenizer(family: Family, tokenizer: Tokenizer | None = None) -> Any:
         from tokenizers.processors import TemplateProcessing
 
         bos = special["bos"]
-        wrapped.backend_tokenizer.post_processor = TemplateProcessing(
-            single=f"{bos} $A", special_tokens=[(bos, wrapped.bos_token_id)]
+        fast_tokenizer.backend_tokenizer.post_processor = TemplateProcessing(
+            single=f"{bos} $A", special_tokens=[(bos, fast_tokenizer.bos_token_id)]
         )
-    return wrapped
+    return fast_tokenizer
 
 
 def _byte_level() -> Tokenizer:
@@ -174,7 +174,7 @@ def _qwen3_vl(transformers: Any, ids: Mapping[str, int], base: Overrides, text: 
         "rope_parameters": {"rope_type": "default", "rope_theta": 10000.0, "mrope_section": [4, 2, 2]},
         **text,
     }
-    eyes = {
+    vision_config = {
         "depth": 2,
         "hidden_size": _VISION_SIZE,
         "intermediate_size": 64,
@@ -186,7 +186,7 @@ def _qwen3_vl(transformers: Any, ids: Mapping[str, int], base: Overrides, text: 
     }
     return transformers.Qwen3VLConfig(
         text_config=words,
-        vision_config=eyes,
+        vision_config=vision_config,
         image_token_id=ids["image"],
         video_token_id=ids["video"],
         vision_start_token_id=ids["vision_start"],
@@ -212,7 +212,7 @@ def _gemma_4(transformers: Any, ids: Mapping[str, int], base: Overrides, text: O
         "sliding_window": 64,
         **text,
     }
-    eyes = {
+    vision_config = {
         "hidden_size": _VISION_SIZE,
         "intermediate_size": 64,
         "num_hidden_layers": 2,
@@ -224,7 +224,7 @@ def _gemma_4(transformers: Any, ids: Mapping[str, int], base: Overrides, text: O
     }
     return transformers.Gemma4Config(
         text_config=words,
-        vision_config=eyes,
+        vision_config=vision_config,
         audio_config=None,
         boi_token_id=ids["boi"],
         eoi_token_id=ids["eoi"],
@@ -240,7 +240,7 @@ def _llava_next_video(
     transformers: Any, ids: Mapping[str, int], base: Overrides, text: Overrides, vision: Overrides
 ) -> Any:
     words = {**base, "max_position_embeddings": 4096, **text}
-    eyes = {
+    vision_config = {
         "model_type": "clip_vision_model",
         "hidden_size": _VISION_SIZE,
         "intermediate_size": 64,
@@ -253,10 +253,10 @@ def _llava_next_video(
     }
     return transformers.LlavaNextVideoConfig(
         text_config=transformers.LlamaConfig(**words),
-        vision_config=transformers.CLIPVisionConfig(**eyes),
+        vision_config=transformers.CLIPVisionConfig(**vision_config),
         image_token_index=ids["image"],
         video_token_index=ids["video"],
-        image_grid_pinpoints=[[eyes["image_size"], eyes["image_size"] * 2]],
+        image_grid_pinpoints=[[vision_config["image_size"], vision_config["image_size"] * 2]],
     )
 
 
@@ -270,15 +270,20 @@ def make_processor(family: Family, tokenizer: Any, video: Overrides | None = Non
                 "size": {"shortest_edge": 32 * 32, "longest_edge": 2 * 64 * 64},
                 "cap_pixels_per_frame": False,
             }
-            eyes = transformers.Qwen3VLVideoProcessor(**video_sizes | video_settings)
-            image_settings = {name: getattr(eyes, name) for name in ("patch_size", "image_mean", "image_std")}
-            image_settings["size"] = {"shortest_edge": (2 * eyes.patch_size) ** 2, "longest_edge": _STILL_PIXELS}
+            video_processor = transformers.Qwen3VLVideoProcessor(**video_sizes | video_settings)
+            image_settings = {
+                name: getattr(video_processor, name) for name in ("patch_size", "image_mean", "image_std")
+            }
+            image_settings["size"] = {
+                "shortest_edge": (2 * video_processor.patch_size) ** 2,
+                "longest_edge": _STILL_PIXELS,
+            }
             return transformers.Qwen3VLProcessor(
                 image_processor=transformers.Qwen2VLImageProcessor(
                     **image_settings
                 ),  # a server may receive frames one by one
                 tokenizer=tokenizer,
-                video_processor=eyes,
+                video_processor=video_processor,
                 chat_template=_TEMPLATES[family],
             )
         case "gemma-4":

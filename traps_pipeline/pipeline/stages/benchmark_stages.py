@@ -197,8 +197,8 @@ def arms(workspace: Workspace, category: str) -> StageOutput:
     from traps_pipeline.benchmark.filmed_arms import build_arms
 
     rows = build_arms(workspace, category)
-    admitted = sum(row.refused is None for row in rows)
-    return StageOutput(rows, shown={"admitted": admitted, "refused": len(rows) - admitted})
+    n_admitted = sum(row.refused is None for row in rows)
+    return StageOutput(rows, shown={"admitted": n_admitted, "refused": len(rows) - n_admitted})
 
 
 def _odd_pairs(workspace: Workspace, key: str | None, output: StageOutput) -> dict[str, list[str]]:

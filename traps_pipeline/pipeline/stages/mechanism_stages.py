@@ -205,8 +205,8 @@ def steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | 
         cell = SteeringCell.parse(key)
         entry = examined_model(workspace, cell.evaluation.model)
         along = {cell.directions: saved_directions(workspace, Extraction(entry.id, cell.directions))}
-        for finished, output in collect_steered(workspace, entry, [cell], along):
-            yield finished.key, output
+        for finished_cell, output in collect_steered(workspace, entry, [cell], along):
+            yield finished_cell.key, output
 
 
 @_stage(
@@ -221,8 +221,8 @@ def steering_votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[
     """Yield the panel's votes on steered answers: abstention, and correct controls."""
     from traps_pipeline.mechanism.steering import collect_steering_votes
 
-    for finished, output in collect_steering_votes(workspace, [SteeringCell.parse(key) for key in keys]):
-        yield finished.key, output
+    for finished_cell, output in collect_steering_votes(workspace, [SteeringCell.parse(key) for key in keys]):
+        yield finished_cell.key, output
 
 
 def _answers_and_votes(workspace: Workspace) -> "tuple[pd.DataFrame, pd.DataFrame]":

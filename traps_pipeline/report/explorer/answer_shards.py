@@ -152,8 +152,8 @@ def _item_rows(workspace: Workspace, table: Table, columns: Sequence[str], items
 
 def _evaluations(responses: pa.Table) -> list[Evaluation]:
     """Return evaluations with answers by model, regime (benchmark's order) and run."""
-    distinct = responses.group_by([*_EVALUATION]).aggregate([]).to_pylist()
-    evaluations = [Evaluation(row["model"], row["regime"], row["run"]) for row in distinct]
+    distinct_rows = responses.group_by([*_EVALUATION]).aggregate([]).to_pylist()
+    evaluations = [Evaluation(row["model"], row["regime"], row["run"]) for row in distinct_rows]
     return sorted(evaluations, key=lambda e: (e.model, REGIMES.index(e.regime), e.run))
 
 

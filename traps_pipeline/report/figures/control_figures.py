@@ -262,7 +262,7 @@ def doses_among_nulls(results: Results) -> Figure:
             ax.set_xlabel("dose in class gaps | nulls", size=7)
         axes[0, 0].set_ylim(-6, 106)
         handles = [legend_key("+ on controls", INK, "o", "-", 3.5), legend_key("− on voids", SOFT, "s", "--", 3.5)]
-        handles += [legend_key(f"{null} null", colour[null], "o", size=3) for null in NULLS]
+        handles += [legend_key(f"{null_kind} null", colour[null_kind], "o", size=3) for null_kind in NULLS]
         figure.legend(handles=handles, loc="outside lower center", ncols=5)
     return figure
 
@@ -275,7 +275,7 @@ def _p_values(nulls: pd.DataFrame, model: str, directions: str, regime: str, dat
     for side, sign in (("control", "+"), ("void", "−")):
         rows = of.loc[of["side"] == side].sort_values("dose").drop_duplicates("null", keep="last")
         p_of_null = {str(row["null"]): f"{row['p']:.2f}".removeprefix("0") for row in rows.to_dict("records")}
-        lines += [f"p {sign} {' '.join(p_of_null.get(null, '–') for null in NULLS)}"] if p_of_null else []
+        lines += [f"p {sign} {' '.join(p_of_null.get(null_kind, '–') for null_kind in NULLS)}"] if p_of_null else []
     return lines
 
 
@@ -287,14 +287,14 @@ def _dose(ax: Axes, rows: pd.DataFrame, colour: dict[str, str]) -> None:
         void = of.loc[of["kind"] == "void"].sort_values("gaps").drop_duplicates("gaps")
         ax.plot(void["gaps"], 100 * void["abstention"].astype(float), color=ink, linestyle=line, marker=marker,
                 markersize=3.2, linewidth=1.0, clip_on=False)  # fmt: skip
-        for place, null in enumerate(NULLS):
-            nulls = of.loc[(of["kind"] == null) & (of["dose"] > 0)]
+        for place, null_kind in enumerate(NULLS):
+            nulls = of.loc[(of["kind"] == null_kind) & (of["dose"] > 0)]
             if not len(nulls):
                 continue
             top = float(nulls["gaps"].iloc[0])
             at = top * (1.25 + 0.14 * place + (0.55 if side == "void" else 0))
             counts = (100 * nulls["abstention"].astype(float)).round(6).value_counts()
-            ax.scatter([at] * len(counts), counts.index, s=3 + 1.6 * counts.to_numpy(), color=colour[null],
+            ax.scatter([at] * len(counts), counts.index, s=3 + 1.6 * counts.to_numpy(), color=colour[null_kind],
                        marker=marker, linewidths=0, clip_on=False)  # fmt: skip
             ax.axvline(1.12 * top, color=GRID, linewidth=0.7, zorder=0)
             doses = [dose for dose in sorted(set(void["gaps"])) if dose == 0 or dose >= top / 4]

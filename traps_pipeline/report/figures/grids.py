@@ -58,8 +58,8 @@ def sub_scenarios(results: Results) -> Figure:
         figure = new_figure(PAGE_IN, 1.35 + 0.17 * len(rows))
         column_counts = [len(panel.columns) for panel in panels]
         axes = figure.subplots(1, len(panels), sharey=True, squeeze=False, width_ratios=column_counts)[0]
-        first = int((~rows["order"]).sum())
-        scales = {panel.scale: _draw_grid(ax, panel, names, first) for ax, panel in zip(axes, panels, strict=True)}
+        n_before = int((~rows["order"]).sum())
+        scales = {panel.scale: _draw_grid(ax, panel, names, n_before) for ax, panel in zip(axes, panels, strict=True)}
         for scale, image in scales.items():
             figure.colorbar(image, ax=list(axes), label=f"{scale}, %", shrink=0.6, aspect=30, pad=0.01)
     return figure
@@ -94,8 +94,8 @@ def _model_panels(results: Results, rows: pd.DataFrame) -> list[Panel]:
 
 
 def _means(rows: pd.DataFrame) -> list[Panel]:
-    good = {"abs_rec": "AbsRec, standard", "guided_abs_rec": "AbsRec, guided", "acc": "Acc"}
-    of = {GOOD: good, BAD: {"false_abs": "FalseAbs"}}
+    good_columns = {"abs_rec": "AbsRec, standard", "guided_abs_rec": "AbsRec, guided", "acc": "Acc"}
+    of = {GOOD: good_columns, BAD: {"false_abs": "FalseAbs"}}
     titles = {GOOD: "means over models", BAD: ""}
     return [Panel(titles[s], [*names.values()], 100 * rows[[*names]].to_numpy(float), s) for s, names in of.items()]
 

@@ -63,8 +63,8 @@ def place_labels(axes: Axes, labels: Sequence[Label], markers: np.ndarray) -> No
         boxes = _boxes(
             axes.transData.transform((label.x, label.y)) + offsets * pixel, offsets, size + np.array([4, 1]) * pixel
         )
-        outside = np.prod(boxes[0, 2:] - boxes[0, :2]) - _overlap(boxes, room)
-        area = 10 * (_overlap(boxes, obstacles) + outside) + 2 * _overlap(boxes, lines)
+        outside_area = np.prod(boxes[0, 2:] - boxes[0, :2]) - _overlap(boxes, room)
+        area = 10 * (_overlap(boxes, obstacles) + outside_area) + 2 * _overlap(boxes, lines)
         best = int(np.argmin(area / pixel**2 + distance))
         dx, dy = offsets[best]
         note.set(position=(dx, dy), ha=_side(dx, "left", "right"), va=_side(dy, "bottom", "top"))

@@ -120,8 +120,8 @@ def _draw_intervals(axes: Axes, row: Mapping[Any, Any], colour: str) -> None:
         low, high = row.get(f"{name}_ci_low", np.nan), row.get(f"{name}_ci_high", np.nan)
         if low is None or high is None or not np.isfinite([low, high]).all():
             continue
-        ends, other = (max(lower_limit, low), min(1.0, high)), row["acc" if name == "j" else "j"]
-        axes.plot(*((ends, (other, other)) if name == "j" else ((other, other), ends)), **style)
+        ends, other_value = (max(lower_limit, low), min(1.0, high)), row["acc" if name == "j" else "j"]
+        axes.plot(*((ends, (other_value, other_value)) if name == "j" else ((other_value, other_value), ends)), **style)
 
 
 def _draw_frontier(axes: Axes, guided: pd.DataFrame) -> None:

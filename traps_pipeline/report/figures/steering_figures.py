@@ -261,15 +261,15 @@ def _heatmap(ax: Axes, part: pd.DataFrame) -> Any:
     names = [TITLES[name].replace(", ill", ",\nill") for name in DATASETS]
     row_of = {(row["dataset"], row["other_dataset"]): row for row in part.to_dict("records")}
     values, texts = np.full((4, 4), np.nan), dict[tuple[int, ...], str]()
-    for (row, one), (column, other) in product(enumerate(DATASETS), repeat=2):
-        at = row_of.get((one, other), {})
-        cleaned = row < column and _is_known(at.get("disattenuated"))
-        figure = at.get("split_half" if row == column else "disattenuated" if cleaned else "cosine")
+    for (row, row_dataset), (column, column_dataset) in product(enumerate(DATASETS), repeat=2):
+        at = row_of.get((row_dataset, column_dataset), {})
+        is_corrected = row < column and _is_known(at.get("disattenuated"))
+        figure = at.get("split_half" if row == column else "disattenuated" if is_corrected else "cosine")
         if not _is_known(figure):
             texts[row, column] = "1" if row == column else "–"
             continue
         values[row, column] = np.nan if row == column else figure
-        star = "*" if cleaned and _is_known(at["low"]) and at["low"] * at["high"] > 0 else ""
+        star = "*" if is_corrected and _is_known(at["low"]) and at["low"] * at["high"] > 0 else ""
         texts[row, column] = f"{figure:.2f}{star}".replace("-", "−")
     image = ax.imshow(values, cmap="PuOr", vmin=-COSINE_SCALE, vmax=COSINE_SCALE)
     ax.set_facecolor("#f2f4f7")

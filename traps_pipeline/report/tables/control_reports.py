@@ -192,8 +192,10 @@ def _pecs(results: Results) -> PrintedTable:
 
     rows = results.steering_pecs
     rows = rows.loc[rows["source"] == rows["target"]]
-    unsteered = rows["dose"] == 0  # once per path: the unsteered model is the same in every unit and under all signs
-    table_rows = pd.concat([rows.loc[unsteered].drop_duplicates([*MODEL_OF, "source", "target"]), rows.loc[~unsteered]])
+    is_unsteered = rows["dose"] == 0  # once per path: the unsteered model is the same in every unit and under all signs
+    table_rows = pd.concat(
+        [rows.loc[is_unsteered].drop_duplicates([*MODEL_OF, "source", "target"]), rows.loc[~is_unsteered]]
+    )
     rows = table_rows.sort_values([*MODEL_OF, "source"], kind="stable", ignore_index=True)
     table_rows = rows.assign(
         step=_dose(rows),
@@ -246,8 +248,8 @@ _GATE_NOTES = (
 def _gates(results: Results) -> pd.DataFrame:
     """Return gate rows; states, other datasets, mid threshold, all datasets first."""
     rows = results.gate
-    firsts = {"features": "states", **DEFAULT_GATE, "target": "all"}
-    is_later = {f"{name}_later": rows[name].astype(object) != first for name, first in firsts.items()}
+    first_values = {"features": "states", **DEFAULT_GATE, "target": "all"}
+    is_later = {f"{name}_later": rows[name].astype(object) != first for name, first in first_values.items()}
     rows = rows.assign(**is_later).sort_values(["model", "regime", *is_later], kind="stable", ignore_index=True)
     return rows.assign(
         mark=few_marks(rows, "n_controls", "n_voids"),

@@ -239,9 +239,9 @@ def _within_table(results: Results) -> PrintedTable:
     table = shuffled_means.agg(shuffled=("value", "mean"), spread=("spread", "mean")).reset_index()
     best = rows.loc[(rows["analysis"] == "within") & rows["own_best"], ["model", "source", "layer", "value"]]
     table = table.merge(best, on=["model", "source"], how="left")
-    itself = rows.loc[(rows["analysis"] == "held_out") & (rows["source"] == rows["target"]) & rows["chosen"]]
-    itself = itself[["model", "source", "target", "value", "low", "high", "n_voids", "n_controls"]]
-    table = table.merge(itself.rename(columns={"value": "pooled"}), on=["model", "source"], how="left")
+    own_rows = rows.loc[(rows["analysis"] == "held_out") & (rows["source"] == rows["target"]) & rows["chosen"]]
+    own_rows = own_rows[["model", "source", "target", "value", "low", "high", "n_voids", "n_controls"]]
+    table = table.merge(own_rows.rename(columns={"value": "pooled"}), on=["model", "source"], how="left")
     table = table.join(best_baselines(results, "held_out"), on=KEYS)
     table = table.assign(dataset=short_names(table["source"]), mark=few_marks(table, "n_voids", "n_controls"))
     columns = [
@@ -366,12 +366,14 @@ def layer_curves(rows: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
     parts, notes = [pd.DataFrame(columns=pd.Index(["model", "layer", "n_at_top"]))], list[str]()
     for model, group in rows.groupby("model", sort=False):
         curves = pair_curves({str(name): value for name, value in row.items()} for row in group.to_dict("records"))
-        within = group.loc[group["analysis"] == "within", ["source", "layer", "value"]]
-        if not curves or not len(within):
+        within_rows = group.loc[group["analysis"] == "within", ["source", "layer", "value"]]
+        if not curves or not len(within_rows):
             continue
-        part = within.assign(top=within["value"] >= within.groupby("source")["value"].transform("max") - ROUNDING)
+        part = within_rows.assign(
+            top=within_rows["value"] >= within_rows.groupby("source")["value"].transform("max") - ROUNDING
+        )
         part = part.groupby("layer")["top"].sum().rename("n_at_top").to_frame()
-        choices = {name: layer_choice(curves, name) for name in SHORT if name in set(within["source"])}
+        choices = {name: layer_choice(curves, name) for name in SHORT if name in set(within_rows["source"])}
         for name, choice in choices.items():
             part[name] = pd.Series(choice.curve)
             part[f"{name}_mark"] = ["*" if layer == choice.layer else "" for layer in part.index]

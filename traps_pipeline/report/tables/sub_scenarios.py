@@ -84,9 +84,9 @@ def _sub_table(results: Results, rows: pd.DataFrame, name: str, title: str) -> P
     ]  # fmt: skip
     omission_note = "; reference strategies left out where others were asked" if results.is_study else ""
     notes = [epochs(rows), f"means over models{omission_note}", "standard, where no regime is named"]
-    fewer = {"guided": "guided_n_models", "Δ": "uplift_n_models", "ill-posed": "ill_posed_n_models"}
-    if any(((rows[name] != rows["n_models"]) & (rows[name] > 0)).any() for name in fewer.values()):
-        columns += [Column(name, f"Models, {words}", "count") for words, name in fewer.items()]
+    count_columns = {"guided": "guided_n_models", "Δ": "uplift_n_models", "ill-posed": "ill_posed_n_models"}
+    if any(((rows[name] != rows["n_models"]) & (rows[name] > 0)).any() for name in count_columns.values()):
+        columns += [Column(name, f"Models, {words}", "count") for words, name in count_columns.items()]
     notes += marks(rows)
     taxonomy = "occlusion" if name.startswith("occlusion") else "chaotic"
     return PrintedTable(name, title, rows, columns, notes, results.why("sub_scenarios"), _sub_trace(taxonomy))

@@ -101,12 +101,12 @@ def meanings(marks: Iterable[str]) -> list[str]:
 
 def epochs(rows: pd.DataFrame) -> str:
     """Return a note on the only epoch, or on mixed ones; empty without rows."""
-    dated = rows.dropna(subset=["epoch"]) if "epoch" in rows else rows.iloc[:0]
-    epoch_names = sorted({part for epoch in dated["epoch"] for part in str(epoch).split("+")})
+    dated_rows = rows.dropna(subset=["epoch"]) if "epoch" in rows else rows.iloc[:0]
+    epoch_names = sorted({part for epoch in dated_rows["epoch"] for part in str(epoch).split("+")})
     if len(epoch_names) <= 1:
         return f"epoch {epoch_names[0]}" if epoch_names else ""
     groups: dict[str, list[str]] = {}
-    for key, part in dated.groupby("dataset", sort=False) if "dataset" in dated else []:
+    for key, part in dated_rows.groupby("dataset", sort=False) if "dataset" in dated_rows else []:
         names = " and ".join(sorted(set(part["epoch"].astype(str))))
         groups.setdefault(names, []).append(SHORT.get(str(key), str(key)))
     main_epoch = max(groups, key=lambda name: len(groups[name]), default="")

@@ -414,11 +414,11 @@ def _hidden(pair: Pair) -> Evidence:
 
 
 def _judge_hidden(e: Evidence, claim: Claim) -> Failures:
-    late = "the occluder does not hide the outcome before it is committed"
+    message = "the occluder does not hide the outcome before it is committed"
     if e.get("past_panel_px"):
-        yield f"{late}: {e['past_panel_px']:.0f} pixels of decisive bodies or the hidden element are seen past it"
+        yield f"{message}: {e['past_panel_px']:.0f} pixels of decisive bodies or the hidden element are seen past it"
     if e["hidden_from_s"] >= e["commit_s"]:
-        yield late
+        yield message
 
 
 HIDDEN = Certificate(
@@ -538,13 +538,13 @@ def _referents(pair: Pair) -> Evidence:
         else:
             least_px.append(float(control.pixels_of(static).min()))
             visibility[noun] = "in view" if least_px[-1] >= REFERENT_PIXELS else "hidden"
-    swept = swept_points(model, control.qpos[:: control.physics.fps // checks.SAMPLED_FPS])
+    swept_corners = swept_points(model, control.qpos[:: control.physics.fps // checks.SAMPLED_FPS])
     return {
         "referents": visibility,
         "referents_px": min(least_px, default=None),
         "referents_moving_s": None if not least_s else round(min(least_s), 3),
         "cause_moving_s": round(max(seconds_moving.values(), default=0.0), 3),
-        "panel_covers": checks.swept_behind(control.camera, list(swept.reshape(-1, 8, 3)), control.occluder),
+        "panel_covers": checks.swept_behind(control.camera, list(swept_corners.reshape(-1, 8, 3)), control.occluder),
     }
 
 
@@ -692,11 +692,11 @@ def _twin_of_cut(pair: Pair) -> Evidence:
     apart_px = ensemble.deviation_px(control.model, control.camera, control.qpos[cut], twin.qpos[cut])
     with control.renderer() as renderer:
         frames = list(renderer.frames(control.qpos[shown_frames]))
-        _, largest = checks.differing_pixels(frames, renderer.frames(twin.qpos[shown_frames]))
+        _, largest_difference = checks.differing_pixels(frames, renderer.frames(twin.qpos[shown_frames]))
     return {
         "twin_answer": settled_answer(twin),
         "twin_deviation_px": apart_px * fineness(control.params),
-        "twin_largest_difference": largest,
+        "twin_largest_difference": largest_difference,
         "start_off": float(np.abs(start.astype(np.float32) - twin.qpos[0]).max()),
         "rebuilt": future.qpos is not None and np.array_equal(future.qpos, twin.qpos),
         "rebuilt_answer": future.label,
@@ -941,7 +941,7 @@ def table() -> str:
         kinds = {"occluder": " (occlusion)", "truncation": " (chaotic)"}
         kind = kinds[certificate.kinds[0]] if len(certificate.kinds) == 1 else ""
         numbers = [number for number in certificate.numbers if number.kept]
-        stored = ", ".join(f"`{number.name}`" if number.compared else f"[`{number.name}`]" for number in numbers)
-        cells = (f"`{certificate.name}`{kind}", certificate.promises, certificate.does_not_promise, stored)
+        stored_names = ", ".join(f"`{number.name}`" if number.compared else f"[`{number.name}`]" for number in numbers)
+        cells = (f"`{certificate.name}`{kind}", certificate.promises, certificate.does_not_promise, stored_names)
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)

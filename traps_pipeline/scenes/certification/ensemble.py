@@ -105,10 +105,10 @@ class Futures:
 
     def batches(self) -> Iterator[list[Rollout]]:
         """Yield all rollouts so far after each batch of `BATCHES`."""
-        for tried in BATCHES:
-            if len(self._rollouts) < tried:
-                self._rollouts += self._roll_all(range(len(self._rollouts), tried))
-            yield self._rollouts[:tried]
+        for n_tried in BATCHES:
+            if len(self._rollouts) < n_tried:
+                self._rollouts += self._roll_all(range(len(self._rollouts), n_tried))
+            yield self._rollouts[:n_tried]
 
     def start(self, number: int) -> np.ndarray:
         """Return a start, (nq,) float64, drawn around the first row. Raises Rejected."""
@@ -201,20 +201,20 @@ class Futures:
         data, scratch = mujoco.MjData(camera_view.model), mujoco.MjData(camera_view.model)
         data.qpos[:], data.qvel[:] = camera_view.starts[number], camera_view.velocity
         frames = np.empty((len(shown_geoms), camera_view.model.nq))
-        parted = len(shown_geoms)
+        parted_frame = len(shown_geoms)
         for i in range(len(shown_geoms)):
             frames[i] = data.qpos
             if (
-                parted == len(shown_geoms)
+                parted_frame == len(shown_geoms)
                 and np.abs(outline.pixels(data.qpos, scratch) - shown_geoms[i]).max() > self._alike_px
             ):
-                parted = i
+                parted_frame = i
                 if i < self.first and not to_end:
-                    return Rollout(number, parted, None)
+                    return Rollout(number, parted_frame, None)
             mujoco.mj_step(camera_view.model, data, control.physics.substeps)
         if not np.isfinite(frames).all():
-            return Rollout(number, parted, None)
-        return Rollout(number, parted, self._settled_label(frames), frames.astype(np.float32))
+            return Rollout(number, parted_frame, None)
+        return Rollout(number, parted_frame, self._settled_label(frames), frames.astype(np.float32))
 
 
 def at_cut(rollouts: Sequence[Rollout], frame: int, perturbation: float) -> Cut:
@@ -259,12 +259,12 @@ def unseen_steps(model: mujoco.MjModel, data: mujoco.MjData, camera: Camera) -> 
     import mujoco
 
     scales = np.empty(model.nv)
-    for joint in range(model.njnt):
-        body, dof = model.jnt_bodyid[joint], int(model.jnt_dofadr[joint])
+    for joint_id in range(model.njnt):
+        body, dof = model.jnt_bodyid[joint_id], int(model.jnt_dofadr[joint_id])
         geoms = model.geom_bodyid == body
         metres = UNSEEN_PX * camera.metres_a_pixel(data.xpos[body])
         radians = metres / (np.linalg.norm(model.geom_pos[geoms], axis=1) + model.geom_rbound[geoms]).max()
-        kind = model.jnt_type[joint]
+        kind = model.jnt_type[joint_id]
         if kind == mujoco.mjtJoint.mjJNT_FREE:
             scales[dof : dof + 6] = [metres] * 3 + [radians] * 3
         else:
@@ -319,5 +319,5 @@ class _Silhouette:
         rotation = data.geom_xmat[self._solids].reshape(-1, 3, 3)
         corners = np.einsum("gij,gkj->gki", rotation, self._corners) + data.geom_xpos[self._solids, None]
         outline = self._outline + data.geom_xpos[self._balls, None]
-        soft = [vertices(self._model, data, flex) for flex in range(self._model.nflex)]
-        return self._camera.project(np.concatenate([corners.reshape(-1, 3), outline.reshape(-1, 3), *soft]))
+        soft_vertices = [vertices(self._model, data, flex) for flex in range(self._model.nflex)]
+        return self._camera.project(np.concatenate([corners.reshape(-1, 3), outline.reshape(-1, 3), *soft_vertices]))

@@ -101,13 +101,13 @@ def _rewrite(
     records = {spec.scenario_id: spec for spec in map(SceneSpec.model_validate_json, lines)}
     chosen_ids = [id_ for id_ in records if only is None or id_ in only]
     jobs = [(records[id_], released / "trajectories", tally) for id_ in chosen_ids]
-    for finished, ((spec, folder, _), result) in enumerate(run_in_order(change, jobs, workers), start=1):
+    for n_finished, ((spec, folder, _), result) in enumerate(run_in_order(change, jobs, workers), start=1):
         if isinstance(result, str):
             rejections[spec.scenario_id] = result
         else:
             save_trajectory(folder, spec.scenario_id, result.qpos, result.twin)
             records[spec.scenario_id] = result.spec
-        report(f"{spec.scenario_id}: {rejections.get(spec.scenario_id, 'written again')}; {finished} of {len(jobs)}")
+        report(f"{spec.scenario_id}: {rejections.get(spec.scenario_id, 'written again')}; {n_finished} of {len(jobs)}")
     write_text(released / f"{name}.jsonl", "".join(map(record_line, records.values())))
     tallies = load_tallies(released)
     tallies[name] = replace(tallies[name], file=family_digest(name), look=sorted(get_family(name).looks))

@@ -81,9 +81,9 @@ def require_difficulty(names: Iterable[str], difficulty: Difficulty) -> None:
     unsupported = {name: settings for name, settings in unsupported.items() if settings}
     if unsupported:
         advice = "; ".join(f"{name}: no --{', no --'.join(settings)}" for name, settings in sorted(unsupported.items()))
-        able = [name for name in family_names() if not unsupported_settings(get_family(name), difficulty)]
+        supporting = [name for name in family_names() if not unsupported_settings(get_family(name), difficulty)]
         raise TrapsError(
-            f"some families cannot be drawn like this ({advice}): name others with --families: {', '.join(able)}"
+            f"some families cannot be drawn like this ({advice}): name others with --families: {', '.join(supporting)}"
         )
 
 
@@ -150,8 +150,8 @@ def sample_family(
     answers = Counter(spec.ground_truth for spec in specs)
     texts = Counter(spec.ill_posed_question for spec in specs)
     hashes = {} if len(specs) == count else {spec.scenario_id: frame_hash(spec, records.qpos(spec)) for spec in specs}
-    occupied = {int(spec.scenario_id.rpartition("-")[2]) for spec in specs}
-    places = [place for place in range(1, count + 1) if place not in occupied]
+    taken_numbers = {int(spec.scenario_id.rpartition("-")[2]) for spec in specs}
+    places = [place for place in range(1, count + 1) if place not in taken_numbers]
     if not places:
         return tally
 
@@ -179,12 +179,12 @@ def sample_family(
                     reported_kinds.add(rejection_kind(result))
                     report(f"{name}: draw {draw.number + 1} is rejected: {result}")
                 continue
-            placed = _with_id(family, result, draw, places.pop(0), texts, count)
-            hashes[placed.spec.scenario_id] = picture_hash
-            answers[placed.spec.ground_truth] += 1
-            texts[placed.spec.ill_posed_question] += 1
-            records.append(placed, tally)
-            report(f"{placed.spec.scenario_id}: {placed.spec.ground_truth} after {tally.draws} draws")
+            placed_draw = _with_id(family, result, draw, places.pop(0), texts, count)
+            hashes[placed_draw.spec.scenario_id] = picture_hash
+            answers[placed_draw.spec.ground_truth] += 1
+            texts[placed_draw.spec.ill_posed_question] += 1
+            records.append(placed_draw, tally)
+            report(f"{placed_draw.spec.scenario_id}: {placed_draw.spec.ground_truth} after {tally.draws} draws")
             if not places:
                 records.sort()
                 return tally
@@ -290,8 +290,8 @@ def _mean_choices(family: Family, longer: bool = False) -> Mapping[str, float]:
     for labels in choices_by_draw:
         for label in labels:
             shares[label] += 1 / len(labels) / len(choices_by_draw)
-    rare = float(len(choices_by_draw))  # an answer that none of them offers
-    return defaultdict(lambda: rare, {label: 1 / share for label, share in shares.items()})
+    n_choices = float(len(choices_by_draw))  # an answer that none of them offers
+    return defaultdict(lambda: n_choices, {label: 1 / share for label, share in shares.items()})
 
 
 def try_draw(draw: Draw) -> Resolved | str:
@@ -382,5 +382,5 @@ def simulated_scene(family: Family, params: Any, physics: Physics) -> tuple[str,
     settled_at = settles_share(outcome.commit_frame, len(qpos))
     if settled_at > LATEST_SHARE:  # where it settles too early the clip will end earlier
         raise Rejected(str(out_of_pace(settled_at)))
-    covered = () if scene.cover is None else (scene.cover.corners(),)
-    return outcome.answer, scene, np.concatenate([shown_points(model, scene, qpos), *covered])
+    cover_corners = () if scene.cover is None else (scene.cover.corners(),)
+    return outcome.answer, scene, np.concatenate([shown_points(model, scene, qpos), *cover_corners])

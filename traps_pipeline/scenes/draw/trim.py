@@ -87,7 +87,7 @@ def _plane_points(camera: Camera, pixels: np.ndarray, ahead: np.ndarray, front: 
     """Return where lines of sight through pixels (N, 2) meet an upright plane, (N, 3)."""
     right, up, forward = camera.axes()
     focal = HEIGHT / 2 / np.tan(np.radians(camera.fovy_deg) / 2)
-    sideways, upwards = (pixels[:, 0] - WIDTH / 2) / focal, (HEIGHT / 2 - pixels[:, 1]) / focal
-    rays = forward + sideways[:, None] * right + upwards[:, None] * up
+    ray_x, ray_y = (pixels[:, 0] - WIDTH / 2) / focal, (HEIGHT / 2 - pixels[:, 1]) / focal
+    rays = forward + ray_x[:, None] * right + ray_y[:, None] * up
     eye = camera.position()
     return eye + rays * ((front - eye @ ahead) / (rays @ ahead))[:, None]

@@ -118,9 +118,11 @@ def _add_beam(course: Course, p: Params) -> None:
         surface.on(add_box(body, f"cup_{i}", centre, size, "white", density=1))
     size = p.counterweight_half_m
     counterweight_at = p.even_m * {"near": p.near_share, "even": 1.0, "far": p.far_share}[p.place]
-    balanced = ball_kg * p.arm_m / (p.even_m * 8 * size**3)  # density that keeps the ball in balance at `even_m`
+    balancing_density = (
+        ball_kg * p.arm_m / (p.even_m * 8 * size**3)
+    )  # density that keeps the ball in balance at `even_m`
     at = (d * counterweight_at, 0, BEAM_HALF_M + size)
-    add_box(body, "counterweight", at, (size, size, size), p.counterweight_colour, density=balanced)
+    add_box(body, "counterweight", at, (size, size, size), p.counterweight_colour, density=balancing_density)
 
 
 def outcome(motion: Motion, p: Params) -> Reading:

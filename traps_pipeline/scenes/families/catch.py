@@ -153,10 +153,10 @@ def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     if sides is None or len(flight) < 3:
         return None
     a, b, c = flight
-    fall_px, faster = c.y - b.y, c.y - 2 * b.y + a.y  # in a frame, and by how much more in the next
+    fall_px, gain_px = c.y - b.y, c.y - 2 * b.y + a.y  # in a frame, and by how much more in the next
     down = (sides[2] + sides[3]) / 2 - c.y
-    speed = fall_px + faster / 2
-    frames_on = (math.sqrt(max(speed**2 + 2 * faster * down, 0.0)) - speed) / faster if faster > 0 else 0.0
+    speed = fall_px + gain_px / 2
+    frames_on = (math.sqrt(max(speed**2 + 2 * gain_px * down, 0.0)) - speed) / gain_px if gain_px > 0 else 0.0
     return "yes" if _is_between(c.x + max(frames_on, 0.0) * (c.x - b.x), sides) else "no"
 
 

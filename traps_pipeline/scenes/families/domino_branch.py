@@ -99,13 +99,13 @@ def build(p: Params, physics: Physics) -> Scene:
 
 def _add_branch(course: Course, p: Params, side: str, yaw: float, junction: float) -> None:
     """Add the dominoes of a branch, of which one may lie beside it, on the inner side."""
-    ahead, inwards = np.array([np.sin(yaw), np.cos(yaw)]), np.sign(yaw) * np.array([-np.cos(yaw), np.sin(yaw)])
+    ahead, inward = np.array([np.sin(yaw), np.cos(yaw)]), np.sign(yaw) * np.array([-np.cos(yaw), np.sin(yaw)])
     start = np.array([0.0, junction]) + (BALL - PUSH + p.thickness / 2) * ahead
     colours = [p.row_colour] * (p.branch - 1) + [p.left_colour if side == "left" else p.right_colour]
     for i, (name, colour) in enumerate(zip(p.bodies(side), colours, strict=True)):
         at, is_lying = start + i * p.spacing * ahead, i == p.gap_index and side == p.gap_side
         if is_lying:
-            at = at + (p.width + 0.15) * inwards
+            at = at + (p.width + 0.15) * inward
         _add_domino(course, p, name, at, yaw, colour, lying=is_lying)
 
 
@@ -165,10 +165,10 @@ def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
 def look(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return the side whose end domino rests and is the flatter of the two."""
     ends = [end_of(track(frames, slots[side], 60)) for side in SIDES]
-    upright = [end.box[3] / end.box[2] for end in ends if end is not None]
-    if len(upright) < 2 or max(upright) < FLATTER * min(upright):
+    heights = [end.box[3] / end.box[2] for end in ends if end is not None]
+    if len(heights) < 2 or max(heights) < FLATTER * min(heights):
         return None
-    return SIDES[int(np.argmin(upright))]
+    return SIDES[int(np.argmin(heights))]
 
 
 def _is_standing(frames: np.ndarray, colour: str) -> bool | None:

@@ -126,8 +126,8 @@ def _ask_colour(part: str, question: str) -> Aside:
 
     def ask(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
         colours = [p.ball_colour, p.cube_colour]
-        third = next(str(c) for c in rng.permutation(FREE_COLOURS) if c not in colours)
-        return choice_of(question, lambda p: [*colours, third], lambda p: part_colours(p)[part])(p, rng)
+        third_colour = next(str(c) for c in rng.permutation(FREE_COLOURS) if c not in colours)
+        return choice_of(question, lambda p: [*colours, third_colour], lambda p: part_colours(p)[part])(p, rng)
 
     return ask
 

@@ -59,14 +59,14 @@ def build(p: Params, physics: Physics) -> Scene:
     r, half_deck, half_width, high = p.radius_m, p.half_deck_m, 1.7 * p.radius_m, DECK_M + 2 * p.radius_m
     depth_span, deck_span, board_at = (-half_width, half_width), (0, DECK_M), half_deck - 0.10
     for i, name in enumerate(SIDES):
-        outwards = course.towards((-1, 1)[i])
-        board = Surface(_roughness(p), priority=2) if outwards.direction == p.rough_side else FELT
-        outwards.block(f"deck_{name}", (LINE_M, board_at - BOARD_M), depth_span, deck_span, p.deck_colour, FELT)
-        outwards.block(f"board_{name}", (board_at - BOARD_M, board_at), depth_span, deck_span, "wood", board)
-        outwards.block(f"entry_{name}", (board_at, half_deck), depth_span, deck_span, p.deck_colour, FELT)
-        _add_ramp(outwards, p, name, half_width)
+        outward_course = course.towards((-1, 1)[i])
+        board = Surface(_roughness(p), priority=2) if outward_course.direction == p.rough_side else FELT
+        outward_course.block(f"deck_{name}", (LINE_M, board_at - BOARD_M), depth_span, deck_span, p.deck_colour, FELT)
+        outward_course.block(f"board_{name}", (board_at - BOARD_M, board_at), depth_span, deck_span, "wood", board)
+        outward_course.block(f"entry_{name}", (board_at, half_deck), depth_span, deck_span, p.deck_colour, FELT)
+        _add_ramp(outward_course, p, name, half_width)
         at = _ramp_point(p, p.ramp_m - p.starts_m[i], r)
-        LIVELY.on(outwards.ball(f"ball_{name}", at, r, p.colours[i]))
+        LIVELY.on(outward_course.ball(f"ball_{name}", at, r, p.colours[i]))
     course.block("line", (-LINE_M, LINE_M), depth_span, deck_span, "black", FELT)
     course.sides("rim", (-half_deck, half_deck), half_width, WALL_M, (0, DECK_M + 0.2 * r), p.ramp_colour)
 

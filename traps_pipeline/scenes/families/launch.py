@@ -55,8 +55,8 @@ class Params:
     @property
     def way(self) -> list[Point]:
         """Points of the way: a straight slide, then a curve of flat pieces to the lip."""
-        bends = np.linspace(-self.slide_deg, self.kicker_deg, 10)[1:]
-        steps = [(0.035 * np.cos(np.radians(b)), 0.035 * np.sin(np.radians(b))) for b in bends]
+        slopes_deg = np.linspace(-self.slide_deg, self.kicker_deg, 10)[1:]
+        steps = [(0.035 * np.cos(np.radians(b)), 0.035 * np.sin(np.radians(b))) for b in slopes_deg]
         fall_m = self.slide_m * np.tan(np.radians(self.slide_deg))
         points = np.cumsum([(0.0, 0.0), (self.slide_m, -fall_m), *steps], axis=0)
         points[:, 1] += FLOOR_M + 0.015 - points[:, 1].min()

@@ -236,10 +236,10 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     grounds = {colour: _ground(frames[-1], colour) for colour in ZONE_COLOURS}
     colours = sorted({colour for pool in BALL_COLOURS.values() for colour in pool})
     balls = [round_ball(frames[-1], colour) for colour in colours]
-    homes = [_zone_of(ball, grounds) or _zone_below(ball, grounds) for ball in balls if ball is not None]
-    if len(homes) != BALLS or None in homes:
+    zones = [_zone_of(ball, grounds) or _zone_below(ball, grounds) for ball in balls if ball is not None]
+    if len(zones) != BALLS or None in zones:
         return None
-    return str(homes.count(slots["zone"]))
+    return str(zones.count(slots["zone"]))
 
 
 def _zone_below(ball: Blob, grounds: Mapping[str, np.ndarray | None]) -> str | None:

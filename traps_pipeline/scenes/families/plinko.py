@@ -145,15 +145,15 @@ def build(p: Params, physics: Physics) -> Scene:
 def _add_digit(board: Board, digit: int, x: float) -> None:
     """Add a seven-segment digit on the apron, drawn only."""
     half_width, pen = 0.024, 0.007  # half the digit's width, half a stroke
-    low, mid, high = 0.025, 0.07, 0.115
+    low, middle, high = 0.025, 0.07, 0.115
     strokes = {
         "a": (0, high, half_width + pen, pen),
-        "g": (0, mid, half_width + pen, pen),
+        "g": (0, middle, half_width + pen, pen),
         "d": (0, low, half_width + pen, pen),
-        "f": (-half_width, (mid + high) / 2, pen, (high - mid) / 2),
-        "b": (half_width, (mid + high) / 2, pen, (high - mid) / 2),
-        "e": (-half_width, (low + mid) / 2, pen, (mid - low) / 2),
-        "c": (half_width, (low + mid) / 2, pen, (mid - low) / 2),
+        "f": (-half_width, (middle + high) / 2, pen, (high - middle) / 2),
+        "b": (half_width, (middle + high) / 2, pen, (high - middle) / 2),
+        "e": (-half_width, (low + middle) / 2, pen, (middle - low) / 2),
+        "c": (half_width, (low + middle) / 2, pen, (middle - low) / 2),
     }
     for segment in SEGMENTS[digit]:
         right, up, half_x, half_y = strokes[segment]
@@ -222,10 +222,10 @@ def _count_digits(frame: np.ndarray, edge: tuple[np.ndarray, np.ndarray]) -> int
 def _lower_edge(frame: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the lower left and right corner of the white apron."""
     outlines, _ = cv2.findContours((frame.min(axis=2) > 225).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    large = [outline[:, 0] for outline in outlines if cv2.contourArea(outline) > 1500]
-    if not large:
+    large_outlines = [outline[:, 0] for outline in outlines if cv2.contourArea(outline) > 1500]
+    if not large_outlines:
         return None
-    points = np.concatenate(large).astype(float)
+    points = np.concatenate(large_outlines).astype(float)
     return points[np.argmax(points[:, 1] - points[:, 0])], points[np.argmax(points[:, 1] + points[:, 0])]
 
 

@@ -85,14 +85,14 @@ def build(p: Params, physics: Physics) -> Scene:
 
     high, along = p.deck_m + 2 * r + 0.01, (p.mouth_m, end + WALL_M)
     across = (outer[0] - 0.01, outer[1] + 0.5 * high)
-    highest = ramp.at(p.ramp_m)
+    ramp_top = ramp.at(p.ramp_m)
     course.mark("box", "box_floor")
     return course.scene(
         p,
         decisive=["ball"],
         hidden=["board"],
         cover=course.box(along, across, (0, high), right=course.ahead(SHADOW_RIGHT * high)),
-        in_view=[course.box(along, outer, deck), course.box((highest[0], 0), depth_span, (0, highest[2]))],
+        in_view=[course.box(along, outer, deck), course.box((ramp_top[0], 0), depth_span, (0, ramp_top[2]))],
         things=[f"{p.ball_colour} ball", f"{p.box_colour} box", "ramp", "deck"],
         also=["end"],
         shown_by={"end": ["box"]},

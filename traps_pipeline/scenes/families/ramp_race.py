@@ -77,17 +77,17 @@ def build(p: Params, physics: Physics) -> Scene:
     """Build two tracks towards the front, a ramp behind each, and one tray."""
     course = Course(physics)
     r, half_track, track = p.radius_m, 1.5 * p.radius_m, (0, p.track_m)
-    rough = (p.tray_m + p.after_m, p.tray_m + p.after_m + ROUGH_M)
-    foot = rough[1] + p.lead_m
+    rough_span = (p.tray_m + p.after_m, p.tray_m + p.after_m + ROUGH_M)
+    foot = rough_span[1] + p.lead_m
     mat_colour = next(c for c in ("black", "wood", "grey") if c not in p.track_colours)
     half_up, tracks = p.ramp_m / 2, (-p.apart_m / 2, p.apart_m / 2)
     ramps = [Ramp(p.slope_deg, p.track_m, foot, towards_camera=True, middle_m=x) for x in tracks]
     for i, (x, ramp) in enumerate(zip(tracks, ramps, strict=True)):
         across, colour = (x - half_track, x + half_track), p.track_colours[i]
-        course.block(f"track_out_{i}", across, (p.tray_m, rough[0]), track, colour)
+        course.block(f"track_out_{i}", across, (p.tray_m, rough_span[0]), track, colour)
         mat, rolling_friction = (mat_colour, _roughness(p, i, physics)) if i == p.rough_track else (colour, 2e-5)
-        course.block(f"board_{i}", across, rough, track, mat).friction = [4.0, 0.005, rolling_friction]
-        course.block(f"track_in_{i}", across, (rough[1], foot + 0.01), track, colour)
+        course.block(f"board_{i}", across, rough_span, track, mat).friction = [4.0, 0.005, rolling_friction]
+        course.block(f"track_in_{i}", across, (rough_span[1], foot + 0.01), track, colour)
         for k in (-1, 1):
             rail = (x + k * half_track - 0.004, x + k * half_track + 0.004)
             course.block(f"rail_{i}_{k}", rail, (p.tray_m, foot), (0, p.track_m + 0.01), colour)
@@ -111,7 +111,9 @@ def build(p: Params, physics: Physics) -> Scene:
     course.block("tray_side_1", (half_width, outer[1]), tray_depth, rim, p.tray_colour)
     course.block("divider", (-0.006, 0.006), tray_depth, (0, 0.9 * r), p.tray_colour)
 
-    hidden_y = rough[1] + 1.8 * r + 0.03  # the ball that feels the rough board is behind the occluder with its shadow
+    hidden_y = (
+        rough_span[1] + 1.8 * r + 0.03
+    )  # the ball that feels the rough board is behind the occluder with its shadow
     high = p.track_m + 2 * r + 0.015
     _, back, top = ramps[0].at(p.ramp_m)
     flag_x = half_width if p.azimuth_deg < 94 else -half_width  # where no ball rolls behind the flag
@@ -136,8 +138,8 @@ def _roughness(p: Params, track: int, physics: Physics) -> float:
     """
     slope = float(np.radians(p.slope_deg))
     down = 10 / 7 * physics.gravity_m_s2 * (p.starts_m[track] - p.radius_m * np.tan(slope / 2)) * np.sin(slope)
-    entering = ARRIVING * down * (5 / 7 * np.cos(slope) + 2 / 7) ** 2
-    return float(brake(p.radius_m, entering - p.creep_m_s**2, ROUGH_M, physics))
+    entry_speed2 = ARRIVING * down * (5 / 7 * np.cos(slope) + 2 / 7) ** 2
+    return float(brake(p.radius_m, entry_speed2 - p.creep_m_s**2, ROUGH_M, physics))
 
 
 def outcome(motion: Motion, p: Params) -> Reading:

@@ -219,8 +219,8 @@ def build(p: Params, physics: Physics) -> Scene:
 def _add_funnel(board: Board, p: Params, colour: str) -> Callable[[float, float], bool]:
     """Add two slanted bars; return whether a ball passes them by a peg at a place."""
     tip = p.pivot_m + TIP_M
-    feet = [p.bin_m - FUNNEL_IN_M + side * p.middle_m for side in (-1, 1)]
-    for name, side, foot in zip(("funnel_left", "funnel_right"), (-1, 1), feet, strict=True):
+    foot_positions = [p.bin_m - FUNNEL_IN_M + side * p.middle_m for side in (-1, 1)]
+    for name, side, foot in zip(("funnel_left", "funnel_right"), (-1, 1), foot_positions, strict=True):
         a, b = np.array([side * foot, tip]), np.array([side * board.side, tip + STEEP * (board.side - foot)])
         middle, along = (a + b) / 2, b - a
         bar = board.block(name, (-1e-3, 1e-3), (-1e-3, 1e-3), (0, board.deep), colour)
@@ -230,7 +230,7 @@ def _add_funnel(board: Board, p: Params, colour: str) -> Callable[[float, float]
         SLICK.on(bar)
 
     def has_room(across: float, up: float) -> bool:
-        foot = feet[0] if across < 0 else feet[1]
+        foot = foot_positions[0] if across < 0 else foot_positions[1]
         high = tip + STEEP * (board.side - foot) + p.ball_radius_m
         return up > high or foot + (up - tip) / STEEP - abs(across) - p.peg_radius_m > 2.9 * p.ball_radius_m
 

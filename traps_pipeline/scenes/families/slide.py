@@ -106,14 +106,17 @@ def build(p: Params, physics: Physics) -> Scene:
 
     high, along = p.deck_m + 2 * max(p.block_half_m) + 0.01, (p.mouth_m, end + WALL_M)
     across = (outer[0] - 0.01, outer[1] + 0.5 * high)
-    highest = ramp.at(p.incline_m)
+    incline_top = ramp.at(p.incline_m)
     course.mark("tray", "tray_floor")
     return course.scene(
         p,
         decisive=["block"],
         hidden=["board"],
         cover=course.box(along, across, (0, high), right=course.ahead(SHADOW_RIGHT * high)),
-        in_view=[course.box(along, outer, (0, p.deck_m)), course.box((highest[0], 0), depth_span, (0, highest[2]))],
+        in_view=[
+            course.box(along, outer, (0, p.deck_m)),
+            course.box((incline_top[0], 0), depth_span, (0, incline_top[2])),
+        ],
         things=[f"{p.block_colour} block", f"{p.tray_colour} tray", "incline", "deck"],
         also=["end"],
         shown_by={"end": ["deck"]},

@@ -127,8 +127,8 @@ def outcome(motion: Motion, p: Params) -> Reading:
     """Read the pointer's sector, from when it turns no more."""
     tip = -motion.rot("pointer")[:, :2, 1]
     angles = np.degrees(np.arctan2(p.direction * tip[:, 0], -tip[:, 1])) % 360  # from the near side
-    turned = np.abs(np.radians(angles - angles[-1] + 180) % (2 * np.pi) - np.pi)
-    rest_frame = lasting_from(turned <= 0.02)
+    turn_left = np.abs(np.radians(angles - angles[-1] + 180) % (2 * np.pi) - np.pi)
+    rest_frame = lasting_from(turn_left <= 0.02)
     angle_in_sector = (angles[-1] - FIRST_DEG) % p.sector_deg
     margin = np.radians(min(angle_in_sector, p.sector_deg - angle_in_sector)) * POINTER * p.disc_m
     index = np.floor((angles - FIRST_DEG) / p.sector_deg).astype(int)

@@ -79,11 +79,11 @@ def build(p: Params, physics: Physics) -> Scene:
     occluder_at = strip[0] - 2 * r - 0.05
     start = occluder_at - p.run_m + r
 
-    is_strip, rough = p.kind == "strip", Surface(0.03)
+    is_strip, rough_surface = p.kind == "strip", Surface(0.03)
     for name, along, surface, colour in (
         ("ledge_in", (start - 0.06, occluder_at + 2 * r), Surface(1e-4), p.ledge_colour),
         ("felt", (occluder_at + 2 * r, strip[0]), FELT, p.ledge_colour),
-        ("strip", strip, rough if p.barred and is_strip else FELT, "black" if is_strip else p.ledge_colour),
+        ("strip", strip, rough_surface if p.barred and is_strip else FELT, "black" if is_strip else p.ledge_colour),
         ("ledge_out", (strip[1], ledge_end), FELT, p.ledge_colour),
     ):
         course.block(name, along, depth_span, (0, ledge), colour, surface)

@@ -102,9 +102,9 @@ def _add_target(course: Course, p: Params) -> None:
 
     half_block = p.block_m / 2
     at = (p.block_at_m, 0, DECK_M + half_block)
-    lively = (-20000.0, -25.0)
+    solref = (-20000.0, -25.0)
     body = course.free_box(
-        "block", at, (half_block, half_block, half_block), p.block_colour, density=700, sliding=0.1, solref=lively
+        "block", at, (half_block, half_block, half_block), p.block_colour, density=700, sliding=0.1, solref=solref
     )
     geom = body.first_geom()
     geom.priority = 1

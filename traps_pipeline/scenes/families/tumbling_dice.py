@@ -183,8 +183,14 @@ def _first_die(motion: Motion, p: Params) -> tuple[int, int] | None:
     By the look of it, a die may reach the tray when it is past the steps or when it lands.
     """
     along, height = _short_of_tray(motion, p)
-    firsts = [_first_arrival(has_reached, motion.times) for has_reached in (along <= 0, np.maximum(along, height) <= 0)]
-    return firsts[1] if firsts[0] and firsts[1] and firsts[0][0] == firsts[1][0] else None
+    first_arrivals = [
+        _first_arrival(has_reached, motion.times) for has_reached in (along <= 0, np.maximum(along, height) <= 0)
+    ]
+    return (
+        first_arrivals[1]
+        if first_arrivals[0] and first_arrivals[1] and first_arrivals[0][0] == first_arrivals[1][0]
+        else None
+    )
 
 
 def _first_arrival(has_reached: np.ndarray, times: np.ndarray) -> tuple[int, int] | None:
@@ -214,13 +220,13 @@ def outcome(motion: Motion, p: Params) -> Reading:
     if first is None:
         return Reading(undecided(motion), 0.0)
     die, arrival = first
-    top, lean = _lean(motion, die)
+    top, lean_angle = _lean(motion, die)
     steps = np.linalg.norm(np.diff(motion.pos(f"die_{die}"), axis=0, prepend=math.inf), axis=1)
-    is_lying = (lean < FLAT_RAD) & (steps < STILL * 2 * p.half_m) & (np.arange(len(top)) > arrival)
-    lead = np.min(np.delete(np.maximum(*_short_of_tray(motion, p))[arrival], die))
-    rise = 2 * p.half_m * math.sin(max(0.0, math.pi / 4 - lean[-1]))
+    is_lying = (lean_angle < FLAT_RAD) & (steps < STILL * 2 * p.half_m) & (np.arange(len(top)) > arrival)
+    lead_m = np.min(np.delete(np.maximum(*_short_of_tray(motion, p))[arrival], die))
+    rise = 2 * p.half_m * math.sin(max(0.0, math.pi / 4 - lean_angle[-1]))
     labels = [p.faces[die][face] if does_lie else None for face, does_lie in zip(top, is_lying, strict=True)]
-    return Reading(labels, float(min(lead, rise)), _in_order(motion, p, die))
+    return Reading(labels, float(min(lead_m, rise)), _in_order(motion, p, die))
 
 
 def _in_order(motion: Motion, p: Params, die: int) -> tuple[int, int]:
@@ -275,7 +281,7 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
 def _sight(frame: np.ndarray, edge: str) -> _Sight | None:
     """Return the die with edges of a colour, whose outline holds much vivid face."""
     high, low = frame.max(axis=2).astype(int), frame.min(axis=2)
-    vivid = (high - low > 0.68 * high) & (high > 60)
+    is_vivid = (high - low > 0.68 * high) & (high > 60)
     if edge == "white":
         mask = (low > 220) & (high - low < 30)
     else:
@@ -285,7 +291,7 @@ def _sight(frame: np.ndarray, edge: str) -> _Sight | None:
     for region in np.argsort(-sizes)[:5]:
         hull = cv2.convexHull(cv2.findNonZero((names == region).astype(np.uint8)))
         outline = cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), hull, 1) > 0
-        if sizes[region] >= 40 and outline.sum() < 2500 and vivid[outline].mean() > 0.25:
+        if sizes[region] >= 40 and outline.sum() < 2500 and is_vivid[outline].mean() > 0.25:
             y, x = np.nonzero(outline)
             return _Sight(float(x.mean()), float(y.mean()), math.sqrt(len(x)), outline)
     return None
@@ -298,10 +304,10 @@ def _tray_edge(frames: np.ndarray) -> tuple[int, float, float] | None:
     grey = (np.ptp(median_frame, axis=2) < 22) & (shade > 125) & (shade < 185)
     wooden = colour_mask(median_frame, "wood").astype(np.uint8)
     wood = np.nonzero(wooden)[1]
-    solid = cv2.findNonZero(cv2.morphologyEx(wooden, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8)))
-    if solid is None:
+    wood_points = cv2.findNonZero(cv2.morphologyEx(wooden, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8)))
+    if wood_points is None:
         return None
-    hull = cv2.convexHull(solid)
+    hull = cv2.convexHull(wood_points)
     grey &= cv2.fillConvexPoly(np.zeros(grey.shape, np.uint8), hull, 1) > 0  # a floor may be grey as well
     tray = next(iter(blobs(grey, 400)), None)
     if tray is None:

@@ -129,8 +129,8 @@ def _add_ramp(course: Course, p: Params, ramp: Ramp, bore: float) -> None:
 def outcome(motion: Motion, p: Params) -> Reading:
     """Read the side on which the ball is wholly out of the tunnel."""
     across = motion.pos("ball")[:, 0]
-    outside = np.abs(across) - p.radius_m - p.half_width_m
-    return Reading(side_while(outside > 0, across, over="right", under="left"), float(outside[-1]))
+    outside_m = np.abs(across) - p.radius_m - p.half_width_m
+    return Reading(side_while(outside_m > 0, across, over="right", under="left"), float(outside_m[-1]))
 
 
 def observe(frames: np.ndarray, slots: Mapping[str, str], ahead: float | None = None) -> str | None:

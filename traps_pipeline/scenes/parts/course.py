@@ -359,8 +359,8 @@ class Course:
         ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
         across = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
         points = np.concatenate([box.corners() for box in (*in_view, cover)])
-        upright = np.array([0.0, 0.0, np.cos(down)]) + ahead * np.sin(down)
-        scale = max(np.ptp(_project(points, across)), np.ptp(_project(points, upright)) * 4 / 3)
+        up_vector = np.array([0.0, 0.0, np.cos(down)]) + ahead * np.sin(down)
+        scale = max(np.ptp(_project(points, across)), np.ptp(_project(points, up_vector)) * 4 / 3)
         width, height = FLAG * scale, FLAG_SHAPE * FLAG * scale / float(np.cos(down))
         corners, flags, boxes = cover.corners(), [], []
         for phrase, (foot, colour) in sorted(self._marks.items(), key=lambda mark: float(_project(mark[1][0], across))):

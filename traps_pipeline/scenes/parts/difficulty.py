@@ -73,12 +73,12 @@ def unsupported_settings(family: Family, difficulty: Difficulty) -> list[str]:
 
     Distractors move, and the board that closes a chaotic control must hide all that moves.
     """
-    takes = {
+    is_supported = {
         "distractors": family.taxonomy == "occlusion" and family.category not in EXTENSION_CATEGORIES,
         "speed": difficulty.speed <= MAX_SPEEDS.get(family.name, 1.0),
         "longer": vary.can_be_longer(family.params),
     }
-    return [name for name in difficulty.settings() if not takes[name]]
+    return [name for name in difficulty.settings() if not is_supported[name]]
 
 
 _PLAUSIBLE = ConfigDict(extra="forbid", allow_inf_nan=False)
@@ -141,8 +141,8 @@ def draw_distractors(
     texts = (wording.question, wording.answerable_question.question)
     words = {*re.findall(r"\w+", " ".join((*texts, *wording.answerable_question.labels, *wording.labels)).lower())}
     question_words = re.findall(r"\w+", wording.question)
-    coloured = dict.fromkeys((*question_words, *scene.inventory.colours))
-    named_colours: list[Colour] = [BALL_COLOURS[word] for word in coloured if word in BALL_COLOURS]
+    colour_words = dict.fromkeys((*question_words, *scene.inventory.colours))
+    named_colours: list[Colour] = [BALL_COLOURS[word] for word in colour_words if word in BALL_COLOURS]
     taken_colours = words | {*scene.inventory.colours}
     things = list[Distractor]()
     for number, lane in enumerate(rng.permutation(count)):

@@ -59,12 +59,18 @@ def scene_family(
         if frames.shape[1:3] != (HEIGHT, WIDTH):  # what an observer takes for large is so at this size
             frames = np.stack([cv2.resize(frame, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA) for frame in frames])
         visible = before_occluder(frames)  # what an occluder covers at the end was seen before it came
-        unflagged = visible if twins is None else without_flags(visible)
+        frames_without_flags = visible if twins is None else without_flags(visible)
         if foresee is not None and len(visible) < len(frames):
-            rests = is_still(visible) or is_still(visible[:-1])  # the shadow of an occluder may come before it does
-            return _first_answer(unflagged, slots, (observe, foresee) if rests else (foresee, observe))
-        answer = observe(unflagged, slots)
-        if answer is None and look is not None and len(end := after_occluder(unflagged)) < len(unflagged):
+            is_at_rest = is_still(visible) or is_still(
+                visible[:-1]
+            )  # the shadow of an occluder may come before it does
+            return _first_answer(frames_without_flags, slots, (observe, foresee) if is_at_rest else (foresee, observe))
+        answer = observe(frames_without_flags, slots)
+        if (
+            answer is None
+            and look is not None
+            and len(end := after_occluder(frames_without_flags)) < len(frames_without_flags)
+        ):
             return look(end, slots)
         return answer
 

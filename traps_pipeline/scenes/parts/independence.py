@@ -71,12 +71,12 @@ def _rows(scenes: list[dict[str, Any]]) -> dict[str, np.ndarray]:
     columns = {}
     for name in sorted(set().union(*scenes)):
         values = [scene.get(name) for scene in scenes]
-        distinct = sorted(set(values), key=repr)
-        if len(distinct) > 8 and not any(isinstance(value, str) for value in distinct):
+        distinct_values = sorted(set(values), key=repr)
+        if len(distinct_values) > 8 and not any(isinstance(value, str) for value in distinct_values):
             numbers = np.array([np.nan if value is None else value for value in values], float)
             rows = np.searchsorted(np.nanquantile(numbers, [0.25, 0.5, 0.75]), numbers)
         else:
-            rows = np.array([distinct.index(value) for value in values])
+            rows = np.array([distinct_values.index(value) for value in values])
         if rows.any():
             columns[name] = rows
     return columns

@@ -99,9 +99,9 @@ def draw_look(rng: np.random.Generator, parts: Collection[str]) -> Look | None:
     if floor is not None:
         fields_drawn |= dict(zip(_FLOOR_FIELDS, floor.draw(rng, {}, len(_FLOOR_FIELDS)), strict=True))
     if "light" in parts:
-        bright, warm = uniform(rng, 0.8, 1.1), uniform(rng, -0.06, 0.06)
+        brightness, warmth = uniform(rng, 0.8, 1.1), uniform(rng, -0.06, 0.06)
         fields_drawn["light_turn_deg"] = uniform(rng, -15, 15)
-        fields_drawn["light"] = tuple(round(bright * (1 + tint), 3) for tint in (warm, 0.0, -warm))
+        fields_drawn["light"] = tuple(round(brightness * (1 + tint), 3) for tint in (warmth, 0.0, -warmth))
     if "panel" in parts:
         fields_drawn["panel"] = str(rng.choice(list(OCCLUDERS)))
     if "bystanders" in parts:

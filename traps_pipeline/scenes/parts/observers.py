@@ -258,12 +258,12 @@ def will_clear(thing: str, mark: str) -> Observer:
         if wall is None or start is None or now is None or later_blob is None:
             return None
         side = 1.0 if wall.x > start.x else -1.0
-        lead, speed = side * (now.x - wall.x), side * (later_blob.x - now.x)
-        if lead > 0:
+        lead_px, speed = side * (now.x - wall.x), side * (later_blob.x - now.x)
+        if lead_px > 0:
             return "yes"
-        if speed <= 0 or lead + FLIGHT * speed < 0:
+        if speed <= 0 or lead_px + FLIGHT * speed < 0:
             return "no"  # it comes back, or does not get there
-        height = now.y - lead / speed * (later_blob.y - now.y)
+        height = now.y - lead_px / speed * (later_blob.y - now.y)
         return "yes" if height < wall.box[1] else "no"
 
     return foresee

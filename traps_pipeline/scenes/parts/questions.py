@@ -171,8 +171,8 @@ def colour_from(part: str, question: str, pool: Sequence[str], unlike: Sequence[
 
     def ask(p: Any, rng: np.random.Generator) -> AnswerableQuestion:
         colours = part_colours(p)
-        excluded = [colours[name] for name in unlike]
-        other_colours = [str(c) for c in rng.permutation([c for c in pool if c not in excluded])[:2]]
+        excluded_colours = [colours[name] for name in unlike]
+        other_colours = [str(c) for c in rng.permutation([c for c in pool if c not in excluded_colours])[:2]]
         return choice_of(question, lambda p: [colours[part], *other_colours], lambda p: colours[part])(p, rng)
 
     return ask

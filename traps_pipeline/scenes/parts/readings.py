@@ -20,8 +20,8 @@ Labels = list[str | None]
 
 def lasting_from(holds: np.ndarray) -> int:
     """Return the first frame from which `holds` (F,) stays true; F if none."""
-    broken = np.flatnonzero(~holds)
-    return int(broken[-1]) + 1 if broken.size else 0
+    false_frames = np.flatnonzero(~holds)
+    return int(false_frames[-1]) + 1 if false_frames.size else 0
 
 
 def still_from(*paths: np.ndarray, within_m: float) -> int:
@@ -32,8 +32,8 @@ def still_from(*paths: np.ndarray, within_m: float) -> int:
     distances = [
         np.abs(path - path[-1]) if path.ndim == 1 else np.linalg.norm(path - path[-1], axis=-1) for path in paths
     ]
-    restless = [(move > within_m).reshape(len(move), -1).any(axis=1) for move in distances]
-    return lasting_from(~np.any(restless, axis=0))
+    is_moving = [(move > within_m).reshape(len(move), -1).any(axis=1) for move in distances]
+    return lasting_from(~np.any(is_moving, axis=0))
 
 
 def clear_m(past: np.ndarray, before_m: float = 0.0) -> float:

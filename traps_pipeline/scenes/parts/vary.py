@@ -183,9 +183,9 @@ def with_field(params: type, name: str, kind: Any) -> type:
     new_field = field(
         default=None, metadata={READER_KEY: lambda value: None if value is None else kind.from_record(value)}
     )
-    extended = make_dataclass(params.__name__, [(name, kind | None, new_field)], bases=(params,), frozen=True)
-    extended.__module__, extended.__doc__ = params.__module__, params.__doc__
-    return extended
+    new_class = make_dataclass(params.__name__, [(name, kind | None, new_field)], bases=(params,), frozen=True)
+    new_class.__module__, new_class.__doc__ = params.__module__, params.__doc__
+    return new_class
 
 
 # --- values from a file -----------------------------------------------------------------------------------------------

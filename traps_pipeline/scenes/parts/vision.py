@@ -100,9 +100,9 @@ def largest_board(frame: np.ndarray, min_area: int = 12) -> Blob | None:
     pixels, mask = frame.astype(np.float32) / 255, np.zeros(frame.shape[:2], bool)
     for rgb in OCCLUDERS.values():
         colour = np.array(rgb, np.float32)
-        bright = pixels @ colour / (colour @ colour)
-        colour_error = np.linalg.norm(pixels - bright[..., None] * colour, axis=2) / np.linalg.norm(colour)
-        mask |= (bright > 0.5) & (bright < 1.1) & (colour_error < 0.06 * bright)
+        brightness = pixels @ colour / (colour @ colour)
+        colour_error = np.linalg.norm(pixels - brightness[..., None] * colour, axis=2) / np.linalg.norm(colour)
+        mask |= (brightness > 0.5) & (brightness < 1.1) & (colour_error < 0.06 * brightness)
     lines = np.ones((9, 9), np.uint8)  # are no wider
     return next(iter(blobs(cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, lines), min_area)), None)
 
@@ -145,12 +145,14 @@ def before_occluder(frames: np.ndarray) -> np.ndarray:
         previous_colour, colour = (
             np.median(frame[region], axis=0).astype(np.uint8) for frame in (frames[at - 1], frames[at])
         )
-        even, ring_share = ((_levels(frames[at][part], colour) <= SAME_COLOUR_LEVELS).mean() for part in (region, ring))
+        region_share, ring_share = (
+            (_levels(frames[at][part], colour) <= SAME_COLOUR_LEVELS).mean() for part in (region, ring)
+        )
         was_even = (_levels(frames[at - 1][region], previous_colour) <= SAME_COLOUR_LEVELS).mean()
         stands_out = ring_share < 0.4 or (
-            ring_share < 0.75 and was_even < even
+            ring_share < 0.75 and was_even < region_share
         )  # some of what is around it may be as dark
-        if sizes.max() >= STEP_PX and even > 0.5 and stands_out and _is_standing_later(frames, at, colour):
+        if sizes.max() >= STEP_PX and region_share > 0.5 and stands_out and _is_standing_later(frames, at, colour):
             return frames[: _first_moving_frame(frames, at, colour)]
     return frames
 
@@ -158,10 +160,10 @@ def before_occluder(frames: np.ndarray) -> np.ndarray:
 def _is_standing_later(frames: np.ndarray, comes: int, colour: np.ndarray) -> bool:
     """Return whether a region that turned to a colour has it soon and at the end."""
     earlier_frame, later_frame = max(0, comes - 1 - COMES_FRAMES), min(comes + COMES_FRAMES, len(frames) - 1)
-    level_before, was, soon_after, level_at_end = (
+    level_before, level_early, soon_after, level_at_end = (
         _levels(frames[at], colour) <= SAME_COLOUR_LEVELS for at in (comes - 1, earlier_frame, later_frame, -1)
     )
-    new_region = level_at_end & ~level_before & ~was
+    new_region = level_at_end & ~level_before & ~level_early
     filled_mask = cv2.morphologyEx(
         new_region.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8)
     )  # lines between slats
@@ -215,15 +217,17 @@ def without_flags(frames: np.ndarray) -> np.ndarray:
             patch = _flag_patch(background, seed)
             if patch is None or patch[0] > left + width + 3:
                 continue
-            x, y, wide, height = patch
-            box = np.s_[y : y + height, x : x + wide]
+            x, y, flag_width, height = patch
+            box = np.s_[y : y + height, x : x + flag_width]
             changes = np.abs(np.stack([frames[0][box], frames[-1][box]]).astype(int) - background[box])
             rest_share = (changes[1] > 40).any(axis=-1).mean()  # a thing that lies before the patch is smaller than it
             if min(abs(y - top), abs(y + height - top)) > 6 or changes.mean() > 12 or rest_share > 0.03:
                 continue  # neither flies at the end of the mast, or it moves
             row_above = max(0, min(top, y) - 4)
             colour_beside = painted_frames[:, row_above, max(0, left - 4)]
-            painted_frames[:, row_above + 2 : y + height + 3, left - 1 : x + wide + 3] = colour_beside[:, None, None]
+            painted_frames[:, row_above + 2 : y + height + 3, left - 1 : x + flag_width + 3] = colour_beside[
+                :, None, None
+            ]
             break
     return painted_frames
 
@@ -235,10 +239,12 @@ def _flag_patch(background: np.ndarray, seed: tuple[int, int]) -> tuple[int, int
         return None
     region = np.zeros((height + 2, width + 2), np.uint8)
     flags = 4 | cv2.FLOODFILL_MASK_ONLY | cv2.FLOODFILL_FIXED_RANGE | (1 << 8)
-    _, _, _, (x, y, wide, high) = cv2.floodFill(background.copy(), region, seed, (0, 0, 0), (22,) * 3, (22,) * 3, flags)
-    filled_share = region[1:-1, 1:-1][y : y + high, x : x + wide].mean()
-    is_flag = 8 <= wide <= FLAG_PX[0] and 6 <= high <= FLAG_PX[1] and filled_share > 0.6
-    return (x, y, wide, high) if is_flag else None
+    _, _, _, (x, y, patch_width, patch_height) = cv2.floodFill(
+        background.copy(), region, seed, (0, 0, 0), (22,) * 3, (22,) * 3, flags
+    )
+    filled_share = region[1:-1, 1:-1][y : y + patch_height, x : x + patch_width].mean()
+    is_flag = 8 <= patch_width <= FLAG_PX[0] and 6 <= patch_height <= FLAG_PX[1] and filled_share > 0.6
+    return (x, y, patch_width, patch_height) if is_flag else None
 
 
 def _mast_tops(background: np.ndarray) -> list[tuple[int, int, int]]:

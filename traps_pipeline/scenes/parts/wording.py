@@ -212,8 +212,8 @@ def is_far(colour: str, present: Sequence[str]) -> bool:
 def colour_distance(colour: str, neighbour: str) -> float:
     """Return the least CIELAB (D65) distance of two colours, in shade and light too."""
     srgb_of = {**COLOURS, **_ELSEWHERE}
-    lit = (tuple(min(1.0, light * part) for part in srgb_of[neighbour]) for light in LIGHTS)
-    return min(float(np.linalg.norm(_lab(srgb_of[colour]) - _lab(shade))) for shade in lit)
+    lit_colours = (tuple(min(1.0, light * part) for part in srgb_of[neighbour]) for light in LIGHTS)
+    return min(float(np.linalg.norm(_lab(srgb_of[colour]) - _lab(shade))) for shade in lit_colours)
 
 
 def _lab(srgb: Sequence[float]) -> np.ndarray:

@@ -252,8 +252,8 @@ class Family:
     def params_from(self, values: Mapping[str, Any]) -> Any:
         """Return parameters from a stored mapping. Raises ValueError naming a wrong one."""
         field_of = {f.name: f for f in fields(self.params)}
-        required = {name for name, f in field_of.items() if f.default is MISSING}
-        unknown, missing = sorted(set(values) - set(field_of)), sorted(required - set(values))
+        required_names = {name for name, f in field_of.items() if f.default is MISSING}
+        unknown, missing = sorted(set(values) - set(field_of)), sorted(required_names - set(values))
         if unknown or missing:
             raise ValueError(
                 f"family {self.name}: unknown parameters {unknown}, missing parameters {missing}; "

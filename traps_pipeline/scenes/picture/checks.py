@@ -35,8 +35,8 @@ class PastOccluder:
 
     def hidden_from(self) -> int:
         """Return the first frame from which no decisive pixel is seen; F if none."""
-        showing = np.flatnonzero(self.decisive)
-        return int(showing[-1]) + 1 if showing.size else 0
+        visible_frames = np.flatnonzero(self.decisive)
+        return int(visible_frames[-1]) + 1 if visible_frames.size else 0
 
     def leaked(self, first: int) -> float:
         """Return decisive pixels from a frame on, and all of the hidden element."""
@@ -87,8 +87,8 @@ def closing_frames(
     board: offset of the board in each row; once it stands it is drawn in place of the void's own.
     """
     for row, offset in zip(qpos, board, strict=True):
-        stands = offset == LANDED
-        yield from renderer.frames([row], occluder=occluder or stands, board=None if stands else offset)
+        is_standing = offset == LANDED
+        yield from renderer.frames([row], occluder=occluder or is_standing, board=None if is_standing else offset)
 
 
 def ablation_pixels(
@@ -104,10 +104,10 @@ def ablation_pixels(
 
 def differing_pixels(frames: Iterable[np.ndarray], counterparts: Iterable[np.ndarray]) -> tuple[int, int]:
     """Return how many pixels of two videos differ, and the largest difference (0-255)."""
-    pixels, largest = 0, 0
+    pixels, largest_difference = 0, 0
     for a, b in zip(frames, counterparts, strict=True):
         if not np.array_equal(a, b):
             difference = np.abs(a.astype(np.int16) - b)
             pixels += int(difference.any(axis=2).sum())
-            largest = max(largest, int(difference.max()))
-    return pixels, largest
+            largest_difference = max(largest_difference, int(difference.max()))
+    return pixels, largest_difference

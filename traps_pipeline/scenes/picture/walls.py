@@ -31,12 +31,12 @@ def outlines(model: mujoco.MjModel, camera: Camera, qpos: np.ndarray) -> Mapping
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_kinematics(model, data)
-    solid = (model.geom_contype | model.geom_conaffinity) != 0
+    is_solid = (model.geom_contype | model.geom_conaffinity) != 0
     static = model.body_weldid[model.geom_bodyid] == 0
     visible = model.geom_rgba[:, 3] > 0
-    edges = np.flatnonzero(static & visible & ~solid)
+    edges = np.flatnonzero(static & visible & ~is_solid)
     names: dict[str, tuple[str, ...]] = {}
-    for wall in np.flatnonzero(solid & ~visible):
+    for wall in np.flatnonzero(is_solid & ~visible):
         if _is_facing_eye(model, data, camera, int(wall)):
             continue
         nearby_edges = [

@@ -258,7 +258,7 @@ def _count_agreeing(scenario: Scenario, frame: int) -> int | None:
     state = np.empty(mujoco.mj_stateSize(model, kind))
     mujoco.mj_getState(model, data, state, kind)
     rng = np.random.default_rng([spec.seed, frame, FUTURES])
-    trajectory, disagree = np.array(control.qpos, float), 0
+    trajectory, n_disagreeing = np.array(control.qpos, float), 0
     for _ in range(FUTURES):
         mujoco.mj_setState(model, data, state, kind)
         mujoco.mj_integratePos(model, data.qpos, rng.normal(scale=control.family.perturbation, size=model.nv), 1.0)
@@ -266,10 +266,10 @@ def _count_agreeing(scenario: Scenario, frame: int) -> int | None:
             mujoco.mj_step(model, data, substeps)
             row[:] = data.qpos
         labels = control.family.outcome(replay(model, trajectory, control.physics), control.params).labels
-        disagree += labels[-1] != spec.ground_truth
-        if disagree > (1 - AGREE_SHARE) * FUTURES:
+        n_disagreeing += labels[-1] != spec.ground_truth
+        if n_disagreeing > (1 - AGREE_SHARE) * FUTURES:
             return None
-    return FUTURES - disagree
+    return FUTURES - n_disagreeing
 
 
 # --- the other world, other words -------------------------------------------------------------------------------------

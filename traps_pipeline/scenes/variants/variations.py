@@ -174,15 +174,15 @@ def _sheer(alpha: float) -> Callable[[Scenario], Take]:
         with _renderer(scenario.twin, look) as renderer:
             twin_frames = list(checks.void_frames(renderer, scenario.twin.qpos))
         gaps = [np.abs(frames[k].astype(np.int16) - twin_frames[k]).max(axis=2) for k in last]
-        noticed, levels = (
+        n_noticed, levels = (
             max(int((gap >= SEEN_LEVELS).sum()) for gap in gaps),
             max(int(gap.max()) for gap in gaps),
         )
-        evidence = {"alpha": alpha, "seen_through_px": noticed, "levels": levels}
-        if noticed < SEEN_PX:
+        evidence = {"alpha": alpha, "seen_through_px": n_noticed, "levels": levels}
+        if n_noticed < SEEN_PX:
             raise Rejected(
                 f"through an occluder of alpha {alpha:g} the two worlds differ by {SEEN_LEVELS} levels or more in "
-                f"{noticed} pixels of a late frame ({levels} levels at most), {SEEN_PX:.0f} are wanted"
+                f"{n_noticed} pixels of a late frame ({levels} levels at most), {SEEN_PX:.0f} are wanted"
             )
         return Take(frames, evidence)
 
@@ -196,18 +196,20 @@ def _later(scenario: Scenario) -> Take:
     """Return no clip, if the frames after those shown at the end show the outcome too."""
     control = scenario.control
     end_frames = shown_at_end(len(control.qpos), scenario.fps, END_S, control.open_frames - 1)
-    late = [frame + 1 for frame in end_frames]
-    if late[0] < control.outcome.commit_frame:
-        raise Rejected(f"the outcome is settled at frame {control.outcome.commit_frame}, frame {late[0]} is shown")
+    late_frames = [frame + 1 for frame in end_frames]
+    if late_frames[0] < control.outcome.commit_frame:
+        raise Rejected(
+            f"the outcome is settled at frame {control.outcome.commit_frame}, frame {late_frames[0]} is shown"
+        )
     groups = legible_groups(control.family, control.model, control.scene, control.motion, control.params)
     with control.renderer() as renderer:
-        min_pixels = checks.least_visible(renderer, control.qpos[late], groups)
+        min_pixels = checks.least_visible(renderer, control.qpos[late_frames], groups)
     too_small = [
         f"{px:.0f} of {needed:.0f} pixels" for px, (_, needed) in zip(min_pixels, groups, strict=True) if px < needed
     ]
     if too_small:
         raise Rejected(f"the frames that are shown later show {', '.join(too_small)} of the outcome")
-    return Take([], {"late_frames": late, "least_visible_px": min(min_pixels)})
+    return Take([], {"late_frames": late_frames, "least_visible_px": min(min_pixels)})
 
 
 # --- all of them ------------------------------------------------------------------------------------------------------

@@ -88,8 +88,8 @@ def _render_scene(job: Job, family: Family, physics: Physics, missing: Sequence[
             opening_frames = checks.closing_frames(renderer, job.qpos[:open_to], board[:open_to], occluder=True)
             void = [*opening_frames, *closed_frames]
             still_frames = [frame for frame, offset in enumerate(board) if offset in (None, LANDED)]
-            leaked = _leaked_pixels(renderer, scene, decisive, job, void, still_frames)
-            n_frames += save_clip(job.void, void, physics.fps, leaked)
+            leaked_pixels = _leaked_pixels(renderer, scene, decisive, job, void, still_frames)
+            n_frames += save_clip(job.void, void, physics.fps, leaked_pixels)
         elif job.void in missing:
             save_clip(job.void, control[: spec.void["cut_frame"]], physics.fps)
         if job.twin in missing and spec.twin.params is None:

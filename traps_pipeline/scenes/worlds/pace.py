@@ -111,9 +111,9 @@ def shortened(world: World, n_frames: int) -> World:
     """Return the world's first frames, as a clip of its own."""
     if n_frames == len(world.qpos):
         return world
-    simulated = None if world.simulated is None else world.simulated[:n_frames]
+    simulated_qpos = None if world.simulated is None else world.simulated[:n_frames]
     physics = with_length(world.physics, n_frames)
-    return replace(world, physics=physics, qpos=world.qpos[:n_frames], simulated=simulated)
+    return replace(world, physics=physics, qpos=world.qpos[:n_frames], simulated=simulated_qpos)
 
 
 def with_length(physics: Physics, n_frames: int) -> Physics:
