@@ -153,7 +153,7 @@ def protocol(
     seed = mechanism.seed if mechanism else 0
     run = ProbeRun(items, read, 1, 0, settings, seed, fit=fit)
     columns = ["analysis", "source", "target", "value", "low", "high", "n_voids", "n_controls"]
-    return pd.DataFrame(run.comparable(0), columns=pd.Index(columns))
+    return pd.DataFrame(run.comparable_rows(0), columns=pd.Index(columns))
 
 
 # --- interventions ----------------------------------------------------------------------------------------------------

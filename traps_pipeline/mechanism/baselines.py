@@ -84,7 +84,7 @@ def score_features(run: ProbeRun, features: Features, fit: Fit = fit_probe) -> l
     Those of nearest centroids are included. fit: another probe than the protocol's.
     """
     on = replace(run, read=lambda dataset, _: features[dataset], fit=fit)
-    return on.comparable(0) + on.centroids(0)
+    return on.comparable_rows(0) + on.centroids(0)
 
 
 # --- features ---------------------------------------------------------------------------------------------------------

@@ -280,8 +280,8 @@ def groups_of(target: Side, source: Side) -> dict[str, np.ndarray] | None:
 def best_cells(estimates: Sequence[Row], settings: PatchingSettings, n_layers: int) -> list[Cell]:
     """Return each direction's cells with the largest estimates over all pairs.
 
-    Only every so many layers count. All positions of the residual stream together are left out; their effect is 1 by
-    construction.
+    Only some layers count, at equal steps. All positions of the residual stream together are left out; their effect is
+    1 by construction.
     """
     layers = {*range(0, n_layers + 1, settings.stride), n_layers}
     sums = defaultdict[Cell, float](float)

@@ -145,10 +145,10 @@ class ProbeRun:
     def layer_rows(self, layer: int) -> list[Row]:
         """Return every row of one layer, whose states are in memory only during this call."""
         splits = {name: self._split(name, layer) for name in self._datasets}
-        rows = self.comparable(layer, splits) + self.within(layer, splits)
+        rows = self.comparable_rows(layer, splits) + self.within(layer, splits)
         return rows + (self.centroids(layer, splits) if layer == self.centroid_layer else [])
 
-    def comparable(self, layer: int, splits: Mapping[str, Split] | None = None) -> list[Row]:
+    def comparable_rows(self, layer: int, splits: Mapping[str, Split] | None = None) -> list[Row]:
         """Return one layer's rows that baselines share, from transfer to swapped times."""
         splits = splits or {name: self._split(name, layer) for name in self._datasets}
         unseen_scores = {source: self._unseen_scores(source, splits) for source in self._own}

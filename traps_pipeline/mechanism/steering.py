@@ -252,14 +252,14 @@ def steered_request(
         params=loaded_params(entry) | {"do_sample": False, "max_new_tokens": max_new_tokens, "steering": steering},
         system=system_prompt(cell.evaluation.regime),
         user=item["question"],
-        about={"item_id": shared_item(item), "model": entry.id, "regime": cell.evaluation.regime},
+        about={"item_id": ledger_item_id(item), "model": entry.id, "regime": cell.evaluation.regime},
         media=clip,
         sent=media,
         media_digest=media.sha256,
     )
 
 
-def shared_item(item: Mapping[str, Any]) -> str:
+def ledger_item_id(item: Mapping[str, Any]) -> str:
     """Return an item's ledger id; a taxonomy's datasets share the ids of controls."""
     dataset = taxonomy_of(item["dataset"]) if item["side"] == "control" else item["dataset"]
     return f"{dataset}:{item['scenario_id']}:{item['side']}"
@@ -360,7 +360,7 @@ def wanted_steering_ballots(workspace: Workspace, panel: Sequence[JudgeEntry], c
     """Return the calls for every vote on the steered answers of a cell."""
     ballots = []
     for answer, item in judged_answers(workspace, STEERING, cell):
-        control_item = item | {"item_id": shared_item(answer)}
+        control_item = item | {"item_id": ledger_item_id(answer)}
         answer_row = item | answer
         for task in tasks_for(answer["side"]):
             for request in vote_requests(panel, task, cell, control_item, answer["text"]):

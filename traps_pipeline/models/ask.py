@@ -254,7 +254,7 @@ async def settle(
 ) -> AsyncIterator[SettledCell[AnyCell, AnyCall] | Exception]:
     """Settle all cells, models in parallel; a failing model yields its exception."""
     results: asyncio.Queue[SettledCell[AnyCell, AnyCall] | Exception | None] = asyncio.Queue()
-    turn = asyncio.Semaphore(1)  # a cell waits here with its rows until the one before it is written
+    write_turn = asyncio.Semaphore(1)  # a cell waits here with its rows until the one before it is written
 
     async def one_model(evaluations: Sequence[tuple[Evaluation, list[AnyCell]]]) -> None:
         try:
@@ -262,7 +262,7 @@ async def settle(
                 if stop.is_set():
                     return
                 async for settled_cell in settle_evaluation(work, evaluation, evaluation_cells, stop):
-                    await turn.acquire()
+                    await write_turn.acquire()
                     results.put_nowait(settled_cell)
                     del settled_cell
         except LockGivenUp:
@@ -287,7 +287,7 @@ async def settle(
             else:
                 yield settled_cell
                 if isinstance(settled_cell, SettledCell):
-                    turn.release()
+                    write_turn.release()
     finally:
         for task in tasks:
             task.cancel()

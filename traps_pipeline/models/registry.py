@@ -356,7 +356,7 @@ def effective_params(entry: ModelEntry, regime: str, dataset: str = "") -> dict[
 
 
 def answering_version(evaluation: Evaluation) -> str:
-    """Return the version of what decides a model's answers besides the prompt."""
+    """Return the digest of a model's settings that decide its answers, prompt aside."""
     entry = get_model(evaluation.model)
     parts: list[Any] = [effective_params(entry, evaluation.regime)]
     parts += [profile_digest(entry.media)] if entry.media else []

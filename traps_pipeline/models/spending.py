@@ -1,4 +1,4 @@
-"""Yield the budget of a run: what its study and accounts leave to spend."""
+"""Yield the budget of a run: the remaining money of its study and accounts."""
 
 from __future__ import annotations
 

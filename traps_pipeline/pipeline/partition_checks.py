@@ -130,7 +130,7 @@ def raise_for_run(context: dg.AssetExecutionContext, graph: Graph, last: str) ->
 def evaluations(
     history: History, stage: str, key: str | None, found: Mapping[str, Mapping[str, Any]]
 ) -> Iterator[dg.AssetCheckEvaluation]:
-    """Yield the evaluation of each check of a partition by what it found wrong."""
+    """Yield the evaluation of each check of a partition, from the checks' failures."""
     target = history.check_target(stage, key)
     for check, failure in found.items():
         yield dg.AssetCheckEvaluation(

@@ -1,4 +1,4 @@
-"""Materialize what is missing or stale, one Dagster run per block of stages."""
+"""Materialize missing or stale partitions, one Dagster run per block of stages."""
 
 from __future__ import annotations
 

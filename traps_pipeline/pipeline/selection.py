@@ -1,4 +1,4 @@
-"""Decide what a run must materialize, if anything, from tables' footers alone.
+"""Select the partitions that a run must materialize, from tables' footers alone.
 
 Nothing here imports Dagster or opens its history, so `traps run` with nothing to do ends before either.
 """

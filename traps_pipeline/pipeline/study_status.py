@@ -35,7 +35,7 @@ class StageStatus:
 
 
 def stage_statuses(workspace: Workspace, lineage: Lineage, experiment: str | None) -> Iterator[StageStatus]:
-    """Yield each stage's status over what the study, or one experiment, wants."""
+    """Yield each stage's status over the partitions that a study or experiment wants."""
     partitions = StudyPartitions(workspace, experiment)
     for stage in lineage.graph.stages:
         statuses = {key or stage.name: lineage.status(stage.name, key) for key in stage.wanted(partitions)}

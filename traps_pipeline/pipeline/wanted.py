@@ -1,4 +1,4 @@
-"""Compute the wanted partitions: what a study's experiments ask of its scenarios.
+"""Compute the wanted partitions, which a study's experiments ask of its scenarios.
 
 Partition keys, `traps run`, `traps status`, Dagster's buttons and its automation all use this module, so nothing asks a
 model that no experiment of the study names.

@@ -100,7 +100,7 @@ class SteeringSettings(BaseModel):
 
 
 class GateSettings(BaseModel):
-    """Probe-gated abstention (docs/mechanism.md)."""
+    """The settings of probe-gated abstention (docs/mechanism.md)."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     false_abs: float = Field(default=0.05, gt=0, lt=1, description="of source controls, that conformal gates promise")
@@ -110,7 +110,7 @@ class GateSettings(BaseModel):
 
 
 class PatchingSettings(BaseModel):
-    """Activation patching between matched controls and voids (docs/mechanism.md)."""
+    """The settings of activation patching between controls and voids."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     pairs: int = Field(default=50, ge=1, description="pairs of each well-posed dataset, the first of a seeded order")

@@ -1,4 +1,4 @@
-"""Name what a block reads besides the residual stream and its own cache.
+"""Name inputs of a block besides the residual stream and its own cache.
 
 Gemma 4 has two such paths, both of them arguments of its blocks. Its upper blocks compute no keys and values: each
 reads those of the last lower block with its kind of attention (`shared_kv_states`, a mapping by kind). And every block

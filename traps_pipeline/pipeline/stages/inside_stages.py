@@ -12,7 +12,7 @@ from traps_pipeline.pipeline.schemes import CELL, EXTRACTION, by_extraction, the
 from traps_pipeline.pipeline.stage import of, source, stage
 from traps_pipeline.pipeline.stages.evaluation_stages import responses, verdicts
 from traps_pipeline.pipeline.stages.mechanism_stages import (
-    ANSWERED,
+    ANSWERED_CELLS,
     GROUP,
     hidden_states,
     probe_items,
@@ -71,7 +71,7 @@ def _model_and_states(workspace: Workspace, key: str) -> "tuple[ModelEntry, Stor
 @_stage(
     tables.PROBE_BASELINES,  # on this machine, since the output margin needs the model's head
     code="2",
-    parents=[_STATES, of(probe_items, EVERY), of(verdicts, ANSWERED, need="none"), probing_settings],
+    parents=[_STATES, of(probe_items, EVERY), of(verdicts, ANSWERED_CELLS, need="none"), probing_settings],
     kinds=["parquet", "scikitlearn"],
     wants=lambda study, key: Extraction.parse(key).prompt in study.probed_prompts,
 )

@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 GROUP = "mechanism"
 _stage, _source = partial(stage, group=GROUP), partial(source, group=GROUP, kinds=["yaml"])
 # Cells of the local models' answers under Standard in run 1: their verdicts tell confabulated voids.
-ANSWERED = these_keys(CELL, [Cell(d, Evaluation(m, "standard", 1)).key for d in DATASETS for m in local_models()])
+ANSWERED_CELLS = these_keys(CELL, [Cell(d, Evaluation(m, "standard", 1)).key for d in DATASETS for m in local_models()])
 _OCCLUSION = to_keys(CATEGORY, PROBED, lambda key: [ANSWERABLE] if taxonomy_of_category(key) == "occlusion" else [])
 
 
@@ -143,7 +143,11 @@ def _outside_shares(workspace: Workspace, key: str | None, output: StageOutput) 
 @_stage(
     PROBES,
     code="3",
-    parents=[of(hidden_states, by_extraction, need="some"), of(verdicts, ANSWERED, need="none"), probing_settings],
+    parents=[
+        of(hidden_states, by_extraction, need="some"),
+        of(verdicts, ANSWERED_CELLS, need="none"),
+        probing_settings,
+    ],
     scheme=EXTRACTION,
     kinds=["parquet", "scikitlearn"],
     takes=RunResources(memory_gb=1.0, each_gb=0.5),

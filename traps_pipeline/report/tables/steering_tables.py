@@ -47,8 +47,8 @@ def cosines(results: Results) -> list[PrintedTable]:
     order = [*SHORT]
     place, other_place = ([order.index(name) for name in rows[column]] for column in ("dataset", "other_dataset"))
     rows = rows.assign(step=np.subtract(other_place, place))
-    across = (rows["prompt"] == STANDARD) & (rows["other_prompt"] == GUIDED) & (rows["step"] == 0)
-    rows = rows.loc[((rows["prompt"] == rows["other_prompt"]) & (rows["step"] > 0)) | across]
+    is_across_prompts = (rows["prompt"] == STANDARD) & (rows["other_prompt"] == GUIDED) & (rows["step"] == 0)
+    rows = rows.loc[((rows["prompt"] == rows["other_prompt"]) & (rows["step"] > 0)) | is_across_prompts]
     own_columns = ["model", "prompt", "dataset"]
     halves = results.cosines.drop_duplicates(own_columns).loc[:, [*own_columns, "split_half"]]
     halves = halves.rename(columns={name: f"other_{name}" for name in ("prompt", "dataset", "split_half")})

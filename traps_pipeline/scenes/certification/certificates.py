@@ -112,7 +112,7 @@ def certificates_for(kind: VoidKind, *about: About) -> list[Certificate]:
 def pair_of(spec: SceneSpec, qpos: np.ndarray, twin: np.ndarray, *, frame_step: int = 1) -> Pair:
     """Return the pair of a record from its trajectories, (F, nq), without evidence.
 
-    frame_step: pixel certificates look at every so many frames (1: full rate; 2: the 5 FPS sample).
+    frame_step: step between the frames of pixel certificates (1: full rate; 2: the 5 FPS sample).
     """
     control = World.of_record(spec, qpos, frame_step=frame_step)
     void_frame = spec.void["hidden_from_frame" if spec.void_kind == "occluder" else "cut_frame"]

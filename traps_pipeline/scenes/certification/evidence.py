@@ -1,4 +1,4 @@
-"""Define what a certificate is: measured numbers of a pair, and a rule on them.
+"""Define certificates: numbers measured on a pair, and a rule that judges them.
 
 Measuring needs the pair. Judging is a pure function of numbers and of what the record claims, so that fresh evidence
 and stored evidence are judged alike.

@@ -1,6 +1,6 @@
 """Resolve parameters to a scenario: simulate, frame, choose void and twin.
 
-`resolve` is the only way a record comes to be; it raises `Rejected` with the reason when the draw makes no good pair.
+Only `resolve` creates records; it raises `Rejected`, with the reason, for a draw without a valid pair.
 """
 
 from __future__ import annotations

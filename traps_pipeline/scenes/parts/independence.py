@@ -1,7 +1,7 @@
 """Test that the hidden element is independent of everything that a void shows.
 
-Tested over draws: which of a scene's possible worlds was drawn (it and its twins, in a fixed order) must not go with a
-parameter that they share, nor with two of them together. So it does not matter how a family draws and makes its twins.
+The test runs over draws: the index of the drawn world among the scene's possible ones (it and its twins, in a fixed
+order) must be independent of each parameter that they share, and of each two. How a family makes twins is irrelevant.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ MIN_EXPECTED = 5  # draws of each world in a row of a table; rarer values share 
 
 
 def dependence(family: Family) -> str | None:
-    """Return how the hidden element depends on what is seen; None if it does not."""
+    """Return how the hidden element depends on visible things; None if it does not."""
     if family.twins is None:
         return None
     scenes = [_worlds(family, family.draw(np.random.default_rng(seed))) for seed in range(DRAWS)]

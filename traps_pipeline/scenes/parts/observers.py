@@ -83,7 +83,7 @@ def round_blob(frame: np.ndarray, colour: str, *, fill: float = 0.9, longer: flo
 
 
 def is_upper_half_in_place(frames: np.ndarray, colour: str, first: Blob) -> bool:
-    """Return whether a thing's upper half is in the last frame where it was at first."""
+    """Return whether a thing's upper half keeps its initial place in the last frame."""
     x, y, width, height = first.box
     part = np.s_[y : y + height // 2, x : x + width]
     mask_before, mask_after = (colour_mask(frame, colour)[part] for frame in (frames[0], frames[-1]))

@@ -222,9 +222,9 @@ class Family:
     outcome(motion, params): the run's outcome.
     word(params, rng): the question and its companions.
     questions: the templates that `word` fills; no other family has the same.
-    observe(frames, question): the answer of one who sees only the 5 FPS frames (N, 360, 480, 3) RGB and the question;
+    observe(frames, question): the answer by the 5 FPS frames (N, 360, 480, 3) RGB and the question alone;
         None if the decisive thing is not to be seen.
-    legible(motion, params): groups of geoms that must be seen at the end and the least pixels of each group; by default
+    legible(motion, params): groups of geoms that must be seen at the end and the minimum pixels of each; by default
         each decisive body's geoms and 150.
     twins(params): the same scene with only the hidden element changed, so that the outcome may differ (occlusion).
     """

@@ -1,7 +1,7 @@
 """Find walls that are not drawn, and the drawn edges that reveal them.
 
-A thing that turns round where nothing is to be seen breaks the physics that a viewer can reckon with. So a wall that
-is not drawn (a pane that would tint what is behind it) must have edges that are. A pane before the scene that lies
+A thing that turns back where nothing is visible contradicts the physics that a viewer expects. So a wall that is not
+drawn (a pane that would tint what is behind it) must have edges that are. A pane before the scene that lies
 parallel to the picture needs none: it stops only what would come towards the eye.
 """
 

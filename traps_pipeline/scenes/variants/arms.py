@@ -113,7 +113,7 @@ class Question:
 
 @dataclass(frozen=True)
 class Arm:
-    """An arm of some scenarios; `protocol.datasets` says of which, and what it asks.
+    """An arm of some scenarios; `protocol.datasets` says of which, and its questions.
 
     takes_away: the shortcut that it turns against its user. promises: its certificate in words.
 

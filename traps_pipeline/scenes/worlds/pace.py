@@ -117,5 +117,5 @@ def shortened(world: World, n_frames: int) -> World:
 
 
 def with_length(physics: Physics, n_frames: int) -> Physics:
-    """Return the settings of a clip of so many frames."""
+    """Return the settings of a clip with this number of frames."""
     return replace(physics, duration_s=round(n_frames / physics.fps, 6))

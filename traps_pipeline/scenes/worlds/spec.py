@@ -182,7 +182,7 @@ class SceneSpec(BaseModel):
 
     @property
     def scene_hash(self) -> str:
-        """Digest of what the clips show; a corrected question leaves it alone."""
+        """Digest of the clips' content; a corrected question does not change it."""
         parts = ("family", "params", "physics", "camera", "void_kind", "void", "control", "trajectory_sha256", "twin")
         record = self.model_dump(mode="json", include=set(parts))
         return digest(record)
