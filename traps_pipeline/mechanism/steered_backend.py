@@ -33,7 +33,7 @@ class SteeredBackend(LocalBackend):
         self._vectors, self._made = vectors, shared
         self._prompt = lru_cache(PROMPTS_KEPT)(self._make_prompt)
 
-    def _answers(self, batch: _Batch) -> list[Outcome]:
+    def _answer_batch(self, batch: _Batch) -> list[Outcome]:
         """Answer a batch, in the worker thread, except for answers from another process."""
         return self._made.outcomes(batch.requests, self.generate, batch.abandoned.is_set)
 

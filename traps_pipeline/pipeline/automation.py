@@ -33,7 +33,7 @@ from traps_pipeline.pipeline.run import materialize_stale, pending_in
 from traps_pipeline.pipeline.runs import LocalRuns, range_tags
 from traps_pipeline.pipeline.schemes import study_here
 from traps_pipeline.pipeline.selection import failed_checks
-from traps_pipeline.pipeline.step import MAKE_TAG, OUTDATED, STALE
+from traps_pipeline.pipeline.step import MAKE_TAG, STALE_ONLY, STALE_OR_MISSING
 from traps_pipeline.pipeline.translation import asset_key
 from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.storage.workspace import Workspace
@@ -76,7 +76,7 @@ def jobs() -> list[Any]:
 def _job(name: str, doc: str, stages: Sequence[Stage]) -> Any:
     if all(stage.scheme is None for stage in stages):
         selection = dg.AssetSelection.assets(*(asset_key(stage.name) for stage in stages))
-        return dg.define_asset_job(name, selection=selection, description=doc, tags={MAKE_TAG: STALE})
+        return dg.define_asset_job(name, selection=selection, description=doc, tags={MAKE_TAG: STALE_OR_MISSING})
 
     @dg.op(name=f"make_{name}", description=doc)
     def make(context: dg.OpExecutionContext, workspace: WorkspaceResource) -> None:
@@ -157,7 +157,7 @@ def _requests(
                 dg.RunRequest(
                     digest([*batch, states])[:32],
                     partition_key=batch[0] if batch[0] == batch[1] else None,
-                    tags={MAKE_TAG: OUTDATED, "outdated": ", ".join(map(name_of, nodes[:8])), **range_tags(batch)},
+                    tags={MAKE_TAG: STALE_ONLY, "outdated": ", ".join(map(name_of, nodes[:8])), **range_tags(batch)},
                     asset_selection=[asset_key(stage.name) for stage in stages],
                 )
             )

@@ -23,7 +23,7 @@ from traps_pipeline.pipeline.graph import Stage, the_graph
 from traps_pipeline.pipeline.history import History
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.pipeline.runs import HOST_TAG, PID_TAG, Runs, this_host
-from traps_pipeline.pipeline.step import EXPERIMENT_TAG, MAKE_TAG, STALE, to_make
+from traps_pipeline.pipeline.step import EXPERIMENT_TAG, MAKE_TAG, STALE_OR_MISSING, to_make
 from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.storage.several_hosts import several_hosts
 from traps_pipeline.storage.workspace import Workspace
@@ -158,7 +158,7 @@ def materialize_stale(
     """
     outcome, started_at, graph = MaterializationResult(), time.monotonic(), the_graph()
     history, partitions = History(instance, graph), StudyPartitions(workspace, experiment)
-    tags = {MAKE_TAG: STALE} | ({EXPERIMENT_TAG: experiment} if experiment else {})
+    tags = {MAKE_TAG: STALE_OR_MISSING} | ({EXPERIMENT_TAG: experiment} if experiment else {})
     with remembering_stops():
         for block in graph.blocks([name for name in stages if graph[name].wanted(partitions)]):
             pending, keys = pending_in(block, Lineage(workspace), history, partitions)

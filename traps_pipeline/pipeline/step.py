@@ -33,7 +33,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 MAKE_TAG, EXPERIMENT_TAG = "traps/make", "traps/experiment"  # tags of runs: what to build, for which experiment
 BACKFILL_TAG = "dagster/backfill"  # tag of a backfill's run: a run with nothing to do must not end the backfill
-STALE, OUTDATED = "stale", "outdated"  # MAKE_TAG: what is not fresh; what is there and not fresh
+STALE_OR_MISSING, STALE_ONLY = "stale", "outdated"  # values of MAKE_TAG: the partitions to build
 # In an event's metadata: nobody asks for the partition; another run has built it.
 UNWANTED, TAKEN = "not wanted", "taken over"
 RESUMED_ELSEWHERE = 5  # the exit code of a process whose run another process has resumed
@@ -108,7 +108,7 @@ class _Step:
         """Return the wanted keys, or those among them that the run's tag selects."""
         if MAKE_TAG not in self.tags:
             return self._wanted
-        recorded_versions, existing = self.history.recorded(self.stage.name), self.tags[MAKE_TAG] == OUTDATED
+        recorded_versions, existing = self.history.recorded(self.stage.name), self.tags[MAKE_TAG] == STALE_ONLY
         name, lineage = self.stage.name, self.lineage
         keys = [k for k in self._wanted if to_make(lineage, recorded_versions, name, k, existing=existing)]
         # A partition that waits for an upstream one would be built twice.

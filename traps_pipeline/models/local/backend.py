@@ -78,7 +78,7 @@ class LocalBackend:
             for answer in batch.answers:
                 answer.add_done_callback(batch.forget)
             try:
-                outcomes = await asyncio.get_running_loop().run_in_executor(self._worker, self._answers, batch)
+                outcomes = await asyncio.get_running_loop().run_in_executor(self._worker, self._answer_batch, batch)
             except Exception as error:  # noqa: BLE001 - raised by `ask` in each request's own task
                 for answer in batch.answers:
                     if not answer.done():
@@ -88,7 +88,7 @@ class LocalBackend:
                     if not answer.done():
                         answer.set_result(outcome)
 
-    def _answers(self, batch: _Batch) -> list[Outcome]:
+    def _answer_batch(self, batch: _Batch) -> list[Outcome]:
         """Load the model, sample frames and generate answers, in the worker thread."""
         from traps_pipeline.models.local.adapter import load_local_model
         from traps_pipeline.models.local.sampling import Sampling
