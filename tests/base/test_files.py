@@ -84,7 +84,7 @@ def test_a_durable_file_that_does_not_reach_the_disk_does_not_take_the_place(
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
     monkeypatch.setattr(os, "fsync", broken)
-    with raises(TrapsError, "base.files.replacing", "table.bin"):
+    with raises(TrapsError, "base.files.replace_file", "table.bin"):
         write_bytes(file, b"next", durable=True)
     assert file.read_text() == "former"
     assert alone(file)

@@ -334,7 +334,7 @@ def test_a_full_disk_is_named_and_leaves_no_part(
     for spec in (VIDEO, IMAGES, QWEN):
         with monkeypatch.context() as disk:
             disk.setattr(Path, "replace", full)
-            with raises(TrapsError, "base.files.replacing"):
+            with raises(TrapsError, "base.files.replace_file"):
                 store.prepare(*clip, spec)
         assert [path.name for path in store.folder.rglob("*") if path.is_file()] == [".lock"]
 
