@@ -203,10 +203,10 @@ def check(p: Any) -> None:
             types[member.name].validate_python(value, strict=True)
         except ValidationError as error:
             raise ValueError(f"parameter {member.name} is {_short_repr(value)}: {error.errors()[0]['msg']}") from None
-        for member in _members(value):
-            if isinstance(member, float) and not np.isfinite(member):
+        for element in _members(value):
+            if isinstance(element, float) and not np.isfinite(element):
                 raise ValueError(f"parameter {member.name} is {_short_repr(value)}; it must be finite")
-            _check_member(p, member, member)
+            _check_member(p, member, element)
 
 
 @cache
