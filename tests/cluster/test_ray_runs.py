@@ -19,7 +19,7 @@ from dagster._daemon.monitoring.run_monitoring import RESUME_RUN_LOG_MESSAGE
 from tests.postgres import Postgres
 from traps_pipeline.base.cores import cores
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.progress import Progress, reporting
+from traps_pipeline.base.progress import Progress, use_progress
 from traps_pipeline.cluster.history import HISTORY, LOGS, dagster_yaml
 from traps_pipeline.cluster.node import code_here, require_same_code
 from traps_pipeline.cluster.ray_runs import RESOURCES_TAG, STUDY_TAG, RayRuns, own_tags

@@ -1,4 +1,4 @@
-"""Access an object store (S3, Google, Azure) with obstore; reword its errors."""
+"""Reach an object store (S3, Google, Azure) by obstore; its errors are sentences."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Bucket:
             self._store = from_url(address, retry_config={"max_retries": 5})
 
     @contextmanager
-    def _translate_errors(self) -> Iterator[None]:
+    def _used(self) -> Iterator[None]:
         """Translate errors within the block to FileNotFoundError or TrapsError."""
         from obstore.exceptions import BaseError
 

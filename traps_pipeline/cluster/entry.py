@@ -1,4 +1,4 @@
-"""Expose this package to others under one name; see `storage/several_hosts.py`.
+"""Offer this room to others by one name; see `storage/several_hosts.py`.
 
 Modules above the storage are imported in functions: importing them opens the study.
 """

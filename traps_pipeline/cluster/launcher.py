@@ -30,7 +30,7 @@ class ClusterLauncher(RayRunLauncher):
         return _NodeClient(self.address, metadata=self.metadata, headers=self.headers, cookies=self.cookies)
 
     def launch_run(self, context: Any) -> None:
-        """Launch a run; one from a page or sensor first gets the tags of a command's run."""
+        """Launch a run; first tag one from Dagster's pages or sensors like a command's."""
         run = context.dagster_run
         if RESOURCES_TAG not in run.tags:
             tags = tags_of_page_run(run)

@@ -152,14 +152,14 @@ class ObjectNames:
         """
 
         def work(connection: sa.Connection) -> list[bytes]:
-            started_at = time.monotonic()
+            began = time.monotonic()
             self._next_change(connection, removals=1)
             named = {bytes(row.digest) for row in self._select(connection, _is_one_of(_OBJECTS.c.digest, digests))}
             unnamed = [digest for digest in digests if digest not in named]
             if time.monotonic() - began > REMOVAL_S:
                 return []  # the server may have ended the session, and thus the lock, meanwhile
-            delete(unnamed_digests)
-            return unnamed_digests
+            delete(unnamed)
+            return unnamed
 
         return self._database.run(work)
 

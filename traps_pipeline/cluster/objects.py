@@ -51,7 +51,7 @@ class ObjectStore(Store):
     def _name(self, path: Path) -> str:
         return path.relative_to(self.root).as_posix()
 
-    def _current_objects(self, paths: Iterable[Path]) -> dict[Path, CurrentObject]:
+    def _known(self, paths: Iterable[Path]) -> dict[Path, CurrentObject]:
         names = {path: self._name(path) for path in paths}
         current = self.names.current({*names.values()})
         return {path: current[name] for path, name in names.items() if name in current}
@@ -70,11 +70,11 @@ class ObjectStore(Store):
 
     # --- contents ---------------------------------------------------------------------------------------------------
 
-    def _cache_path(self, digest: bytes) -> Path:
+    def _cached(self, digest: bytes) -> Path:
         return self.root / OBJECTS / object_name(digest)
 
     def _is_cached(self, digest: bytes) -> bool:
-        path = self._cache_path(digest)
+        path = self._cached(digest)
         if digest not in self._verified and path.is_file() and sha256(path.read_bytes()).digest() == digest:
             self._verified.add(digest)
         return digest in self._verified and path.is_file()
@@ -83,7 +83,7 @@ class ObjectStore(Store):
         if not self._is_cached(digest):
             write_bytes(self._cached(digest), content)
             self._verified.add(digest)
-        return self._cache_path(digest)
+        return self._cached(digest)
 
     def _fetched(self, row: CurrentObject) -> Path | None:
         """Return an object's local file; None if it is lost or altered, and so no longer named."""
@@ -117,7 +117,7 @@ class ObjectStore(Store):
             if cached is not None and not is_same_file(path, cached):
                 link(cached, path)
 
-        _side_by_side(one, self._current_objects(path for path in paths if path.is_relative_to(self.root)).items())
+        _side_by_side(one, self._known(path for path in paths if path.is_relative_to(self.root)).items())
 
     def keep(self, paths: Iterable[Path]) -> None:
         """See `Store`."""
@@ -152,9 +152,9 @@ class ObjectStore(Store):
 
     def remove(self, paths: Iterable[Path]) -> None:
         """See `Store`."""
-        rows_by_path = self._current_objects(paths)
-        self._change(dict.fromkeys(rows_by_path), self.names.removals)
-        for path in rows_by_path:
+        named = self._known(paths)
+        self._change(dict.fromkeys(named), self.names.removals)
+        for path in named:
             path.unlink(missing_ok=True)
 
     # --- what there is ----------------------------------------------------------------------------------------------
@@ -173,11 +173,11 @@ class ObjectStore(Store):
 
     def there(self, paths: Iterable[Path]) -> set[Path]:
         """See `Store`."""
-        return {*self._current_objects(paths)}
+        return {*self._known(paths)}
 
     def digests(self, paths: Iterable[Path]) -> dict[Path, str]:
         """See `Store`; the digests are those of the rows."""
-        return {path: row.digest.hex() for path, row in self._current_objects(paths).items()}
+        return {path: row.digest.hex() for path, row in self._known(paths).items()}
 
     def below(self, folder: Path, pattern: str = "**/*") -> list[Path]:
         """See `Store`."""
@@ -197,10 +197,10 @@ class ObjectStore(Store):
 
     def unused(self, *, is_removed: bool = False, grace_days: float | None = None) -> list[UnusedObject]:
         """See `Store`."""
-        cutoff = datetime.now(UTC) - timedelta(days=GRACE_DAYS if grace_days is None else grace_days)
+        before = datetime.now(UTC) - timedelta(days=GRACE_DAYS if grace_days is None else grace_days)
         objects = {
-            bytes.fromhex(match[2]): UnusedObject(name, size, modified_at)
-            for name, size, modified_at in self.bucket.names()
+            bytes.fromhex(match[2]): UnusedObject(name, size, modified)
+            for name, size, modified in self.bucket.names()
             if (match := _OBJECT.fullmatch(name))
         }
         named = {row.digest for row in self.names.naming().values()}
@@ -210,10 +210,8 @@ class ObjectStore(Store):
                 f"{self._database.study_name}; see that {self._database.variable} has the address of the study's own "
                 "database: nothing was removed"
             )
-        unnamed_digests = (
-            digest for digest, content in objects.items() if digest not in named_digests and content.at < cutoff
-        )
-        old = sorted(unnamed_digests, key=lambda digest: objects[digest].at)
+        unnamed = (digest for digest, content in objects.items() if digest not in named and content.at < before)
+        old = sorted(unnamed, key=lambda digest: objects[digest].at)
         if is_removed:
             batches = [old[first : first + BATCH] for first in range(0, len(old), BATCH)]
             delete = lambda digests: self.bucket.delete([object_name(digest) for digest in digests])  # noqa: E731

@@ -22,7 +22,7 @@ from traps_pipeline.base.cores import CORES
 from traps_pipeline.base.databases import database_error
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.extras import missing
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.cluster.node import CODE, REFUSED_TAG, code_here
 from traps_pipeline.cluster.postgres import PATIENCE_S
 from traps_pipeline.cluster.sensors import REQUEST_TAG, submit
@@ -74,28 +74,27 @@ def require_cluster(workspace: Workspace, instance: dg.DagsterInstance) -> None:
 
     Other hosts must see the study, Ray's address must be known, and a daemon must take runs from the queue.
     """
-    prefix = f"the host {socket.gethostname()} submits no runs of the study {workspace.study.name}: "
-    if absent_modules := missing("cluster", "ray", "dagster_ray", "dagster_postgres"):
+    where = f"the host {socket.gethostname()} submits no runs of the study {workspace.study.name}: "
+    if absent := missing("cluster", "ray", "dagster_ray", "dagster_postgres"):
         raise TrapsError(
-            f"{prefix}runs on other hosts need {' and '.join(absent_modules)} here and there: "
-            "install the extra `cluster`, in a checkout "
-            "`python -m pip install --no-deps --require-hashes -r requirements-cluster.lock`"
+            f"{where}runs on other hosts need {' and '.join(absent)} here and there: install the extra `cluster`, in a "
+            "checkout `python -m pip install --no-deps --require-hashes -r requirements-cluster.lock`"
         )
     if not workspace.study.database:
         raise TrapsError(
-            f"{prefix}its ledger lies in {workspace.root}, where one host writes; a study for --cluster keeps it in "
+            f"{where}its ledger lies in {workspace.root}, where one host writes; a study for --cluster keeps it in "
             f"PostgreSQL, and its files in a folder that all hosts see or in an object store: {VARIABLE}="
             "s3://BUCKET/STUDY (docs/cluster.md)"
         )
     if not os.environ.get(RAY):
         raise TrapsError(
-            f"{prefix}{RAY} is not set: export {RAY}=http://HEAD:8265, the address of Ray's head for the study"
+            f"{where}{RAY} is not set: export {RAY}=http://HEAD:8265, the address of Ray's head for the study"
         )
-    heartbeats = instance.get_daemon_heartbeats()
-    oldest = min(heartbeats[name].timestamp if name in heartbeats else 0.0 for name in DAEMONS)
+    beats = instance.get_daemon_heartbeats()
+    oldest = min(beats[name].timestamp if name in beats else 0.0 for name in DAEMONS)
     if time.time() - oldest > ALIVE_S:
         raise TrapsError(
-            f"{prefix}nobody takes runs from its queue; run `traps ui` on the head, with the same variables, and then "
+            f"{where}nobody takes runs from its queue; run `traps ui` on the head, with the same variables, and then "
             "the same command again"
         )
 
@@ -129,7 +128,7 @@ class RayRuns(Runs):
         """Wait for runs of earlier commands."""
         filters = dg.RunsFilter(statuses=_UNFINISHED, tags={STUDY_TAG: self._workspace.study.name})
         if runs := [*self._instance.get_runs(filters)]:
-            progress.current().note(f"waiting first for {counted(len(runs), 'run')} that an earlier command left")
+            progress.current().note(f"waiting first for {count_noun(len(runs), 'run')} that an earlier command left")
             stages = [(the_graph()[key.path[-1]], run.tags) for run in runs for key in run.asset_selection or ()]
             progress.current().stage("runs that were left", sum(len(keys_of(*each)) or 1 for each in stages))
             self._watch([], [run.run_id for run in runs])
@@ -142,8 +141,8 @@ class RayRuns(Runs):
         """
         self._keys = frozenset(keys)
         scheme = stages[0].scheme if stages else None
-        concurrent_builds = [stage.shared for stage in stages if stage.shared is not None]
-        if not concurrent_builds:
+        shared = [stage.shared for stage in stages if stage.shared is not None]
+        if not shared:
             return cut(scheme, keys, self._most)
         seconds = {key: sum(each.seconds(self._workspace, key) for each in shared) / self._cpus for key in keys}
         return shared_out(scheme, keys, seconds, self._most)
@@ -173,15 +172,15 @@ class RayRuns(Runs):
             while requests or run_ids:
                 time.sleep(POLL_S)
                 try:
-                    self._look_at(requests, run_ids, outcomes)
+                    self._look_at(requests, run_ids, done)
                     seen_at = time.monotonic()
                 except Exception as error:
                     if database_error(error) is None or time.monotonic() - seen_at > PATIENCE_S:
                         raise
         except KeyboardInterrupt:
-            self._stop_runs(requests, run_ids)
+            self._interrupted(requests, run_ids)
             raise
-        return outcomes
+        return done
 
     def _look_at(self, requests: list[str], run_ids: list[str], done: list[RunOutcome]) -> None:
         """Report progress of runs; replace requests by runs, and add ended ones to `done`."""
@@ -238,7 +237,7 @@ class RayRuns(Runs):
                 elif UNWANTED not in result.metadata:
                     progress.current().partition(name, result.partition or "", tally)
 
-    def _end_message(self, run_id: str, run: dg.DagsterRun | None, failures: Sequence[dg.DagsterEvent]) -> RunOutcome:
+    def _ended(self, run_id: str, run: dg.DagsterRun | None, failures: Sequence[dg.DagsterEvent]) -> RunOutcome:
         name = f"run {run_id[:8]} of the study {self._workspace.study.name}"
         if run is None:
             return RunOutcome([f"{name} is in Dagster's history no more"], over_budget=False)
@@ -247,8 +246,8 @@ class RayRuns(Runs):
             message = " ".join(self._last_message(run_id).split())
             # The beginning names what failed, and at its end a log has the cause.
             reason = message if len(message) <= 2 * ENDS else f"{message[:ENDS]} ... {message[-ENDS:]}"
-            text = f"{name} ended as {run.status.value.lower()} ({reason}); see its log in `traps ui`"
-            outcome.problems.append(message if REFUSED_TAG in run.tags else text)
+            ended = f"{name} ended as {run.status.value.lower()} ({reason}); see its log in `traps ui`"
+            outcome.problems.append(message if REFUSED_TAG in run.tags else ended)
         return outcome
 
     def _last_message(self, run_id: str) -> str:
@@ -263,14 +262,14 @@ class RayRuns(Runs):
     def _interrupted(self, requests: list[str], run_ids: list[str]) -> None:
         if self._on_interrupt == "leave":
             progress.current().note(
-                f"left running: {counted(len(requests) + len(run_ids), 'run')}; the same command shows the progress "
+                f"left running: {count_noun(len(requests) + len(run_ids), 'run')}; the same command shows the progress "
                 "again, and `--on-interrupt cancel` would end such runs"
             )
             return
-        deadline = time.monotonic() + CREATED_S
-        while requests and time.monotonic() < deadline:
+        until = time.monotonic() + CREATED_S
+        while requests and time.monotonic() < until:
             self._take_created(requests, run_ids)
             time.sleep(POLL_S)
         for run_id in run_ids:
             self._instance.run_coordinator.cancel_run(run_id)
-        progress.current().note(f"told {counted(len(run_ids), 'run')} to end; finished work is kept")
+        progress.current().note(f"told {count_noun(len(run_ids), 'run')} to end; finished work is kept")

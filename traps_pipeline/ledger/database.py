@@ -195,8 +195,8 @@ class Database(ABC):
                 self.sharers[account] = count
 
     def _unshare(self, batch: Batch) -> None:
-        is_expired = (SHARERS.c.session == self.session) | (SHARERS.c.seen_s < self.now_s(batch.connection) - SHARER_S)
-        batch.connection.execute(sa.delete(SHARERS).where(is_expired))
+        expired = (SHARERS.c.session == self.session) | (SHARERS.c.seen_s < self.now_s(batch.connection) - SHARER_S)
+        batch.connection.execute(sa.delete(SHARERS).where(expired))
 
     def _begin(self) -> None:
         self.session = secrets.token_hex(8)

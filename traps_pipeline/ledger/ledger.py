@@ -44,7 +44,7 @@ GiveUp = Callable[[], bool]  # returns whether to stop waiting
 
 
 def wait_forever() -> bool:
-    """Return False, so that a wait has no limit."""
+    """Return False: wait without end."""
     return False
 
 
@@ -120,7 +120,7 @@ class Ledger:
         totals = dict[str, Totals]()
         for row in self._select(sa.select(TOTALS).where(self._is_own_kind(TOTALS))):
             sums = {name: (getattr(row, f"{name}_sum"), getattr(row, f"{name}_n")) for name in AVERAGED_COLUMNS}
-            means = {name: sum_and_count for name, sum_and_count in sums.items() if sum_and_count[1]}
+            means = {name: its for name, its in sums.items() if its[1]}
             totals[row.participant] = Totals(row.dollars, row.failed, row.dearest, row.unknown, means)
         return totals
 
@@ -149,8 +149,8 @@ class Ledger:
             yield from self._select(query)
             return
         keys = iter(wanted)
-        while chunk := [*islice(keys, _KEYS)]:
-            yield from self._select(query.where(ROWS.c.key.in_(chunk)))
+        while some := [*islice(keys, _KEYS)]:
+            yield from self._select(query.where(ROWS.c.key.in_(some)))
 
     def _add(self, rows: EvaluationRows, entry: sa.Row[Any]) -> None:
         """Add a row and a note about impossible values, or only a note if it is damaged."""
@@ -158,8 +158,8 @@ class Ledger:
             rows.notes[self._place(entry)] = f"{NOT_WHOLE}: it is not believed; its answer is asked again"
             return
         row = json.loads(entry.content)
-        if healed_fields := replace_impossible(row):
-            rows.notes[self._place(entry)] = f"{', '.join(healed_fields)}: no possible value, counted as unknown"
+        if healed := replace_impossible(row):
+            rows.notes[self._place(entry)] = f"{', '.join(healed)}: no possible value, counted as unknown"
         rows.add(row)
 
     def _place(self, row: sa.Row[Any]) -> str:
@@ -191,9 +191,9 @@ class Ledger:
         async with AsyncExitStack() as stack:
             writers = {name: await stack.enter_async_context(self.writing(name, waiting)) for name in sorted(rows)}
             new = {
-                name: [entry for entry in rows[name] if entry[0]["key"] not in settled_rows]
+                name: [entry for entry in rows[name] if entry[0]["key"] not in known]
                 for name in writers
-                if (settled_rows := self.read(name, {row["key"] for row, _ in rows[name]}).settled) is not None
+                if (known := self.read(name, {row["key"] for row, _ in rows[name]}).settled) is not None
             }
             contents = [(writers[name], _Content.of(*entry)) for name in new for entry in new[name]]
 
@@ -275,11 +275,11 @@ class Writer:
         self.check(batch)
         batch.rows.append(content.values(self._evaluation))
         participant = participant_of(content.row)
-        totals = batch.totals.setdefault((self._kind, participant), Totals())
-        previous_usd = totals.dollars
-        totals.add(content.row)
-        if totals.dollars > previous_usd:
-            batch.spend(participant, totals.dollars - previous_usd)
+        its = batch.totals.setdefault((self._kind, participant), Totals())
+        before = its.dollars
+        its.add(content.row)
+        if its.dollars > before:
+            batch.spend(participant, its.dollars - before)
         batch.cover(participant, paid_by)
 
     def check(self, batch: Batch) -> None:

@@ -128,16 +128,16 @@ def this_host() -> str:
 def problems_of(failures: Sequence[dg.DagsterEvent]) -> RunOutcome:
     """Return the messages of failed steps."""
     problems = [line for event in failures for line in reason(event.step_failure_data.error).splitlines()]
-    is_over_budget = any(error.cls_name == BudgetReached.__name__ for event in failures for error in _causes(event))
-    return RunOutcome(problems, is_over_budget)
+    over = any(error.cls_name == BudgetReached.__name__ for event in failures for error in _causes(event))
+    return RunOutcome(problems, over)
 
 
 def is_broken_off(run: dg.DagsterRun, failures: Sequence[dg.DagsterEvent]) -> bool:
     """Return whether a run failed without a reason, as when host or network fails."""
-    error_names = [{error.cls_name for error in _causes(event)} for event in failures]
-    is_interrupted = any(names & {*_INTERRUPTS} for names in error_names)
-    has_unnamed_error = not failures or any(not names & {*_SENTENCES} for names in error_names)
-    return run.status == dg.DagsterRunStatus.FAILURE and has_unnamed_error and not is_interrupted
+    named = [{error.cls_name for error in _causes(event)} for event in failures]
+    is_interrupted = any(names & {*_INTERRUPTS} for names in named)
+    unnamed = not failures or any(not names & {*_SENTENCES} for names in named)
+    return run.status == dg.DagsterRunStatus.FAILURE and unnamed and not is_interrupted
 
 
 def _causes(event: dg.DagsterEvent) -> list[Any]:
@@ -156,7 +156,7 @@ def _chain(error: Any) -> list[Any]:
 def reason(error: Any) -> str:
     """Return a Dagster error's message: our own sentence, else its innermost cause."""
     chain = _chain(error)
-    readable_links = [link for link in chain if link.cls_name in _SENTENCES]
-    if not readable_links:
+    readable = [link for link in chain if link.cls_name in _SENTENCES]
+    if not readable:
         return chain[-1].message.strip() if chain else "the step failed"
-    return re.sub(rf"^\S*\b{readable_links[0].cls_name}: ", "", readable_links[0].message.strip())
+    return re.sub(rf"^\S*\b{readable[0].cls_name}: ", "", readable[0].message.strip())

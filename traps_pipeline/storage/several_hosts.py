@@ -47,7 +47,7 @@ class SeveralHosts(Protocol):
     def runs(self, workspace: Any, instance: dg.DagsterInstance, options: Any) -> Any:
         """Return a cluster's `Runs`, after those of earlier commands have ended.
 
-        options: the options of `traps run`. Raises TrapsError if no run can be submitted from this host.
+        options: of `traps run`. Raises TrapsError if no run can be submitted from this host.
         """
         ...
 

@@ -85,7 +85,7 @@ class Store(ABC):
 
     @abstractmethod
     def there(self, paths: Iterable[Path]) -> set[Path]:
-        """Return which of these paths have a file, without reading any content."""
+        """Return those of these paths that have a file, without looking at any content."""
 
     @abstractmethod
     def digests(self, paths: Iterable[Path]) -> dict[Path, str]:
@@ -188,7 +188,7 @@ class FolderStore(Store):
 def _file_lease(folder: Path, name: str) -> Lease | None:
     """Lock a file, which is removed at the lease's end."""
     path = folder / name.replace("/", "-")
-    with writable(folder):
+    with require_writable(folder):
         descriptor = try_lock(path)
 
     def close() -> None:

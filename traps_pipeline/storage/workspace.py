@@ -127,9 +127,9 @@ class Workspace:
 
     def allow(self, **changes: Any) -> Workspace:
         """Return the workspace with changed fields of its study, such as budgets."""
-        workspace = Workspace(self.root, self.study.model_copy(update=changes), self._address)
-        workspace.save_study()
-        return workspace
+        changed = Workspace(self.root, self.study.model_copy(update=changes), self._address)
+        changed.save_study()
+        return changed
 
     @classmethod
     def open(cls, place: Place | None = None) -> Workspace:
@@ -151,13 +151,13 @@ class Workspace:
         return cls(scratch_of(place), study, place) if isinstance(place, str) else cls(place.absolute(), study)
 
     def copy_dagster_yaml(self, home: Path | None = None) -> None:
-        """Copy `assets/dagster.yaml` to Dagster's folder (default: the workspace's), once.
+        """Copy `assets/dagster.yaml` to Dagster's folder (default: the workspace's) if it has none.
 
         A study's own `dagster.yaml` may name another storage.
         """
-        own_file = (home or self.dagster_home) / "dagster.yaml"
-        if own_file.is_symlink() or not own_file.exists():
-            write_text(own_file, (ASSETS / "dagster.yaml").read_text(encoding="utf-8"))
+        own = (home or self.dagster_home) / "dagster.yaml"
+        if own.is_symlink() or not own.exists():
+            write_text(own, (ASSETS / "dagster.yaml").read_text(encoding="utf-8"))
 
     @property
     def is_on_cluster(self) -> bool:
