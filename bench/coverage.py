@@ -26,7 +26,7 @@ from scipy.stats import norm
 from bench.quick import parse
 from traps_pipeline.protocol.datasets import CROSSED, DATASETS, TWIN, taxonomy_of
 from traps_pipeline.scoring.bootstrap import (
-    RESAMPLED,
+    RESAMPLED_FIGURES,
     TAXONOMIES,
     Resampling,
     difference,
@@ -72,8 +72,8 @@ ARMS = ("decoy", "length_matched", TWIN, CROSSED)
 STUDIES, RESAMPLES, PARTS = 25, 1000, 12
 N_FAMILIES, ARM_SHARE = 8, 4  # an arm has an item of a quarter of the scenarios, of all families
 FIGURES = (
-    *(f"{name}, one dataset" for name in RESAMPLED),
-    *RESAMPLED,
+    *(f"{name}, one dataset" for name in RESAMPLED_FIGURES),
+    *RESAMPLED_FIGURES,
     "robust",
     "difference of j",
     "difference of pecs",
@@ -128,7 +128,7 @@ class Setting:
 
 
 def cell_figures(counts: np.ndarray, drawn: Resampling, taxonomy: str, named: str, in_mean: bool) -> np.ndarray:
-    """Return the ends of RESAMPLED of one dataset or arm, mean over runs: (studies, 2, RESAMPLED, 1 + resamples)."""
+    """Return ends of figures of a dataset or arm, mean over runs: (studies, 2, figures, 1 + resamples)."""
     scenarios, studies, runs, kinds = counts.shape
     sums = resampled_sums(drawn.scenarios[taxonomy][1], counts.reshape(scenarios, studies * runs, kinds))
     having = (counts[..., 1::2] > 0).sum(axis=0)
@@ -143,12 +143,12 @@ def ends_now(counts: Mapping[str, np.ndarray], drawn: Resampling, model: str) ->
         return cell_figures(counts[name], drawn, _taxonomy(name), f"{model}|{name}", in_mean)
 
     of_one = ends_of(next(iter(counts)), in_mean=False)
-    ends = {f"{name}, one dataset": of_one[:, :, k] for k, name in enumerate(RESAMPLED)}
+    ends = {f"{name}, one dataset": of_one[:, :, k] for k, name in enumerate(RESAMPLED_FIGURES)}
     if not all(name in counts for name in DATASETS):
         return ends
     inside = {name: ends_of(name, in_mean=True) for name in counts}
     overall = np.mean([inside[name] for name in DATASETS], axis=0)
-    ends |= {name: overall[:, :, k] for k, name in enumerate(RESAMPLED)}
+    ends |= {name: overall[:, :, k] for k, name in enumerate(RESAMPLED_FIGURES)}
     scenarios = {name: int((own[..., 1] > 0).any(axis=(1, 2)).sum()) for name, own in counts.items()}
     robust = [
         robust_ends({name: own[study] for name, own in inside.items()}, scenarios) for study in range(len(overall))
@@ -166,16 +166,16 @@ def draws_before(counts: Mapping[str, np.ndarray], weights: Mapping[str, np.ndar
             acc, false_abs, abs_rec = np.moveaxis(sums[:, 0::2] / sums[:, 1::2], 1, 0)
         j = abs_rec - false_abs
         stacked = np.stack([acc, abs_rec, false_abs, j, pecs_of(acc, j)])
-        figures[name] = stacked.reshape(len(RESAMPLED), studies, runs, -1).mean(axis=2)
+        figures[name] = stacked.reshape(len(RESAMPLED_FIGURES), studies, runs, -1).mean(axis=2)
     first = next(iter(figures.values()))
-    draws = {f"{name}, one dataset": first[k] for k, name in enumerate(RESAMPLED)}
+    draws = {f"{name}, one dataset": first[k] for k, name in enumerate(RESAMPLED_FIGURES)}
     if not all(name in figures for name in DATASETS):
         return draws
     overall = np.mean([figures[name] for name in DATASETS], axis=0)
-    draws |= {name: overall[k] for k, name in enumerate(RESAMPLED)}
+    draws |= {name: overall[k] for k, name in enumerate(RESAMPLED_FIGURES)}
 
     def mean_over_kinds(figure: str, of: Sequence[str]) -> np.ndarray:
-        k = RESAMPLED.index(figure)
+        k = RESAMPLED_FIGURES.index(figure)
         return np.nanmean([overall[k], *(figures[arm][k] for arm in of)], axis=0)
 
     acc, false_abs = (mean_over_kinds(figure, ARMS) for figure in ("acc", "false_abs"))

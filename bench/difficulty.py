@@ -20,9 +20,9 @@ os.environ.setdefault("MUJOCO_GL", "osmesa")
 import numpy as np
 
 from bench.quick import parse
-from traps_pipeline.scenes.draw.sample import MOST_DRAWS, Draw, scene_of_draw
+from traps_pipeline.scenes.draw.sample import MAX_DRAWS, Draw, scene_of_draw
 from traps_pipeline.scenes.family_registry import family_names, get_family
-from traps_pipeline.scenes.parts.difficulty import DISTRACTOR, Difficulty, untakeable
+from traps_pipeline.scenes.parts.difficulty import DISTRACTOR, Difficulty, unsupported_settings
 from traps_pipeline.scenes.physics.kit import COLOURS, LOOK_ALIKE, Motion
 from traps_pipeline.scenes.picture.camera import fit_shot
 from traps_pipeline.scenes.worlds.outcome import Rejected, compile_scene, decisive_geoms, read_outcome, simulated
@@ -64,7 +64,7 @@ def main() -> None:
     for level in arguments.levels:
         reads, draws = list[Read](), 0
         for family in arguments.families:
-            if untakeable(get_family(family), LEVELS[level]):
+            if unsupported_settings(get_family(family), LEVELS[level]):
                 continue
             own = list(controls(family, LEVELS[level], arguments.seed, arguments.count))
             if not own:
@@ -78,7 +78,7 @@ def main() -> None:
 
 
 def fast_families() -> list[str]:
-    return [name for name in family_names() if not untakeable(get_family(name), LEVELS["both"])]
+    return [name for name in family_names() if not unsupported_settings(get_family(name), LEVELS["both"])]
 
 
 def print_row(level: str, family: str, reads: Sequence[Read], draws: int) -> None:
@@ -92,7 +92,7 @@ def controls(name: str, difficulty: Difficulty, seed: int, count: int) -> Iterat
     """Yield the number, question and world of the first draws of a family that come to an outcome in time."""
     family = get_family(name)
     looks, found = tuple(sorted(family.looks)), 0
-    for number in range(MOST_DRAWS * count):
+    for number in range(MAX_DRAWS * count):
         try:
             drawn = scene_of_draw(Draw(name, seed, number, frozenset(), looks, difficulty))
             model, scene = compile_scene(family, drawn.params, drawn.physics)

@@ -25,7 +25,7 @@ import numpy as np
 
 from bench.quick import parse
 from traps_pipeline.base.paths import ASSETS
-from traps_pipeline.base.progress import Progress, reporting
+from traps_pipeline.base.progress import Progress, use_progress
 from traps_pipeline.mechanism.hidden_states import Item, extract
 from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.models.local import adapter
@@ -222,7 +222,7 @@ def main() -> None:
     import torch
 
     few = max(3, arguments.runs // 10)
-    with TemporaryDirectory() as folder, reporting(Progress()):
+    with TemporaryDirectory() as folder, use_progress(Progress()):
         entry = the_entry(arguments.model, Path(folder))
         threads = torch.get_num_threads()
         print(f"median of {arguments.runs} alternating runs ({few} against a plain loop), {threads} threads")

@@ -20,7 +20,10 @@ PLANK_M = 0.04  # height of the plank's upper face
 WALL_M = 0.012  # thickness of rails and of the tray's walls
 POST_M = 0.012  # radius of the post
 STILL_M = 0.01  # a ball that moves less than this any more is as good as at rest
-PLAY, PLAIN = apart("red", "green", "blue", "yellow", "cyan", "purple"), shuffled("wood", "grey", "white")
+PLAY_COLOURS, PLAIN_COLOURS = (
+    apart("red", "green", "blue", "yellow", "cyan", "purple"),
+    shuffled("wood", "grey", "white"),
+)
 
 
 @dataclass(frozen=True)
@@ -28,10 +31,10 @@ class Params:
     """direction: +1 rolls to the right. Lengths run along the plank, from its beginning."""
 
     direction: int = one_of(-1, 1)
-    ball_colour: str = PLAY()
-    tray_colour: str = PLAY()
-    plank_colour: str = PLAIN()
-    rail_colour: str = PLAIN()
+    ball_colour: str = PLAY_COLOURS()
+    tray_colour: str = PLAY_COLOURS()
+    plank_colour: str = PLAIN_COLOURS()
+    rail_colour: str = PLAIN_COLOURS()
     post_in_way: bool = hidden(False, True)
     radius_m: float = between(0.045, 0.055)
     speed_m_s: float = between(0.55, 0.75)

@@ -15,7 +15,7 @@ import traps_pipeline.definitions  # noqa: F401 - declares the graph
 from tests.conftest import ROOT
 from tools.docs_hooks import NOTEBOOK, notebook_page
 from traps_pipeline.cli import GROUPS, build_parser
-from traps_pipeline.cli.command import SHORT
+from traps_pipeline.cli.command import SHORT_NAMES
 from traps_pipeline.definitions import defs
 from traps_pipeline.pipeline.graph import the_graph
 
@@ -70,7 +70,7 @@ def name(words: list[str]) -> str:
     """What is run, without what it is run on: `traps study import-answers`, `make demo`."""
     if words[0].startswith("python"):
         words = words[words.index("-m") + 1 :]
-    if words[0] == "traps" and words[2:] and words[2] in SHORT:
+    if words[0] == "traps" and words[2:] and words[2] in SHORT_NAMES:
         words = [words[0], *words[2:]]
     deep = 3 if words[0] == "dagster" or words[1] in GROUPS else 1 if words[0] in ("lmms_eval", "venv") else 2
     return " ".join(words[:deep])

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from traps_pipeline.cli import GROUPS, build_parser
-from traps_pipeline.cli.command import SHORT, Parser
+from traps_pipeline.cli.command import SHORT_NAMES, Parser
 
 PAGE = Path(__file__).parents[1] / "docs" / "commands.md"
 HEAD = """# Commands
@@ -39,7 +39,7 @@ def page() -> str:
     parser = build_parser()
     counts = Counter(row for command in parser.commands.values() for row in _rows(command))
     common = {row: None for row, count in counts.items() if count >= COMMANDS_OF_A_COMMON_ARGUMENT}
-    short = ", ".join(f"`{name}`" for name in SHORT)
+    short = ", ".join(f"`{name}`" for name in SHORT_NAMES)
     parts = [HEAD.format(short=short, common="\n".join(common))]
     for group in (*GROUPS, ""):
         own = {path: each for path, each in parser.commands.items() if path.rpartition(" ")[0] == group}

@@ -30,7 +30,7 @@ SHEET = Layout(6.4, 0.95, 0.5, letters=108, questions=2, ids=True, moments=4, co
 ON_SHEET = ("tumbling_dice-0006", "domino_chain-0005")
 HOLD_MS = 2600  # the last frame, with the answers
 WIDTH, HEIGHT, HEAD, FOOT, GAP = 420, 315, 100, 62, 8  # px: a clip, the texts above and below it, between the clips
-MOST_BYTES = 1_500_000
+MAX_BYTES = 1_500_000
 NEARLY_WHITE = 245
 
 
@@ -106,8 +106,8 @@ def main() -> None:
     (root,) = map(Path, sys.argv[1:])
     workspace = Workspace.open(root)
     moving = moving_pair(workspace)
-    if len(moving) > MOST_BYTES:
-        raise SystemExit(f"docs/moving_pair.gif has {len(moving)} bytes, more than {MOST_BYTES}; shorten SHOWN_S")
+    if len(moving) > MAX_BYTES:
+        raise SystemExit(f"docs/moving_pair.gif has {len(moving)} bytes, more than {MAX_BYTES}; shorten SHOWN_S")
     items = workspace.tables.read_all(ITEMS).query("scenario_id in @ON_SHEET and dataset in ('chaotic', 'occlusion')")
     (DOCS / "two_pairs.png").write_bytes(figure_bytes(pairs_figure(items, workspace.root, SHEET)))
     (DOCS / "finding.png").write_bytes(finding())

@@ -22,7 +22,7 @@ import pandas as pd
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.judging_rows import VERDICTS
-from traps_pipeline.mechanism.hook import Site, changing
+from traps_pipeline.mechanism.hook import Site, register_change
 from traps_pipeline.mechanism.live_gate import Where, open_study
 from traps_pipeline.mechanism.live_gate import gate as gate
 from traps_pipeline.mechanism.other_probes import erased as erased
@@ -153,7 +153,7 @@ def protocol(
     seed = mechanism.seed if mechanism else 0
     run = ProbeRun(items, read, 1, 0, settings, seed, fit=fit)
     columns = ["analysis", "source", "target", "value", "low", "high", "n_voids", "n_controls"]
-    return pd.DataFrame(run.comparable(0), columns=pd.Index(columns))
+    return pd.DataFrame(run.comparable_rows(0), columns=pd.Index(columns))
 
 
 # --- interventions ----------------------------------------------------------------------------------------------------
@@ -209,7 +209,9 @@ class Direction:
             raise TrapsError("this direction has no class gap; give amount, or take a direction of `inside.direction`")
         dose = float(amount) if amount is not None else float(gaps or 0) * float(self.gap or 0)
         along = torch.from_numpy(unit / length)
-        handle = changing(block, site, lambda states: change(states, along.to(states.device, states.dtype), dose))
+        handle = register_change(
+            block, site, lambda states: change(states, along.to(states.device, states.dtype), dose)
+        )
         try:
             yield
         finally:

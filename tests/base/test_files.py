@@ -14,7 +14,7 @@ import pytest
 from tests.build.errors import raises
 from tests.conftest import ROOT
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.files import replacing, write_bytes, write_text
+from traps_pipeline.base.files import replace_file, write_bytes, write_text
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ def alone(file: Path) -> bool:
 
 
 def test_what_the_block_wrote_takes_the_place_of_the_file_when_the_block_ends(file: Path) -> None:
-    with replacing(file) as part:
+    with replace_file(file) as part:
         part.write_text("next")
         assert part.parent == file.parent  # a rename between file systems is a copy
         assert file.read_text() == "former"
@@ -42,7 +42,7 @@ def test_what_the_block_wrote_takes_the_place_of_the_file_when_the_block_ends(fi
 def test_an_error_or_ctrl_c_in_the_middle_leaves_the_former_content_and_nothing_else(
     file: Path, end: BaseException
 ) -> None:
-    with pytest.raises(type(end)), replacing(file) as part:
+    with pytest.raises(type(end)), replace_file(file) as part:
         part.write_text("half of what")
         raise end
     assert file.read_text() == "former"
@@ -51,8 +51,8 @@ def test_an_error_or_ctrl_c_in_the_middle_leaves_the_former_content_and_nothing_
 
 def test_a_kill_in_the_middle_leaves_the_former_content_and_the_next_write_goes_through(file: Path) -> None:
     code = (
-        "import sys, time; from pathlib import Path; from traps_pipeline.base.files import replacing\n"
-        "with replacing(Path(sys.argv[1])) as part, part.open('w') as stream:\n"
+        "import sys, time; from pathlib import Path; from traps_pipeline.base.files import replace_file\n"
+        "with replace_file(Path(sys.argv[1])) as part, part.open('w') as stream:\n"
         "    stream.write('half of what'); stream.flush(); print('writing', flush=True); time.sleep(600)"
     )
     writer = subprocess.Popen([sys.executable, "-c", code, file], cwd=ROOT, stdout=subprocess.PIPE, text=True)
@@ -84,14 +84,14 @@ def test_a_durable_file_that_does_not_reach_the_disk_does_not_take_the_place(
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
     monkeypatch.setattr(os, "fsync", broken)
-    with raises(TrapsError, "base.files.replacing", "table.bin"):
+    with raises(TrapsError, "base.files.replace_file", "table.bin"):
         write_bytes(file, b"next", durable=True)
     assert file.read_text() == "former"
     assert alone(file)
 
 
 def test_a_missing_file_that_the_block_reads_is_not_taken_for_one_that_cannot_be_written(file: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"no-such-clip\.mp4"), replacing(file) as part:
+    with pytest.raises(FileNotFoundError, match=r"no-such-clip\.mp4"), replace_file(file) as part:
         part.write_bytes((file.parent / "no-such-clip.mp4").read_bytes())
     assert file.read_text() == "former"
     assert alone(file)

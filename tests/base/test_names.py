@@ -11,13 +11,13 @@ import yaml
 
 from tests.build.entries import nobodys_own
 from tests.build.errors import raises
-from traps_pipeline.base.names import LONGEST, check_name
+from traps_pipeline.base.names import MAX_NAME_LENGTH, check_name
 from traps_pipeline.cli import main
 from traps_pipeline.protocol.cells import Cell, Evaluation
 
 __all__ = ["nobodys_own"]  # a fixture
 KEYS = ["", "a_b", "a__b", "A", "a|b", "a/b", "a b", "a,b", "a\n", "ä", "a\u0663"]
-PATHS = [".", "..", "a..b", "a...b", ".a", "a.", "-a", "a-", "a" * (LONGEST + 1)]
+PATHS = [".", "..", "a..b", "a...b", ".a", "a.", "-a", "a-", "a" * (MAX_NAME_LENGTH + 1)]
 VALUES = ["1", "1.5", "1e3", "0x1f", "0b1", "2026-11-01", "2026-13-45", "20261101", "nan", "inf", "infinity"]
 VALUES += ["true", "false", "yes", "no", "on", "off", "null"]
 
@@ -28,7 +28,7 @@ def test_a_name_that_becomes_something_else_is_refused(name: str) -> None:
         check_name(name)
 
 
-@pytest.mark.parametrize("name", ["m", "gpt-5", "qwen3-vl-8b.2", "4o", "7b-1e3", "a--b", "a" * LONGEST])
+@pytest.mark.parametrize("name", ["m", "gpt-5", "qwen3-vl-8b.2", "4o", "7b-1e3", "a--b", "a" * MAX_NAME_LENGTH])
 def test_any_other_name_is_a_key_a_file_and_a_text(name: str, tmp_path: Path) -> None:
     assert check_name(name) == name
     key = Cell("occlusion_ill_posed", Evaluation(name, "standard", 1)).evaluation.key

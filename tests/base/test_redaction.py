@@ -117,7 +117,7 @@ def test_the_password_of_an_address_and_a_key_with_any_name_are_secrets(monkeypa
 
 TRACEBACK = """
 import logging, threading, warnings
-from traps_pipeline.base.redaction import redact_tracebacks, redacted
+from traps_pipeline.base.redaction import redact_tracebacks, redact_exception
 redact_tracebacks()
 redact_tracebacks()
 key = __import__("os").environ["MY_API_KEY"]
@@ -129,7 +129,7 @@ try:
     fail()
 except ValueError as error:
     logging.exception("it failed")
-    print(redacted(error), redacted(KeyError("x")).__class__)
+    print(redact_exception(error), redact_exception(KeyError("x")).__class__)
 thread = threading.Thread(target=fail)
 thread.start()
 thread.join()

@@ -59,7 +59,7 @@ def test_a_terminal_gets_headings_with_a_rule_and_the_columns_that_fit(columns: 
 
 def test_lines_of_a_terminal_are_broken_between_words_and_their_rest_is_indented() -> None:
     text = f"stage is not fresh\n    reason: {'words ' * 20}end"
-    code = f"from traps_pipeline.base.terminal import wrapped; print(wrapped({text!r}))"
+    code = f"from traps_pipeline.base.terminal import wrap_text; print(wrap_text({text!r}))"
     environment = {name: value for name, value in os.environ.items() if name != "COLUMNS"}
     returned, screen = run_in_terminal([sys.executable, "-c", code], 80, 24, ROOT, environment)
     first, reason, *rest = screen.text.splitlines()

@@ -12,7 +12,7 @@ from itertools import count
 import pytest
 
 from traps_pipeline.base import workers
-from traps_pipeline.base.workers import kept_workers, run_in_order
+from traps_pipeline.base.workers import keep_workers, run_in_order
 
 
 def who(job: int) -> int:
@@ -25,13 +25,13 @@ def who(job: int) -> int:
 @pytest.mark.slow
 def test_a_worker_gives_way_after_so_many_jobs_also_where_it_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(workers, "JOBS_A_WORKER", 3)
-    with kept_workers():
+    with keep_workers():
         pids = [pid for jobs in (2, 5) for _, pid in run_in_order(who, range(jobs), 1)]
     assert pids == [pids[0]] * 3 + [pids[3]] * 3 + [pids[6]] and len(set(pids)) == 3
 
 
 def test_after_a_worker_died_the_next_call_has_others_and_after_an_early_stop_the_same() -> None:
-    with kept_workers():
+    with keep_workers():
         with pytest.raises(BrokenProcessPool):
             list(run_in_order(who, [0, -1, 0], 1))
         results = run_in_order(who, count(), 1)

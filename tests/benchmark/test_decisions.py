@@ -96,7 +96,7 @@ def test_who_decides_on_what_somebody_else_decided_is_told(tmp_path: Path) -> No
 
 def test_a_file_that_would_overrule_reviews_is_named(tmp_path: Path) -> None:
     (tmp_path / "zz.jsonl").write_text("")
-    with raises(TrapsError, "benchmark.decisions._appending", "zz.jsonl", "review.jsonl"):
+    with raises(TrapsError, "benchmark.decisions._open_for_append", "zz.jsonl", "review.jsonl"):
         decide(decision("keep"), n_seen=0, folder=tmp_path)
 
 

@@ -13,7 +13,7 @@ PACKAGE = "traps_pipeline."
 
 
 def raised_in(error: BaseException) -> str:
-    """Return the innermost function of the package in a traceback, as `base.files.replacing`.
+    """Return the innermost function of the package in a traceback, as `base.files.replace_file`.
 
     Otherwise the model of pydantic that refused, or nothing.
     """
@@ -28,7 +28,7 @@ def raised_in(error: BaseException) -> str:
 
 @contextmanager
 def raises(error: type[BaseException], by: str = "", *names: str) -> Iterator[pytest.ExceptionInfo[BaseException]]:
-    """Expect an error that a function, class or module of the package raises, as `base.files.replacing`.
+    """Expect an error that a function, class or module of the package raises, as `base.files.replace_file`.
 
     by: any of the package if empty; of pydantic's errors the model. names: values of the test that the sentence must
     repeat, such as a file, a line or a model: a user finds the input by them.

@@ -20,7 +20,7 @@ from traps_pipeline.base.errors import TrapsError
 
 pytestmark = pytest.mark.slow
 TRIES = int(os.environ.get("TRAPS_CAMPAIGN", "1200"))
-MOST_SAID = 400  # characters, the file's own name aside
+MAX_SAID = 400  # characters, the file's own name aside
 # What people and programs write where something else belongs.
 ODD = (
     b"null", b"~", b"true", b"yes", b"NaN", b".inf", b"-1", b"1e999", b"9" * 5000, b"18446744073709551616", b"1:30",
@@ -111,5 +111,5 @@ def test_altered_files_are_read_or_refused_in_a_sentence_that_names_them(
         first = said.split("\n")[0]
         assert Path(reader.file).name in first or first.startswith(f"{folder}: "), said
         first = first.replace(str(folder), "")
-        assert len(first) <= MOST_SAID, said
+        assert len(first) <= MAX_SAID, said
         assert "\x1b" not in said, said

@@ -75,7 +75,7 @@ def test_an_error_in_a_200_is_named_as_one(
     check: Check, provider: Provider, capsys: pytest.CaptureFixture[str], code: int, cause: str
 ) -> None:
     provider.configure(raw_by_model={NAME: {"content": f'{{"error": {{"message": "busy", "code": {code}}}}}'}})
-    with progress.reporting(progress.Progress()):
+    with progress.use_progress(progress.Progress()):
         assert all(cause in problem for problem in check().problems)
     assert "busy (an error object in an HTTP 200)" in capsys.readouterr().err
 

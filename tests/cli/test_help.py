@@ -12,7 +12,7 @@ import pytest
 from tests.conftest import ROOT
 from tools.commands_page import PAGE, page
 from traps_pipeline.cli import GROUPS, START, build_parser, main
-from traps_pipeline.cli.command import SHORT
+from traps_pipeline.cli.command import SHORT_NAMES
 
 
 def test_the_examples_of_help_texts_can_be_given_as_they_stand() -> None:
@@ -34,7 +34,7 @@ def test_no_line_of_a_help_text_is_wider_than_a_terminal(monkeypatch: pytest.Mon
 
 def test_every_command_but_completion_stands_in_a_group_and_daily_ones_need_none() -> None:
     assert {path.split()[0] for path in build_parser().commands} == {*GROUPS, "completion"}
-    for name, group in SHORT.items():
+    for name, group in SHORT_NAMES.items():
         words = ["demo"] if name in ("plan", "run") else ["a:b:c"] if name == "why" else []
         assert build_parser().parse_args([name, *words]).parser.prog == f"traps {group} {name}"
 

@@ -19,7 +19,7 @@ from dagster._daemon.monitoring.run_monitoring import RESUME_RUN_LOG_MESSAGE
 from tests.postgres import Postgres
 from traps_pipeline.base.cores import cores
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.progress import Progress, reporting
+from traps_pipeline.base.progress import Progress, use_progress
 from traps_pipeline.cluster.history import HISTORY, LOGS, dagster_yaml
 from traps_pipeline.cluster.node import code_here, require_same_code
 from traps_pipeline.cluster.ray_runs import RESOURCES_TAG, STUDY_TAG, RayRuns, own_tags
@@ -272,7 +272,7 @@ def test_an_interrupted_command_leaves_its_runs_or_ends_them_and_the_next_one_co
     stages = [the_graph()[name] for name in (RESPONSES.name, "votes")]
     selected = frozenset(asset_key(stage.name) for stage in stages)
     cells = range_tags(("occlusion|oracle__standard__run1", "chaotic|oracle__standard__run1"))
-    with dg.DagsterInstance.ephemeral() as instance, reporting(shown):
+    with dg.DagsterInstance.ephemeral() as instance, use_progress(shown):
         run = dg.DagsterRun("a job", asset_selection=selected, tags={**cells, STUDY_TAG: "lab"})
         instance.add_run(run)
         ended = list[str]()

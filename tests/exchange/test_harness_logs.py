@@ -12,7 +12,7 @@ import pytest
 
 from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.exchange.answer_exchange import Answer, AnswerContext, _by_item, checked_answers
+from traps_pipeline.exchange.answer_exchange import Answer, AnswerContext, _answers_by_item, checked_answers
 from traps_pipeline.exchange.harness_logs import reader_of
 from traps_pipeline.models.request import Request
 
@@ -37,7 +37,7 @@ def imported(folder: Path, *samples: Mapping[str, Any], run: int = 1) -> tuple[d
     log.write_text(json.dumps({"samples": samples}))
     reader = reader_of(log)
     assert reader is not None
-    return _by_item(reader(log), wanted(1, 2, 3), AnswerContext("m", run))
+    return _answers_by_item(reader(log), wanted(1, 2, 3), AnswerContext("m", run))
 
 
 def test_failed_samples_are_counted_and_stay_missing_while_the_others_are_imported(tmp_path: Path) -> None:
@@ -52,7 +52,7 @@ def test_failed_samples_are_counted_and_stay_missing_while_the_others_are_import
 def test_epochs_are_runs_from_the_one_that_is_named(tmp_path: Path) -> None:
     answers, _ = imported(tmp_path, sample("a"), sample("b", epoch=2), run=2)
     assert {key: answer.text for key, answer in answers.items()} == {"x2": "a", "x3": "b"}
-    with raises(TrapsError, "exchange.answer_exchange._by_item"):
+    with raises(TrapsError, "exchange.answer_exchange._answers_by_item"):
         imported(tmp_path, sample(epoch=2), run=3)
 
 
@@ -92,7 +92,7 @@ def test_scores_that_are_no_numbers_and_twice_written_samples_hinder_no_import(t
         with pytest.warns(UserWarning, match="Duplicate name"):
             archive.writestr("samples/x_epoch_1.json", json.dumps(scored))
     reader = reader_of(log)
-    assert reader is not None and _by_item(reader(log), wanted(1), AnswerContext("m"))[0]["x1"].text == "left"
+    assert reader is not None and _answers_by_item(reader(log), wanted(1), AnswerContext("m"))[0]["x1"].text == "left"
 
 
 def test_a_byte_order_mark_before_the_first_line_is_no_part_of_it(tmp_path: Path) -> None:
@@ -101,4 +101,4 @@ def test_a_byte_order_mark_before_the_first_line_is_no_part_of_it(tmp_path: Path
     assert checked_answers(path, wanted(1))["x1"].text == "left"
     path.write_text('{"item": "x", "regime": "json", "text": "left"}\n', encoding="utf-8-sig")
     reader = reader_of(path)
-    assert reader is not None and _by_item(reader(path), wanted(1), AnswerContext("m"))[0]["x1"].text == "left"
+    assert reader is not None and _answers_by_item(reader(path), wanted(1), AnswerContext("m"))[0]["x1"].text == "left"

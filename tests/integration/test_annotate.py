@@ -22,7 +22,7 @@ from traps_pipeline.people.human_label_rows import HUMAN_AGREEMENT, HUMAN_LABELS
 from traps_pipeline.people.human_score_rows import CORRECTED, HUMAN_ROW, PANEL_ERRORS
 from traps_pipeline.people.label_units import TaskName, units
 from traps_pipeline.protocol.datasets import DATASETS
-from traps_pipeline.report.tables.human_tables import said_by_people
+from traps_pipeline.report.tables.human_tables import people_notes
 from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.workspace import Workspace
@@ -220,7 +220,7 @@ def rest(server: Server, knowing: Knowing, truth: Mapping[str, str | None]) -> N
 def check_tables(study: Checkout, knowing: Knowing) -> None:
     """`traps run` makes the tables of the labels, and nothing is asked for them."""
     workspace = Workspace.open(study.workspace)
-    before = said_by_people(workspace.tables.read_all(HUMAN_ROW), workspace.tables.read_all(PANEL_ERRORS))
+    before = people_notes(workspace.tables.read_all(HUMAN_ROW), workspace.tables.read_all(PANEL_ERRORS))
     assert before[0].startswith("people: not run") and before[1].startswith("the panel: not validated")
     ran = study.traps("run", EXPERIMENT, "--until", "report_page").ok()
     assert ran.counts() == {"answers": 0, "votes": 0, "frames": 0}
@@ -242,7 +242,7 @@ def check_tables(study: Checkout, knowing: Knowing) -> None:
     for name in ("acc", "abs_rec", "false_abs", "pecs", "pecs_ci_low", "pecs_ci_high"):
         assert both[name].to_numpy() == pytest.approx(both[f"{name}_board"].to_numpy(), nan_ok=True)
     assert both["pecs_corrected"].notna().all() and (both["pecs_corrected"] != both["pecs"]).any()
-    after = said_by_people(workspace.tables.read(HUMAN_ROW, {}), workspace.tables.read(PANEL_ERRORS, {}))
+    after = people_notes(workspace.tables.read(HUMAN_ROW, {}), workspace.tables.read(PANEL_ERRORS, {}))
     assert "2 people, 48 clips" in after[0] and "abstention sensitivity" in after[1]
 
 

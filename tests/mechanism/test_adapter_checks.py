@@ -14,7 +14,7 @@ from tests.local_models import FAMILIES, Family, model
 from tests.models.local import check_table
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism import patching_effects
-from traps_pipeline.mechanism.adapter_checks import CHECKS, Subject, brightening
+from traps_pipeline.mechanism.adapter_checks import CHECKS, Subject, brightening_clip
 from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.models.local import capture
 from traps_pipeline.models.local import vision_cache as clips
@@ -73,7 +73,7 @@ def paths_beside_the_stream_forgotten(patch: pytest.MonkeyPatch) -> None:
 def test_a_check_loses_where_the_adapter_is_broken(
     family: Family, check: str, broken: Callable[[pytest.MonkeyPatch], None], said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    subject = Subject(model(family), *brightening())
+    subject = Subject(model(family), *brightening_clip())
     subject.model.clips = clips.ClipMemory()
     with monkeypatch.context() as patch:
         broken(patch)
@@ -84,7 +84,7 @@ def test_a_check_loses_where_the_adapter_is_broken(
 
 
 def test_in_sixteen_bits_what_rounding_changes_is_not_looked_at() -> None:
-    subject = Subject(model("qwen3-vl", dtype="bfloat16"), *brightening())
+    subject = Subject(model("qwen3-vl", dtype="bfloat16"), *brightening_clip())
     found = {check.name: check.found(subject) for check in CHECKS}
     assert found["states"] == "5 states, bit for bit"
     assert found["batches"] == "not looked at: in bfloat16 rounding differs with the shape of a pass"

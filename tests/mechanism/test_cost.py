@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from traps_pipeline.cli import main
-from traps_pipeline.mechanism.cost import Card, Work, cost_of, passes_inside
+from traps_pipeline.mechanism.cost import Card, Work, cost_of, mechanism_passes
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.storage.media import MediaSpec
@@ -33,13 +33,13 @@ def test_the_passes_of_the_papers_study_are_counted() -> None:
         }
     )
     scenarios = {"occlusion": 202, "chaotic": 500}
-    passes = {work.kind: work.passes for work in passes_inside(settings, DATASETS, scenarios)}
+    passes = {work.kind: work.passes for work in mechanism_passes(settings, DATASETS, scenarios)}
     assert passes["states"] == 2 * (4 * 202 + 4 * 500) + 202 + 2 * 500
     assert passes["sentences"] == (3 + 1) * 2 * (4 * 202 + 4 * 500)  # three abstentions and the own answer, two regimes
     assert passes["states of random weights"] == 4 * 202 + 4 * 500 + 202 + 2 * 500
     # Two directions of 100 pairs: 2 records and a gradient (3); 1 + 4 records; 4 sources x (24 + 1) rows of half a pass
     assert passes["patching"] == 2 * 100 * (5 + 5 + 50)
-    few = passes_inside(settings, ["chaotic"], {"chaotic": 3, "occlusion": 202})[0]
+    few = mechanism_passes(settings, ["chaotic"], {"chaotic": 3, "occlusion": 202})[0]
     assert few.passes == 2 * (2 * 3) + 2 * 3
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from traps_pipeline.mechanism import gating
 from traps_pipeline.mechanism.gate import (
-    NEVER,
+    NO_THRESHOLD,
     OTHER_DATASETS,
     OTHER_FAMILIES,
     Items,
@@ -29,7 +29,7 @@ def test_thresholds_are_the_ones_worked_out() -> None:
     found = thresholds(score, void, 0.05)
     assert found["mid"] == pytest.approx((17 / 3 + 1) / 2)
     assert found["J"] == pytest.approx(2.5)
-    assert found["conformal"] == NEVER  # three controls cannot promise 5 %
+    assert found["conformal"] == NO_THRESHOLD  # three controls cannot promise 5 %
     assert thresholds(score, void, 0.25)["conformal"] == 2.0  # rank ceil(4 x 0.75) = 3 of 3
     many = np.arange(19.0)
     found = thresholds(np.append(many, 50.0), np.arange(20) == 19, 0.05)
@@ -55,7 +55,7 @@ def test_the_interval_of_a_gate_has_a_width_where_all_items_agree(right: float) 
     void = np.tile([False, True], n)
     outcomes = Outcomes(void, np.where(void, np.nan, right), np.where(void, right, 0.0))
     names = np.repeat([f"occlusion-{number:03d}" for number in range(n)], 2)
-    figures = figures_of(gating._resampled(outcomes, "occlusion", names, 2000, 1))
+    figures = figures_of(gating._resample(outcomes, "occlusion", names, 2000, 1))
     low, high = interval(figures[:, gating._PECS, 1:], right, (0.0, 1.0))
     outermost = 0.025 ** (1 / n)  # Clopper and Pearson's lower end of n of n; .74 for 12
     assert low <= outermost + 0.02 and high == 1.0 if right else low == 0.0 < high

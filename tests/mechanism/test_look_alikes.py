@@ -126,7 +126,7 @@ def test_a_probe_that_reads_what_look_alikes_share_with_voids_is_told_from_one_t
     for layer, against_voids, against_controls in ((0, 0.5, 1.0), (1, 1.0, 0.5)):
         value = {
             row["analysis"]: row["value"]
-            for row in run.comparable(layer)
+            for row in run.comparable_rows(layer)
             if (row["source"], row["target"]) == (source, arm)
         }
         assert value["answerable_void"] == pytest.approx(against_voids, abs=0.2)

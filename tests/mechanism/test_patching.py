@@ -17,7 +17,7 @@ from accelerate.hooks import AlignDevicesHook, add_hook_to_module, remove_hook_f
 from tests import local_models
 from tests.local_models import QUESTIONS, SYSTEM, Family, ask, clip, model
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.mechanism.adapter_checks import CHECKS, Subject, brightening
+from traps_pipeline.mechanism.adapter_checks import CHECKS, Subject, brightening_clip
 from traps_pipeline.mechanism.margin import abstention_tokens
 from traps_pipeline.mechanism.patching_effects import (
     Patch,
@@ -173,7 +173,7 @@ def test_models_whose_blocks_read_more_than_is_known_are_refused(
     of = model("qwen3-vl")
     monkeypatch.setattr(of.network.config.text_config, field, 1, raising=False)
     (check,) = [check for check in CHECKS if check.name == "patching"]
-    assert check.found(Subject(of, *brightening())) == f"refused: {what}"
+    assert check.found(Subject(of, *brightening_clip())) == f"refused: {what}"
     with pytest.raises(TrapsError, match=rf"{what} \({field}\), which patching does not replace"):
         require_patchable(of)
 

@@ -240,7 +240,7 @@ def test_cf_of_shared_controls_is_held_out_by_scenario_too_or_says_that_too_few_
     def of(scenarios: int) -> dict[str, pd.DataFrame]:
         some = frozenset(f"occlusion-{n:02d}" for n in range(scenarios))
         run = run_of(items, states, Confabulated({"occlusion": some, "occlusion_ill_posed": some}), folds=5)
-        return {str(name): part for name, part in pd.DataFrame(run.comparable(0)).groupby("analysis")}
+        return {str(name): part for name, part in pd.DataFrame(run.comparable_rows(0)).groupby("analysis")}
 
     many, two = of(12), of(2)
     assert many["confabulated"]["value"].min() > 0.9 > 0.8 > many["confabulated_held_out"]["value"].max()
@@ -302,7 +302,7 @@ def test_swapped_times_tell_a_probe_of_stamps_from_one_of_frames() -> None:
             states[dataset, layer][:, column] = 8.0 * shown
     run = run_of(items, states)
     for layer, expected in ((0, 1.0), (1, 0.0)):
-        rows = [r for r in run.comparable(layer) if r["analysis"] == "time_swapped" and r["source"] == "chaotic"]
+        rows = [r for r in run.comparable_rows(layer) if r["analysis"] == "time_swapped" and r["source"] == "chaotic"]
         assert [row["value"] for row in rows] == [pytest.approx(expected, abs=0.25)]
 
 

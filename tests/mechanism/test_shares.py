@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from traps_pipeline.mechanism.shares import effect_rows, share_rows
-from traps_pipeline.mechanism.steering import UNSTEERED, shared_item
+from traps_pipeline.mechanism.steering import UNSTEERED, ledger_item_id
 from traps_pipeline.mechanism.transfer_paths import STEERING_PATHS
 from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 from traps_pipeline.scoring.bootstrap import resampled_sums
@@ -27,7 +27,7 @@ def study(scenarios: tuple[str, ...] = ("s0", "s1")) -> tuple[pd.DataFrame, pd.D
                 rows.append(
                     item
                     | {"item_id": f"{target}:{scenario}:{side}", "source": source, "kind": kind, "layer": layer}
-                    | {"alpha": alpha, "request_key": f"{shared_item(item)} {source} {alpha}"}
+                    | {"alpha": alpha, "request_key": f"{ledger_item_id(item)} {source} {alpha}"}
                     | {"abstained": side == "void" and scenario.endswith(ABSTAINS)}
                 )
     frame = pd.DataFrame(rows).assign(model="m", directions="guided", regime="guided", epoch="e", alpha_relative=0.1)

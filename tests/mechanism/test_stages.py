@@ -35,7 +35,7 @@ from traps_pipeline.mechanism.mechanism_rows import (
 )
 from traps_pipeline.mechanism.nulls import null_rows, pecs_rows
 from traps_pipeline.mechanism.probing_versions import extraction_version, steering_version
-from traps_pipeline.mechanism.shares import effect_rows, of_paper
+from traps_pipeline.mechanism.shares import effect_rows, paper_protocol_rows
 from traps_pipeline.mechanism.steering import (
     UNSTEERED,
     collect_steered,
@@ -347,7 +347,7 @@ def effects_of_wrong_answers(steered: Workspace) -> pd.DataFrame:
 
 def test_effects_put_the_model_as_it_is_into_every_path(steered: Workspace) -> None:
     effects = effects_of_wrong_answers(steered)
-    main = of_paper(effects).query("layer == 2")
+    main = paper_protocol_rows(effects).query("layer == 2")
     assert len(main.groupby(["source", "target"])) == 14
     answers = main["n"] + main["n_missing"]  # at alpha 0 as many: the path's own scenarios, not all
     own = main["source"].isin(["occlusion", "chaotic"]) & (

@@ -15,7 +15,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.account_budget import AccountBudget
 from traps_pipeline.models.budget import Budget, BudgetReached
 from traps_pipeline.models.registry import get_model
-from traps_pipeline.models.spending import spending
+from traps_pipeline.models.spending import open_budget
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 
@@ -106,9 +106,9 @@ def test_a_second_study_stops_where_the_first_has_spent_the_accounts_money(tmp_p
     async def pay(budget: Budget, dollars: float) -> None:
         await budget.settle(await budget.reserve(entry.id, dollars), dollars - 1)
 
-    with spending(study(tmp_path / "one", folder), [entry]) as one:
+    with open_budget(study(tmp_path / "one", folder), [entry]) as one:
         asyncio.run(pay(one, 6))
-        with spending(study(tmp_path / "two", folder), [entry]) as two:  # at the same time
+        with open_budget(study(tmp_path / "two", folder), [entry]) as two:  # at the same time
             asyncio.run(pay(two, 5))
             with pytest.raises(BudgetReached, match=r"account openai is reached: 2 studies have spent \$9\.00 of \$10"):
                 asyncio.run(pay(two, 2))
@@ -119,7 +119,7 @@ def test_money_spent_before_a_study_named_the_account_counts(tmp_path: Path, fol
     workspace = study(tmp_path / "study", folder)
     write(workspace.answers, paid("k", 4.0, "gpt-5-mini"))
     for _ in range(2):  # once, not each time
-        with spending(workspace, [get_model("gpt-5-mini")]):
+        with open_budget(workspace, [get_model("gpt-5-mini")]):
             pass
     assert AccountBudget("openai", folder, "x").spent_usd == {workspace.study.name: 4.0}
 
@@ -127,11 +127,11 @@ def test_money_spent_before_a_study_named_the_account_counts(tmp_path: Path, fol
 def test_an_account_without_a_file_or_a_name_is_refused(tmp_path: Path) -> None:
     entry = get_model("gpt-5-mini")
     nobody = Workspace.create(tmp_path / "a", Study(budget_usd=5, account_budgets={"opnai": "x"}))
-    with pytest.raises(TrapsError, match="account_budgets names opnai, no account"), spending(nobody, [entry]):
+    with pytest.raises(TrapsError, match="account_budgets names opnai, no account"), open_budget(nobody, [entry]):
         pass
     missing = study(tmp_path / "b", tmp_path / "nowhere")
     with (
         pytest.raises(TrapsError, match=r"nowhere/budget\.yaml: no such file; write `usd: 100`"),
-        spending(missing, [entry]),
+        open_budget(missing, [entry]),
     ):
         pass

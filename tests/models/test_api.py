@@ -135,7 +135,7 @@ def test_what_will_not_pass_is_final_and_told_once_without_the_key(
     provider: Provider, route: str, fault: str, error: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     provider.configure(faults={fault: 1.0})
-    with progress.reporting(progress.Progress()):
+    with progress.use_progress(progress.Progress()):
         outcome = ask(provider, route)
     assert (outcome.kind, outcome.error, outcome.text) == ("error", error, None)
     told = capsys.readouterr().err

@@ -19,7 +19,7 @@ from tests.build.ledger import local
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models import participants
 from traps_pipeline.models.answers import answer_request
-from traps_pipeline.models.ask import STOPS, run_work, settle
+from traps_pipeline.models.ask import STOP_SIGNALS, run_work, settle
 from traps_pipeline.models.registry import Limits, get_model
 from traps_pipeline.models.request import Outcome, Request, TransientError
 from traps_pipeline.protocol.cells import Evaluation
@@ -200,7 +200,7 @@ def interrupted(script: str, folder: Path) -> subprocess.Popen[str]:
 
 @pytest.mark.slow
 @pytest.mark.promise
-@pytest.mark.parametrize("stop", STOPS)
+@pytest.mark.parametrize("stop", STOP_SIGNALS)
 def test_a_stop_waits_for_the_calls_in_flight_and_goes_on_later(tmp_path: Path, stop: signal.Signals) -> None:
     run = interrupted(INTERRUPTED, tmp_path)
     run.send_signal(stop)

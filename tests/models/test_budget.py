@@ -22,7 +22,7 @@ from traps_pipeline.models.budget import Budget, BudgetReached, check_money, mos
 from traps_pipeline.models.participants import Participants
 from traps_pipeline.models.registry import Account, Entry, Limits, Prices
 from traps_pipeline.models.request import Outcome, Request, TransientError
-from traps_pipeline.models.spending import spending
+from traps_pipeline.models.spending import open_budget
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
@@ -151,7 +151,7 @@ def test_a_call_that_may_be_billed_counts_as_its_worst_case(
 def test_a_cap_for_nobody_is_refused(tmp_path: Path) -> None:
     workspace = Workspace.create(tmp_path, Study(budget_usd=5, model_budgets_usd={"gpt-5-mini": 1, "gpt-6": 1}))
     complaint = r"study\.yaml: model_budgets_usd names gpt-6, neither a model"
-    with pytest.raises(TrapsError, match=complaint), spending(workspace, [PRICED]):
+    with pytest.raises(TrapsError, match=complaint), open_budget(workspace, [PRICED]):
         pass
 
 

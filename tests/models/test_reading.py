@@ -8,7 +8,7 @@ import pytest
 
 from tests.build.errors import raises
 from traps_pipeline.models.reading import Reading, degenerate, read_answer
-from traps_pipeline.models.thinking import USUAL, how_to_declare, marks_of, strip_fence, strip_tokens
+from traps_pipeline.models.thinking import COMMON_MARKS, declaration_line, marks_of, strip_fence, strip_tokens
 
 THINK = ("<think>", "</think>")
 
@@ -116,12 +116,12 @@ def test_a_whole_final_answer_stands_although_its_object_breaks_off(text: str) -
     assert (read(text, "truncated", "json").outcome, read(text, "truncated", "json").text) == ("answer", text)
 
 
-@pytest.mark.parametrize(("opens", "closes"), USUAL)
+@pytest.mark.parametrize(("opens", "closes"), COMMON_MARKS)
 def test_every_usual_mark_is_split_off_once_declared_and_named_before(opens: str, closes: str) -> None:
     marks = marks_of(opens)
     row = {"outcome": "answer", "text": f"{opens}It may be left.{closes} right"}
     undeclared = read_answer(row, None, "standard")
-    assert undeclared.outcome == "degenerate" and how_to_declare(opens) in str(undeclared.why)
+    assert undeclared.outcome == "degenerate" and declaration_line(opens) in str(undeclared.why)
     found = read_answer(row, None, "standard", thinking=marks)
     assert (found.outcome, found.text, found.reasoning) == ("answer", "right", "It may be left.")
     endless = {"outcome": "answer", "text": f"The answer is: left. {opens}I guess"}
@@ -131,7 +131,7 @@ def test_every_usual_mark_is_split_off_once_declared_and_named_before(opens: str
 def test_what_gpt_oss_writes_around_its_messages_is_no_answer() -> None:
     thought = "<|start|>assistant<|channel|>analysis<|message|>Left?<|end|>"
     text = f"{thought}<|start|>assistant<|channel|>final<|message|>right<|return|>"
-    found = read_answer({"outcome": "answer", "text": text}, None, "standard", thinking=marks_of(USUAL[-1][0]))
+    found = read_answer({"outcome": "answer", "text": text}, None, "standard", thinking=marks_of(COMMON_MARKS[-1][0]))
     assert (found.text, found.reasoning) == ("right", "Left?")
 
 

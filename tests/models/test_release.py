@@ -16,7 +16,7 @@ from traps_pipeline.cli import main
 from traps_pipeline.ledger.money import Money, Releasable
 from traps_pipeline.models.budget import BudgetReached
 from traps_pipeline.models.release import releasable, release
-from traps_pipeline.models.spending import spending
+from traps_pipeline.models.spending import open_budget
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 
@@ -42,7 +42,7 @@ def in_flight(workspace: Workspace, participant: str) -> None:
 
 def room_for(workspace: Workspace, dollars: float) -> bool:
     """Whether a call of so many dollars fits into the study's budget."""
-    with spending(workspace, [entry_of("m")]) as budget:
+    with open_budget(workspace, [entry_of("m")]) as budget:
         try:
             reservation = asyncio.run(budget.reserve("m", dollars))
         except BudgetReached:

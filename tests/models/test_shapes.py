@@ -193,7 +193,7 @@ def test_a_usage_that_contradicts_itself_is_booked_at_its_largest_and_said(
     odd: Provider, said: str, completion: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
     odd.configure(raw_by_model={"m": {"content": said}})
-    with progress.reporting(progress.Progress()):
+    with progress.use_progress(progress.Progress()):
         outcome, booked_usd = booked_for(odd, "m")
     assert booked_usd >= completion * 1e-5 and outcome and outcome.text == ANSWER
     assert "(usage: contradicts itself; " in capsys.readouterr().err
@@ -292,7 +292,7 @@ def test_keys_do_not_follow_a_redirect_to_another_host(odd: Provider) -> None:
 def test_words_of_a_provider_cannot_steer_a_terminal(odd: Provider, capsys: pytest.CaptureFixture[str]) -> None:
     error = json.dumps({"error": {"message": "\x1b[2J\x1b]52;c;ZWNobw==\x07 \u202enever", "type": "x", "code": "y"}})
     odd.configure(raw_by_model={"m": {"content": error, "status": 404}})
-    with progress.reporting(progress.Progress()):
+    with progress.use_progress(progress.Progress()):
         assert booked_for(odd, "m")[0] == Outcome("error", error="http_404", cost_usd=0.0)
     told = capsys.readouterr().err
     assert "(http_404: " in told and told.count("\n") == 1

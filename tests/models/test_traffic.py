@@ -11,7 +11,13 @@ import pytest
 
 from tests.build.errors import raises
 from traps_pipeline.models.request import Outcome
-from traps_pipeline.models.traffic import Breaker, Gate, Meter, ParticipantStopped, remembering_stops
+from traps_pipeline.models.traffic import (
+    CircuitBreaker,
+    ConnectionLimit,
+    ParticipantStopped,
+    RateLimiter,
+    remembering_stops,
+)
 
 ANSWER, ERROR = Outcome("answer", "left"), Outcome("error", error="timeout")
 
@@ -19,7 +25,7 @@ ANSWER, ERROR = Outcome("answer", "left"), Outcome("error", error="timeout")
 def test_a_429_halves_the_connections_once_a_second_and_answers_win_them_back(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    gate = Gate(24)
+    gate = ConnectionLimit(24)
     gate.slow_down()
     gate.slow_down()  # of the same burst
     assert gate.limit == 12
@@ -40,7 +46,7 @@ def test_a_429_halves_the_connections_once_a_second_and_answers_win_them_back(mo
 
 def test_no_more_calls_are_open_than_there_are_connections() -> None:
     async def run() -> int:
-        gate, most = Gate(3), 0
+        gate, most = ConnectionLimit(3), 0
 
         async def call() -> None:
             nonlocal most
@@ -58,7 +64,7 @@ def test_no_more_calls_are_open_than_there_are_connections() -> None:
 
 def test_a_cancelled_wait_frees_its_place_in_the_queue() -> None:
     async def run() -> None:
-        gate = Gate(1)
+        gate = ConnectionLimit(1)
         async with gate.connection():
             connections = [gate.connection() for _ in range(2)]
             waiting = [asyncio.create_task(connection.__aenter__()) for connection in connections]
@@ -70,7 +76,7 @@ def test_a_cancelled_wait_frees_its_place_in_the_queue() -> None:
     asyncio.run(run())
 
 
-def admitted(meter: Meter, calls: int, tokens: int) -> float:
+def admitted(meter: RateLimiter, calls: int, tokens: int) -> float:
     """Return the seconds until a meter has let all calls through."""
 
     async def run() -> float:
@@ -83,16 +89,16 @@ def admitted(meter: Meter, calls: int, tokens: int) -> float:
 
 def test_an_account_sends_no_more_calls_and_tokens_a_minute_than_it_may() -> None:
     # 20 calls at once, 5 more at ten a second; 2,000 tokens at once, 500 more at a thousand a second.
-    assert admitted(Meter(600, None), 25, 1000) >= 0.45
-    assert admitted(Meter(None, 60_000), 5, 500) >= 0.45
+    assert admitted(RateLimiter(600, None), 25, 1000) >= 0.45
+    assert admitted(RateLimiter(None, 60_000), 5, 500) >= 0.45
 
 
 def test_processes_that_share_an_account_share_its_pace() -> None:
-    assert admitted(Meter(1200, None, lambda: 2), 25, 1000) >= 0.45  # ten a second of twenty, a burst of 20
+    assert admitted(RateLimiter(1200, None, lambda: 2), 25, 1000) >= 0.45  # ten a second of twenty, a burst of 20
 
 
 def test_twenty_refusals_of_one_kind_in_a_row_stop_a_model_and_nineteen_do_not() -> None:
-    breaker, refusal = Breaker("m"), Outcome("refused", error="content_policy")
+    breaker, refusal = CircuitBreaker("m"), Outcome("refused", error="content_policy")
     for _ in range(19):
         breaker.watch(refusal)
     breaker.watch(ANSWER)
@@ -101,13 +107,13 @@ def test_twenty_refusals_of_one_kind_in_a_row_stop_a_model_and_nineteen_do_not()
     breaker.watch(Outcome("refused", finish_reason="content_filter"))  # another kind
     for _ in range(19):
         breaker.watch(refusal)
-    with raises(ParticipantStopped, "models.traffic.Breaker._stop"):
+    with raises(ParticipantStopped, "models.traffic.CircuitBreaker._stop"):
         breaker.watch(refusal)
 
 
 def test_a_call_that_the_provider_refuses_as_it_is_counts_as_a_refusal() -> None:
-    breaker = Breaker("m")
-    with raises(ParticipantStopped, "models.traffic.Breaker._stop"):
+    breaker = CircuitBreaker("m")
+    with raises(ParticipantStopped, "models.traffic.CircuitBreaker._stop"):
         for _ in range(20):
             breaker.watch(Outcome("error", error="http_401"))
 
@@ -115,25 +121,25 @@ def test_a_call_that_the_provider_refuses_as_it_is_counts_as_a_refusal() -> None
 def test_a_stop_lasts_for_the_whole_run_and_no_longer() -> None:
     def stop(name: str) -> None:
         for _ in range(20):
-            Breaker(name).check()
+            CircuitBreaker(name).check()
             breaker.watch(Outcome("refused"))
 
     with remembering_stops():
-        breaker = Breaker("m")
+        breaker = CircuitBreaker("m")
         with pytest.raises(ParticipantStopped) as first:
             stop("m")
         with pytest.raises(ParticipantStopped) as again:
-            Breaker("m").check()  # as the next batch of the run makes it
+            CircuitBreaker("m").check()  # as the next batch of the run makes it
         assert str(again.value) == str(first.value)
-        Breaker("n").check()
-    Breaker("m").check()
+        CircuitBreaker("n").check()
+    CircuitBreaker("m").check()
 
 
 def test_more_than_ten_errors_in_a_hundred_calls_stop_a_model() -> None:
-    breaker = Breaker("m")
+    breaker = CircuitBreaker("m")
     for n in range(100):
         breaker.watch(ERROR if n % 10 == 0 else ANSWER)  # ten: at the limit
-    with raises(ParticipantStopped, "models.traffic.Breaker._stop"):
+    with raises(ParticipantStopped, "models.traffic.CircuitBreaker._stop"):
         for n in range(1, 12):
             breaker.watch(ERROR if n % 2 else ANSWER)
 
@@ -164,7 +170,7 @@ def test_five_calls_in_a_row_that_never_left_over_twelve_seconds_stop_a_model_an
 ) -> None:
     now = [1000.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    breaker = Breaker("m", "http://127.0.0.1:8000/v1")
+    breaker = CircuitBreaker("m", "http://127.0.0.1:8000/v1")
     for _ in range(24):  # all connections at once, while the server is started again
         breaker.no_connection()
     now[0] += 11
@@ -174,5 +180,5 @@ def test_five_calls_in_a_row_that_never_left_over_twelve_seconds_stop_a_model_an
     for _ in range(5):
         breaker.no_connection()
     now[0] += 12
-    with raises(ParticipantStopped, "models.traffic.Breaker._stop", "http://127.0.0.1:8000/v1", "no such name"):
+    with raises(ParticipantStopped, "models.traffic.CircuitBreaker._stop", "http://127.0.0.1:8000/v1", "no such name"):
         breaker.no_connection("no such name")

@@ -60,7 +60,7 @@ def call(base_url: str, timeout_s: float = LONG_S, **limits: int) -> tuple[Outco
 
 def unsent(capsys: pytest.CaptureFixture[str], base_url: str, timeout_s: float = LONG_S) -> str:
     """What is said of a call that never left; it cost nothing, and its row says no cost."""
-    with progress.reporting(progress.Progress()):
+    with progress.use_progress(progress.Progress()):
         outcome, booked_usd = call(base_url, timeout_s)
     assert (outcome, booked_usd) == (Outcome("error", error="unreachable"), 0.0)
     said = capsys.readouterr().err
@@ -273,7 +273,7 @@ def test_a_content_filter_is_a_refusal_and_other_403s_are_told_from_those_about_
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     refused = Outcome("refused", error="content_policy", cost_usd=0.0)
-    with progress.reporting(progress.Progress()):
+    with progress.use_progress(progress.Progress()):
         assert error(400, AZURE)[0] == refused
         assert error(403, FLAGGED)[0] == refused
         assert error(403, REGION)[0] == Outcome("error", error="http_403_denied", cost_usd=0.0)
@@ -304,7 +304,7 @@ def test_a_compressed_answer_is_read_with_all_its_members(encoding: str, content
 def test_a_compressed_answer_that_breaks_off_or_is_a_bomb_is_no_answer(
     content: bytes, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with answering(200, content, {"content-encoding": "gzip"}) as server, progress.reporting(progress.Progress()):
+    with answering(200, content, {"content-encoding": "gzip"}) as server, progress.use_progress(progress.Progress()):
         outcome, booked_usd = call(f"http://127.0.0.1:{server.port}/v1")
     assert outcome and (outcome.kind, outcome.text) == ("error", None) and booked_usd > 0.0
     said = capsys.readouterr().err

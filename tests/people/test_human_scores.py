@@ -15,7 +15,7 @@ from traps_pipeline.people.corrected_scores import NO_BETTER, corrected, panel_e
 from traps_pipeline.people.human_label_rows import HUMAN_LABELS
 from traps_pipeline.people.human_scores import human_row
 from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
-from traps_pipeline.scoring.bootstrap import RESAMPLED, intervals, resample
+from traps_pipeline.scoring.bootstrap import RESAMPLED_FIGURES, intervals, resample
 
 Rows = Callable[..., pd.DataFrame]
 
@@ -140,10 +140,10 @@ def test_judged_and_corrected_equal_another_implementation(rows: Rows) -> None:
             abs_rec = inverse("abstention", void)
             j = abs_rec - false_abs
             by_dataset.append((acc, abs_rec, false_abs, j, acc * max(0.0, j)))
-        return dict(zip(RESAMPLED, np.mean(by_dataset, axis=0), strict=True))
+        return dict(zip(RESAMPLED_FIGURES, np.mean(by_dataset, axis=0), strict=True))
 
     observed = figures(dict.fromkeys(items["scenario_id"], 1))
-    for name in RESAMPLED:
+    for name in RESAMPLED_FIGURES:
         assert table[f"{name}_corrected"] == pytest.approx(observed[name], abs=1e-9)
         low, high = table[f"{name}_corrected_ci_low"], table[f"{name}_corrected_ci_high"]
         assert low <= observed[name] <= high and low < high

@@ -79,7 +79,7 @@ def test_a_wrong_experiment_names_its_file_and_field(tmp_path: Path, text: str) 
 def test_an_unknown_model_or_experiment_is_answered_with_the_known_ones(tmp_path: Path) -> None:
     path = tmp_path / "other.yaml"
     path.write_text("name: other\nmodels: [oracle, gpt-6]\n")
-    with raises(TrapsError, "base.yamlfile.within"):
+    with raises(TrapsError, "base.yamlfile.name_file_in_errors"):
         load_experiment(str(path))
     with raises(TrapsError, "pipeline.experiment.load_experiment", "demmo"):
         load_experiment("demmo")

@@ -18,7 +18,7 @@ from traps_pipeline.benchmark.held_out import held_out_key
 from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.release.checksums import altered_files
 from traps_pipeline.release.content import content_of, item_rows
-from traps_pipeline.release.folder import Options, identifying, write_release
+from traps_pipeline.release.folder import Options, identity_texts, write_release
 from traps_pipeline.release.released_rows import OPEN
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.workspace import Workspace
@@ -121,7 +121,7 @@ def test_a_changed_a_swapped_a_removed_and_an_added_file_are_each_named(copy: Pa
 
 def test_for_double_blind_review_nothing_names_its_authors(workspace: Workspace, tmp_path: Path) -> None:
     write_release(content_of(workspace), tmp_path / "blind", Options(anonymous=True))
-    words = [name for one in identifying() for name in one.split(", ")]
+    words = [name for one in identity_texts() for name in one.split(", ")]
     assert len(words) > 6
     texts = [" ".join(c.decode().split()) for name, c in files(tmp_path / "blind").items() if not name.endswith("mp4")]
     assert [word for word in words for text in texts if word in text] == []

@@ -19,7 +19,7 @@ from traps_pipeline.judging.verdicts import decide
 from traps_pipeline.release.content import content_of
 from traps_pipeline.release.folder import Options, write_release
 from traps_pipeline.release.released_rows import SUBMITTED
-from traps_pipeline.release.submission import ABOUT, TABLES, _zipped, pack, read_submission, table_bytes
+from traps_pipeline.release.submission import ABOUT, TABLES, _zip, pack, read_submission, table_bytes
 from traps_pipeline.release.submissions import gather, write_board
 from traps_pipeline.release.verification import verify
 from traps_pipeline.scoring.score_rows import LEADERBOARD
@@ -60,7 +60,7 @@ def forged(
     content = {name: table_bytes(TABLES[name], frame) for name, frame in frames.items()}
     digests = {name: hashlib.sha256(data).hexdigest() for name, data in content.items()}
     said = json.loads(submission.about.model_dump_json()) | {"files": digests} | about
-    target.write_bytes(_zipped({ABOUT: json.dumps(said).encode(), **content}))
+    target.write_bytes(_zip({ABOUT: json.dumps(said).encode(), **content}))
     return target
 
 
@@ -96,7 +96,7 @@ def test_a_table_that_is_not_the_packed_one_is_named(packed: Path, tmp_path: Pat
     about = json.loads(submission.about.model_dump_json())
     about["files"]["votes.parquet"] = "0" * 64
     content = {name: table_bytes(TABLES[name], frame) for name, frame in submission.tables.items()}
-    (tmp_path / "f.zip").write_bytes(_zipped({ABOUT: json.dumps(about).encode(), **content}))
+    (tmp_path / "f.zip").write_bytes(_zip({ABOUT: json.dumps(about).encode(), **content}))
     assert problems(tmp_path / "f.zip") == ["votes.parquet: is not the table that was packed"]
 
 
@@ -201,10 +201,10 @@ def test_compressed_members_other_columns_and_other_files_are_refused(packed: Pa
     table = pq.read_table(io.BytesIO(content["votes.parquet"])).drop_columns(["rationale"])
     made = io.BytesIO()
     pq.write_table(table, made)
-    path.write_bytes(_zipped(content | {"votes.parquet": made.getvalue()}))
+    path.write_bytes(_zip(content | {"votes.parquet": made.getvalue()}))
     with pytest.raises(TrapsError, match=r"votes\.parquet has other columns"):
         read_submission(path)
-    path.write_bytes(_zipped(content | {"votes.parquet": b"\x80\x04K\x01."}))  # a pickle is no table
+    path.write_bytes(_zip(content | {"votes.parquet": b"\x80\x04K\x01."}))  # a pickle is no table
     with pytest.raises(TrapsError, match=r"votes\.parquet is no readable table"):
         read_submission(path)
     path.write_bytes(b"no zip")

@@ -38,8 +38,8 @@ def test_an_export_goes_to_another_folder_or_to_one_that_was_deleted(unasked: Ch
 
 @pytest.mark.parametrize("ending", ["json", "eval"])
 def test_a_log_without_images_is_read(ending: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(harness_logs, "MOST_LOG_BYTES", 1000)
-    monkeypatch.setattr(harness_logs, "MOST_SAMPLE_BYTES", 1000)
+    monkeypatch.setattr(harness_logs, "MAX_LOG_BYTES", 1000)
+    monkeypatch.setattr(harness_logs, "MAX_SAMPLE_BYTES", 1000)
     log = tmp_path / f"log.{ending}"
 
     def write(pixels: int) -> None:

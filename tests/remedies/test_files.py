@@ -47,7 +47,7 @@ def test_a_full_disk_is_written_to_once_some_space_is_freed(tiny_disk: Path) -> 
     filler.write_bytes(b"0" * 60_000)
     text = "x" * 30_000
     call = written(tiny_disk / "a.txt", text)
-    assert remedied(call, "base.files.replacing", filler.unlink) == text
+    assert remedied(call, "base.files.replace_file", filler.unlink) == text
 
 
 def test_a_folder_of_somebody_else_is_written_to_once_this_user_may(tmp_path: Path) -> None:
@@ -63,7 +63,7 @@ def test_a_folder_of_somebody_else_is_written_to_once_this_user_may(tmp_path: Pa
                     stack.callback(os.seteuid, 65534)
                 folder.chmod(0o777)
 
-        remedied(written(folder / "a.txt"), "base.files.replacing", allow)
+        remedied(written(folder / "a.txt"), "base.files.replace_file", allow)
 
 
 @pytest.mark.parametrize("in_the_way", ["f", "f/a.txt"])
@@ -73,7 +73,7 @@ def test_what_lies_in_the_way_is_moved_away(tmp_path: Path, in_the_way: str) -> 
         path.write_text("a file where a folder is to be")
     else:
         path.mkdir(parents=True)
-    remedied(written(tmp_path / "f" / "a.txt"), "base.files.replacing", lambda: path.rename(tmp_path / "away"))
+    remedied(written(tmp_path / "f" / "a.txt"), "base.files.replace_file", lambda: path.rename(tmp_path / "away"))
 
 
 def test_a_trajectory_of_another_scene_is_read_once_it_is_restored(tmp_path: Path) -> None:

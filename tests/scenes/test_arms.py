@@ -12,7 +12,7 @@ from tests.scenes import arm_table
 from tests.scenes.released import load
 from traps_pipeline.benchmark.filmed_arms import arm_of
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.protocol.datasets import ARMS, GRADED, arms_of, beside_of, sides_of
+from traps_pipeline.protocol.datasets import ARMS, GRADED, arms_of, extra_datasets_of, sides_of
 from traps_pipeline.scenes.variants import arms, graded_cuts
 from traps_pipeline.scenes.worlds.outcome import Rejected
 
@@ -119,7 +119,7 @@ def test_what_is_wanted_is_spread_evenly_whatever_the_family() -> None:
         members = [spec for spec in load_released().values() if spec.family == family]
         for first in (10, len(members)):
             shares = np.sort([graded_cuts.target_probability(spec) for spec in members[:first]])
-            gaps = np.diff([graded_cuts.LEAST, *shares, 1.0])
+            gaps = np.diff([graded_cuts.MIN_PROBABILITY, *shares, 1.0])
             assert gaps.min() >= 0 and gaps.max() < 0.6 * 3 / first, family
 
 
@@ -155,5 +155,5 @@ def test_a_control_that_is_settled_before_the_earliest_cut_has_none(monkeypatch:
 
 
 def test_graded_cuts_are_of_chaotic_scenarios_and_no_arm() -> None:
-    assert GRADED in beside_of("chaotic") and GRADED not in beside_of("occlusion")
+    assert GRADED in extra_datasets_of("chaotic") and GRADED not in extra_datasets_of("occlusion")
     assert GRADED not in arms_of("chaotic")

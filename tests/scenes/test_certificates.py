@@ -423,7 +423,7 @@ def test_a_certificate_that_is_added_reaches_draws_records_asset_checks_and_the_
     )
     monkeypatch.setattr(certificates, "CERTIFICATES", (*CERTIFICATES, level))
     wording = race.family.word(race.params, np.random.default_rng(0))
-    with raises(Rejected, "scenes.certification.evidence.required"):
+    with raises(Rejected, "scenes.certification.evidence.require_certificates"):
         resolve(race.family, race.params, wording, "?", scenario_id="race-1", seed=0)
     assert "looks down by" in failures(race, race.spec)["level"]
     assert unanswerable_controls([race.spec]) == ["hidden_race-0001: level: no evidence 'elevation_deg'"]

@@ -17,21 +17,21 @@ from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.composition import sample_benchmark
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.cli import build_parser, main
-from traps_pipeline.cli.benchmark_commands import MOST_DISTRACTORS as SAID_DISTRACTORS
+from traps_pipeline.cli.benchmark_commands import MAX_DISTRACTORS as SAID_DISTRACTORS
 from traps_pipeline.cli.benchmark_commands import SPEEDS as SAID_SPEEDS
-from traps_pipeline.release.commitment import broken_seals, commit, drawn_again, read_reveal
+from traps_pipeline.release.commitment import broken_seals, commit, read_reveal, redraw_records
 from traps_pipeline.scenes.certification.certify_record import certify
 from traps_pipeline.scenes.draw.resolve import plain
 from traps_pipeline.scenes.draw.sample import Draw, DrawnScene, load_tallies, scene_of_draw
 from traps_pipeline.scenes.family_registry import families, get_family
 from traps_pipeline.scenes.parts.difficulty import (
     DISTRACTOR,
-    FASTEST,
-    MOST_DISTRACTORS,
+    MAX_DISTRACTORS,
+    MAX_SPEEDS,
     SPEEDS,
     Difficulty,
     SceneDifficulty,
-    untakeable,
+    unsupported_settings,
 )
 from traps_pipeline.scenes.parts.look import look_of_draw
 from traps_pipeline.scenes.physics.kit import LOOK_ALIKE, params_to_dict
@@ -187,16 +187,16 @@ def test_families_that_cannot_be_drawn_like_this_are_named(tmp_path: Path, capsy
     assert "plinko: no --speed, no --longer" in told and "bounce: no --longer" in told and "chain: no" not in told
     assert told.rstrip().endswith("--families: chain, domino_branch")
     assert not (tmp_path / "out").exists()
-    assert {*FASTEST.values()} <= {*SPEEDS}
-    assert {f.name for f in families() if not untakeable(f, Difficulty(speed=1.5))} == {*FASTEST}
-    assert {f.name for f in families() if untakeable(f, Difficulty(distractors=1))} == {
+    assert {*MAX_SPEEDS.values()} <= {*SPEEDS}
+    assert {f.name for f in families() if not unsupported_settings(f, Difficulty(speed=1.5))} == {*MAX_SPEEDS}
+    assert {f.name for f in families() if unsupported_settings(f, Difficulty(distractors=1))} == {
         f.name for f in families() if f.taxonomy == "chaotic" or f.category == "soft_bodies"
     }
 
 
 @pytest.mark.parametrize("setting", [["--distractors", "4"], ["--distractors", "-1"], ["--speed", "3"]])
 def test_a_setting_that_does_not_exist_is_bad_usage(setting: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert (SAID_DISTRACTORS, SAID_SPEEDS) == (MOST_DISTRACTORS, SPEEDS)
+    assert (SAID_DISTRACTORS, SAID_SPEEDS) == (MAX_DISTRACTORS, SPEEDS)
     with pytest.raises(SystemExit) as ended:
         build_parser().parse_args(["benchmark", "sample", "--seed", "1", "--out", "x", *setting])
     assert ended.value.code == 2
@@ -229,6 +229,6 @@ def test_a_harder_benchmark_is_certified_and_committed_with_its_settings(
     published = commit(folder, tmp_path / "public.json", tmp_path / "secret.json")
     assert published.difficulty == difficulty
     reveal = read_reveal(tmp_path / "secret.json")
-    assert broken_seals(published, reveal, drawn_again(published, reveal, workers=1)) == []
+    assert broken_seals(published, reveal, redraw_records(published, reveal, workers=1)) == []
     with raises(TrapsError, "scenes.draw.sample.require_difficulty", "plinko"):
         sample_benchmark(tmp_path / "other", {"plinko": 1}, 1, "other", difficulty=difficulty)

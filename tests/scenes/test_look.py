@@ -16,7 +16,7 @@ from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.cli.benchmark_commands import LOOKS
 from traps_pipeline.scenes.certification.certify_record import certify
-from traps_pipeline.scenes.draw.redraw import relook_family, with_look
+from traps_pipeline.scenes.draw.redraw import redraw_looks, with_look
 from traps_pipeline.scenes.draw.sample import load_tallies, record_line, save_tallies
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.parts.look import MATERIALS, OCCLUDERS, PARTS, Look, frame_size, look_of_draw
@@ -166,7 +166,7 @@ def test_a_record_without_its_look_is_given_the_look_of_its_draw(tmp_path: Path)
     bare = spec.model_copy(update={"params": {k: v for k, v in spec.params.items() if k != "look"}})
     (tmp_path / "plinko.jsonl").write_text(record_line(bare), encoding="utf-8")
     save_tallies(tmp_path, {"plinko": replace(load_tallies(RELEASED)["plinko"], look=[])})
-    assert relook_family(tmp_path, "plinko", workers=1) == {}
+    assert redraw_looks(tmp_path, "plinko", workers=1) == {}
     assert SceneSpec.model_validate_json((tmp_path / "plinko.jsonl").read_text(encoding="utf-8")) == spec
     assert load_tallies(tmp_path)["plinko"].look == sorted(get_family("plinko").looks)
 

@@ -13,7 +13,7 @@ from traps_pipeline.scenes.parts import readings as outcome
 from traps_pipeline.scenes.parts.course import Course, Surface
 from traps_pipeline.scenes.physics.kit import COLOURS, Motion, Physics
 
-PLAY = vary.apart("red", "green", "blue", "yellow")
+PLAY_COLOURS = vary.apart("red", "green", "blue", "yellow")
 
 
 def _direction(rng: np.random.Generator, so_far: vary.Drawn) -> int:
@@ -24,9 +24,9 @@ def _direction(rng: np.random.Generator, so_far: vary.Drawn) -> int:
 @dataclass(frozen=True)
 class Params:
     direction: int = vary.drawn_by(_direction)
-    ball_colour: str = PLAY()
+    ball_colour: str = PLAY_COLOURS()
     length_m: float = vary.between(0.1, 0.2)
-    lane_colours: tuple[str, ...] = PLAY("lanes")
+    lane_colours: tuple[str, ...] = PLAY_COLOURS("lanes")
     gate: str = vary.hidden("open", "shut", "ajar")
     lane: int = vary.one_of(3, 4)
     azimuth_deg: float = vary.facing(-10, 10)
@@ -190,9 +190,9 @@ def test_what_moves_is_carried_on_as_it_moved_last() -> None:
     lost = moving("red", (40, 110, 180, 200))
     lost[3, 150:170, 200:220] = 200  # behind something: where it was last is where it goes on from
     path = [observers.compact_blob(frame, "red") for frame in lost]
-    end = observers.carried_on(path, 1.0)
+    end = observers.extrapolate(path, 1.0)
     assert path[-1] is None and end is not None and abs(end.x - (189.5 + 2 * 70)) < 1
-    assert observers.carried_on([*path, None, None], 1.0) is None  # for too long
+    assert observers.extrapolate([*path, None, None], 1.0) is None  # for too long
     assert observers.end_of(path) is None  # it does not rest
 
 

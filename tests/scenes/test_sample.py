@@ -22,8 +22,8 @@ from traps_pipeline.scenes.draw.likeness import (
 )
 from traps_pipeline.scenes.draw.redraw import draw_again
 from traps_pipeline.scenes.draw.sample import (
-    _choices,
     _full_answers,
+    _mean_choices,
     answer_quota,
     load_tallies,
     rejection_kind,
@@ -54,7 +54,7 @@ def test_the_quota_of_an_answer(count: int, labels: int, quota: int) -> None:
 
 def test_an_answer_that_few_questions_offer_has_its_quota_sooner() -> None:
     plinko = get_family("plinko")  # boards of five, six or seven buckets, a third each
-    shares = {bucket: 1 / choices for bucket, choices in _choices(plinko).items()}
+    shares = {bucket: 1 / choices for bucket, choices in _mean_choices(plinko).items()}
     assert sum(shares.values()) == pytest.approx(1)
     assert shares["1"] == pytest.approx((1 / 5 + 1 / 6 + 1 / 7) / 3, abs=0.01)
     assert shares["7"] == pytest.approx(1 / 7 / 3, abs=0.01)

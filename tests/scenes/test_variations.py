@@ -15,14 +15,14 @@ from traps_pipeline.protocol.datasets import (
     OCCLUDER_DOSES,
     SCHEMAS,
     VARIATIONS,
-    beside_of,
+    extra_datasets_of,
     sides_of,
 )
 from traps_pipeline.scenes.observe import family_asking
 from traps_pipeline.scenes.parts.vision import largest
 from traps_pipeline.scenes.variants import variations
 from traps_pipeline.scenes.variants.arms import SEEN_PX, Scenario
-from traps_pipeline.scenes.variants.variations import NOTICED, with_labels
+from traps_pipeline.scenes.variants.variations import SEEN_LEVELS, with_labels
 from traps_pipeline.scenes.worlds.outcome import Rejected
 
 
@@ -37,7 +37,7 @@ def test_every_variation_that_can_be_asked_is_defined_and_asks_its_sides():
     race = load_released()["hidden_race-0001"]
     for name in VARIATIONS:
         assert tuple(question.side for question in variations.VARIATIONS[name].ask(race)) == sides_of(name)
-    of_chaotic = {name for name in beside_of("chaotic") if name in VARIATIONS}
+    of_chaotic = {name for name in extra_datasets_of("chaotic") if name in VARIATIONS}
     assert of_chaotic == {*LABEL_DOSES, *SCHEMAS, *FRAMINGS}  # what has no occluder has no look of it
 
 
@@ -97,10 +97,10 @@ def test_an_occluder_of_another_look_hides_as_much_and_one_that_lets_light_throu
     assert largest(grey.frames[0], "navy", 1000) is None  # the cue of the occluder rule is gone
     assert grey.evidence["contrast"] < 30  # against 65 of the pair's own occluder, which is larger here
     large = variations.VARIATIONS["occluder_large"].film(bounce)
-    assert large.evidence["wide"] == variations.WIDER
+    assert large.evidence["wide"] == variations.WIDTH_FACTOR
     assert large.evidence["panel_px"] > grey.evidence["panel_px"]
     sheer = variations.VARIATIONS["occluder_alpha_50"].film(bounce)
-    assert sheer.evidence["seen_through_px"] >= SEEN_PX and sheer.evidence["levels"] >= NOTICED
+    assert sheer.evidence["seen_through_px"] >= SEEN_PX and sheer.evidence["levels"] >= SEEN_LEVELS
     assert sides_of("occluder_alpha_50") == ("control",) and "occluder_alpha_50" in OCCLUDER_DOSES
 
 

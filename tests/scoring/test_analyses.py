@@ -191,5 +191,5 @@ def test_hidden_sub_scenarios_against_the_others_as_published():
 
 
 def test_a_cell_given_twice_is_an_error():
-    with raises(ValueError, "scoring.analyses._checked", "occlusion", "standard"):
+    with raises(ValueError, "scoring.analyses._check", "occlusion", "standard"):
         overall(cells(cell(), cell()))

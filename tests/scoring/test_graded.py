@@ -16,7 +16,7 @@ from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.prompts import prompt
 from traps_pipeline.protocol.regimes import ANSWER_FROM, WRONG_COSTS
-from traps_pipeline.scoring.graded import GradedItem, brier, decided, graded, wrong_rows
+from traps_pipeline.scoring.graded import GradedItem, answer_points, brier, graded, wrong_rows
 
 LABELS = ("left", "right", "elsewhere")
 # An answer is worth .9 - 3 x .1 = .6 in the first, .5 - 3 x .5 = -1 in the second. Of the family "right" is commonest.
@@ -47,7 +47,7 @@ def test_the_prompt_states_the_price_that_is_scored() -> None:
 def test_regret_is_what_the_ideal_observer_earns_more_and_falls_into_three(
     item: GradedItem, answer: str | None, points: float, by_answer: float, rash: float, shy: float
 ) -> None:
-    of = decided(item, answer)
+    of = answer_points(item, answer)
     assert of["points"] == pytest.approx(points)
     assert [of[f"regret_{part}"] for part in ("label", "rash", "shy")] == pytest.approx([by_answer, rash, shy])
     assert of["regret"] == pytest.approx(by_answer + rash + shy) == pytest.approx(of["points_ideal"] - points)

@@ -16,7 +16,7 @@ from traps_pipeline.cli import main
 from traps_pipeline.judging.judging_rows import JUDGE_VALIDATION
 from traps_pipeline.protocol.ratings import AXES
 from traps_pipeline.servers.annotate import Annotation, SubmittedLabel
-from traps_pipeline.servers.server import Listening
+from traps_pipeline.servers.server import ServerSettings
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 
@@ -60,7 +60,7 @@ def test_each_person_has_an_address_of_their_own_that_stays(tmp_path: Path) -> N
     tokens = personal_tokens("one secret of sixteen", ["jd", "ab"])
     assert set(tokens) < set(personal_tokens("one secret of sixteen", ["ab", "cy", "jd"]))
     assert not set(tokens) & set(personal_tokens("another secret, sixteen", ["jd", "ab"]))
-    behind = Listening("127.0.0.1", 3200, tokens, "traps people annotate", "https://labels.example.org/")
+    behind = ServerSettings("127.0.0.1", 3200, tokens, "traps people annotate", "https://labels.example.org/")
     assert {who: address.partition("=")[0] for who, address in behind.addresses().items()} == {
         "jd": "https://labels.example.org/?token",
         "ab": "https://labels.example.org/?token",

@@ -334,7 +334,7 @@ def test_a_full_disk_is_named_and_leaves_no_part(
     for spec in (VIDEO, IMAGES, QWEN):
         with monkeypatch.context() as disk:
             disk.setattr(Path, "replace", full)
-            with raises(TrapsError, "base.files.replacing"):
+            with raises(TrapsError, "base.files.replace_file"):
                 store.prepare(*clip, spec)
         assert [path.name for path in store.folder.rglob("*") if path.is_file()] == [".lock"]
 
@@ -358,7 +358,7 @@ print(count[0], made.sha256)
 @pytest.mark.slow
 def test_two_processes_at_once_make_one_good_file(clip: tuple[Path, str], store: MediaStore) -> None:
     command = [sys.executable, "-c", PREPARE, str(clip[0]), clip[1], str(store.folder)]
-    with media._alone(store.folder / clip[1][:2]):  # so that both find nothing there, and wait for their turn
+    with media._lock_folder(store.folder / clip[1][:2]):  # so that both find nothing there, and wait for their turn
         processes = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(2)]
         for process in processes:
             assert process.stdout is not None and process.stdout.readline() == "ready\n"

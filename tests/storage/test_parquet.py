@@ -58,7 +58,7 @@ ROW, OTHER = clip("plinko-0001"), clip("plinko-0002")
 def test_rows_that_are_not_of_the_table_are_refused_and_nothing_is_written(
     store: TableStore, rows: Any, names: list[str]
 ) -> None:
-    with raises(TrapsError, "storage.parquet.TableStore._checked", "videos", *names):
+    with raises(TrapsError, "storage.parquet.TableStore._arrow_of", "videos", *names):
         store.write(VIDEOS, PARTITION, rows, {})
     assert store.state(VIDEOS, PARTITION) is None
 
@@ -92,7 +92,7 @@ def test_a_disk_that_is_really_full_leaves_the_former_file(tiny_disk: Path) -> N
     store = TableStore(tiny_disk)
     store.write(VIDEOS, PARTITION, [clip("plinko-0001")], {})
     noise = [clip(f"plinko-{n:04d}", path=os.urandom(500).hex()) for n in range(200)]
-    with raises(TrapsError, "base.files.replacing", "plinko.parquet"):
+    with raises(TrapsError, "base.files.replace_file", "plinko.parquet"):
         store.write(VIDEOS, PARTITION, noise, {})
     assert leftovers(tiny_disk) == []
     assert list(store.read(VIDEOS, PARTITION)["scenario_id"]) == ["plinko-0001"]

@@ -20,7 +20,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cluster.bucket import object_name
 from traps_pipeline.cluster.objects import OBJECTS, ObjectStore
 from traps_pipeline.storage.benchmark_tables import VIDEOS
-from traps_pipeline.storage.leases import alone, leased_ranges
+from traps_pipeline.storage.leases import hold_lease, leased_ranges
 from traps_pipeline.storage.parquet import TableStore
 from traps_pipeline.storage.store import LEASES, FolderStore, Store
 
@@ -170,7 +170,7 @@ def test_what_a_killed_process_held_is_free_again(where: Sequence[str]) -> None:
         assert store.lease("work") is None
         process.kill()
         process.wait()
-        with alone(store, "work"):
+        with hold_lease(store, "work"):
             assert store.lease("work") is None
 
 

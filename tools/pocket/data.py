@@ -26,7 +26,7 @@ from tools.pocket.shots import Shot, draw_shot, render_decoy, render_shot
 from tools.pocket.words import guess
 from traps_pipeline.base.digests import canonical_json, digest, file_digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.files import replacing, write_text
+from traps_pipeline.base.files import replace_file, write_text
 from traps_pipeline.base.workers import run_in_order
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.physics.kit import params_to_dict
@@ -35,7 +35,7 @@ from traps_pipeline.storage.media import pick, resize
 from traps_pipeline.video.encode import encode
 
 SHARD = 50  # scenes
-_MOST_DRAWS = 20  # for each scene of a shard
+_MAX_DRAWS = 20  # for each scene of a shard
 STREAM: dict[Split, int] = {"train": 101, "held-out": 102}  # first word of a stream's seed; released draws have none
 
 
@@ -210,7 +210,7 @@ def draw_shard(job: ShardJob) -> int:
     rng = np.random.default_rng([STREAM[job.split], job.recipe.data_seed, *job.family.encode(), job.number])
     records: list[SceneRecord] = []
     frames: list[np.ndarray] = []
-    for _ in range(_MOST_DRAWS * job.count):
+    for _ in range(_MAX_DRAWS * job.count):
         if len(records) == job.count:
             break
         try:
@@ -230,9 +230,9 @@ def draw_shard(job: ShardJob) -> int:
             _write_clips(job, record, len(records), sides)
         records.append(record)
     if len(records) < job.count:
-        raise TrapsError(f"{job.family}: {len(records)} of {job.count} scenes after {_MOST_DRAWS * job.count} draws")
+        raise TrapsError(f"{job.family}: {len(records)} of {job.count} scenes after {_MAX_DRAWS * job.count} draws")
     if frames:
-        with replacing(job.pixels) as part, part.open("wb") as stream:
+        with replace_file(job.pixels) as part, part.open("wb") as stream:
             np.save(stream, np.stack(frames), allow_pickle=False)
     write_text(job.lines, "".join(record.line for record in records))
     return len(records)

@@ -11,7 +11,7 @@ from typing import ClassVar, TypeVar
 from pydantic import TypeAdapter
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.files import replacing
+from traps_pipeline.base.files import replace_file
 
 Row = TypeVar("Row", bound="SeedRow")
 
@@ -38,7 +38,7 @@ def write_seeds(path: Path, rows: Sequence[SeedRow]) -> None:
     """Write rows as CSV; they replace the rows of the same seeds."""
     seeds = {row.seed for row in rows}
     kept = [row for row in (read_seeds(path, type(rows[0])) if path.is_file() else []) if row.seed not in seeds]
-    with replacing(path) as part, part.open("w", encoding="utf-8", newline="") as stream:
+    with replace_file(path) as part, part.open("w", encoding="utf-8", newline="") as stream:
         table = csv.DictWriter(stream, [field.name for field in fields(rows[0])], lineterminator="\n")
         table.writeheader()
         table.writerows(asdict(row) for row in sorted([*kept, *rows], key=lambda row: row.seed))

@@ -14,7 +14,7 @@ from tools.pocket.model import make_model, save, train_tokenizer
 from tools.pocket.recipe import Recipe, Training
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.files import replacing
+from traps_pipeline.base.files import replace_file
 from traps_pipeline.models.local.library import load_transformers
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ class _State:
         import torch
 
         parts = {name: part.state_dict() for name, part in self._parts.items()}
-        with replacing(self._path) as file:
+        with replace_file(self._path) as file:
             torch.save({"step": step, "identity": self._identity, **parts}, file)
 
     def load(self) -> int:

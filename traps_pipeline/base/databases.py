@@ -7,7 +7,7 @@ import re
 from traps_pipeline.base.terminal import plain
 
 NO_SPACE = "no space left"
-MOST_WORDS = 200  # characters of a reason that has no sentence here
+MAX_WORDS = 200  # characters of a reason that has no sentence here
 # What SQLite, PostgreSQL and the system say; the first that is found counts.
 _UNWRITABLE = (
     (r"disk is full|no space left|disk quota exceeded", NO_SPACE, "free some space"),
@@ -19,7 +19,7 @@ _SERVER = r"connection to server|could not translate host name|server closed the
 
 def reason_and_remedy(error: BaseException) -> tuple[str, str, bool]:
     """Return why a database is unusable, a remedy, and whether it is unwritable."""
-    words = plain(" ".join(str(getattr(error, "orig", None) or error).split()))[:MOST_WORDS]
+    words = plain(" ".join(str(getattr(error, "orig", None) or error).split()))[:MAX_WORDS]
     for pattern, reason, remedy in _UNWRITABLE:
         if re.search(pattern, words, re.IGNORECASE):
             return reason, remedy, True

@@ -44,17 +44,17 @@ def missing(name: ExtraName, *modules: str) -> list[str]:
 
 def require(name: ExtraName, *modules: str) -> None:
     """Raise TrapsError with the command to type unless an extra is installed."""
-    if absent := missing(name, *modules):
-        raise TrapsError(_sentence(name, absent))
+    if missing_modules := missing(name, *modules):
+        raise TrapsError(_sentence(name, missing_modules))
 
 
 def sentence_of(error: ModuleNotFoundError) -> str | None:
     """Return the sentence of `require` for an ImportError; None outside all extras."""
     module = (error.name or "").partition(".")[0]
-    known: tuple[ExtraName, ...] = get_args(ExtraName)
-    return next((_sentence(name, [module]) for name in known if module in EXTRAS[name].modules), None)
+    names: tuple[ExtraName, ...] = get_args(ExtraName)
+    return next((_sentence(name, [module]) for name in names if module in EXTRAS[name].modules), None)
 
 
 def _sentence(name: ExtraName, absent: list[str]) -> str:
-    are = "is" if len(absent) == 1 else "are"
-    return f"{EXTRAS[name].purpose} needs {' and '.join(absent)}, which {are} not installed: `{install_line(name)}`"
+    verb = "is" if len(absent) == 1 else "are"
+    return f"{EXTRAS[name].purpose} needs {' and '.join(absent)}, which {verb} not installed: `{install_line(name)}`"

@@ -38,7 +38,7 @@ def remedy(error: OSError) -> str:
 
 
 @contextmanager
-def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
+def replace_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
     """Yield a temporary path beside `path`, which replaces `path` after the block.
 
     Until then, and after an error, Ctrl-C or a kill, `path` keeps its former content. An unfinished file is removed;
@@ -85,10 +85,10 @@ def sync_folder(folder: Path) -> None:
 def is_in_place(descriptor: int, path: Path) -> bool:
     """Return whether an open file still has its name; else its lock excludes nobody."""
     try:
-        current, opened = path.stat(), os.fstat(descriptor)
+        current, open_file = path.stat(), os.fstat(descriptor)
     except FileNotFoundError:
         return False
-    return (current.st_dev, current.st_ino) == (opened.st_dev, opened.st_ino)
+    return (current.st_dev, current.st_ino) == (open_file.st_dev, open_file.st_ino)
 
 
 def try_lock(path: Path) -> int | None:
@@ -127,7 +127,7 @@ def require_in_place(descriptor: int, path: Path) -> None:
 
 def write_bytes(path: Path, content: bytes, *, durable: bool = False) -> None:
     """Write a file atomically, as `replacing` does."""
-    with replacing(path, durable=durable) as part:
+    with replace_file(path, durable=durable) as part:
         part.write_bytes(content)
 
 

@@ -9,8 +9,8 @@ from typing import Annotated
 
 from pydantic import AfterValidator
 
-LONGEST = 80  # characters: two names and what is added to them stay below the 255 bytes of a file name
-_NAME = re.compile(rf"(?!.*\.\.)[a-z0-9](?:[a-z0-9.-]{{0,{LONGEST - 2}}}[a-z0-9])?")
+MAX_NAME_LENGTH = 80  # characters: two names and what is added to them stay below the 255 bytes of a file name
+_NAME = re.compile(rf"(?!.*\.\.)[a-z0-9](?:[a-z0-9.-]{{0,{MAX_NAME_LENGTH - 2}}}[a-z0-9])?")
 
 
 @lru_cache(maxsize=4096)
@@ -23,7 +23,7 @@ def check_name(name: str) -> str:
     if not _NAME.fullmatch(name) or not _is_text(name):
         raise ValueError(
             f"id {name[:100]!r} must match [a-z0-9.-]+, begin and end with a letter or digit, have no two dots in a "
-            f"row and at most {LONGEST} characters, and be no number, date or truth value (it becomes part of "
+            f"row and at most {MAX_NAME_LENGTH} characters, and be no number, date or truth value (it becomes part of "
             "partition keys, file names and YAML)"
         )
     return name

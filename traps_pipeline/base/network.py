@@ -31,12 +31,12 @@ class Proxy:
     @property
     def address(self) -> str:
         """Scheme, host and port, without the name and password that the URL may hold."""
-        scheme, _, rest = self.url.partition("://")
-        return f"{scheme}://{rest.rpartition('@')[2].partition('/')[0]}"
+        scheme, _, authority = self.url.partition("://")
+        return f"{scheme}://{authority.rpartition('@')[2].partition('/')[0]}"
 
     @property
     def problem(self) -> str | None:
-        """Why no call can go through this proxy; None if one may."""
+        """The reason why no call can use this proxy; None if calls can."""
         if not _is_address(self.url):
             return f"{self.variable} is no address of a proxy: write it as http://HOST:PORT, or unset it"
         if urlsplit(self.url).scheme in PROXY_SCHEMES:

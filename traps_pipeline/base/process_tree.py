@@ -85,19 +85,19 @@ def descendants() -> list[int]:
         with suppress(OSError):  # the process has ended meanwhile
             parent = int((folder / "stat").read_text(errors="replace").rpartition(")")[2].split()[1])
             children.setdefault(parent, []).append(int(folder.name))
-    below = list(children.get(os.getpid(), ()))
-    for pid in below:  # grows while it is read
-        below += children.get(pid, ())
-    return below
+    ids = list(children.get(os.getpid(), ()))
+    for pid in ids:  # grows while it is read
+        ids += children.get(pid, ())
+    return ids
 
 
 def _reap_until_gone(pids: Collection[int], wait_s: float) -> None:
-    until = time.monotonic() + wait_s
+    deadline = time.monotonic() + wait_s
     while True:
         with suppress(ChildProcessError):
             while os.waitpid(-1, os.WNOHANG)[0]:
                 pass
-        if not {*pids} & {*descendants()} or time.monotonic() >= until:
+        if not {*pids} & {*descendants()} or time.monotonic() >= deadline:
             return
         time.sleep(_PAUSE_S)
 

@@ -16,7 +16,7 @@ from itertools import chain
 from typing import Any, TypeVar
 
 from traps_pipeline.base.terminal import plain
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 
 HEARTBEAT_S = 30.0  # between two lines about the same stage
 
@@ -53,7 +53,7 @@ class Traffic:
 
     @property
     def per_second(self) -> float:
-        """Answers a second since the first call."""
+        """Answers per second since the first call."""
         return self.done / max(time.monotonic() - self.began, 1e-9)
 
     def latency_s(self, share: float) -> float:
@@ -105,11 +105,11 @@ class StageProgress:
 
     def total(self) -> Traffic:
         """Return the sum of all calls."""
-        each = [*self.calls.values()]
-        total = Traffic(began=min((traffic.began for traffic in each), default=self.began))
-        total.latencies = deque(chain.from_iterable([*traffic.latencies] for traffic in each))
+        tallies = [*self.calls.values()]
+        total = Traffic(began=min((traffic.began for traffic in tallies), default=self.began))
+        total.latencies = deque(chain.from_iterable([*traffic.latencies] for traffic in tallies))
         for name in ("wanted", "cached", "done", "errors", "retries", "dollars"):
-            setattr(total, name, sum(getattr(traffic, name) for traffic in each))
+            setattr(total, name, sum(getattr(traffic, name) for traffic in tallies))
         return total
 
     def work(self) -> list[str]:
@@ -169,9 +169,9 @@ class Progress:
             self.current_stage = StageProgress(stage, 0)
         self.current_stage.cells += 1
         self.current_stage.detail, self.current_stage.share = "", 0.0
-        for participant, (missing, known) in calls.items():
+        for participant, (missing, recorded_calls) in calls.items():
             traffic = self.current_stage.calls.setdefault(participant, Traffic())
-            traffic.wanted, traffic.cached = traffic.wanted + missing, traffic.cached + known
+            traffic.wanted, traffic.cached = traffic.wanted + missing, traffic.cached + recorded_calls
         self.changed()
 
     def called(self, who: str, failed: bool, latency_s: float, dollars: float) -> None:
@@ -195,11 +195,11 @@ class Progress:
 
     def end_stage(self) -> None:
         """End the running stage, if any."""
-        if (ended := self.current_stage) is not None:
+        if (stage := self.current_stage) is not None:
             self.current_stage = None
-            if ended.work():
+            if stage.work():
                 for listener in self._listeners:
-                    listener(summary(ended))
+                    listener(summary(stage))
 
     def close(self) -> None:
         """End the run."""
@@ -246,8 +246,8 @@ class Progress:
             parts.append(now.detail)
         if total.wanted:
             parts += [f"{total.per_second:.1f}/s at {total.latency_s(0.5):.1f} s"]
-            parts += [counted(total.errors, "error")] if total.errors else []
-            parts += [counted(total.retries, "retry", "retries")] if total.retries else []
+            parts += [count_noun(total.errors, "error")] if total.errors else []
+            parts += [count_noun(total.retries, "retry", "retries")] if total.retries else []
             parts += [self.spent()] if self.budget_usd else []
         parts.append(f"{clock(now.seconds)} so far" if now.left_s is None else f"{clock(now.left_s)} left")
         return f"{now.name}: {', '.join(parts)}"
@@ -271,8 +271,8 @@ def summary(stage: StageProgress) -> str:
 
 def clock(seconds: float) -> str:
     """Return a duration as m:ss."""
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes}:{rest:02d}"
+    minutes, seconds_left = divmod(round(seconds), 60)
+    return f"{minutes}:{seconds_left:02d}"
 
 
 AnyProgress = TypeVar("AnyProgress", bound=Progress)
@@ -285,7 +285,7 @@ def current() -> Progress:
 
 
 @contextmanager
-def reporting(progress: AnyProgress) -> Iterator[AnyProgress]:
+def use_progress(progress: AnyProgress) -> Iterator[AnyProgress]:
     """Make a progress the active one within the block."""
     _current.append(progress)
     try:

@@ -21,7 +21,7 @@ from html import unescape
 from typing import Any
 
 MASK = "***"
-SHORTEST = 8  # characters: anything shorter could be an ordinary word
+MIN_SECRET_LENGTH = 8  # characters: anything shorter could be an ordinary word
 # A secret is looked for by pieces, one after another; what stands around a piece is compared with the secret. So each
 # part of a secret that has as many characters as two pieces is found.
 _PIECE = 6
@@ -60,20 +60,20 @@ def remember(value: str) -> None:
 
 def redact(text: str) -> str:
     """Replace secrets, known or recognizable by their header, by `***`."""
-    if len(text) < SHORTEST:  # most cells of a table
+    if len(text) < MIN_SECRET_LENGTH:  # most cells of a table
         return text
     environment = frozenset(os.environb.items())  # `os.environ` decodes each name and value anew
     secrets = _secrets(environment, frozenset(_variables), frozenset(_values))
     pieces, spans = _pieces(secrets), list[tuple[int, int]]()
     for is_decoded in (False, True) if _ENCODED.search(text) else (False,):
-        searched = _searched(text, is_decoded)
-        windows = {searched[place : place + _PIECE] for place in range(len(searched) - _PIECE + 1)}
+        search_text = _search_text(text, is_decoded)
+        windows = {search_text[place : place + _PIECE] for place in range(len(search_text) - _PIECE + 1)}
         if windows & pieces.keys():
             spans += _spans(text, pieces, is_decoded)
-    for start, end in sorted(_merged(spans), reverse=True):
+    for start, end in sorted(_merge(spans), reverse=True):
         text = f"{text[:start]}{MASK}{text[end:]}"
-    lowered = text.lower()
-    if any(sign in lowered for sign in _SIGNS):  # searching with the expression alone takes ten times as long
+    lower_text = text.lower()
+    if any(sign in lower_text for sign in _SIGNS):  # searching with the expression alone takes ten times as long
         text = _UNKNOWN.sub(lambda match: f"{match[1] or match[2]}{MASK}", text)
     return text
 
@@ -90,8 +90,8 @@ def redact_tracebacks() -> None:
             message = record.getMessage()
         except (TypeError, ValueError):
             message = f"{record.msg} {record.args}"
-        if (without := redact(message)) != message:  # else it stays as it is: formatters read its arguments
-            record.msg, record.args = without, ()
+        if (clean_message := redact(message)) != message:  # else it stays as it is: formatters read its arguments
+            record.msg, record.args = clean_message, ()
         if record.exc_info and record.exc_info[0]:
             record.exc_text = redact("".join(traceback.format_exception(*record.exc_info)).rstrip())
         return record
@@ -106,11 +106,11 @@ def redact_tracebacks() -> None:
     )
 
 
-def redacted(error: Exception) -> Exception:
+def redact_exception(error: Exception) -> Exception:
     """Return the exception, or a replacement if its traceback would show a key."""
     text = "".join(traceback.format_exception(error))
-    without = redact(text)
-    return error if without == text else RuntimeError(without).with_traceback(error.__traceback__)
+    clean_text = redact(text)
+    return error if clean_text == text else RuntimeError(clean_text).with_traceback(error.__traceback__)
 
 
 @lru_cache(maxsize=8)
@@ -134,33 +134,37 @@ def _pieces(secrets: frozenset[str]) -> dict[str, list[tuple[str, int]]]:
     forms = set[str]()
     for secret in secrets:
         for part in {secret, *re.split(r"[^!-~]+", secret)}:
-            if len(_searched(part, is_decoded=False)) >= SHORTEST:
-                forms |= {_searched(part, is_decoded=False), _searched(part, is_decoded=True), *_encoded(part)}
+            if len(_search_text(part, is_decoded=False)) >= MIN_SECRET_LENGTH:
+                forms |= {_search_text(part, is_decoded=False), _search_text(part, is_decoded=True), *_encodings(part)}
     pieces = dict[str, list[tuple[str, int]]]()
     for form in forms:
-        places = range(0, len(form) - _PIECE + 1, _PIECE) if len(form) >= SHORTEST else ()
+        places = range(0, len(form) - _PIECE + 1, _PIECE) if len(form) >= MIN_SECRET_LENGTH else ()
         for piece, place in {form[place : place + _PIECE]: place for place in reversed(places)}.items():
             pieces.setdefault(piece, []).append((form, place))
     return pieces
 
 
-def _encoded(secret: str) -> Iterator[str]:
+def _encodings(secret: str) -> Iterator[str]:
     """Yield a secret in hexadecimal, and inside base64 at each of three offsets."""
     content = secret.encode("utf-8", "surrogateescape")
     yield content.hex()
-    for before, skipped in ((0, 0), (1, 2), (2, 3)):
-        encoded = b64encode(bytes(before) + content).decode()[skipped : (before + len(content)) * 8 // 6].lower()
-        yield from (encoded, encoded.replace("+", "-").replace("/", "_"))
+    for prefix_length, skip_length in ((0, 0), (1, 2), (2, 3)):
+        encodings = (
+            b64encode(bytes(prefix_length) + content)
+            .decode()[skip_length : (prefix_length + len(content)) * 8 // 6]
+            .lower()
+        )
+        yield from (encodings, encodings.replace("+", "-").replace("/", "_"))
 
 
-def _searched(text: str, is_decoded: bool) -> str:
+def _search_text(text: str, is_decoded: bool) -> str:
     """Reduce a text to the lower-case printable ASCII characters to search."""
     if is_decoded:
-        text = _ENCODED.sub(lambda match: _decoded(match[0]), text)
+        text = _ENCODED.sub(lambda match: _decode(match[0]), text)
     return text.encode("ascii", "ignore").translate(None, _IGNORED).lower().decode()
 
 
-def _decoded(code: str) -> str:
+def _decode(code: str) -> str:
     if code[0] == "&":
         return unescape(code)
     if code[0] == "%":
@@ -178,33 +182,41 @@ def _spans(text: str, pieces: dict[str, list[tuple[str, int]]], is_decoded: bool
     while place < len(text):
         code = codes.get(place)
         end = code.end() if code else place + 1
-        for character in _searched(_decoded(code[0]) if code else text[place], is_decoded=False):
+        for character in _search_text(_decode(code[0]) if code else text[place], is_decoded=False):
             characters.append(character)
             places.append((place, end))
         place = end
-    searched = "".join(characters)
-    for piece, (form, place) in ((piece, each) for piece, every in pieces.items() for each in every):
-        start = searched.find(piece)
+    search_text = "".join(characters)
+    for piece, (form, place) in (
+        (piece, candidate_match) for piece, matches in pieces.items() for candidate_match in matches
+    ):
+        start = search_text.find(piece)
         while start >= 0:
-            before, candidate = searched[max(0, start - place) : start], searched[start : start + len(form) - place]
-            first, last = start - _alike(before[::-1], form[:place][::-1]), start + _alike(candidate, form[place:])
+            prefix, candidate = (
+                search_text[max(0, start - place) : start],
+                search_text[start : start + len(form) - place],
+            )
+            first, last = (
+                start - _common_prefix_length(prefix[::-1], form[:place][::-1]),
+                start + _common_prefix_length(candidate, form[place:]),
+            )
             is_part = last - first >= min(2 * _PIECE, len(form))
             if is_part:
                 yield places[first][0], places[last - 1][1]
-            start = searched.find(piece, last if is_part else start + 1)
+            start = search_text.find(piece, last if is_part else start + 1)
 
 
-def _alike(text: str, reference: str) -> int:
+def _common_prefix_length(text: str, reference: str) -> int:
     """Return how many characters two texts have in common at their beginnings."""
     differences = (k for k, (char, other_char) in enumerate(zip(text, reference, strict=False)) if char != other_char)
     return next(differences, min(len(text), len(reference)))
 
 
-def _merged(spans: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    merged = list[tuple[int, int]]()
+def _merge(spans: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    result = list[tuple[int, int]]()
     for start, end in sorted(spans):
-        if merged and start <= merged[-1][1]:
-            merged[-1] = merged[-1][0], max(end, merged[-1][1])
+        if result and start <= result[-1][1]:
+            result[-1] = result[-1][0], max(end, result[-1][1])
         else:
-            merged.append((start, end))
-    return merged
+            result.append((start, end))
+    return result

@@ -12,11 +12,11 @@ def nearest(word: str, candidates: Iterable[str]) -> str | None:
     from difflib import get_close_matches
 
     names = {name.lower(): name for name in candidates}
-    near = get_close_matches(word.lower()[:100], names, n=1, cutoff=_LIKENESS)
-    return names[near[0]] if near else None
+    matches = get_close_matches(word.lower()[:100], names, n=1, cutoff=_LIKENESS)
+    return names[matches[0]] if matches else None
 
 
 def did_you_mean(word: str, candidates: Iterable[str]) -> str:
-    """Return a sentence's end that suggests the nearest known word, or nothing."""
-    near = nearest(word, candidates)
-    return f"; did you mean {near}?" if near else ""
+    """Return a clause that suggests the nearest known word; empty if none is near."""
+    suggestion = nearest(word, candidates)
+    return f"; did you mean {suggestion}?" if suggestion else ""

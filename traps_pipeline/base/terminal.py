@@ -36,16 +36,16 @@ def visible(text: str) -> str:
 
 
 def _number(match: re.Match[str]) -> str:
-    before, after = match.string[: match.start()][-1:], match.string[match.end() :][:1]
-    is_emoji = unicodedata.category(before or " ") in ("So", "Sk") or before == _EMOJI_STYLE
-    if match[0] == _EMOJI_STYLE and (is_emoji or before in "0123456789#*") and before:
+    previous_character, next_character = match.string[: match.start()][-1:], match.string[match.end() :][:1]
+    is_emoji = unicodedata.category(previous_character or " ") in ("So", "Sk") or previous_character == _EMOJI_STYLE
+    if match[0] == _EMOJI_STYLE and (is_emoji or previous_character in "0123456789#*") and previous_character:
         return match[0]
-    if match[0] == _JOINER and is_emoji and unicodedata.category(after or " ") == "So":
+    if match[0] == _JOINER and is_emoji and unicodedata.category(next_character or " ") == "So":
         return match[0]
     return f"[U+{ord(match[0]):04X}]"
 
 
-def finalized(value: object) -> object:
+def finalize_value(value: object) -> object:
     """Format an expression's value for a Jinja2 template (its `finalize`)."""
     return visible(value) if isinstance(value, str) else value
 
@@ -61,7 +61,7 @@ def _printable(text: str) -> str:
     return "".join(c if c.isprintable() else " " if c in "\n\t" else "?" for c in text)
 
 
-def wrapped(text: str, stream: TextIO | None = None, *, hang: int | None = None) -> str:
+def wrap_text(text: str, stream: TextIO | None = None, *, hang: int | None = None) -> str:
     """Return lines for a stream (default: stdout), wrapped at words on a terminal.
 
     hang: extra indentation of continuation lines, in columns (default: 4 if the line is indented, else 0).
@@ -72,8 +72,12 @@ def wrapped(text: str, stream: TextIO | None = None, *, hang: int | None = None)
     lines = []
     for line in text.split("\n"):
         indent = len(line) - len(line.lstrip())
-        further = " " * (indent + (4 if indent else 0) if hang is None else indent + hang)
-        options: dict[str, Any] = {"break_long_words": False, "break_on_hyphens": False, "subsequent_indent": further}
+        continuation_indent = " " * (indent + (4 if indent else 0) if hang is None else indent + hang)
+        options: dict[str, Any] = {
+            "break_long_words": False,
+            "break_on_hyphens": False,
+            "subsequent_indent": continuation_indent,
+        }
         lines.append(textwrap.fill(line, columns, **options))
     return "\n".join(lines)
 
@@ -87,22 +91,22 @@ def text_table(headings: Sequence[str], rows: Iterable[Sequence[object]], left: 
     """
     from rich.cells import cell_len
 
-    styled = sys.stdout.isatty()
+    is_styled = sys.stdout.isatty()
     cells = [[plain(heading) for heading in headings], *([_printable(str(cell)) for cell in row] for row in rows)]
     widths = [max(map(cell_len, column)) for column in zip(*cells, strict=True)]
     count, hidden = len(headings), ""
-    if styled:
+    if is_styled:
         columns = shutil.get_terminal_size().columns
         while count > 1 and sum(widths[:count]) + _GAP * (count - 1) > columns:
             count -= 1
         names = ", ".join(cells[0][count:])
-        hidden = "\n" + wrapped(f"not shown in {columns} columns: {names}") if names else ""
+        hidden = "\n" + wrap_text(f"not shown in {columns} columns: {names}") if names else ""
     lines = list[str]()
     for row in cells:
         blanks = [" " * (width - cell_len(cell)) for width, cell in zip(widths, row, strict=True)]
         aligned = [c + b if k in left else b + c for k, (c, b) in enumerate(zip(row, blanks, strict=True))]
         lines.append((" " * _GAP).join(aligned[:count]).rstrip())
-    if styled:
+    if is_styled:
         lines[:1] = [f"\x1b[1m{lines[0]}\x1b[0m", "─" * (sum(widths[:count]) + _GAP * (count - 1))]
     return redact("\n".join(lines) + hidden)
 
@@ -123,6 +127,6 @@ class TextTable:
 
     def text(self) -> str:
         """Return title, table and notes for standard output, like `text_table`."""
-        table = wrapped(plain(self.absence)) if self.absence else text_table(self.headings, self.rows, self.left)
-        notes = [wrapped(plain(note)) for note in self.notes]
-        return "\n".join([wrapped(plain(self.title)), "", table, *([""] if notes else []), *notes]) + "\n"
+        table = wrap_text(plain(self.absence)) if self.absence else text_table(self.headings, self.rows, self.left)
+        notes = [wrap_text(plain(note)) for note in self.notes]
+        return "\n".join([wrap_text(plain(self.title)), "", table, *([""] if notes else []), *notes]) + "\n"

@@ -18,7 +18,7 @@ from urllib.parse import parse_qsl, quote, urlencode, urlsplit
 
 from traps_pipeline.base.errors import TrapsError
 
-LEAST_TOKEN = 16  # characters
+MIN_TOKEN = 16  # characters
 TOKEN_OWNER = "traps.who"  # key of a request's scope: the owner of its token
 LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 _SAFE_METHODS = ("GET", "HEAD")
@@ -61,8 +61,8 @@ def token_for(host: str, token: str | None, *, danger: str, variable: str) -> st
             f"give a token of your own (--token, or {variable}), and put a server that speaks HTTPS before it, "
             "since the token crosses the network; or leave --host out and use an SSH tunnel"
         )
-    if token is not None and (len(token) < LEAST_TOKEN or not token.isascii() or not token.isprintable()):
-        raise TrapsError(f"--token: {LEAST_TOKEN} or more printable ASCII characters, so that it cannot be guessed")
+    if token is not None and (len(token) < MIN_TOKEN or not token.isascii() or not token.isprintable()):
+        raise TrapsError(f"--token: {MIN_TOKEN} or more printable ASCII characters, so that it cannot be guessed")
     return token or secrets.token_urlsafe(24)
 
 
@@ -118,15 +118,15 @@ class Guard:
         if scope["type"] not in ("http", "websocket"):
             return
         headers = {name.lower(): value for name, value in scope["headers"]}
-        refused = self._refusal(scope, headers)
-        if refused is None and scope["type"] == "http" and self._has_token(scope):
+        refusal = self._refusal(scope, headers)
+        if refusal is None and scope["type"] == "http" and self._has_token(scope):
             await self._enter(scope, send)
-        elif refused is None and (person := self._header_owner(headers)) is not None:
+        elif refusal is None and (person := self._header_owner(headers)) is not None:
             scope[TOKEN_OWNER] = person
-        elif refused is None:
-            refused = 403, f"open the address that `{self._command}` printed: the token in it lets this browser in"
-        if refused is not None:
-            await _refuse(scope, receive, send, *refused)
+        elif refusal is None:
+            refusal = 403, f"open the address that `{self._command}` printed: the token in it lets this browser in"
+        if refusal is not None:
+            await _refuse(scope, receive, send, *refusal)
         elif not (scope["type"] == "http" and self._has_token(scope)):
             await self._app(scope, receive, _with_headers(send))
 
@@ -138,8 +138,8 @@ class Guard:
             return 421, f"this is not the name of this server: open the address that `{self._command}` printed"
         origin, websocket = headers.get(b"origin"), scope["type"] == "websocket"
         if origin is not None or websocket:
-            of_origin = urlsplit((origin or b"").decode("latin-1").lower())
-            if of_origin.scheme not in ("http", "https") or of_origin.netloc != host:
+            origin_url = urlsplit((origin or b"").decode("latin-1").lower())
+            if origin_url.scheme not in ("http", "https") or origin_url.netloc != host:
                 return 403, "a page of another site asked for this"
         reads = not websocket and scope["method"] in _SAFE_METHODS
         if headers.get(b"sec-fetch-site", b"none") not in _OWN_SITE and not (reads and self._has_token(scope)):
@@ -159,7 +159,7 @@ class Guard:
     def _has_token(self, scope: Scope) -> bool:
         if scope["method"] not in _SAFE_METHODS:
             return False
-        return self._owner(_given_token(scope)) is not None
+        return self._owner(_token_of_address(scope)) is not None
 
     def _owner(self, token_given: str | None) -> str | None:
         """Return the token's owner, if any, in constant time."""
@@ -187,12 +187,12 @@ class Guard:
         """Set the token as a cookie and redirect, so that no address shows the token."""
         parameters = [pair for pair in parse_qsl(scope["query_string"].decode("latin-1")) if pair[0] != "token"]
         place = "/" + quote(scope["path"].lstrip("/\\")) + (f"?{urlencode(parameters)}" if parameters else "")
-        cookie = f"{self._cookie}={_given_token(scope)}; HttpOnly; SameSite=Strict; Path=/{self._secure}"
+        cookie = f"{self._cookie}={_token_of_address(scope)}; HttpOnly; SameSite=Strict; Path=/{self._secure}"
         headers = [(b"location", place.encode()), (b"set-cookie", cookie.encode("latin-1"))]
         await _answer(send, 303, b"", headers)
 
 
-def _given_token(scope: Scope) -> str | None:
+def _token_of_address(scope: Scope) -> str | None:
     """Return the token in the address of a request."""
     return dict(parse_qsl(scope.get("query_string", b"").decode("latin-1"))).get("token")
 
@@ -216,8 +216,11 @@ def _with_headers(send: Send) -> Send:
         if message["type"] == "http.response.start":
             token_of = {name for name, _ in _HEADERS if name != b"cache-control"}
             headers = [(name, value) for name, value in message.get("headers", ()) if name.lower() not in token_of]
-            cached = any(name.lower() == b"cache-control" for name, _ in headers)
-            message["headers"] = [*headers, *(each for each in _HEADERS if not cached or each[0] != b"cache-control")]
+            has_cache_control = any(name.lower() == b"cache-control" for name, _ in headers)
+            message["headers"] = [
+                *headers,
+                *(header for header in _HEADERS if not has_cache_control or header[0] != b"cache-control"),
+            ]
         await send(message)
 
     return sending

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 
-def counted(count: int, singular: str, plural: str | None = None) -> str:
+def count_noun(count: int, singular: str, plural: str | None = None) -> str:
     """Return a count with its noun: `1 family`, `2,340 scenarios`.
 
-    plural: by default the singular with an s.
+    plural: the plural form; default: the singular with an s.
     """
     return f"{count:,} {singular if count == 1 else plural or f'{singular}s'}"
 

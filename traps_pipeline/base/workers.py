@@ -45,7 +45,7 @@ _idle: list[_Pool] | None = None  # idle pools of `kept_workers`
 
 
 @contextmanager
-def kept_workers() -> Iterator[None]:
+def keep_workers() -> Iterator[None]:
     """Keep idle workers for the block's next `run_in_order`, as starting one is slow."""
     global _idle
     if _idle is not None:
@@ -55,8 +55,8 @@ def kept_workers() -> Iterator[None]:
     try:
         yield
     finally:
-        idle, _idle = _idle, None
-        for pool in idle:
+        idle_pool, _idle = _idle, None
+        for pool in idle_pool:
             pool.end()
 
 
@@ -76,11 +76,11 @@ def run_in_order(
     A GL context belongs to a process, so each worker keeps its own. Closing the iterator cancels pending jobs.
     """
     workers = workers or cores()
-    most = min(2 * workers - 1, ahead or 2 * workers)
+    max_pending = min(2 * workers - 1, ahead or 2 * workers)
     source = iter(jobs)
     for job in source:  # a fresh pool after so many: recycling inside a pool can deadlock (CPython 3.11)
         with _pool(workers) as pool:
-            yield from _in_order(function, chain([job], source), pool, most, at_once=at_once)
+            yield from _in_order(function, chain([job], source), pool, max_pending, at_once=at_once)
 
 
 @contextmanager

@@ -22,9 +22,9 @@ from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.base.terminal import plain
 
 Model = TypeVar("Model", bound=BaseModel)
-MOST_YAML_BYTES, MOST_LINE_BYTES = 4 * 2**20, 4 * 2**20
-MOST_DEPTH, MOST_NODES, MOST_ALIASES = 40, 200_000, 200
-MOST_SAID = 300  # characters of a complaint
+MAX_YAML_BYTES, MAX_LINE_BYTES = 4 * 2**20, 4 * 2**20
+MAX_DEPTH, MAX_NODES, MAX_ALIASES = 40, 200_000, 200
+MAX_SAID = 300  # characters of a complaint
 _TAG = "tag:yaml.org,2002:"
 _STRINGS = re.compile(r'"(?:[^"\\]|\\.)*"')
 _STEPS = {ord("["): 1, ord("{"): 1, ord("]"): -1, ord("}"): -1}
@@ -82,14 +82,14 @@ def _check_events(content: str) -> None:
         nodes += 1
         if isinstance(event, yaml.AliasEvent):
             aliases += 1
-            if aliases > MOST_ALIASES or any(anchors):
+            if aliases > MAX_ALIASES or any(anchors):
                 raise yaml.MarkedYAMLError(None, None, "too many aliases, or one inside an anchor", event.start_mark)
         elif (tag := getattr(event, "tag", None)) is not None:
             tag = str(tag).replace(_TAG, "!!")
             raise yaml.MarkedYAMLError(None, None, f"remove the tag {tag}: no value has one", event.start_mark)
         if isinstance(event, yaml.CollectionStartEvent):
             anchors.append(event.anchor is not None)
-        if len(anchors) >= MOST_DEPTH or nodes > MOST_NODES:
+        if len(anchors) >= MAX_DEPTH or nodes > MAX_NODES:
             raise yaml.MarkedYAMLError(None, None, "nested too deeply, or too large", event.start_mark)
 
 
@@ -99,8 +99,8 @@ def read_yaml(path: Path) -> Any:
         content = path.read_bytes()
     except OSError as error:
         raise TrapsError(f"{path}: cannot be read ({error.strerror})") from error
-    if len(content) > MOST_YAML_BYTES:
-        raise TrapsError(f"{path}: not valid YAML (larger than {MOST_YAML_BYTES} bytes)")
+    if len(content) > MAX_YAML_BYTES:
+        raise TrapsError(f"{path}: not valid YAML (larger than {MAX_YAML_BYTES} bytes)")
     try:
         text = content.decode("utf-8")
         _check_events(text)
@@ -120,7 +120,7 @@ def read_mapping(path: Path) -> dict[str, Any]:
 
 
 @contextmanager
-def within(path: Path) -> Iterator[None]:
+def name_file_in_errors(path: Path) -> Iterator[None]:
     """Add the file's name to errors of the block that do not name it."""
     try:
         yield
@@ -133,9 +133,9 @@ def within(path: Path) -> Iterator[None]:
 def _complaint(error: Exception) -> str:
     """Return a parser's complaint on one line."""
     mark = getattr(error, "problem_mark", None)
-    where = f"line {mark.line + 1}: " if mark is not None else ""
+    location = f"line {mark.line + 1}: " if mark is not None else ""
     problem = getattr(error, "problem", None) or str(error)
-    return where + plain(" ".join(problem.split()))[:MOST_SAID]
+    return location + plain(" ".join(problem.split()))[:MAX_SAID]
 
 
 def read_lines(path: Path) -> Iterator[tuple[int, str]]:
@@ -153,7 +153,7 @@ def read_unchecked_lines(path: Path) -> Iterator[tuple[int, str]]:
     try:
         text = path.read_text(encoding="utf-8-sig")  # some editors and shells put a byte-order mark first
     except (OSError, UnicodeDecodeError) as error:
-        raise TrapsError(f"{path}: cannot be read as lines of text ({plain(error)[:MOST_SAID]}); restore it") from error
+        raise TrapsError(f"{path}: cannot be read as lines of text ({plain(error)[:MAX_SAID]}); restore it") from error
     for number, line in enumerate(text.split("\n"), start=1):  # not splitlines: JSON may hold U+2028 as it is
         if line.strip():
             yield number, line
@@ -162,15 +162,15 @@ def read_unchecked_lines(path: Path) -> Iterator[tuple[int, str]]:
 def check_line(line: str, where: str) -> None:
     """Raise TrapsError for ambiguous or unbounded JSON; ignore invalid JSON."""
     try:
-        if len(line) > MOST_LINE_BYTES or _depth(line) > MOST_DEPTH:
+        if len(line) > MAX_LINE_BYTES or _depth(line) > MAX_DEPTH:
             raise _Odd("too large, or nested too deeply")
-        json.loads(line, object_pairs_hook=_once, parse_constant=_finite, parse_float=_finite)
+        json.loads(line, object_pairs_hook=_require_unique, parse_constant=_finite, parse_float=_finite)
         if re.search(r"\\u[dD][89a-fA-F]", line):
             json.dumps(json.loads(line), ensure_ascii=False).encode()
     except UnicodeEncodeError:
         raise TrapsError(f"{where}: half of a surrogate pair stands in it; correct that line") from None
     except _Odd as error:
-        raise TrapsError(f"{where}: {plain(error)[:MOST_SAID]}; correct that line") from None
+        raise TrapsError(f"{where}: {plain(error)[:MAX_SAID]}; correct that line") from None
     except ValueError as error:
         if "digits" in str(error):
             raise TrapsError(f"{where}: a number of thousands of digits; correct that line") from None
@@ -180,7 +180,7 @@ class _Odd(Exception):
     """A value that a line must not contain."""
 
 
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _require_unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     fields = dict(pairs)
     if len(fields) < len(pairs):
         names = [name for name, _ in pairs]
@@ -197,8 +197,8 @@ def _finite(text: str) -> float:
 
 def _depth(line: str) -> int:
     """Return the nesting depth of brackets outside strings (must be fast)."""
-    outside = _STRINGS.sub("", line) if "\\" in line else "".join(line.split('"')[::2])
-    brackets = outside.encode().translate(None, _NO_BRACKETS)
+    unquoted = _STRINGS.sub("", line) if "\\" in line else "".join(line.split('"')[::2])
+    brackets = unquoted.encode().translate(None, _NO_BRACKETS)
     return max(accumulate(map(_STEPS.__getitem__, brackets)), default=0)
 
 
@@ -207,15 +207,15 @@ def parse_yaml_model(
 ) -> Model:
     """Validate parsed YAML. Raises TrapsError naming file, entry and field."""
     try:
-        parsed = model.model_validate(data, context=context)
+        instance = model.model_validate(data, context=context)
     except ValidationError as error:
         raise TrapsError(f"{path}{where and ': ' + where}: {explain(error, model)}") from error
-    for field in _other_kinds(data, parsed):
+    for field in _converted_values(data, instance):
         raise TrapsError(f"{path}{where and ': ' + where}: {field}")
-    return parsed
+    return instance
 
 
-def _other_kinds(data: Any, validated: Any, name: str = "") -> Iterator[str]:
+def _converted_values(data: Any, validated: Any, name: str = "") -> Iterator[str]:
     """Yield values that a model converted to another type, and non-finite numbers."""
     if isinstance(validated, float) and not math.isfinite(validated):
         yield f"{name}: {validated} is no finite number"
@@ -231,19 +231,19 @@ def _other_kinds(data: Any, validated: Any, name: str = "") -> Iterator[str]:
     elif isinstance(data, list | tuple) and isinstance(validated, list | tuple):
         fields = dict(enumerate(zip(data, validated, strict=False)))
     for key, (raw, value) in fields.items():
-        yield from _other_kinds(raw, value, f"{name}.{key}" if name else str(key))
+        yield from _converted_values(raw, value, f"{name}.{key}" if name else str(key))
 
 
 def explain(error: ValidationError, model: type[BaseModel] | None = None) -> str:
     """Return a validation error as `field: complaint`, with the nearest known field."""
     parts = list[str]()
-    for each in error.errors():
-        field, message = ".".join(map(str, each["loc"])), each["msg"].removeprefix("Value error, ")
-        if each["type"] == "extra_forbidden":
-            known = [] if model is None else _fields_at(model, each["loc"][:-1])
-            message = f"there is no such key{did_you_mean(str(each['loc'][-1]), known)}"
+    for error_details in error.errors():
+        field, message = ".".join(map(str, error_details["loc"])), error_details["msg"].removeprefix("Value error, ")
+        if error_details["type"] == "extra_forbidden":
+            field_names = [] if model is None else _fields_at(model, error_details["loc"][:-1])
+            message = f"there is no such key{did_you_mean(str(error_details['loc'][-1]), field_names)}"
         parts.append(f"{field}: {message}" if field else message)
-    return plain("; ".join(parts))[:MOST_SAID]
+    return plain("; ".join(parts))[:MAX_SAID]
 
 
 def _fields_at(model: type[BaseModel], place: Sequence[int | str]) -> list[str]:
@@ -252,7 +252,9 @@ def _fields_at(model: type[BaseModel], place: Sequence[int | str]) -> list[str]:
         field = model.model_fields.get(str(step))
         if field is None:  # a number in a list, a name in a mapping or of a union's member
             continue
-        inner = [each for each in _types_in(field.annotation) if isinstance(each, type) and issubclass(each, BaseModel)]
+        inner = [
+            type_ for type_ in _types_in(field.annotation) if isinstance(type_, type) and issubclass(type_, BaseModel)
+        ]
         if len(inner) != 1:
             return []
         model = inner[0]
@@ -261,5 +263,5 @@ def _fields_at(model: type[BaseModel], place: Sequence[int | str]) -> list[str]:
 
 def _types_in(annotation: Any) -> Iterator[Any]:
     yield annotation
-    for each in get_args(annotation):
-        yield from _types_in(each)
+    for argument in get_args(annotation):
+        yield from _types_in(argument)

@@ -18,7 +18,7 @@ from traps_pipeline.base.paths import PACKAGE
 from traps_pipeline.base.terminal import text_table
 from traps_pipeline.base.workers import run_in_order
 from traps_pipeline.benchmark.composition import load_composition, problems
-from traps_pipeline.benchmark.outcome_leakage import AT_MOST, FEWEST, outcome_leakage
+from traps_pipeline.benchmark.outcome_leakage import MAX_GAIN, MIN_RECORDS, outcome_leakage
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.scenes.certification.certify_record import Verdict, certify
 from traps_pipeline.scenes.draw.sample import Tally, load_tallies
@@ -43,29 +43,27 @@ def certify_all(
     fresh: bool = False,
     report: Callable[[str], None] = lambda _: None,
 ) -> tuple[list[Verdict], list[str]]:
-    """Return verdicts on a folder's records, and all problems, scenarios' ones first.
+    """Return verdicts on a folder's records, and problems, scenarios' before others.
 
     Verdicts are cached in `cache_folder` by record and code, so that an interrupted call resumes.
     """
-    released = folder / "released"
-    specs = [s for s in load_released(released).values() if families is None or s.family in families]
+    released_folder = folder / "released"
+    specs = [s for s in load_released(released_folder).values() if families is None or s.family in families]
     if not specs:
-        raise TrapsError(f"{released}: holds no records of {', '.join(families or ())}")
-    cases = [_case(released, cache_folder, spec) for spec in specs]
+        raise TrapsError(f"{released_folder}: holds no records of {', '.join(families or ())}")
+    cases = [_case(released_folder, cache_folder, spec) for spec in specs]
     if fresh:
         for case in cases:
             case.verdict.unlink(missing_ok=True)
     verdicts = []
-    for finished, (_, verdict) in enumerate(run_in_order(judge, cases, workers), start=1):
+    for count, (_, verdict) in enumerate(run_in_order(judge, cases, workers), start=1):
         verdicts.append(verdict)
-        if not verdict.passed or finished % 20 == 0 or finished == len(cases):
-            report(
-                f"{finished} of {len(cases)} examined: {verdict.scenario_id} {'passes' if verdict.passed else 'FAILS'}"
-            )
+        if not verdict.passed or count % 20 == 0 or count == len(cases):
+            report(f"{count} of {len(cases)} examined: {verdict.scenario_id} {'passes' if verdict.passed else 'FAILS'}")
     failures = [f"{v.scenario_id}: {name}: {reason}" for v in verdicts for name, reason in v.failures.items()]
     is_complete = families is None and (folder / "composition.yaml").is_file()
     failures += problems(specs, load_composition(folder / "composition.yaml") if is_complete else None)
-    return verdicts, failures + _alike(verdicts) + foreseeable(specs, verdicts)
+    return verdicts, failures + _repeated_endings(verdicts) + foreseeable(specs, verdicts)
 
 
 def _case(released: Path, folder: Path, spec: SceneSpec) -> Case:
@@ -98,7 +96,7 @@ def judge(case: Case) -> Verdict:
     return verdict
 
 
-def _alike(verdicts: Iterable[Verdict]) -> list[str]:
+def _repeated_endings(verdicts: Iterable[Verdict]) -> list[str]:
     """Return problems: clips of different scenarios that end in the same frame."""
     problems = []
     for side in ("control_end", "void_end"):
@@ -120,15 +118,15 @@ def foreseeable(specs: Iterable[SceneSpec], verdicts: Iterable[Verdict]) -> list
     problems = []
     for family, members in families.items():
         outcomes = [spec.ground_truth for spec in members]
-        predicted = (
+        messages = (
             outcome_leakage([states[spec.scenario_id] for spec in members], outcomes)
-            if len(members) >= FEWEST
+            if len(members) >= MIN_RECORDS
             else None
         )
-        if predicted is not None and predicted.gain > AT_MOST:
+        if messages is not None and messages.gain > MAX_GAIN:
             problems.append(
-                f"{family}: the state at the cut predicts {predicted.best:.3f} of the outcomes, the commonest one is "
-                f"{predicted.prior:.3f}; at most {AT_MOST} more is allowed"
+                f"{family}: the state at the cut predicts {messages.best:.3f} of the outcomes, the commonest one is "
+                f"{messages.prior:.3f}; at most {MAX_GAIN} more is allowed"
             )
     return problems
 
@@ -150,11 +148,11 @@ def family_table(folder: Path, verdicts: Sequence[Verdict]) -> str:
     rows = []
     for family, group in sorted(members.items()):
         twins = sum("twin" not in v.failures and "record" not in v.failures for v in group)
-        rejected = tallies.get(family, Tally(0, 0)).rejected.total()
-        changed = sum(not v.same_physics for v in group)
+        n_rejected = tallies.get(family, Tally(0, 0)).rejected.total()
+        n_changed = sum(not v.same_physics for v in group)
         spans = (_span(group, "entropy_bits", 2), _span(group, "top_share", 2), _span(group, "margin_m", 3))
         seconds = f"{np.median([v.cpu_s for v in group]):.1f}"
-        rows.append((family, len(group), sum(v.passed for v in group), rejected, *spans, twins, seconds, changed))
+        rows.append((family, len(group), sum(v.passed for v in group), n_rejected, *spans, twins, seconds, n_changed))
     lines = [text_table(headings, rows)]
     if any(not v.same_physics for v in verdicts):
         lines.append(

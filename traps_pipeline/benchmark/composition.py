@@ -1,4 +1,4 @@
-"""Sample a benchmark with so many scenarios per family, and check it as a whole."""
+"""Sample a benchmark with set numbers of scenarios, and check it as a whole."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from pydantic import RootModel, ValidationError
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import SCENE_SPECS
-from traps_pipeline.base.wording import counted
-from traps_pipeline.base.workers import kept_workers
+from traps_pipeline.base.wording import count_noun
+from traps_pipeline.base.workers import keep_workers
 from traps_pipeline.base.yamlfile import explain, read_yaml
 from traps_pipeline.benchmark.items import commonest_answers
 from traps_pipeline.scenes.draw.sample import answer_quota, ill_posed_quota, require_difficulty, sample_family
-from traps_pipeline.scenes.parts.difficulty import USUAL, Difficulty
+from traps_pipeline.scenes.parts.difficulty import DEFAULT_DIFFICULTY, Difficulty
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 
 PRIOR_AT_MOST = 0.55  # accuracy of the commonest answer, occlusion and chaotic weighted equally
@@ -43,17 +43,17 @@ def sample_benchmark(
     name: str,
     *,
     look: Collection[str] = (),
-    difficulty: Difficulty = USUAL,
+    difficulty: Difficulty = DEFAULT_DIFFICULTY,
     workers: int | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> None:
     """Sample a benchmark into `out`: records, trajectories, and `benchmark.yaml`.
 
     It has a canary of its own. Existing records of the same seed and numbers stay: an interrupted sampling resumes.
-    Raises TrapsError if a family cannot be filled, or not with a difficulty.
+    Raises TrapsError if a family cannot be filled, or does not support a setting of the difficulty.
     """
     require_difficulty(counts, difficulty)
-    with kept_workers():
+    with keep_workers():
         for family, count in counts.items():
             try:
                 tally = sample_family(
@@ -69,50 +69,50 @@ def sample_benchmark(
             except RuntimeError as error:
                 raise TrapsError(str(error)) from error
             reasons = ", ".join(f"{n} x {reason}" for reason, n in tally.rejected.most_common()) or "none rejected"
-            report(f"{family}: {count} of {counted(tally.draws, 'draw')}; {reasons}")
+            report(f"{family}: {count} of {count_noun(tally.draws, 'draw')}; {reasons}")
     if not (out / "benchmark.yaml").exists():
         release = {"name": name, "version": "1.0.0", "canary": f"{name.upper()}:CANARY:{uuid.uuid4()}"}
         write_text(out / "benchmark.yaml", yaml.safe_dump(release, sort_keys=False))
 
 
 def problems(specs: Sequence[SceneSpec], counts: Mapping[str, int] | None = None) -> list[str]:
-    """Return problems of records as a whole (against `counts`), one sentence each."""
+    """Check all records together (numbers against `counts`); return problems in words."""
     families: defaultdict[str, list[SceneSpec]] = defaultdict(list)
     for spec in specs:
         families[spec.family].append(spec)
-    wrong = [] if counts is None else _wrong_counts(families, counts)
+    messages = [] if counts is None else _wrong_counts(families, counts)
     for family, members in families.items():
-        wrong += _unbalanced(family, members)
-        wrong += _repeated_questions(family, members)
-        wrong += _constant_margin(family, members)
-    wrong += _repeated(families, "trajectory", lambda spec: spec.trajectory_sha256 + spec.scene_hash)
+        messages += _imbalances(family, members)
+        messages += _repeated_questions(family, members)
+        messages += _constant_margin(family, members)
+    messages += _repetitions(families, "trajectory", lambda spec: spec.trajectory_sha256 + spec.scene_hash)
     if counts is not None:
-        wrong += _predictable(specs)
-    return wrong
+        messages += _predictable(specs)
+    return messages
 
 
 def _wrong_counts(families: Mapping[str, Sequence[SceneSpec]], counts: Mapping[str, int]) -> list[str]:
     return [
-        f"{family}: {counted(len(families.get(family, ())), 'scenario')}, {counts.get(family, 0)} wanted"
+        f"{family}: {count_noun(len(families.get(family, ())), 'scenario')}, {counts.get(family, 0)} wanted"
         for family in sorted({*families, *counts})
         if len(families.get(family, ())) != counts.get(family, 0)
     ]
 
 
-def _unbalanced(family: str, members: Sequence[SceneSpec]) -> list[str]:
-    wrong = []
+def _imbalances(family: str, members: Sequence[SceneSpec]) -> list[str]:
+    messages = []
     for answer, n in Counter(spec.ground_truth for spec in members).items():
         choices = [len(spec.labels) for spec in members if answer in spec.labels]
-        most = answer_quota(len(members), len(members) / sum(1 / c for c in choices))  # the fair share of this answer
-        if n > most:
-            wrong.append(f"{family}: answer {answer!r} occurs {n} times, at most {most} allowed")
-    return wrong
+        quota = answer_quota(len(members), len(members) / sum(1 / c for c in choices))  # the fair share of this answer
+        if n > quota:
+            messages.append(f"{family}: answer {answer!r} occurs {n} times, at most {quota} allowed")
+    return messages
 
 
 def _repeated_questions(family: str, members: Sequence[SceneSpec]) -> list[str]:
-    most = ill_posed_quota(members[0].taxonomy, len(members))
+    quota = ill_posed_quota(members[0].taxonomy, len(members))
     texts = Counter(spec.ill_posed_question for spec in members)
-    return [f"{family}: {text!r} is asked {n} times, at most {most} allowed" for text, n in texts.items() if n > most]
+    return [f"{family}: {text!r} is asked {n} times, at most {quota} allowed" for text, n in texts.items() if n > quota]
 
 
 def _constant_margin(family: str, members: Sequence[SceneSpec]) -> list[str]:
@@ -121,7 +121,9 @@ def _constant_margin(family: str, members: Sequence[SceneSpec]) -> list[str]:
     return [f"{family}: every scenario has the margin {margins.pop()} m"] if len(margins) == 1 < len(members) else []
 
 
-def _repeated(families: Mapping[str, Iterable[SceneSpec]], subject: str, key: Callable[[SceneSpec], str]) -> list[str]:
+def _repetitions(
+    families: Mapping[str, Iterable[SceneSpec]], subject: str, key: Callable[[SceneSpec], str]
+) -> list[str]:
     owners: defaultdict[str, list[str]] = defaultdict(list)
     for members in families.values():
         for spec in members:

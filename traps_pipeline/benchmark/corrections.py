@@ -63,7 +63,7 @@ class Correction(BaseModel):
 
 @dataclass(frozen=True)
 class Scenario:
-    """A scenario after corrections: its changes, and its record (None if added).
+    """A scenario with its corrections; `record` is the released one, None if added.
 
     `params` is not None if the scene itself must be resolved again; the scene_specs stage does that.
     """
@@ -78,7 +78,7 @@ class Scenario:
 
     @property
     def released(self) -> SceneSpec | None:
-        """The released record, None if added. Raises TrapsError for a line that is none."""
+        """The released record, None if added. Raises TrapsError for an invalid line."""
         return self.record.spec if isinstance(self.record, ReleasedLine) else self.record
 
     @property
@@ -103,7 +103,7 @@ _OfFamily = TypeVar("_OfFamily", bound=_HasFamily)
 
 
 def apply_words(spec: SceneSpec, words: Mapping[str, Any], where: str) -> SceneSpec:
-    """Return a record with other words and checked labels. Raises TrapsError."""
+    """Return a record with corrected words. Raises TrapsError if labels do not fit."""
     if not words:
         return spec
     record = spec.model_dump(mode="json") | {name: value for name, value in words.items() if name != "answer"}
@@ -121,15 +121,15 @@ def read_corrections(folder: Path = CORRECTIONS) -> list[tuple[str, Correction]]
     corrections = []
     for path in sorted(folder.glob("*.jsonl")):
         for number, line in read_lines(path):
-            where = f"{path}:{number}"
+            location = f"{path}:{number}"
             try:
-                corrections.append((where, Correction.model_validate(json.loads(line))))
+                corrections.append((location, Correction.model_validate(json.loads(line))))
             except ValidationError as error:
                 raise TrapsError(
-                    f"{where}: not a valid correction ({explain(error, Correction)}); correct that line"
+                    f"{location}: not a valid correction ({explain(error, Correction)}); correct that line"
                 ) from error
             except ValueError as error:
-                raise TrapsError(f"{where}: not JSON ({error}); correct that line") from error
+                raise TrapsError(f"{location}: not JSON ({error}); correct that line") from error
     return corrections
 
 
@@ -140,30 +140,32 @@ def fold(
     scenarios = {
         id_: Scenario(id_, spec.family, spec.category, spec, where="released") for id_, spec in released.items()
     }
-    for where, correction in corrections:
+    for location, correction in corrections:
         scenario = scenarios.get(correction.scenario_id)
         if correction.action == "add":
             if scenario is not None or correction.scenario_id in released:
                 raise TrapsError(
-                    f"{where}: cannot add {correction.scenario_id!r}: the id is taken; choose a free number"
+                    f"{location}: cannot add {correction.scenario_id!r}: the id is taken; choose a free number"
                 )
-            scenarios[correction.scenario_id] = _add(where, correction)
+            scenarios[correction.scenario_id] = _add(location, correction)
             continue
         if correction.action in ("keep", "discard", "restore") and correction.changes():
             raise TrapsError(
-                f"{where}: `{correction.action}` changes nothing, yet gives {sorted(correction.changes())}; "
+                f"{location}: `{correction.action}` changes nothing, yet gives {sorted(correction.changes())}; "
                 "use `correct`"
             )
         if correction.action == "restore":
-            scenarios[correction.scenario_id] = _restore(where, correction.scenario_id, released)
+            scenarios[correction.scenario_id] = _restore(location, correction.scenario_id, released)
             continue
         if scenario is None:
             state = "was discarded" if correction.scenario_id in released else "is unknown"
-            raise TrapsError(f"{where}: scenario {correction.scenario_id!r} {state}; name a scenario of the benchmark")
+            raise TrapsError(
+                f"{location}: scenario {correction.scenario_id!r} {state}; name a scenario of the benchmark"
+            )
         if correction.action == "discard":
             del scenarios[correction.scenario_id]
         elif correction.action == "correct":
-            scenarios[correction.scenario_id] = _correct(where, scenario, correction)
+            scenarios[correction.scenario_id] = _correct(location, scenario, correction)
     return dict(sorted(scenarios.items()))
 
 
@@ -222,14 +224,14 @@ def check_benchmark(study: Study) -> None:
     if study.benchmark != current:
         raise TrapsError(
             f"the benchmark of the study is {study.benchmark!r}, the records in {SCENE_SPECS} are {current!r}; "
-            f"{_elsewhere(study.benchmark)}, or write `benchmark: {current}` into the experiment of a new workspace"
+            f"{_records_advice(study.benchmark)}, or write `benchmark: {current}` into a new workspace's experiment"
         )
 
 
-def _elsewhere(benchmark: str) -> str:
+def _records_advice(benchmark: str) -> str:
     """Return where to look for the records of a benchmark, as an instruction."""
-    released = benchmark == "released"
-    return f"unset {SPECS_VARIABLE}" if released else f"set {SPECS_VARIABLE} to the folder of {benchmark!r}"
+    is_released = benchmark == "released"
+    return f"unset {SPECS_VARIABLE}" if is_released else f"set {SPECS_VARIABLE} to the folder of {benchmark!r}"
 
 
 @cache
@@ -253,10 +255,10 @@ def subset(scenarios: Mapping[str, _OfFamily], study: Study) -> dict[str, _OfFam
         return dict(scenarios)
     families = {id_: spec.family for id_, spec in released_lines().items()}
     families |= {id_: scenario.family for id_, scenario in scenarios.items()}
-    by_family: dict[str, list[str]] = {}
+    ids_by_family: dict[str, list[str]] = {}
     for id_, family in sorted(families.items()):
-        by_family.setdefault(family, []).append(id_)
-    scenario_ids = {id_ for ids in by_family.values() for id_ in ids[: study.per_family]}
+        ids_by_family.setdefault(family, []).append(id_)
+    scenario_ids = {id_ for ids in ids_by_family.values() for id_ in ids[: study.per_family]}
     return {id_: scenario for id_, scenario in scenarios.items() if id_ in scenario_ids}
 
 
@@ -267,5 +269,5 @@ def _all_ids() -> set[str]:
 
 def categories_of(scenarios: Mapping[str, Scenario]) -> list[str]:
     """Return the categories that have scenarios, in their fixed order."""
-    present = {scenario.category for scenario in scenarios.values()}
-    return [category for category in ALL_CATEGORIES if category in present]
+    categories = {scenario.category for scenario in scenarios.values()}
+    return [category for category in ALL_CATEGORIES if category in categories]

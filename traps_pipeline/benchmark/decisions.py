@@ -1,4 +1,4 @@
-"""Append review decisions to the corrections, also of several reviewers at once.
+"""Append review decisions to the corrections; reviewers may write concurrently.
 
 The append-only file is the only store. A decision is checked by folding it over all earlier ones, written at once and
 synced to disk before it is confirmed; so a kill loses no confirmed decision, and concurrent reviewers append one after
@@ -32,7 +32,7 @@ class DecidedMeanwhile(TrapsError):
 
 def decisions_on(scenario_id: str, folder: Path = CORRECTIONS) -> list[Correction]:
     """Return a scenario's decisions, in order. Raises TrapsError if unreadable."""
-    return [each for _, each in read_corrections(folder) if each.scenario_id == scenario_id]
+    return [correction for _, correction in read_corrections(folder) if correction.scenario_id == scenario_id]
 
 
 def is_reviewed(decisions: Sequence[Correction]) -> bool:
@@ -46,7 +46,7 @@ def decide(correction: Correction, n_seen: int, folder: Path = CORRECTIONS) -> N
     n_seen: the number of decisions about the scenario that the reviewer knew of. Raises DecidedMeanwhile if there are
     more by now, and TrapsError if the decision does not fit the record; nothing is written then.
     """
-    with _appending(folder) as append:
+    with _open_for_append(folder) as append:
         _require_known(correction.scenario_id, n_seen, folder)
         append([correction])
 
@@ -56,19 +56,25 @@ def undo(scenario_id: str, n_seen: int, *, who: str, why: str, folder: Path = CO
 
     Raises DecidedMeanwhile as `decide` does, and TrapsError if there is no decision to take back.
     """
-    with _appending(folder) as append:
+    with _open_for_append(folder) as append:
         decisions = _require_known(scenario_id, n_seen, folder)
         if not is_reviewed(decisions):
             raise TrapsError(f"{scenario_id}: no decision stands that could be taken back")
-        released = load_released()
-        other_decisions = [(where, each) for where, each in read_corrections(folder) if each.scenario_id != scenario_id]
-        previous = fold(released, [*other_decisions, *(("before", each) for each in decisions[:-1])]).get(scenario_id)
+        records = load_released()
+        other_decisions = [
+            (location, correction)
+            for location, correction in read_corrections(folder)
+            if correction.scenario_id != scenario_id
+        ]
+        previous = fold(records, [*other_decisions, *(("before", correction) for correction in decisions[:-1])]).get(
+            scenario_id
+        )
 
         def sign(action: str, **changes: Any) -> Correction:
             signature = {"who": who, "when": date.today(), "why": why}
             return Correction.model_validate({"scenario_id": scenario_id, "action": action, **changes, **signature})
 
-        append(_bring_back(scenario_id in released, previous, was_reviewed=is_reviewed(decisions[:-1]), sign=sign))
+        append(_bring_back(scenario_id in records, previous, was_reviewed=is_reviewed(decisions[:-1]), sign=sign))
 
 
 def _bring_back(is_released: bool, previous: Scenario | None, *, was_reviewed: bool, sign: Sign) -> list[Correction]:
@@ -97,16 +103,16 @@ def _require_known(scenario_id: str, n_seen: int, folder: Path) -> list[Correcti
 
 
 @contextmanager
-def _appending(folder: Path) -> Iterator[Callable[[Sequence[Correction]], None]]:
+def _open_for_append(folder: Path) -> Iterator[Callable[[Sequence[Correction]], None]]:
     """Yield a function that appends decisions, while no other process does.
 
     Raises TrapsError if a later file would overrule them, and if the folder belongs to an installed wheel.
     """
     require_own_corrections(folder).mkdir(parents=True, exist_ok=True)
-    overruling = sorted(path.name for path in folder.glob("*.jsonl") if path.name > FILE)
-    if overruling:
+    later_files = sorted(path.name for path in folder.glob("*.jsonl") if path.name > FILE)
+    if later_files:
         raise TrapsError(
-            f"{folder / overruling[0]}: is read after {FILE}, to which reviews are appended, and would overrule them; "
+            f"{folder / later_files[0]}: is read after {FILE}, to which reviews are appended, and would overrule them; "
             f"rename it to a name that comes before {FILE}"
         )
     path = folder / FILE
@@ -116,9 +122,9 @@ def _appending(folder: Path) -> Iterator[Callable[[Sequence[Correction]], None]]
         _cut_torn_line(stream)
 
         def append(corrections: Sequence[Correction]) -> None:
-            where = f"{path} (new)"
-            fold(load_released(), [*read_corrections(folder), *((where, each) for each in corrections)])
-            lines = [each.model_dump(mode="json", exclude_none=True) for each in corrections]
+            location = f"{path} (new)"
+            fold(load_released(), [*read_corrections(folder), *((location, correction) for correction in corrections)])
+            lines = [correction.model_dump(mode="json", exclude_none=True) for correction in corrections]
             stream.write("".join(json.dumps(line, ensure_ascii=False) + "\n" for line in lines).encode())
             stream.flush()
             os.fsync(stream.fileno())

@@ -17,10 +17,10 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import PACKAGE
 from traps_pipeline.benchmark.corrections import corrected_scenarios
-from traps_pipeline.benchmark.sharing import Filming, Row, existing_clips, share
+from traps_pipeline.benchmark.sharing import RenderWork, Row, existing_clips, share
 from traps_pipeline.benchmark.specs import clips_version, released_in_study, spec_of, spec_rows, trajectory_of
 from traps_pipeline.protocol.datasets import ARMS as ARM_NAMES
-from traps_pipeline.protocol.datasets import CROSSED, GRADED, beside_of, sides_of, taxonomy_of_category
+from traps_pipeline.protocol.datasets import CROSSED, GRADED, extra_datasets_of, sides_of, taxonomy_of_category
 from traps_pipeline.scenes.variants.arms import ARMS as SHORTCUT_ARMS
 from traps_pipeline.scenes.variants.arms import Arm, Question, Scenario, crossed, partners
 from traps_pipeline.scenes.variants.graded_cuts import GRADED_CUT
@@ -50,13 +50,13 @@ class ArmResult:
         """Return the stored result if it is of this record and this code, else None."""
         if not path.is_file():
             return None
-        finding = ArmResult(**json.loads(path.read_text(encoding="utf-8")))
-        return finding if finding.of == of else None
+        result = ArmResult(**json.loads(path.read_text(encoding="utf-8")))
+        return result if result.of == of else None
 
 
 @dataclass(frozen=True)
 class Job:
-    """A scenario's arms to render, by arm with its clip; trajectories are (F, nq)."""
+    """A scenario's arms to render: clip paths by arm, and trajectories (F, nq)."""
 
     spec: SceneSpec
     qpos: np.ndarray
@@ -67,7 +67,7 @@ class Job:
 def asked_arms(workspace: Workspace, category: str) -> list[str]:
     """Return a category's arms and variations that some experiment requests."""
     datasets = {dataset for experiment in workspace.study.experiments.values() for dataset in experiment.datasets}
-    return [arm for arm in beside_of(taxonomy_of_category(category)) if arm in datasets]
+    return [arm for arm in extra_datasets_of(taxonomy_of_category(category)) if arm in datasets]
 
 
 def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tuple[int, bool]:
@@ -93,8 +93,8 @@ def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tupl
     def tick(finished: int) -> None:
         progress.current().tick("arms", f"{category}, scenarios", finished, len(specs))
 
-    filming = Filming(f"arms/{category}", missing, files, job, film)
-    return share(workspace.store, specs, filming, tick, wait=wait)
+    render_work = RenderWork(f"arms/{category}", missing, files, job, film)
+    return share(workspace.store, specs, render_work, tick, wait=wait)
 
 
 def seconds_left(workspace: Workspace, category: str) -> float:
@@ -110,7 +110,7 @@ def seconds_left(workspace: Workspace, category: str) -> float:
 def build_arms(workspace: Workspace, category: str) -> list[ArmRow]:
     """Return a category's arms. Raises TrapsError for a missing or damaged one."""
     specs, arms = spec_rows(workspace, category), asked_arms(workspace, category)
-    of_pairs = {
+    pair_clips = {
         (row["scenario_id"], row["side"]): row
         for row in workspace.tables.read(VIDEOS, {"category": category}).to_dict("records")
     }
@@ -119,7 +119,7 @@ def build_arms(workspace: Workspace, category: str) -> list[ArmRow]:
     clips = existing_clips(workspace.store, films)
     version = clips_version(workspace, category, specs)
     return [
-        arm_row for row in specs for arm in arms for arm_row in _rows(workspace, row, arm, of_pairs, clips, version)
+        arm_row for row in specs for arm in arms for arm_row in _rows(workspace, row, arm, pair_clips, clips, version)
     ]
 
 
@@ -131,10 +131,8 @@ def _is_missing(row: Row, clips: Mapping[str, Path], existing: set[Path]) -> boo
     """Return whether the study lacks files of these arms of a scenario."""
     spec = spec_of(row)
     for arm, clip in clips.items():
-        finding = (
-            ArmResult.read(_finding_of(clip), _record_digest(spec, arm)) if _finding_of(clip) in existing else None
-        )
-        if finding is None or (finding.frames and not {clip, note_of(clip)} <= existing):
+        result = ArmResult.read(_finding_of(clip), _record_digest(spec, arm)) if _finding_of(clip) in existing else None
+        if result is None or (result.frames and not {clip, note_of(clip)} <= existing):
             return True
     return False
 
@@ -179,8 +177,8 @@ def _record_digest(spec: SceneSpec, arm: str) -> str:
 
 def _is_made(spec: SceneSpec, arm: str, clip: Path) -> bool:
     """Return whether an arm and its clip, if any, are complete. Raises DamagedClip."""
-    finding = ArmResult.read(_finding_of(clip), _record_digest(spec, arm))
-    return finding is not None and (not finding.frames or read_clip(clip) is not None)
+    result = ArmResult.read(_finding_of(clip), _record_digest(spec, arm))
+    return result is not None and (not result.frames or read_clip(clip) is not None)
 
 
 def film(job: Job) -> int:
@@ -191,13 +189,13 @@ def film(job: Job) -> int:
         try:
             variant = arm_of(job.spec, arm)
             variant.ask(job.spec)
-            take = variant.film(scenario)
-            if take.frames:
-                frame_count += save_clip(clip, take.frames, scenario.fps)
-            finding = ArmResult(record_digest, None, take.evidence, len(take.frames))
+            arm_clip = variant.film(scenario)
+            if arm_clip.frames:
+                frame_count += save_clip(clip, arm_clip.frames, scenario.fps)
+            result = ArmResult(record_digest, None, arm_clip.evidence, len(arm_clip.frames))
         except Rejected as rejection:
-            finding = ArmResult(record_digest, str(rejection), {})
-        write_text(_finding_of(clip), json.dumps(asdict(finding)))
+            result = ArmResult(record_digest, str(rejection), {})
+        write_text(_finding_of(clip), json.dumps(asdict(result)))
     return frame_count
 
 
@@ -211,8 +209,8 @@ def _rows(
 ) -> Iterator[ArmRow]:
     spec = spec_of(row)
     path = workspace.clip(spec.scenario_id, arm, row["scene_hash"])
-    finding, clip = ArmResult.read(_finding_of(path), _record_digest(spec, arm)), clips.get(path)
-    if finding is None or (finding.frames and clip is None):
+    result, clip = ArmResult.read(_finding_of(path), _record_digest(spec, arm)), clips.get(path)
+    if result is None or (result.frames and clip is None):
         raise TrapsError(f"{path}: was not filmed; run again")
     empty = ArmRow(
         scenario_id=spec.scenario_id,
@@ -222,8 +220,8 @@ def _rows(
         question=spec.question,
         labels=list(spec.labels),
         ground_truth=None,
-        refused=finding.refused,
-        evidence=json.dumps(finding.evidence),
+        refused=result.refused,
+        evidence=json.dumps(result.evidence),
         clip=None,
         media_digest=None,
         n_frames=None,
@@ -231,13 +229,13 @@ def _rows(
         scene_hash=row["scene_hash"],
         benchmark_version=version,
     )
-    if finding.refused is not None:
+    if result.refused is not None:
         yield replace(empty, ground_truth=None)
         return
     for question in arm_of(spec, arm).ask(spec):
-        of_pair = question.clip
-        if of_pair is not None:
-            columns = _pair_clip_columns(of_pairs[spec.scenario_id, of_pair])
+        pair_side = question.clip
+        if pair_side is not None:
+            columns = _pair_clip_columns(of_pairs[spec.scenario_id, pair_side])
         else:
             assert clip is not None, "what shows a clip of its own has frames"
             columns = _clip_columns(workspace.relative(path), clip)
@@ -270,8 +268,8 @@ def _pair_clip_columns(row: Row) -> dict[str, Any]:
 def incomplete_reasons(workspace: Workspace, category: str) -> list[str]:
     """Return why a category's table is incomplete: a new arm or a lost clip."""
     rows = workspace.tables.read(ARMS, {"category": category}, ["arm", "clip"])
-    present = set(rows["arm"])
-    reasons = [f"arm {arm} is asked for now" for arm in asked_arms(workspace, category) if arm not in present]
+    arms_in_table = set(rows["arm"])
+    reasons = [f"arm {arm} is asked for now" for arm in asked_arms(workspace, category) if arm not in arms_in_table]
     clips = sorted({str(clip) for clip in rows["clip"].dropna()})
     sizes = workspace.sizes(clips)
     return reasons + [f"clip {clip} is gone" for clip in clips if clip not in sizes]

@@ -50,13 +50,14 @@ def build_items(workspace: Workspace, dataset: str) -> list[ItemRow]:
         raise TrapsError(f"items {dataset}: no scene_specs yet; materialize scene_specs and videos first")
     if dataset not in UNPAIRED:
         _check_clips(workspace, dataset, specs, clips)
-    released = [s for c in categories_of_dataset(dataset) for s in released_in_study(workspace, c).values()]
+    released_specs = [s for c in categories_of_dataset(dataset) for s in released_in_study(workspace, c).values()]
     version = version_of(
-        (item_content(dataset, spec_record(spec)) for spec in released), (item_content(dataset, row) for row in specs)
+        (item_content(dataset, spec_record(spec)) for spec in released_specs),
+        (item_content(dataset, row) for row in specs),
     )
     commonest = commonest_answers(specs)
     if dataset in UNPAIRED:
-        return _of_arm(workspace, dataset, {spec["scenario_id"]: spec for spec in specs}, commonest, version)
+        return _arm_items(workspace, dataset, {spec["scenario_id"]: spec for spec in specs}, commonest, version)
     return [_item(dataset, spec, side, clips, commonest, version) for spec in specs for side in SIDES]
 
 
@@ -78,12 +79,12 @@ def expected_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
         for row in workspace.tables.read_all(VIDEOS, category=categories_of_dataset(dataset)).to_dict("records")
         if row["scene_hash"] == scenes.get(row["scenario_id"])
     }
-    complete = [spec for spec in specs if all((spec["scenario_id"], side) in clips for side in SIDES)]
+    complete_specs = [spec for spec in specs if all((spec["scenario_id"], side) in clips for side in SIDES)]
     commonest = commonest_answers(specs)
-    return [asdict(_item(dataset, spec, side, clips, commonest, "")) for spec in complete for side in SIDES]
+    return [asdict(_item(dataset, spec, side, clips, commonest, "")) for spec in complete_specs for side in SIDES]
 
 
-def _of_arm(
+def _arm_items(
     workspace: Workspace, arm: str, specs: Mapping[str, Record], commonest: Mapping[str, str], version: str
 ) -> list[ItemRow]:
     """Return items with the arms table's questions, per scenario that admits the arm."""

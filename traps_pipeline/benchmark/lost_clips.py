@@ -1,4 +1,4 @@
-"""Find the clips that a study has lost, without importing what renders one."""
+"""Find a study's missing clips without importing the renderer."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 
 def missing_clips(workspace: Workspace, category: str) -> Sequence[str]:
-    """Return a category's clips that are lost or of another size, for `traps status`."""
+    """Return a category's clips that are missing or of a wrong size."""
     table = workspace.tables.read_arrow(VIDEOS, ["path", "size_bytes"], category=category)
     expected = dict(zip(table["path"].to_pylist(), table["size_bytes"].to_pylist(), strict=True))
     notes = {path: workspace.relative(note_of(workspace.root / path)) for path in expected}

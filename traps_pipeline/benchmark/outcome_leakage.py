@@ -14,16 +14,16 @@ from dataclasses import dataclass
 import numpy as np
 
 FOLDS, SEED = 5, 0
-AT_MOST = 0.05  # maximum accuracy above always giving the commonest outcome
-FEWEST = 100  # records of a family; fewer cannot tell such a leakage from chance
+MAX_GAIN = 0.05  # maximum accuracy above always giving the commonest outcome
+MIN_RECORDS = 100  # records of a family; fewer cannot tell such a leakage from chance
 
 
 @dataclass(frozen=True)
 class OutcomeLeakage:
     """Accuracy of predicting the outcomes.
 
-    best: of the better of two cross-validated classifiers of the states, which favours them; prior: of always giving
-    the commonest outcome.
+    best: accuracy of the better of two cross-validated classifiers of the states, which favours them; prior: accuracy
+    of always giving the commonest outcome.
     """
 
     best: float

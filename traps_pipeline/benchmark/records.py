@@ -66,12 +66,12 @@ def released_lines(folder: Path = RELEASED) -> dict[str, ReleasedLine]:
     records: dict[str, ReleasedLine] = {}
     for path in sorted(folder.glob("*.jsonl")):
         for number, line in read_unchecked_lines(path):
-            released = _line(line, f"{path}:{number}")
-            if released.scenario_id in records:
+            record_line = _line(line, f"{path}:{number}")
+            if record_line.scenario_id in records:
                 raise TrapsError(
-                    f"{path}:{number}: scenario {released.scenario_id!r} occurs twice; remove one of the lines"
+                    f"{path}:{number}: scenario {record_line.scenario_id!r} occurs twice; remove one of the lines"
                 )
-            records[released.scenario_id] = released
+            records[record_line.scenario_id] = record_line
     if not records:
         raise TrapsError(
             f"{folder}: holds no released records; restore it from git or draw some with `traps benchmark sample`"

@@ -26,12 +26,12 @@ Job = TypeVar("Job")
 
 
 @dataclass(frozen=True)
-class Filming(Generic[Job]):
+class RenderWork(Generic[Job]):
     """The work to do for rows of scene_specs.
 
-    name: of the work, the same on every host. missing: returns the rows with missing files. files: the study's files of
-    a finished row. job: returns what to draw for a row (None: nothing), after existing files were fetched. draw: draws
-    it, in a process of its own, and returns the number of new frames.
+    name: the work's name, the same on every host. missing: returns the rows with missing files. files: the study's
+    files of a finished row. job: returns what to draw for a row (None: nothing), after existing files were fetched.
+    draw: draws it, in a process of its own, and returns the number of new frames.
     """
 
     name: str
@@ -42,7 +42,7 @@ class Filming(Generic[Job]):
 
 
 def share(
-    store: Store, rows: Sequence[Row], filming: Filming[Job], tick: Callable[[int], None], *, wait: bool = True
+    store: Store, rows: Sequence[Row], filming: RenderWork[Job], tick: Callable[[int], None], *, wait: bool = True
 ) -> tuple[int, bool]:
     """Make the missing files of rows, concurrently with other processes.
 
@@ -57,7 +57,9 @@ def share(
 
 
 class _Sharing(Generic[Job]):
-    def __init__(self, store: Store, rows: Sequence[Row], filming: Filming[Job], tick: Callable[[int], None]) -> None:
+    def __init__(
+        self, store: Store, rows: Sequence[Row], filming: RenderWork[Job], tick: Callable[[int], None]
+    ) -> None:
         self._store, self._filming, self._tick = store, filming, tick
         missing = {id(row) for row in filming.missing(rows)}
         # By number, which is the same in every process.

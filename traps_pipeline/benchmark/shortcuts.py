@@ -1,4 +1,4 @@
-"""Measure how well superficial cues (wording, length, file size) tell the side.
+"""Measure how well superficial cues (wording, length, file size) predict the side.
 
 A model that abstained on such a cue alone would score without having seen anything, so a reader must know their size.
 They are reported beside the observer and are no gate: a cut clip *is* shorter.
@@ -49,9 +49,9 @@ def shortcuts(
         data = items.loc[items["dataset"] == dataset].reset_index(drop=True)
         if data["scenario_id"].nunique() < FOLDS:
             continue
-        of_items: list[Any] = data[["scenario_id", "pair_id", "side"]].to_numpy().tolist()
+        id_rows: list[Any] = data[["scenario_id", "pair_id", "side"]].to_numpy().tolist()
         for name, cue in cues.items():
-            key = digest([*code, dataset, name, of_items, cue.values(data).tolist()])
+            key = digest([*code, dataset, name, id_rows, cue.values(data).tolist()])
             results[key] = (cache or {}).get(key) or _accuracy(_hits(data, cue.features(data), cue.model()))
             rows.append((dataset, name, data["pair_id"].nunique(), *results[key]))
     if cache is not None:
@@ -91,9 +91,9 @@ def _hits(items: pd.DataFrame, features: np.ndarray, model: Pipeline) -> np.ndar
     from sklearn.model_selection import GroupKFold, cross_val_predict
 
     void = (items["side"] == "void").to_numpy()
-    predicted = cross_val_predict(model, features, void, groups=items["scenario_id"], cv=GroupKFold(FOLDS))
+    predictions = cross_val_predict(model, features, void, groups=items["scenario_id"], cv=GroupKFold(FOLDS))
     _, pair = np.unique(items["pair_id"].to_numpy(str), return_inverse=True)
-    return np.bincount(pair, weights=predicted == void) / np.bincount(pair)
+    return np.bincount(pair, weights=predictions == void) / np.bincount(pair)
 
 
 def _thumbnail(clip: Path) -> np.ndarray:

@@ -42,7 +42,7 @@ def resolve_scenario(workspace: Workspace, scenario: Scenario) -> ResolvedScenar
     if scenario.params is None:
         spec = scenario.changed_words()
         return ResolvedScenario(spec, RELEASED / "trajectories" / f"{spec.scenario_id}.npz")
-    spec, trajectory = _resolved_anew(workspace, scenario)
+    spec, trajectory = _resolve_again(workspace, scenario)
     words = dict(scenario.words)
     if _has_valid_words(scenario):
         assert scenario.released is not None
@@ -56,9 +56,9 @@ def resolve_scenario(workspace: Workspace, scenario: Scenario) -> ResolvedScenar
     return ResolvedScenario(apply_words(spec, words, scenario.where), trajectory)
 
 
-def _resolved_anew(workspace: Workspace, scenario: Scenario) -> tuple[SceneSpec, Path]:
+def _resolve_again(workspace: Workspace, scenario: Scenario) -> tuple[SceneSpec, Path]:
     """Return the scene of corrected parameters, with its family's words; stored once."""
-    name = _resolved_name(scenario)
+    name = _resolution_name(scenario)
     files = [workspace.trajectories / f"{name}{ending}" for ending in (".npz", ".json")]
     workspace.store.bring(files)
     for folder in (CORRECTIONS / "trajectories", workspace.trajectories):
@@ -80,7 +80,7 @@ def _resolved_anew(workspace: Workspace, scenario: Scenario) -> tuple[SceneSpec,
     return spec, workspace.trajectories / f"{name}.npz"
 
 
-def _resolved_name(scenario: Scenario) -> str:
+def _resolution_name(scenario: Scenario) -> str:
     scene = [scenario.family, scenario.params, _seed(scenario), _physics(scenario)]
     return f"{scenario.scenario_id}-{digest(scene)[:16]}"
 
@@ -98,7 +98,7 @@ def _wording(scenario: Scenario, params: Mapping[str, Any]) -> Wording:
 
 
 def wording_of(family_name: str, seed: int, scenario_id: str, params: Mapping[str, Any]) -> Wording:
-    """Return the family's words for parameters, fixed for a scenario.
+    """Return the question and labels of a scenario, which seed and id determine.
 
     Raises ValueError or TypeError if the family has no such parameters.
     """
@@ -109,8 +109,8 @@ def wording_of(family_name: str, seed: int, scenario_id: str, params: Mapping[st
 
 def _has_valid_words(scenario: Scenario) -> bool:
     """Return whether released and corrected parameters have the same family words."""
-    released = scenario.released
-    return released is not None and _wording(scenario, released.params) == _wording(scenario, scenario.params or {})
+    record = scenario.released
+    return record is not None and _wording(scenario, record.params) == _wording(scenario, scenario.params or {})
 
 
 def _simulate(scenario: Scenario) -> tuple[SceneSpec, np.ndarray, np.ndarray]:
@@ -127,7 +127,7 @@ def _simulate(scenario: Scenario) -> tuple[SceneSpec, np.ndarray, np.ndarray]:
         physics = Physics(**_physics(scenario))
         rng = np.random.default_rng([_seed(scenario), *scenario.scenario_id.encode(), 1])
         question = draw_ill_posed(family.taxonomy, family.build(params, physics).inventory, rng)
-        resolved = resolve(
+        resolution = resolve(
             family,
             params,
             wording,
@@ -136,7 +136,7 @@ def _simulate(scenario: Scenario) -> tuple[SceneSpec, np.ndarray, np.ndarray]:
             seed=_seed(scenario),
             physics=physics,
         )
-        return resolved.spec, resolved.qpos, resolved.twin
+        return resolution.spec, resolution.qpos, resolution.twin
     except (Rejected, ValueError, TypeError) as error:
         raise TrapsError(
             f"{scenario.where}: {scenario.scenario_id}: these parameters make no valid pair ({error}); "
@@ -154,16 +154,16 @@ def seconds_left(workspace: Workspace, category: str) -> float:
 def build_specs(workspace: Workspace, category: str) -> tuple[list[SceneSpecRow], list[ResolvedScenario]]:
     """Return a category's rows and resolved records, with trajectories verified."""
     scenarios = [s for s in load_scenarios(workspace.study).values() if s.category == category]
-    resolved = [resolve_scenario(workspace, scenario) for scenario in scenarios]
-    released = released_in_study(workspace, category).values()
-    version = version_of((spec.spec_hash for spec in released), (r.spec.spec_hash for r in resolved))
-    for item in resolved:
+    resolved_scenarios = [resolve_scenario(workspace, scenario) for scenario in scenarios]
+    released_specs = released_in_study(workspace, category).values()
+    version = version_of((spec.spec_hash for spec in released_specs), (r.spec.spec_hash for r in resolved_scenarios))
+    for item in resolved_scenarios:
         try:
             get_family(item.spec.family).params_from(item.spec.params)
             load_trajectory(item.trajectory, item.spec.trajectory_sha256)
         except ValueError as error:
             raise TrapsError(f"{item.spec.scenario_id}: {error}") from error
-    return [_row(workspace, item, version) for item in resolved], resolved
+    return [_row(workspace, item, version) for item in resolved_scenarios], resolved_scenarios
 
 
 def spec_rows(workspace: Workspace, category: str) -> list[dict[str, Any]]:
@@ -173,9 +173,10 @@ def spec_rows(workspace: Workspace, category: str) -> list[dict[str, Any]]:
 
 def clips_version(workspace: Workspace, category: str, rows: Sequence[Mapping[str, Any]]) -> str:
     """Return the version of a category's clips, by its rows of scene_specs."""
-    released = released_in_study(workspace, category).items()
+    released_specs = released_in_study(workspace, category).items()
     return version_of(
-        ([id_, spec.scene_hash] for id_, spec in released), ([row["scenario_id"], row["scene_hash"]] for row in rows)
+        ([id_, spec.scene_hash] for id_, spec in released_specs),
+        ([row["scenario_id"], row["scene_hash"]] for row in rows),
     )
 
 
@@ -186,7 +187,7 @@ def expected_specs(workspace: Workspace, category: str) -> list[SceneSpecRow]:
     """
 
     def is_resolved(scenario: Scenario) -> bool:
-        name = f"{_resolved_name(scenario)}.json" if scenario.params is not None else ""
+        name = f"{_resolution_name(scenario)}.json" if scenario.params is not None else ""
         is_stored = workspace.store.has(workspace.trajectories / name)
         return not name or is_stored or (CORRECTIONS / "trajectories" / name).is_file()
 
@@ -212,7 +213,7 @@ def corrections_version(workspace: Workspace, category: str) -> str:
 
 
 def void_from_s(spec: SceneSpec) -> float:
-    """Return the time (s) of hiding (occluder) or of the cut (truncation) in the void."""
+    """Return the time (s) from which the void's occluder or its cut hides the outcome."""
     frame = spec.void["hidden_from_frame"] if spec.void_kind == "occluder" else spec.void["cut_frame"]
     return frame / spec.physics["fps"]
 
@@ -245,7 +246,7 @@ def _relative(path: Path, *roots: Path) -> str:
 
 
 def spec_of(row: Mapping[str, Any]) -> SceneSpec:
-    """Return the record of a row of scene_specs."""
+    """Return the record that a row of scene_specs holds."""
     record = {name: row[name] for name in SceneSpec.model_fields}
     for name in (*_AS_JSON, "evidence"):
         record[name] = json.loads(record[name])

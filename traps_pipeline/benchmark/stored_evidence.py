@@ -18,12 +18,12 @@ _NO_FRAMES = np.empty((0, 0), np.float32)  # words are certified without a traje
 
 
 def unanswerable_controls(specs: Iterable[SceneSpec]) -> list[str]:
-    """Return lost control certificates by the records' evidence, one sentence each."""
+    """Return control certificates that the stored evidence fails, one sentence each."""
     return list(_lost_certificates(specs, "control"))
 
 
 def answerable_voids(specs: Iterable[SceneSpec]) -> list[str]:
-    """Return lost void certificates by the records' evidence, one sentence each."""
+    """Return void certificates that the stored evidence fails, one sentence each."""
     return list(_lost_certificates(specs, "void", "twin", "worlds"))
 
 

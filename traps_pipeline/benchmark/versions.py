@@ -1,4 +1,4 @@
-"""Name benchmark versions by content digests, alike if rebuilt or corrected.
+"""Name benchmark versions by content digests: equal content has equal versions.
 
 A part (a category's specs or clips, a dataset's items) has the release's version while it equals the release, and
 `release+digest` once a correction has changed it. Other parts keep their version. So a rebuilt study and one corrected
@@ -18,14 +18,14 @@ from traps_pipeline.scenes.worlds.spec import SceneSpec
 
 
 def version_of(released: Iterable[Any], current: Iterable[Any]) -> str:
-    """Return the release's version, as 0.2.0+3f2a9c01 if current content differs."""
+    """Return the release's version; with a digest (0.2.0+3f2a9c01) if content differs."""
     release = load_release().version
     digests = sorted(digest(part) for part in current)
     return release if digests == sorted(digest(part) for part in released) else f"{release}+{digest(digests)[:8]}"
 
 
 def item_content(dataset: str, record: Mapping[str, Any]) -> list[Any]:
-    """Return a spec's or scene_specs row's content behind a dataset's version."""
+    """Return the fields of a spec (or its row) that a dataset's version hashes."""
     aliases = record["aliases"] if isinstance(record["aliases"], dict) else json.loads(record["aliases"])
     content = [record["scenario_id"], record["scene_hash"], record["question"], list(record["labels"]), aliases]
     content.append(record["ground_truth"])

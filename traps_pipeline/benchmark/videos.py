@@ -9,7 +9,7 @@ from pathlib import Path
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.benchmark.sharing import Filming, Row, existing_clips, share
+from traps_pipeline.benchmark.sharing import RenderWork, Row, existing_clips, share
 from traps_pipeline.benchmark.specs import clips_version, released_in_study, spec_of, spec_rows, trajectory_of
 from traps_pipeline.scenes.parts.look import frame_size
 from traps_pipeline.scenes.worlds.clip_cache import ClipCache
@@ -40,7 +40,7 @@ def render_videos(workspace: Workspace, category: str, *, wait: bool = True) -> 
         return None if all(are_here) else _job(workspace, row)
 
     tick = partial(_tick, category, len(specs))
-    rendering = Filming(f"videos/{category}", missing, partial(_files, workspace), job, _render)
+    rendering = RenderWork(f"videos/{category}", missing, partial(_files, workspace), job, _render)
     frames, is_whole = share(workspace.store, specs, rendering, tick, wait=wait)
     if frames and cache is not None:
         cache.trim()

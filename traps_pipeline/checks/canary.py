@@ -21,7 +21,7 @@ from traps_pipeline.judging.rules import read_statement
 from traps_pipeline.models.answers import answer_request
 from traps_pipeline.models.ask import Call, SettledCell, collect
 from traps_pipeline.models.judged_answers import UNREAD
-from traps_pipeline.models.participants import Row, when_asked
+from traps_pipeline.models.participants import Row, call_time_columns
 from traps_pipeline.models.reading import read_answer
 from traps_pipeline.models.registry import NETWORK, ModelEntry, get_model
 from traps_pipeline.protocol.cells import Cell, Evaluation
@@ -34,7 +34,7 @@ from traps_pipeline.storage.workspace import Workspace
 N_ITEMS = 20
 CELL = Cell("occlusion", Evaluation("canary", "standard", 1))  # a name in the ledger, not a model
 REGIME = "json"  # rules can read its final answers most often
-COMPARED = ("outcome", "abstained", "value")
+COMPARED_COLUMNS = ("outcome", "abstained", "value")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +58,7 @@ CANARY = Table("canary", CanaryRow, partition_by=(), key=("model", "item_id", "e
 
 
 def canary_items(workspace: Workspace) -> list[dict[str, Any]]:
-    """Return each dataset's items of smallest digest. Raises TrapsError without items."""
+    """Return each dataset's items of smallest digest. Raises TrapsError if none exist."""
     items = workspace.tables.read_all(ITEMS, dataset=DATASETS).to_dict("records")
     if not items:
         raise TrapsError("canary: no items yet; materialize items first")
@@ -114,7 +114,7 @@ def _row(call: _Asked, row: Row, epoch: str) -> CanaryRow:
         value=statement and statement.value,
         prompt_tokens=row["prompt_tokens"],
         epoch=epoch,
-        created_at=when_asked(row)["created_at"],
+        created_at=call_time_columns(row)["created_at"],
     )
 
 
@@ -124,21 +124,38 @@ def changes(rows: pd.DataFrame) -> pd.DataFrame:
     Columns model, from, to, served (names then and now), n (items asked in both), outcome, abstained and value (numbers
     of changed items), tokens (mean change of prompt tokens).
     """
-    by_epoch: dict[str, dict[str, dict[str, Mapping[str, Any]]]] = {}  # by model, epochs in order
+    answers_by_model: dict[str, dict[str, dict[str, Mapping[str, Any]]]] = {}  # by model, epochs in order
     for row in rows.sort_values(["model", "created_at"], kind="stable").to_dict("records"):
-        by_epoch.setdefault(row["model"], {}).setdefault(row["epoch"], {})[row["item_id"]] = row
-    changed = list[dict[str, Any]]()
-    for model, epochs in by_epoch.items():
-        for earlier, later in pairwise(epochs):
-            both = [(epochs[earlier][item], row) for item, row in epochs[later].items() if item in epochs[earlier]]
-            served = dict.fromkeys(str(side["served_model"]) for k in (0, 1) for side in (pair[k] for pair in both))
-            tokens = [new["prompt_tokens"] - old["prompt_tokens"] for old, new in both if _has_tokens(old, new)]
-            changed.append(
-                {"model": model, "from": earlier, "to": later, "served": " -> ".join(served), "n": len(both)}
-                | {name: sum(_words(old[name]) != _words(new[name]) for old, new in both) for name in COMPARED}
+        answers_by_model.setdefault(row["model"], {}).setdefault(row["epoch"], {})[row["item_id"]] = row
+    change_rows = list[dict[str, Any]]()
+    for model, epochs in answers_by_model.items():
+        for previous_epoch, epoch in pairwise(epochs):
+            answer_pairs = [
+                (epochs[previous_epoch][item], row)
+                for item, row in epochs[epoch].items()
+                if item in epochs[previous_epoch]
+            ]
+            served_models = dict.fromkeys(
+                str(side["served_model"]) for k in (0, 1) for side in (pair[k] for pair in answer_pairs)
+            )
+            tokens = [new["prompt_tokens"] - old["prompt_tokens"] for old, new in answer_pairs if _has_tokens(old, new)]
+            change_rows.append(
+                {
+                    "model": model,
+                    "from": previous_epoch,
+                    "to": epoch,
+                    "served": " -> ".join(served_models),
+                    "n": len(answer_pairs),
+                }
+                | {
+                    name: sum(_words(old[name]) != _words(new[name]) for old, new in answer_pairs)
+                    for name in COMPARED_COLUMNS
+                }
                 | {"tokens": sum(tokens) / len(tokens) if tokens else float("nan")}
             )
-    return pd.DataFrame(changed, columns=pd.Index(["model", "from", "to", "served", "n", *COMPARED, "tokens"]))
+    return pd.DataFrame(
+        change_rows, columns=pd.Index(["model", "from", "to", "served", "n", *COMPARED_COLUMNS, "tokens"])
+    )
 
 
 def _has_tokens(*rows: Mapping[str, Any]) -> bool:

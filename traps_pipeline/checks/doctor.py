@@ -17,7 +17,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import PART, check_disk
 from traps_pipeline.base.keys import optional_key
 from traps_pipeline.base.network import check_network
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.scenes.picture.trial import draw_frame, encode_clip
 from traps_pipeline.storage.place import Place, scratch_of
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 MIN_FREE_GB = 1.0
 STATES = ("*.safetensors", "*.parquet")  # files of an extraction
 FOLDERS = ("tables", "clips", "media", "trajectories", "states", "directions", "reports")
-MOST_FILES = 5  # damaged files named per kind
+MAX_FILES = 5  # damaged files named per kind
 UNFINISHED_AFTER_S = 24 * 3600.0  # longer than the writing of any file
 
 
@@ -64,8 +64,8 @@ def examine_local(models: Sequence[str] = ()) -> Iterator[Finding]:
     from traps_pipeline.models.local.tiny import FAMILIES
     from traps_pipeline.models.registry import LOCAL, get_model, local_models
 
-    named = [get_model(model) for model in models]
-    for entry in named:
+    entries = [get_model(model) for model in models]
+    for entry in entries:
         if entry.backend != LOCAL:
             raise TrapsError(
                 f"{entry.id}: runs elsewhere, so nobody looks into it; name one of {', '.join(local_models())}"
@@ -75,19 +75,19 @@ def examine_local(models: Sequence[str] = ()) -> Iterator[Finding]:
         yield _finding("devices", selfcheck.describe_devices)
         for family in FAMILIES:
             yield _finding(family, partial(selfcheck.check_family, family, folder))
-            yield from _inside(family, partial(adapter_checks.tiny_subject, family, folder))
+            yield from _adapter_findings(family, partial(adapter_checks.tiny_subject, family, folder))
         yield _finding("nf4", lambda: selfcheck.check_nf4(folder))
         yield _finding("checkpoints", selfcheck.describe_checkpoints)
-    for entry in named:
-        yield from _inside(
+    for entry in entries:
+        yield from _adapter_findings(
             entry.id,
             lambda entry=entry: adapter_checks.Subject(
-                load_local_model(entry, inside=True), *adapter_checks.brightening()
+                load_local_model(entry, inside=True), *adapter_checks.brightening_clip()
             ),
         )
 
 
-def _inside(name: str, load: Callable[[], Subject]) -> Iterator[Finding]:
+def _adapter_findings(name: str, load: Callable[[], Subject]) -> Iterator[Finding]:
     """Yield one finding per check of a model; a single one if it cannot be loaded."""
     from traps_pipeline.mechanism.adapter_checks import CHECKS
 
@@ -103,13 +103,15 @@ def _inside(name: str, load: Callable[[], Subject]) -> Iterator[Finding]:
 def examine_files(place: Place) -> Iterator[Finding]:
     """Read every self-checking file of a study in full; yield one finding per kind."""
     from traps_pipeline.mechanism.hidden_states import damage
-    from traps_pipeline.storage.parquet import altered
+    from traps_pipeline.storage.parquet import bytes_damage
     from traps_pipeline.storage.workspace import Workspace
 
     workspace = Workspace.open(place)
     store, missing = workspace.store, list[str]()
-    remote = [store.below(workspace.root / folder) for folder in FOLDERS] if workspace.is_shared else []
-    for path in (path for below in remote for path in below):  # fetched, and compared with their digests
+    remote_paths = [store.below(workspace.root / folder) for folder in FOLDERS] if workspace.is_shared else []
+    for path in (
+        path for folder_paths in remote_paths for path in folder_paths
+    ):  # fetched, and compared with their digests
         try:
             store.here(path)
         except TrapsError as error:
@@ -117,21 +119,21 @@ def examine_files(place: Place) -> Iterator[Finding]:
     for folder in FOLDERS:
         workspace.bring_folder(workspace.root / folder)
     if workspace.is_shared:
-        yield Finding(not missing, "store", "; ".join(missing[:MOST_FILES]) or "every object is what was written")
+        yield Finding(not missing, "store", "; ".join(missing[:MAX_FILES]) or "every object is what was written")
     for topic, files, damage_of in (
-        ("tables", sorted((workspace.root / "tables").rglob("*.parquet")), altered),
-        ("clips", sorted((workspace.root / "clips").rglob("*.mp4")), _damaged_clip),
-        ("media", sorted((workspace.root / "media").glob("*/*.json")), _damaged_media),
+        ("tables", sorted((workspace.root / "tables").rglob("*.parquet")), bytes_damage),
+        ("clips", sorted((workspace.root / "clips").rglob("*.mp4")), _clip_damage),
+        ("media", sorted((workspace.root / "media").glob("*/*.json")), _media_damage),
         ("states", sorted(file for kind in STATES for file in (workspace.root / "states").rglob(kind)), damage),
-        ("history", sorted(workspace.dagster_home.rglob("*.db")), _damaged_history),
+        ("history", sorted(workspace.dagster_home.rglob("*.db")), _history_damage),
     ):
-        damaged = [message for path in files if (message := damage_of(path))]
-        summary = "; ".join(damaged[:MOST_FILES]) + (
-            f"; and {len(damaged) - MOST_FILES} more" if len(damaged) > MOST_FILES else ""
+        messages = [message for path in files if (message := damage_of(path))]
+        summary = "; ".join(messages[:MAX_FILES]) + (
+            f"; and {len(messages) - MAX_FILES} more" if len(messages) > MAX_FILES else ""
         )
-        yield Finding(not damaged, topic, summary or f"{counted(len(files), 'file')} read, as written")
+        yield Finding(not messages, topic, summary or f"{count_noun(len(files), 'file')} read, as written")
     message = [*workspace.answers.damage(), *workspace.votes.damage()]
-    yield Finding(not message, "ledger", "; ".join(message[:MOST_FILES]) or "all rows are what was written")
+    yield Finding(not message, "ledger", "; ".join(message[:MAX_FILES]) or "all rows are what was written")
     yield Finding(True, "unfinished", _remove_unfinished(workspace.root))
 
 
@@ -149,18 +151,19 @@ def examine_unused(place: Place, *, is_removed: bool) -> Finding:
             f"{place}: a study in a folder has no objects that nobody names; give the address of one in an object "
             "store with --workspace s3://BUCKET/STUDY"
         )
-    unused = workspace.store.unused(is_removed=is_removed)
-    volume = f"{counted(len(unused), 'object')} ({sum(item.size for item in unused) / 1e6:.1f} MB)"
-    if unused:
-        volume += f", the oldest of {unused[0].at:%Y-%m-%d}: {', '.join(item.name for item in unused[:MOST_FILES])}"
-        volume += ", .." * (len(unused) > MOST_FILES)
+    unused_objects = workspace.store.unused(is_removed=is_removed)
+    volume = f"{count_noun(len(unused_objects), 'object')} ({sum(item.size for item in unused_objects) / 1e6:.1f} MB)"
+    if unused_objects:
+        names = ", ".join(item.name for item in unused_objects[:MAX_FILES])
+        volume += f", the oldest of {unused_objects[0].at:%Y-%m-%d}: {names}"
+        volume += ", .." * (len(unused_objects) > MAX_FILES)
     effect = "removed" if is_removed else "would be removed by `traps doctor --unused remove`"
     return Finding(
         True, "unused", f"{effect}, since nobody names them and they are older than {GRACE_DAYS:.0f} days: {volume}"
     )
 
 
-def _damaged_clip(path: Path) -> str:
+def _clip_damage(path: Path) -> str:
     from traps_pipeline.scenes.worlds.clip_notes import DamagedClip, read_clip
 
     try:
@@ -170,7 +173,7 @@ def _damaged_clip(path: Path) -> str:
     return ""
 
 
-def _damaged_media(note: Path) -> str:
+def _media_damage(note: Path) -> str:
     from traps_pipeline.storage.media import payload, read_note
     from traps_pipeline.video.encode import DamagedClip
 
@@ -183,11 +186,11 @@ def _damaged_media(note: Path) -> str:
     return ""
 
 
-def _damaged_history(path: Path) -> str:
+def _history_damage(path: Path) -> str:
     """Return why a history is damaged; the next command puts it aside, losing nothing."""
     try:
-        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as opened:
-            (result,) = opened.execute("pragma quick_check(1)").fetchone()
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as connection:
+            (result,) = connection.execute("pragma quick_check(1)").fetchone()
     except sqlite3.DatabaseError as error:
         result = str(error)
     return "" if result == "ok" else f"{path}: {result}; what counts stands in the tables"
@@ -200,7 +203,7 @@ def _remove_unfinished(root: Path) -> str:
     for path in old:
         path.unlink(missing_ok=True)
     return (
-        f"{counted(len(old), 'file')} of killed runs removed ({size / 1e6:.1f} MB)"
+        f"{count_noun(len(old), 'file')} of killed runs removed ({size / 1e6:.1f} MB)"
         if old
         else "no killed run left a file"
     )
@@ -222,9 +225,9 @@ def _checkout() -> str:
     root, release = require_root(), load_release()
     counts = ", ".join(
         (
-            counted(len(load_released()), "scenario"),
-            counted(len(read_corrections()), "correction"),
-            counted(len(load_models()), "model"),
+            count_noun(len(load_released()), "scenario"),
+            count_noun(len(read_corrections()), "correction"),
+            count_noun(len(load_models()), "model"),
         )
     )
     return f"{root}: {release.name} {release.version}, {counts}"
@@ -233,8 +236,8 @@ def _checkout() -> str:
 def _clip_cache() -> str:
     from traps_pipeline.scenes.worlds.clip_cache import VARIABLE, ClipCache
 
-    rendered = ClipCache.of_user()
-    return "off" if rendered is None else f"{rendered.describe()}; {VARIABLE} sets its GB, or off"
+    clip_cache = ClipCache.of_user()
+    return "off" if clip_cache is None else f"{clip_cache.describe()}; {VARIABLE} sets its GB, or off"
 
 
 def _workspace(place: Place) -> str:

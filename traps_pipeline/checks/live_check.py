@@ -23,7 +23,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.network import check_network, is_loopback
 from traps_pipeline.base.redaction import redact
 from traps_pipeline.base.terminal import plain
-from traps_pipeline.checks.wire_check import Studio, model_name, question
+from traps_pipeline.checks.wire_check import SyntheticClip, model_name, question
 from traps_pipeline.judging.panel import parse_vote, vote_request
 from traps_pipeline.models.ask import Call, SettledCell, collect
 from traps_pipeline.models.backends import make_backend
@@ -41,7 +41,7 @@ from traps_pipeline.models.request import (
     Request,
     TransientError,
 )
-from traps_pipeline.models.thinking import how_to_declare, split_thinking, undeclared_mark
+from traps_pipeline.models.thinking import declaration_line, split_thinking, undeclared_mark
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.workspace import Workspace
 
@@ -51,6 +51,7 @@ BAD_REQUEST = 400
 COLOURS = {"red": (200, 30, 30), "blue": (30, 30, 200)}
 QUESTION = "The whole picture has one colour and then another: which two colours does the clip show?"
 _FPS, _SIZE, _FRAMES = 10, (120, 160), 50
+_NO_SCHEMA = "say `json_schema: false` and `waivers: {json_schema: WHY}`"
 _JUDGED = (("I don't know.", True, False), ("The ball rolls down the ramp. The answer is: left.", False, True))
 _ITEM: Mapping[str, Any] = {
     "item_id": "preflight",
@@ -79,13 +80,13 @@ class LiveResult:
 
 
 @cache
-def _studio() -> Studio:
+def _studio() -> SyntheticClip:
     halves = [np.full((*_SIZE, 3), colour, np.uint8) for colour in COLOURS.values()]
-    return Studio([halves[2 * k // _FRAMES] for k in range(_FRAMES)], _FPS)
+    return SyntheticClip([halves[2 * k // _FRAMES] for k in range(_FRAMES)], _FPS)
 
 
 def requests_of(entry: Entry) -> dict[str, Request]:
-    """Return the calls to an entry by name; they hold the time, so none is reused."""
+    """Return an entry's test calls by name, stamped with the time so none is reused."""
     now = datetime.now(UTC).isoformat()
     if isinstance(entry, JudgeEntry):
         tasks: tuple[Task, ...] = ("abstention", "correctness")
@@ -97,10 +98,10 @@ def requests_of(entry: Entry) -> dict[str, Request]:
         }
         return {name: replace(call, about={**call.about, "check": name, "at": now}) for name, call in requests.items()}
     assert isinstance(entry, ModelEntry)
-    sent = _studio().prepare(entry.media) if entry.media else None
-    forms = {"clip": ("standard", sent), "no clip": ("standard", None)}
+    clip_media = _studio().prepare(entry.media) if entry.media else None
+    forms = {"clip": ("standard", clip_media), "no clip": ("standard", None)}
     if entry.json_schema:
-        forms["schema"] = ("json", sent)
+        forms["schema"] = ("json", clip_media)
     return {
         name: question(entry, regime, QUESTION, media, {"check": name, "at": now})
         for name, (regime, media) in forms.items()
@@ -124,7 +125,7 @@ class ServerCheck:
     refused: str = ""
 
 
-def reach(entry: Entry, account: Account) -> ServerCheck:
+def check_server(entry: Entry, account: Account) -> ServerCheck:
     """Check the key, the address, and the server's own list of models if it has one."""
     from traps_pipeline.models.wire import get
 
@@ -143,34 +144,36 @@ def reach(entry: Entry, account: Account) -> ServerCheck:
     if answer.status_code in (401, 403):
         return ServerCheck(_wrong_key(account))
     if answer.status_code == BAD_REQUEST and account.key:
-        even = f"{account.base_url} refuses even its list of models (HTTP 400), which wants nothing but a key"
-        return ServerCheck(refused=f"{even}: is the one in {account.key} right?")
-    known = [str(model["id"]) for model in _listed(answer) if isinstance(model, dict) and "id" in model]
-    if known and model_name(entry) not in known:
-        unlisted = f"{account.base_url} serves no {model_name(entry)!r}; it lists {plain(', '.join(known[:8]))[:200]}"
-        return ServerCheck(unlisted=unlisted)
+        list_problem = f"{account.base_url} refuses even its list of models (HTTP 400), which wants nothing but a key"
+        return ServerCheck(refused=f"{list_problem}: is the one in {account.key} right?")
+    served_names = [str(model["id"]) for model in _served_models(answer) if isinstance(model, dict) and "id" in model]
+    if served_names and model_name(entry) not in served_names:
+        name_problem = (
+            f"{account.base_url} serves no {model_name(entry)!r}; it lists {plain(', '.join(served_names[:8]))[:200]}"
+        )
+        return ServerCheck(unlisted=name_problem)
     return ServerCheck()
 
 
 def nobody_at(address: str, why: str = "the cause stands above") -> str:
-    """Return the sentence about an address without a server."""
+    """Return the error message for an address at which no server listens."""
     is_here = is_loopback(urlsplit(address).hostname or "")
     remedy = "start the server there" if is_here else "look at this machine's network and proxy variables"
     return f"nothing answers at {address} ({why}): {remedy}, or mend its `base_url`"
 
 
 def _wrong_key(account: Account) -> str:
-    where = f" at {account.base_url}" if account.base_url else ""
+    location = f" at {account.base_url}" if account.base_url else ""
     if account.key:
-        return f"the key in {account.key} is not accepted{where}: export the right one"
-    return f"a key is wanted{where}: name its variable as `key`"
+        return f"the key in {account.key} is not accepted{location}: export the right one"
+    return f"a key is wanted{location}: name its variable as `key`"
 
 
-def _listed(answer: Any) -> list[Any]:
+def _served_models(answer: Any) -> list[Any]:
     if answer.status_code == 200:
         with suppress(ValueError, AttributeError):
-            listed = answer.json().get("data")
-            return listed if isinstance(listed, list) else []
+            model_list = answer.json().get("data")
+            return model_list if isinstance(model_list, list) else []
     return []
 
 
@@ -178,14 +181,16 @@ def findings(
     entry: Entry, account: Account, outcomes: Mapping[str, Outcome], reached: ServerCheck | None = None
 ) -> LiveResult:
     """Return an entry's problems and notes, from outcomes of `requests_of`."""
-    problems, notes, before = list[str](), list[str](), reached or ServerCheck()
-    answering = {(outcome.served_model or "").partition("@")[0] for outcome in outcomes.values()}  # @VERSION may follow
-    if before.unlisted and model_name(entry) not in answering:
-        return LiveResult(entry, [before.unlisted])
-    if before.unlisted:
-        notes.append(f"{before.unlisted}, and answers to that name: make sure that it is the model that you mean")
-    if before.refused and all(outcome.error == f"http_{BAD_REQUEST}" for outcome in outcomes.values()):
-        return LiveResult(entry, [before.refused])
+    problems, notes, server_check = list[str](), list[str](), reached or ServerCheck()
+    answering_models = {
+        (outcome.served_model or "").partition("@")[0] for outcome in outcomes.values()
+    }  # @VERSION may follow
+    if server_check.unlisted and model_name(entry) not in answering_models:
+        return LiveResult(entry, [server_check.unlisted])
+    if server_check.unlisted:
+        notes.append(f"{server_check.unlisted}, and answers to that name: make sure that it is the model that you mean")
+    if server_check.refused and all(outcome.error == f"http_{BAD_REQUEST}" for outcome in outcomes.values()):
+        return LiveResult(entry, [server_check.refused])
     for name, outcome in outcomes.items():
         if name == "schema" and outcome.error is not None and outcome.error == outcomes["clip"].error:
             continue  # a failure without a schema, too, says nothing about schemas
@@ -196,8 +201,8 @@ def findings(
             else:
                 (notes if outcome.error == "timeout" else problems).append(sentence)
         elif outcome.kind == "malformed":
-            odd = None if outcome.error == MALFORMED else outcome.error
-            problems.append(f"{name}: {odd or 'its answer has no shape of its API; what it is stands above'}")
+            form_error = None if outcome.error == MALFORMED else outcome.error
+            problems.append(f"{name}: {form_error or 'its answer has no shape of its API; what it is stands above'}")
         elif outcome.kind == UNFINISHED:
             problems.append(f"{name}: it ends its answers for a reason that is not known ({outcome.finish_reason!r})")
         elif outcome.kind == "refused":
@@ -213,26 +218,26 @@ def findings(
 
 
 def _failure(entry: Entry, account: Account, name: str, error: str) -> str:
-    where = account.base_url or entry.endpoint
+    location = account.base_url or entry.endpoint
     match error:
         case "unreachable" | "connection":
-            return nobody_at(where)
+            return nobody_at(location)
         case "http_401" | "http_403":
             return _wrong_key(account)
         case "http_403_denied":
-            return f"{name}: {where} refuses the call (HTTP 403), and not for its key; what it said stands above"
+            return f"{name}: {location} refuses the call (HTTP 403), and not for its key; what it said stands above"
         case "http_404":
-            return f"{where} knows no model {model_name(entry)!r}, or has another path (is /v1 missing?)"
+            return f"{location} knows no model {model_name(entry)!r}, or has another path (is /v1 missing?)"
         case _ if error.startswith("ended_"):
             return f"{name}: its answer breaks off ({error.removeprefix('ended_')}), which the server's log explains"
         case "timeout":
             return f"{name}: no answer within {TIMEOUT_S:.0f} s; a model that thinks for long may need more"
         case "server_error" if name != "schema":
-            return f"{name}: {where} ends in an error of its own; what it said stands above, and in the server's log"
+            return f"{name}: {location} ends in an error of its own; what it said stands above, and in the server's log"
         case "rate_limited":
-            return f"{where} takes no call now; what it said stands above: wait, or raise the limit or quota there"
+            return f"{location} takes no call now; what it said stands above: wait, or raise the limit or quota there"
         case _ if name == "schema":
-            return f"it refuses structured output ({error}): say `json_schema: false` and why under waivers"
+            return f"it refuses structured output ({error}): {_NO_SCHEMA}"
         case _:
             return (
                 f"{name}: it refuses what the entry declares ({error}); what it said stands above. "
@@ -243,11 +248,11 @@ def _failure(entry: Entry, account: Account, name: str, error: str) -> str:
 def _undeclared_thinking(entry: Entry, outcome: Outcome) -> str | None:
     """Return what to declare if an answer shows thinking between common marks."""
     mark = undeclared_mark(split_thinking(outcome.text or "", entry.thinking).answer)
-    return f"it thinks between marks in its answer: say `{how_to_declare(mark)}` in its entry" if mark else None
+    return f"it thinks between marks in its answer: say `{declaration_line(mark)}` in its entry" if mark else None
 
 
 def _wrong_votes(entry: JudgeEntry, outcomes: Mapping[str, Outcome]) -> list[str]:
-    wrong = []
+    messages = []
     for name, outcome in outcomes.items():
         if outcome.kind not in (*WITH_TEXT, "empty"):
             continue
@@ -256,33 +261,30 @@ def _wrong_votes(entry: JudgeEntry, outcomes: Mapping[str, Outcome]) -> list[str
         vote = parse_vote(task, {"outcome": outcome.kind, "text": outcome.text}, _ITEM, entry.thinking)
         if not vote.valid:
             invalid = f"its vote on {task} does not meet the schema ({vote.invalid_reason})"
-            wrong.append(_undeclared_thinking(entry, outcome) or invalid)
+            messages.append(_undeclared_thinking(entry, outcome) or invalid)
         elif vote.decision is not (abstained if task == "abstention" else correct):
-            wrong.append(f"its vote on {task} of the plain answer {_JUDGED[int(name[-1])][0]!r} is wrong")
-    return wrong
+            messages.append(f"its vote on {task} of the plain answer {_JUDGED[int(name[-1])][0]!r} is wrong")
+    return messages
 
 
 def _wrong_answers(entry: ModelEntry, outcomes: Mapping[str, Outcome]) -> list[str]:
-    wrong = []
+    messages = []
     for name, outcome in outcomes.items():
         text = outcome.text or ""
         if outcome.kind == "empty":
-            wrong.append(f"{name}: its answer is empty (finish reason {outcome.finish_reason})")
+            messages.append(f"{name}: its answer is empty (finish reason {outcome.finish_reason})")
         if outcome.kind not in WITH_TEXT:
             continue
-        if marked := _undeclared_thinking(entry, outcome):
-            wrong.append(marked)
+        if thinking_mark := _undeclared_thinking(entry, outcome):
+            messages.append(thinking_mark)
             continue
         row = {"outcome": outcome.kind, "text": text}
         reading = read_answer(row, None, "json" if name == "schema" else "standard", thinking=entry.thinking)
         if reading.outcome == "degenerate":
-            wrong.append(f"its answer is {plain(text)[:40]!r}, which {degenerate(text)}")
+            messages.append(f"its answer is {plain(text)[:40]!r}, which {degenerate(text)}")
         elif reading.is_json is False and reading.outcome == "answer":
-            wrong.append(
-                "it ignores the schema (its answer in the JSON regime is no such object): say `json_schema: false` and "
-                "why under waivers"
-            )
-    return wrong
+            messages.append(f"it ignores the schema (its answer in the JSON regime is no such object): {_NO_SCHEMA}")
+    return messages
 
 
 def _clip_problems(entry: ModelEntry, outcomes: Mapping[str, Outcome], notes: list[str]) -> list[str]:
@@ -290,19 +292,19 @@ def _clip_problems(entry: ModelEntry, outcomes: Mapping[str, Outcome], notes: li
     clip, blank = outcomes.get("clip"), outcomes.get("no clip")
     if clip is None or blank is None or clip.kind not in WITH_TEXT:
         return []
-    named = all(re.search(rf"\b{colour}\b", (clip.text or "").lower()) for colour in COLOURS)
-    counted = None
+    names_both_colours = all(re.search(rf"\b{colour}\b", (clip.text or "").lower()) for colour in COLOURS)
+    frame_count = None
     if clip.prompt_tokens is not None and blank.prompt_tokens is not None:
-        counted = clip.prompt_tokens - blank.prompt_tokens
-    if counted is not None and counted <= 0:
+        frame_count = clip.prompt_tokens - blank.prompt_tokens
+    if frame_count is not None and frame_count <= 0:
         return [
             f"it does not see the clip: {clip.prompt_tokens} prompt tokens with it and {blank.prompt_tokens} without; "
             f"is this a model that sees, and is `{entry.media.profile if entry.media else ''}` what its server takes?"
         ]
-    if not named and counted is None:
+    if not names_both_colours and frame_count is None:
         return ["it does not see the clip: it names no colour of one that is red and then blue, nor counts its tokens"]
-    if not named:
-        notes.append(f"it counts {counted} tokens for the clip, and does not name its colours (red, then blue)")
+    if not names_both_colours:
+        notes.append(f"it counts {frame_count} tokens for the clip, and does not name its colours (red, then blue)")
     return []
 
 
@@ -317,9 +319,9 @@ def check_live(entries: Iterable[Entry]) -> list[LiveResult]:
 
     async def one(entry: Entry) -> LiveResult:
         account = account_of(entry)
-        reached = await asyncio.to_thread(reach, entry, account)
-        if reached.problem:
-            return LiveResult(entry, [reached.problem])
+        server_check = await asyncio.to_thread(check_server, entry, account)
+        if server_check.problem:
+            return LiveResult(entry, [server_check.problem])
         backend = make_backend(entry)
 
         async def asked(request: Request) -> Outcome:
@@ -333,7 +335,7 @@ def check_live(entries: Iterable[Entry]) -> list[LiveResult]:
 
         requests = requests_of(entry)
         outcomes = await asyncio.gather(*map(asked, requests.values()))
-        return findings(entry, account, dict(zip(requests, outcomes, strict=True)), reached)
+        return findings(entry, account, dict(zip(requests, outcomes, strict=True)), server_check)
 
     return asyncio.run(every())
 
@@ -348,30 +350,32 @@ def preflight(workspace: Workspace, models: Sequence[Entry], judges: Sequence[En
     for entry in entries:
         check_money(workspace.study, entry)
     accounts = {entry.id: account_of(entry) for entry in entries}
-    reached = {entry.id: reach(entry, accounts[entry.id]) for entry in entries}
-    quick = {
+    server_checks = {entry.id: check_server(entry, accounts[entry.id]) for entry in entries}
+    quick_entries = {
         entry.id: entry.model_copy(
             update={"limits": entry.limits.model_copy(update={"retries": 1, "timeout_s": TIMEOUT_S / 2})}
         )
         for entry in entries
-        if not reached[entry.id].problem
+        if not server_checks[entry.id].problem
     }
-    requests = {name: requests_of(entry) for name, entry in quick.items()}
-    calls = [Call(request) for of_one in requests.values() for request in of_one.values()]
+    requests = {name: requests_of(entry) for name, entry in quick_entries.items()}
+    calls = [Call(request) for entry_requests in requests.values() for request in entry_requests.values()]
     outcomes: Mapping[str, Outcome] = {}
     if calls:
 
         def finish(settled: SettledCell[Cell, Call]) -> Mapping[str, Outcome]:
             return {key: _outcome(row) for key, row in settled.rows.items()}
 
-        (outcomes,) = collect(workspace, "preflight", workspace.votes, quick.values(), [CELL], lambda _: calls, finish)
+        (outcomes,) = collect(
+            workspace, "preflight", workspace.votes, quick_entries.values(), [CELL], lambda _: calls, finish
+        )
     problems = []
     for entry in entries:
-        if problem := reached[entry.id].problem:
+        if problem := server_checks[entry.id].problem:
             problems.append(LiveResult(entry, [problem]))
         else:
             own_outcomes = {name: outcomes[request.key] for name, request in requests[entry.id].items()}
-            problems.append(findings(entry, accounts[entry.id], own_outcomes, reached[entry.id]))
+            problems.append(findings(entry, accounts[entry.id], own_outcomes, server_checks[entry.id]))
     return problems
 
 
@@ -381,8 +385,8 @@ def _outcome(row: Row) -> Outcome:
 
 
 def require_sound(results: Sequence[LiveResult]) -> None:
-    """Raise TrapsError that names every problem of every entry."""
-    wrong = [f"{result.entry.id}: {problem}" for result in results for problem in result.problems]
-    if wrong:
-        more = "nothing was rendered and nothing was judged; --no-preflight runs all the same"
-        raise TrapsError("\n".join([*wrong, more]))
+    """Raise TrapsError naming all problems of all entries, if there are any."""
+    messages = [f"{result.entry.id}: {problem}" for result in results for problem in result.problems]
+    if messages:
+        advice = "nothing was rendered and nothing was judged; --no-preflight runs all the same"
+        raise TrapsError("\n".join([*messages, advice]))

@@ -11,12 +11,12 @@ from threading import Thread
 from typing import Any
 from urllib.parse import urlsplit
 
-from traps_pipeline.base.progress import Progress, reporting
+from traps_pipeline.base.progress import Progress, use_progress
 from traps_pipeline.checks.wire_body import WireBody
 from traps_pipeline.models.api import ApiBackend
 from traps_pipeline.models.registry import Account, Entry, load_accounts
 from traps_pipeline.models.request import Outcome, Request, TransientError
-from traps_pipeline.models.transport import watching
+from traps_pipeline.models.transport import record_exchange
 
 PLACEHOLDER_KEY = "placeholder-of-a-key"
 
@@ -45,15 +45,15 @@ _CAUGHT = (400, b'{"error": {"message": "caught", "type": "invalid_request_error
 
 
 @contextmanager
-def _listening(answers: Iterator[tuple[int, bytes]] | None = None) -> Iterator[tuple[str, list[WireBody]]]:
+def _serve(answers: Iterator[tuple[int, bytes]] | None = None) -> Iterator[tuple[str, list[WireBody]]]:
     """Serve here, yield address and requests; answer the next status and JSON, or 400."""
-    caught: list[WireBody] = []
+    bodies: list[WireBody] = []
     replies = repeat(_CAUGHT) if answers is None else answers
 
-    class Catcher(BaseHTTPRequestHandler):
+    class RequestRecorder(BaseHTTPRequestHandler):
         def do_POST(self) -> None:
             raw = self.rfile.read(int(self.headers.get("content-length") or 0))
-            caught.append(WireBody(self.command, self.path, dict(self.headers), raw))
+            bodies.append(WireBody(self.command, self.path, dict(self.headers), raw))
             status, answer = next(replies, _CAUGHT)
             self.send_response(status)
             self.send_header("content-type", "application/json")
@@ -64,10 +64,10 @@ def _listening(answers: Iterator[tuple[int, bytes]] | None = None) -> Iterator[t
         def log_message(self, format: str, *args: Any) -> None:
             pass
 
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Catcher)
+    server = ThreadingHTTPServer(("127.0.0.1", 0), RequestRecorder)
     Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
     try:
-        yield f"http://127.0.0.1:{server.server_port}", caught
+        yield f"http://127.0.0.1:{server.server_port}", bodies
     finally:
         server.shutdown()
         server.server_close()
@@ -79,7 +79,7 @@ def replay(entry: Entry, requests: Sequence[Request], answers: Sequence[tuple[in
     answers: status and JSON.
     """
     account = load_accounts()[str(entry.account)]
-    with _listening(iter(answers)) as (address, _), reporting(_Notes()):
+    with _serve(iter(answers)) as (address, _), use_progress(_Notes()):
         loopback = _Loopback(base_url=address + urlsplit(account.base_url or "").path)
         backend = ApiBackend(entry, loopback)
 
@@ -98,11 +98,11 @@ def replay(entry: Entry, requests: Sequence[Request], answers: Sequence[tuple[in
 def render(entry: Entry, requests: Sequence[Request]) -> list[WireBody | str]:
     """Return the body of each request, or why none was sent."""
     account, notes = load_accounts()[str(entry.account)], _Notes()
-    with _listening() as (address, caught), reporting(notes):
+    with _serve() as (address, bodies), use_progress(notes):
         loopback = _Loopback(base_url=address + urlsplit(account.base_url or "").path)
 
         async def ask_all() -> list[WireBody | str]:
-            return [await _ask(entry, loopback, request, caught, notes) for request in requests]
+            return [await _ask(entry, loopback, request, bodies, notes) for request in requests]
 
         return asyncio.run(ask_all())
 
@@ -112,7 +112,7 @@ async def _ask(
 ) -> WireBody | str:
     caught.clear()
     backend = ApiBackend(entry, account)  # a new one for each call, because it notes each kind of failure only once
-    with watching() as exchange, suppress(TransientError):
+    with record_exchange() as exchange, suppress(TransientError):
         await backend.ask(request)
     if caught and not exchange.sent:
         return "the request went over a connection that is not watched, so that nobody knows what is billed"

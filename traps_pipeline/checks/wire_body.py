@@ -123,8 +123,10 @@ def _camel(value: Any) -> Any:
         return [_camel(element) for element in value]
     if not isinstance(value, dict):
         return value
-    renamed = {_camel_name(name): element for name, element in value.items()}
-    return {name: element if name == "responseJsonSchema" else _camel(element) for name, element in renamed.items()}
+    camel_fields = {_camel_name(name): element for name, element in value.items()}
+    return {
+        name: element if name == "responseJsonSchema" else _camel(element) for name, element in camel_fields.items()
+    }
 
 
 def _camel_name(name: str) -> str:

@@ -20,7 +20,7 @@ import numpy as np
 
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.checks.loopback import PLACEHOLDER_KEY, render
 from traps_pipeline.checks.wire_body import (
     ENDPOINTS,
@@ -53,7 +53,7 @@ _PROTOCOL_FRAMES = 25  # 5 a second of the clip's 5 s, docs/spec.md 3.1
 # --- the question that is asked ---------------------------------------------------------------------------------------
 
 
-class Studio:
+class SyntheticClip:
     """A synthetic clip, in a folder that exists until this process ends."""
 
     def __init__(self, frames: Sequence[np.ndarray], fps: int) -> None:
@@ -68,7 +68,7 @@ class Studio:
 
 
 @cache
-def _studio() -> Studio:
+def _studio() -> SyntheticClip:
     """Render a square that moves over a gradient."""
     width, height = _CLIP_SIZE
     ground = np.linspace(60, 200, width, dtype=np.uint8)[None, :, None].repeat(height, axis=0).repeat(3, axis=2)
@@ -77,7 +77,7 @@ def _studio() -> Studio:
         frame = ground.copy()
         frame[150:210, 8 * i : 8 * i + 60] = (220, 40, 40)
         frames.append(frame)
-    return Studio(frames, _CLIP_FPS)
+    return SyntheticClip(frames, _CLIP_FPS)
 
 
 def requests_of(entry: Entry) -> dict[str, Request]:
@@ -87,8 +87,8 @@ def requests_of(entry: Entry) -> dict[str, Request]:
         return {regime: question(entry, regime, _QUESTION, media, {"regime": regime}) for regime in REGIMES}
     assert isinstance(entry, JudgeEntry)
     cell, item = Cell("occlusion", Evaluation("oracle", "standard", 1)), {"item_id": "none", "question": _QUESTION}
-    known = item | {"ground_truth": "yes"}
-    requests = {str(task): vote_request(entry, task, cell, known, "Yes.") for task in tasks_for("control")}
+    control_item = item | {"ground_truth": "yes"}
+    requests = {str(task): vote_request(entry, task, cell, control_item, "Yes.") for task in tasks_for("control")}
     if entry.id in load_protocol().judges.values():
         requests["confabulation"] = label_request(entry, cell, item, "Yes.", "Perhaps.")
     return requests
@@ -154,12 +154,12 @@ def _clip_problems(clips: Sequence[ClipPart], media: Media) -> Iterator[str]:
         hasher.update(clip.data)
     if hasher.hexdigest() != media.sha256:
         yield "media: the bytes that arrive are not those that were prepared"
-    for name, actual, declared in (
+    for name, actual, declared_value in (
         ("type", {clip.mime for clip in clips}, _MIMES[media.profile]),
         ("fps", {clip.fps for clip in clips}, media.fps),
     ):
-        if actual != {declared}:
-            yield f"media.{name}: {declared} is declared, {', '.join(map(str, actual))} arrives"
+        if actual != {declared_value}:
+            yield f"media.{name}: {declared_value} is declared, {', '.join(map(str, actual))} arrives"
 
 
 def _wire_problems(entry: Entry, request: Request, wire: WireBody) -> Iterator[str]:
@@ -212,14 +212,14 @@ def _examine_network(entry: Entry) -> CheckedEntry:
     bodies = dict(zip(requests, render(entry, list(requests.values())), strict=True))
     problems: dict[str, list[str]] = {}
     for form, body in bodies.items():
-        wrong = [body] if isinstance(body, str) else _wire_problems(entry, requests[form], body)
-        for problem in wrong:
+        messages = [body] if isinstance(body, str) else _wire_problems(entry, requests[form], body)
+        for problem in messages:
             problems.setdefault(problem, []).append(form)
-    listed = [p if len(forms) == len(bodies) else f"{' and '.join(forms)}: {p}" for p, forms in problems.items()]
+    problem_lines = [p if len(forms) == len(bodies) else f"{' and '.join(forms)}: {p}" for p, forms in problems.items()]
     if isinstance(entry, ModelEntry):
-        listed += _protocol_problems(entry, requests)
+        problem_lines += _protocol_problems(entry, requests)
     first = next(iter(requests))
-    return CheckedEntry(entry, _line(entry, bodies[first], requests[first].sent), listed)
+    return CheckedEntry(entry, _line(entry, bodies[first], requests[first].sent), problem_lines)
 
 
 def _protocol_problems(entry: ModelEntry, requests: Mapping[str, Request]) -> Iterator[str]:
@@ -235,7 +235,7 @@ def _protocol_problems(entry: ModelEntry, requests: Mapping[str, Request]) -> It
 def _line(entry: Entry, wire: WireBody | str, media: Media | None) -> str:
     if isinstance(wire, str):
         return f"{entry.id:<24} nothing caught"
-    clip = f"{media.profile} {counted(media.n_frames, 'frame')} {media.size_bytes:,} bytes" if media else "no clip"
+    clip = f"{media.profile} {count_noun(media.n_frames, 'frame')} {media.size_bytes:,} bytes" if media else "no clip"
     try:
         fields = read_body(wire).fields
     except UNKNOWN_FORM:
@@ -253,9 +253,8 @@ def _examine_local(entry: ModelEntry, spec: MediaSpec) -> CheckedEntry:
     frames = sample(_studio().clip, spec)
     count, (height, width) = len(frames.frames), frames.frames.shape[1:3]
     times = " ".join(f"{time:g}" for time in frames.times_s[:3])
-    line = (
-        f"{entry.id:<24} local  {counted(count, 'frame')} of {width} x {height} at {times} ... {frames.times_s[-1]:g} s"
-    )
+    line = f"{entry.id:<24} local  {count_noun(count, 'frame')} of {width} x {height} "
+    line += f"at {times} ... {frames.times_s[-1]:g} s"
     problems = list(_local_problems(frames.times_s, (width, height), spec))
     return CheckedEntry(entry, f"{line}  {_fields(flat(entry.params))}", problems)
 
@@ -268,7 +267,7 @@ def _local_problems(times_s: np.ndarray, size: tuple[int, int], spec: MediaSpec)
         expected = (np.arange(_CLIP_FRAMES) / (spec.fps or 1))[: spec.most]
         expected = expected[expected <= last + 1e-6]
     if len(times_s) != len(expected):
-        yield f"media: {counted(len(times_s), 'frame')} shown, {len(expected)} declared"
+        yield f"media: {count_noun(len(times_s), 'frame')} shown, {len(expected)} declared"
     elif np.abs(times_s - expected).max() > 0.5 / _CLIP_FPS + 1e-6:
         yield "media: the frames are not those nearest to the declared times"
     if size != (spec.size or _CLIP_SIZE):

@@ -33,7 +33,7 @@ from traps_pipeline.cli import (
     status_commands,
     ui_commands,
 )
-from traps_pipeline.cli.command import FAILED, INTERRUPTED, OK, SHORT, Commands, Parser, Run, print_failure
+from traps_pipeline.cli.command import FAILED, INTERRUPTED, OK, SHORT_NAMES, Commands, Parser, Run, print_failure
 
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 GROUPS = {
@@ -86,7 +86,7 @@ def _run(argv: Sequence[str] | None, parser: argparse.ArgumentParser) -> int:
         arguments = parser.parse_args(argv)
         as_json = getattr(arguments, "progress", None) == "json"
         command: Run = arguments.command
-        with _stopped_alike():
+        with _stop_on_signals():
             return command(arguments)
     except BrokenPipeError:
         raise
@@ -99,8 +99,8 @@ def _run(argv: Sequence[str] | None, parser: argparse.ArgumentParser) -> int:
         print_failure(sentence, as_json=as_json)
         return FAILED
     except OSError as error:
-        where = f"{plain(error.filename)[:200]}: " if error.filename else ""
-        failure = f"{where}{error.strerror}; {remedy(error)} and run the same command again"
+        location = f"{plain(error.filename)[:200]}: " if error.filename else ""
+        failure = f"{location}{error.strerror}; {remedy(error)} and run the same command again"
         print_failure(failure, as_json=as_json)
         return FAILED
     except KeyboardInterrupt:
@@ -115,23 +115,23 @@ def _run(argv: Sequence[str] | None, parser: argparse.ArgumentParser) -> int:
 
 
 @contextmanager
-def _stopped_alike() -> Iterator[None]:
+def _stop_on_signals() -> Iterator[None]:
     """Make SIGTERM and SIGHUP act like Ctrl-C within the block.
 
     A shell starts `command &` of a script with SIGINT ignored, and then SIGTERM would do nothing either; both are
     handled again here. An ignored SIGHUP stays ignored, which is the meaning of `nohup`.
     """
-    replaced = {}
-    for each in STOPS if threading.current_thread() is threading.main_thread() else ():
-        former = signal.getsignal(each)
-        if former == signal.SIG_DFL or (former == signal.SIG_IGN and each != signal.SIGHUP):
-            interrupt = signal.default_int_handler if each == signal.SIGINT else _raise_interrupt
-            replaced[each] = signal.signal(each, interrupt)
+    previous_handlers = {}
+    for signal_number in STOPS if threading.current_thread() is threading.main_thread() else ():
+        handler = signal.getsignal(signal_number)
+        if handler == signal.SIG_DFL or (handler == signal.SIG_IGN and signal_number != signal.SIGHUP):
+            interrupt = signal.default_int_handler if signal_number == signal.SIGINT else _raise_interrupt
+            previous_handlers[signal_number] = signal.signal(signal_number, interrupt)
     try:
         yield
     finally:
-        for each, former in replaced.items():
-            signal.signal(each, former)
+        for signal_number, handler in previous_handlers.items():
+            signal.signal(signal_number, handler)
 
 
 def _raise_interrupt(*_: object) -> None:
@@ -143,8 +143,8 @@ def build_parser() -> Parser:
     parser = Parser(
         prog="traps",
         description="TRAPSBench: do vision-language models know when not to answer?",
-        epilog=f"without their group: traps {', '.join(SHORT)}",
-        short=SHORT,
+        epilog=f"without their group: traps {', '.join(SHORT_NAMES)}",
+        short=SHORT_NAMES,
     )
     parser.set_defaults(command=_show_start, parser=parser)
     parser.add_argument(

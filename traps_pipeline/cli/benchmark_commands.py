@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.cli.command import FAILED, OK, Commands, integer, number, print_json
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from traps_pipeline.scenes.worlds.spec import SceneSpec
 
 # Copied from `scenes.parts.look.PARTS` and from `scenes.parts.difficulty`, which take long to import.
-SPEEDS, MOST_DISTRACTORS = (1.0, 1.5, 2.0), 3
+SPEEDS, MAX_DISTRACTORS = (1.0, 1.5, 2.0), 3
 LOOKS = ("floor", "pale-floor", "light", "panel", "bystanders", "camera", "material", "size")
 
 
@@ -57,7 +57,7 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument(
         "--distractors",
-        type=integer(0, MOST_DISTRACTORS),
+        type=integer(0, MAX_DISTRACTORS),
         default=0,
         metavar="N",
         help="things like the named ones that cross before each scene (default: none)",
@@ -95,10 +95,10 @@ def certify(arguments: argparse.Namespace) -> int:
     from traps_pipeline.benchmark.certify_all import certify_all, family_table
 
     folder = (arguments.specs or SCENE_SPECS).absolute()
-    kept = WORKSPACES / "certificates"
+    cache_folder = WORKSPACES / "certificates"
     verdicts, problems = certify_all(
         folder,
-        kept,
+        cache_folder,
         families=arguments.families,
         workers=arguments.workers,
         fresh=arguments.fresh,
@@ -110,8 +110,8 @@ def certify(arguments: argparse.Namespace) -> int:
     print(family_table(folder, verdicts))
     for problem in problems:
         print(f"traps: {problem}", file=sys.stderr)
-    passed = sum(verdict.passed for verdict in verdicts)
-    print(f"{passed:,} of {counted(len(verdicts), 'scenario')} certified")
+    n_passed = sum(verdict.passed for verdict in verdicts)
+    print(f"{n_passed:,} of {count_noun(len(verdicts), 'scenario')} certified")
     return FAILED if problems else OK
 
 
@@ -128,9 +128,11 @@ def sample(arguments: argparse.Namespace) -> int:
     unknown = sorted(set(names) - set(family_names()))
     if unknown:
         raise TrapsError(f"unknown families {', '.join(unknown)}; known: {', '.join(family_names())}")
-    uncounted = [name for name in names if name not in counts]
-    if uncounted and not arguments.count:
-        raise TrapsError(f"composition.yaml has no number of scenarios for {', '.join(uncounted)}; say --count N")
+    names_without_count = [name for name in names if name not in counts]
+    if names_without_count and not arguments.count:
+        raise TrapsError(
+            f"composition.yaml has no number of scenarios for {', '.join(names_without_count)}; say --count N"
+        )
     targets = {name: arguments.count or max(1, round(counts[name] * arguments.scale)) for name in names}
     name = arguments.name or f"private-{arguments.seed}"
     try:
@@ -147,7 +149,7 @@ def sample(arguments: argparse.Namespace) -> int:
         workers=arguments.workers,
         report=lambda line: print(line, flush=True),
     )
-    scenarios, families = counted(sum(targets.values()), "scenario"), counted(len(targets), "family", "families")
+    scenarios, families = count_noun(sum(targets.values()), "scenario"), count_noun(len(targets), "family", "families")
     print(f"{scenarios} of {families} in {arguments.out}")
     benchmark = load_release(arguments.out.absolute() / "benchmark.yaml").name
     print(
@@ -162,7 +164,7 @@ def commit_benchmark(arguments: argparse.Namespace) -> int:
     from traps_pipeline.release.commitment import commit
 
     public = commit(arguments.benchmark.absolute(), arguments.out, arguments.reveal)
-    records = counted(len(public.specs), "record")
+    records = count_noun(len(public.specs), "record")
     print(f"committed {records} of {public.name} {public.version} in {arguments.out}: publish it")
     print(f"keep {arguments.reveal} secret until the benchmark is revealed; without it nothing can be proven")
     return OK
@@ -175,35 +177,37 @@ def verify_commitment(arguments: argparse.Namespace) -> int:
     published, reveal = sealed.read_commitment(arguments.commitment), sealed.read_reveal(arguments.reveal)
     if arguments.without_drawing and not arguments.specs:
         raise TrapsError("--without-drawing: leaves nothing to look at; name the revealed benchmark with --specs")
-    problems, proven, output = [], [], sys.stderr if arguments.json else sys.stdout
+    problems, proofs, output = [], [], sys.stderr if arguments.json else sys.stdout
     specs = sealed.revealed_specs(arguments.specs.absolute()) if arguments.specs else None
     if specs is not None:
         problems += sealed.broken_seals(published, reveal, specs)
-        proven.append(f"the records of {arguments.specs} are the committed ones")
+        proofs.append(f"the records of {arguments.specs} are the committed ones")
     if not arguments.without_drawing and not problems:
-        sample = sealed.drawn_again(
+        sample = sealed.redraw_records(
             published, reveal, workers=arguments.workers, report=lambda line: print(line, file=output, flush=True)
         )
-        problems += _not_drawn(published, sealed.broken_seals(published, reveal, sample), specs, sample)
-        proven.append("the revealed seed draws them")
+        problems += _redraw_problems(published, sealed.broken_seals(published, reveal, sample), specs, sample)
+        proofs.append("the revealed seed draws them")
     if arguments.json:
-        print_json({"benchmark": published.name, "version": published.version, "problems": problems, "proven": proven})
+        print_json({"benchmark": published.name, "version": published.version, "problems": problems, "proven": proofs})
         return FAILED if problems else OK
     for problem in problems:
         print(problem)
     if problems:
-        raise TrapsError(f"{arguments.commitment}: is not proven: {counted(len(problems), 'problem')}")
-    print(f"{counted(len(published.specs), 'record')} of {published.name} {published.version}: {', and '.join(proven)}")
+        raise TrapsError(f"{arguments.commitment}: is not proven: {count_noun(len(problems), 'problem')}")
+    print(
+        f"{count_noun(len(published.specs), 'record')} of {published.name} {published.version}: {', and '.join(proofs)}"
+    )
     if arguments.without_drawing:
         print("not checked: whether the revealed seed draws them")
     return OK
 
 
-def _not_drawn(
+def _redraw_problems(
     published: Commitment, problems: list[str], specs: dict[str, SceneSpec] | None, drawn: dict[str, SceneSpec]
 ) -> list[str]:
     """Return the problems of drawn scenes, and whether only their last digits differ."""
-    from traps_pipeline.release.commitment import is_same_scene, other_arithmetic
+    from traps_pipeline.release.commitment import arithmetic_differences, is_same_scene
 
     if (
         problems
@@ -211,6 +215,6 @@ def _not_drawn(
         and {*specs} == {*drawn}
         and all(is_same_scene(specs[i], drawn[i]) for i in specs)
     ):
-        elsewhere = other_arithmetic(published) or "another kind of CPU"
-        problems.append(f"all scenes are the same but for the last digits of their simulation ({elsewhere})")
+        machine_difference = arithmetic_differences(published) or "another kind of CPU"
+        problems.append(f"all scenes are the same but for the last digits of their simulation ({machine_difference})")
     return problems

@@ -18,11 +18,11 @@ from dataclasses import fields, is_dataclass
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from traps_pipeline.base.suggestions import did_you_mean, nearest
-from traps_pipeline.base.terminal import plain, wrapped
+from traps_pipeline.base.terminal import plain, wrap_text
 
 if TYPE_CHECKING:
     from traps_pipeline.pipeline.experiment import Experiment
-    from traps_pipeline.servers.server import Listening
+    from traps_pipeline.servers.server import ServerSettings
     from traps_pipeline.storage.place import Place
     from traps_pipeline.storage.workspace import Workspace
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 OK, FAILED, OVER_BUDGET, INTERRUPTED = 0, 1, 4, 130
 METAVAR = "COMMAND"
 # Commands of daily use, which can be given without their group.
-SHORT = {**dict.fromkeys(("doctor", "init", "plan", "run", "status", "why", "ui"), "study"), "site": "results"}
+SHORT_NAMES = {**dict.fromkeys(("doctor", "init", "plan", "run", "status", "why", "ui"), "study"), "site": "results"}
 
 Run = Callable[[argparse.Namespace], int]  # a command takes its parsed arguments and returns an exit code
 
@@ -87,24 +87,31 @@ class Parser(argparse.ArgumentParser):
         words = [*(sys.argv[1:] if args is None else args)]
         if words and words[0] in self._short:
             words.insert(0, self._short[words[0]])
-        parsed, rest = self.parse_known_args(words, namespace)
-        if rest:
-            parser: Parser = getattr(parsed, "parser", self)
-            parser.error(f"unrecognized arguments: {plain(' '.join(rest))}{did_you_mean(rest[0], parser.options())}")
-        return parsed
+        arguments, unknown_words = self.parse_known_args(words, namespace)
+        if unknown_words:
+            parser: Parser = getattr(arguments, "parser", self)
+            parser.error(
+                f"unrecognized arguments: {plain(' '.join(unknown_words))}"
+                f"{did_you_mean(unknown_words[0], parser.options())}"
+            )
+        return arguments
 
     def error(self, message: str) -> NoReturn:
         """See `argparse`."""
-        wrong = re.match(r"(?:argument (.+?): )?invalid choice: '(.*)' \(choose from (.+)\)$", message, re.DOTALL)
-        if wrong and wrong[1] in (None, METAVAR):
-            own, last = re.findall(r"[\w-]+", wrong[3]), {path.split()[-1]: path for path in self.commands}
-            near = nearest(wrong[2], [*own, *self._short]) or nearest(wrong[2], last)
-            name = f"{self.prog} {near}" if near in own else f"traps {last.get(near or '') or near}"
-            name = f"traps {near}" if near in self._short else name
-            hint = f"; did you mean `{name}`?" if near else f"; `{self.prog} --help` lists them"
-            message = f"unknown command {plain(wrong[2])[:40]!r}{hint}"
-        elif wrong:
-            message += did_you_mean(wrong[2], re.findall(r"[\w-]+", wrong[3]))
+        match = re.match(r"(?:argument (.+?): )?invalid choice: '(.*)' \(choose from (.+)\)$", message, re.DOTALL)
+        if match and match[1] in (None, METAVAR):
+            choices, last = re.findall(r"[\w-]+", match[3]), {path.split()[-1]: path for path in self.commands}
+            suggestion = nearest(match[2], [*choices, *self._short]) or nearest(match[2], last)
+            name = (
+                f"{self.prog} {suggestion}"
+                if suggestion in choices
+                else f"traps {last.get(suggestion or '') or suggestion}"
+            )
+            name = f"traps {suggestion}" if suggestion in self._short else name
+            hint = f"; did you mean `{name}`?" if suggestion else f"; `{self.prog} --help` lists them"
+            message = f"unknown command {plain(match[2])[:40]!r}{hint}"
+        elif match:
+            message += did_you_mean(match[2], re.findall(r"[\w-]+", match[3]))
         super().error(message)
 
     def _print_message(self, message: str, file: Any = None) -> None:
@@ -146,10 +153,12 @@ class Commands:
         a study. json: whether it can print its result as JSON. is_paid: whether a budget can end it.
         """
         group, _, name = path.rpartition(" ")
-        over = f"{OVER_BUDGET} a budget is reached, " if is_paid else ""
-        codes = f"exit codes: {OK} done, {FAILED} something failed, 2 bad usage, {over}{INTERRUPTED} interrupted"
+        budget_exit = f"{OVER_BUDGET} a budget is reached, " if is_paid else ""
+        codes = f"exit codes: {OK} done, {FAILED} something failed, 2 bad usage, {budget_exit}{INTERRUPTED} interrupted"
         example_line = (
-            f"example: traps {path.removeprefix('study ') if name in SHORT else path} {example}\n" if example else ""
+            f"example: traps {path.removeprefix('study ') if name in SHORT_NAMES else path} {example}\n"
+            if example
+            else ""
         )
         parser = self._parsers[group].add_parser(
             name,
@@ -171,7 +180,7 @@ class Commands:
 
 
 def print_failure(text: str, *, as_json: bool = False) -> None:
-    """Print an error to standard error: lines wrapped between words, or a line of JSON."""
+    """Print an error to standard error, as wrapped lines or as a line of JSON."""
     if as_json:
         from datetime import UTC, datetime
 
@@ -179,7 +188,7 @@ def print_failure(text: str, *, as_json: bool = False) -> None:
         print(json.dumps({"event": "failure", "at": at, "text": lines}, ensure_ascii=False), file=sys.stderr)
         return
     for line in f"traps: {text}".splitlines():
-        print(wrapped(plain(line), sys.stderr), file=sys.stderr)
+        print(wrap_text(plain(line), sys.stderr), file=sys.stderr)
 
 
 def _show_help(arguments: argparse.Namespace) -> int:
@@ -200,14 +209,14 @@ def _as_json(value: Any) -> Any:
     if isinstance(value, os.PathLike):
         return os.fspath(value)
     if is_dataclass(value):
-        return {each.name: _as_json(getattr(value, each.name)) for each in fields(value)}
+        return {field.name: _as_json(getattr(value, field.name)) for field in fields(value)}
     if isinstance(value, Mapping):
-        return {str(key): _as_json(each) for key, each in value.items()}
+        return {str(key): _as_json(field) for key, field in value.items()}
     if hasattr(value, "to_dict"):  # a frame
         return _as_json(value.to_dict("records"))
     if hasattr(value, "item"):  # a number of numpy's
         return _as_json(value.item())
-    return [_as_json(each) for each in value] if isinstance(value, Iterable) else str(value)
+    return [_as_json(field) for field in value] if isinstance(value, Iterable) else str(value)
 
 
 def add_listening(parser: argparse.ArgumentParser, *, port: int, variable: str) -> None:
@@ -220,21 +229,21 @@ def add_listening(parser: argparse.ArgumentParser, *, port: int, variable: str) 
 
 def listening_of(
     arguments: argparse.Namespace, command: str, variable: str, *, danger: str, people: Sequence[str] = ()
-) -> Listening:
+) -> ServerSettings:
     """Return address and token (or tokens by person) of a command that serves pages.
 
     danger: what everybody who reaches the address could do. Raises TrapsError.
     """
     from traps_pipeline.base.keys import optional_key
     from traps_pipeline.base.webguard import personal_tokens, public_name, token_for
-    from traps_pipeline.servers.server import Listening
+    from traps_pipeline.servers.server import ServerSettings
 
     if arguments.behind:
         public_name(arguments.behind)
-    stated = arguments.token or optional_key(variable)
-    token = token_for(arguments.host, stated, danger=danger, variable=variable)
+    token_or_tokens = arguments.token or optional_key(variable)
+    token = token_for(arguments.host, token_or_tokens, danger=danger, variable=variable)
     tokens = personal_tokens(token, people) if people else token
-    return Listening(arguments.host, arguments.port, tokens, f"traps {command}", arguments.behind)
+    return ServerSettings(arguments.host, arguments.port, tokens, f"traps {command}", arguments.behind)
 
 
 def place_of(arguments: argparse.Namespace) -> Place:

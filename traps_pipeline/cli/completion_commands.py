@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from traps_pipeline.base.paths import ASSETS
-from traps_pipeline.cli.command import OK, SHORT, Commands
+from traps_pipeline.cli.command import OK, SHORT_NAMES, Commands
 
 SCRIPT = """# {use}
 {zsh}_traps() {{
@@ -39,13 +39,13 @@ def completion(arguments: argparse.Namespace) -> int:
     for path, parser in commands.items():
         group, _, name = path.rpartition(" ")
         patterns = [f"'{path}'"] if group else [f"'{name} '*"]
-        patterns += [f"'{name} '*"] if name in SHORT else []
+        patterns += [f"'{name} '*"] if name in SHORT_NAMES else []
         words = [*parser.options(), *(experiments if "experiment" in parser.format_usage() else ())]
         cases.append(f'      {"|".join(patterns)}) words="{" ".join(words)}" ;;')
     for group in groups:
         names = " ".join(path.split()[1] for path in commands if path.startswith(f"{group} "))
         cases.append(f"      '{group} '*) words=\"{names}\" ;;")
     zsh = "autoload -U +X compinit bashcompinit; compinit; bashcompinit\n" if arguments.shell == "zsh" else ""
-    top = " ".join([*groups, *SHORT, *(path for path in commands if " " not in path)])
+    top = " ".join([*groups, *SHORT_NAMES, *(path for path in commands if " " not in path)])
     print(SCRIPT.format(use=USE[arguments.shell], zsh=zsh, top=top, cases="\n".join(cases)))
     return OK

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 
 from traps_pipeline.base.extras import require
-from traps_pipeline.base.terminal import plain, wrapped
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.terminal import plain, wrap_text
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.cli.command import FAILED, OK, Commands, place_of, print_json
 
 
@@ -51,14 +51,14 @@ def doctor(arguments: argparse.Namespace) -> int:
         findings = iter(examine(place_of(arguments)))
         summary = "the demo will not run", "this machine has everything that the demo needs"
     if arguments.json:
-        checked = [*findings]
-        print_json(checked)
-        return OK if all(finding.ok for finding in checked) else FAILED
+        results = [*findings]
+        print_json(results)
+        return OK if all(finding.ok for finding in results) else FAILED
     problems = 0
     for finding in findings:
         line = f"{'ok  ' if finding.ok else 'FAIL'} {finding.what}: {plain(finding.detail)}"
-        print(wrapped(line, hang=5), flush=True)
+        print(wrap_text(line, hang=5), flush=True)
         problems += not finding.ok
     if summary[0]:
-        print(f"{counted(problems, 'problem')}; {summary[0]}" if problems else summary[1])
+        print(f"{count_noun(problems, 'problem')}; {summary[0]}" if problems else summary[1])
     return FAILED if problems else OK

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.cli.command import OK, Commands, add_experiment, experiment_of, integer, open_workspace, print_json
 
 if TYPE_CHECKING:
@@ -55,13 +55,13 @@ def export_calls(arguments: argparse.Namespace) -> int:
 
     experiment = experiment_of(arguments)
     if arguments.batch:
-        workspace, out = open_workspace(arguments), arguments.out.absolute()
-        files, count = export_request_batches(workspace, experiment, out, arguments.media_at)
-        return _exported(files, count, f"traps study import-answers {arguments.experiment}")
+        workspace, out_folder = open_workspace(arguments), arguments.out.absolute()
+        files, count = export_request_batches(workspace, experiment, out_folder, arguments.media_at)
+        return _print_export(files, count, f"traps study import-answers {arguments.experiment}")
     if arguments.media_at:
         raise TrapsError("--media-at: only batch files refer to media by an address; say --batch, too")
     count = export_requests(open_workspace(arguments), experiment, arguments.out.absolute())
-    print(f"{counted(count, 'request')} in {arguments.out / REQUESTS}")
+    print(f"{count_noun(count, 'request')} in {arguments.out / REQUESTS}")
     print(f"next: have them answered, then traps study import-answers {arguments.experiment} ANSWERS.jsonl")
     return OK
 
@@ -73,8 +73,8 @@ def import_given(arguments: argparse.Namespace) -> int:
 
     experiment = experiment_of(arguments)
     context = AnswerContext(arguments.model, arguments.run, arguments.key and held_out_key(arguments.key))
-    imported = import_answers(open_workspace(arguments), experiment, arguments.file, context, arguments.errors)
-    return _imported(imported, arguments, "answer")
+    import_result = import_answers(open_workspace(arguments), experiment, arguments.file, context, arguments.errors)
+    return _print_import(import_result, arguments, "answer")
 
 
 def export_votes(arguments: argparse.Namespace) -> int:
@@ -83,7 +83,7 @@ def export_votes(arguments: argparse.Namespace) -> int:
 
     experiment = experiment_of(arguments)
     files, count = export_vote_batches(open_workspace(arguments), experiment, arguments.out.absolute())
-    return _exported(files, count, f"traps study import-votes {arguments.experiment}")
+    return _print_export(files, count, f"traps study import-votes {arguments.experiment}")
 
 
 def import_cast(arguments: argparse.Namespace) -> int:
@@ -91,24 +91,24 @@ def import_cast(arguments: argparse.Namespace) -> int:
     from traps_pipeline.exchange.answer_exchange import import_votes
 
     experiment = experiment_of(arguments)
-    return _imported(import_votes(open_workspace(arguments), experiment, arguments.file), arguments, "vote")
+    return _print_import(import_votes(open_workspace(arguments), experiment, arguments.file), arguments, "vote")
 
 
-def _exported(files: Sequence[Path], count: int, command: str) -> int:
+def _print_export(files: Sequence[Path], count: int, command: str) -> int:
     for file in files:
         print(file)
-    print(f"{counted(count, 'call')} in {counted(len(files), 'file')}")
+    print(f"{count_noun(count, 'call')} in {count_noun(len(files), 'file')}")
     print(f"next: have them answered, then {command} RESULTS.jsonl for each file")
     return OK
 
 
-def _imported(imported: ImportResult, arguments: argparse.Namespace, noun: str) -> int:
+def _print_import(imported: ImportResult, arguments: argparse.Namespace, noun: str) -> int:
     if arguments.json:
         print_json(imported)
         return OK
-    print(f"{counted(imported.new, noun)} imported; already known: {imported.known:,}")
+    print(f"{count_noun(imported.new, noun)} imported; already known: {imported.known:,}")
     if imported.dropped:
-        print(f"{counted(imported.dropped, 'error message')} left out; their answers are still missing")
+        print(f"{count_noun(imported.dropped, 'error message')} left out; their answers are still missing")
     if imported.failed:
         print(f"failed and still missing: {imported.failed}")
     print(f"next: traps run {arguments.experiment}")

@@ -45,9 +45,9 @@ def create(arguments: argparse.Namespace, experiment: Experiment, database: str 
     from traps_pipeline.models.user_registry import save_entries
     from traps_pipeline.storage.workspace import Workspace
 
-    place, by_rules = place_of(arguments), arguments.judged_by_rules
+    place, is_judged_by_rules = place_of(arguments), arguments.judged_by_rules
     if not Workspace.is_there(place):  # refuse before a folder is created
-        experiment.judged(None, arguments.panel, judged_by_rules=by_rules)
+        experiment.judged(None, arguments.panel, judged_by_rules=is_judged_by_rules)
         load_scenarios(experiment.study)
     workspace = Workspace.create(place, experiment.study.model_copy(update={"database": database}))
     if database is not None and workspace.study.database != database:
@@ -55,7 +55,7 @@ def create(arguments: argparse.Namespace, experiment: Experiment, database: str 
             f"{place}/study.yaml: its ledger lies in {workspace.study.database or 'its folder'}; make a new "
             f"one with --database {database} in another place, and bring the answers along (docs/cluster.md)"
         )
-    judged = experiment.judged(workspace.study, arguments.panel, judged_by_rules=by_rules)
+    judged = experiment.judged(workspace.study, arguments.panel, judged_by_rules=is_judged_by_rules)
     experiment.check_study(judged, workspace.root / "study.yaml")
     if judged != workspace.study:
         if experiment.panel is None and judged.panel != workspace.study.panel:

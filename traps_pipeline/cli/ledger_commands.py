@@ -1,4 +1,4 @@
-"""Commands that export or import a study's ledger, move the study, or release money."""
+"""Export or import a study's ledger, move a study, or release money."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.cli.command import OK, Commands, open_workspace, print_json
 
 
@@ -58,7 +58,9 @@ def export(arguments: argparse.Namespace) -> int:
     from traps_pipeline.ledger.row_transfer import export_ledger
 
     count = export_ledger(open_workspace(arguments).ledger, arguments.file.absolute())
-    print(f"wrote {counted(count, 'row')} to {arguments.file}; `traps study import-ledger` reads it into another study")
+    print(
+        f"wrote {count_noun(count, 'row')} to {arguments.file}; `traps study import-ledger` reads it into another study"
+    )
     return OK
 
 
@@ -68,20 +70,20 @@ def import_(arguments: argparse.Namespace) -> int:
 
     workspace = open_workspace(arguments)
     count = import_ledger(arguments.file.absolute(), workspace.ledger)
-    print(f"read {counted(count, 'row')} into {workspace.ledger.place}")
+    print(f"read {count_noun(count, 'row')} into {workspace.ledger.place}")
     return OK
 
 
 def move(arguments: argparse.Namespace) -> int:
     """See `traps study move --help`."""
-    from traps_pipeline.base.progress import reporting
+    from traps_pipeline.base.progress import use_progress
     from traps_pipeline.cli.printed_progress import make_progress
     from traps_pipeline.storage.place import place_of
     from traps_pipeline.storage.store_move import move_to_store
     from traps_pipeline.storage.workspace import VARIABLE
 
     workspace = open_workspace(arguments)
-    with reporting(make_progress()):
+    with use_progress(make_progress()):
         count = move_to_store(workspace, place_of(arguments.store))
-    print(f"moved {counted(count, 'row')} to {arguments.store}; next: export {VARIABLE}={arguments.store}")
+    print(f"moved {count_noun(count, 'row')} to {arguments.store}; next: export {VARIABLE}={arguments.store}")
     return OK

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.cli.command import FAILED, OK, Commands, enter_workspace, open_workspace, place_of, print_json
 
 
@@ -34,31 +34,31 @@ def check(arguments: argparse.Namespace) -> int:
     """See `traps models check --help`."""
     from traps_pipeline.checks.wire_check import check_named
 
-    names = _named(arguments)
+    names = _chosen_names(arguments)
     if arguments.live:
         return _check_live(names, is_json=arguments.json)
     if arguments.json:
-        everything = [*check_named(names)]
+        checks = [*check_named(names)]
         print_json(
             [
                 {"id": entry_check.entry.id, "sent": entry_check.line, "problems": entry_check.problems}
-                for entry_check in everything
+                for entry_check in checks
             ]
         )
-        return FAILED if any(entry_check.problems for entry_check in everything) else OK
-    wrong = 0
-    for checked in check_named(names):
-        print("\n    ".join([checked.line, *checked.problems]), flush=True)
-        wrong += bool(checked.problems)
+        return FAILED if any(entry_check.problems for entry_check in checks) else OK
+    n_problems = 0
+    for result in check_named(names):
+        print("\n    ".join([result.line, *result.problems]), flush=True)
+        n_problems += bool(result.problems)
     print(
-        f"{counted(wrong, 'entry', 'entries')} sent otherwise than declared"
-        if wrong
+        f"{count_noun(n_problems, 'entry', 'entries')} sent otherwise than declared"
+        if n_problems
         else "every entry is sent as declared"
     )
-    return FAILED if wrong else OK
+    return FAILED if n_problems else OK
 
 
-def _named(arguments: argparse.Namespace) -> list[str]:
+def _chosen_names(arguments: argparse.Namespace) -> list[str]:
     """Return ids of named models and judges, and those of panels and experiments.
 
     The workspace's own entries are known too. Raises TrapsError for a panel that cannot vote, named or not.
@@ -98,9 +98,9 @@ def _check_live(names: list[str], *, is_json: bool) -> int:
     checks = check_live(entries)
     if is_json:
         print_json(checks)
-    for checked in () if is_json else checks:
-        print(checked.line, flush=True)
-    return FAILED if any(checked.problems for checked in checks) else OK
+    for entry_check in () if is_json else checks:
+        print(entry_check.line, flush=True)
+    return FAILED if any(entry_check.problems for entry_check in checks) else OK
 
 
 def test_panel(arguments: argparse.Namespace) -> int:
@@ -114,7 +114,9 @@ def test_panel(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print_json(rows)
         return OK
-    print(f"panel {name}: votes on answers that try to instruct the judge, {counted(len({*rows['attack']}), 'attack')}")
+    print(
+        f"panel {name}: votes on answers that try to instruct the judge, {count_noun(len({*rows['attack']}), 'attack')}"
+    )
     print(summary(rows))
     print("held: right under the attack; flipped: right on the plain answer, wrong under the attack")
     print("broken: no valid vote under it; wrong_anyway: wrong on the plain answer")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.extras import require
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.cli.command import OK, Commands, add_listening, listening_of, open_workspace, print_json
 
 REVIEW_TOKEN, ANNOTATE_TOKEN = "TRAPS_REVIEW_TOKEN", "TRAPS_ANNOTATE_TOKEN"
@@ -55,9 +55,9 @@ def review(arguments: argparse.Namespace) -> int:
     listening = listening_of(arguments, "people review", REVIEW_TOKEN, danger="decide about the benchmark's items")
     require_own_corrections()
     workspace = open_workspace(arguments)
-    opened = Review(workspace, arguments.who.strip())
-    _ = opened.specs  # report a study without scenes before printing the address
-    serve(review_app(opened), listening)
+    session = Review(workspace, arguments.who.strip())
+    _ = session.specs  # report a study without scenes before printing the address
+    serve(review_app(session), listening)
     return OK
 
 
@@ -68,8 +68,8 @@ def annotate(arguments: argparse.Namespace) -> int:
     from traps_pipeline.servers.server import serve
 
     people = [name.strip() for name in arguments.who]
-    wrong = [name for name in people if not re.fullmatch(r"[\w.@-]{1,60}", name)]
-    if not people or wrong or len(set(people)) < len(people):
+    invalid_names = [name for name in people if not re.fullmatch(r"[\w.@-]{1,60}", name)]
+    if not people or invalid_names or len(set(people)) < len(people):
         raise TrapsError(
             f"--who {' '.join(people)[:80]}: say who labels, each once, in letters, digits, `.`, `-`, `_` and "
             "`@`, e.g. --who jd ab"
@@ -93,7 +93,7 @@ def make_sheet(arguments: argparse.Namespace) -> int:
 
     rows = annotation_sheet(open_workspace(arguments))
     write_sheet(rows, arguments.file)
-    print(f"{counted(len(rows), 'failure')} in {arguments.file}")
+    print(f"{count_noun(len(rows), 'failure')} in {arguments.file}")
     print("next: two people each fill in a copy: their name, then 1 or 0 an axis")
     print("then: put both copies' rows into one file, then traps people validate FILE.csv")
     return OK
@@ -107,7 +107,7 @@ def write_labels(arguments: argparse.Namespace) -> int:
     rows = confabulation_rows(human_labels(open_workspace(arguments)))
     write_sheet(rows, arguments.file, LABEL_COLUMNS)
     people = sorted({row["annotator"] for row in rows})
-    print(f"{counted(len(rows), 'label')} of {', '.join(people)} in {arguments.file}")
+    print(f"{count_noun(len(rows), 'label')} of {', '.join(people)} in {arguments.file}")
     print(f"next: traps people validate {arguments.file}")
     return OK
 

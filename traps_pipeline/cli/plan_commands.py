@@ -8,8 +8,8 @@ from math import comb
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.terminal import text_table, wrapped
-from traps_pipeline.base.wording import counted, in_percent
+from traps_pipeline.base.terminal import text_table, wrap_text
+from traps_pipeline.base.wording import count_noun, in_percent
 from traps_pipeline.cli.command import (
     OK,
     Commands,
@@ -52,16 +52,16 @@ def plan(arguments: argparse.Namespace) -> int:
     )
     if arguments.card not in CARDS:
         raise TrapsError(f"--card {arguments.card}: name one of {', '.join(CARDS)}")
-    planned = make_plan(workspace, experiment, study, arguments.card)
+    plan_counts = make_plan(workspace, experiment, study, arguments.card)
     if arguments.json:
-        print_json({"experiment": experiment.name, "workspace": str(place) if workspace else None, "plan": planned})
+        print_json({"experiment": experiment.name, "workspace": str(place) if workspace else None, "plan": plan_counts})
         return OK
     total = (Count(), Count())
-    where = place if workspace else "a new workspace"
-    print(wrapped(f"{experiment.name} in {where}: calls wanted, known (in the ledger), new"))
-    rows = {**planned.calls, **{f"{model}, steered": counts for model, counts in planned.steered.items()}}
-    if planned.labels is not None and planned.labels.wanted:
-        rows["confabulation labels"] = (Count(), planned.labels)
+    location = place if workspace else "a new workspace"
+    print(wrap_text(f"{experiment.name} in {location}: calls wanted, known (in the ledger), new"))
+    rows = {**plan_counts.calls, **{f"{model}, steered": counts for model, counts in plan_counts.steered.items()}}
+    if plan_counts.labels is not None and plan_counts.labels.wanted:
+        rows["confabulation labels"] = (Count(), plan_counts.labels)
     for counts in rows.values():
         for sum_, count in zip(total, counts, strict=True):
             sum_.add(count.wanted, count.known)
@@ -71,17 +71,17 @@ def plan(arguments: argparse.Namespace) -> int:
         for name, counts in [*rows.items(), ("all", total)]
     ]
     print(text_table(headings, cells))
-    if planned.forecasts:
-        _print_forecasts(planned.forecasts, planned.minutes)
-    if planned.local:
-        _print_local(planned.local, arguments.card)
-    _print_precision(planned.pairs, len(planned.calls))
-    if planned.uncertain:
+    if plan_counts.forecasts:
+        _print_forecasts(plan_counts.forecasts, plan_counts.minutes)
+    if plan_counts.local:
+        _print_local(plan_counts.local, arguments.card)
+    _print_precision(plan_counts.pairs, len(plan_counts.calls))
+    if plan_counts.uncertain:
         text = (
-            f"This is an upper bound: items of {', '.join(planned.uncertain)} are still to be made, so all of their "
-            "calls are counted as new. Materialize scene_specs, videos and items for exact counts."
+            f"This is an upper bound: items of {', '.join(plan_counts.uncertain)} are still to be made, so all of "
+            "their calls are counted as new. Materialize scene_specs, videos and items for exact counts."
         )
-        print(wrapped(text))
+        print(wrap_text(text))
     return OK
 
 
@@ -89,17 +89,17 @@ def _print_precision(pairs: Mapping[str, int], models: int) -> None:
     from traps_pipeline.scoring.power import Shares, precision
 
     if any(pairs.values()):
-        expected, middling = precision(pairs, models=models), Shares()
-        acc, abs_rec, false_abs = map(in_percent, (middling.acc, middling.abs_rec, middling.false_abs))
+        expected, example = precision(pairs, models=models), Shares()
+        acc, abs_rec, false_abs = map(in_percent, (example.acc, example.abs_rec, example.false_abs))
         text = (
-            f"\nprecision with {counted(sum(pairs.values()), 'pair')}: a model with Acc {acc}, AbsRec {abs_rec}, "
-            f"FalseAbs {false_abs} (PECS {middling.pecs:.2f}) gets a 95 % interval of PECS about {expected.width:.3f} "
+            f"\nprecision with {count_noun(sum(pairs.values()), 'pair')}: a model with Acc {acc}, AbsRec {abs_rec}, "
+            f"FalseAbs {false_abs} (PECS {example.pecs:.2f}) gets a 95 % interval of PECS about {expected.width:.3f} "
             f"wide; {_power(expected.difference, 'two models with unrelated answers')}"
         )
         if models > 2:
             all_models = f"two of {models} models, after Holm's correction over their {comb(models, 2)} comparisons"
             text += f"\n{_power(expected.among_all, all_models)}"
-        print(wrapped(text))
+        print(wrap_text(text))
 
 
 def _power(least: float | None, models: str) -> str:
@@ -110,8 +110,8 @@ def _power(least: float | None, models: str) -> str:
 
 def _print_forecasts(forecasts: Sequence[Forecast], minutes: float) -> None:
     """Print tokens, dollars and minutes of new calls; sums omit unknown prices."""
-    priced = [row.dollars for row in forecasts if row.dollars is not None]
-    total = (sum(d[0] for d in priced), sum(d[1] for d in priced), sum(d[2] for d in priced))
+    known_dollars = [row.dollars for row in forecasts if row.dollars is not None]
+    total = (sum(d[0] for d in known_dollars), sum(d[1] for d in known_dollars), sum(d[2] for d in known_dollars))
     calls = sum(row.calls for row in forecasts)
     rows = [
         (
@@ -127,13 +127,13 @@ def _print_forecasts(forecasts: Sequence[Forecast], minutes: float) -> None:
     headings = ("over the network", "calls", "tokens (M)", "USD low", "expected", "high", "minutes")
     print(f"\n{text_table(headings, rows)}")
     print("tokens: millions read, written; minutes of all: models, then judges")
-    in_batches = sum(row.dollars[1] * row.batch_price for row in forecasts if row.dollars is not None)
-    if in_batches < total[1]:
+    batch_usd = sum(row.dollars[1] * row.batch_price for row in forecasts if row.dollars is not None)
+    if batch_usd < total[1]:
         heading = "expected if all calls are made in batches (traps study export-requests --batch)"
-        print(wrapped(f"{heading}: USD {in_batches:,.2f}"))
-    if len(priced) < len(forecasts):
+        print(wrap_text(f"{heading}: USD {batch_usd:,.2f}"))
+    if len(known_dollars) < len(forecasts):
         unknown = ", ".join(row.participant for row in forecasts if row.dollars is None)
-        print(wrapped(f"price unknown, not in the sum: {unknown}"))
+        print(wrap_text(f"price unknown, not in the sum: {unknown}"))
 
 
 def _print_local(costs: Sequence[Cost], card: str) -> None:

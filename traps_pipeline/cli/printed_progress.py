@@ -14,31 +14,31 @@ from typing import TYPE_CHECKING, Any, Literal, TextIO
 
 from traps_pipeline.base.progress import HEARTBEAT_S, Progress, StageProgress, Tally, clock, summary
 from traps_pipeline.base.terminal import plain
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 
 if TYPE_CHECKING:
     from rich.console import Group
     from rich.table import Table
 
 Form = Literal["auto", "plain", "json"]
-MOST_ROWS = 12  # models and judges in the live region
+MAX_ROWS = 12  # models and judges in the live region
 _OF_CALLS = 58  # columns of the live table beside the name
 
 
 def make_progress(form: Form = "auto", stream: TextIO | None = None) -> PrintedProgress:
-    """Return and start the progress of a form; `auto` is live on a terminal."""
-    out: TextIO = stream or sys.stderr or Path(os.devnull).open("w")  # noqa: SIM115 - None where closed (`2>&-`)
-    is_terminal = out.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown")
+    """Start and return a progress printer; `auto` is live on a terminal, else text."""
+    output: TextIO = stream or sys.stderr or Path(os.devnull).open("w")  # noqa: SIM115 - None where closed (`2>&-`)
+    is_terminal = output.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown")
     kind = LiveProgress if form == "auto" and is_terminal else PrintedProgress
-    report = JsonProgress(out) if form == "json" else kind(out)
+    report = JsonProgress(output) if form == "json" else kind(output)
     report.start()
     return report
 
 
 class PrintedProgress(Progress):
-    """Progress as text: a line per stage that called, rendered or took long.
+    """Progress as text: a line per stage that made calls, rendered or took long.
 
-    Another line stands for all others, and one comes every 30 s.
+    One more line sums up all other stages; the running stage prints a line every 30 s.
     """
 
     beat_s = HEARTBEAT_S
@@ -56,21 +56,21 @@ class PrintedProgress(Progress):
 
     def end_stage(self) -> None:
         """See `Progress`."""
-        ended = self.current_stage
+        stage = self.current_stage
         super().end_stage()
-        if ended is None or not ended.partitions:
+        if stage is None or not stage.partitions:
             return
-        if ended.work() or ended.seconds >= HEARTBEAT_S:
-            self.write(summary(ended))
+        if stage.work() or stage.seconds >= HEARTBEAT_S:
+            self.write(summary(stage))
         else:
-            self._tables, self._tables_s = self._tables + ended.done - ended.empty, self._tables_s + ended.seconds
+            self._tables, self._tables_s = self._tables + stage.done - stage.empty, self._tables_s + stage.seconds
 
     def close(self) -> None:
         """See `Progress`."""
         super().close()
         self._closed.set()
         if self._tables:
-            tables = counted(self._tables, "table or figure", "tables and figures")
+            tables = count_noun(self._tables, "table or figure", "tables and figures")
             self.write(f"{tables}, {self._tables_s:.0f} s")
             self._tables, self._tables_s = 0, 0.0
 
@@ -91,8 +91,8 @@ class PrintedProgress(Progress):
         """Print untrusted text; a closed stream ends the run as SIGTERM would."""
         try:
             with self._printing:
-                for each in text.split("\n"):
-                    self.print_line(plain(each))
+                for line in text.split("\n"):
+                    self.print_line(plain(line))
         except OSError:
             if self._is_gone:
                 return
@@ -111,7 +111,7 @@ class PrintedProgress(Progress):
 
 
 class JsonProgress(PrintedProgress):
-    """Progress as JSON lines: `begin` and `end` of stages, `progress`, `note`, `finish`."""
+    """Progress as JSON lines: `begin`, `end` (stages), `progress`, `note`, `finish`."""
 
     def __init__(self, stream: TextIO) -> None:
         super().__init__(stream)
@@ -213,9 +213,9 @@ class LiveProgress(PrintedProgress):
     def _heading(self, now: StageProgress) -> str:
         """Return the stage, partitions, times and money, within 80 columns."""
         counts = f"  {now.done:,} of {now.partitions:,} made" if now.partitions else ""
-        remaining = "" if now.left_s is None else f", {clock(now.left_s)} left"
+        time_left = "" if now.left_s is None else f", {clock(now.left_s)} left"
         money = f"  {self.spent()}" if self.budget_usd and now.calls else ""
-        return f"{now.name}{counts}  {clock(now.seconds)}{remaining}{money}"
+        return f"{now.name}{counts}  {clock(now.seconds)}{time_left}{money}"
 
     def _calls(self, now: StageProgress) -> Table:
         from rich.table import Table
@@ -226,8 +226,8 @@ class LiveProgress(PrintedProgress):
         for heading in ("done", "calls", "p50", "p95", "errors", "retries", "spent"):
             table.add_column(heading, justify="right", no_wrap=True)
         rows = sorted(now.calls.items(), key=lambda pair: pair[1].done >= pair[1].wanted)
-        most = max(1, min(MOST_ROWS, self._console.height - 6))
-        for participant, traffic in rows[:most]:
+        max_rows = max(1, min(MAX_ROWS, self._console.height - 6))
+        for participant, traffic in rows[:max_rows]:
             name = Text(plain(participant), no_wrap=True)
             name.truncate(max(10, self._console.width - _OF_CALLS), overflow="ellipsis")
             calls, pace = f"{traffic.done:,}/{traffic.wanted:,}", f"{traffic.per_second:.1f}/s"
@@ -235,6 +235,6 @@ class LiveProgress(PrintedProgress):
             table.add_row(
                 name, calls, pace, *latencies, f"{traffic.errors:,}", f"{traffic.retries:,}", f"${traffic.dollars:,.2f}"
             )
-        if len(rows) > most:
-            table.add_row(f"and {len(rows) - most} more")
+        if len(rows) > max_rows:
+            table.add_row(f"and {len(rows) - max_rows} more")
         return table

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.terminal import plain
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.cli.command import FAILED, OK, Commands, integer, open_workspace, print_json
 
 
@@ -93,7 +93,7 @@ def release(arguments: argparse.Namespace) -> int:
     )
     output = write_release(content_of(workspace, arguments.arms), target, options)
     rows = ", ".join(f"{count} {table}" for table, count in output.rows.items())
-    print(f"{counted(output.files, 'file')} in {target}: {counted(output.clips, 'clip')}; {rows}")
+    print(f"{count_noun(output.files, 'file')} in {target}: {count_noun(output.clips, 'clip')}; {rows}")
     if output.answers:
         print(f"which item is which, for you alone: {output.answers}")
     if arguments.sign:
@@ -124,17 +124,17 @@ def verify(arguments: argparse.Namespace) -> int:
     if arguments.key:
         from traps_pipeline.release.signing import check_signature
 
-        wrong = check_signature(arguments.path, arguments.key)
-        problems += [wrong] if wrong else []
+        signature_problem = check_signature(arguments.path, arguments.key)
+        problems += [signature_problem] if signature_problem else []
     if arguments.json:
         print_json({"problems": problems, "files": len(read_checksums(arguments.path))})
         return FAILED if problems else OK
     for problem in problems:
         print(problem)
     if problems:
-        raise TrapsError(f"{arguments.path}: differs from the release in {counted(len(problems), 'file')}")
-    signed = "; the signature is of this key" if arguments.key else "; no signature was checked (say --key)"
-    print(f"{counted(len(read_checksums(arguments.path)), 'file')} checked, as released{signed}")
+        raise TrapsError(f"{arguments.path}: differs from the release in {count_noun(len(problems), 'file')}")
+    signature_note = "; the signature is of this key" if arguments.key else "; no signature was checked (say --key)"
+    print(f"{count_noun(len(read_checksums(arguments.path)), 'file')} checked, as released{signature_note}")
     return OK
 
 
@@ -143,17 +143,19 @@ def verify_file(path: Path, release: Path | None, *, is_json: bool) -> int:
     from traps_pipeline.release.submission import read_submission
     from traps_pipeline.release.verification import verify
 
-    verified = verify(read_submission(path), release)
+    verification = verify(read_submission(path), release)
     if is_json:
-        print_json({"problems": verified.problems, "checked": verified.checked, "not_checked": verified.unchecked})
-        return FAILED if verified.problems else OK
-    for problem in verified.problems:
+        print_json(
+            {"problems": verification.problems, "checked": verification.checked, "not_checked": verification.unchecked}
+        )
+        return FAILED if verification.problems else OK
+    for problem in verification.problems:
         print(plain(problem))
-    print(f"checked: {', '.join(verified.checked)}")
-    for part in verified.unchecked:
+    print(f"checked: {', '.join(verification.checked)}")
+    for part in verification.unchecked:
         print(f"not checked: {part}")
-    print(f"{path}: {'does not hold' if verified.problems else 'holds'}")
-    return FAILED if verified.problems else OK
+    print(f"{path}: {'does not hold' if verification.problems else 'holds'}")
+    return FAILED if verification.problems else OK
 
 
 def harness(arguments: argparse.Namespace) -> int:
@@ -162,7 +164,7 @@ def harness(arguments: argparse.Namespace) -> int:
 
     target = arguments.folder.absolute()
     count = write_harness(arguments.release, target, media_settings(arguments.media, arguments.uniform))
-    print(f"{counted(count, 'item')} in {target}")
+    print(f"{count_noun(count, 'item')} in {target}")
     print(f"next: inspect eval {target / 'traps_task.py'} -T regime=standard --model MODEL")
     print(f"or: python -m lmms_eval --include_path {target / LMMS} --tasks traps_standard --model MODEL --log_samples")
     return OK
@@ -172,10 +174,10 @@ def submit(arguments: argparse.Namespace) -> int:
     """See `traps publish submit --help`."""
     from traps_pipeline.release.submission import pack
 
-    about = pack(open_workspace(arguments), arguments.file.absolute(), arguments.name)
+    description = pack(open_workspace(arguments), arguments.file.absolute(), arguments.name)
     size = arguments.file.stat().st_size / 1e6
-    of_what = f"benchmark {about.benchmark} {about.version}, panel {about.panel}"
-    print(f"{arguments.file}: {about.name}, {of_what}, {size:.1f} MB")
+    contents_text = f"benchmark {description.benchmark} {description.version}, panel {description.panel}"
+    print(f"{arguments.file}: {description.name}, {contents_text}, {size:.1f} MB")
     print(f"next: traps publish verify {arguments.file} --release FOLDER")
     return OK
 
@@ -186,7 +188,7 @@ def results(arguments: argparse.Namespace) -> int:
 
     target, attribution = arguments.folder.absolute(), Attribution(arguments.organization, arguments.developer)
     files = write_results(open_workspace(arguments), target, arguments.dataset, attribution)
-    print(f"{counted(len(files), 'file')} in {target}")
+    print(f"{count_noun(len(files), 'file')} in {target}")
     return OK
 
 

@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 
 from traps_pipeline.base.sheets import csv_bytes
-from traps_pipeline.base.terminal import text_table, wrapped
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.terminal import text_table, wrap_text
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.cli.command import OK, Commands, open_workspace, place_of, print_json
 
 
@@ -44,12 +44,12 @@ def site(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print_json({"folder": folder, **vars(summary)})
         return OK
-    clips = f"{counted(summary.clips, 'clip')}, {_megabytes(summary.clip_bytes)}"
-    files = f"{counted(summary.files, 'file')}, {_megabytes(summary.bytes)}"
-    content = f"{counted(summary.answers, 'answer')} with {counted(summary.votes, 'vote')}"
+    clips = f"{count_noun(summary.clips, 'clip')}, {_megabytes(summary.clip_bytes)}"
+    files = f"{count_noun(summary.files, 'file')}, {_megabytes(summary.bytes)}"
+    content = f"{count_noun(summary.answers, 'answer')} with {count_noun(summary.votes, 'vote')}"
     print(f"{content}: {files}; {'without clips' if arguments.without_clips else clips}")
     if summary.lacking:
-        print(f"{counted(len(summary.lacking), 'clip')} missing from the study, {summary.lacking[0]} first")
+        print(f"{count_noun(len(summary.lacking), 'clip')} missing from the study, {summary.lacking[0]} first")
     print(f"next: open {folder / INDEX}")
     return OK
 
@@ -66,7 +66,7 @@ def audit_published(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print_json(findings)
     else:
-        print(wrapped(audit_text(findings, arguments.all)))
+        print(wrap_text(audit_text(findings, arguments.all)))
     if arguments.csv:
         arguments.csv.write_bytes(csv_bytes(findings))
         print(f"every finding: {arguments.csv}", file=sys.stderr)
@@ -80,7 +80,7 @@ def export_results(arguments: argparse.Namespace) -> int:
     workspace = open_workspace(arguments)
     target = (arguments.folder or workspace.root / "export").absolute()
     count = export(workspace, target, say=lambda line: print(line, flush=True))
-    print(f"{counted(count, 'file')} in {target}\nnext: open {target / INDEX}")
+    print(f"{count_noun(count, 'file')} in {target}\nnext: open {target / INDEX}")
     return OK
 
 
@@ -92,8 +92,8 @@ def compare_studies(arguments: argparse.Namespace) -> int:
     from traps_pipeline.storage.workspace import Workspace
 
     studies = Workspace.open(arguments.other), Workspace.open(place_of(arguments))
-    earlier, later = (current_rows(study, VERDICTS) for study in studies)
-    table = version_contrasts(earlier, later)
+    other_rows, own_rows = (current_rows(study, VERDICTS) for study in studies)
+    table = version_contrasts(other_rows, own_rows)
     if arguments.csv:
         arguments.csv.write_bytes(csv_bytes(table))
     if arguments.json:

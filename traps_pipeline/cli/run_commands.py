@@ -12,8 +12,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.terminal import wrapped
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.terminal import wrap_text
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.cli.command import (
     FAILED,
     OK,
@@ -95,15 +95,15 @@ def add(commands: Commands) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """See `traps run --help`."""
-    from traps_pipeline.base.progress import reporting
+    from traps_pipeline.base.progress import use_progress
     from traps_pipeline.cli.printed_progress import make_progress
 
     experiment = experiment_of(arguments)
     workspace = _allow(create(arguments, experiment), experiment, arguments)
-    about = sys.stderr if arguments.json else sys.stdout
+    stream = sys.stderr if arguments.json else sys.stdout
     title = f"{experiment.name}: {experiment.description}" if experiment.description else experiment.name
-    print(f"{wrapped(title, about)}\nworkspace {workspace.place}", file=about, flush=True)
-    with reporting(make_progress(arguments.progress)) as progress:
+    print(f"{wrap_text(title, stream)}\nworkspace {workspace.place}", file=stream, flush=True)
+    with use_progress(make_progress(arguments.progress)) as progress:
         load_definitions()  # takes seconds, as Dagster's import does
         from traps_pipeline.pipeline.experiment_run import run_experiment
 
@@ -120,9 +120,9 @@ def run(arguments: argparse.Namespace) -> int:
     if experiment.canary and not report.problems:
         from traps_pipeline.checks.canary import ask_canary, changes_text
 
-        with reporting(make_progress(arguments.progress)):
+        with use_progress(make_progress(arguments.progress)):
             changes = ask_canary(workspace, experiment.models)
-        print(changes_text(changes), file=about)
+        print(changes_text(changes), file=stream)
     if arguments.json:
         from traps_pipeline.scoring.score_rows import LEADERBOARD
 
@@ -134,16 +134,18 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         return OK
     if arguments.until is not None:
-        where = [] if arguments.workspace is None else ["--workspace", arguments.workspace]
-        command = shlex.join(["traps", "run", arguments.experiment, *where])
-        print(wrapped(f"next: `{command}` for the stages after {arguments.until}"))
+        workspace_option = [] if arguments.workspace is None else ["--workspace", arguments.workspace]
+        command = shlex.join(["traps", "run", arguments.experiment, *workspace_option])
+        print(wrap_text(f"next: `{command}` for the stages after {arguments.until}"))
         return OK
     from traps_pipeline.report.printed_board import printed_board
 
     print(printed_board(workspace))
     print(f"report {workspace.reports / 'report.html'}\nexplorer {workspace.reports / 'index.html'}")
     print(
-        wrapped("next: open one of them; traps why ITEM examines an item's answers; traps site writes a folder to send")
+        wrap_text(
+            "next: open one of them; traps why ITEM examines an item's answers; traps site writes a folder to send"
+        )
     )
     return OK
 
@@ -151,41 +153,43 @@ def run(arguments: argparse.Namespace) -> int:
 def _print_work(report: RunReport, *, is_inside: bool) -> None:
     from traps_pipeline.base.progress import clock
 
-    responses, voted = report.tally("responses"), report.tally("votes")
-    print(f"\n{counted(responses.asked, 'answer')} asked ({responses.cached} from the ledger)")
-    print(f"{counted(voted.asked, 'vote')} asked ({voted.cached} from the ledger)")
-    print(f"{counted(report.frames, 'frame')} rendered, {clock(report.seconds)} min")
+    responses, vote_tally = report.tally("responses"), report.tally("votes")
+    print(f"\n{count_noun(responses.asked, 'answer')} asked ({responses.cached} from the ledger)")
+    print(f"{count_noun(vote_tally.asked, 'vote')} asked ({vote_tally.cached} from the ledger)")
+    print(f"{count_noun(report.frames, 'frame')} rendered, {clock(report.seconds)} min")
     if is_inside:
-        states, steered, judged = map(report.tally, ("hidden_states", "steering", "steering_votes"))
-        steered_answers = f"{counted(steered.asked, 'steered answer')} asked ({steered.cached} from the ledger)"
+        states, steering_tally, judged = map(report.tally, ("hidden_states", "steering", "steering_votes"))
+        steered_answers = (
+            f"{count_noun(steering_tally.asked, 'steered answer')} asked ({steering_tally.cached} from the ledger)"
+        )
         print(
-            f"inside models: {counted(states.asked, 'item')} extracted, {steered_answers}, "
-            f"{counted(judged.asked, 'vote')} on them"
+            f"inside models: {count_noun(states.asked, 'item')} extracted, {steered_answers}, "
+            f"{count_noun(judged.asked, 'vote')} on them"
         )
 
 
 def _print_problems(problems: Sequence[str], *, as_json: bool) -> None:
     """Print each cause once, last the one behind most problems, to fix first."""
-    show = partial(print_failure, as_json=as_json)
-    alike = dict[str, list[str]]()
+    print_line = partial(print_failure, as_json=as_json)
+    problems_by_cause = dict[str, list[str]]()
     for problem in problems:
-        alike.setdefault(problem.partition(": ")[2] or problem, []).append(problem)
-    for first, *more in alike.values():
-        show(f"{first}{f' (and {len(more)} more)' if more else ''}")
-    show(f"{counted(len(problems), 'problem')}; finished work is kept: run the same command to continue")
-    cause, most = max(alike.items(), key=lambda pair: len(pair[1]))
-    if len(most) > 1:
-        show(f"{len(most)} of them have one cause: {cause}")
+        problems_by_cause.setdefault(problem.partition(": ")[2] or problem, []).append(problem)
+    for first, *repeats in problems_by_cause.values():
+        print_line(f"{first}{f' (and {len(repeats)} more)' if repeats else ''}")
+    print_line(f"{count_noun(len(problems), 'problem')}; finished work is kept: run the same command to continue")
+    cause, cause_problems = max(problems_by_cause.items(), key=lambda pair: len(pair[1]))
+    if len(cause_problems) > 1:
+        print_line(f"{len(cause_problems)} of them have one cause: {cause}")
 
 
 @contextmanager
 def _open_runs(arguments: argparse.Namespace, instance: DagsterInstance, workspace: Workspace) -> Iterator[Runs]:
     """Open the executor of runs, here or on a cluster. Raises TrapsError without one."""
     from traps_pipeline.definitions import defs
-    from traps_pipeline.pipeline.runs import RunsHere
+    from traps_pipeline.pipeline.runs import LocalRuns
 
     if not arguments.cluster:
-        yield RunsHere(instance, defs.resolve_implicit_global_asset_job_def())
+        yield LocalRuns(instance, defs.resolve_implicit_global_asset_job_def())
         return
     from traps_pipeline.storage.several_hosts import several_hosts
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.suggestions import did_you_mean
-from traps_pipeline.base.terminal import plain, text_table, wrapped
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.terminal import plain, text_table, wrap_text
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.cli.command import (
     OK,
     Commands,
@@ -25,7 +25,7 @@ from traps_pipeline.cli.command import (
 if TYPE_CHECKING:
     from traps_pipeline.storage.workspace import Workspace
 
-MOST_KEYS, MOST_REASON = 4, 300  # partitions and characters printed per reason
+MAX_KEYS, MAX_REASON = 4, 300  # partitions and characters printed per reason
 
 
 def add(commands: Commands) -> None:
@@ -40,7 +40,7 @@ def add(commands: Commands) -> None:
 
 def status(arguments: argparse.Namespace) -> int:
     """See `traps status --help`."""
-    exported = dict(os.environ)
+    environment = dict(os.environ)
     workspace = open_workspace(arguments)
     experiment = arguments.experiment
     if experiment is not None and experiment not in workspace.study.experiments:  # a file, or a misspelt name
@@ -56,7 +56,7 @@ def status(arguments: argparse.Namespace) -> int:
     load_definitions()
     rows = list(stage_statuses(workspace, Lineage(workspace), experiment))
     checks = [*failing_checks(workspace)]
-    command = _command(workspace, arguments, exported)
+    command = _command(workspace, arguments, environment)
     if arguments.json:
         names = ("check", "stage", "partition", "reason")
         failing = [dict(zip(names, check, strict=True)) for check in checks]
@@ -64,22 +64,22 @@ def status(arguments: argparse.Namespace) -> int:
         return OK
     print(f"workspace {workspace.place}")
     for check, stage, partition, reason in checks:
-        print(wrapped(plain(f"check {check} of {stage} {partition} does not pass: {reason}")))
-    total, unfresh = sum(row.fresh for row in rows), [row for row in rows if row.stale or row.missing]
-    if not unfresh:
-        print(f"everything is fresh: {counted(total, 'partition')} of {counted(len(rows), 'stage')}")
+        print(wrap_text(plain(f"check {check} of {stage} {partition} does not pass: {reason}")))
+    total, rows_to_make = sum(row.fresh for row in rows), [row for row in rows if row.stale or row.missing]
+    if not rows_to_make:
+        print(f"everything is fresh: {count_noun(total, 'partition')} of {count_noun(len(rows), 'stage')}")
         return OK
-    table = [(row.stage, row.fresh, len(row.stale), len(row.missing)) for row in unfresh]
+    table = [(row.stage, row.fresh, len(row.stale), len(row.missing)) for row in rows_to_make]
     lines = text_table(("stage", "fresh", "stale", "missing"), table).splitlines()
-    print("\n".join(lines[: -len(unfresh)]))
-    for line, row in zip(lines[-len(unfresh) :], unfresh, strict=True):
+    print("\n".join(lines[: -len(rows_to_make)]))
+    for line, row in zip(lines[-len(rows_to_make) :], rows_to_make, strict=True):
         print(line)
         for reason, keys in row.by_reason().items():
-            more = f" and {len(keys) - MOST_KEYS} more" if len(keys) > MOST_KEYS else ""
-            prefix = "" if keys == [row.stage] else f"{', '.join(keys[:MOST_KEYS])}{more}: "
-            print(wrapped(plain(f"    {prefix}{reason[:MOST_REASON]}")))
-    count = sum(len(row.stale) + len(row.missing) for row in unfresh)
-    print(f"not fresh: {count:,} of {counted(total + count, 'partition')}; `{command}` makes them again")
+            suffix = f" and {len(keys) - MAX_KEYS} more" if len(keys) > MAX_KEYS else ""
+            prefix = "" if keys == [row.stage] else f"{', '.join(keys[:MAX_KEYS])}{suffix}: "
+            print(wrap_text(plain(f"    {prefix}{reason[:MAX_REASON]}")))
+    count = sum(len(row.stale) + len(row.missing) for row in rows_to_make)
+    print(f"not fresh: {count:,} of {count_noun(total + count, 'partition')}; `{command}` makes them again")
     return OK
 
 
@@ -92,14 +92,18 @@ def _command(workspace: Workspace, arguments: argparse.Namespace, exported: Mapp
     from traps_pipeline.pipeline.experiment import EXPERIMENTS
     from traps_pipeline.storage.workspace import VARIABLE
 
-    given = [arguments.experiment] if arguments.experiment else [*workspace.study.experiments]
-    files = [name for name in given if name.endswith((".yaml", ".yml")) or (EXPERIMENTS / f"{name}.yaml").exists()]
-    if len(files) == len(given) == 1:
-        where = [] if arguments.workspace is None else ["--workspace", str(workspace.place)]
-        return shlex.join(["traps", "run", files[0], *where])
-    needed = {VARIABLE: str(workspace.place), "DAGSTER_HOME": os.environ["DAGSTER_HOME"]}
-    lacking = [f"{name}={shlex.quote(value)}" for name, value in needed.items() if exported.get(name) != value]
-    return " ".join([*lacking, "dagster job execute -m traps_pipeline.definitions -j everything"])
+    experiments = [arguments.experiment] if arguments.experiment else [*workspace.study.experiments]
+    files = [
+        name for name in experiments if name.endswith((".yaml", ".yml")) or (EXPERIMENTS / f"{name}.yaml").exists()
+    ]
+    if len(files) == len(experiments) == 1:
+        workspace_option = [] if arguments.workspace is None else ["--workspace", str(workspace.place)]
+        return shlex.join(["traps", "run", files[0], *workspace_option])
+    required_variables = {VARIABLE: str(workspace.place), "DAGSTER_HOME": os.environ["DAGSTER_HOME"]}
+    assignments = [
+        f"{name}={shlex.quote(value)}" for name, value in required_variables.items() if exported.get(name) != value
+    ]
+    return " ".join([*assignments, "dagster job execute -m traps_pipeline.definitions -j everything"])
 
 
 def why(arguments: argparse.Namespace) -> int:
@@ -111,5 +115,5 @@ def why(arguments: argparse.Namespace) -> int:
         print_json(explanation)
         return OK
     for line in lines_of(explanation):
-        print(wrapped(plain(line)))
+        print(wrap_text(plain(line)))
     return OK

@@ -22,7 +22,7 @@ from traps_pipeline.base.cores import CORES
 from traps_pipeline.base.databases import database_error
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.extras import missing
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.cluster.node import CODE, REFUSED_TAG, code_here
 from traps_pipeline.cluster.postgres import PATIENCE_S
 from traps_pipeline.cluster.sensors import REQUEST_TAG, submit
@@ -128,7 +128,7 @@ class RayRuns(Runs):
         """Wait for runs of earlier commands."""
         filters = dg.RunsFilter(statuses=_UNFINISHED, tags={STUDY_TAG: self._workspace.study.name})
         if runs := [*self._instance.get_runs(filters)]:
-            progress.current().note(f"waiting first for {counted(len(runs), 'run')} that an earlier command left")
+            progress.current().note(f"waiting first for {count_noun(len(runs), 'run')} that an earlier command left")
             stages = [(the_graph()[key.path[-1]], run.tags) for run in runs for key in run.asset_selection or ()]
             progress.current().stage("runs that were left", sum(len(keys_of(*each)) or 1 for each in stages))
             self._watch([], [run.run_id for run in runs])
@@ -262,7 +262,7 @@ class RayRuns(Runs):
     def _interrupted(self, requests: list[str], run_ids: list[str]) -> None:
         if self._on_interrupt == "leave":
             progress.current().note(
-                f"left running: {counted(len(requests) + len(run_ids), 'run')}; the same command shows the progress "
+                f"left running: {count_noun(len(requests) + len(run_ids), 'run')}; the same command shows the progress "
                 "again, and `--on-interrupt cancel` would end such runs"
             )
             return
@@ -272,4 +272,4 @@ class RayRuns(Runs):
             time.sleep(POLL_S)
         for run_id in run_ids:
             self._instance.run_coordinator.cancel_run(run_id)
-        progress.current().note(f"told {counted(len(run_ids), 'run')} to end; finished work is kept")
+        progress.current().note(f"told {count_noun(len(run_ids), 'run')} to end; finished work is kept")

@@ -18,16 +18,16 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.files import replacing, write_bytes
+from traps_pipeline.base.files import replace_file, write_bytes
 from traps_pipeline.base.terminal import plain
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.base.yamlfile import explain, read_lines
 from traps_pipeline.benchmark.held_out import opaque
 from traps_pipeline.exchange.harness_logs import LOG, OUTCOMES, LoggedAnswer, reader_of
 from traps_pipeline.exchange.provider_batch import export_batches, failures, is_batch, outcomes_of, read_batch
 from traps_pipeline.judging.panel import wanted_ballots
 from traps_pipeline.ledger.ledger import Ledger
-from traps_pipeline.ledger.rows import MOST_TOKENS, Stored
+from traps_pipeline.ledger.rows import MAX_TOKENS, Stored
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.answers import prepare_media, wanted_questions
 from traps_pipeline.models.endings import ending_of
@@ -50,8 +50,8 @@ _ERROR_TEXT = re.compile(
     r"|bad gateway|gateway time-?out|(?:request|connection|read) (?:failed|error|refused|reset|timed out))",
     re.IGNORECASE,
 )
-MOST_LOOKED_AT = 200  # characters of a text
-MOST_LINES = 5  # number of wrong lines that an error names
+MAX_LOOKED_AT = 200  # characters of a text
+MAX_LINES = 5  # number of wrong lines that an error names
 
 
 class Answer(BaseModel):
@@ -64,9 +64,9 @@ class Answer(BaseModel):
     reasoning: str | None = None
     finish_reason: str | None = None
     served_model: str | None = None
-    prompt_tokens: int | None = Field(default=None, ge=0, le=MOST_TOKENS)
-    completion_tokens: int | None = Field(default=None, ge=0, le=MOST_TOKENS)
-    reasoning_tokens: int | None = Field(default=None, ge=0, le=MOST_TOKENS)
+    prompt_tokens: int | None = Field(default=None, ge=0, le=MAX_TOKENS)
+    completion_tokens: int | None = Field(default=None, ge=0, le=MAX_TOKENS)
+    reasoning_tokens: int | None = Field(default=None, ge=0, le=MAX_TOKENS)
     latency_s: float = Field(default=0.0, ge=0.0, allow_inf_nan=False)
 
     @model_validator(mode="before")
@@ -83,8 +83,8 @@ class Answer(BaseModel):
             raise ValueError("outcome: an error is no answer; remove the line, so that the item stays missing")
         has_text = self.outcome in (*WITH_TEXT, UNFINISHED)
         if has_text != bool((self.text or "").strip()):
-            needs = "needs a text" if has_text else "must have no text"
-            raise ValueError(f"text: outcome {self.outcome!r} {needs}")
+            requirement = "needs a text" if has_text else "must have no text"
+            raise ValueError(f"text: outcome {self.outcome!r} {requirement}")
         return self
 
     def as_outcome(self, entry: ModelEntry) -> Outcome:
@@ -121,8 +121,8 @@ class _Stored:
     @property
     def evaluation(self) -> Evaluation:
         """The evaluation whose ledger holds it."""
-        about = self.request.about
-        return Evaluation(str(about["model"]), str(about["regime"]), int(about["run"]))
+        subject = self.request.about
+        return Evaluation(str(subject["model"]), str(subject["regime"]), int(subject["run"]))
 
 
 def export_requests(workspace: Workspace, experiment: Experiment, out: Path) -> int:
@@ -138,7 +138,7 @@ def export_requests(workspace: Workspace, experiment: Experiment, out: Path) -> 
     (out / MEDIA).mkdir(parents=True, exist_ok=True)
     prepare_media(workspace, _cells(workspace, experiment))
     count = 0
-    with replacing(out / REQUESTS) as part, part.open("w", encoding="utf-8") as stream:
+    with replace_file(out / REQUESTS) as part, part.open("w", encoding="utf-8") as stream:
         for request in _missing_requests(workspace, experiment):
             stream.write(json.dumps(_line(request, out), ensure_ascii=False) + "\n")
             count += 1
@@ -157,13 +157,13 @@ def _cells(workspace: Workspace, experiment: Experiment) -> list[Cell]:
 
 
 def _missing_requests(workspace: Workspace, experiment: Experiment) -> Iterator[Request]:
-    settled: dict[Evaluation, set[str]] = {}
+    settled_keys: dict[Evaluation, set[str]] = {}
     for cell in _cells(workspace, experiment):
         evaluation = cell.evaluation
-        if evaluation not in settled:
-            settled[evaluation] = {*workspace.answers.read(evaluation.key).settled}
+        if evaluation not in settled_keys:
+            settled_keys[evaluation] = {*workspace.answers.read(evaluation.key).settled}
         requests = (question.request for question in wanted_questions(workspace, cell))
-        yield from (request for request in requests if request.key not in settled[evaluation])
+        yield from (request for request in requests if request.key not in settled_keys[evaluation])
 
 
 def _line(request: Request, out: Path) -> dict[str, Any]:
@@ -173,9 +173,9 @@ def _line(request: Request, out: Path) -> dict[str, Any]:
         file = out / MEDIA / f"{request.sent.sha256}{source.suffix}"
         if not file.exists():
             write_bytes(file, source.read_bytes())
-        sent = request.sent
-        media = {"profile": sent.profile, "file": f"{MEDIA}/{file.name}", "sha256": sent.sha256}
-        media |= {"n_frames": sent.n_frames, "times_s": list(sent.times_s), "fps": sent.fps}
+        request_media = request.sent
+        media = {"profile": request_media.profile, "file": f"{MEDIA}/{file.name}", "sha256": request_media.sha256}
+        media |= {"n_frames": request_media.n_frames, "times_s": list(request_media.times_s), "fps": request_media.fps}
     return {
         "key": request.key,
         "model": request.participant,
@@ -192,7 +192,8 @@ def _line(request: Request, out: Path) -> dict[str, Any]:
 class AnswerContext:
     """The context that a file of answers by item lacks.
 
-    model: of the experiment (None: its only one); run; key: of the held-out set whose opaque names the file has.
+    model: a model of the experiment (None: its only one); run; key: key of the held-out set whose opaque names the
+    file has.
     """
 
     model: str | None = None
@@ -218,39 +219,39 @@ def import_answers(
     cells = _cells(workspace, experiment)
     prepare_media(workspace, cells)
     requests = [question.request for cell in cells for question in wanted_questions(workspace, cell)]
-    requested = {request.key: request for request in requests}
+    requests_by_key = {request.key: request for request in requests}
     if path.suffix != LOG and is_batch(path):
-        return _import_batch(workspace, workspace.answers, load_models(), requested, path)
+        return _import_batch(workspace, workspace.answers, load_models(), requests_by_key, path)
     reader = reader_of(path)
     answers, n_failed = (
-        (checked_answers(path, requested), 0)
+        (checked_answers(path, requests_by_key), 0)
         if reader is None
-        else _by_item(reader(path), requested, context or AnswerContext())
+        else _answers_by_item(reader(path), requests_by_key, context or AnswerContext())
     )
     if not answers:
         raise TrapsError(f"{path}: holds no answers; nothing was imported")
-    like_errors = [key for key, answer in answers.items() if _ERROR_TEXT.match((answer.text or "")[:MOST_LOOKED_AT])]
+    like_errors = [key for key, answer in answers.items() if _ERROR_TEXT.match((answer.text or "")[:MAX_LOOKED_AT])]
     if like_errors and errors is None:
-        raise TrapsError(_said_of_errors(path, {key: answers[key] for key in like_errors}, requested))
+        raise TrapsError(_error_warning(path, {key: answers[key] for key in like_errors}, requests_by_key))
     for key in like_errors if errors == "drop" else ():
         del answers[key]
     outcomes = [
-        _Stored(requested[key], answer.as_outcome(get_model(requested[key].participant)), answer.latency_s)
+        _Stored(requests_by_key[key], answer.as_outcome(get_model(requests_by_key[key].participant)), answer.latency_s)
         for key, answer in answers.items()
     ]
     new = asyncio.run(_store(workspace, workspace.answers, outcomes))
-    failed = f"{counted(n_failed, 'sample')} of the log" if n_failed else ""
+    failed = f"{count_noun(n_failed, 'sample')} of the log" if n_failed else ""
     return ImportResult(new, len(answers) - new, failed, dropped=len(like_errors) if errors == "drop" else 0)
 
 
-def _said_of_errors(path: Path, answers: Mapping[str, Answer], requested: Mapping[str, Request]) -> str:
+def _error_warning(path: Path, answers: Mapping[str, Answer], requested: Mapping[str, Request]) -> str:
     """Return a message about texts that look like errors, with number and examples."""
     examples = [f"{requested[key].about['item_id']}: {plain(answer.text)[:60]!r}" for key, answer in answers.items()][
-        :MOST_LINES
+        :MAX_LINES
     ]
     return (
-        f"{path}: {counted(len(answers), 'text')} may be an error message, not an answer ({'; '.join(examples)}): say "
-        "--errors drop to leave them missing, or --errors keep if they are answers; nothing was imported"
+        f"{path}: {count_noun(len(answers), 'text')} may be an error message, not an answer ({'; '.join(examples)}): "
+        "say --errors drop to leave them missing, or --errors keep if they are answers; nothing was imported"
     )
 
 
@@ -271,11 +272,11 @@ def export_vote_batches(workspace: Workspace, experiment: Experiment, out: Path)
     Return the files, and the number of calls. Raises TrapsError if answers are missing.
     """
     missing: dict[str, list[Request]] = {}
-    settled: dict[Evaluation, set[str]] = {}
+    settled_keys: dict[Evaluation, set[str]] = {}
     for cell, request in _wanted_votes(workspace, experiment):
-        if cell.evaluation not in settled:
-            settled[cell.evaluation] = {*workspace.votes.read(cell.evaluation.key).settled}
-        if request.key not in settled[cell.evaluation]:
+        if cell.evaluation not in settled_keys:
+            settled_keys[cell.evaluation] = {*workspace.votes.read(cell.evaluation.key).settled}
+        if request.key not in settled_keys[cell.evaluation]:
             missing.setdefault(request.participant, []).append(request)
     judges = load_judges()
     return export_batches({name: (judges[name], requests) for name, requests in missing.items()}, out)
@@ -283,8 +284,8 @@ def export_vote_batches(workspace: Workspace, experiment: Experiment, out: Path)
 
 def import_votes(workspace: Workspace, experiment: Experiment, path: Path) -> ImportResult:
     """Import votes into their ledger. Raises TrapsError as `import_answers` does."""
-    requested = {request.key: request for _, request in _wanted_votes(workspace, experiment)}
-    return _import_batch(workspace, workspace.votes, load_judges(), requested, path)
+    requests_by_key = {request.key: request for _, request in _wanted_votes(workspace, experiment)}
+    return _import_batch(workspace, workspace.votes, load_judges(), requests_by_key, path)
 
 
 def _wanted_votes(workspace: Workspace, experiment: Experiment) -> Iterator[tuple[Cell, Request]]:
@@ -296,7 +297,7 @@ def _wanted_votes(workspace: Workspace, experiment: Experiment) -> Iterator[tupl
         yield from ((cell, ballot.request) for ballot in wanted_ballots(workspace, panel, cell))
 
 
-def _at_batch_price(entry: Entry, outcome: Outcome) -> Outcome:
+def _apply_batch_price(entry: Entry, outcome: Outcome) -> Outcome:
     outcome = replace(outcome, client=None)  # the client is unknown: another version may have exported the call
     if outcome.cost_usd is None:
         return outcome
@@ -306,12 +307,12 @@ def _at_batch_price(entry: Entry, outcome: Outcome) -> Outcome:
 def _import_batch(
     workspace: Workspace, ledger: Ledger, entries: Mapping[str, Entry], requested: Mapping[str, Request], path: Path
 ) -> ImportResult:
-    returned = read_batch(path, requested)
-    if not returned:
+    results = read_batch(path, requested)
+    if not results:
         raise TrapsError(f"{path}: holds no answers; nothing was imported")
     outcomes = [
-        _Stored(request, _at_batch_price(entries[request.participant], outcome), 0.0)
-        for request, outcome in outcomes_of(entries, requested, returned)
+        _Stored(request, _apply_batch_price(entries[request.participant], outcome), 0.0)
+        for request, outcome in outcomes_of(entries, requested, results)
     ]
     new = asyncio.run(_store(workspace, ledger, outcomes))
     failed = sum(answer.outcome.kind in ("error", "malformed") for answer in outcomes)
@@ -321,27 +322,27 @@ def _import_batch(
 def checked_answers(path: Path, requested: Mapping[str, Request]) -> dict[str, Answer]:
     """Return a file's answers by key. Raises TrapsError naming up to five bad lines."""
     answers: dict[str, Answer] = {}
-    wrong: list[str] = []
+    problems: list[str] = []
     for number, line in read_lines(path):
         try:
             answer = Answer.model_validate(json.loads(line))
         except ValidationError as error:
-            wrong.append(f"{path}:{number}: {explain(error, Answer)}")
+            problems.append(f"{path}:{number}: {explain(error, Answer)}")
             continue
         except (ValueError, RecursionError) as error:
-            wrong.append(f"{path}:{number}: not JSON ({plain(error)[:200]})")
+            problems.append(f"{path}:{number}: not JSON ({plain(error)[:200]})")
             continue
         if answer.key not in requested:
-            wrong.append(f"{path}:{number}: key {answer.key[:16]} is not wanted: question, clip or setting changed")
+            problems.append(f"{path}:{number}: key {answer.key[:16]} is not wanted: question, clip or setting changed")
         elif answers.setdefault(answer.key, answer) != answer:
-            wrong.append(f"{path}:{number}: gives another answer to the key of an earlier line")
-    if wrong:
-        more = f"\n... and {len(wrong) - MOST_LINES} more" if len(wrong) > MOST_LINES else ""
-        raise TrapsError("\n".join(wrong[:MOST_LINES]) + more + "\nnothing was imported")
+            problems.append(f"{path}:{number}: gives another answer to the key of an earlier line")
+    if problems:
+        suffix = f"\n... and {len(problems) - MAX_LINES} more" if len(problems) > MAX_LINES else ""
+        raise TrapsError("\n".join(problems[:MAX_LINES]) + suffix + "\nnothing was imported")
     return answers
 
 
-def _by_item(
+def _answers_by_item(
     imported: Iterable[LoggedAnswer], requested: Mapping[str, Request], context: AnswerContext
 ) -> tuple[dict[str, Answer], int]:
     """Return a harness's answers by key, and how many calls have no answer anywhere.
@@ -353,31 +354,32 @@ def _by_item(
     if model not in models:
         raise TrapsError(f"say whose answers these are: --model, one of {', '.join(models)}")
     keys = {
-        (str(about["item_id"]), str(about["regime"]), int(about["run"])): key
+        (str(subject["item_id"]), str(subject["regime"]), int(subject["run"])): key
         for key, request in requested.items()
-        if (about := request.about)["model"] == model
+        if (subject := request.about)["model"] == model
     }
     names = {opaque(context.key, item): item for item, _, _ in keys} if context.key else {}
-    answers, wrong, failed = dict[str, Answer](), list[str](), set[str]()
-    for logged in imported:
-        run = context.run + logged.epoch - 1 if logged.run is None else logged.run
-        key = keys.get((names.get(logged.item, logged.item), logged.regime, run))
+    answers, problems, failed = dict[str, Answer](), list[str](), set[str]()
+    for log_answer in imported:
+        run = context.run + log_answer.epoch - 1 if log_answer.run is None else log_answer.run
+        key = keys.get((names.get(log_answer.item, log_answer.item), log_answer.regime, run))
         try:
             if key is None:
-                wrong.append(
-                    f"{logged.where}: {logged.item} under {logged.regime}, run {run}, is not wanted of {model}"
+                problems.append(
+                    f"{log_answer.where}: {log_answer.item} under {log_answer.regime}, run {run}, "
+                    f"is not wanted of {model}"
                 )
-            elif logged.has_failed:
+            elif log_answer.has_failed:
                 failed.add(key)
-            elif answers.setdefault(key, answer := Answer(key=key, **logged.answer)) != answer:
-                wrong.append(f"{logged.where}: gives another answer to {logged.item} than an earlier one")
+            elif answers.setdefault(key, answer := Answer(key=key, **log_answer.answer)) != answer:
+                problems.append(f"{log_answer.where}: gives another answer to {log_answer.item} than an earlier one")
         except ValidationError as error:
-            wrong.append(f"{logged.where}: {explain(error)}")
+            problems.append(f"{log_answer.where}: {explain(error)}")
         except TypeError as error:
-            wrong.append(f"{logged.where}: {plain(error)[:200]}")
-    if wrong:
-        more = f"\n... and {len(wrong) - MOST_LINES} more" if len(wrong) > MOST_LINES else ""
-        raise TrapsError("\n".join(map(plain, wrong[:MOST_LINES])) + more + "\nnothing was imported")
+            problems.append(f"{log_answer.where}: {plain(error)[:200]}")
+    if problems:
+        suffix = f"\n... and {len(problems) - MAX_LINES} more" if len(problems) > MAX_LINES else ""
+        raise TrapsError("\n".join(map(plain, problems[:MAX_LINES])) + suffix + "\nnothing was imported")
     return answers, len(failed - answers.keys())
 
 

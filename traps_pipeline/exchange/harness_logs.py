@@ -22,7 +22,7 @@ from traps_pipeline.models.endings import ending_of
 from traps_pipeline.models.request import UNFINISHED, WITH_TEXT
 from traps_pipeline.models.usage import Sizes, read_usage
 
-MOST_SAMPLE_BYTES, MOST_LOG_BYTES, MOST_SAMPLES = 2**28, 2 * 2**30, 1_000_000
+MAX_SAMPLE_BYTES, MAX_LOG_BYTES, MAX_SAMPLES = 2**28, 2 * 2**30, 1_000_000
 # Outcome by finish reason in a log; an error is asked again.
 OUTCOMES = {"complete": "answer", "truncated": "truncated", "refused": "refused", "transient": "error"}
 _ZSTD, _LOCAL_HEADER = 93, struct.Struct("<4s5H3I2H")
@@ -62,7 +62,7 @@ def reader_of(path: Path) -> Reader | None:
         return None
     if {"filtered_resps", "traps_pecs"} <= names:
         return _lmms_samples
-    return _own_lines if {"item", "regime"} <= names else None
+    return _plain_lines if {"item", "regime"} <= names else None
 
 
 # --- inspect_ai -------------------------------------------------------------------------------------------------------
@@ -70,8 +70,8 @@ def reader_of(path: Path) -> Reader | None:
 
 def _json_log(path: Path) -> Iterator[LoggedAnswer]:
     try:
-        if path.stat().st_size > MOST_LOG_BYTES:
-            raise TrapsError(f"{path}: is larger than {MOST_LOG_BYTES} bytes; log it without images (--no-log-images)")
+        if path.stat().st_size > MAX_LOG_BYTES:
+            raise TrapsError(f"{path}: is larger than {MAX_LOG_BYTES} bytes; log it without images (--no-log-images)")
         log = json.loads(path.read_bytes())
         samples = log["samples"]
     except OSError as error:
@@ -87,12 +87,12 @@ def _eval_log(path: Path) -> Iterator[LoggedAnswer]:
     try:
         with zipfile.ZipFile(path) as archive, path.open("rb") as raw:
             entries = [entry for entry in archive.infolist() if entry.filename.startswith("samples/")]
-            if len(entries) > MOST_SAMPLES:
-                raise TrapsError(f"{path}: has more than {MOST_SAMPLES} samples")
+            if len(entries) > MAX_SAMPLES:
+                raise TrapsError(f"{path}: has more than {MAX_SAMPLES} samples")
             for entry in entries:
-                if entry.file_size > MOST_SAMPLE_BYTES:
+                if entry.file_size > MAX_SAMPLE_BYTES:
                     raise TrapsError(f"{path}: {entry.filename} has {entry.file_size} bytes; log without images")
-                content = _unpacked(raw, entry) if entry.compress_type == _ZSTD else archive.read(entry)
+                content = _unpack(raw, entry) if entry.compress_type == _ZSTD else archive.read(entry)
                 yield _sample(f"{path}: {entry.filename}", json.loads(content))
     except OSError as error:
         raise TrapsError(f"{path}: cannot be read ({error.strerror or error})") from error
@@ -102,16 +102,16 @@ def _eval_log(path: Path) -> Iterator[LoggedAnswer]:
         ) from error
 
 
-def _unpacked(raw: Any, entry: zipfile.ZipInfo) -> bytes:
+def _unpack(raw: Any, entry: zipfile.ZipInfo) -> bytes:
     """Decompress a zstd entry, which zipfile lacks here. Raises ValueError."""
     import pyarrow as pa
 
     raw.seek(entry.header_offset)
     header = _LOCAL_HEADER.unpack(raw.read(_LOCAL_HEADER.size))
     raw.seek(header[-2] + header[-1], 1)  # the name and the extra field
-    packed = raw.read(entry.compress_size)
+    packed_bytes = raw.read(entry.compress_size)
     try:
-        content = pa.decompress(packed, decompressed_size=entry.file_size, codec="zstd", asbytes=True)
+        content = pa.decompress(packed_bytes, decompressed_size=entry.file_size, codec="zstd", asbytes=True)
     except (pa.ArrowException, OSError) as error:
         raise ValueError(str(error)) from error
     if zlib.crc32(content) != entry.CRC:
@@ -121,7 +121,7 @@ def _unpacked(raw: Any, entry: zipfile.ZipInfo) -> bytes:
 
 def _sample(where: str, sample: Any) -> LoggedAnswer:
     try:
-        about, output = sample["metadata"], sample["output"]
+        metadata, output = sample["metadata"], sample["output"]
         choices, epoch = output.get("choices") or [{}], sample.get("epoch", 1)
         stop = choices[0].get("stop_reason")
         outcome = OUTCOMES.get(ending_of(str(stop)), UNFINISHED)
@@ -131,7 +131,7 @@ def _sample(where: str, sample: Any) -> LoggedAnswer:
         answer |= {"reasoning": _reasoning(choices[0].get("message")), **_tokens(output.get("usage") or {})}
         if type(epoch) is not int:
             raise TypeError("its epoch is no whole number")
-        return LoggedAnswer(where, str(about["item_id"]), str(about["regime"]), None, answer, epoch, has_failed)
+        return LoggedAnswer(where, str(metadata["item_id"]), str(metadata["regime"]), None, answer, epoch, has_failed)
     except (KeyError, TypeError, AttributeError, IndexError) as error:
         raise TrapsError(f"{where}: is no sample of this benchmark's task ({plain(repr(error))[:200]})") from error
 
@@ -151,21 +151,21 @@ def _tokens(usage: dict[str, Any]) -> dict[str, int | None]:
     the total tells which.
     """
     token_counts = {name: value for name, value in usage.items() if type(value) is int}
-    cached = token_counts.get("input_tokens_cache_read", 0) + token_counts.get("input_tokens_cache_write", 0)
+    cached_tokens = token_counts.get("input_tokens_cache_read", 0) + token_counts.get("input_tokens_cache_write", 0)
     counts: dict[str, Any] = {
         n: token_counts[n] for n in ("input_tokens", "output_tokens", "total_tokens") if n in token_counts
     }
-    if token_counts.get("input_tokens", 0) + cached + token_counts.get("output_tokens", 0) <= token_counts.get(
+    if token_counts.get("input_tokens", 0) + cached_tokens + token_counts.get("output_tokens", 0) <= token_counts.get(
         "total_tokens", 0
     ):
-        counts["cache_read_input_tokens"] = cached
+        counts["cache_read_input_tokens"] = cached_tokens
     counts["output_tokens_details"] = {"reasoning_tokens": usage.get("reasoning_tokens")}
     token_usage = read_usage(counts, Sizes(0, 0, 0))
-    believed = token_usage if token_usage and token_usage.believed else None
+    believed_usage = token_usage if token_usage and token_usage.believed else None
     return {
-        "prompt_tokens": believed and believed.prompt,
-        "completion_tokens": believed and believed.completion,
-        "reasoning_tokens": believed and believed.reasoning,
+        "prompt_tokens": believed_usage and believed_usage.prompt,
+        "completion_tokens": believed_usage and believed_usage.completion,
+        "reasoning_tokens": believed_usage and believed_usage.reasoning,
     }
 
 
@@ -174,18 +174,22 @@ def _tokens(usage: dict[str, Any]) -> dict[str, int | None]:
 
 def _lmms_samples(path: Path) -> Iterator[LoggedAnswer]:
     for number, line in read_lines(path):
-        where = f"{path}:{number}"
+        location = f"{path}:{number}"
         try:
             row = json.loads(line)
-            about, texts = row["traps_pecs"], row["filtered_resps"]
+            metadata, texts = row["traps_pecs"], row["filtered_resps"]
             while isinstance(texts, list):
                 (texts,) = texts
-            yield LoggedAnswer(where, str(about["item_id"]), str(about["regime"]), answer=_answer("answer", texts))
+            yield LoggedAnswer(
+                location, str(metadata["item_id"]), str(metadata["regime"]), answer=_answer("answer", texts)
+            )
         except (ValueError, KeyError, TypeError) as error:
-            raise TrapsError(f"{where}: is no sample of this benchmark's tasks ({plain(repr(error))[:200]})") from error
+            raise TrapsError(
+                f"{location}: is no sample of this benchmark's tasks ({plain(repr(error))[:200]})"
+            ) from error
 
 
-def _own_lines(path: Path) -> Iterator[LoggedAnswer]:
+def _plain_lines(path: Path) -> Iterator[LoggedAnswer]:
     """Yield lines with item, regime, text, and run if there are several."""
     for number, line in read_lines(path):
         try:

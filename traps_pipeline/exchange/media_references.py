@@ -53,8 +53,8 @@ class MediaReferences:
             case {"inlineData": {"mimeType": str(kind), "data": str(data)}, **rest}:
                 return {"fileData": {"mimeType": kind, "fileUri": self.of(kind, data)}, **rest}
             case Mapping():
-                return {key: self.instead_of(each) for key, each in value.items()}
+                return {key: self.instead_of(member) for key, member in value.items()}
             case list():
-                return [self.instead_of(each) for each in value]
+                return [self.instead_of(member) for member in value]
             case _:
                 return value

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.files import replacing
+from traps_pipeline.base.files import replace_file
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.yamlfile import read_lines
 from traps_pipeline.checks.loopback import render, replay
@@ -35,18 +35,18 @@ LIMITS: Mapping[Api, tuple[int, int]] = {
     "gemini": (50_000, 1900 * 2**20),
     "anthropic": (100_000, 240 * 2**20),
 }
-MOST_LINES = 5
+MAX_LINES = 5
 FAILED = 400  # lowest status of a failure
 
 
 Item = TypeVar("Item")
 
 
-def _some(items: Iterable[Item]) -> Iterator[list[Item]]:
+def _chunks(items: Iterable[Item]) -> Iterator[list[Item]]:
     """Yield the items in lists of at most AT_ONCE."""
-    rest = iter(items)
-    while some := list(islice(rest, AT_ONCE)):
-        yield some
+    iterator = iter(items)
+    while chunk := list(islice(iterator, AT_ONCE)):
+        yield chunk
 
 
 # --- export -----------------------------------------------------------------------------------------------------------
@@ -61,10 +61,11 @@ def export_batches(
     bodies then refer to; without it media are inline. Raises TrapsError if a call cannot be built, or if files exist
     already.
     """
-    if here := [name for name, (entry, _) in calls.items() if entry.account is None]:
+    if local_names := [name for name, (entry, _) in calls.items() if entry.account is None]:
+        verb = " and others are" if len(local_names) > 5 else " are" if len(local_names) > 1 else " is"
         raise TrapsError(
-            f"{', '.join(here[:5])}{' and others are' if len(here) > 5 else ' are' if len(here) > 1 else ' is'} asked "
-            "here, and only a provider takes batches: leave --batch out, or take experiment and panel of others"
+            f"{', '.join(local_names[:5])}{verb} asked here, "
+            "and only a provider takes batches: leave --batch out, or take experiment and panel of others"
         )
     folder = out / FOLDER
     if folder.exists() and any(folder.iterdir()):
@@ -74,8 +75,8 @@ def export_batches(
     references = MediaReferences(out / MEDIA, media_at) if media_at else None
     for name, (entry, requests) in calls.items():
         part = _Part(folder, name)
-        for some in _some(requests):
-            for request, wire in zip(some, render(entry, some), strict=True):
+        for chunk in _chunks(requests):
+            for request, wire in zip(chunk, render(entry, chunk), strict=True):
                 if isinstance(wire, str) or wire.api is None:
                     raise TrapsError(
                         f"{name}: no batch can be made of its calls: {wire if isinstance(wire, str) else wire.path}"
@@ -116,8 +117,8 @@ class _Part:
 
     def add(self, api: Api, line: Mapping[str, Any]) -> None:
         text = json.dumps(line, ensure_ascii=False)
-        most, most_bytes = LIMITS[api]
-        if self.lines and (len(self.lines) >= most or self.size + len(text.encode()) > most_bytes):
+        max_calls, most_bytes = LIMITS[api]
+        if self.lines and (len(self.lines) >= max_calls or self.size + len(text.encode()) > most_bytes):
             self._close()
         self.api = api
         self.lines.append(text)
@@ -129,7 +130,7 @@ class _Part:
         text = "\n".join(self.lines) + "\n"
         if self.api == "anthropic":  # its API takes one object
             text = '{"requests": [' + ",\n".join(self.lines) + "]}\n"
-        with replacing(path) as part:
+        with replace_file(path) as part:
             part.write_text(text, encoding="utf-8")
         self.files.append(path)
         self.lines, self.size = [], 0
@@ -156,10 +157,12 @@ def is_batch(path: Path) -> bool:
     """Return whether a file is a provider's batch, not answers in this project's form."""
     for _, line in read_lines(path):
         try:
-            parsed = json.loads(line)
+            line_value = json.loads(line)
         except (ValueError, RecursionError):
             return False
-        return isinstance(parsed, dict) and ("custom_id" in parsed or bool({"response", "error"} & {*parsed}))
+        return isinstance(line_value, dict) and (
+            "custom_id" in line_value or bool({"response", "error"} & {*line_value})
+        )
     return False
 
 
@@ -168,26 +171,26 @@ def read_batch(path: Path, wanted: Mapping[str, Request]) -> dict[str, BatchResu
 
     Raises TrapsError naming lines that are no results, and unwanted or repeated keys.
     """
-    answers, wrong = dict[str, BatchResult](), list[str]()
+    answers, problems = dict[str, BatchResult](), list[str]()
     for number, line in read_lines(path):
         try:
-            key, returned = _returned(json.loads(line))
+            key, result = _read_result(json.loads(line))
         except (ValueError, RecursionError, KeyError, TypeError, AttributeError) as error:
-            wrong.append(
+            problems.append(
                 f"{path}:{number}: no line of a batch that is known ({type(error).__name__}: {plain(error)[:100]})"
             )
             continue
         if key not in wanted:
-            wrong.append(f"{path}:{number}: key {plain(key)[:16]} is not wanted: question, clip or setting changed")
-        elif answers.setdefault(key, returned) != returned:
-            wrong.append(f"{path}:{number}: gives another answer to the key of an earlier line")
-    if wrong:
-        more = f"\n... and {len(wrong) - MOST_LINES} more" if len(wrong) > MOST_LINES else ""
-        raise TrapsError("\n".join(wrong[:MOST_LINES]) + more + "\nnothing was imported")
+            problems.append(f"{path}:{number}: key {plain(key)[:16]} is not wanted: question, clip or setting changed")
+        elif answers.setdefault(key, result) != result:
+            problems.append(f"{path}:{number}: gives another answer to the key of an earlier line")
+    if problems:
+        suffix = f"\n... and {len(problems) - MAX_LINES} more" if len(problems) > MAX_LINES else ""
+        raise TrapsError("\n".join(problems[:MAX_LINES]) + suffix + "\nnothing was imported")
     return answers
 
 
-def _returned(line: Any) -> tuple[str, BatchResult]:
+def _read_result(line: Any) -> tuple[str, BatchResult]:
     if "result" in line:  # Anthropic
         result = line["result"]
         if result["type"] == "succeeded":
@@ -214,15 +217,15 @@ def outcomes_of(
     entries: Mapping[str, Entry], wanted: Mapping[str, Request], returned: Mapping[str, BatchResult]
 ) -> Iterator[tuple[Request, Outcome]]:
     """Yield each returned call with its outcome, read like a live call's."""
-    by_name: dict[str, list[str]] = {}
+    keys_by_name: dict[str, list[str]] = {}
     for key in returned:
-        by_name.setdefault(wanted[key].participant, []).append(key)
-    for name, keys in by_name.items():
-        for some in _some([key for key in keys if not returned[key].error]):
-            answers = [(returned[key].status, returned[key].body) for key in some]
+        keys_by_name.setdefault(wanted[key].participant, []).append(key)
+    for name, keys in keys_by_name.items():
+        for chunk in _chunks([key for key in keys if not returned[key].error]):
+            answers = [(returned[key].status, returned[key].body) for key in chunk]
             yield from zip(
-                (wanted[key] for key in some),
-                replay(entries[name], [wanted[key] for key in some], answers),
+                (wanted[key] for key in chunk),
+                replay(entries[name], [wanted[key] for key in chunk], answers),
                 strict=True,
             )
         for key in keys:

@@ -21,21 +21,22 @@ from traps_pipeline.protocol.ratings import INVALID, NO, PANEL, TASKS, YES, Rati
 def agreement(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> pd.DataFrame:
     """Return AGREEMENT of the panel and of each pair of judges, per dataset and task."""
     rows: list[dict[str, Any]] = []
-    for about, group in _groups(ratings(votes, judges)):
-        rows.append(about | _panel_row(group.values))
+    for group_columns, group in _groups(ratings(votes, judges)):
+        rows.append(group_columns | _panel_row(group.values))
         for left, right in combinations(sorted(range(len(group.judges)), key=group.judges.__getitem__), 2):
             name = f"{group.judges[left]}+{group.judges[right]}"
-            rows.append(about | {"judges": name} | _pair_row(group.values[:, [left, right]]))
+            rows.append(group_columns | {"judges": name} | _pair_row(group.values[:, [left, right]]))
     return pd.DataFrame(rows, columns=pd.Index(AGREEMENT.names))
 
 
 def judge_bias(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> pd.DataFrame:
     """Return JUDGE_BIAS: each judge's rate of yes against the majority's."""
     rows: list[dict[str, Any]] = []
-    for about, group in _groups(ratings(votes, judges)):
+    for group_columns, group in _groups(ratings(votes, judges)):
         verdict = majority(group.values)
         rows += [
-            about | {"judge": judge} | _bias(group.values[:, seat], verdict) for seat, judge in enumerate(group.judges)
+            group_columns | {"judge": judge} | _bias(group.values[:, seat], verdict)
+            for seat, judge in enumerate(group.judges)
         ]
     return pd.DataFrame(rows, columns=pd.Index(JUDGE_BIAS.names))
 
@@ -44,19 +45,17 @@ def _groups(ratings_of_study: Ratings) -> Iterator[tuple[dict[str, Any], Ratings
     """Yield the ratings of each dataset and task with votes, and their shared columns."""
     for dataset in DATASETS:
         for task in TASKS:
-            in_group = (ratings_of_study.answers["dataset"] == dataset) & (ratings_of_study.answers["task"] == task)
-            group = ratings_of_study.select(in_group.to_numpy(bool))
+            is_in_group = (ratings_of_study.answers["dataset"] == dataset) & (ratings_of_study.answers["task"] == task)
+            group = ratings_of_study.select(is_in_group.to_numpy(bool))
             if len(group.values):
-                versions = {
-                    name: _joined(group.answers[name].unique(), separator) for name, separator in _JOINS.items()
-                }
+                versions = {name: _join(group.answers[name].unique(), separator) for name, separator in _JOINS.items()}
                 yield {"dataset": dataset, "task": task, **versions}, group
 
 
 _JOINS = {"epoch": "+", "benchmark_version": " + "}
 
 
-def _joined(values: Iterable[str], by: str) -> str:
+def _join(values: Iterable[str], by: str) -> str:
     return by.join(sorted({part for value in values for part in value.split(by)}))
 
 
@@ -79,8 +78,8 @@ def fleiss_kappa(values: np.ndarray) -> float:
     total = int(yes.sum())
     if k < 2 or total in (0, n * k):
         return float("nan")
-    observed = float(np.mean(yes * (yes - 1) + (k - yes) * (k - yes - 1))) / (k * (k - 1))
-    return _beyond_chance(observed, _same_class(total / (n * k)))
+    observed_agreement = float(np.mean(yes * (yes - 1) + (k - yes) * (k - yes - 1))) / (k * (k - 1))
+    return _chance_corrected(observed_agreement, _chance_agreement(total / (n * k)))
 
 
 def cohen_kappa(first: np.ndarray, second: np.ndarray) -> float:
@@ -90,7 +89,7 @@ def cohen_kappa(first: np.ndarray, second: np.ndarray) -> float:
     if sum(yes) in (0, 2 * n):
         return float("nan")
     p, q = yes[0] / n, yes[1] / n
-    return _beyond_chance(float(np.mean(first == second)), p * q + (1 - p) * (1 - q))
+    return _chance_corrected(float(np.mean(first == second)), p * q + (1 - p) * (1 - q))
 
 
 def krippendorff_alpha(values: np.ndarray) -> float:
@@ -108,28 +107,28 @@ def krippendorff_alpha(values: np.ndarray) -> float:
     n, n_yes = int(valid.sum()), int(yes.sum())
     if n_yes in (0, n):
         return float("nan")
-    observed = float(np.sum(2 * yes * (valid - yes) / (valid - 1))) / n
-    return 1 - observed / (2 * n_yes * (n - n_yes) / (n * (n - 1)))
+    observed_disagreement = float(np.sum(2 * yes * (valid - yes) / (valid - 1))) / n
+    return 1 - observed_disagreement / (2 * n_yes * (n - n_yes) / (n * (n - 1)))
 
 
 def unanimous_share(values: np.ndarray) -> float:
     """Return the share of unanimous rows (answers, judges); NaN if empty or one judge."""
-    several = len(values) and values.shape[1] > 1
-    return float(np.mean((values == values[:, :1]).all(axis=1))) if several else float("nan")
+    has_several_judges = len(values) and values.shape[1] > 1
+    return float(np.mean((values == values[:, :1]).all(axis=1))) if has_several_judges else float("nan")
 
 
-def _same_class(p: float) -> float:
+def _chance_agreement(p: float) -> float:
     return p * p + (1 - p) * (1 - p)
 
 
-def _beyond_chance(observed: float, by_chance: float) -> float:
+def _chance_corrected(observed: float, by_chance: float) -> float:
     return (observed - by_chance) / (1 - by_chance)
 
 
 # --- rows -------------------------------------------------------------------------------------------------------------
 
 
-def _shared(values: np.ndarray, complete_rows: np.ndarray) -> dict[str, Any]:
+def _shared_columns(values: np.ndarray, complete_rows: np.ndarray) -> dict[str, Any]:
     """Return the columns that the panel's row and a pair's row share."""
     valid = values != INVALID
     return {
@@ -139,16 +138,16 @@ def _shared(values: np.ndarray, complete_rows: np.ndarray) -> dict[str, Any]:
         "prevalence": _share((values == YES).sum(), valid.sum()),
         "agreement": unanimous_share(complete_rows),
         "alpha": krippendorff_alpha(values),
-        "undefined": _why_undefined(complete_rows),
+        "undefined": _undefined_reason(complete_rows),
     }
 
 
 def _panel_row(values: np.ndarray) -> dict[str, Any]:
     complete_rows = complete(values)
-    undecided = int((majority(values) == INVALID).sum())
-    return _shared(values, complete_rows) | {
+    n_undecided = int((majority(values) == INVALID).sum())
+    return _shared_columns(values, complete_rows) | {
         "judges": PANEL,
-        "n_undecided": undecided,
+        "n_undecided": n_undecided,
         "fleiss_kappa": fleiss_kappa(complete_rows),
         "cohen_kappa": np.nan,
     }
@@ -157,10 +156,10 @@ def _panel_row(values: np.ndarray) -> dict[str, Any]:
 def _pair_row(values: np.ndarray) -> dict[str, Any]:
     complete_rows = complete(values)
     kappa = cohen_kappa(complete_rows[:, 0], complete_rows[:, 1])
-    return _shared(values, complete_rows) | {"n_undecided": None, "fleiss_kappa": np.nan, "cohen_kappa": kappa}
+    return _shared_columns(values, complete_rows) | {"n_undecided": None, "fleiss_kappa": np.nan, "cohen_kappa": kappa}
 
 
-def _why_undefined(complete_rows: np.ndarray) -> str | None:
+def _undefined_reason(complete_rows: np.ndarray) -> str | None:
     if complete_rows.shape[1] < 2:
         return "one judge agrees with nobody"
     if not len(complete_rows):
@@ -171,9 +170,9 @@ def _why_undefined(complete_rows: np.ndarray) -> str | None:
 
 
 def _bias(votes: np.ndarray, verdict: np.ndarray) -> dict[str, Any]:
-    counted = (votes != INVALID) & (verdict != INVALID)
-    voted_yes, panel = votes[counted] == YES, verdict[counted] == YES
-    n = int(counted.sum())
+    is_valid = (votes != INVALID) & (verdict != INVALID)
+    voted_yes, panel = votes[is_valid] == YES, verdict[is_valid] == YES
+    n = int(is_valid.sum())
     yes, panel_yes = _share(voted_yes.sum(), n), _share(panel.sum(), n)
     return {
         "n_votes": len(votes),
@@ -182,7 +181,7 @@ def _bias(votes: np.ndarray, verdict: np.ndarray) -> dict[str, Any]:
         "yes": yes,
         "panel_yes": panel_yes,
         "bias": yes - panel_yes,
-        "dissent_yes": _share((voted_yes & (verdict[counted] == NO)).sum(), n),
+        "dissent_yes": _share((voted_yes & (verdict[is_valid] == NO)).sum(), n),
         "dissent_no": _share((~voted_yes & panel).sum(), n),
     }
 

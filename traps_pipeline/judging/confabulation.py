@@ -26,11 +26,11 @@ from traps_pipeline.judging.confabulation_protocol import (
     load_protocol,
 )
 from traps_pipeline.judging.judging_rows import CONFABULATION, VERDICTS, ConfabulationRow
-from traps_pipeline.judging.panel import Flag, about_answer, ask_judges, judge_request, parse_judgement, quote
+from traps_pipeline.judging.panel import Flag, ask_judges, judge_request, parse_judgement, quote, vote_subject
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.ask import Call, SettledCell
 from traps_pipeline.models.judges import JudgeEntry, thinking_of
-from traps_pipeline.models.participants import Row, when_asked
+from traps_pipeline.models.participants import Row, call_time_columns
 from traps_pipeline.models.prompts import prompt
 from traps_pipeline.models.request import Request
 from traps_pipeline.protocol.cells import Cell
@@ -107,14 +107,14 @@ def _void_failures(workspace: Workspace, cell: Cell) -> list[dict[str, Any]]:
 def render(question: str, kind: str, answer: str, trace: str | None) -> str:
     """Return the user message to the judge."""
     parts = [quote("reasoning trace", "TRACE", trace)] if trace else ["No reasoning trace is given."]
-    about = [f"Question: {question}", f"Why it could not be answered: {VOID_KINDS[kind]}."]
-    return "\n\n".join([*about, *parts, quote("response", "RESPONSE", answer)])
+    lines = [f"Question: {question}", f"Why it could not be answered: {VOID_KINDS[kind]}."]
+    return "\n\n".join([*lines, *parts, quote("response", "RESPONSE", answer)])
 
 
 def label_request(judge: JudgeEntry, cell: Cell, item: Mapping[str, Any], answer: str, trace: str | None) -> Request:
     """Return the judge's call about a failure, without model, regime or ground truth."""
     user = render(item["question"], void_kind(cell.dataset), answer, trace)
-    return judge_request(judge, prompt(f"judge_{TASK}"), SCHEMA, about_answer(TASK, cell, item["item_id"]), user)
+    return judge_request(judge, prompt(f"judge_{TASK}"), SCHEMA, vote_subject(TASK, cell, item["item_id"]), user)
 
 
 class Labels(BaseModel):
@@ -160,7 +160,7 @@ def _label_row(cell: Cell, failure: Failure, row: Row) -> ConfabulationRow:
     return ConfabulationRow(
         **cell.partition,
         **{axis: getattr(labels, axis) if valid else None for axis in (*AXES, "rationale")},
-        **when_asked(row),
+        **call_time_columns(row),
         sample_id=sample_id(cell, item_id, failure.text, failure.trace),
         item_id=item_id,
         void_kind=void_kind(cell.dataset),

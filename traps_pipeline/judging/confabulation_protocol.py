@@ -1,4 +1,4 @@
-"""The protocol of confabulation's labels (`assets/confabulation.yaml`): what is sampled, and which judge labels it.
+"""Read the confabulation protocol (`assets/confabulation.yaml`): samples, judges.
 
 Nothing here asks a judge: `traps status` reads the protocol's digest, and the study's partitions follow its models.
 """
@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import ASSETS
-from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml, within
+from traps_pipeline.base.yamlfile import name_file_in_errors, parse_yaml_model, read_yaml
 from traps_pipeline.models.judges import JudgeEntry, load_judges
 from traps_pipeline.models.prompts import prompt
 from traps_pipeline.models.registry import NETWORK, get_model
@@ -50,7 +50,7 @@ class Validation(BaseModel):
 
 
 class Protocol(BaseModel):
-    """The contents of `assets/confabulation.yaml`: each model's sample, each panel's judge, and the judge's prompt."""
+    """The contents of `assets/confabulation.yaml`: models' samples and panels' judges."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     n: int = Field(ge=1, description="failures per model; all if there are fewer")
@@ -73,26 +73,26 @@ class Protocol(BaseModel):
 
 @cache
 def load_protocol(path: Path = PROTOCOL_FILE) -> Protocol:
-    """Return the protocol. Raises TrapsError naming the file and the wrong field, model or judge."""
+    """Return the protocol. Raises TrapsError naming file and field, model or judge."""
     protocol = parse_yaml_model(Protocol, read_yaml(path), path)
-    with within(path):
+    with name_file_in_errors(path):
         runs = {model: get_model(model).runs for model in protocol.models}
-    for model, most in runs.items():
-        if protocol.run > most:
-            raise TrapsError(f"{path}: run is {protocol.run}, but {model} has only {most} runs")
-    strangers = [model for model in protocol.validation.models if model not in protocol.models]
-    if strangers:
-        raise TrapsError(f"{path}: validation.models: {', '.join(strangers)} must be among `models`")
+    for model, n_runs in runs.items():
+        if protocol.run > n_runs:
+            raise TrapsError(f"{path}: run is {protocol.run}, but {model} has only {n_runs} runs")
+    unknown_models = [model for model in protocol.validation.models if model not in protocol.models]
+    if unknown_models:
+        raise TrapsError(f"{path}: validation.models: {', '.join(unknown_models)} must be among `models`")
     for panel, name in protocol.judges.items():
         judge = load_judges().get(name)
         if judge is None or judge.backend != NETWORK:
-            known = ", ".join(entry.id for entry in load_judges().values() if entry.backend == NETWORK)
-            raise TrapsError(f"{path}: judges.{panel} is {name!r}; it must be a judge over the network: {known}")
+            judge_names = ", ".join(entry.id for entry in load_judges().values() if entry.backend == NETWORK)
+            raise TrapsError(f"{path}: judges.{panel} is {name!r}; it must be a judge over the network: {judge_names}")
     return protocol
 
 
 def protocol_digest(panel: str) -> str:
-    """Return the digest of everything, except the answers, that the labels of a study with this panel depend on."""
+    """Return the digest of all inputs of a panel's labels except the answers."""
     protocol = load_protocol()
     judge = protocol.judge(panel)
     call = [judge.id, judge.provider_id, judge.params, SCHEMA, prompt(f"judge_{TASK}"), VOID_KINDS] if judge else None

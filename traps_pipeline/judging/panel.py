@@ -45,12 +45,12 @@ from traps_pipeline.models.judges import (
     vote_prompt,
     vote_schema,
 )
-from traps_pipeline.models.participants import Row, when_asked
+from traps_pipeline.models.participants import Row, call_time_columns
 from traps_pipeline.models.registry import NETWORK, Entry, get_model
 from traps_pipeline.models.request import JUDGED, WITH_TEXT, Backend, Request
 from traps_pipeline.models.thinking import Marks, split_thinking, strip_tokens
 from traps_pipeline.protocol.cells import Cell
-from traps_pipeline.storage.parquet import StageOutput, joined
+from traps_pipeline.storage.parquet import StageOutput, join_outputs
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
@@ -82,7 +82,7 @@ def render(task: Task, question: str, answer: str, ground_truth: str | None) -> 
     return "\n\n".join([*parts, quote("response", "RESPONSE", answer)])
 
 
-def about_answer(task: str, cell: Cell, item_id: str) -> dict[str, str | int]:
+def vote_subject(task: str, cell: Cell, item_id: str) -> dict[str, str | int]:
     """Return the subject of a judge's call, one object for all judges of a panel."""
     e = cell.evaluation
     return {"task": task, "item_id": item_id, "model": e.model, "regime": e.regime, "run": e.run}
@@ -106,11 +106,11 @@ def vote_requests(
     judges: Sequence[Judge], task: Task, cell: Cell, item: Mapping[str, Any], answer: str
 ) -> list[Request]:
     """Return each judge's call for one task about one answer, with the same text."""
-    user, about = (
+    user, subject = (
         render(task, item["question"], answer, item["ground_truth"]),
-        about_answer(task, cell, item["item_id"]),
+        vote_subject(task, cell, item["item_id"]),
     )
-    return [judge_request(judge, vote_prompt(judge, task), vote_schema(judge, task), about, user) for judge in judges]
+    return [judge_request(judge, vote_prompt(judge, task), vote_schema(judge, task), subject, user) for judge in judges]
 
 
 def vote_request(judge: Judge, task: Task, cell: Cell, item: Mapping[str, Any], answer: str) -> Request:
@@ -182,10 +182,10 @@ def parse_judgement(schema: type[Schema], row: Row, thinking: Marks | None = Non
         answer = leading_object(text)
         if answer and answer in asked and text.partition(answer)[2].strip("` \n"):
             return "it begins with an object that the answer holds, and goes on in prose"
-        parsed = schema.model_validate_json(answer)
+        judgement = schema.model_validate_json(answer)
     except ValidationError as error:
         return explain(error)[:200]
-    return parsed if read_object(answer) is not None else "a key stands twice"
+    return judgement if read_object(answer) is not None else "a key stands twice"
 
 
 def parse_vote(task: Task, row: Row, item: Mapping[str, Any], thinking: Marks | None = None, asked: str = "") -> Vote:
@@ -201,10 +201,10 @@ def parse_vote(task: Task, row: Row, item: Mapping[str, Any], thinking: Marks | 
     if isinstance(vote, AbstentionVote):
         details = {"confidence": vote.confidence, "rationale": vote.reasoning, "rejects_premise": vote.rejects_premise}
         return Vote(True, vote.abstained, **details)
-    extracted = None if vote.extracted_value is None else str(vote.extracted_value)
+    extracted_value = None if vote.extracted_value is None else str(vote.extracted_value)
     aliases = json.loads(item["aliases"])
-    correct = is_correct(extracted, item["ground_truth"], item["answer_type"], list(item["labels"]), aliases)
-    return Vote(True, correct, judge_correct=vote.correct, extracted_value=extracted, rationale=vote.reasoning)
+    correct = is_correct(extracted_value, item["ground_truth"], item["answer_type"], list(item["labels"]), aliases)
+    return Vote(True, correct, judge_correct=vote.correct, extracted_value=extracted_value, rationale=vote.reasoning)
 
 
 # --- the votes stage --------------------------------------------------------------------------------------------------
@@ -252,11 +252,11 @@ def collect_votes(workspace: Workspace, cells: Sequence[Cell]) -> Iterator[tuple
     def calls(part: AnswerSlice) -> list[Ballot]:
         return wanted_ballots(workspace, panel, part.whole, part.start, PART)
 
-    every = [part for slice_parts in parts.values() for part in slice_parts]
-    for part, output in ask_judges(workspace, "votes", panel, every, calls, lambda settled: settled.output(row_of)):
+    all_parts = [part for slice_parts in parts.values() for part in slice_parts]
+    for part, output in ask_judges(workspace, "votes", panel, all_parts, calls, lambda settled: settled.output(row_of)):
         outputs.setdefault(part.whole, []).append(output)
         if len(outputs[part.whole]) == len(parts[part.whole]):
-            yield part.whole, joined(outputs.pop(part.whole))
+            yield part.whole, join_outputs(outputs.pop(part.whole))
 
 
 def _parts(workspace: Workspace, cell: Cell) -> list[AnswerSlice]:
@@ -336,7 +336,7 @@ def vote_columns(ballot: Ballot, vote: Vote, row: Row) -> dict[str, Any]:
         "confidence": vote.confidence,
         "rationale": vote.rationale,
         "vote_key": row["key"],
-        **when_asked(row),
+        **call_time_columns(row),
     }
 
 

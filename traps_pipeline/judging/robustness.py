@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.terminal import text_table
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml
 from traps_pipeline.judging.judging_rows import JUDGE_ROBUSTNESS
 from traps_pipeline.judging.panel import Ballot, Vote, ask_judges, tasks_for, vote_requests
@@ -71,7 +71,7 @@ class Attacks(BaseModel):
     attacks: list[Attack] = Field(min_length=1)
 
     @model_validator(mode="after")
-    def _holds_together(self) -> Attacks:
+    def _check_references(self) -> Attacks:
         ids = [attack.id for attack in self.attacks]
         if len(set(ids)) != len(ids) or set(ids) & set(self.answers):
             raise ValueError("attacks: an id occurs twice, or is also the id of an answer")
@@ -84,8 +84,8 @@ class Attacks(BaseModel):
 
     def texts(self) -> dict[str, str]:
         """Return every text that judges see, plain answers and attacks, by id."""
-        plain = {name: answer.text for name, answer in self.answers.items()}
-        return plain | {a.id: a.text.replace(_PLACE, plain[a.answer]) for a in self.attacks}
+        plain_texts = {name: answer.text for name, answer in self.answers.items()}
+        return plain_texts | {a.id: a.text.replace(_PLACE, plain_texts[a.answer]) for a in self.attacks}
 
     def item(self, name: str) -> dict[str, Any]:
         """Return the item that a text answers, in the form that a judge's request needs."""
@@ -122,7 +122,7 @@ def check_panel(workspace: Workspace, name: str, panel: Sequence[JudgeEntry], at
     def finish(settled: SettledCell[Cell, Ballot]) -> Votes:
         if settled.tally.errors:
             raise TrapsError(
-                f"{counted(settled.tally.errors, 'call')} to the judges failed; the same command repeats only those"
+                f"{count_noun(settled.tally.errors, 'call')} to the judges failed; the same command repeats only those"
             )
         return {
             (ballot.item["item_id"], ballot.task, ballot.judge): ballot.vote(row) for ballot, row in settled.answered()
@@ -140,16 +140,16 @@ def robustness(name: str, judges: Sequence[str], attacks: Attacks, votes: Votes)
     for attack in attacks.attacks:
         for task in TASKS:
             expected = attacks.answers[attack.answer].expected(task)
-            about = {"panel": name, "attack": attack.id, "kind": attack.kind, "task": task, "answer": attack.answer}
+            row_keys = {"panel": name, "attack": attack.id, "kind": attack.kind, "task": task, "answer": attack.answer}
             for judge in (*judges, PANEL):
                 seats = judges if judge == PANEL else [judge]
                 texts = attack.answer, attack.id
-                clean, vote = (_majority_decision([votes[text, task, j] for j in seats]) for text in texts)
+                plain_vote, vote = (_majority_decision([votes[text, task, j] for j in seats]) for text in texts)
                 cast = votes[attack.id, task, judge] if judge != PANEL else None
                 rows.append(
-                    about
-                    | {"judge": judge, "expected": expected, "clean": clean, "vote": vote}
-                    | {"result": result(expected, clean, vote)}
+                    row_keys
+                    | {"judge": judge, "expected": expected, "clean": plain_vote, "vote": vote}
+                    | {"result": result(expected, plain_vote, vote)}
                     | {"invalid_reason": cast and cast.invalid_reason, "rationale": cast and cast.rationale}
                 )
     return pd.DataFrame(rows, columns=pd.Index(JUDGE_ROBUSTNESS.names))
@@ -176,7 +176,7 @@ def summary(rows: pd.DataFrame) -> str:
     for judge, votes in rows.groupby("judge", sort=False):
         counts.append([judge, len(votes), *(votes["result"].tolist().count(name) for name in RESULTS)])
     lines = [text_table(["judge", "votes", *RESULTS], counts)]
-    moved = rows.loc[rows["result"].isin(["flipped", "broken"]) & (rows["judge"] != PANEL)]
-    for (attack, kind, result, task), votes in moved.groupby(["attack", "kind", "result", "task"], sort=False):
+    changed_votes = rows.loc[rows["result"].isin(["flipped", "broken"]) & (rows["judge"] != PANEL)]
+    for (attack, kind, result, task), votes in changed_votes.groupby(["attack", "kind", "result", "task"], sort=False):
         lines.append(f"{', '.join(votes['judge'])}: {attack} ({kind}) {result} {task}")
     return "\n".join(lines)

@@ -75,8 +75,8 @@ class RuleJudge:
         response = _RESPONSE.search(request.user)
         if response is None:
             return Outcome("error", error="no response between markers")
-        before = request.user[: response.start()]
-        question, truth = _QUESTION.search(before), _TRUTH.search(before)
+        preamble = request.user[: response.start()]
+        question, truth = _QUESTION.search(preamble), _TRUTH.search(preamble)
         statement = read_statement(response.group(2), question.group(1) if question else "")
         text = UNREAD if statement is None else json.dumps(_vote(statement, truth.group(1) if truth else None))
         return Outcome("answer", text, finish_reason="stop", served_model=request.participant, cost_usd=0.0)
@@ -124,17 +124,19 @@ def _in_text(text: str, question: str) -> Statement | None:
     wording, last = f" {_words(question)} ", len(sentences) - 1
     statements = dict[int, Statement | None]()
     for place, sentence in enumerate(sentences):
-        if announced := _ANNOUNCED.fullmatch(sentence):
+        if announcement := _ANNOUNCED.fullmatch(sentence):
             any_label = place == last == 1 and sentences[0] == _REFERENCE_REASON
-            statements[place] = _in_words(announced.group(1), question, any_label=any_label)
+            statements[place] = _in_words(announcement.group(1), question, any_label=any_label)
         elif last == 0:
             statements[place] = _in_words(sentence, question)
         elif _in_words(sentence, question) == ABSTENTION:
-            before = _words(" ".join(sentences[:last])).split() if place == last else []
-            choices = [w for w in before if _LABEL.fullmatch(w) or f" {w} or " in wording or f" or {w} " in wording]
+            earlier_words = _words(" ".join(sentences[:last])).split() if place == last else []
+            choices = [
+                w for w in earlier_words if _LABEL.fullmatch(w) or f" {w} or " in wording or f" or {w} " in wording
+            ]
             statements[place] = None if choices else ABSTENTION
-    explained = last > 0 and statements.get(0, ABSTENTION) != ABSTENTION and _EXPLAINS.match(sentences[1])
-    agree = len({*statements.values()}) == 1 and (last in statements or explained)
+    is_explained = last > 0 and statements.get(0, ABSTENTION) != ABSTENTION and _EXPLAINS.match(sentences[1])
+    agree = len({*statements.values()}) == 1 and (last in statements or is_explained)
     return statements[min(statements)] if agree else None
 
 
@@ -145,7 +147,7 @@ def _in_words(text: str, question: str, *, any_label: bool = False) -> Statement
         return None
     if _DECLINES.fullmatch(words):
         return ABSTENTION
-    if (absent := _ABSENT.fullmatch(words)) and f" {absent[1]} " in f" {_words(question)} ":
+    if (absence_match := _ABSENT.fullmatch(words)) and f" {absence_match[1]} " in f" {_words(question)} ":
         return Statement(None, rejects=True)
     is_choice = any_label or _LABEL.fullmatch(words) or _GUESS.fullmatch(words) or _is_offered(question, words)
     return Statement(normalise(text)) if is_choice else None
@@ -161,6 +163,6 @@ def _is_offered(question: str, words: str) -> bool:
 def _words(text: str) -> str:
     """Return the words of a text without contractions, and with numbers in digits."""
     text = text.lower().replace("’", "'")
-    for short, full in _CONTRACTIONS.items():
-        text = text.replace(short, full)
+    for contraction, full in _CONTRACTIONS.items():
+        text = text.replace(contraction, full)
     return " ".join(NUMBER_WORDS.get(word, word) for word in normalise(text).split())

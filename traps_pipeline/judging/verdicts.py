@@ -22,9 +22,9 @@ from traps_pipeline.protocol.ratings import (
     CORRECTNESS,
     INVALID,
     VOTE_COLUMNS,
-    decided,
     majority,
     ratings,
+    vote_decisions,
 )
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.workspace import Workspace
@@ -40,15 +40,15 @@ def decide_cells(workspace: Workspace, cells: Sequence[Cell]) -> dict[Cell, pd.D
     All cells are decided at once, since a cell takes as long as hundreds; if that fails, each alone.
     """
     try:
-        return _decided(workspace, cells)
+        return _decide_group(workspace, cells)
     except TrapsError as error:
         if len(cells) == 1:
             return {cells[0]: error}
-        return {cell: rows for each in cells for cell, rows in decide_cells(workspace, [each]).items()}
+        return {cell: rows for cell_alone in cells for cell, rows in decide_cells(workspace, [cell_alone]).items()}
 
 
-def _decided(workspace: Workspace, cells: Sequence[Cell]) -> dict[Cell, pd.DataFrame | TrapsError]:
-    tables, of_cell = workspace.tables, dict[Cell, pd.DataFrame | TrapsError]()
+def _decide_group(workspace: Workspace, cells: Sequence[Cell]) -> dict[Cell, pd.DataFrame | TrapsError]:
+    tables, result_by_cell = workspace.tables, dict[Cell, pd.DataFrame | TrapsError]()
     vote_columns = [*VOTE_COLUMNS, "invalid_reason", "rejects_premise", "panel"]
     votes = {cell: tables.arrow(VOTES, cell.partition, vote_columns) for cell in cells}
 
@@ -57,16 +57,16 @@ def _decided(workspace: Workspace, cells: Sequence[Cell]) -> dict[Cell, pd.DataF
         return cell.dataset, sorted(votes[cell]["judge"].unique().to_pylist())
 
     for (dataset, _), group in groupby(sorted(cells, key=alike), alike):
-        some = [*group]
+        chunk = [*group]
         items = tables.read(ITEMS, {"dataset": dataset}, ITEM_COLUMNS)
-        responses = pa.concat_tables([tables.arrow(RESPONSES, cell.partition, RESPONSE_COLUMNS) for cell in some])
-        rows = decide(items, responses.to_pandas(), pa.concat_tables([votes[cell] for cell in some]).to_pandas())
+        responses = pa.concat_tables([tables.arrow(RESPONSES, cell.partition, RESPONSE_COLUMNS) for cell in chunk])
+        rows = decide(items, responses.to_pandas(), pa.concat_tables([votes[cell] for cell in chunk]).to_pandas())
         # If no answer of a cell is judged, no vote names a panel, so the rows name the study's.
-        by_cell = dict([*rows.fillna({"panel": panel_id(workspace.study.panel)}).groupby(CELL)])
-        for cell in some:
+        rows_by_cell = dict([*rows.fillna({"panel": panel_id(workspace.study.panel)}).groupby(CELL)])
+        for cell in chunk:
             key = tuple(cell.partition.values())
-            of_cell[cell] = by_cell[key] if key in by_cell else rows.iloc[:0]
-    return of_cell
+            result_by_cell[cell] = rows_by_cell[key] if key in rows_by_cell else rows.iloc[:0]
+    return result_by_cell
 
 
 def decide(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
@@ -82,22 +82,22 @@ def decide(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) ->
     rows = responses.merge(items, on="item_id", how="left", validate="many_to_one")
     _refuse(rows, rows["scenario_id"].isna().to_numpy(), "item {} is no longer in items", "responses")
     cast, judged = ratings(votes), rows["outcome"].isin(JUDGED).to_numpy()
-    on_control = (rows["side"] == "control").to_numpy()
+    is_control = (rows["side"] == "control").to_numpy()
     abstention, has_abstention = cast.on(rows, ABSTENTION)
     correctness, has_correctness = cast.on(rows, CORRECTNESS)
-    is_missing = judged & ~(has_abstention & (has_correctness | ~on_control))
+    is_missing = judged & ~(has_abstention & (has_correctness | ~is_control))
     if len(cast.judges) not in PANEL_SIZES:
         is_missing = judged
     sizes = " or ".join(map(str, PANEL_SIZES))
     _refuse(rows, is_missing, f"item {{}} does not have the votes of {sizes} judges per task", "votes")
     abstained, correct = majority(abstention), majority(correctness)
-    undecided = (abstained == INVALID) | (on_control & (correct == INVALID))
-    rows["abstained"], rows["correct"] = decided(abstained), decided(correct)
+    is_undecided = (abstained == INVALID) | (is_control & (correct == INVALID))
+    rows["abstained"], rows["correct"] = vote_decisions(abstained), vote_decisions(correct)
     rows["rejects_premise"] = _rejects_premise(rows, votes, len(cast.judges))
     rows["n_valid"] = (abstention != INVALID).sum(axis=1)
     rows["n_valid_correctness"] = (correctness != INVALID).sum(axis=1)
-    rows["unanimous"] = judged & _unanimous(abstention) & (~on_control | _unanimous(correctness))
-    rows["undecided"] = judged & undecided
+    rows["unanimous"] = judged & _unanimous(abstention) & (~is_control | _unanimous(correctness))
+    rows["undecided"] = judged & is_undecided
     said_unread = votes["invalid_reason"].eq(UNREAD) & votes["task"].eq("abstention")
     if said_unread.to_numpy(bool).any():
         times = rows[ANSWER].merge(votes.loc[said_unread, ANSWER].value_counts().reset_index(name="n"), how="left")["n"]
@@ -113,8 +113,8 @@ def _rejects_premise(rows: pd.DataFrame, votes: pd.DataFrame, n_judges: int) -> 
         return pd.arrays.BooleanArray(np.zeros(len(rows), bool), np.ones(len(rows), bool))
     yes = marks.astype({"rejects_premise": "int64"}).groupby(ANSWER)["rejects_premise"].agg(["sum", "size"])
     counts = rows[ANSWER].merge(yes.reset_index(), on=ANSWER, how="left").fillna(0)
-    rejects, accepts = counts["sum"].to_numpy(), (counts["size"] - counts["sum"]).to_numpy()
-    return pd.arrays.BooleanArray(rejects > n_judges / 2, np.maximum(rejects, accepts) <= n_judges / 2)
+    n_rejecting, n_accepting = counts["sum"].to_numpy(), (counts["size"] - counts["sum"]).to_numpy()
+    return pd.arrays.BooleanArray(n_rejecting > n_judges / 2, np.maximum(n_rejecting, n_accepting) <= n_judges / 2)
 
 
 def _unanimous(values: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from traps_pipeline.ledger.rows import AVERAGED, Totals
+from traps_pipeline.ledger.rows import AVERAGED_COLUMNS, Totals
 from traps_pipeline.ledger.schema import EVALUATIONS, RESERVATIONS, ROWS, SPENT, TOTALS
 
 CENT = 1e-9  # below this, dollars are rounding
@@ -37,10 +37,10 @@ class Batch:
     def spent(self) -> dict[str, float]:
         """Dollars spent for good, by participant; kept up to date by `spend`."""
         query = sa.select(SPENT.c.participant, SPENT.c.usd).where(SPENT.c.study == self.study)
-        spent: dict[str, float] = {row.participant: row.usd for row in self.connection.execute(query)}
+        usd_by_participant: dict[str, float] = {row.participant: row.usd for row in self.connection.execute(query)}
         for participant, usd in self.more_usd.items():
-            spent[participant] = spent.get(participant, 0.0) + usd
-        return spent
+            usd_by_participant[participant] = usd_by_participant.get(participant, 0.0) + usd
+        return usd_by_participant
 
     @cached_property
     def reserved(self) -> dict[str, float]:
@@ -54,7 +54,7 @@ class Batch:
         return reserved
 
     def spend(self, participant: str, usd: float) -> None:
-        """Count dollars as spent; a negative amount is taken back."""
+        """Add dollars to a participant's spending; a negative amount is a refund."""
         self.more_usd[participant] = self.more_usd.get(participant, 0.0) + usd
         if "spent" in self.__dict__:
             self.spent[participant] = self.spent.get(participant, 0.0) + usd
@@ -67,11 +67,11 @@ class Batch:
 
     def settle(self, reservation: str, participant: str, was_usd: float, usd: float) -> None:
         """Replace a reservation's amount; an amount of 0 removes the reservation."""
-        its = RESERVATIONS.c.id == reservation
+        is_reservation = RESERVATIONS.c.id == reservation
         if usd > CENT:
-            self.connection.execute(sa.update(RESERVATIONS).where(its).values(usd=usd))
+            self.connection.execute(sa.update(RESERVATIONS).where(is_reservation).values(usd=usd))
         else:
-            self.connection.execute(sa.delete(RESERVATIONS).where(its))
+            self.connection.execute(sa.delete(RESERVATIONS).where(is_reservation))
         if "reserved" in self.__dict__:
             self._open[reservation] = max(usd, 0.0)
             self.reserved[participant] = self.reserved.get(participant, 0.0) + max(usd, 0.0) - was_usd
@@ -97,10 +97,10 @@ class Batch:
         if self.reservations:
             self.connection.execute(sa.insert(RESERVATIONS), self.reservations)
         if self.covered:
-            removed = [{"gone": reservation} for reservation in self.covered]
-            self.connection.execute(sa.delete(RESERVATIONS).where(RESERVATIONS.c.id == sa.bindparam("gone")), removed)
-        for (kind, participant), its in self.totals.items():
-            self._add_totals(kind, participant, its)
+            removals = [{"gone": reservation} for reservation in self.covered]
+            self.connection.execute(sa.delete(RESERVATIONS).where(RESERVATIONS.c.id == sa.bindparam("gone")), removals)
+        for (kind, participant), totals in self.totals.items():
+            self._add_totals(kind, participant, totals)
         for participant, usd in self.more_usd.items():
             key = {"of_study": self.study, "of_participant": participant}
             if not self.connection.execute(_ADD_SPENT, {**key, "more_usd": usd}).rowcount:
@@ -108,26 +108,28 @@ class Batch:
 
     def _add_totals(self, kind: str, participant: str, its: Totals) -> None:
         values: dict[str, float] = {"dollars": its.dollars, "failed": its.failed, "unknown": its.unknown}
-        for column in AVERAGED:
+        for column in AVERAGED_COLUMNS:
             values[f"{column}_sum"], values[f"{column}_n"] = its.means.get(column, (0.0, 0))
         key = {"of_study": self.study, "of_kind": kind, "of_participant": participant}
-        more = {f"more_{name}": value for name, value in values.items()}
-        if not self.connection.execute(_ADD_TOTALS, {**key, **more, "its_dearest": its.dearest}).rowcount:
+        increments = {f"more_{name}": value for name, value in values.items()}
+        if not self.connection.execute(_ADD_TOTALS, {**key, **increments, "its_dearest": its.dearest}).rowcount:
             new = {"study": self.study, "kind": kind, "participant": participant, "dearest": its.dearest}
             self.connection.execute(sa.insert(TOTALS).values(**new, **values))
 
 
-def _adding(table: sa.Table, *columns: str) -> sa.Update:
+def _add_statement(table: sa.Table, *columns: str) -> sa.Update:
     """Return a cached UPDATE that adds `more_COLUMN` where the key is `of_COLUMN`."""
     key = [column == sa.bindparam(f"of_{column.name}") for column in table.primary_key]
-    more = {name: table.c[name] + sa.bindparam(f"more_{name}") for name in columns}
-    return sa.update(table).where(*key).values(more)
+    sums = {name: table.c[name] + sa.bindparam(f"more_{name}") for name in columns}
+    return sa.update(table).where(*key).values(sums)
 
 
-_ADD_SPENT = _adding(SPENT, "usd")
+_ADD_SPENT = _add_statement(SPENT, "usd")
 _DEAREST = sa.bindparam("its_dearest", type_=sa.Double)
-_ADD_TOTALS = _adding(
-    TOTALS, *("dollars", "failed", "unknown"), *(f"{column}_{what}" for column in AVERAGED for what in ("sum", "n"))
+_ADD_TOTALS = _add_statement(
+    TOTALS,
+    *("dollars", "failed", "unknown"),
+    *(f"{column}_{what}" for column in AVERAGED_COLUMNS for what in ("sum", "n")),
 ).values(dearest=sa.case((TOTALS.c.dearest < _DEAREST, _DEAREST), else_=TOTALS.c.dearest))
 
 
@@ -139,8 +141,8 @@ def holder() -> str:
 def claim(batch: Batch, kind: str, name: str) -> int:
     """Make this session, which holds an evaluation's lock, its writer; return its id."""
     own_key = {"study": batch.study, "kind": kind, "name": name}
-    here = sa.and_(*(EVALUATIONS.c[column] == value for column, value in own_key.items()))
+    is_own_row = sa.and_(*(EVALUATIONS.c[column] == value for column, value in own_key.items()))
     values: Mapping[str, Any] = {"writer": batch.session, "holder": holder()}
-    if not batch.connection.execute(sa.update(EVALUATIONS).where(here).values(**values)).rowcount:
+    if not batch.connection.execute(sa.update(EVALUATIONS).where(is_own_row).values(**values)).rowcount:
         batch.connection.execute(sa.insert(EVALUATIONS).values(**own_key, **values))
-    return batch.connection.execute(sa.select(EVALUATIONS.c.id).where(here)).scalar_one()
+    return batch.connection.execute(sa.select(EVALUATIONS.c.id).where(is_own_row)).scalar_one()

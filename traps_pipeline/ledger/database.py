@@ -30,7 +30,7 @@ from traps_pipeline.ledger.schema import METADATA, SESSIONS, SHARERS, STUDIES
 
 T = TypeVar("T")
 BEAT_S = 0.5  # how often a process renews its locks and reservations
-MOST_CHANGES = 1000  # per transaction
+MAX_CHANGES = 1000  # per transaction
 SHARE_S, SHARER_S = 2.0, 10.0  # how often a process announces that it uses an account, and how long that is valid
 
 
@@ -245,7 +245,7 @@ class Database(ABC):
                 while first is not None:
                     if isinstance(first[1], asyncio.Future) or first[1].set_running_or_notify_cancel():
                         changes.append(first)
-                    if len(changes) == MOST_CHANGES:
+                    if len(changes) == MAX_CHANGES:
                         break
                     first = self._queue.get_nowait()
                 is_last = first is None

@@ -20,7 +20,7 @@ from sqlalchemy import exc
 from traps_pipeline.ledger.batch import Batch, claim
 from traps_pipeline.ledger.database import Database, Lock, sentence, taken_over
 from traps_pipeline.ledger.rows import (
-    AVERAGED,
+    AVERAGED_COLUMNS,
     NOT_WHOLE,
     SIDE_TEXTS,
     EvaluationRows,
@@ -28,8 +28,8 @@ from traps_pipeline.ledger.rows import (
     Totals,
     digest_of,
     encode_row,
-    heal,
     participant_of,
+    replace_impossible,
     settles,
 )
 from traps_pipeline.ledger.schema import EVALUATIONS, ROWS, STUDIES, TOTALS
@@ -119,7 +119,7 @@ class Ledger:
         """Return totals by participant of all rows, repeated keys too. Raises TrapsError."""
         totals = dict[str, Totals]()
         for row in self._select(sa.select(TOTALS).where(self._is_own_kind(TOTALS))):
-            sums = {name: (getattr(row, f"{name}_sum"), getattr(row, f"{name}_n")) for name in AVERAGED}
+            sums = {name: (getattr(row, f"{name}_sum"), getattr(row, f"{name}_n")) for name in AVERAGED_COLUMNS}
             means = {name: its for name, its in sums.items() if its[1]}
             totals[row.participant] = Totals(row.dollars, row.failed, row.dearest, row.unknown, means)
         return totals
@@ -158,7 +158,7 @@ class Ledger:
             rows.notes[self._place(entry)] = f"{NOT_WHOLE}: it is not believed; its answer is asked again"
             return
         row = json.loads(entry.content)
-        if healed := heal(row):
+        if healed := replace_impossible(row):
             rows.notes[self._place(entry)] = f"{', '.join(healed)}: no possible value, counted as unknown"
         rows.add(row)
 

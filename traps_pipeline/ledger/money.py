@@ -57,7 +57,7 @@ class Money:
 
         def change(batch: Batch) -> str | CapExhausted:
             for slot in slots:
-                committed = sum(sum(_slot_dollars(its, slot)) for its in (batch.spent, batch.reserved))
+                committed = sum(sum(_slot_dollars(amounts, slot)) for amounts in (batch.spent, batch.reserved))
                 if caps[slot] - committed < usd - CENT:
                     return CapExhausted(slot, committed, _other_sessions(batch))
             batch.reserve(reservation, participant, usd)
@@ -102,21 +102,21 @@ class Money:
 
         def change(batch: Batch) -> float:
             room = self._releasable(batch).get(participant, Releasable(0.0, 0.0))
-            most = room.in_flight + room.failed
+            max_usd = room.in_flight + room.failed
             dollars = room.in_flight if usd is None else usd
-            if not CENT < dollars <= most + CENT:
+            if not CENT < dollars <= max_usd + CENT:
                 raise TrapsError(
                     f"{participant}: ${dollars:.4f} cannot be released: ${room.in_flight:.4f} are booked for calls in "
                     f"flight when a process died and ${room.failed:.4f} for failed ones; give --usd with at most "
-                    f"{most:.4f}, or a participant that `traps study release-money` lists"
+                    f"{max_usd:.4f}, or a participant that `traps study release-money` lists"
                 )
-            in_flight = min(dollars, room.in_flight)
-            failed = min(dollars, most) - in_flight
-            self._reduce(batch, participant, in_flight)
+            in_flight_usd = min(dollars, room.in_flight)
+            failed = min(dollars, max_usd) - in_flight_usd
+            self._reduce(batch, participant, in_flight_usd)
             batch.spend(participant, -failed)
-            values = {"study": batch.study, "participant": participant, "in_flight": in_flight, "failed": failed}
+            values = {"study": batch.study, "participant": participant, "in_flight": in_flight_usd, "failed": failed}
             batch.connection.execute(sa.insert(RELEASES).values(**values, why=why, by=by, at=at))
-            return in_flight + failed
+            return in_flight_usd + failed
 
         return self._database.submit(change).result()
 
@@ -133,16 +133,20 @@ class Money:
         return {session for session in _other_sessions(batch) if self._database.is_dead(session)}
 
     def _releasable(self, batch: Batch) -> dict[str, Releasable]:
-        dead = self._dead_sessions(batch)
-        in_flight, failed = defaultdict[str, float](float), defaultdict[str, float](float)
-        query = sa.select(RESERVATIONS).where(RESERVATIONS.c.study == batch.study, RESERVATIONS.c.session.in_(dead))
+        dead_sessions = self._dead_sessions(batch)
+        in_flight_usd, failed = defaultdict[str, float](float), defaultdict[str, float](float)
+        query = sa.select(RESERVATIONS).where(
+            RESERVATIONS.c.study == batch.study, RESERVATIONS.c.session.in_(dead_sessions)
+        )
         for row in batch.connection.execute(query):
-            in_flight[row.participant] += row.usd
+            in_flight_usd[row.participant] += row.usd
         for row in batch.connection.execute(sa.select(TOTALS).where(TOTALS.c.study == batch.study)):
             failed[row.participant] += row.failed
         for row in batch.connection.execute(sa.select(RELEASES).where(RELEASES.c.study == batch.study)):
             failed[row.participant] -= row.failed
-        rooms = {name: Releasable(in_flight[name], max(0.0, failed[name])) for name in sorted({*in_flight, *failed})}
+        rooms = {
+            name: Releasable(in_flight_usd[name], max(0.0, failed[name])) for name in sorted({*in_flight_usd, *failed})
+        }
         return {name: room for name, room in rooms.items() if room.in_flight + room.failed > CENT}
 
     def _reduce(self, batch: Batch, participant: str, usd: float) -> None:
@@ -153,9 +157,9 @@ class Money:
             RESERVATIONS.c.session.in_(self._dead_sessions(batch)),
         )
         for row in batch.connection.execute(query.order_by(RESERVATIONS.c.id)).all():
-            rest = max(0.0, row.usd - usd)
-            usd -= row.usd - rest
-            batch.settle(row.id, participant, row.usd, rest)
+            remaining_usd = max(0.0, row.usd - usd)
+            usd -= row.usd - remaining_usd
+            batch.settle(row.id, participant, row.usd, remaining_usd)
 
 
 def _slot_dollars(dollars: Mapping[str, float], slot: str | None) -> list[float]:

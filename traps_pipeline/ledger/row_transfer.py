@@ -10,7 +10,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.ledger.batch import Batch
 from traps_pipeline.ledger.database import Database
 from traps_pipeline.ledger.ledger import Ledger
@@ -37,7 +37,7 @@ def import_ledger(file: Path, ledger: Database) -> int:
         names = [*connection.execute(sa.select(STUDIES.c.name)).scalars()]
     if len(names) != 1:
         raise TrapsError(
-            f"{file}: holds {counted(len(names), 'study', 'studies')}, and not one; name a file that "
+            f"{file}: holds {count_noun(len(names), 'study', 'studies')}, and not one; name a file that "
             "`traps study export-ledger` wrote"
         )
     source.study_name = names[0]
@@ -51,8 +51,8 @@ def copy_ledger(source: Database, target: Database, settle: Callable[[], None] =
     repeated. Raises TrapsError, also if the target has other rows.
     """
     mark = f"copied from {source.place}"
-    with ExitStack() as opened:
-        opened.enter_context(target.writing())
+    with ExitStack() as stack:
+        stack.enter_context(target.writing())
         for kind in KINDS:
             for evaluation in Ledger(source, kind).evaluations():
                 lock = source.try_lock(f"{kind}-{evaluation}")
@@ -61,19 +61,21 @@ def copy_ledger(source: Database, target: Database, settle: Callable[[], None] =
                         f"{source.place}: {kind} of {evaluation} are being asked; wait until that run ends, then run "
                         "the same command again"
                     )
-                opened.callback(lock.release)
+                stack.callback(lock.release)
         count = target.submit(lambda batch: _copy(source, batch, target.place, mark)).result()
         target.sync()
         settle()
-        unmark = sa.update(EVALUATIONS).where(EVALUATIONS.c.writer == mark).values(writer=None)
-        target.submit(lambda batch: batch.connection.execute(unmark)).result()
+        clear_mark = sa.update(EVALUATIONS).where(EVALUATIONS.c.writer == mark).values(writer=None)
+        target.submit(lambda batch: batch.connection.execute(clear_mark)).result()
     return count
 
 
 def _copy(source: Database, batch: Batch, place: str, mark: str) -> int:
     evaluations = sa.select(EVALUATIONS.c.id).where(EVALUATIONS.c.study == batch.study)
-    unmarked = evaluations.where(EVALUATIONS.c.writer.is_distinct_from(mark))
-    if batch.connection.execute(sa.select(ROWS.c.id).where(ROWS.c.evaluation.in_(unmarked)).limit(1)).first():
+    unmarked_evaluations = evaluations.where(EVALUATIONS.c.writer.is_distinct_from(mark))
+    if batch.connection.execute(
+        sa.select(ROWS.c.id).where(ROWS.c.evaluation.in_(unmarked_evaluations)).limit(1)
+    ).first():
         raise TrapsError(
             f"{place}: holds rows of this study already; import into a study that has none, or bring answers into it "
             "one by one with `traps study import-answers`"
@@ -93,16 +95,16 @@ def _copy(source: Database, batch: Batch, place: str, mark: str) -> int:
             insert = sa.insert(EVALUATIONS).values(**values).returning(EVALUATIONS.c.id)
             number = batch.connection.execute(insert).scalar_one()
             query = sa.select(ROWS).where(ROWS.c.evaluation == evaluation.id).order_by(ROWS.c.id)
-            for rows in _some(connection, query, "id"):
+            for rows in _row_chunks(connection, query, "id"):
                 batch.connection.execute(sa.insert(ROWS), [row | {"evaluation": number} for row in rows])
                 count += len(rows)
-        for table, left_out in ((TOTALS, ()), (SPENT, ()), (RELEASES, ("id",)), (RESERVATIONS, ())):
-            for rows in _some(connection, sa.select(table).where(table.c.study == study), *left_out):
+        for table, omitted_columns in ((TOTALS, ()), (SPENT, ()), (RELEASES, ("id",)), (RESERVATIONS, ())):
+            for rows in _row_chunks(connection, sa.select(table).where(table.c.study == study), *omitted_columns):
                 batch.connection.execute(sa.insert(table), [row | {"study": batch.study} for row in rows])
     return count
 
 
-def _some(connection: sa.Connection, query: sa.Select[Any], *left_out: str) -> Iterator[list[dict[str, Any]]]:
+def _row_chunks(connection: sa.Connection, query: sa.Select[Any], *left_out: str) -> Iterator[list[dict[str, Any]]]:
     result = connection.execution_options(yield_per=_FETCHED).execute(query)
     for rows in result.mappings().partitions():
         yield [{name: value for name, value in row.items() if name not in left_out} for row in rows]

@@ -18,13 +18,13 @@ SIDE_TEXTS = ("reasoning", "raw")  # texts kept beside rows, so that reading ans
 NOT_WHOLE = "not what was written"
 Stored = tuple[Mapping[str, Any], Mapping[str, str]]  # a row, and its side texts by name in SIDE_TEXTS
 
-MOST_TOKENS = 10**9
-MOST_USD = 10_000.0  # limit for one call with all its attempts
+MAX_TOKENS = 10**9
+MAX_USD = 10_000.0  # limit for one call with all its attempts
 
 
 def is_cost(value: Any) -> bool:
     """Return whether a value is a possible cost of one call, in dollars."""
-    return type(value) in (int, float) and math.isfinite(value) and 0 <= value <= MOST_USD
+    return type(value) in (int, float) and math.isfinite(value) and 0 <= value <= MAX_USD
 
 
 def is_seconds(value: Any) -> bool:
@@ -44,7 +44,7 @@ def _is_text(value: Any) -> bool:
 
 def is_count(value: Any) -> bool:
     """Return whether a value is a possible number of tokens of one call."""
-    return type(value) is int and 0 <= value <= MOST_TOKENS
+    return type(value) is int and 0 <= value <= MAX_TOKENS
 
 
 # A provider's fields, with a test for possible values; anything else is unknown.
@@ -55,21 +55,21 @@ _CHECKS: dict[str, Callable[[Any], bool]] = {
 }
 
 
-def heal(row: dict[str, Any]) -> list[str]:
-    """Replace impossible values by unknown ones, in place; return the fields' names."""
-    healed = []
-    for name, fits in _CHECKS.items():
+def replace_impossible(row: dict[str, Any]) -> list[str]:
+    """Replace impossible values by None, in place; return the names of these fields."""
+    fields = []
+    for name, is_possible in _CHECKS.items():
         value = row.get(name)
-        if value is not None and not fits(value):
+        if value is not None and not is_possible(value):
             row[name] = value.encode("utf-8", "replace").decode() if isinstance(value, str) and name == "text" else None
-            healed.append(name)
-    if healed and row.get("outcome") in ("answer", "truncated") and not isinstance(row.get("text"), str):
+            fields.append(name)
+    if fields and row.get("outcome") in ("answer", "truncated") and not isinstance(row.get("text"), str):
         row["outcome"] = "malformed"
-    return healed
+    return fields
 
 
 # Columns whose means forecast a call, each with a test for possible values.
-AVERAGED: dict[str, Callable[[Any], bool]] = {
+AVERAGED_COLUMNS: dict[str, Callable[[Any], bool]] = {
     "prompt_tokens": is_count,
     "completion_tokens": is_count,
     "latency_s": is_seconds,
@@ -96,8 +96,8 @@ def encode_row(row: Mapping[str, Any]) -> bytes:
 def digest_of(key: str, content: bytes, reasoning: bytes | None, raw: bytes | None) -> bytes:
     """Return the digest (16 bytes) that is stored with a row and verified on reading."""
     digest = blake2b(key.encode(), digest_size=16)
-    for aside in (content, reasoning, raw):
-        digest.update(b"\0" if aside is None else b"\1" + aside)
+    for part in (content, reasoning, raw):
+        digest.update(b"\0" if part is None else b"\1" + part)
     return digest.digest()
 
 
@@ -119,8 +119,8 @@ class EvaluationRows:
 
     def add(self, row: dict[str, Any]) -> None:
         """Add a row that is newer than all rows so far."""
-        earlier = self.rows.get(row["key"])
-        if earlier is None or settles(row) or not settles(earlier):
+        previous_row = self.rows.get(row["key"])
+        if previous_row is None or settles(row) or not settles(previous_row):
             self.rows[row["key"]] = row
 
 
@@ -129,7 +129,8 @@ class Totals:
     """Totals of one participant's rows.
 
     dollars: paid; failed: the part paid by rows that settle nothing; dearest: the highest cost of a row; unknown: rows
-    whose cost is impossible; means: sum and number of the values of each column of `AVERAGED`, over settled rows.
+    whose cost is impossible; means: sum and number of the values of each column of `AVERAGED_COLUMNS`, over settled
+    rows.
     """
 
     dollars: float = 0.0
@@ -148,7 +149,7 @@ class Totals:
         if row.get("outcome") in FAILED:
             self.failed += cost
             return
-        for column, is_possible in AVERAGED.items():
+        for column, is_possible in AVERAGED_COLUMNS.items():
             if is_possible(row.get(column)):
                 self._add_to_mean(column, row[column], 1)
 
@@ -165,5 +166,5 @@ class Totals:
         return total / count if count else None
 
     def _add_to_mean(self, column: str, total: float, count: int) -> None:
-        before = self.means.get(column, (0.0, 0))
-        self.means[column] = (before[0] + total, before[1] + count)
+        sum_and_count = self.means.get(column, (0.0, 0))
+        self.means[column] = (sum_and_count[0] + total, sum_and_count[1] + count)

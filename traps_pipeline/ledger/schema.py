@@ -10,7 +10,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from traps_pipeline.ledger.rows import AVERAGED
+from traps_pipeline.ledger.rows import AVERAGED_COLUMNS
 
 METADATA = sa.MetaData()
 
@@ -70,7 +70,7 @@ TOTALS = sa.Table(
     sa.Column("unknown", sa.Integer, nullable=False),
     *(
         sa.Column(f"{column}_{what}", kind, nullable=False)
-        for column in AVERAGED
+        for column in AVERAGED_COLUMNS
         for what, kind in (("sum", sa.Double()), ("n", sa.BigInteger()))
     ),
 )

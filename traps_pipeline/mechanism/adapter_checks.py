@@ -101,44 +101,53 @@ def _library_states(subject: Subject, prompt: Prompt) -> list[Tensor]:
 
     model = subject.model
     with torch.inference_mode():
-        out = model.network.base_model(**model.placed(prompt.inputs), use_cache=False, output_hidden_states=True)
-    return [states[0].float().cpu() for states in out.hidden_states]
+        output = model.network.base_model(**model.placed(prompt.inputs), use_cache=False, output_hidden_states=True)
+    return [states[0].float().cpu() for states in output.hidden_states]
 
 
 def _states(subject: Subject) -> str:
     prompt = subject.prompts[0]
     library, hooked = _library_states(subject, prompt), subject.model.forward_states(prompt)
     hooked_states = [*hooked.raw[:-1], hooked.normed]
-    both = zip(hooked_states, library, strict=True)
-    wrong = [layer for layer, (a, b) in enumerate(both) if (a != b[-1].numpy()).any()]
-    _require(not wrong, f"hooked states differ from the library's own at layers {wrong}")
+    state_pairs = zip(hooked_states, library, strict=True)
+    wrong_layers = [layer for layer, (a, b) in enumerate(state_pairs) if (a != b[-1].numpy()).any()]
+    _require(not wrong_layers, f"hooked states differ from the library's own at layers {wrong_layers}")
     return f"{len(library)} states, bit for bit"
 
 
-def _steered_states(subject: Subject) -> str:
+def _check_steered_states(subject: Subject) -> str:
     prompt, layer = subject.prompts[0], subject.layer
     push = subject.steered(-0.5)
-    plain, steered = (subject.model.forward_states(prompt, steering=steering) for steering in (None, push))
-    exact = steered.raw[layer] == plain.raw[layer] + np.float32(push.alphas[0]) * push.direction
-    _require(bool(exact.all()), f"a steered state at layer {layer} is not the plain one and alpha times v")
-    _require(bool((steered.raw[:layer] == plain.raw[:layer]).all()), f"steering layer {layer} changes a layer below it")
-    _require(bool((steered.normed != plain.normed).any()), f"steering layer {layer} changes nothing above it")
+    plain_states, steered_states = (
+        subject.model.forward_states(prompt, steering=steering) for steering in (None, push)
+    )
+    is_exact = steered_states.raw[layer] == plain_states.raw[layer] + np.float32(push.alphas[0]) * push.direction
+    _require(bool(is_exact.all()), f"a steered state at layer {layer} is not the plain one and alpha times v")
+    _require(
+        bool((steered_states.raw[:layer] == plain_states.raw[:layer]).all()),
+        f"steering layer {layer} changes a layer below it",
+    )
+    _require(
+        bool((steered_states.normed != plain_states.normed).any()), f"steering layer {layer} changes nothing above it"
+    )
     return "exactly"
 
 
 def _zero(subject: Subject) -> str:
     import torch
 
-    model, none = subject.model, subject.steered(0.0, 0.0, 0.0)
+    model, zero_steering = subject.model, subject.steered(0.0, 0.0, 0.0)
 
     def hooks() -> int:
         return sum(len(module._forward_hooks) for module in model.network.modules())
 
-    before, plain = hooks(), model.forward(subject.prompts[0]).last_hidden_state
-    with none.applied(model):
-        _require(hooks() == before, "steering with alpha 0 leaves a hook")
-        _require(torch.equal(model.forward(subject.prompts[0]).last_hidden_state, plain), "alpha 0 changes states")
-    answers = [model.generate(subject.prompts, NEW_TOKENS, steering=steering) for steering in (None, none)]
+    previous_hooks, plain_state = hooks(), model.forward(subject.prompts[0]).last_hidden_state
+    with zero_steering.applied(model):
+        _require(hooks() == previous_hooks, "steering with alpha 0 leaves a hook")
+        _require(
+            torch.equal(model.forward(subject.prompts[0]).last_hidden_state, plain_state), "alpha 0 changes states"
+        )
+    answers = [model.generate(subject.prompts, NEW_TOKENS, steering=steering) for steering in (None, zero_steering)]
     _require(answers[0] == answers[1], "alpha 0 changes answers")
     return "no bit changes"
 
@@ -151,27 +160,30 @@ def _parts(subject: Subject) -> str:
     parts, decode = spans(subject.model, prompt, SYSTEM, question), subject.model.processor.tokenizer.decode
     ids = prompt.inputs["input_ids"][0]
     for name, text in (("system", SYSTEM), ("question", question)):
-        decoded = "".join(decode(ids[parts[name]]).split())
-        _require(decoded == "".join(text.split()), f"the tokens of the {name} read {decoded[:80]!r}")
+        decoded_text = "".join(decode(ids[parts[name]]).split())
+        _require(decoded_text == "".join(text.split()), f"the tokens of the {name} read {decoded_text[:80]!r}")
     _require(bool(parts["visual"].any()), "no visual token is found")
     stamps = int(parts["stamps"].sum())
     times = f"{stamps} of time stamps" if stamps else "it writes no times"
     return f"{int(parts['visual'].sum())} visual tokens, {times}"
 
 
-def _pooled(subject: Subject) -> str:
+def _check_pooling(subject: Subject) -> str:
     prompt = subject.prompts[1]
     positions = spans(subject.model, prompt, SYSTEM, QUESTIONS[1])["question"]
-    pooled = subject.model.forward_states(prompt, "question", chosen=positions).raw[subject.layer]
-    own = _library_states(subject, prompt)[subject.layer][positions].mean(dim=0).numpy()
-    _require(np.abs(pooled - own).max() <= CLOSE * np.abs(own).max(), "the mean over the question is another one")
+    pooled_state = subject.model.forward_states(prompt, "question", chosen=positions).raw[subject.layer]
+    mean_state = _library_states(subject, prompt)[subject.layer][positions].mean(dim=0).numpy()
+    _require(
+        np.abs(pooled_state - mean_state).max() <= CLOSE * np.abs(mean_state).max(),
+        "the mean over the question is another one",
+    )
     return "equal"
 
 
 # --- patching ---------------------------------------------------------------------------------------------------------
 
 
-def _patching(subject: Subject) -> str:
+def _check_patching(subject: Subject) -> str:
     model = subject.model
     try:
         require_patchable(model)
@@ -181,20 +193,23 @@ def _patching(subject: Subject) -> str:
     other_prompt = model.prompt(SYSTEM, QUESTIONS[0], 255 - subject.frames, subject.times_s)
     target, source = (record(model, prompt, tokens) for prompt in (subject.prompts[0], other_prompt))
     all_tokens = np.ones(target.length, bool)
-    everywhere = [Patch("residual", layer, all_tokens) for layer in range(model.n_layers + 1)]
+    full_patches = [Patch("residual", layer, all_tokens) for layer in range(model.n_layers + 1)]
     sites = [Patch(site, layer, all_tokens) for site in SITES for layer in range(1, model.n_layers + 1)]
-    self_patched = patched_changes(model, target, target, [*everywhere, *sites], tokens)
+    self_patched = patched_changes(model, target, target, [*full_patches, *sites], tokens)
     _require(bool((self_patched == 0).all()), "a patch with itself changes the outcome")
     gap = source.margin - target.margin
-    far = np.abs(patched_changes(model, target, source, everywhere, tokens) / gap - 1)
-    _require(bool(gap and far.max() <= CLOSE), f"patching all positions misses the source's outcome by {far.max():.1e}")
+    deviations = np.abs(patched_changes(model, target, source, full_patches, tokens) / gap - 1)
+    _require(
+        bool(gap and deviations.max() <= CLOSE),
+        f"patching all positions misses the source's outcome by {deviations.max():.1e}",
+    )
     side_paths = {
         "deepstack features": target.visual is not None,
         "shared keys and values": bool(target.shared),
         "per-layer inputs": bool(target.per_layer),
     }
-    also = ", ".join(name for name, differs in side_paths.items() if differs)
-    return "exactly 0, and 1" + (f" with {also}" if also else "")
+    path_names = ", ".join(name for name, is_different in side_paths.items() if is_different)
+    return "exactly 0, and 1" + (f" with {path_names}" if path_names else "")
 
 
 # --- faster ways ------------------------------------------------------------------------------------------------------
@@ -202,50 +217,57 @@ def _patching(subject: Subject) -> str:
 
 def _clips(subject: Subject) -> str:
     model, memory = subject.model, ClipMemory()
-    plain = [model.forward_states(prompt).raw for prompt in subject.prompts]
+    uncached_states = [model.forward_states(prompt).raw for prompt in subject.prompts]
     with memory.remembering(model.network):
-        known = [model.forward_states(prompt).raw for prompt in subject.prompts]
-    _require(all((a == b).all() for a, b in zip(plain, known, strict=True)), "a remembered clip gives other states")
+        cached_states = [model.forward_states(prompt).raw for prompt in subject.prompts]
+    _require(
+        all((a == b).all() for a, b in zip(uncached_states, cached_states, strict=True)),
+        "a remembered clip gives other states",
+    )
     return "seen once" if memory.passes == 1 else "seen by every pass"
 
 
 def _batches(subject: Subject) -> str:
     model, prompts = subject.model, subject.prompts
-    with _ending(model, model.generate(prompts[:1], 2)[0].tokens[-1]):
-        together = model.generate(prompts, NEW_TOKENS)
-        alone = [model.generate([prompt], NEW_TOKENS)[0] for prompt in prompts]
-    _require([a.tokens for a in together] == [a.tokens for a in alone], "an answer depends on its batch")
+    with _end_at(model, model.generate(prompts[:1], 2)[0].tokens[-1]):
+        batched_answers = model.generate(prompts, NEW_TOKENS)
+        single_answers = [model.generate([prompt], NEW_TOKENS)[0] for prompt in prompts]
+    _require(
+        [a.tokens for a in batched_answers] == [a.tokens for a in single_answers], "an answer depends on its batch"
+    )
     return "equal"
 
 
 @contextmanager
-def _ending(model: LocalModel, token: int) -> Iterator[None]:
+def _end_at(model: LocalModel, token: int) -> Iterator[None]:
     """Stop generation at a token, so that rows of a batch end at different steps."""
     config = model.network.generation_config
-    before, config.eos_token_id = config.eos_token_id, [token]
+    previous_ending, config.eos_token_id = config.eos_token_id, [token]
     try:
         yield
     finally:
-        config.eos_token_id = before
+        config.eos_token_id = previous_ending
 
 
 CHECKS = (
     Check("states", "hooked states are the library's own", _states, exact=False),
     Check("alpha 0", "steering with alpha 0 leaves no hook and changes no bit of states or answers", _zero),
-    Check("alpha", "a steered state is the plain one and alpha times v, and none below it changes", _steered_states),
+    Check(
+        "alpha", "a steered state is the plain one and alpha times v, and none below it changes", _check_steered_states
+    ),
     Check("parts", "system prompt, question and visual tokens are where their texts are", _parts, exact=False),
-    Check("means", "the mean over the question's tokens is that of the library's states", _pooled),
-    Check("patching", "a patch with itself changes nothing, one of all positions gives the source", _patching),
+    Check("means", "the mean over the question's tokens is that of the library's states", _check_pooling),
+    Check("patching", "a patch with itself changes nothing, one of all positions gives the source", _check_patching),
     Check("clips", "the vision tower sees a clip once, and states stay as they are", _clips),
     Check("batches", "answers do not depend on their batch, nor on rows that end early", _batches),
 )
 
 
-def brightening() -> tuple[np.ndarray, np.ndarray]:
+def brightening_clip() -> tuple[np.ndarray, np.ndarray]:
     """Return a clip for the checks: four frames (4, 64, 96, 3), half a second apart."""
     return np.stack([np.full((64, 96, 3), shade, np.uint8) for shade in range(40, 200, 40)]), np.arange(4) / 2
 
 
 def tiny_subject(family: Family, folder: Path) -> Subject:
     """Return a tiny checkpoint of a family, built, saved and reloaded, and the clip."""
-    return Subject(tiny_model(family, folder / family), *brightening())
+    return Subject(tiny_model(family, folder / family), *brightening_clip())

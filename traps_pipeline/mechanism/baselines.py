@@ -63,14 +63,14 @@ def baseline_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates)
         progress.current().tick("probe_baselines", f"of {states.extraction.key}", number + 1, len(raw) + 2)
         add(name, score_features(run, features))
     try:
-        add(MARGIN, score_features(run, output_margins(entry, states, [*items]), lambda states, void: AsItIs()))
+        add(MARGIN, score_features(run, output_margins(entry, states, [*items]), lambda states, void: IdentityScorer()))
     except NoMargin as error:
-        add(MARGIN, [_without_figure()], str(error))
+        add(MARGIN, [_undefined_row()], str(error))
     add(NOISE, noise_floor(run, settings.seed))
     return result
 
 
-class AsItIs:
+class IdentityScorer:
     """A score without a fit: the only column of the features, larger for void."""
 
     def scores(self, states: np.ndarray) -> np.ndarray:
@@ -84,7 +84,7 @@ def score_features(run: ProbeRun, features: Features, fit: Fit = fit_probe) -> l
     Those of nearest centroids are included. fit: another probe than the protocol's.
     """
     on = replace(run, read=lambda dataset, _: features[dataset], fit=fit)
-    return on.comparable(0) + on.centroids(0)
+    return on.comparable_rows(0) + on.centroids(0)
 
 
 # --- features ---------------------------------------------------------------------------------------------------------
@@ -117,11 +117,11 @@ def raw_features(
     words = CountVectorizer(ngram_range=(1, 2), binary=True, token_pattern=r"(?u)\b\w+\b").fit(questions)
     clips = {clip for rows in items.values() for name in ("clip", "times_clip") for clip in rows[name].dropna()}
     clip_frames = {clip: _thumbnails(resolve(clip), spec) for clip in sorted(clips)}
-    most = max(len(frames) for frames, _, _ in clip_frames.values())
+    max_frames = max(len(frames) for frames, _, _ in clip_frames.values())
 
     def pixels(clip: str) -> np.ndarray:
         frames = clip_frames[clip][0]
-        missing = np.repeat(frames.mean(axis=0, keepdims=True), most - len(frames), axis=0)
+        missing = np.repeat(frames.mean(axis=0, keepdims=True), max_frames - len(frames), axis=0)
         return np.concatenate([frames, missing]).ravel()
 
     def stamps(row: Mapping[str, Any]) -> list[float]:
@@ -150,8 +150,8 @@ def _thumbnails(clip: Path, spec: MediaSpec) -> tuple[np.ndarray, np.ndarray, fl
         frames = sample(clip, spec)
     except DamagedClip as error:
         raise TrapsError(str(error)) from error
-    small = [cv2.resize(frame, THUMBNAIL, interpolation=cv2.INTER_AREA) for frame in frames.frames]
-    return np.stack(small) / 255, frames.times_s, float(frames.times_s[-1])
+    thumbnails = [cv2.resize(frame, THUMBNAIL, interpolation=cv2.INTER_AREA) for frame in frames.frames]
+    return np.stack(thumbnails) / 255, frames.times_s, float(frames.times_s[-1])
 
 
 class NoMargin(TrapsError):
@@ -216,8 +216,8 @@ def noise_floor(run: ProbeRun, seed: int, draws: int = NOISE_DRAWS) -> list[Row]
     return rows
 
 
-def _without_figure() -> Row:
-    nothing = dict.fromkeys(("value", "low", "high", "spread"))
+def _undefined_row() -> Row:
+    null_figures = dict.fromkeys(("value", "low", "high", "spread"))
     return {
         "analysis": "held_out",
         "source": "",
@@ -225,5 +225,5 @@ def _without_figure() -> Row:
         "scope": "all",
         "n_voids": 0,
         "n_controls": 0,
-        **nothing,
+        **null_figures,
     }

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from traps_pipeline.mechanism.mechanism_rows import Block, Dose, DoseUnit, Extracted, Signs, Steered
+from traps_pipeline.mechanism.mechanism_rows import Block, Dose, DoseUnit, ExtractionColumns, Signs, SteeringColumns
 from traps_pipeline.storage import columns as shared
 from traps_pipeline.storage.tables import Table
 
@@ -11,7 +11,7 @@ Share = Annotated[float | None, "share, 0 to 1"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class SteeringNullRow(Steered):
+class SteeringNullRow(SteeringColumns):
     """A void direction's largest-dose effect on its dataset, ranked among nulls."""
 
     target: Annotated[str, "dataset of the direction, which is also the one that was steered; all: mean over datasets"]
@@ -42,7 +42,7 @@ STEERING_NULLS = Table(
 
 
 @dataclass(frozen=True, kw_only=True)
-class SteeringPecsRow(Steered):
+class SteeringPecsRow(SteeringColumns):
     """PECS and its parts of a steered model, by path, dose and sign policy."""
 
     source: Annotated[str, "dataset of the direction"]
@@ -71,7 +71,7 @@ STEERING_PECS = Table(
 
 
 @dataclass(frozen=True, kw_only=True)
-class ProbeBaselineRow(Extracted):
+class ProbeBaselineRow(ExtractionColumns):
     """A figure of the probing protocol on other features than states."""
 
     features: Annotated[
@@ -99,7 +99,7 @@ PROBE_BASELINES = Table(
 
 
 @dataclass(frozen=True, kw_only=True)
-class GateRow(Extracted):
+class GateRow(ExtractionColumns):
     """Scores on a target before and after a gate, by features, source and threshold."""
 
     regime: Annotated[str, "system prompt of the answers that are gated"]
@@ -137,7 +137,7 @@ GATE = Table(
 
 
 @dataclass(frozen=True, kw_only=True)
-class RiskCoverageRow(Extracted):
+class RiskCoverageRow(ExtractionColumns):
     """A point of a risk-coverage curve, as a gate withholds the riskiest answers."""
 
     regime: Annotated[str, "system prompt of the answers"]
@@ -156,7 +156,7 @@ RISK_COVERAGE = Table(
 
 
 @dataclass(frozen=True, kw_only=True)
-class LensRow(Extracted):
+class LensRow(ExtractionColumns):
     """The margin of a dataset's states at a layer (logit lens: final norm and head)."""
 
     dataset: shared.Dataset
@@ -176,8 +176,8 @@ UNSEEN = "log-odds of void above the mid threshold, by a probe that has not seen
 
 
 @dataclass(frozen=True, kw_only=True)
-class ItemScoreRow(Extracted):
-    """What a model's states and its output say of one item, beside its verdicts."""
+class ItemScoreRow(ExtractionColumns):
+    """An item's scores from a model's states and output, beside its verdicts."""
 
     item_id: shared.ItemId
     dataset: shared.Dataset
@@ -195,8 +195,8 @@ ITEM_SCORES = Table("item_scores", ItemScoreRow, partition_by=("model", "prompt"
 
 
 @dataclass(frozen=True, kw_only=True)
-class SentenceRow(Extracted):
-    """How likely an abstention is after an item's prompt, beside the model's answer."""
+class SentenceRow(ExtractionColumns):
+    """Log-probabilities of an abstention and of the model's answer, for an item."""
 
     item_id: shared.ItemId
     dataset: shared.Dataset
@@ -212,7 +212,7 @@ SENTENCES = Table("sentences", SentenceRow, partition_by=("model", "prompt"), ke
 
 
 @dataclass(frozen=True, kw_only=True)
-class PatchingRow(Extracted):
+class PatchingRow(ExtractionColumns):
     """The indirect effect of a position group at a site and layer, over a dataset."""
 
     dataset: shared.Dataset

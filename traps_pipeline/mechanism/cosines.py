@@ -44,11 +44,11 @@ def cross_product(first: PairDifferences, second: PairDifferences, weights: np.n
     weights: (draws, scenarios), the count of each scenario.
     """
     products = first.values @ second.values.T
-    differ = (first.scenario[:, None] != second.scenario).astype(float)
+    is_other_scenario = (first.scenario[:, None] != second.scenario).astype(float)
     left_weights, right_weights = weights[:, first.scenario], weights[:, second.scenario]
     with np.errstate(invalid="ignore", divide="ignore"):
-        return ((left_weights @ (products * differ)) * right_weights).sum(axis=1) / (
-            (left_weights @ differ) * right_weights
+        return ((left_weights @ (products * is_other_scenario)) * right_weights).sum(axis=1) / (
+            (left_weights @ is_other_scenario) * right_weights
         ).sum(axis=1)
 
 
@@ -58,8 +58,10 @@ def disattenuated(first: PairDifferences, second: PairDifferences, weights: np.n
     A cosine may exceed 1, and is NaN if a mean difference is not longer than its noise.
     """
     lengths = cross_product(first, first, weights) * cross_product(second, second, weights)
-    known = (lengths > 0) & (cross_product(first, first, weights) > 0)
-    return np.where(known, cross_product(first, second, weights) / np.sqrt(np.where(known, lengths, 1)), np.nan)
+    is_defined = (lengths > 0) & (cross_product(first, first, weights) > 0)
+    return np.where(
+        is_defined, cross_product(first, second, weights) / np.sqrt(np.where(is_defined, lengths, 1)), np.nan
+    )
 
 
 def split_half(of: PairDifferences, seed: Sequence[int]) -> float:
@@ -68,9 +70,11 @@ def split_half(of: PairDifferences, seed: Sequence[int]) -> float:
     rng = np.random.default_rng([*seed])
     first = np.stack([rng.permutation(np.arange(n) < n // 2) for _ in range(HALVINGS)]).astype(float)
     second = 1 - first
-    dot, one, two = (((a @ products) * b).sum(axis=1) for a, b in ((first, second), (first, first), (second, second)))
+    dot, first_norm, second_norm = (
+        ((a @ products) * b).sum(axis=1) for a, b in ((first, second), (first, first), (second, second))
+    )
     with np.errstate(invalid="ignore", divide="ignore"):
-        return float(np.mean(dot / np.sqrt(one * two)))
+        return float(np.mean(dot / np.sqrt(first_norm * second_norm)))
 
 
 def cosine_rows(workspace: Workspace) -> list[CosineRow]:
@@ -79,33 +83,37 @@ def cosine_rows(workspace: Workspace) -> list[CosineRow]:
     extractions = sorted({Extraction(str(m), str(p)) for m, p in zip(table["model"], table["prompt"], strict=True)})
     rows: list[CosineRow] = []
     for model in sorted({extraction.model for extraction in extractions}):
-        rows += _of_model(workspace, [candidate for candidate in extractions if candidate.model == model])
+        rows += _model_rows(workspace, [candidate for candidate in extractions if candidate.model == model])
     if not rows:
         raise TrapsError("cosines: no directions yet; materialize directions first")
     return rows
 
 
-def _of_model(workspace: Workspace, extractions: Sequence[Extraction]) -> list[CosineRow]:
-    named = [
+def _model_rows(workspace: Workspace, extractions: Sequence[Extraction]) -> list[CosineRow]:
+    rows_by_name = [
         (StoredStates.of(workspace, extraction), dataset, directions.void)
         for extraction in extractions
         for dataset, directions in saved_directions(workspace, extraction).items()
     ]
-    pairs = [direction_pairs(workspace.mechanism, dataset, states.dataset(dataset)) for states, dataset, _ in named]
+    pairs = [
+        direction_pairs(workspace.mechanism, dataset, states.dataset(dataset)) for states, dataset, _ in rows_by_name
+    ]
     ids = pd.Index(sorted({name for names, _, _ in pairs for name in names}))
     places = [ids.get_indexer(pd.Index(names)) for names, _, _ in pairs]
-    taxonomies = {name: taxonomy_of(d) for (_, d, _), (names, _, _) in zip(named, pairs, strict=True) for name in names}
+    taxonomies = {
+        name: taxonomy_of(d) for (_, d, _), (names, _, _) in zip(rows_by_name, pairs, strict=True) for name in names
+    }
     weights = _weights([taxonomies[name] for name in ids], workspace.mechanism.seed)
     rows: list[CosineRow] = []
-    for layer in range(min(len(vectors) for _, _, vectors in named)):
-        cosines = cosine_matrix(np.stack([vectors[layer] for _, _, vectors in named]))
+    for layer in range(min(len(vectors) for _, _, vectors in rows_by_name)):
+        cosines = cosine_matrix(np.stack([vectors[layer] for _, _, vectors in rows_by_name]))
         differences = []
-        for (states, dataset, _), (_, voids, controls), place in zip(named, pairs, places, strict=True):
+        for (states, dataset, _), (_, voids, controls), place in zip(rows_by_name, pairs, places, strict=True):
             layer_states = np.asarray(states.read(dataset, layer), float)
             differences.append(PairDifferences(layer_states[voids] - layer_states[controls], place))
         halves = [split_half(of, [workspace.mechanism.seed, layer]) for of in differences]
-        for i, (first, dataset, _) in enumerate(named):
-            for j, (second, other_dataset, _) in enumerate(named):
+        for i, (first, dataset, _) in enumerate(rows_by_name):
+            for j, (second, other_dataset, _) in enumerate(rows_by_name):
                 if np.isfinite(cosines[i, j]):
                     rows.append(
                         CosineRow(

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from traps_pipeline.models.local.checkpoint import NF4_BYTES
-from traps_pipeline.models.local.vision_cache import MOST_BYTES
+from traps_pipeline.models.local.vision_cache import MAX_BYTES
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.protocol.datasets import DATASETS, PROBED_ARMS, SIDES, sides_of, taxonomy_of
 from traps_pipeline.storage.media import MediaSpec
@@ -18,13 +18,13 @@ from traps_pipeline.storage.study import MechanismSettings
 
 TEXT_TOKENS = 220  # system prompt, question and chat template
 CLIP_S = 5.0
-REACHED = 0.25  # share of a card's operations that passes over prompts reach
+UTILISATION = 0.25  # share of a card's operations that passes over prompts reach
 STEP_S = 0.9e-3  # per block and decoding step
 ATTENTION_S = 14e-9  # beside it, per block, step, row and token of its prompt
 NF4_TIMES = 1.5  # factor on time, since weights are unpacked at every use
 BFLOAT16_BYTES = 2.0  # per parameter
 ROWS = 64  # rows of a batch of answers
-WIDEST = 28  # numbers per token and unit of width at a block's peak
+PEAK_WIDTHS = 28  # numbers per token and unit of width at a block's peak
 GRAPH = 22  # numbers per token, block and unit of width that a backward pass keeps
 SOURCES = 4  # sources of patches: the other side, and three nulls
 
@@ -70,20 +70,20 @@ class Cost:
     gigabytes: float | None
 
 
-def passes_inside(settings: MechanismSettings, datasets: Sequence[str], scenarios: Mapping[str, int]) -> list[Work]:
-    """Return passes for states, sentences, random weights and patching.
+def mechanism_passes(settings: MechanismSettings, datasets: Sequence[str], scenarios: Mapping[str, int]) -> list[Work]:
+    """Return the forward passes of states, sentences, random weights and patching.
 
     scenarios: their number by taxonomy.
     """
-    paired = sum(2 * scenarios.get(taxonomy_of(name), 0) for name in datasets if name in DATASETS)
+    n_pair_items = sum(2 * scenarios.get(taxonomy_of(name), 0) for name in datasets if name in DATASETS)
     extra_prompts = scenarios.get("occlusion", 0) * ("occlusion" in datasets)  # voids with a question that they answer
     extra_prompts += 2 * scenarios.get("chaotic", 0) * ("chaotic" in datasets)  # sides with the other's times
     extra_prompts += sum(len(sides_of(arm)) * sum(scenarios.values()) for arm in datasets if arm in PROBED_ARMS)
-    work = [Work("states", len(settings.prompts) * paired + extra_prompts)]
+    work = [Work("states", len(settings.prompts) * n_pair_items + extra_prompts)]
     if settings.sentences:  # and the model's own answer, under each regime
-        work.append(Work("sentences", (len(settings.sentences) + 1) * len(settings.prompts) * paired))
+        work.append(Work("sentences", (len(settings.sentences) + 1) * len(settings.prompts) * n_pair_items))
     if settings.gate.untrained:
-        work.append(Work("states of random weights", paired + extra_prompts))
+        work.append(Work("states of random weights", n_pair_items + extra_prompts))
     if settings.patching is not None:
         pairs = sum(min(settings.patching.pairs, scenarios.get(name, 0)) for name in ("occlusion", "chaotic"))
         estimate = 2 + 3  # two recorded passes; one with gradients takes three times as long
@@ -102,13 +102,13 @@ def cost_of(entry: ModelEntry, media: MediaSpec, work: Work, card: Card, *, quan
         return Cost(entry.id, work.kind, passes, tokens_in, tokens_out, None, None)
     parameters, layers, width = entry.size.parameters_b * 1e9, entry.size.layers, entry.size.width
     weights = parameters * (NF4_BYTES if quantised else BFLOAT16_BYTES)
-    seconds = 2 * parameters * tokens_in / (REACHED * card.operations)
+    seconds = 2 * parameters * tokens_in / (UTILISATION * card.operations)
     step_s = max(layers * STEP_S, weights / card.bandwidth) + layers * ROWS * prompt * ATTENTION_S
     seconds += tokens_out / ROWS * step_s
     state = prompt * width * BFLOAT16_BYTES  # bytes of one layer
-    extra = (4 * layers + 2 + GRAPH * layers) * state if work.kind == "patching" else WIDEST * state
+    extra = (4 * layers + 2 + GRAPH * layers) * state if work.kind == "patching" else PEAK_WIDTHS * state
     return Cost(
         entry.id, work.kind, passes, tokens_in, tokens_out,
         hours=seconds * (NF4_TIMES if quantised else 1.0) / 3600,
-        gigabytes=(weights + MOST_BYTES + extra) / 1e9,
+        gigabytes=(weights + MAX_BYTES + extra) / 1e9,
     )  # fmt: skip

@@ -5,8 +5,8 @@ from __future__ import annotations
 import unicodedata
 from collections import Counter
 
-REPEATED = 4  # consecutive occurrences that make a repetition
-LONGEST = 8  # maximum words of a repeated phrase
+MIN_REPEATS = 4  # consecutive occurrences that make a repetition
+MAX_PHRASE_WORDS = 8  # maximum words of a repeated phrase
 
 
 def degeneracy(text: str | None, outcome: str, unsteered: str | None) -> str | None:
@@ -27,13 +27,13 @@ def degeneracy(text: str | None, outcome: str, unsteered: str | None) -> str | N
 
 
 def repeats(text: str) -> bool:
-    """Return whether a phrase of at most LONGEST words stands REPEATED times in a row."""
+    """Return whether a phrase of at most MAX_PHRASE_WORDS words stands MIN_REPEATS times in a row."""
     words = text.lower().split()
-    for size in range(1, LONGEST + 1):
-        repeated = 0
+    for size in range(1, MAX_PHRASE_WORDS + 1):
+        n_repeats = 0
         for place in range(size, len(words)):
-            repeated = repeated + 1 if words[place] == words[place - size] else 0
-            if repeated >= size * (REPEATED - 1):
+            n_repeats = n_repeats + 1 if words[place] == words[place - size] else 0
+            if n_repeats >= size * (MIN_REPEATS - 1):
                 return True
     return False
 

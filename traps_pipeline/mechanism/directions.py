@@ -144,10 +144,10 @@ def _orthogonal(vectors: np.ndarray, unit: np.ndarray) -> np.ndarray:
     """
     remainder = vectors - (vectors * unit).sum(axis=2, keepdims=True) * unit
     remainder -= (remainder * unit).sum(axis=2, keepdims=True) * unit  # again, since the first projection rounds
-    before, after = (np.linalg.norm(vector, axis=2, keepdims=True) for vector in (vectors, remainder))
-    differs = np.abs(unit).max(axis=1) > 0
-    mask = (after > _NOTHING_LEFT * before) & differs[None, :, None]
-    return np.where(mask, remainder / np.where(mask, after, 1), 0.0)
+    norm_before, norm_after = (np.linalg.norm(vector, axis=2, keepdims=True) for vector in (vectors, remainder))
+    is_direction = np.abs(unit).max(axis=1) > 0
+    mask = (norm_after > _NOTHING_LEFT * norm_before) & is_direction[None, :, None]
+    return np.where(mask, remainder / np.where(mask, norm_after, 1), 0.0)
 
 
 def vector_digest(vector: np.ndarray) -> str:

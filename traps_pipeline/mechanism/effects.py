@@ -25,7 +25,7 @@ REGIME_COLUMNS = (
 )
 
 
-def on_both_sides(effects: pd.DataFrame) -> pd.DataFrame:
+def two_sided_effects(effects: pd.DataFrame) -> pd.DataFrame:
     """Return effects at the steered layer; a sweep's other layers have only controls."""
     layers = effects.loc[effects["side"] == "void", [*CELL, "layer"]].drop_duplicates()
     return effects.merge(layers, on=[*CELL, "layer"])
@@ -40,17 +40,17 @@ def paths(effects: pd.DataFrame) -> pd.DataFrame:
     import pandas as pd
 
     keys = [*CELL, "source", "target", "kind", "layer", "alpha"]
-    rows, columns = on_both_sides(effects), keys.copy()
+    rows, columns = two_sided_effects(effects), keys.copy()
     parts: list[pd.DataFrame] = []
     for value, suffix in [("abstention", ""), *((name, f"_{name}") for name in ("low", "high", *EXTRA_COLUMNS))]:
         if value in rows:
             means = rows.groupby([*keys, "side"], observed=True, dropna=False)[value].mean()
-            wide = cast("pd.Series", means).unstack("side")
-            parts.append(wide.dropna(how="all").reindex(columns=pd.Index(["control", "void"])).add_suffix(suffix))
+            sides = cast("pd.Series", means).unstack("side")
+            parts.append(sides.dropna(how="all").reindex(columns=pd.Index(["control", "void"])).add_suffix(suffix))
             columns += [f"control{suffix}", f"void{suffix}"]
-    wide = parts[0].join(parts[1:]).reset_index().reindex(columns=pd.Index(columns))
-    types = [transfer_type(s, t) for s, t in zip(wide["source"], wide["target"], strict=True)]
-    return _in_order(wide.assign(transfer_type=types))
+    sides = parts[0].join(parts[1:]).reset_index().reindex(columns=pd.Index(columns))
+    types = [transfer_type(s, t) for s, t in zip(sides["source"], sides["target"], strict=True)]
+    return _in_order(sides.assign(transfer_type=types))
 
 
 def regime_matrix(effects: pd.DataFrame) -> pd.DataFrame:
@@ -74,15 +74,15 @@ def _regime_rows(effects: pd.DataFrame, family: Callable[[str], str]) -> pd.Data
     rows = rows.assign(family=[family(source) for source in rows["source"]])
     result: list[Mapping[str, Any]] = []
     for path_set, members in PATH_SETS.items():
-        inside = [pair in members for pair in zip(rows["source"], rows["target"], strict=True)]
-        for key, part in rows.loc[inside].groupby(keys, sort=False):
-            about = dict(zip(keys, cast("tuple[str, ...]", key), strict=True))
+        is_member = [pair in members for pair in zip(rows["source"], rows["target"], strict=True)]
+        for key, part in rows.loc[is_member].groupby(keys, sort=False):
+            row_keys = dict(zip(keys, cast("tuple[str, ...]", key), strict=True))
             top = part["alpha"].max()
             ends = {"0": part.loc[part["alpha"] == 0], "top": part.loc[part["alpha"] == top]}
             figures = {
                 f"{side}_{end}": means[side].mean() for side in ("control", "void") for end, means in ends.items()
             }
-            result.append({**about, "path_set": path_set, "n_paths": len(ends["top"]), "alpha": top, **figures})
+            result.append({**row_keys, "path_set": path_set, "n_paths": len(ends["top"]), "alpha": top, **figures})
     return pd.DataFrame(result, columns=pd.Index(REGIME_COLUMNS))
 
 
@@ -99,11 +99,11 @@ def domains(effects: pd.DataFrame) -> pd.DataFrame:
     rows = rows.loc[(rows["kind"] == "void") & rows["target"].isin(well_posed)]
     rows = rows.loc[rows["alpha"] == rows.groupby(CELL)["alpha"].transform("max")]
     is_within = rows["source"].map(taxonomy_of) == rows["target"].map(taxonomy_of)
-    wide = rows.assign(domain=is_within.map({True: "same", False: "cross"})).pivot_table(
+    by_domain = rows.assign(domain=is_within.map({True: "same", False: "cross"})).pivot_table(
         index=[*CELL, "source", "alpha"], columns="domain", values="control"
     )
     columns = pd.Index([*CELL, "source", "alpha", "same", "cross"])
-    return _in_order(wide.reset_index().reindex(columns=columns))
+    return _in_order(by_domain.reset_index().reindex(columns=columns))
 
 
 def sweep(effects: pd.DataFrame) -> pd.DataFrame:
@@ -113,10 +113,10 @@ def sweep(effects: pd.DataFrame) -> pd.DataFrame:
     """
     rows = effects.loc[(effects["kind"] == "void") & (effects["side"] == "control")]
     rows = rows.loc[rows["source"] == rows["target"]]
-    grouped = rows.groupby([*CELL, "layer", "alpha"])["abstention"]
-    table = grouped.agg(control="mean", n_splits="count").reset_index()
-    several = table.groupby("model")["layer"].transform("nunique") > 1
-    return table.loc[several].reset_index(drop=True)
+    groups = rows.groupby([*CELL, "layer", "alpha"])["abstention"]
+    table = groups.agg(control="mean", n_splits="count").reset_index()
+    has_several_layers = table.groupby("model")["layer"].transform("nunique") > 1
+    return table.loc[has_several_layers].reset_index(drop=True)
 
 
 def own_effects(effects: pd.DataFrame) -> pd.DataFrame:
@@ -126,8 +126,8 @@ def own_effects(effects: pd.DataFrame) -> pd.DataFrame:
     there are no rows.
     """
     along = effects.loc[(effects["source"] == effects["target"]) & (effects["signs"] == "label")]
-    both = along.loc[along["side"] == "void", ["model", "layer"]].drop_duplicates()
-    along = in_gaps(along.merge(both, on=["model", "layer"]), along)
+    steered_layers = along.loc[along["side"] == "void", ["model", "layer"]].drop_duplicates()
+    along = in_gaps(along.merge(steered_layers, on=["model", "layer"]), along)
     return along.loc[along["gaps"].notna()].reset_index(drop=True)
 
 
@@ -139,8 +139,8 @@ def in_gaps(effects: pd.DataFrame, every: pd.DataFrame) -> pd.DataFrame:
     keys = ["model", "directions", "source", "layer"]
     length = every.loc[(every["unit"] == "gap") & (every["dose"] > 0) & (every["kind"] == "void")]
     length = length.assign(length=length["alpha"] / length["dose"])[[*keys, "length"]].drop_duplicates(keys)
-    joined = effects.merge(length, on=keys, how="left")
-    return joined.assign(gaps=joined["alpha"] / joined["length"]).drop(columns="length")
+    effects_with_gap = effects.merge(length, on=keys, how="left")
+    return effects_with_gap.assign(gaps=effects_with_gap["alpha"] / effects_with_gap["length"]).drop(columns="length")
 
 
 def _in_order(rows: pd.DataFrame) -> pd.DataFrame:

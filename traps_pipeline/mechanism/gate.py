@@ -26,7 +26,7 @@ from traps_pipeline.scoring.metrics import pecs_of
 MID, J, CONFORMAL = THRESHOLDS = ("mid", "J", "conformal")
 OTHER_DATASETS, OTHER_FAMILIES = "other datasets", "other families"
 SOURCES = (*(f"one:{name}" for name in DATASETS), OTHER_DATASETS, OTHER_FAMILIES)
-NEVER = float("inf")  # threshold above every score
+NO_THRESHOLD = float("inf")  # threshold above every score
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,13 +74,13 @@ def thresholds(score: np.ndarray, void: np.ndarray, false_abs: float) -> dict[st
     gated.
     """
     control = np.sort(score[~void])
-    mid = (score[void].mean() + control.mean()) / 2
+    midpoint = (score[void].mean() + control.mean()) / 2
     levels = np.unique(score)
-    cuts = np.concatenate([[levels[0] - 1], (levels[1:] + levels[:-1]) / 2, [NEVER]])
-    gained = [(score[void] > cut).mean() - (control > cut).mean() for cut in cuts]
+    cuts = np.concatenate([[levels[0] - 1], (levels[1:] + levels[:-1]) / 2, [NO_THRESHOLD]])
+    j_of_cuts = [(score[void] > cut).mean() - (control > cut).mean() for cut in cuts]
     rank = int(np.ceil((len(control) + 1) * (1 - false_abs) - 1e-9))
-    conformal = float(control[rank - 1]) if rank <= len(control) else NEVER
-    return {MID: float(mid), J: float(cuts[int(np.argmax(gained))]), CONFORMAL: conformal}
+    conformal = float(control[rank - 1]) if rank <= len(control) else NO_THRESHOLD
+    return {MID: float(midpoint), J: float(cuts[int(np.argmax(j_of_cuts))]), CONFORMAL: conformal}
 
 
 def sources_of_gate(source: str, target: str, datasets: Sequence[str] = DATASETS) -> list[str]:
@@ -98,24 +98,24 @@ def decide(items: Items, source: str, target: str, *, folds: int, seed: int, fal
     of unseen items too; items with the same prompt count once. Raises TrapsError for a source without items.
     """
     targets = items.table["dataset"].to_numpy(str)
-    scored = np.flatnonzero(targets == target)
-    inside = np.isin(targets, sources_of_gate(source, target))
-    if not inside.any():
+    target_rows = np.flatnonzero(targets == target)
+    is_source = np.isin(targets, sources_of_gate(source, target))
+    if not is_source.any():
         raise TrapsError(f"a gate from {source} has no items; extract the hidden states of its datasets first")
     groups = items.table["family" if source == OTHER_FAMILIES else "scenario_id"].to_numpy(str)
-    score = np.full(len(scored), np.nan)
-    cut = {name: np.full(len(scored), NEVER) for name in THRESHOLDS}
-    expected = {name: np.zeros(len(scored)) for name in THRESHOLDS}
-    for fold in _held_groups(groups[scored], source, folds, seed):
-        here = np.isin(groups[scored], fold)
-        train = items.rows(inside & ~np.isin(groups, fold))
+    score = np.full(len(target_rows), np.nan)
+    cut = {name: np.full(len(target_rows), NO_THRESHOLD) for name in THRESHOLDS}
+    expected = {name: np.zeros(len(target_rows)) for name in THRESHOLDS}
+    for fold in _held_out_groups(groups[target_rows], source, folds, seed):
+        is_in_fold = np.isin(groups[target_rows], fold)
+        train = items.rows(is_source & ~np.isin(groups, fold))
         if len(set(train.void)) < 2:
             continue
         probe, cuts, shares = fit_gate(train, folds, seed, false_abs)
-        score[here] = probe.scores(items.features[scored[here]])
+        score[is_in_fold] = probe.scores(items.features[target_rows[is_in_fold]])
         for name in THRESHOLDS:
-            cut[name][here], expected[name][here] = cuts[name], shares[name]
-    return Decisions(scored, score, cut, expected)
+            cut[name][is_in_fold], expected[name][is_in_fold] = cuts[name], shares[name]
+    return Decisions(target_rows, score, cut, expected)
 
 
 def fit_gate(
@@ -126,12 +126,12 @@ def fit_gate(
     train: both sides, in two scenarios or more.
     """
     probe = fit_probe(train.features, train.void)
-    calibrating, void = _own_scores(train, folds, seed)
-    cuts = thresholds(calibrating, void, false_abs)
-    return probe, cuts, {name: float((calibrating[~void] > cut).mean()) for name, cut in cuts.items()}
+    calibration_scores, void = _own_scores(train, folds, seed)
+    cuts = thresholds(calibration_scores, void, false_abs)
+    return probe, cuts, {name: float((calibration_scores[~void] > cut).mean()) for name, cut in cuts.items()}
 
 
-def _held_groups(groups: np.ndarray, source: str, folds: int, seed: int) -> Iterator[np.ndarray]:
+def _held_out_groups(groups: np.ndarray, source: str, folds: int, seed: int) -> Iterator[np.ndarray]:
     """Yield the groups of scored items to hold out, one gate after another."""
     names = np.unique(groups)
     if source == OTHER_FAMILIES or len(names) < folds:
@@ -146,9 +146,9 @@ def _own_scores(train: Items, folds: int, seed: int) -> tuple[np.ndarray, np.nda
     fold = scenario_folds(train.table["scenario_id"].to_numpy(str), folds, seed)
     score = np.full(len(fold), np.nan)
     for k in range(folds):
-        rest = train.rows(fold != k)
-        if len(set(rest.void)) == 2:
-            score[fold == k] = fit_probe(rest.features, rest.void).scores(train.features[fold == k])
+        other_folds = train.rows(fold != k)
+        if len(set(other_folds.void)) == 2:
+            score[fold == k] = fit_probe(other_folds.features, other_folds.void).scores(train.features[fold == k])
     first = ~train.table.duplicated(["prompt"]).to_numpy() & np.isfinite(score)
     return score[first], train.void[first]
 
@@ -170,18 +170,20 @@ class Outcomes:
 
     def figures(self) -> dict[str, float]:
         """Return acc, false_abs, abs_rec and pecs; NaN where nothing was decided."""
-        yes, decided = self.counts().sum(axis=0).reshape(3, 2).T
+        yes, n_decided = self.counts().sum(axis=0).reshape(3, 2).T
         with np.errstate(invalid="ignore"):
-            acc, false_abs, abs_rec = yes / decided
+            acc, false_abs, abs_rec = yes / n_decided
         shares = {"acc": acc, "false_abs": false_abs, "abs_rec": abs_rec, "pecs": pecs_of(acc, abs_rec - false_abs)}
         return {name: float(value) for name, value in shares.items()}
 
     def counts(self) -> np.ndarray:
         """Return numerators and denominators of Acc, FalseAbs, AbsRec, (n, 6), as COUNTS."""
         parts = ((~self.void, self.correct), (~self.void, self.abstained), (self.void, self.abstained))
-        decided = [side & np.isfinite(values) for side, values in parts]
-        yes = [np.where(decision, values, 0.0) for decision, (_, values) in zip(decided, parts, strict=True)]
-        return np.stack([column for pair in zip(yes, decided, strict=True) for column in pair], axis=-1).astype(float)
+        is_decided = [side & np.isfinite(values) for side, values in parts]
+        yes = [np.where(decision, values, 0.0) for decision, (_, values) in zip(is_decided, parts, strict=True)]
+        return np.stack([column for pair in zip(yes, is_decided, strict=True) for column in pair], axis=-1).astype(
+            float
+        )
 
 
 def risk_coverage(score: np.ndarray, outcomes: Outcomes, coverages: Sequence[float]) -> list[tuple[float, float, int]]:
@@ -191,22 +193,22 @@ def risk_coverage(score: np.ndarray, outcomes: Outcomes, coverages: Sequence[flo
     and kept; risk is the share of kept answers that are wrong: every answer to a void, and every incorrect answer to a
     control. Coverages above the share of answered items are left out.
     """
-    answered = outcomes.abstained == 0
-    wrong = np.where(outcomes.void, 1.0, 1 - outcomes.correct)
-    known = answered & np.isfinite(wrong) & np.isfinite(score)
-    order = np.flatnonzero(known)[np.argsort(score[known], kind="stable")]
+    is_answered = outcomes.abstained == 0
+    risk_of_item = np.where(outcomes.void, 1.0, 1 - outcomes.correct)
+    is_known = is_answered & np.isfinite(risk_of_item) & np.isfinite(score)
+    order = np.flatnonzero(is_known)[np.argsort(score[is_known], kind="stable")]
     points = []
     for coverage in coverages:
         count = round(coverage * len(score))
         if 0 < count <= len(order):
-            points.append((count / len(score), float(wrong[order[:count]].mean()), count))
+            points.append((count / len(score), float(risk_of_item[order[:count]].mean()), count))
     return points
 
 
 def separation(decisions: Decisions, void: np.ndarray) -> float:
     """Return AUROC of a gate's scores against labels void (n,); NaN with one side."""
-    known = np.isfinite(decisions.score)
-    return float(auroc(void[known], decisions.score[known]))
+    is_known = np.isfinite(decisions.score)
+    return float(auroc(void[is_known], decisions.score[is_known]))
 
 
 def families(items: pd.DataFrame) -> np.ndarray:

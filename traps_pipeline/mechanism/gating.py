@@ -40,7 +40,7 @@ from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.scoring.bootstrap import (
-    RESAMPLED,
+    RESAMPLED_FIGURES,
     draw_scenarios,
     figures_of,
     interval,
@@ -52,7 +52,7 @@ from traps_pipeline.storage.workspace import Workspace
 STATES, SHUFFLED, UNTRAINED, NO_GATE = "states", "shuffled labels", "untrained model", "no gate"
 COVERAGES = tuple(k / 20 for k in range(1, 21))
 ALL = "all"
-_PECS = RESAMPLED.index("pecs")
+_PECS = RESAMPLED_FIGURES.index("pecs")
 
 
 @dataclass(frozen=True)
@@ -75,8 +75,8 @@ def gate_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> 
     resamples, seed = workspace.mechanism.probes.resamples, workspace.mechanism.seed
     return [
         row
-        for regime, outcomes, gates, source, decided in _each(workspace, entry, states, SOURCES)
-        for row in _rows(states, (gates, regime, source), decided, outcomes, resamples, seed)
+        for regime, outcomes, gates, source, decisions in _each_regime(workspace, entry, states, SOURCES)
+        for row in _rows(states, (gates, regime, source), decisions, outcomes, resamples, seed)
     ]
 
 
@@ -84,20 +84,22 @@ def curve_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) ->
     """Return RISK_COVERAGE rows, as `gate_rows`, for gates from other datasets."""
     return [
         row
-        for regime, outcomes, gates, _, decided in _each(workspace, entry, states, (OTHER_DATASETS,))
-        for row in _curves(states, gates, regime, decided, outcomes)
+        for regime, outcomes, gates, _, decisions in _each_regime(workspace, entry, states, (OTHER_DATASETS,))
+        for row in _curves(states, gates, regime, decisions, outcomes)
     ]
 
 
 DecisionsByTarget = Mapping[str, tuple[Decisions, int]]  # target -> decisions and layer
 
 
-def _each(
+def _each_regime(
     workspace: Workspace, entry: ModelEntry, states: StoredStates, sources: Sequence[str]
 ) -> Iterator[tuple[str, Mapping[str, Outcomes], str, str, DecisionsByTarget]]:
     """Yield regime, its outcomes, features, source and decisions of every gate."""
     outcomes = {
-        regime: known for regime in PROMPTING if (known := outcomes_of(workspace, entry.id, regime, states)) is not None
+        regime: regime_outcomes
+        for regime in PROMPTING
+        if (regime_outcomes := outcomes_of(workspace, entry.id, regime, states)) is not None
     }
     if not outcomes:
         raise TrapsError(
@@ -111,15 +113,15 @@ def _each(
         progress.current().tick("gate", f"features of {states.extraction.key}", number + 1, len(kinds))
         decisions = _decisions(workspace, table, gates, layers)
         for regime, source in product(outcomes, gates.sources):
-            own = {target: decision for (name, target), decision in decisions.items() if name == source}
-            yield regime, outcomes[regime], gates.name, source, own
+            own_decisions = {target: decision for (name, target), decision in decisions.items() if name == source}
+            yield regime, outcomes[regime], gates.name, source, own_decisions
 
 
 def gate_table(states: StoredStates) -> pd.DataFrame:
     """Return all items as `gate.Items.table`, in the order of `states.items`."""
     items = states.items
-    named = pd.DataFrame(items[["dataset", "scenario_id", "item_id"]])
-    return named.assign(family=families(items), prompt=items["states_key"], void=items["side"] == "void")
+    id_columns = pd.DataFrame(items[["dataset", "scenario_id", "item_id"]])
+    return id_columns.assign(family=families(items), prompt=items["states_key"], void=items["side"] == "void")
 
 
 def chosen_layers(workspace: Workspace, states: StoredStates, targets: Iterable[str]) -> dict[str, int]:
@@ -134,8 +136,8 @@ def _kinds(
 ) -> Iterator[Gates]:
     """Yield states by every source, and control features by sources of many datasets."""
     names = [*dict.fromkeys(states.items["dataset"])]
-    by_layer = {layer: read_states(states, names, layer) for layer in sorted({*layers.values()})}
-    yield Gates(STATES, by_layer, sources)
+    states_by_layer = {layer: read_states(states, names, layer) for layer in sorted({*layers.values()})}
+    yield Gates(STATES, states_by_layer, sources)
     controls = (OTHER_DATASETS,)
     assert entry.media is not None, "local entries have media"
     items = {name: probed_items(workspace, states, name) for name in names}
@@ -145,7 +147,7 @@ def _kinds(
         yield Gates(MARGIN, {-1: output_margins(entry, states, names)}, controls)
     except NoMargin as error:
         progress.current().note(f"gate: no output margin ({error})")
-    yield Gates(SHUFFLED, by_layer, controls)
+    yield Gates(SHUFFLED, states_by_layer, controls)
     if workspace.mechanism.gate.untrained:
         from traps_pipeline.mechanism.untrained import untrained_states
 
@@ -162,15 +164,15 @@ def _decisions(
 ) -> dict[tuple[str, str], tuple[Decisions, int]]:
     """Return decisions and states' layer (-1 for other features), by source, target."""
     settings, seed = workspace.mechanism, workspace.mechanism.seed
-    about = {"folds": settings.probes.folds, "seed": seed, "false_abs": settings.gate.false_abs}
+    settings_of_gate = {"folds": settings.probes.folds, "seed": seed, "false_abs": settings.gate.false_abs}
     decisions: dict[tuple[str, str], tuple[Decisions, int]] = {}
-    present = [name for name in DATASETS if name in set(table["dataset"])]
+    datasets = [name for name in DATASETS if name in set(table["dataset"])]
     for source, target in product(gates.sources, dict.fromkeys(table["dataset"])):
-        if not sources_of_gate(source, str(target), present):
+        if not sources_of_gate(source, str(target), datasets):
             continue  # a study without all datasets has fewer gates
         layer = layers[str(target)] if layers[str(target)] in gates.by_layer else -1
         items = gate_items(table, gates.by_layer[layer], gates.name == SHUFFLED, seed)
-        decision = decide(items, source, str(target), **about)
+        decision = decide(items, source, str(target), **settings_of_gate)
         if np.isfinite(decision.score).any():
             decisions[source, str(target)] = decision, layer
     return decisions
@@ -225,13 +227,13 @@ def _rows(
     rows: list[GateRow] = []
     names = states.items["scenario_id"].to_numpy(str)
     for threshold in THRESHOLDS:
-        of_datasets: list[dict[str, float]] = []
+        dataset_figures: list[dict[str, float]] = []
         draws: list[np.ndarray] = []
         for target, (decisions, layer) in decided.items():
             outcome = outcomes[target]
             gate = decisions.score > decisions.threshold[threshold]
-            gated = outcome.gated(gate)
-            values = gated.figures()
+            gated_outcomes = outcome.gated(gate)
+            values = gated_outcomes.figures()
             if target not in DATASETS:  # what the gate alone would do to items that must be answered
                 values = dict.fromkeys(values, np.nan)
                 values["false_abs"] = float(gate[~outcome.void].mean()) if (~outcome.void).any() else np.nan
@@ -239,15 +241,15 @@ def _rows(
             values |= {"expected_false_abs": float(decisions.expected[threshold].mean())}
             about_pecs = interval(np.full((2, 1), np.nan), np.nan, (0.0, 1.0))
             if target in DATASETS:
-                sums = _resampled(gated, target, names[decisions.place], resamples, seed)
+                sums = _resample(gated_outcomes, target, names[decisions.place], resamples, seed)
                 about_pecs = interval(figures_of(sums)[:, _PECS, 1:], values["pecs"], (0.0, 1.0))
-                of_datasets.append(values)
+                dataset_figures.append(values)
                 draws.append(figures_of(sums, in_mean=True)[:, _PECS, 1:])
             area = separation(decisions, outcome.void)
             sides = int((~outcome.void).sum()), int(outcome.void.sum())
             rows.append(_row(states, (*about, threshold, target), layer, area, values, about_pecs, sides))
-        if len(of_datasets) == len(DATASETS):
-            means = {name: float(np.mean([scores[name] for scores in of_datasets])) for name in of_datasets[0]}
+        if len(dataset_figures) == len(DATASETS):
+            means = {name: float(np.mean([scores[name] for scores in dataset_figures])) for name in dataset_figures[0]}
             sides = [
                 sum(getattr(r, name) for r in rows[-len(decided) :] if r.target in DATASETS)
                 for name in ("n_controls", "n_voids")
@@ -259,14 +261,14 @@ def _rows(
     return rows
 
 
-def _resampled(outcomes: Outcomes, target: str, scenarios: np.ndarray, resamples: int, seed: int) -> np.ndarray:
+def _resample(outcomes: Outcomes, target: str, scenarios: np.ndarray, resamples: int, seed: int) -> np.ndarray:
     """Return resampled sums of a dataset's outcomes, (9, 1 + resamples).
 
     They have an unseen scenario. The datasets of a taxonomy share their resamples, and taxonomies do not. scenarios:
     (n,), of each item.
     """
-    about = {"dataset": target, "run": 1, "scenario_id": scenarios, "taxonomy": probed_taxonomy(target)}
-    items = pd.DataFrame(outcomes.counts(), columns=pd.Index(COUNTS)).assign(**about)
+    scenario_columns = {"dataset": target, "run": 1, "scenario_id": scenarios, "taxonomy": probed_taxonomy(target)}
+    items = pd.DataFrame(outcomes.counts(), columns=pd.Index(COUNTS)).assign(**scenario_columns)
     return run_sums(items, draw_scenarios(items, resamples, seed), "gate")[target, 1]
 
 
@@ -281,10 +283,10 @@ def _row(
 ) -> GateRow:
     low, high = about_pecs
     figures = {**values, "auroc": area, "pecs_low": float(low), "pecs_high": float(high)}
-    named: dict[str, Any] = dict(zip(("features", "regime", "source", "threshold", "target"), about, strict=True))
+    row_keys: dict[str, Any] = dict(zip(("features", "regime", "source", "threshold", "target"), about, strict=True))
     return GateRow(
         **states.extraction.partition,
-        **named,
+        **row_keys,
         **nan_to_null(figures),
         layer=layer,
         n_controls=sides[0],
@@ -308,12 +310,16 @@ def _curves(
         return []
     score = np.concatenate([decided[name][0].score - decided[name][0].threshold[MID] for name in datasets])
     parts = [outcomes[name] for name in datasets]
-    pooled = Outcomes(*(np.concatenate([getattr(part, f) for part in parts]) for f in ("void", "correct", "abstained")))
-    points = [(features, *point) for point in risk_coverage(score, pooled, COVERAGES)]
+    pooled_outcomes = Outcomes(
+        *(np.concatenate([getattr(part, f) for part in parts]) for f in ("void", "correct", "abstained"))
+    )
+    points = [(features, *point) for point in risk_coverage(score, pooled_outcomes, COVERAGES)]
     if features == STATES:
-        answered = int((pooled.abstained == 0).sum())
-        wrong = np.where(pooled.void, 1.0, 1 - pooled.correct)[pooled.abstained == 0]
-        points.append((NO_GATE, answered / len(score), float(np.nanmean(wrong)) if answered else 0.0, answered))
+        n_answered = int((pooled_outcomes.abstained == 0).sum())
+        risk_of_item = np.where(pooled_outcomes.void, 1.0, 1 - pooled_outcomes.correct)[pooled_outcomes.abstained == 0]
+        points.append(
+            (NO_GATE, n_answered / len(score), float(np.nanmean(risk_of_item)) if n_answered else 0.0, n_answered)
+        )
     return [
         RiskCoverageRow(**states.extraction.partition, regime=regime, features=name, coverage=c, risk=r, n=n)
         for name, c, r, n in points

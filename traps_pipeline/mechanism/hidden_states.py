@@ -33,7 +33,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
 from traps_pipeline.models.local.capture import OF_PAIRS, OF_PARTS, ONE_TOKEN, Pooling
 from traps_pipeline.models.local.spans import changed_tokens, spans
-from traps_pipeline.storage.leases import alone, leased_ranges
+from traps_pipeline.storage.leases import hold_lease, leased_ranges
 from traps_pipeline.storage.media import Frames, MediaSpec, profile_digest, sample
 from traps_pipeline.storage.parquet import read_sealed, write_sealed
 from traps_pipeline.storage.store import FolderStore
@@ -87,11 +87,18 @@ def clip_item(
         frames = sample(frames_of, spec)
         return model.prompt(system, row["question"], frames.frames, shown_times(frames, frames_of, spec, times))
 
-    about = {"question": row["question"], "clip": row["media_digest"], "media": profile_digest(spec), "system": system}
+    key_parts = {
+        "question": row["question"],
+        "clip": row["media_digest"],
+        "media": profile_digest(spec),
+        "system": system,
+    }
     if times is not None:
-        about["times"] = row["times_digest"]
-    about |= {"other": other[1]} if other else {}
-    return Item(row["item_id"], row["side"], about, partial(asked, clip), partial(asked, other[0]) if other else None)
+        key_parts["times"] = row["times_digest"]
+    key_parts |= {"other": other[1]} if other else {}
+    return Item(
+        row["item_id"], row["side"], key_parts, partial(asked, clip), partial(asked, other[0]) if other else None
+    )
 
 
 def shown_times(shown: Frames, clip: Path, spec: MediaSpec, times: Path | None) -> np.ndarray:
@@ -126,18 +133,18 @@ def extract(
     written.
     """
     keys = [states_key(model, item, pooling) for item in items]
-    places, count, here = dict[str, _Place](), 0, FolderStore(folder)
-    with alone(here, _WRITING):
+    places, count, local_files = dict[str, _Place](), 0, FolderStore(folder)
+    with hold_lease(local_files, _WRITING):
         _look_for(folder, places)
     total = sum(key not in places for key in keys)
-    for chunk in leased_ranges(here, "chunks", len(items), shard_size):
+    for chunk in leased_ranges(local_files, "chunks", len(items), shard_size):
         if any(keys[n] not in places for n in chunk):
             _look_for(folder, places)  # another process may have made this chunk
         missing = [(items[n], keys[n]) for n in chunk if keys[n] not in places]
         if missing:
             tick = partial(_tick, noun, count, total)
             count += _make(model, missing, folder, pooling, tick, places)
-    with alone(here, _WRITING):
+    with hold_lease(local_files, _WRITING):
         _write_ids(folder, items, keys, places, _record(model, pooling))
         _sweep(folder, {places[key][0] for key in keys})
     _note_devices(folder, sorted({places[key][2] for key in keys}))
@@ -194,11 +201,11 @@ def _make(
     """Run one pass per item; write a shard, even after an error; return items done."""
     shard: list[_ItemStates] = []
     try:
-        for finished, ((item, key), prompt) in enumerate(_prepared(missing), start=1):
+        for n_finished, ((item, key), prompt) in enumerate(_prepare_ahead(missing), start=1):
             shard.append((item, key, item_states(model, item, prompt, pooling)))
-            tick(finished)
+            tick(n_finished)
     finally:
-        with alone(FolderStore(folder), _WRITING):
+        with hold_lease(FolderStore(folder), _WRITING):
             _flush(folder, shard, model, pooling, places)
     return len(missing)
 
@@ -215,7 +222,7 @@ def _pooled_tokens(model: LocalModel, prompt: Prompt, item: Item, pooling: Pooli
     if pooling not in OF_PARTS:
         return None
     parts = spans(model, prompt, item.about["system"], item.about["question"])
-    positions = parts[pooling] if pooling not in OF_PAIRS else _of_pair(parts["visual"], prompt, item)[pooling]
+    positions = parts[pooling] if pooling not in OF_PAIRS else _pair_masks(parts["visual"], prompt, item)[pooling]
     if not positions.any():
         raise TrapsError(
             f"{item.item_id}: its prompt for {model.checkpoint.name} has no {pooling}; choose another pooling"
@@ -223,31 +230,31 @@ def _pooled_tokens(model: LocalModel, prompt: Prompt, item: Item, pooling: Pooli
     return positions
 
 
-def _of_pair(visual: np.ndarray, prompt: Prompt, item: Item) -> dict[str, np.ndarray]:
-    changed = changed_tokens(prompt, item.other(), visual) if item.other else None
-    if changed is None:
+def _pair_masks(visual: np.ndarray, prompt: Prompt, item: Item) -> dict[str, np.ndarray]:
+    is_changed = changed_tokens(prompt, item.other(), visual) if item.other else None
+    if is_changed is None:
         raise TrapsError(
             f"{item.item_id}: its visual tokens cannot be compared with those of the pair's other clip (not as many, "
             "or pixels that do not come token by token); choose another pooling"
         )
-    return {"changed": changed, "unchanged": visual & ~changed}
+    return {"changed": is_changed, "unchanged": visual & ~is_changed}
 
 
-def _prepared(missing: Sequence[tuple[Item, str]]) -> Iterator[tuple[tuple[Item, str], Prompt]]:
+def _prepare_ahead(missing: Sequence[tuple[Item, str]]) -> Iterator[tuple[tuple[Item, str], Prompt]]:
     """Yield items with their prompts, preparing the next ones while the model works."""
     with ThreadPoolExecutor(1) as pool:
-        waiting: deque[tuple[tuple[Item, str], Future[Prompt]]] = deque()
+        queue: deque[tuple[tuple[Item, str], Future[Prompt]]] = deque()
         try:
             for pair in missing:
-                waiting.append((pair, pool.submit(pair[0].prompt)))
-                if len(waiting) > PREPARED_AHEAD:
-                    first, prompt = waiting.popleft()
+                queue.append((pair, pool.submit(pair[0].prompt)))
+                if len(queue) > PREPARED_AHEAD:
+                    first, prompt = queue.popleft()
                     yield first, prompt.result()
-            while waiting:
-                first, prompt = waiting.popleft()
+            while queue:
+                first, prompt = queue.popleft()
                 yield first, prompt.result()
         finally:
-            for _, prompt in waiting:
+            for _, prompt in queue:
                 prompt.cancel()
 
 
@@ -280,7 +287,7 @@ def _shards(folder: Path, seen: Container[str]) -> Iterator[tuple[str, pd.DataFr
     for path in sorted(path for path in folder.glob("shard-*.parquet") if path.stem not in seen):
         try:
             table = read_sealed(path).to_pandas()
-            rows = _sound_rows(path.with_suffix(".safetensors"))
+            rows = _count_sound_rows(path.with_suffix(".safetensors"))
         except (OSError, ValueError, TrapsError) as error:
             progress.current().note(f"{path}: damaged ({error}); its items are extracted again")
             continue
@@ -340,7 +347,7 @@ def _tensor(file: Path, name: str) -> np.ndarray:
         ) from error
 
 
-def _sound_rows(file: Path) -> int:
+def _count_sound_rows(file: Path) -> int:
     """Return how many items a shard holds, or raise TrapsError if it is damaged."""
     from safetensors import SafetensorError, safe_open
 
@@ -358,7 +365,7 @@ def _sound_rows(file: Path) -> int:
 def damage(file: Path) -> str:
     """Return what is wrong with a file of an extraction; empty if nothing is."""
     try:
-        _sound_rows(file) if file.suffix == ".safetensors" else read_sealed(file)
+        _count_sound_rows(file) if file.suffix == ".safetensors" else read_sealed(file)
     except (OSError, ValueError, TrapsError) as error:
         return str(error) if str(file) in str(error) else f"{file}: cannot be read ({error})"
     return ""

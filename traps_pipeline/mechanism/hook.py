@@ -29,7 +29,7 @@ Site = Literal["residual", "attention", "mlp"]
 _PARTS: dict[Site, str] = {"attention": "self_attn", "mlp": "mlp"}
 
 
-def changing(block: Module, site: Site, change: Callable[[Tensor], Tensor]) -> RemovableHandle:
+def register_change(block: Module, site: Site, change: Callable[[Tensor], Tensor]) -> RemovableHandle:
     """Register a hook that replaces a site's states (rows, T, d) by `change` of them.
 
     It runs before all others, so that hooks that record states record the changed ones. Raises TrapsError for a block
@@ -37,8 +37,8 @@ def changing(block: Module, site: Site, change: Callable[[Tensor], Tensor]) -> R
     """
 
     def hook(_: Module, __: Any, output: Any) -> Any:
-        changed = change(first_tensor(output))
-        return (changed, *output[1:]) if isinstance(output, tuple) else changed
+        new_states = change(first_tensor(output))
+        return (new_states, *output[1:]) if isinstance(output, tuple) else new_states
 
     part = block if site == "residual" else getattr(block, _PARTS[site], None)
     if part is None:
@@ -83,15 +83,15 @@ class Steering:
             yield
             return
         direction = torch.from_numpy(np.ascontiguousarray(self.direction, dtype=np.float32))
-        added = torch.tensor(self.alphas, dtype=torch.float32)[:, None] * direction  # (rows, d), in float32 until here
-        added = added[:, None, :].to(model.inputs_device, model.network.dtype)
+        shift = torch.tensor(self.alphas, dtype=torch.float32)[:, None] * direction  # (rows, d), in float32 until here
+        shift = shift[:, None, :].to(model.inputs_device, model.network.dtype)
 
         def add(states: Tensor) -> Tensor:
-            if len(states) != len(added):
-                raise ValueError(f"the pass has {len(states)} rows, but {len(added)} alphas were given")
-            return states + added.to(states.device)
+            if len(states) != len(shift):
+                raise ValueError(f"the pass has {len(states)} rows, but {len(shift)} alphas were given")
+            return states + shift.to(states.device)
 
-        handle = changing(block, "residual", add)
+        handle = register_change(block, "residual", add)
         try:
             yield
         finally:

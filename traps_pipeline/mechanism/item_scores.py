@@ -25,27 +25,27 @@ from traps_pipeline.storage.workspace import Workspace
 def item_score_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> list[ItemScoreRow]:
     """Return ITEM_SCORES of an extraction, a row per item of the pairs' datasets."""
     settings, table = workspace.mechanism, gate_table(states)
-    present = [name for name in DATASETS if len(states.dataset(name))]
-    layers = chosen_layers(workspace, states, present)
+    datasets = [name for name in DATASETS if len(states.dataset(name))]
+    layers = chosen_layers(workspace, states, datasets)
     outcomes = {regime: outcomes_of(workspace, entry.id, regime, states) for regime in PROMPTING}
     try:
-        margins = output_margins(entry, states, present)
+        margins = output_margins(entry, states, datasets)
     except NoMargin as error:
         progress.current().note(f"item_scores: no output margin ({error})")
         margins = {}
-    about = {"folds": settings.probes.folds, "seed": settings.seed, "false_abs": settings.gate.false_abs}
+    probe_settings = {"folds": settings.probes.folds, "seed": settings.seed, "false_abs": settings.gate.false_abs}
     rows: list[ItemScoreRow] = []
-    for dataset in present:
+    for dataset in datasets:
         features = read_states(states, [*dict.fromkeys(table["dataset"])], layers[dataset])
         scores: dict[str, np.ndarray] = {}
         items = gate_items(table, features, shuffled=False, seed=settings.seed)
         for name, source in (("own", f"one:{dataset}"), ("others", OTHER_DATASETS)):
-            if sources_of_gate(source, dataset, present):
-                decision = decide(items, source, dataset, **about)
+            if sources_of_gate(source, dataset, datasets):
+                decision = decide(items, source, dataset, **probe_settings)
                 scores[name] = decision.score - decision.threshold[MID]
         for place, item in enumerate(states.dataset(dataset).to_dict("records")):
             abstained: dict[str, Any] = {
-                f"abstained_{regime}": _decided(outcome[dataset].abstained[place] if outcome else np.nan)
+                f"abstained_{regime}": _decision(outcome[dataset].abstained[place] if outcome else np.nan)
                 for regime, outcome in outcomes.items()
             }
             rows.append(
@@ -66,5 +66,5 @@ def _number(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _decided(value: float) -> bool | None:
+def _decision(value: float) -> bool | None:
     return bool(value) if np.isfinite(value) else None

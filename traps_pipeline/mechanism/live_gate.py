@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.mechanism.gate import THRESHOLDS, Items, fit_gate, sources_of_gate
 from traps_pipeline.mechanism.gating import chosen_layers, gate_items, gate_table
 from traps_pipeline.mechanism.probes import Scorer
@@ -31,7 +31,7 @@ Threshold = Literal["mid", "J", "conformal"]
 class Gate:
     """A probe of a layer's states, whose score above the threshold means abstain.
 
-    pooling: of the states that it was fitted on.
+    pooling: the pooling of the states that it was fitted on.
     """
 
     layer: int
@@ -97,7 +97,7 @@ def gate(
     if len(set(train.void)) < 2 or len(set(train.table["scenario_id"])) < folds:
         raise TrapsError(
             f"a gate from {source} needs both sides of {folds} scenarios (`probes.folds`), and has "
-            f"{counted(len(train.table), 'item')}; extract the hidden states of more pairs"
+            f"{count_noun(len(train.table), 'item')}; extract the hidden states of more pairs"
         )
     probe, cuts, _ = fit_gate(train, folds, settings.seed, false_abs)
     return Gate(layer, probe, cuts[threshold], pooling)  # pyright: ignore[reportArgumentType]
@@ -105,11 +105,11 @@ def gate(
 
 def _train(states: StoredStates, source: str, target: str, layer: int, without: Collection[str]) -> Items:
     table = gate_table(states)
-    present = [name for name in DATASETS if name in set(table["dataset"])]
-    names = sources_of_gate(source, target, present)
+    datasets = [name for name in DATASETS if name in set(table["dataset"])]
+    names = sources_of_gate(source, target, datasets)
     if not names:
-        raise TrapsError(f"no gate from {source!r}; the study has states of {', '.join(present) or 'no dataset'}")
+        raise TrapsError(f"no gate from {source!r}; the study has states of {', '.join(datasets) or 'no dataset'}")
     table = table.loc[table["dataset"].isin(names)].reset_index(drop=True)
-    unseen = ~(table["scenario_id"].isin(without) | table["family"].isin(without)).to_numpy(bool)
+    is_training = ~(table["scenario_id"].isin(without) | table["family"].isin(without)).to_numpy(bool)
     features = {name: states.read(name, layer) for name in names}
-    return gate_items(table, features, shuffled=False, seed=0).rows(unseen)
+    return gate_items(table, features, shuffled=False, seed=0).rows(is_training)

@@ -1,7 +1,7 @@
 """Compute the output margin: log-odds that an answer begins with an abstention.
 
-At the first answer token, the tokens that begin an abstention stand against all others. A probe says something about a
-gap between representation and output only as far as it separates better than this.
+It compares, at the first answer token, the tokens that begin an abstention with all others. A probe says something
+about a gap between representation and output only as far as it separates better than this.
 """
 
 from __future__ import annotations

@@ -29,15 +29,15 @@ Percentile = Annotated[float | None, "95 % percentile interval"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Extracted:
-    """Columns of what is made from one model's states under one prompt."""
+class ExtractionColumns:
+    """Columns of rows that are computed from a model's states under one prompt."""
 
     model: shared.Model
     prompt: Prompt
 
 
 @dataclass(frozen=True, kw_only=True)
-class Steered:
+class SteeringColumns:
     """Columns of figures of steered answers."""
 
     model: shared.Model
@@ -117,7 +117,7 @@ HIDDEN_STATES = Table("hidden_states", HiddenStatesRow, partition_by=("dataset",
 
 
 @dataclass(frozen=True, kw_only=True)
-class ProbeRow(Extracted):
+class ProbeRow(ExtractionColumns):
     """A figure of a probe of one dataset (source) on another (target) at one layer."""
 
     analysis: Annotated[
@@ -161,7 +161,7 @@ PROBES = Table(
 
 
 @dataclass(frozen=True, kw_only=True)
-class DirectionRow(Extracted):
+class DirectionRow(ExtractionColumns):
     """A direction: one dataset at one layer."""
 
     dataset: shared.Dataset

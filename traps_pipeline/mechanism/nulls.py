@@ -23,54 +23,54 @@ _CONDITION = [*_CELL, "layer", "unit", "dose", "side"]
 
 def null_rows(effects: pd.DataFrame) -> list[SteeringNullRow]:
     """Return STEERING_NULLS: datasets' own directions and their mean, if nulls exist."""
-    own = effects.loc[(effects["source"] == effects["target"]) & (effects["signs"] == "label")]
-    moved = _moved(own)
-    nulls = moved.loc[moved["kind"].isin(NULLS)]
+    own_effects = effects.loc[(effects["source"] == effects["target"]) & (effects["signs"] == "label")]
+    changes = _with_changes(own_effects)
+    nulls = changes.loc[changes["kind"].isin(NULLS)]
     rows: list[SteeringNullRow] = []
     for target in [*sorted(set(nulls["target"])), ALL]:
-        part = moved if target == ALL else moved.loc[moved["target"] == target]
-        rows += _ranked(part, target)
+        part = changes if target == ALL else changes.loc[changes["target"] == target]
+        rows += _rank(part, target)
     return rows
 
 
-def _moved(effects: pd.DataFrame) -> pd.DataFrame:
+def _with_changes(effects: pd.DataFrame) -> pd.DataFrame:
     """Return effects with `moved`, the change against unsteered answers.
 
     It is in the claimed direction: more abstention on controls, and less on voids.
     """
     path = [*_CELL, "target", "kind", "draw", "layer", "unit", "side"]
-    plain = effects.loc[effects["dose"] == 0, [*path, "abstention"]].rename(columns={"abstention": "plain"})
-    steered = effects.loc[effects["dose"] != 0].merge(plain, on=path)
-    change = steered["abstention"].astype(float) - steered["plain"].astype(float)
-    return steered.assign(moved=np.where(steered["side"] == "control", change, -change))
+    unsteered_effects = effects.loc[effects["dose"] == 0, [*path, "abstention"]].rename(columns={"abstention": "plain"})
+    steered_effects = effects.loc[effects["dose"] != 0].merge(unsteered_effects, on=path)
+    change = steered_effects["abstention"].astype(float) - steered_effects["plain"].astype(float)
+    return steered_effects.assign(moved=np.where(steered_effects["side"] == "control", change, -change))
 
 
-def _ranked(moved: pd.DataFrame, target: str) -> Iterator[SteeringNullRow]:
+def _rank(moved: pd.DataFrame, target: str) -> Iterator[SteeringNullRow]:
     for key, group in moved.groupby(_CONDITION, sort=True):
-        about: dict[str, Any] = dict(zip(_CONDITION, key if isinstance(key, tuple) else (key,), strict=True))
+        row_keys: dict[str, Any] = dict(zip(_CONDITION, key if isinstance(key, tuple) else (key,), strict=True))
         void = group.loc[group["kind"] == VOID]
-        for null in NULLS:
-            draws = group.loc[group["kind"] == null].groupby("draw")
-            here = void.loc[void["target"].isin(set(group.loc[group["kind"] == null, "target"]))]
+        for null_kind in NULLS:
+            draws = group.loc[group["kind"] == null_kind].groupby("draw")
+            same_targets = void.loc[void["target"].isin(set(group.loc[group["kind"] == null_kind, "target"]))]
             values = draws["moved"].mean().dropna().to_numpy(float)  # leave out draws without a decided answer
-            if not len(values) or here["moved"].isna().any() or here.empty:
+            if not len(values) or same_targets["moved"].isna().any() or same_targets.empty:
                 continue
-            effect = float(here["moved"].mean())
+            effect = float(same_targets["moved"].mean())
             # Shares of few answers tie often, so ties count against the direction; rounding must not break a tie.
-            reached = int(np.count_nonzero(values >= effect - 1e-9))
+            n_reaching = int(np.count_nonzero(values >= effect - 1e-9))
             yield SteeringNullRow(
-                **about,
+                **row_keys,
                 target=target,
-                null=null,
+                null=null_kind,
                 effect=effect,
                 null_mean=float(values.mean()),
                 null_lowest=float(values.min()),
                 null_highest=float(values.max()),
                 draws=len(values),
-                n_at_least=reached,
-                p=(1 + reached) / (1 + len(values)),
-                n=int(here["n"].sum()),
-                epoch=joined_epochs(here["epoch"]),
+                n_at_least=n_reaching,
+                p=(1 + n_reaching) / (1 + len(values)),
+                n=int(same_targets["n"].sum()),
+                epoch=joined_epochs(same_targets["epoch"]),
             )
 
 

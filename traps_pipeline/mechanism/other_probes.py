@@ -56,8 +56,9 @@ def erased(states: np.ndarray, void: np.ndarray) -> np.ndarray:
     centred, label = states - states.mean(axis=0), void - np.mean(void)
     left_vectors, size, right_vectors = np.linalg.svd(centred, full_matrices=False)
     mask = size > size[0] * max(states.shape) * np.finfo(float).eps
-    towards = left_vectors[:, mask].T @ label  # rows of `left` have unit covariance up to a factor
-    towards /= np.linalg.norm(towards)
+    label_direction = left_vectors[:, mask].T @ label  # rows of `left` have unit covariance up to a factor
+    label_direction /= np.linalg.norm(label_direction)
     return states - np.outer(
-        centred @ ((towards / size[mask]) @ right_vectors[mask]), (towards * size[mask]) @ right_vectors[mask]
+        centred @ ((label_direction / size[mask]) @ right_vectors[mask]),
+        (label_direction * size[mask]) @ right_vectors[mask],
     )

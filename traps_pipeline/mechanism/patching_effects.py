@@ -39,7 +39,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.hook import Site
 from traps_pipeline.mechanism.margin import first_token_margins
 from traps_pipeline.models.local.capture import first_tensor
-from traps_pipeline.models.local.sidepaths import PER_LAYER, SHARED, argument_of, unknown_path, with_argument
+from traps_pipeline.models.local.sidepaths import PER_LAYER, SHARED_KEYS, argument_of, unknown_path, with_argument
 from traps_pipeline.models.local.spans import visual_tokens
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ def record(model: LocalModel, prompt: Prompt, tokens: Sequence[int], sites: Sequ
     inputs: dict[str, Any] = {}
     states: dict[tuple[Site, int], Tensor] = {}
     per_layer: list[Tensor] = []
-    shared: dict[str, tuple[int, Tensor, Tensor]] = {}
+    shared_keys: dict[str, tuple[int, Tensor, Tensor]] = {}
 
     def keep_inputs(_: Module, __: Any, kwargs: dict[str, Any]) -> None:
         inputs.update(kwargs)
@@ -140,14 +140,14 @@ def record(model: LocalModel, prompt: Prompt, tokens: Sequence[int], sites: Sequ
         states[site, layer] = first_tensor(output)[0].clone()
 
     def keep_own(block: Module, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
-        own = argument_of(block, PER_LAYER, args, kwargs)
-        if own is not None:
-            per_layer.append(own[0])
+        layer_input = argument_of(block, PER_LAYER, args, kwargs)
+        if layer_input is not None:
+            per_layer.append(layer_input[0])
 
     def keep_shared(layer: int, block: Module, args: tuple[Any, ...], kwargs: dict[str, Any], _: Any) -> None:
-        for name, (keys, values) in (argument_of(block, SHARED, args, kwargs) or {}).items():
-            if name not in shared or shared[name][1] is not keys:
-                shared[name] = layer, keys, values
+        for name, (keys, values) in (argument_of(block, SHARED_KEYS, args, kwargs) or {}).items():
+            if name not in shared_keys or shared_keys[name][1] is not keys:
+                shared_keys[name] = layer, keys, values
 
     with ExitStack() as hooks, torch.inference_mode():
         decoder = model.network.get_decoder()
@@ -162,7 +162,7 @@ def record(model: LocalModel, prompt: Prompt, tokens: Sequence[int], sites: Sequ
         last = model.forward(prompt).last_hidden_state[:, -1]
         states["residual", 0] = inputs["inputs_embeds"][0].clone()
         margin = float(first_token_margins(model, last, tokens)[0])
-        return RecordedPass(inputs, states, margin, visual_tokens(model, prompt), tuple(per_layer), shared)
+        return RecordedPass(inputs, states, margin, visual_tokens(model, prompt), tuple(per_layer), shared_keys)
 
 
 def patched_changes(
@@ -239,8 +239,8 @@ def _masks(patches: Sequence[Patch], length: int, device: str) -> Weights:
 
     masks: dict[tuple[Site, int], Tensor] = {}
     for row, patch in enumerate(patches, start=1):
-        nothing = torch.zeros(len(patches) + 1, length, dtype=torch.bool)
-        masks.setdefault((patch.site, patch.layer), nothing)[row] = torch.from_numpy(patch.positions)
+        empty_mask = torch.zeros(len(patches) + 1, length, dtype=torch.bool)
+        masks.setdefault((patch.site, patch.layer), empty_mask)[row] = torch.from_numpy(patch.positions)
     return {key: mask.to(device) for key, mask in masks.items()}
 
 
@@ -253,7 +253,7 @@ def _residual_weights(weights: Weights, layer: int) -> Tensor | None:
     return reduce(operator.add, [part.to(parts[0].device) for part in parts]) if parts else None
 
 
-def _mixed(states: Tensor, source: Tensor, weights: Tensor) -> Tensor:
+def _mix(states: Tensor, source: Tensor, weights: Tensor) -> Tensor:
     """Return states (rows, .., T, d), mixed with theirs, (T, d) or (1, .., T, d)."""
     import torch
 
@@ -272,21 +272,21 @@ def _margins(
     tokens: Sequence[int],
 ) -> Tensor:
     """Return outcomes (rows,) of a pass over copies of the target from layer `start`."""
-    inputs = _repeated(target, rows)
+    inputs = _repeat_inputs(target, rows)
     if ("residual", 0) in weights:
-        inputs["inputs_embeds"] = _mixed(inputs["inputs_embeds"], source.states["residual", 0], weights["residual", 0])
+        inputs["inputs_embeds"] = _mix(inputs["inputs_embeds"], source.states["residual", 0], weights["residual", 0])
     for number, source_embeds in enumerate(source.inputs.get("deepstack_visual_embeds") or ()):
         # Features number k are added to what block k + 1 puts out: behind the sites up to there.
         weight, features = _residual_weights(weights, number + 1), inputs["deepstack_visual_embeds"]
         if weight is not None and target.visual is not None:
-            own = features[number].unflatten(0, (rows, -1))
-            features[number] = _mixed(own, source_embeds, weight[:, target.visual]).flatten(0, 1)
-    with _replacing(model, target, source, weights, start, rows):
+            row_features = features[number].unflatten(0, (rows, -1))
+            features[number] = _mix(row_features, source_embeds, weight[:, target.visual]).flatten(0, 1)
+    with _replace_states(model, target, source, weights, start, rows):
         last = model.network.get_decoder()(**inputs).last_hidden_state[:, -1]
     return first_token_margins(model, last, tokens)
 
 
-def _repeated(target: RecordedPass, rows: int) -> dict[str, Any]:
+def _repeat_inputs(target: RecordedPass, rows: int) -> dict[str, Any]:
     """Return the decoder's inputs for several rows of one prompt."""
     import torch
 
@@ -302,13 +302,13 @@ def _repeated(target: RecordedPass, rows: int) -> dict[str, Any]:
 
 
 @contextmanager
-def _replacing(
+def _replace_states(
     model: LocalModel, target: RecordedPass, source: RecordedPass, weights: Weights, start: int, rows: int
 ) -> Iterator[None]:
     """Let passes start behind block `start`, replacing states, inside the context."""
 
     def replace(site: Site, layer: int, _: Module, __: Any, output: Any) -> Any:
-        states = _mixed(first_tensor(output), source.states[site, layer], weights[site, layer])
+        states = _mix(first_tensor(output), source.states[site, layer], weights[site, layer])
         return (states, *output[1:]) if isinstance(output, tuple) else states
 
     def skip(layer: int, hidden_states: Tensor, *_: Any, **__: Any) -> Tensor:
@@ -316,18 +316,23 @@ def _replacing(
 
     def beside(below: int, block: Module, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """Return the next block's arguments, the source's where the stream was patched."""
-        own, weight = argument_of(block, PER_LAYER, args, kwargs), _residual_weights(weights, below)
-        if own is not None and weight is not None:
-            args, kwargs = with_argument(block, PER_LAYER, _mixed(own, source.per_layer[below], weight), args, kwargs)
-        shared = argument_of(block, SHARED, args, kwargs)  # one mapping, shared by all blocks
-        if shared is not None and below == start:
+        own_forward, weight = argument_of(block, PER_LAYER, args, kwargs), _residual_weights(weights, below)
+        if own_forward is not None and weight is not None:
+            args, kwargs = with_argument(
+                block, PER_LAYER, _mix(own_forward, source.per_layer[below], weight), args, kwargs
+            )
+        shared_keys = argument_of(block, SHARED_KEYS, args, kwargs)  # one mapping, shared by all blocks
+        if shared_keys is not None and below == start:
             for name, (maker, *pair) in target.shared.items():
                 if maker <= start:
-                    shared[name] = tuple(part.expand(rows, *part.shape[1:]) for part in pair)
-        if shared and ("residual", below) in weights:
-            here = weights["residual", below]
-            for name, pair in [*shared.items()]:
-                shared[name] = tuple(_mixed(*both, here) for both in zip(pair, source.shared[name][1:], strict=True))
+                    shared_keys[name] = tuple(part.expand(rows, *part.shape[1:]) for part in pair)
+        if shared_keys and ("residual", below) in weights:
+            residual_weight = weights["residual", below]
+            for name, pair in [*shared_keys.items()]:
+                shared_keys[name] = tuple(
+                    _mix(*tensor_pair, residual_weight)
+                    for tensor_pair in zip(pair, source.shared[name][1:], strict=True)
+                )
         return args, kwargs
 
     blocks = [*model.blocks]
@@ -338,9 +343,11 @@ def _replacing(
         for below, block in enumerate(blocks[start:], start=start):
             hooks.callback(block.register_forward_pre_hook(partial(beside, below), with_kwargs=True).remove)
         for layer, block in enumerate(blocks[:start], start=1):
-            own = vars(block).get("forward")  # set by accelerate on a model that is spread over devices
+            own_forward = vars(block).get("forward")  # set by accelerate on a model that is spread over devices
             block.forward = partial(skip, layer)
             hooks.callback(
-                partial(vars(block).pop, "forward") if own is None else partial(setattr, block, "forward", own)
+                partial(vars(block).pop, "forward")
+                if own_forward is None
+                else partial(setattr, block, "forward", own_forward)
             )
         yield

@@ -123,66 +123,80 @@ class Pairs:
         Nulls are measured, too. There is a row for each pair, direction, source and cell.
         """
         paths = set[Path]()
-        estimates = self._each("estimates", self._estimates, paths)
+        estimates = self._pair_rows("estimates", self._estimates, paths)
         best = best_cells(estimates, self._settings, self._model.n_layers)
-        patches = self._each(f"patches-{digest(best)[:8]}", lambda name: self._patches(name, best), paths)
+        patches = self._pair_rows(f"patches-{digest(best)[:8]}", lambda name: self._patches(name, best), paths)
         store = self._workspace.store
         store.remove({*store.below(self._folder)} - paths)  # files of other settings or items
         return estimates, patches
 
-    def _each(self, kind: str, make: Callable[[str], Iterable[Row]], paths: set[Path]) -> list[Row]:
+    def _pair_rows(self, kind: str, make: Callable[[str], Iterable[Row]], paths: set[Path]) -> list[Row]:
         """Return the rows of all pairs, from their files or computed and written."""
         rows, store = list[Row](), self._workspace.store
         for number, name in enumerate(self._names, start=1):
             path = self._folder / f"{name}-{self._version}-{kind}.json"
             try:
-                of_pair = json.loads(store.here(path).read_text(encoding="utf-8"))
+                pair_result = json.loads(store.here(path).read_text(encoding="utf-8"))
             except (FileNotFoundError, ValueError):
-                of_pair = [*make(name)]
-                store.write({path: json.dumps(of_pair).encode()})
-            rows += of_pair
+                pair_result = [*make(name)]
+                store.write({path: json.dumps(pair_result).encode()})
+            rows += pair_result
             paths.add(path)
             progress.current().tick("patching", f"pairs of {self._dataset}, {kind}", number, len(self._names))
         return rows
 
     def _estimates(self, name: str) -> Iterator[Row]:
-        for into, target, source, groups in self._directions(name):
+        for side, target, source, groups in self._directions(name):
             if groups is None:
-                yield {"scenario": name, "into": into, "source": OWN, "left_out": True}
+                yield {"scenario": name, "into": side, "source": OWN, "left_out": True}
                 continue
-            ends, changes = self._attributed(target, source)
-            for (site, layer), by_token in changes.items():
+            ends, changes = self._attribute(target, source)
+            for (site, layer), token_changes in changes.items():
                 for group, positions in groups.items():
                     if positions.any() and site in self._settings.sites:
-                        change = float(by_token[positions].sum())
-                        yield _row(name, into, OWN, (site, layer, group), positions, ends, change)
+                        change = float(token_changes[positions].sum())
+                        yield _row(name, side, OWN, (site, layer, group), positions, ends, change)
 
     def _patches(self, name: str, best: Sequence[Cell]) -> Iterator[Row]:
-        for into, target, _, groups in self._directions(name):
+        for patched_side, target, _, groups in self._directions(name):
             if groups is None:
                 continue
             cells: list[tuple[Site, int, str]]
-            cells = [(site, layer, group) for side, site, layer, group in best if side == into and groups[group].any()]
+            cells = [
+                (site, layer, group)
+                for side, site, layer, group in best
+                if side == patched_side and groups[group].any()
+            ]
             patches = [Patch(site, layer, groups[group]) for site, layer, group in cells]
-            plain, source_margin = record(self._model, target.prompt, self._tokens, ()), 0.0
+            target_pass, source_margin = record(self._model, target.prompt, self._tokens, ()), 0.0
             for kind in SOURCES:
-                side = self._source(name, into, kind)
+                side = self._source(name, patched_side, kind)
                 if side is None:
-                    yield {"scenario": name, "into": into, "source": kind, "left_out": True}
+                    yield {"scenario": name, "into": patched_side, "source": kind, "left_out": True}
                     continue
-                margin, changes = self._patched(plain, side, patches)
+                margin, changes = self._patch(target_pass, side, patches)
                 source_margin = margin if kind == OWN else source_margin
                 for cell, patch, change in zip(cells, patches, changes, strict=True):
-                    yield _row(name, into, kind, cell, patch.positions, (plain.margin, source_margin), float(change))
-            del plain  # before the other side's pass is recorded
+                    yield _row(
+                        name,
+                        patched_side,
+                        kind,
+                        cell,
+                        patch.positions,
+                        (target_pass.margin, source_margin),
+                        float(change),
+                    )
+            del target_pass  # before the other side's pass is recorded
 
-    def _attributed(self, target: Side, source: Side) -> tuple[tuple[float, float], dict[tuple[Site, int], np.ndarray]]:
+    def _attribute(self, target: Side, source: Side) -> tuple[tuple[float, float], dict[tuple[Site, int], np.ndarray]]:
         """Return both sides' margins and each token's estimate; free the states."""
-        plain = record(self._model, target.prompt, self._tokens, ())
-        patched = record(self._model, source.prompt, self._tokens, self._settings.sites)
-        return (plain.margin, patched.margin), attributed_changes(self._model, plain, patched, self._tokens)
+        target_pass = record(self._model, target.prompt, self._tokens, ())
+        source_pass = record(self._model, source.prompt, self._tokens, self._settings.sites)
+        return (target_pass.margin, source_pass.margin), attributed_changes(
+            self._model, target_pass, source_pass, self._tokens
+        )
 
-    def _patched(self, target: RecordedPass, side: Side, patches: Sequence[Patch]) -> tuple[float, np.ndarray]:
+    def _patch(self, target: RecordedPass, side: Side, patches: Sequence[Patch]) -> tuple[float, np.ndarray]:
         """Return a source's margin, and the changes by its patches; free its states."""
         source = record(self._model, side.prompt, self._tokens, self._settings.sites)
         return source.margin, patched_changes(self._model, target, source, patches, self._tokens)
@@ -190,20 +204,20 @@ class Pairs:
     def _directions(self, name: str) -> Iterator[tuple[str, Side, Side, dict[str, np.ndarray] | None]]:
         """Yield each side of a complete pair, with the other as source, and groups."""
         if all((name, side) in self._items for side in SIDES):
-            for into, towards in (SIDES, SIDES[::-1]):
-                target, source = self._side(name, into), self._side(name, towards)
-                yield into, target, source, groups_of(target, source)
+            for patched_side, other_side in (SIDES, SIDES[::-1]):
+                target, source = self._side(name, patched_side), self._side(name, other_side)
+                yield patched_side, target, source, groups_of(target, source)
 
     def _source(self, name: str, into: str, kind: str) -> Side | None:
         """Return the side whose states patch a pair's side; None without one of its form."""
-        towards = SIDES[1 - SIDES.index(into)]
-        where = {OWN: (name, towards, ""), TIMES: (name, into, towards)}
-        if kind in where:
-            candidates = [where[kind]]
+        other_side = SIDES[1 - SIDES.index(into)]
+        source_keys = {OWN: (name, other_side, ""), TIMES: (name, into, other_side)}
+        if kind in source_keys:
+            candidates = [source_keys[kind]]
         else:
             first = self._names.index(name)
             other_names = [*self._names[first + 1 :], *self._names[:first]]
-            candidates = [(other, towards if kind == OTHER else into, "") for other in other_names]
+            candidates = [(other_name, other_side if kind == OTHER else into, "") for other_name in other_names]
         form = self._form(name, into)
         for candidate in candidates:
             if candidate[:2] in self._items and _has_same_form(form, self._form(*candidate)):
@@ -238,8 +252,8 @@ def _row(
 ) -> Row:
     """Return a patch's effect on a pair; ends: outcomes of patched and other side."""
     site, layer, group = cell
-    about = {"scenario": scenario, "into": into, "source": source, "site": site, "layer": layer, "group": group}
-    return about | {"before": ends[0], "there": ends[1], "change": change, "tokens": int(positions.sum())}
+    row_keys = {"scenario": scenario, "into": into, "source": source, "site": site, "layer": layer, "group": group}
+    return row_keys | {"before": ends[0], "there": ends[1], "change": change, "tokens": int(positions.sum())}
 
 
 def _has_same_form(target: Mapping[str, np.ndarray], source: Mapping[str, np.ndarray]) -> bool:
@@ -256,9 +270,9 @@ def groups_of(target: Side, source: Side) -> dict[str, np.ndarray] | None:
     if not _has_same_form(target.parts, source.parts):
         return None
     parts, visual = target.parts, target.parts["visual"]
-    changed = changed_tokens(target.prompt, source.prompt, visual)
-    changed = visual if changed is None else changed
-    groups = {"changed": changed, "unchanged": visual & ~changed, "all": np.ones(len(visual), bool)}
+    is_changed = changed_tokens(target.prompt, source.prompt, visual)
+    is_changed = visual if is_changed is None else is_changed
+    groups = {"changed": is_changed, "unchanged": visual & ~is_changed, "all": np.ones(len(visual), bool)}
     groups |= {name: parts[name] for name in ("system", "stamps", "question", "last")}
     return {name: groups[name] for name in GROUPS}
 
@@ -266,18 +280,18 @@ def groups_of(target: Side, source: Side) -> dict[str, np.ndarray] | None:
 def best_cells(estimates: Sequence[Row], settings: PatchingSettings, n_layers: int) -> list[Cell]:
     """Return each direction's cells with the largest estimates over all pairs.
 
-    Only every so many layers count. All positions of the residual stream together are left out; their effect is 1 by
-    construction.
+    Only some layers count, at equal steps. All positions of the residual stream together are left out; their effect is
+    1 by construction.
     """
     layers = {*range(0, n_layers + 1, settings.stride), n_layers}
     sums = defaultdict[Cell, float](float)
     for row in estimates:
         if "left_out" not in row and row["layer"] in layers and (row["site"], row["group"]) != ("residual", "all"):
             sums[row["into"], row["site"], row["layer"], row["group"]] += row["change"]
-    by_size = [
-        nlargest(settings.exact, (c for c in sums if c[0] == into), key=lambda c: abs(sums[c])) for into in SIDES
+    largest_cells = [
+        nlargest(settings.exact, (c for c in sums if c[0] == side), key=lambda c: abs(sums[c])) for side in SIDES
     ]
-    return sorted(cell for cells in by_size for cell in cells)
+    return sorted(cell for cells in largest_cells for cell in cells)
 
 
 def summarize_effects(
@@ -287,40 +301,46 @@ def summarize_effects(
 
     If all pairs were left out, a row without an effect says so.
     """
-    left_out = Counter((row["into"], row["source"]) for row in (*estimates, *patches) if "left_out" in row)
+    n_left_out = Counter((row["into"], row["source"]) for row in (*estimates, *patches) if "left_out" in row)
     cells = [defaultdict[tuple[Any, ...], list[Row]](list), defaultdict[tuple[Any, ...], list[Row]](list)]
-    for by_cell, rows in zip(cells, (estimates, patches), strict=True):
+    for rows_by_cell, rows in zip(cells, (estimates, patches), strict=True):
         for row in rows:
             if "left_out" not in row:
-                by_cell[row["into"], row["source"], row["site"], row["layer"], row["group"]].append(row)
-    estimated, patched = cells
-    present = {key[:2] for key in (*estimated, *patched)}
-    nothing = [(*key, "residual", 0, "all") for key in left_out if key not in present]
-    for key in sorted({*estimated, *patched, *nothing}):
-        into, source, site, layer, group = key
-        rows = patched.get(key) or estimated.get(key) or []
-        before, target, change = (np.array([row[name] for row in rows]) for name in ("before", "there", "change"))
-        gap = float((target - before).sum()) if len(rows) else 0.0
-        attributed = sum(row["change"] for row in estimated.get(key, ()))
-        effect = effect_of(before, before + change, target, seed) if key in patched else (None, None, None)
-        differs = np.sign(before) != np.sign(target)
-        flipped = (np.sign(before + change) != np.sign(before)) & differs
+                rows_by_cell[row["into"], row["source"], row["site"], row["layer"], row["group"]].append(row)
+    estimated, measured_rows = cells
+    known_keys = {key[:2] for key in (*estimated, *measured_rows)}
+    empty_cells = [(*key, "residual", 0, "all") for key in n_left_out if key not in known_keys]
+    for key in sorted({*estimated, *measured_rows, *empty_cells}):
+        side, source, site, layer, group = key
+        rows = measured_rows.get(key) or estimated.get(key) or []
+        source_outcome, target, change = (
+            np.array([row[name] for row in rows]) for name in ("before", "there", "change")
+        )
+        gap = float((target - source_outcome).sum()) if len(rows) else 0.0
+        estimated_change = sum(row["change"] for row in estimated.get(key, ()))
+        effect = (
+            effect_of(source_outcome, source_outcome + change, target, seed)
+            if key in measured_rows
+            else (None, None, None)
+        )
+        is_different = np.sign(source_outcome) != np.sign(target)
+        is_flipped = (np.sign(source_outcome + change) != np.sign(source_outcome)) & is_different
         yield PatchingRow(
             **extraction.partition,
             dataset=dataset,
-            into=into,
+            into=side,
             source=source,
             site=site,
             layer=layer,
             group=group,
-            attributed=attributed / gap if key in estimated and gap else None,
+            attributed=estimated_change / gap if key in estimated and gap else None,
             effect=effect[0],
             low=effect[1],
             high=effect[2],
-            flips=float(flipped.sum() / differs.sum()) if key in patched and differs.any() else None,
-            n_flippable=int(differs.sum()),
+            flips=float(is_flipped.sum() / is_different.sum()) if key in measured_rows and is_different.any() else None,
+            n_flippable=int(is_different.sum()),
             n=len(rows),
-            n_left_out=left_out[into, source],
+            n_left_out=n_left_out[side, source],
             tokens=float(np.mean([row["tokens"] for row in rows])) if rows else 0.0,
         )
 

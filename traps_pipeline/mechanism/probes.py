@@ -14,7 +14,7 @@ import numpy as np
 
 from traps_pipeline.base.errors import TrapsError
 
-_TOLERANCE, _MOST_STEPS = 1e-10, 200
+_TOLERANCE, _MAX_STEPS = 1e-10, 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,17 +105,20 @@ def solve_gram(gram: np.ndarray, void: np.ndarray) -> tuple[np.ndarray, float]:
     label = np.asarray(void, float)
     odds = float(np.log(label.mean() / (1 - label.mean())))
     at = _Point(np.zeros(len(label)), odds, np.full(len(label), odds))
-    newton, before = None, np.inf
-    for _ in range(_MOST_STEPS):
+    newton, previous_loss = None, np.inf
+    for _ in range(_MAX_STEPS):
         chance = expit(at.logits)
         missing = label - chance - at.dual
-        worst = float(max(np.abs(missing).max(), abs(at.dual.sum()) / len(label)))
-        if worst < _TOLERANCE:
+        max_residual = float(max(np.abs(missing).max(), abs(at.dual.sum()) / len(label)))
+        if max_residual < _TOLERANCE:
             return at.dual, at.intercept
-        if newton is None or worst > 0.2 * before:
+        if newton is None or max_residual > 0.2 * previous_loss:
             newton = _NewtonStep(gram, chance * (1 - chance))
         step, intercept_step = newton.solve(missing, at.dual.sum())
-        at, before = _descended(at, _Point(step, intercept_step, gram @ step + intercept_step), label), worst
+        at, previous_loss = (
+            _descend(at, _Point(step, intercept_step, gram @ step + intercept_step), label),
+            max_residual,
+        )
     raise _unfit(len(label))
 
 
@@ -131,13 +134,15 @@ class _Point(NamedTuple):
         return float(0.5 * self.dual @ (self.logits - self.intercept) + loss)  # scikit-learn's, with C = 1
 
 
-def _descended(at: _Point, step: _Point, label: np.ndarray) -> _Point:
+def _descend(at: _Point, step: _Point, label: np.ndarray) -> _Point:
     """Return the place after a step, halved until the objective falls."""
     value, size = at.objective(label), 1.0
     while True:
-        moved = _Point(at.dual + size * step.dual, at.intercept + size * step.intercept, at.logits + size * step.logits)
-        if moved.objective(label) <= value + 1e-12 * abs(value) or size < 1e-6:
-            return moved
+        candidate = _Point(
+            at.dual + size * step.dual, at.intercept + size * step.intercept, at.logits + size * step.logits
+        )
+        if candidate.objective(label) <= value + 1e-12 * abs(value) or size < 1e-6:
+            return candidate
         size /= 2
 
 
@@ -163,8 +168,8 @@ class _NewtonStep:
         """Return (I + W gram)^-1 right."""
         from scipy.linalg import cho_solve
 
-        scaled = self._root * (self._gram @ right)
-        return right - self._root * cho_solve((self._factor, False), scaled, check_finite=False)
+        scaled_product = self._root * (self._gram @ right)
+        return right - self._root * cho_solve((self._factor, False), scaled_product, check_finite=False)
 
     def solve(self, missing: np.ndarray, dual_sum: float) -> tuple[np.ndarray, float]:
         """Return steps of dual and intercept, after which the dual sums to 0."""
@@ -205,16 +210,16 @@ def auroc_interval(
     column of `weights` for each item. A resample in which a class is empty is dropped.
     """
     void = np.asarray(void, bool)
-    above, below = scores[void][:, None], scores[~void][None, :]
-    wins = (above > below).astype(np.float32) + np.float32(0.5) * (above == below)
+    void_scores, control_scores = scores[void][:, None], scores[~void][None, :]
+    win_weights = (void_scores > control_scores).astype(np.float32) + np.float32(0.5) * (void_scores == control_scores)
     times_void, times_control = weights[:, scenario[void]], weights[:, scenario[~void]]
-    won = ((times_void @ wins) * times_control).sum(axis=1, dtype=float)
+    won_weight = ((times_void @ win_weights) * times_control).sum(axis=1, dtype=float)
     pairs = times_void.sum(axis=1, dtype=float) * times_control.sum(axis=1, dtype=float)
     if not (pairs > 0).any():
         return np.nan, np.nan
-    low, high = np.quantile(won[pairs > 0] / pairs[pairs > 0], [(1 - level) / 2, (1 + level) / 2])
-    certain = ((1 - level) / 2) ** (1 / min(len(np.unique(scenario[side])) for side in (void, ~void)))
-    return min(float(low), certain), max(float(high), 1 - certain)
+    low, high = np.quantile(won_weight[pairs > 0] / pairs[pairs > 0], [(1 - level) / 2, (1 + level) / 2])
+    certain_share = ((1 - level) / 2) ** (1 / min(len(np.unique(scenario[side])) for side in (void, ~void)))
+    return min(float(low), certain_share), max(float(high), 1 - certain_share)
 
 
 # --- within a split ---------------------------------------------------------------------------------------------------
@@ -256,10 +261,10 @@ def within_split(split: Split, labels: np.ndarray, folds: np.ndarray) -> np.ndar
         train, test = folds != fold, folds == fold
         states = np.asarray(split.states[train], float)
         mean, scale = standardiser(states)
-        train_states, unseen = (states - mean) / scale, (split.states[test] - mean) / scale
+        train_states, test_states = (states - mean) / scale, (split.states[test] - mean) / scale
         gram = train_states @ train_states.T
         duals = np.column_stack([solve_gram(gram, column)[0] for column in labels[train].T])
-        scores = unseen @ (train_states.T @ duals)
+        scores = test_states @ (train_states.T @ duals)
         areas.append([auroc(labels[test, k], scores[:, k]) for k in range(labels.shape[1])])
     return np.mean(areas, axis=0)
 
@@ -273,9 +278,9 @@ def nearest_centroid(source: Split, states: np.ndarray) -> np.ndarray:
     Standardiser and centroids are the source's; with equal distances a state is assigned to control.
     """
     _check_labels(source.void)
-    known = np.asarray(source.states, float)
-    mean, scale = standardiser(known)
-    standard = (known - mean) / scale
+    source_states = np.asarray(source.states, float)
+    mean, scale = standardiser(source_states)
+    standard = (source_states - mean) / scale
     centroids = np.stack([standard[~source.void].mean(axis=0), standard[source.void].mean(axis=0)])
     centroids /= np.maximum(np.linalg.norm(centroids, axis=1, keepdims=True), np.finfo(float).tiny)
     control, void = centroids @ ((states - mean) / scale).T  # an item's own length has no effect

@@ -41,7 +41,7 @@ from traps_pipeline.protocol.datasets import DATASETS, PROBED_DATASETS, TIME_SWA
 from traps_pipeline.scoring.bootstrap import scenario_weights
 from traps_pipeline.storage.study import ProbeSettings
 
-MOST_WORKERS = 4
+MAX_WORKERS = 4
 Result = TypeVar("Result")
 Row = dict[str, Any]
 ReadLayer = Callable[[str, int], np.ndarray]  # dataset, layer -> states (n, d) in the order of the dataset's items
@@ -137,24 +137,24 @@ class ProbeRun:
     def rows(self, progress: Callable[[int, int], None] = lambda layers_done, total: None) -> list[Row]:
         """Return every row of the probes table without the columns that partition it."""
         rows: list[Row] = []
-        for layers_done, of_layer in enumerate(each_layer(self.layer_rows, self.n_layers), start=1):
-            rows += of_layer
+        for layers_done, layer_rows in enumerate(each_layer(self.layer_rows, self.n_layers), start=1):
+            rows += layer_rows
             progress(layers_done, self.n_layers)
         return mark_layers(rows + self._problems())
 
     def layer_rows(self, layer: int) -> list[Row]:
         """Return every row of one layer, whose states are in memory only during this call."""
         splits = {name: self._split(name, layer) for name in self._datasets}
-        rows = self.comparable(layer, splits) + self.within(layer, splits)
+        rows = self.comparable_rows(layer, splits) + self.within(layer, splits)
         return rows + (self.centroids(layer, splits) if layer == self.centroid_layer else [])
 
-    def comparable(self, layer: int, splits: Mapping[str, Split] | None = None) -> list[Row]:
+    def comparable_rows(self, layer: int, splits: Mapping[str, Split] | None = None) -> list[Row]:
         """Return one layer's rows that baselines share, from transfer to swapped times."""
         splits = splits or {name: self._split(name, layer) for name in self._datasets}
-        unseen = {source: self._unseen_scores(source, splits) for source in self._own}
-        rows = self.transfer(layer, splits) + self.held_out(layer, splits, unseen)
+        unseen_scores = {source: self._unseen_scores(source, splits) for source in self._own}
+        rows = self.transfer(layer, splits) + self.held_out(layer, splits, unseen_scores)
         rows += self.confabulated_transfer(layer, splits) + self.confabulated_held_out(layer, splits)
-        return rows + self.answerable(layer, splits, unseen) + self.time_swapped(layer, splits, unseen)
+        return rows + self.answerable(layer, splits, unseen_scores) + self.time_swapped(layer, splits, unseen_scores)
 
     def transfer(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
         """Return the twelve ordered pairs on all samples.
@@ -163,45 +163,49 @@ class ProbeRun:
         were used in the fit (see `held_out`).
         """
         scores = transfer_scores(splits, self._pairs, self.fit)
-        return [self._scored("transfer", path, layer, splits[path[1]], values) for path, values in scores.items()]
+        return [self._score_row("transfer", path, layer, splits[path[1]], values) for path, values in scores.items()]
 
     def confabulated_transfer(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
         """Return the same pairs restricted to confabulated voids and their controls."""
-        restricted = self._confabulated(splits)
-        pairs = [pair for pair in self._pairs if set(pair) <= set(restricted)]
-        scores = transfer_scores(restricted, pairs, self.fit)
-        return [self._scored("confabulated", path, layer, restricted[path[1]], v) for path, v in scores.items()]
+        confabulated_splits = self._confabulated_splits(splits)
+        pairs = [pair for pair in self._pairs if set(pair) <= set(confabulated_splits)]
+        scores = transfer_scores(confabulated_splits, pairs, self.fit)
+        return [
+            self._score_row("confabulated", path, layer, confabulated_splits[path[1]], v) for path, v in scores.items()
+        ]
 
     def confabulated_held_out(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
         """Return Cf->Cf within a taxonomy by held-out probes, null with few scenarios."""
-        restricted, rows = self._confabulated(splits), []
+        confabulated_splits, rows = self._confabulated_splits(splits), []
         for source, target in self._pairs:
-            if not {source, target} <= set(restricted) or taxonomy_of(source) != taxonomy_of(target):
+            if not {source, target} <= set(confabulated_splits) or taxonomy_of(source) != taxonomy_of(target):
                 continue
-            both = {name: restricted[name] for name in (source, target)}
-            few = self._too_few(source, both)
-            scores = None if few else self._unseen_scores(source, both)[target]
+            split_pair = {name: confabulated_splits[name] for name in (source, target)}
+            note = self._shortage_note(source, split_pair)
+            scores = None if note else self._unseen_scores(source, split_pair)[target]
             if scores is None:
-                rows.append(_row("confabulated_held_out", (source, target), layer, None, both[target], note=few))
+                rows.append(_row("confabulated_held_out", (source, target), layer, None, split_pair[target], note=note))
             else:
-                rows.append(self._scored("confabulated_held_out", (source, target), layer, both[target], scores))
+                rows.append(
+                    self._score_row("confabulated_held_out", (source, target), layer, split_pair[target], scores)
+                )
         return rows
 
-    def _confabulated(self, splits: Mapping[str, Split]) -> dict[str, Split]:
+    def _confabulated_splits(self, splits: Mapping[str, Split]) -> dict[str, Split]:
         return {name: splits[name].rows(mask) for name, mask in self._restricted.items()}
 
-    def _too_few(self, source: str, splits: Mapping[str, Split]) -> str:
+    def _shortage_note(self, source: str, splits: Mapping[str, Split]) -> str:
         """Return why a source's probes cannot hold out a fold of scenarios, if so."""
         n, folds = len(np.unique(splits[source].scenario)), self.settings.folds
-        every = np.unique(np.concatenate([split.scenario for split in splits.values()]))
-        if len(every) >= folds and len(np.unique(self._folds(splits)[source])) > 1:
+        scenarios = np.unique(np.concatenate([split.scenario for split in splits.values()]))
+        if len(scenarios) >= folds and len(np.unique(self._folds(splits)[source])) > 1:
             return ""
         return f"{path_name(*splits)}, held out: {n} confabulated voids are too few for {folds} folds of scenarios"
 
     def _folds(self, splits: Mapping[str, Split]) -> dict[str, np.ndarray]:
         """Return the fold of each item, by dataset; a scenario's fold is the same in all."""
-        every = np.unique(np.concatenate([split.scenario for split in splits.values()]))
-        fold_of = dict(zip(every, scenario_folds(every, self.settings.folds, self.seed), strict=True))
+        scenarios = np.unique(np.concatenate([split.scenario for split in splits.values()]))
+        fold_of = dict(zip(scenarios, scenario_folds(scenarios, self.settings.folds, self.seed), strict=True))
         return {name: np.array([fold_of[s] for s in split.scenario]) for name, split in splits.items()}
 
     def within(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
@@ -210,11 +214,13 @@ class ProbeRun:
         for name in self._own:
             split = splits[name]
             folds = scenario_folds(split.scenario, self.settings.folds, self.seed)
-            swapped = swapped_labels(split.void, split.scenario, self.settings.shuffles, self.seed)
-            areas = within_split(split, np.column_stack([split.void, swapped]), folds)
-            shuffled = areas[1:]
+            shuffled_labels = swapped_labels(split.void, split.scenario, self.settings.shuffles, self.seed)
+            areas = within_split(split, np.column_stack([split.void, shuffled_labels]), folds)
+            shuffled_areas = areas[1:]
             rows.append(_row("within", (name, name), layer, areas[0], split))
-            rows.append(_row("shuffled", (name, name), layer, shuffled.mean(), split, spread=shuffled.std()))
+            rows.append(
+                _row("shuffled", (name, name), layer, shuffled_areas.mean(), split, spread=shuffled_areas.std())
+            )
         return rows
 
     def held_out(
@@ -222,7 +228,7 @@ class ProbeRun:
     ) -> list[Row]:
         """Return the pairs within a taxonomy, by probes that hold out the scenario."""
         pairs = [(s, t) for s in self._own for t in self._own if taxonomy_of(s) == taxonomy_of(t)]
-        return [self._scored("held_out", (s, t), layer, splits[t], unseen[s][t]) for s, t in pairs]
+        return [self._score_row("held_out", (s, t), layer, splits[t], unseen[s][t]) for s, t in pairs]
 
     def answerable(
         self, layer: int, splits: Mapping[str, Split], unseen: Mapping[str, Mapping[str, np.ndarray]]
@@ -235,19 +241,19 @@ class ProbeRun:
         of these against the controls; the reverse. Probes of the same taxonomy are fitted without the scored scenario.
         """
         rows = []
-        for source, (extra, of_extra) in product(self._own, LOOK_ALIKES.items()):
-            if not {extra, of_extra} <= set(splits):
+        for source, (extra, extra_kind) in product(self._own, LOOK_ALIKES.items()):
+            if not {extra, extra_kind} <= set(splits):
                 continue
             for analysis, positive, negative in (
-                ("answerable_void", (of_extra, True), (extra, None)),
-                ("answerable_control", (extra, None), (of_extra, False)),
+                ("answerable_void", (extra_kind, True), (extra, None)),
+                ("answerable_control", (extra, None), (extra_kind, False)),
             ):
                 sides = [self._side(splits, unseen[source], *side) for side in (positive, negative)]
                 labels = np.repeat([True, False], [len(values) for values, _ in sides])
                 values = np.concatenate([values for values, _ in sides])
                 scenario = np.concatenate([places for _, places in sides])
                 split = Split(values[:, None], labels, scenario)
-                rows.append(self._scored(analysis, (source, extra), layer, split, values))
+                rows.append(self._score_row(analysis, (source, extra), layer, split, values))
         return rows
 
     def time_swapped(
@@ -258,7 +264,7 @@ class ProbeRun:
             return []
         split = splits[TIME_SWAPPED]
         return [
-            self._scored("time_swapped", (s, TIME_SWAPPED), layer, split, unseen[s][TIME_SWAPPED]) for s in self._own
+            self._score_row("time_swapped", (s, TIME_SWAPPED), layer, split, unseen[s][TIME_SWAPPED]) for s in self._own
         ]
 
     @staticmethod
@@ -295,7 +301,7 @@ class ProbeRun:
         """
         splits, rows = splits or {name: self._split(name, layer) for name in self._own}, []
         for source, target in self._pairs:
-            assigned, split = nearest_centroid(splits[source], splits[target].states), splits[target]
+            is_assigned_void, split = nearest_centroid(splits[source], splits[target].states), splits[target]
             groups = self._of[target]["sub_scenario"].to_numpy(str)
             scopes = {"all": np.full(len(groups), True)}
             scopes |= {f"sub_scenario:{name}": groups == name for name in sorted(set(groups))}
@@ -303,11 +309,11 @@ class ProbeRun:
                 scopes.items(), (("centroid_void", True), ("centroid_control", False))
             ):
                 is_selected = mask & (split.void == side)
-                share = assigned[is_selected].mean() if is_selected.any() else None
+                share = is_assigned_void[is_selected].mean() if is_selected.any() else None
                 rows.append(_row(analysis, (source, target), layer, share, split.rows(mask), scope=scope))
         return rows
 
-    def _scored(self, analysis: str, path: Path, layer: int, of: Split, scores: np.ndarray) -> Row:
+    def _score_row(self, analysis: str, path: Path, layer: int, of: Split, scores: np.ndarray) -> Row:
         weights = self._weights[probed_taxonomy(path[1])]
         interval = auroc_interval(of.void, scores, of.scenario, weights)
         return _row(analysis, path, layer, float(auroc(of.void, scores)), of, interval=interval)
@@ -330,7 +336,7 @@ def each_layer(work: Callable[[int], Result], n_layers: int) -> Iterator[Result]
     """
     from threadpoolctl import threadpool_limits
 
-    workers = min(cores(), MOST_WORKERS)
+    workers = min(cores(), MAX_WORKERS)
     with threadpool_limits(1), ThreadPoolExecutor(workers) as pool:
         yield from pool.map(work, range(n_layers))
 
@@ -371,9 +377,9 @@ def mark_layers(rows: Sequence[Row]) -> list[Row]:
             key = (row["analysis"], row["source"], row["target"])
             curves.setdefault(key, {})[row["layer"]] = row["value"]
     best = {key: min(curve, key=lambda layer: (-curve[layer], layer)) for key, curve in curves.items()}
-    of_pairs = pair_curves(rows)
+    curve_of = pair_curves(rows)
     targets = {row["target"] for row in rows if row["analysis"] in CURVES}
-    layers = {target: layer_choice(of_pairs, target).layer for target in targets} if of_pairs else {}
+    layers = {target: layer_choice(curve_of, target).layer for target in targets} if curve_of else {}
     return [
         row
         if row["analysis"] not in CURVES

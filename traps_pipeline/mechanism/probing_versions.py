@@ -23,13 +23,13 @@ SAMPLING = ("do_sample", "temperature", "top_p", "max_new_tokens")
 
 def loaded_params(entry: ModelEntry) -> dict[str, Any]:
     """Return a local model's parameters that its states depend on, without sampling."""
-    inside, left_out = entry.inside_params(), (*SAMPLING, "nf4_skip")
-    params = {name: value for name, value in effective_params(entry, "standard").items() if name not in left_out}
-    skipped = {"nf4_skip": [*inside.nf4_skip]} if inside.nf4_skip else {}
-    return params | {"quantisation": inside.quantisation} | skipped
+    local_params, omitted_names = entry.inside_params(), (*SAMPLING, "nf4_skip")
+    params = {name: value for name, value in effective_params(entry, "standard").items() if name not in omitted_names}
+    nf4_skip = {"nf4_skip": [*local_params.nf4_skip]} if local_params.nf4_skip else {}
+    return params | {"quantisation": local_params.quantisation} | nf4_skip
 
 
-def shown_inside(entry: ModelEntry, settings: MechanismSettings) -> ModelEntry:
+def mechanism_entry(entry: ModelEntry, settings: MechanismSettings) -> ModelEntry:
     """Return a model's entry with the media settings of the study's `mechanism`."""
     media = settings.models[entry.id].media
     return entry if media is None else entry.model_copy(update={"media": media})
@@ -64,7 +64,7 @@ def extraction_version(workspace: Workspace, extraction: Extraction) -> str:
     """Return the digest of checkpoint, precision, frames, VQA prompt and pooling."""
     entry, settings = get_model(extraction.model), workspace.study.mechanism
     if settings is not None and entry.id in settings.models:
-        entry = shown_inside(entry, settings)
+        entry = mechanism_entry(entry, settings)
     media = profile_digest(entry.media) if entry.media else None
     pooling = settings.pooling if settings else None
     system = states_prompt(settings.system if settings else "vqa", extraction.prompt)
@@ -112,7 +112,7 @@ def steering_version(workspace: Workspace, run: str) -> str:
     entry, settings = get_model(model), workspace.study.mechanism
     if settings is None or settings.steering is None or model not in settings.models:
         return "none"
-    entry = shown_inside(entry, settings)
+    entry = mechanism_entry(entry, settings)
     inputs = settings.steering.model_dump(mode="json"), settings.models[model].model_dump(mode="json"), settings.seed
     media = profile_digest(entry.media) if entry.media else None
     return digest([*inputs, loaded_params(entry), media, system_prompt(regime)])[:16]

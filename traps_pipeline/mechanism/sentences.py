@@ -47,20 +47,22 @@ def sentence_rows(workspace: Workspace, entry: ModelEntry, extraction: Extractio
         items = workspace.tables.read(PROBE_ITEMS, {"dataset": dataset}).to_dict("records")
         for number, item in enumerate(items, start=1):
             progress.current().tick("sentences", f"items of {cell.key}", number, len(items))
-            about = {str(name): value for name, value in item.items()}
-            prompt = probed_item(workspace, model, entry.media, about, system_prompt(regime)).prompt()
-            text = texts.get(about["item_id"])
+            item_columns = {str(name): value for name, value in item.items()}
+            prompt = probed_item(workspace, model, entry.media, item_columns, system_prompt(regime)).prompt()
+            text = texts.get(item_columns["item_id"])
             answer_ids = answer_tokens(model, text)[:OWN_TOKENS] if isinstance(text, str) and text else []
             with model.caching_clips():
-                likely = {name: mean_log_probability(model, prompt, tokens) for name, tokens in sentences.items()}
+                log_probability_of = {
+                    name: mean_log_probability(model, prompt, tokens) for name, tokens in sentences.items()
+                }
                 answer = mean_log_probability(model, prompt, answer_ids) if answer_ids else None
-            best = max(likely, key=lambda name: likely[name])
+            best = max(log_probability_of, key=lambda name: log_probability_of[name])
             rows.append(
                 SentenceRow(
                     **extraction.partition,
-                    **{name: about[name] for name in ("item_id", "dataset", "scenario_id", "side")},
+                    **{name: item_columns[name] for name in ("item_id", "dataset", "scenario_id", "side")},
                     sentence=best,
-                    abstention=likely[best],
+                    abstention=log_probability_of[best],
                     own=answer,
                     own_tokens=len(answer_ids),
                 )
@@ -82,8 +84,8 @@ def mean_log_probability(model: LocalModel, prompt: Prompt, tokens: list[int]) -
     """Return tokens' mean log-probability after a prompt (nats per token); one pass."""
     import torch
 
-    forced = prompt.followed_by(tokens)
+    full_prompt = prompt.followed_by(tokens)
     with torch.inference_mode():
-        states = model.forward(forced).last_hidden_state[0, -len(tokens) - 1 : -1]
+        states = model.forward(full_prompt).last_hidden_state[0, -len(tokens) - 1 : -1]
         chances = head_logits(model, states).log_softmax(-1)
         return float(chances[torch.arange(len(tokens)), torch.tensor(tokens)].mean())

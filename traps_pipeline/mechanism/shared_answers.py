@@ -43,7 +43,7 @@ class SharedAnswers:
         """Split a cell's calls into chunks, register these, and return them."""
         calls = list({request.key: request for request in requests}.values())
         parts = [calls[first : first + self._size] for first in range(0, len(calls), self._size)]
-        result = [Chunk(digest([each.key for each in part])[:16], {each.key: each for each in part}) for part in parts]
+        result = [Chunk(digest([call.key for call in part])[:16], {call.key: call for call in part}) for part in parts]
         for chunk in result:
             self._of |= dict.fromkeys(chunk.calls, chunk)
         return result
@@ -64,7 +64,7 @@ class SharedAnswers:
                 outcome_of |= self._read(chunk)
             missing = [request for request in requests if request.key not in outcome_of]
             if missing:
-                outcome_of |= zip([each.key for each in missing], make(missing, stopped), strict=True)
+                outcome_of |= zip([call.key for call in missing], make(missing, stopped), strict=True)
         return [outcome_of[request.key] for request in requests]
 
     def fill(self, chunk: Chunk, settled_among: Callable[[Sequence[str]], set[str]], make: Make) -> int | None:
@@ -74,12 +74,12 @@ class SharedAnswers:
             return None
         with closing(lease):
             chunk_outcomes = self._read(chunk)
-            settled = settled_among(list(chunk.calls)) | {*chunk_outcomes}
-            missing = [request for key, request in chunk.calls.items() if key not in settled]
+            settled_keys = settled_among(list(chunk.calls)) | {*chunk_outcomes}
+            missing = [request for key, request in chunk.calls.items() if key not in settled_keys]
             if missing:
                 outcomes = make(missing, lambda: False)
-                chunk_outcomes |= zip([each.key for each in missing], outcomes, strict=True)
-                content = json.dumps({key: asdict(each) for key, each in chunk_outcomes.items()})
+                chunk_outcomes |= zip([call.key for call in missing], outcomes, strict=True)
+                content = json.dumps({key: asdict(call) for key, call in chunk_outcomes.items()})
                 self._store.write({self._path(chunk): content.encode()})
             return len(missing)
 
@@ -135,9 +135,9 @@ def make_meanwhile(
     tick: receives the chunks done and their number.
     """
     chunks, count = shared.chunks(wanted), 0
-    for finished, chunk in enumerate(reversed(chunks), start=1):
+    for n_finished, chunk in enumerate(reversed(chunks), start=1):
         count += shared.fill(chunk, lambda keys: {*ledger.read(evaluation, keys).settled}, make) or 0
-        tick(finished, len(chunks))
+        tick(n_finished, len(chunks))
         if not is_written(ledger, evaluation):
             break
     return count

@@ -18,7 +18,7 @@ from traps_pipeline.mechanism.mechanism_rows import SteeringEffectRow, SteeringS
 from traps_pipeline.mechanism.steering import UNSTEERED
 from traps_pipeline.mechanism.transfer_paths import PATH_SETS, STEERING_PATHS
 from traps_pipeline.protocol.datasets import taxonomy_of, transfer_type
-from traps_pipeline.protocol.ratings import ABSTENTION, CORRECTNESS, decided, majority, ratings
+from traps_pipeline.protocol.ratings import ABSTENTION, CORRECTNESS, majority, ratings, vote_decisions
 from traps_pipeline.scoring.bootstrap import (
     RESAMPLES,
     SEED,
@@ -42,20 +42,20 @@ _PATH = [*_CELL, "source", "kind", "layer", "alpha", "side"]
 _PATH_SETS = {ALL: STEERING_PATHS, **PATH_SETS}
 
 
-def of_paper(rows: pd.DataFrame) -> pd.DataFrame:
+def paper_protocol_rows(rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows of the paper's protocol: void or unsteered, alphas, signs by label."""
     return rows.loc[rows["kind"].isin(["void", UNSTEERED]) & (rows["unit"] == "alpha") & (rows["signs"] == "label")]
 
 
 def answers_of_paths(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
     """Return answers with verdicts, one row per path; alpha 0 belongs to every path."""
-    copied = ["side", "alpha", "scenario_id", "alpha_relative", "degenerate", "request_key", "epoch"]
-    joined = _with_verdicts(pd.DataFrame(answers[[*_ANSWER, *copied]]), votes)
-    steered = joined.loc[joined["kind"] != UNSTEERED]
-    plain = joined.loc[joined["kind"] == UNSTEERED].drop(columns=_ALONG)
+    columns = ["side", "alpha", "scenario_id", "alpha_relative", "degenerate", "request_key", "epoch"]
+    judged_answers = _with_verdicts(pd.DataFrame(answers[[*_ANSWER, *columns]]), votes)
+    steered_answers = judged_answers.loc[judged_answers["kind"] != UNSTEERED]
+    unsteered_answers = judged_answers.loc[judged_answers["kind"] == UNSTEERED].drop(columns=_ALONG)
     keys = [*_RUN, "dataset", "side", "scenario_id"]  # compare a path with unsteered answers to its scenarios
-    paths = steered[[*keys, *_ALONG]].drop_duplicates()
-    return pd.concat([steered, plain.merge(paths, on=keys)], ignore_index=True)
+    paths = steered_answers[[*keys, *_ALONG]].drop_duplicates()
+    return pd.concat([steered_answers, unsteered_answers.merge(paths, on=keys)], ignore_index=True)
 
 
 def _with_verdicts(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
@@ -64,12 +64,16 @@ def _with_verdicts(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
     They are null without a text, votes or a majority, and `correct` on voids. Each cell is decided by itself: after a
     change of panel, a cell keeps votes of the old panel until the new votes are made.
     """
-    votes_on, none = dict(iter(votes.groupby(_CELL))), votes.head(0)
+    votes_on, no_votes = dict(iter(votes.groupby(_CELL))), votes.head(0)
     parts: list[pd.DataFrame] = []
-    for cell, of_cell in answers.groupby(_CELL, sort=False):
-        matrix = ratings(votes_on.get(cell, none), answer=_ANSWER)
+    for cell, cell_answers in answers.groupby(_CELL, sort=False):
+        matrix = ratings(votes_on.get(cell, no_votes), answer=_ANSWER)
         tasks = {"abstained": ABSTENTION, "correct": CORRECTNESS}
-        parts.append(of_cell.assign(**{n: decided(majority(matrix.on(of_cell, t)[0])) for n, t in tasks.items()}))
+        parts.append(
+            cell_answers.assign(
+                **{n: vote_decisions(majority(matrix.on(cell_answers, t)[0])) for n, t in tasks.items()}
+            )
+        )
     return pd.concat(parts, ignore_index=True)
 
 
@@ -77,17 +81,17 @@ def effect_rows(answers: pd.DataFrame, votes: pd.DataFrame) -> list[SteeringEffe
     """Return STEERING_EFFECTS rows: abstention by path, dose, kind, draw, layer, side."""
     rows: list[SteeringEffectRow] = []
     for key, group in answers_of_paths(answers, votes).groupby(_EFFECT, sort=True):
-        about = dict(zip(_EFFECT, cast(tuple[Any, ...], key), strict=True))
-        target = about.pop("dataset")
-        decided, correct = (group[name].dropna().to_numpy(bool) for name in ("abstained", "correct"))
-        n, yes = len(decided), int(np.count_nonzero(decided))
+        row_keys = dict(zip(_EFFECT, cast(tuple[Any, ...], key), strict=True))
+        target = row_keys.pop("dataset")
+        abstentions, correct = (group[name].dropna().to_numpy(bool) for name in ("abstained", "correct"))
+        n, yes = len(abstentions), int(np.count_nonzero(abstentions))
         low, high = wilson(np.array([yes]), np.array([n]))
         relative = group["alpha_relative"].dropna()
         rows.append(
             SteeringEffectRow(
-                **about,
+                **row_keys,
                 target=target,
-                transfer_type=transfer_type(str(about["source"]), str(target)),
+                transfer_type=transfer_type(str(row_keys["source"]), str(target)),
                 alpha=float(group["alpha"].iloc[0]),
                 alpha_relative=float(relative.iloc[0]) if len(relative) else None,
                 correct=int(np.count_nonzero(correct)),
@@ -113,28 +117,32 @@ def share_rows(
     There are rows for each regime of directions and of answers and over all regimes, with an interval from resampled
     scenarios (all paths share the scenarios of a resample, and the unseen one).
     """
-    decided = answers_of_paths(of_paper(answers), of_paper(votes)).dropna(subset=["abstained"])
-    decided = decided.merge(decided.loc[decided["side"] == "void", ["model", "layer"]].drop_duplicates())  # no sweep
+    decided_answers = answers_of_paths(paper_protocol_rows(answers), paper_protocol_rows(votes)).dropna(
+        subset=["abstained"]
+    )
+    decided_answers = decided_answers.merge(
+        decided_answers.loc[decided_answers["side"] == "void", ["model", "layer"]].drop_duplicates()
+    )  # no sweep
     rows: list[SteeringShareRow] = []
-    for _, of_model in decided.groupby("model", sort=True):
-        paths = pd.DataFrame(of_model[_PATH]).drop_duplicates(ignore_index=True)
-        numbered = of_model.merge(paths.reset_index(names="path"), on=_PATH)
-        ends = _shares(numbered, len(paths), resamples, seed)
+    for _, model_answers in decided_answers.groupby("model", sort=True):
+        paths = pd.DataFrame(model_answers[_PATH]).drop_duplicates(ignore_index=True)
+        path_answers = model_answers.merge(paths.reset_index(names="path"), on=_PATH)
+        ends = _shares(path_answers, len(paths), resamples, seed)
         for pool, members in _pools(paths):
-            of_pool = numbered.loc[np.isin(numbered["path"], members)]
-            of_mean = ends[:, members].mean(axis=1)
-            low, high = interval(of_mean[:, 1:], of_mean[0, 0], (0.0, 1.0))
+            pool_answers = path_answers.loc[np.isin(path_answers["path"], members)]
+            mean_ends = ends[:, members].mean(axis=1)
+            low, high = interval(mean_ends[:, 1:], mean_ends[0, 0], (0.0, 1.0))
             rows.append(
                 SteeringShareRow(
                     **pool,
-                    n_paths=len(of_pool[["source", "dataset"]].drop_duplicates()),
-                    n=len(of_pool),
-                    n_answers=len(set(of_pool["request_key"])),
-                    n_scenarios=len(set(of_pool["scenario_id"])),
-                    abstention=float(of_mean[0, 0]),
+                    n_paths=len(pool_answers[["source", "dataset"]].drop_duplicates()),
+                    n=len(pool_answers),
+                    n_answers=len(set(pool_answers["request_key"])),
+                    n_scenarios=len(set(pool_answers["scenario_id"])),
+                    abstention=float(mean_ends[0, 0]),
                     low=float(low),
                     high=float(high),
-                    epoch="+".join(sorted(set(of_pool["epoch"]))),
+                    epoch="+".join(sorted(set(pool_answers["epoch"]))),
                 )
             )
     return rows
@@ -149,12 +157,12 @@ def _shares(numbered: pd.DataFrame, n_paths: int, resamples: int, seed: int) -> 
     numbered = numbered.assign(taxonomy=numbered["dataset"].map(taxonomy_of))
     resampling = draw_scenarios(numbered, resamples, seed)
     for taxonomy in TAXONOMIES:
-        of_taxonomy = numbered.loc[numbered["taxonomy"] == taxonomy]
+        own_answers = numbered.loc[numbered["taxonomy"] == taxonomy]
         names, weights = resampling.scenarios[taxonomy]
-        path, path_names = pd.factorize(of_taxonomy["path"])
+        path, path_names = pd.factorize(own_answers["path"])
         counts = np.zeros((len(names), len(path_names), 2))
-        places = names.get_indexer(pd.Index(of_taxonomy["scenario_id"])), path
-        np.add.at(counts[..., 0], places, of_taxonomy["abstained"].to_numpy(bool))
+        places = names.get_indexer(pd.Index(own_answers["scenario_id"])), path
+        np.add.at(counts[..., 0], places, own_answers["abstained"].to_numpy(bool))
         np.add.at(counts[..., 1], places, 1)
         sums = with_unseen(
             resampled_sums(weights, counts), (counts[..., 1:] > 0).sum(axis=0), resampling.unseen(taxonomy, decisions=1)
@@ -166,11 +174,13 @@ def _shares(numbered: pd.DataFrame, n_paths: int, resamples: int, seed: int) -> 
 def _pools(paths: pd.DataFrame) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
     """Yield the path sets to average: their naming columns, and rows of `paths`."""
     pairs = pd.Series(list(zip(paths["source"], paths["dataset"], strict=True)), index=paths.index)
-    every = {name: [ALL, *sorted(set(paths[name]))] for name in ("directions", "regime")}
-    for (path_set, members), directions, regime in product(_PATH_SETS.items(), every["directions"], every["regime"]):
-        inside = pairs.isin(members)
+    values_by_name = {name: [ALL, *sorted(set(paths[name]))] for name in ("directions", "regime")}
+    for (path_set, members), directions, regime in product(
+        _PATH_SETS.items(), values_by_name["directions"], values_by_name["regime"]
+    ):
+        is_member = pairs.isin(members)
         for name, value in (("directions", directions), ("regime", regime)):
-            inside &= (paths[name] == value) | (value == ALL)
-        for key, group in paths.loc[inside].groupby(["model", "kind", "layer", "alpha", "side"], sort=True):
+            is_member &= (paths[name] == value) | (value == ALL)
+        for key, group in paths.loc[is_member].groupby(["model", "kind", "layer", "alpha", "side"], sort=True):
             names = dict(zip(("model", "kind", "layer", "alpha", "side"), cast(tuple[Any, ...], key), strict=True))
             yield names | {"path_set": path_set, "directions": directions, "regime": regime}, group.index.to_numpy()

@@ -31,7 +31,7 @@ from traps_pipeline.mechanism.mechanism_rows import (
 )
 from traps_pipeline.mechanism.probe_items import other_clip
 from traps_pipeline.mechanism.probing import Confabulated, NothingConfabulated, ProbeRun, confabulated_scenarios
-from traps_pipeline.mechanism.probing_versions import shown_inside, states_folder
+from traps_pipeline.mechanism.probing_versions import mechanism_entry, states_folder
 from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.mechanism.transfer_paths import CURVES
 from traps_pipeline.models.prompts import states_prompt
@@ -63,7 +63,7 @@ def examined_model(workspace: Workspace, model: str) -> ModelEntry:
         )
     if model not in settings.models:
         raise TrapsError(f"study.yaml: mechanism.models does not name {model}; add it with its layers")
-    return shown_inside(entry, settings)
+    return mechanism_entry(entry, settings)
 
 
 # --- hidden states ----------------------------------------------------------------------------------------------------
@@ -92,10 +92,10 @@ def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[list[HiddenS
     record, (ids, _) = read_record(folder), read_layer(folder, 0)
     keys, devices = (dict(zip(ids["item_id"], ids[name], strict=True)) for name in ("key", "device"))
     source = {name: record[name] for name in ("checkpoint", "checkpoint_digest", "dtype", "quantisation", "pooling")}
-    copied = ("item_id", "scenario_id", "side", "sub_scenario", "benchmark_version")
+    columns = ("item_id", "scenario_id", "side", "sub_scenario", "benchmark_version")
     rows = [
         HiddenStatesRow(
-            **{name: item[name] for name in copied},
+            **{name: item[name] for name in columns},
             **source,
             dataset=cell.dataset,
             model=cell.extraction.model,
@@ -125,7 +125,7 @@ def probed_item(workspace: Workspace, model: LocalModel, spec: MediaSpec, row: M
 
 
 def unsound_layers(workspace: Workspace, cell: StatesCell, n_layers: int) -> list[int]:
-    """Return which of the first and last layers contain a number that is not finite."""
+    """Return which of the first and last layers contain non-finite numbers."""
     from traps_pipeline.mechanism.hidden_states import read_layer
 
     folder = workspace.bring_folder(states_folder(workspace, cell))
@@ -164,9 +164,9 @@ def probe_rows(workspace: Workspace, extraction: Extraction) -> list[ProbeRow]:
             [settings.probes.model_dump(mode="json"), layers.centroid, settings.seed, CURVES],
         ]
     )[:16]
-    known = _known_rows(workspace, extraction, made_of)
-    if known is not None:
-        return known
+    known_rows = _known_rows(workspace, extraction, made_of)
+    if known_rows is not None:
+        return known_rows
     centroid, n_layers = layers.centroid, states.n_layers
     run = ProbeRun(states.items, states.read, n_layers, centroid, settings.probes, settings.seed, confabulated)
     rows = run.rows(lambda done, total: progress.current().tick("probes", f"layers of {extraction.key}", done, total))
@@ -257,15 +257,15 @@ def _dataset_directions(workspace: Workspace, states: StoredStates, dataset: str
     kinds, draws = (nulls.kinds, nulls.draws) if nulls else ((), 1)
     directions = extract_directions(voids, controls, seed, kinds, draws)
     path = directions_file(workspace, states.extraction, dataset)
-    used = items.loc[items["scenario_id"].isin(scenarios)]
-    first = used.iloc[0]
+    scenario_items = items.loc[items["scenario_id"].isin(scenarios)]
+    first = scenario_items.iloc[0]
     origin = Origin(
         **states.extraction.partition,
         **{name: str(first[name]) for name in ("checkpoint", "checkpoint_digest", "dtype", "quantisation", "pooling")},
         dataset=dataset,
         seed=settings.seed,
         scenarios=tuple(scenarios),
-        states_digest=digest(sorted(used["states_key"])),
+        states_digest=digest(sorted(scenario_items["states_key"])),
     )
     save_directions(path, directions, origin)
     workspace.store.keep([path, path.with_suffix(".json")])
@@ -286,8 +286,8 @@ def _dataset_directions(workspace: Workspace, states: StoredStates, dataset: str
             direction_digest=vector_digest(vectors[layer]),
             pooling=origin.pooling,
         )
-        for kind, of_kind in directions.vectors.items()
-        for draw, vectors in enumerate(of_kind)
+        for kind, kind_vectors in directions.vectors.items()
+        for draw, vectors in enumerate(kind_vectors)
         for layer in range(states.n_layers)
     ]
 

@@ -33,7 +33,7 @@ class SteeredBackend(LocalBackend):
         self._vectors, self._made = vectors, shared
         self._prompt = lru_cache(PROMPTS_KEPT)(self._make_prompt)
 
-    def _answers(self, batch: _Batch) -> list[Outcome]:
+    def _answer_batch(self, batch: _Batch) -> list[Outcome]:
         """Answer a batch, in the worker thread, except for answers from another process."""
         return self._made.outcomes(batch.requests, self.generate, batch.abandoned.is_set)
 
@@ -58,10 +58,10 @@ class SteeredBackend(LocalBackend):
                 along = [request.params["steering"] for request in requests]
                 vectors = np.stack([self._vectors[steering["direction"]] for steering in along])
                 hook = Steering(vectors, group, tuple(float(steering["alpha"]) for steering in along))
-            most = requests[0].params["max_new_tokens"]
+            max_tokens = requests[0].params["max_new_tokens"]
             with model.caching_clips():
-                generated = model.generate(prompts, most, None, hook, stopped=stopped)
-            for number, answer in zip(numbers, generated, strict=True):
+                answers = model.generate(prompts, max_tokens, None, hook, stopped=stopped)
+            for number, answer in zip(numbers, answers, strict=True):
                 counts = (answer.prompt_tokens, answer.completion_tokens)
                 outcomes[number] = outcome(answer.text, answer.finish_reason, *counts, model.served_model)
         return [outcomes[number] for number in range(len(batch))]

@@ -31,7 +31,7 @@ from traps_pipeline.mechanism.transfer_paths import sources_of
 from traps_pipeline.models.answers import Question
 from traps_pipeline.models.ask import SettledCell, collect
 from traps_pipeline.models.judges import JudgeEntry, load_panel
-from traps_pipeline.models.participants import Row, when_asked
+from traps_pipeline.models.participants import Row, call_time_columns
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.registry import Entry, ModelEntry
 from traps_pipeline.models.request import Request
@@ -71,7 +71,7 @@ class Strength:
 
 
 def sign_of(signs: str, side: str) -> int:
-    """Return whether a policy adds (1) or subtracts (-1) on a side."""
+    """Return 1 if a policy adds the direction on a side, -1 if it subtracts it."""
     return {"plus": 1, "minus": -1}.get(signs, 1 if side == "control" else -1)
 
 
@@ -187,13 +187,15 @@ def count_answers(
             if side in row.sides:
                 along = (owner, side, row.source, row.kind, row.draw, row.layer, sign_of(row.signs, side))
                 doses = row.doses if row.kind == "void" else row.doses[-1:]
-                cells |= {(*along, *rest) for rest in product(steering.direction_regimes, doses)}
+                cells |= {(*along, *combination) for combination in product(steering.direction_regimes, doses)}
     answers = Counter[str]()
     for cell in cells:
         source, taxonomy = str(cell[2]), taxonomy_of(str(cell[0]))
-        own = source != UNSTEERED and taxonomy_of(source) == taxonomy  # along a direction of its own scenarios
-        unseen = scenarios.get(taxonomy, 0) - (steering.direction_pairs(source) if own else 0)
-        answers[cell[1]] += max(0, min(steering.pairs, unseen))
+        is_own_direction = (
+            source != UNSTEERED and taxonomy_of(source) == taxonomy
+        )  # along a direction of its own scenarios
+        n_scenarios = scenarios.get(taxonomy, 0) - (steering.direction_pairs(source) if is_own_direction else 0)
+        answers[cell[1]] += max(0, min(steering.pairs, n_scenarios))
     return dict.fromkeys(steering.inference_regimes, answers)
 
 
@@ -211,16 +213,16 @@ def wanted_steered(
     cell: SteeringCell,
     directions: Mapping[str, Directions],
 ) -> list[SteeredQuestion]:
-    """Return a cell's calls, those with the same prompt together, to share a clip."""
+    """Return a cell's calls, grouped by prompt so that answers share a clip."""
     settings = workspace.mechanism
     assert settings.steering is not None, "an experiment without steering has no steering cells"
     items = workspace.tables.read(ITEMS, {"dataset": cell.dataset})
     scenarios = steered_scenarios(sorted(set(items["scenario_id"])), settings.steering.pairs, settings.seed)
     rows = items.loc[items["scenario_id"].isin(scenarios)].to_dict("records")
     plan = strengths(cell.dataset, settings.models[entry.id], settings, directions)
-    most = settings.steering.max_new_tokens
+    max_tokens = settings.steering.max_new_tokens
     return [
-        SteeredQuestion(steered_request(workspace, entry, item, cell, strength, most), item, strength)
+        SteeredQuestion(steered_request(workspace, entry, item, cell, strength, max_tokens), item, strength)
         for item in rows
         for strength, sides in plan
         if item["side"] in sides
@@ -242,23 +244,23 @@ def steered_request(
     media = workspace.media.prepare(clip, item["media_digest"], entry.media)
     steering = None
     if strength.alpha:
-        signed = strength.signed_alpha(item["side"])
-        steering = {"direction": strength.digest, "layer": strength.layer, "alpha": signed}
+        signed_alpha = strength.signed_alpha(item["side"])
+        steering = {"direction": strength.digest, "layer": strength.layer, "alpha": signed_alpha}
     return Request(
         participant=entry.id,
         endpoint=entry.backend,
         params=loaded_params(entry) | {"do_sample": False, "max_new_tokens": max_new_tokens, "steering": steering},
         system=system_prompt(cell.evaluation.regime),
         user=item["question"],
-        about={"item_id": shared_item(item), "model": entry.id, "regime": cell.evaluation.regime},
+        about={"item_id": ledger_item_id(item), "model": entry.id, "regime": cell.evaluation.regime},
         media=clip,
         sent=media,
         media_digest=media.sha256,
     )
 
 
-def shared_item(item: Mapping[str, Any]) -> str:
-    """Return an item's id in the ledger, one for a taxonomy's shared controls."""
+def ledger_item_id(item: Mapping[str, Any]) -> str:
+    """Return an item's ledger id; a taxonomy's datasets share the ids of controls."""
     dataset = taxonomy_of(item["dataset"]) if item["side"] == "control" else item["dataset"]
     return f"{dataset}:{item['scenario_id']}:{item['side']}"
 
@@ -279,8 +281,8 @@ def collect_steered(
     """
     vectors = {
         vector_digest(vector): vector
-        for of_prompt in directions.values()
-        for group in of_prompt.values()
+        for prompt_directions in directions.values()
+        for group in prompt_directions.values()
         for kind in group.vectors
         for draw in group.vectors[kind]
         for vector in draw
@@ -290,14 +292,14 @@ def collect_steered(
 
     def calls(cell: SteeringCell) -> list[SteeredQuestion]:
         questions = wanted_steered(workspace, entry, cell, directions[cell.directions])
-        store.chunks([each.request for each in questions])
+        store.chunks([question.request for question in questions])
         return questions
 
     def finish(settled: SettledCell[SteeringCell, SteeredQuestion]) -> tuple[SteeringCell, StageOutput]:
-        store.forget([each.request for each in settled.calls])
-        answered = settled.answered()
-        plain = {q.item["item_id"]: row["text"] for q, row in answered if q.strength.kind == UNSTEERED}
-        return settled.output(partial(_steering_row, plain))
+        store.forget([call.request for call in settled.calls])
+        answers = settled.answered()
+        unsteered_texts = {q.item["item_id"]: row["text"] for q, row in answers if q.strength.kind == UNSTEERED}
+        return settled.output(partial(_steering_row, unsteered_texts))
 
     def make(entry: Entry) -> SteeredBackend:
         return SteeredBackend(entry, vectors, store)
@@ -318,7 +320,7 @@ def _make_meanwhile(
     """Generate answers of a cell while another process writes those of its evaluation."""
     report = progress.current()
     report.note(f"{cell.key}: another process writes the answers; some are made here, from the last one on")
-    requests = [each.request for each in questions]
+    requests = [question.request for question in questions]
     tick = partial(report.tick, "steering", f"chunks of answers of {cell.key}")
     count = make_meanwhile(shared, workspace.answers, cell.evaluation.key, requests, backend.generate, tick)
     report.note(f"{cell.key}: {count} answers were made for the process that writes them")
@@ -332,7 +334,7 @@ def _steering_row(
         **cell.partition,
         **{name: item[name] for name in ("item_id", "scenario_id", "side", "benchmark_version")},
         **{name: row[name] for name in ("outcome", "text", "served_model", "completion_tokens")},
-        **when_asked(row),
+        **call_time_columns(row),
         **{name: getattr(strength, name) for name in ("source", "kind", "draw", "layer", "unit", "dose", "signs")},
         alpha=strength.alpha,
         alpha_relative=strength.relative,
@@ -358,18 +360,18 @@ def wanted_steering_ballots(workspace: Workspace, panel: Sequence[JudgeEntry], c
     """Return the calls for every vote on the steered answers of a cell."""
     ballots = []
     for answer, item in judged_answers(workspace, STEERING, cell):
-        shared = item | {"item_id": shared_item(answer)}
-        both = item | answer
+        control_item = item | {"item_id": ledger_item_id(answer)}
+        answer_row = item | answer
         for task in tasks_for(answer["side"]):
-            for request in vote_requests(panel, task, cell, shared, answer["text"]):
-                about = {**request.about, "steered": answer["request_key"]}
-                ballots.append(Ballot(replace(request, about=about), both, task))
+            for request in vote_requests(panel, task, cell, control_item, answer["text"]):
+                subject = {**request.about, "steered": answer["request_key"]}
+                ballots.append(Ballot(replace(request, about=subject), answer_row, task))
     return ballots
 
 
 def _vote_row(cell: SteeringCell, ballot: Ballot, row: Row) -> SteeringVoteRow:
-    copied = ("source", "kind", "draw", "layer", "unit", "dose", "signs", "alpha", "item_id", "side")
-    about = {name: ballot.item[name] for name in (*copied, "benchmark_version")}
+    columns = ("source", "kind", "draw", "layer", "unit", "dose", "signs", "alpha", "item_id", "side")
+    item_columns = {name: ballot.item[name] for name in (*columns, "benchmark_version")}
     vote = ballot.vote(row)
     correct = vote.decision if ballot.task == "correctness" else None
-    return SteeringVoteRow(**cell.partition, **about, **vote_columns(ballot, vote, row), correct=correct)
+    return SteeringVoteRow(**cell.partition, **item_columns, **vote_columns(ballot, vote, row), correct=correct)

@@ -25,18 +25,18 @@ def untrained_model(entry: ModelEntry, seed: int) -> LocalModel:
     """Return the entry's network with random, unquantised weights: a second model."""
     import torch
 
-    trained = load_local_model(entry, inside=True)
+    trained_model = load_local_model(entry, inside=True)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         network = load_transformers().AutoModelForImageTextToText.from_config(
-            trained.network.config, dtype=trained.network.dtype
+            trained_model.network.config, dtype=trained_model.network.dtype
         )
     return LocalModel(
-        network.to(trained.inputs_device).eval().requires_grad_(False),
-        trained.processor,
-        trained.checkpoint,
-        trained.params,
-        trained.device,
+        network.to(trained_model.inputs_device).eval().requires_grad_(False),
+        trained_model.processor,
+        trained_model.checkpoint,
+        trained_model.params,
+        trained_model.device,
     )
 
 
@@ -47,14 +47,14 @@ def untrained_states(
     model = untrained_model(entry, workspace.mechanism.seed)
     system, layer = states_prompt(workspace.mechanism.system, states.extraction.prompt), (model.n_layers + 1) // 2
     assert entry.media is not None, "local entries have media"
-    by_dataset: dict[str, np.ndarray] = {}
+    states_by_dataset: dict[str, np.ndarray] = {}
     parts: dict[str, list[np.ndarray]] = {}
     for dataset, rows in items.items():
         keys = states.dataset(dataset)["states_key"]
         for key, row in zip(keys, rows.to_dict("records"), strict=True):
-            if key not in by_dataset:
-                named = {str(name): value for name, value in row.items()}
-                item = probed_item(workspace, model, entry.media, named, system)
-                by_dataset[key] = item_states(model, item, item.prompt(), workspace.mechanism.pooling).raw[layer]
-            parts.setdefault(dataset, []).append(by_dataset[key])
+            if key not in states_by_dataset:
+                item_row = {str(name): value for name, value in row.items()}
+                item = probed_item(workspace, model, entry.media, item_row, system)
+                states_by_dataset[key] = item_states(model, item, item.prompt(), workspace.mechanism.pooling).raw[layer]
+            parts.setdefault(dataset, []).append(states_by_dataset[key])
     return {dataset: np.stack(vectors) for dataset, vectors in parts.items()}

@@ -52,7 +52,7 @@ class AccountBudget:
         self.cap_usd = parse_yaml_model(Cap, read_yaml(path), path).usd
         self._spent: defaultdict[str, float] = defaultdict(float)
         self._descriptor, self._read = -1, 0
-        with self._locked():
+        with self._lock():
             if self._read > _COMPACTED:
                 content = b"".join(line_with_checksum({"study": name, "usd": usd}) for name, usd in self._spent.items())
                 write_bytes(self._path, content, durable=True)  # other processes notice the new file and read it
@@ -64,22 +64,22 @@ class AccountBudget:
     @property
     def spent_usd(self) -> Mapping[str, float]:
         """Dollars spent or reserved, by study."""
-        with self._locked():
+        with self._lock():
             return dict(self._spent)
 
     def begin(self, known_usd: float) -> None:
-        """Add this study's spending through the account that the folder lacks.
+        """Record this study's earlier spending that the account's folder lacks.
 
         The study spent it before it named the folder, or the file was lost. known_usd: dollars by the study's own
         ledgers and journal.
         """
-        with self._locked():
+        with self._lock():
             if (missing := known_usd - self._spent[self.study]) > 1e-6:
                 self._append(missing)
 
     def reserve(self, dollars: float) -> bool:
         """Reserve a call's worst case if the cap leaves room; return whether it does."""
-        with self._locked():
+        with self._lock():
             if sum(self._spent.values()) + dollars > self.cap_usd + 1e-9:
                 return False
             self._append(dollars)
@@ -88,16 +88,16 @@ class AccountBudget:
     def correct(self, dollars: float) -> None:
         """Replace a call's worst case by its cost: add the difference, usually negative."""
         if dollars:
-            with self._locked():
+            with self._lock():
                 self._append(dollars)
 
     def explain(self, worst_usd: float) -> str:
         """Return why there is no room for a call."""
-        spent = self.spent_usd
+        spent_usd = self.spent_usd
         return (
-            f"the budget of the account {self.account} is reached: {len(spent)} studies have spent "
-            f"${sum(spent.values()):.2f} of ${self.cap_usd:.2f} (calls in flight count as their worst case), the next "
-            f"call may cost ${worst_usd:.4f}. Raise `usd` in {self.folder / CAP} and run the same command to go on"
+            f"the budget of the account {self.account} is reached: {len(spent_usd)} studies have spent "
+            f"${sum(spent_usd.values()):.2f} of ${self.cap_usd:.2f} (calls in flight count as their worst case), the "
+            f"next call may cost ${worst_usd:.4f}. Raise `usd` in {self.folder / CAP} and run the same command to go on"
         )
 
     def close(self) -> None:
@@ -107,7 +107,7 @@ class AccountBudget:
             self._descriptor = -1
 
     @contextmanager
-    def _locked(self) -> Iterator[None]:
+    def _lock(self) -> Iterator[None]:
         """Hold the file's lock for a moment, after reading all lines of other processes."""
         try:
             while True:
@@ -135,8 +135,10 @@ class AccountBudget:
             self._read = 0
             self._spent.clear()
         content = os.pread(self._descriptor, size - self._read, self._read)
-        if torn := len(content) - (content.rfind(b"\n") + 1):  # torn line of a dead process: its call was never sent
-            size, content = size - torn, content[:-torn]
+        if torn_length := len(content) - (
+            content.rfind(b"\n") + 1
+        ):  # torn line of a dead process: its call was never sent
+            size, content = size - torn_length, content[:-torn_length]
             os.ftruncate(self._descriptor, size)
         for line in content.splitlines(keepends=True):
             if not is_whole(line):

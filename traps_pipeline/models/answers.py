@@ -15,7 +15,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.answer_rows import ResponseRow
 from traps_pipeline.models.ask import Call, SettledCell, collect
 from traps_pipeline.models.framing import media_for_dataset
-from traps_pipeline.models.participants import Row, when_asked
+from traps_pipeline.models.participants import Row, call_time_columns
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.reading import read_answer
 from traps_pipeline.models.registry import ModelEntry, effective_params, get_model
@@ -80,8 +80,8 @@ def prepare_media(workspace: Workspace, cells: Sequence[Cell]) -> None:
         for item in items:
             jobs[item["media_digest"], repr(spec)] = (workspace.root / item["clip"], item["media_digest"], spec)
     with ThreadPoolExecutor(cores()) as pool:
-        for finished, _ in enumerate(pool.map(lambda job: workspace.media.prepare(*job), jobs.values()), start=1):
-            progress.current().tick("responses", "media to send", finished, len(jobs))
+        for n_finished, _ in enumerate(pool.map(lambda job: workspace.media.prepare(*job), jobs.values()), start=1):
+            progress.current().tick("responses", "media to send", n_finished, len(jobs))
 
 
 def wanted_questions(workspace: Workspace, cell: Cell) -> list[Question]:
@@ -117,8 +117,8 @@ def with_posteriors(workspace: Workspace, dataset: str, items: list[dict[str, An
     """Add `posterior`, which strategy `bayes` reads, to items of graded cuts."""
     if dataset != GRADED:
         return items
-    known = posteriors(workspace)
-    return [item | {"posterior": known[item["pair_id"].removeprefix(f"{GRADED}:")]} for item in items]
+    posterior_of = posteriors(workspace)
+    return [item | {"posterior": posterior_of[item["pair_id"].removeprefix(f"{GRADED}:")]} for item in items]
 
 
 def _secret(entry: ModelEntry, item: Mapping[str, Any]) -> dict[str, Any]:
@@ -152,7 +152,7 @@ def response_row(cell: Cell, item: Mapping[str, Any], row: Row, reasoning: str |
         **{name: item[name] for name in ("item_id", "pair_id", "side", "benchmark_version")},
         **cell.partition,
         **{name: row[name] for name in row_fields},
-        **when_asked(row),
+        **call_time_columns(row),
         outcome=reading.outcome,
         text=reading.text,
         reasoning=reading.reasoning,

@@ -19,7 +19,7 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.extras import require
 from traps_pipeline.base.redaction import redact
 from traps_pipeline.base.terminal import plain
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.models.budget import worst_case_usd
 from traps_pipeline.models.dialects import OddShapeError, Reply, parse_body, read_reply
 from traps_pipeline.models.endings import Ending
@@ -37,14 +37,14 @@ from traps_pipeline.models.request import (
     Request,
     TransientError,
 )
-from traps_pipeline.models.transport import Exchange, watching
+from traps_pipeline.models.transport import Exchange, record_exchange
 from traps_pipeline.models.usage import Sizes, Usage, read_usage
 from traps_pipeline.storage.media import Media, data_uris
 
 UNKNOWN_ERROR = 500  # default status of an error object in a 200
 REFUSED_CONTENT = "content_policy"  # the error of a call stopped by a provider's content filter
 DENIED = "http_403_denied"  # the error of a 403 that is not about the key
-MOST_KEPT = 4000  # characters of a malformed answer
+MAX_KEPT = 4000  # characters of a malformed answer
 # Message for people, by kind of failure.
 _HAPPENED = {
     RATE_LIMITED: "asked too fast",
@@ -161,7 +161,7 @@ class ApiBackend:
         """Return the outcome of one attempt; see `Backend`."""
         prompt = messages(self._entry, request)
         _internal_call().set(True)
-        with watching() as exchange:
+        with record_exchange() as exchange:
             exchange.sent = False  # until the wire says otherwise
             try:
                 await self._litellm.acompletion(messages=prompt, **request.params, **self._fixed)
@@ -170,28 +170,30 @@ class ApiBackend:
                     return self._failure(error, exchange)
             if exchange.status is None:  # a bug of ours, or of a new version of the client library
                 exchange.sent = None
-            elif (reported := read_error(exchange.content)) is not None:
-                return self._reported(reported, exchange)
+            elif (provider_error := read_error(exchange.content)) is not None:
+                return self._provider_outcome(provider_error, exchange)
             return self._read(request, exchange)  # whatever exception the library raises for it
 
     def _read(self, request: Request, exchange: Exchange) -> Outcome:
         """Return the outcome from the provider's own bytes."""
         if exchange.content is None:  # a bug of ours, or a litellm route with its own connections
-            raise self._malformed("the answer came over a connection that is not watched, so its bytes cannot be read")
+            raise self._malformed_error(
+                "the answer came over a connection that is not watched, so its bytes cannot be read"
+            )
         try:
             body = parse_body(exchange.content)
             reply = read_reply(body, str(self._entry.provider_id))
         except OddShapeError as error:
-            raise self._malformed(str(error), exchange.content) from None
+            raise self._malformed_error(str(error), exchange.content) from None
         if reply.ending == "transient":
             self._tell("ended", f"its answer ended with {reply.finish!r}", passes=True)
             cost_usd = self._outcome(reply, request).cost_usd
             raise TransientError(f"ended_{reply.finish.strip().lower()}", cost_usd=cost_usd)
         return self._outcome(reply, request)
 
-    def _malformed(self, why: str, content: bytes = b"") -> TransientError:
+    def _malformed_error(self, why: str, content: bytes = b"") -> TransientError:
         self._tell(MALFORMED, why, passes=True)
-        raw = redact(content.decode("utf-8", "replace"))[:MOST_KEPT]
+        raw = redact(content.decode("utf-8", "replace"))[:MAX_KEPT]
         return TransientError(MALFORMED, raw=raw, why=redact(why))
 
     def _outcome(self, reply: Reply, request: Request) -> Outcome:
@@ -199,7 +201,7 @@ class ApiBackend:
         prompt_bytes = len((request.system + request.user).encode("utf-8", "replace"))
         frames = request.sent.n_frames if request.sent else 0
         usage = read_usage(reply.usage, Sizes(prompt_bytes, frames, len((reply.text or reply.refusal).encode())))
-        believed = usage if usage and usage.believed else None
+        believed_usage = usage if usage and usage.believed else None
         kind = _kind(reply)
         return Outcome(
             kind,
@@ -208,9 +210,9 @@ class ApiBackend:
             finish_reason=reply.finish,
             served_model=reply.served_model,
             client=client_version(),
-            prompt_tokens=believed and believed.prompt,
-            completion_tokens=believed and believed.completion,
-            reasoning_tokens=believed and believed.reasoning,
+            prompt_tokens=believed_usage and believed_usage.prompt,
+            completion_tokens=believed_usage and believed_usage.completion,
+            reasoning_tokens=believed_usage and believed_usage.reasoning,
             cost_usd=self._cost(usage, request),
             first_token=stored_alternatives(reply.first_token, request.about.get("regime")),
         )
@@ -222,11 +224,11 @@ class ApiBackend:
         """
         if self._entry.prices is None or usage is None:
             return None
-        cost, worst = self._entry.prices.cost(usage.prompt, usage.completion), worst_case_usd(self._entry, request)
-        if not usage.believed and cost > worst:
+        cost, worst_usd = self._entry.prices.cost(usage.prompt, usage.completion), worst_case_usd(self._entry, request)
+        if not usage.believed and cost > worst_usd:
             counts = f"{usage.prompt} tokens of prompt and {usage.completion} of the answer"
             self._tell("usage", f"contradicts itself; the most that it says is booked, {counts}")
-        return cost if usage.believed else max(cost, worst)
+        return cost if usage.believed else max(cost, worst_usd)
 
     def _failure(self, error: Exception, exchange: Exchange) -> Outcome:
         """Return a failure as an outcome, without its text, or raise it as TransientError."""
@@ -236,42 +238,42 @@ class ApiBackend:
             reason = redact(plain(exchange.problem or cause_of(error)))
             self._tell(UNREACHABLE, reason, passes=True)
             raise TransientError(UNREACHABLE, billed=False, why=reason) from None
-        reported = read_error(exchange.content)
-        if reported is not None or (exchange.status is not None and not exchange.is_answered):
-            return self._reported(reported, exchange)
+        provider_error = read_error(exchange.content)
+        if provider_error is not None or (exchange.status is not None and not exchange.is_answered):
+            return self._provider_outcome(provider_error, exchange)
         kind = "timeout" if isinstance(error, self._litellm.Timeout) else "connection"
         self._tell(kind, exchange.problem or cause_of(error), passes=True)
         raise TransientError(kind) from None
 
-    def _reported(self, error: ProviderError | None, exchange: Exchange) -> Outcome:
+    def _provider_outcome(self, error: ProviderError | None, exchange: Exchange) -> Outcome:
         """Return a provider's error as an outcome, or raise it as TransientError.
 
         The status is the one on the wire, or the one in the error object if that came with a 200. error: None if the
         body holds none.
         """
-        reported = error or ProviderError(self._beginning(exchange))
-        status = (reported.status or UNKNOWN_ERROR) if exchange.is_answered else exchange.status
+        provider_error = error or ProviderError(self._quote_beginning(exchange))
+        status = (provider_error.status or UNKNOWN_ERROR) if exchange.is_answered else exchange.status
         assert status is not None
         is_explained = error is not None and not error.is_beside_answer
-        billed = exchange.is_billable(status, is_explained=is_explained)
+        is_billed = exchange.is_billable(status, is_explained=is_explained)
         origin = " (an error object in an HTTP 200)" if exchange.is_answered else ""
         origin += f" (through the proxy of {exchange.proxy})" if exchange.proxy else ""
-        if reported.is_filtered and status not in TRANSIENT_STATUSES:
-            self._tell(REFUSED_CONTENT, f"{reported}{origin}")
-            return Outcome("refused", error=REFUSED_CONTENT, cost_usd=None if billed else 0.0)
-        kind = failure_kind(status, reported)
+        if provider_error.is_filtered and status not in TRANSIENT_STATUSES:
+            self._tell(REFUSED_CONTENT, f"{provider_error}{origin}")
+            return Outcome("refused", error=REFUSED_CONTENT, cost_usd=None if is_billed else 0.0)
+        kind = failure_kind(status, provider_error)
         is_final = kind.startswith("http_")
-        self._tell(kind, f"{reported}{origin}", passes=not is_final)
+        self._tell(kind, f"{provider_error}{origin}", passes=not is_final)
         if is_final:
-            return Outcome("error", error=kind, cost_usd=None if billed else 0.0)
-        raise TransientError(kind, retry_after_s(exchange.headers, reported), billed=billed) from None
+            return Outcome("error", error=kind, cost_usd=None if is_billed else 0.0)
+        raise TransientError(kind, retry_after_s(exchange.headers, provider_error), billed=is_billed) from None
 
-    def _beginning(self, exchange: Exchange) -> str:
+    def _quote_beginning(self, exchange: Exchange) -> str:
         """Return the beginning of an answer without an error object, for people."""
         text = redact((exchange.content or b"").decode("utf-8", "replace"))  # before it is cut
         kind = exchange.headers.get("Content-Type", "no content type").partition(";")[0]
-        begins = f", beginning {text[:60]!r}" if text.strip() else ""
-        return f"HTTP {exchange.status}, {kind}, {len(exchange.content or b'')} bytes{begins}"
+        quotation = f", beginning {text[:60]!r}" if text.strip() else ""
+        return f"HTTP {exchange.status}, {kind}, {len(exchange.content or b'')} bytes{quotation}"
 
     def _tell(self, kind: str, message: str, *, passes: bool | None = None) -> None:
         """Report a message once per kind, without the key, and whether a run retries.
@@ -281,12 +283,12 @@ class ApiBackend:
         if kind not in self._told:
             self._told.add(kind)
             message = redact(" ".join(message.split())).removeprefix(f"{kind}: ")  # before it is cut
-            happened = _HAPPENED.get(kind, "a call failed")
-            most = self._entry.limits.retries if passes else 0
-            retries = min(most, 1) if kind == MALFORMED else most
-            again = f"again, at most {counted(retries, 'time')}" if retries else "only once"
-            further = "" if passes is None else f"; a run tries such a call {again}"
-            progress.current().note(f"{self._entry.id}: {happened}{further} ({kind}: {plain(message)[:300]})")
+            event_text = _HAPPENED.get(kind, "a call failed")
+            max_retries = self._entry.limits.retries if passes else 0
+            retries = min(max_retries, 1) if kind == MALFORMED else max_retries
+            retry_text = f"again, at most {count_noun(retries, 'time')}" if retries else "only once"
+            retry_note = "" if passes is None else f"; a run tries such a call {retry_text}"
+            progress.current().note(f"{self._entry.id}: {event_text}{retry_note} ({kind}: {plain(message)[:300]})")
 
 
 def failure_kind(status: int, reported: ProviderError) -> str:

@@ -26,12 +26,12 @@ from traps_pipeline.models.budget import Budget, BudgetReached
 from traps_pipeline.models.participants import CallContext, Participant, Participants, Row, attempt, ledger_row
 from traps_pipeline.models.registry import Entry
 from traps_pipeline.models.request import Backend, Request
-from traps_pipeline.models.spending import sharing, spending
+from traps_pipeline.models.spending import open_budget, share_accounts
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
-STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 GRACE_S = 30.0  # grace period of calls in flight after SIGTERM or SIGHUP
 END_S = 1.5  # grace period after the second signal
 INTERRUPTED = 130  # the exit code of a stopped run
@@ -100,8 +100,8 @@ def collect(
     entry_of = {entry.id: entry for entry in entries}
     with (
         workspace.ledger.writing(),
-        sharing(workspace, entry_of.values()) as sharers,
-        spending(workspace, entry_of.values()) as budget,
+        share_accounts(workspace, entry_of.values()) as sharers,
+        open_budget(workspace, entry_of.values()) as budget,
     ):
         if any(entry.prices for entry in entry_of.values()):
             progress.current().money(budget.spent_usd, workspace.study.budget_usd)
@@ -133,15 +133,15 @@ class _Asking:
         if not queue or self.halted():
             return False
         request, name = queue.popleft(), participant.entry.id
-        allowed = CallContext(self.work.budget, self.stop, self.halted, self.writer.require)
-        attempted = await attempt(participant, request, allowed)
-        if attempted is None:
+        context = CallContext(self.work.budget, self.stop, self.halted, self.writer.require)
+        attempt_result = await attempt(participant, request, context)
+        if attempt_result is None:
             return False
-        row, side_texts = ledger_row(request, *attempted, self.work.epoch)
-        await self.writer.write(row, side_texts, [reservation.id for reservation in allowed.paid_by])
+        row, side_texts = ledger_row(request, *attempt_result, self.work.epoch)
+        await self.writer.write(row, side_texts, [reservation.id for reservation in context.paid_by])
         self.rows[request.key] = _Held(row)
         progress.current().called(name, not settles(row), row["latency_s"], row["cost_usd"] or 0.0)
-        participant.breaker.watch(attempted[0])
+        participant.breaker.watch(attempt_result[0])
         return True
 
     def halted(self) -> bool:
@@ -163,14 +163,14 @@ class _Asking:
         for request in self.missing:
             queues.setdefault(request.participant, deque()).append(request)
         queue_of = [(self.work.participants[name], queue) for name, queue in queues.items()]
-        syncing = asyncio.create_task(self.sync())
+        sync_task = asyncio.create_task(self.sync())
         try:
             async with asyncio.TaskGroup() as group:
                 for participant, queue in queue_of:
                     for _ in range(min(participant.entry.limits.concurrency, len(queue))):
                         group.create_task(self.worker(participant, queue))
         finally:
-            syncing.cancel()
+            sync_task.cancel()
         if self.problems:
             raise self.problems[0]
 
@@ -211,14 +211,14 @@ async def settle_evaluation(
 
     Calls and rows are held one cell at a time; a call that two cells share (a steered control) is found by the second.
     """
-    reported = set[str]()
+    reported_keys = set[str]()
     async with work.ledger.writing(evaluation.key, progress.current().note, stop.is_set) as writer:
         for cell in cells:
-            settled = await _settle_cell(work, cell, _Evaluation(writer, reported), stop)
-            if settled is None:
+            settled_cell = await _settle_cell(work, cell, _Evaluation(writer, reported_keys), stop)
+            if settled_cell is None:
                 return  # finished answers are in the ledger
-            yield settled
-            del settled
+            yield settled_cell
+            del settled_cell
             await asyncio.sleep(0)  # let the loop run calls of other cells after a fully known one
 
 
@@ -229,18 +229,18 @@ async def _settle_cell(
     report = progress.current()
     calls = work.calls(cell)
     requests = {call.request.key: call.request for call in calls}
-    recorded = await asyncio.to_thread(work.ledger.read, cell.evaluation.key, requests)
-    for location in sorted({*recorded.notes} - its.reported):
-        report.note(f"{location}: {recorded.notes[location]}")
-    its.reported.update(recorded.notes)
-    rows = {key: _Held(row) for key, row in recorded.settled.items()}
+    recorded_rows = await asyncio.to_thread(work.ledger.read, cell.evaluation.key, requests)
+    for location in sorted({*recorded_rows.notes} - its.reported):
+        report.note(f"{location}: {recorded_rows.notes[location]}")
+    its.reported.update(recorded_rows.notes)
+    rows = {key: _Held(row) for key, row in recorded_rows.settled.items()}
     missing = [request for key, request in requests.items() if key not in rows]
     new = Counter(request.participant for request in missing)
     counts = Counter(request.participant for request in requests.values())
     report.asking(work.stage, {name: (new[name], count - new[name]) for name, count in counts.items()})
-    asking = _Asking(work, its.writer, missing, stop)
-    await asking.run()
-    rows |= asking.rows
+    asker = _Asking(work, its.writer, missing, stop)
+    await asker.run()
+    rows |= asker.rows
     if stop.is_set() or len(rows) < len(requests):
         return None
     await its.writer.sync()
@@ -253,41 +253,41 @@ async def settle(
     work: Work[AnyCell, AnyCall, Any], cells: Sequence[AnyCell], stop: asyncio.Event
 ) -> AsyncIterator[SettledCell[AnyCell, AnyCall] | Exception]:
     """Settle all cells, models in parallel; a failing model yields its exception."""
-    finished: asyncio.Queue[SettledCell[AnyCell, AnyCall] | Exception | None] = asyncio.Queue()
-    turn = asyncio.Semaphore(1)  # a cell waits here with its rows until the one before it is written
+    results: asyncio.Queue[SettledCell[AnyCell, AnyCall] | Exception | None] = asyncio.Queue()
+    write_turn = asyncio.Semaphore(1)  # a cell waits here with its rows until the one before it is written
 
     async def one_model(evaluations: Sequence[tuple[Evaluation, list[AnyCell]]]) -> None:
         try:
             for evaluation, evaluation_cells in evaluations:
                 if stop.is_set():
                     return
-                async for settled in settle_evaluation(work, evaluation, evaluation_cells, stop):
-                    await turn.acquire()
-                    finished.put_nowait(settled)
-                    del settled
+                async for settled_cell in settle_evaluation(work, evaluation, evaluation_cells, stop):
+                    await write_turn.acquire()
+                    results.put_nowait(settled_cell)
+                    del settled_cell
         except LockGivenUp:
             return
         except Exception as error:  # noqa: BLE001 - handed to the caller, who reports it and fails the run
-            finished.put_nowait(error)
+            results.put_nowait(error)
         finally:
-            finished.put_nowait(None)
+            results.put_nowait(None)
 
     ordered = sorted(cells, key=lambda cell: (cell.evaluation, cell.dataset))
-    by_evaluation = [(e, list(group)) for e, group in groupby(ordered, key=lambda cell: cell.evaluation)]
+    cells_by_evaluation = [(e, list(group)) for e, group in groupby(ordered, key=lambda cell: cell.evaluation)]
     tasks = [
         asyncio.create_task(one_model(list(group)))
-        for _, group in groupby(by_evaluation, key=lambda pair: pair[0].model)
+        for _, group in groupby(cells_by_evaluation, key=lambda pair: pair[0].model)
     ]
     try:
         open_tasks = len(tasks)
         while open_tasks:
-            settled = await finished.get()
-            if settled is None:
+            settled_cell = await results.get()
+            if settled_cell is None:
                 open_tasks -= 1
             else:
-                yield settled
-                if isinstance(settled, SettledCell):
-                    turn.release()
+                yield settled_cell
+                if isinstance(settled_cell, SettledCell):
+                    write_turn.release()
     finally:
         for task in tasks:
             task.cancel()
@@ -308,17 +308,17 @@ def run_work(work: Work[AnyCell, AnyCall, Finished], cells: Sequence[AnyCell]) -
             try:
                 # Dagster sets a handler of its own around each step of this generator, so ours is set for each too.
                 with _drain_on_interrupt(loop, stop):
-                    settled = loop.run_until_complete(anext(results))
+                    settled_cell = loop.run_until_complete(anext(results))
             except StopAsyncIteration:
                 break
             except asyncio.CancelledError:
                 raise KeyboardInterrupt from None
             if stop.is_set():
                 continue  # drain: calls in flight are paid for and go to the ledger, no more tables are built
-            if isinstance(settled, Exception):
-                problems.append(settled)
+            if isinstance(settled_cell, Exception):
+                problems.append(settled_cell)
             else:
-                yield work.finish(settled)
+                yield work.finish(settled_cell)
     finally:
         interrupted = stop.is_set()
         stop.set()
@@ -363,11 +363,13 @@ class _drain_on_interrupt:  # noqa: N801 - reads as a verb where it is used
         self._former: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> None:
-        for each in STOPS if self._main else ():
-            former = signal.getsignal(each)
-            if each is signal.SIGINT or former is not signal.SIG_IGN:  # `nohup` lets a run outlive its terminal
-                self._former[each] = former
-                signal.signal(each, lambda number, _: self._interrupt(signal.Signals(number)))
+        for signal_number in STOP_SIGNALS if self._main else ():
+            handler = signal.getsignal(signal_number)
+            if (
+                signal_number is signal.SIGINT or handler is not signal.SIG_IGN
+            ):  # `nohup` lets a run outlive its terminal
+                self._former[signal_number] = handler
+                signal.signal(signal_number, lambda number, _: self._interrupt(signal.Signals(number)))
 
     def _interrupt(self, by: signal.Signals) -> None:
         if self._stop.is_set():
@@ -379,18 +381,18 @@ class _drain_on_interrupt:  # noqa: N801 - reads as a verb where it is used
             end.start()
             return
         self._stop.set()
-        waits, again = "", "Ctrl-C again stops at once"
+        wait_text, advice = "", "Ctrl-C again stops at once"
         if by is not signal.SIGINT:
-            waits, again = f" {GRACE_S:.0f} s at most", f"{by.name} again stops at once"
+            wait_text, advice = f" {GRACE_S:.0f} s at most", f"{by.name} again stops at once"
             self._loop.call_soon_threadsafe(self._loop.call_later, GRACE_S, self._cancel)
         self._loop.call_soon_threadsafe(lambda: None)  # wakes the loop from its select
-        progress.current().note(f"{by.name}: stopping: waiting{waits} for the calls in flight ({again})")
+        progress.current().note(f"{by.name}: stopping: waiting{wait_text} for the calls in flight ({advice})")
 
     def _cancel(self) -> None:
         for task in asyncio.all_tasks(self._loop):
             task.cancel()
 
     def __exit__(self, *_: object) -> None:
-        for each, former in self._former.items():
-            signal.signal(each, former or signal.SIG_DFL)
+        for signal_number, handler in self._former.items():
+            signal.signal(signal_number, handler or signal.SIG_DFL)
         self._former.clear()

@@ -40,10 +40,10 @@ class Tokens:
 def most_tokens(entry: Entry, request: Request) -> Tokens:
     """Return an upper bound of a call's tokens."""
     frames = request.sent.n_frames if request.sent else 0
-    each = entry.tokens_per_frame if isinstance(entry, ModelEntry) else 0
+    tokens_per_frame = entry.tokens_per_frame if isinstance(entry, ModelEntry) else 0
     schema = json.dumps(request.params.get("response_format", ""))
     text = len((request.system + request.user + schema).encode()) // BYTES_A_TOKEN
-    return Tokens(frames * each + text + OVERHEAD_TOKENS, entry.max_tokens)
+    return Tokens(frames * tokens_per_frame + text + OVERHEAD_TOKENS, entry.max_tokens)
 
 
 def worst_case_usd(entry: Entry, request: Request) -> float:
@@ -129,7 +129,9 @@ class Budget:
                 if not self._has_calls_through(account):
                     raise BudgetReached(account.explain(worst_usd))
             elif not await self._has_room_later(result):
-                raise BudgetReached(reached(result.slot, result.taken_usd, self._caps[result.slot], worst_usd))
+                raise BudgetReached(
+                    budget_reached_reason(result.slot, result.taken_usd, self._caps[result.slot], worst_usd)
+                )
             async with self._changed:
                 with suppress(TimeoutError):
                     await asyncio.wait_for(self._changed.wait(), LOOK_S)
@@ -151,22 +153,22 @@ class Budget:
 
     async def _replace(self, reservation: Reservation, cost_usd: float) -> None:
         assert self._money is not None, "what is replaced was reserved"
-        settled = self._money.settle(reservation.id, reservation.participant, reservation.usd, cost_usd)
-        await asyncio.wrap_future(settled)
+        usd = self._money.settle(reservation.id, reservation.participant, reservation.usd, cost_usd)
+        await asyncio.wrap_future(usd)
 
     async def _has_room_later(self, full: CapExhausted) -> bool:
         """Return whether calls in flight, of any process, may yet cost less than reserved."""
-        if any(full.slot in (None, its.participant) for its in self._in_flight.values()):
+        if any(full.slot in (None, call.participant) for call in self._in_flight.values()):
             return True
         assert self._money is not None, "what is full was asked for"
         return await asyncio.to_thread(self._money.is_any_alive, full.others)
 
     def _has_calls_through(self, account: AccountBudget) -> bool:
         """Return whether settling this process's calls may free an account's budget."""
-        return any(self._accounts.get(its.participant) is account for its in self._in_flight.values())
+        return any(self._accounts.get(call.participant) is account for call in self._in_flight.values())
 
 
-def reached(participant: str | None, spent_usd: float, cap_usd: float, worst_usd: float) -> str:
+def budget_reached_reason(participant: str | None, spent_usd: float, cap_usd: float, worst_usd: float) -> str:
     """Return why a budget (None: the study's) leaves no room for a call."""
     return (
         f"the budget of {participant or 'the study'} is reached: ${spent_usd:.2f} of ${cap_usd:.2f} spent, the next "

@@ -17,7 +17,7 @@ from traps_pipeline.models.endings import Ending, ending_of
 
 Dialect = Literal["chat", "responses", "anthropic", "gemini"]
 Json = Mapping[str, Any]
-MOST_WORD = 200  # characters of a provider's short fields: served model, finish reason
+MAX_WORD = 200  # characters of a provider's short fields: served model, finish reason
 _NAMES: Mapping[Dialect, str] = {
     "chat": "OpenAI's chat API",
     "responses": "OpenAI's Responses API",
@@ -100,7 +100,7 @@ def read_reply(body: Json, provider_id: str) -> Reply:
     try:
         return _READERS[dialect](body)
     except (OddShapeError, RecursionError) as error:
-        fields = plain(", ".join(map(str, body)))[:MOST_WORD] or "nothing"
+        fields = plain(", ".join(map(str, body)))[:MAX_WORD] or "nothing"
         raise OddShapeError(f"it sent no answer of {_NAMES[dialect]}: {plain(error)} (it holds {fields})") from None
 
 
@@ -137,9 +137,9 @@ class _Texts:
             text=storable("".join(self.text)).strip(),
             reasoning=storable("\n\n".join(self.reasoning)).strip(),
             refusal=storable("".join(self.refusal)).strip(),
-            finish=storable(finish)[:MOST_WORD],
+            finish=storable(finish)[:MAX_WORD],
             ending=ending_of(finish),
-            served_model=storable(served_model)[:MOST_WORD] if isinstance(served_model, str) else None,
+            served_model=storable(served_model)[:MAX_WORD] if isinstance(served_model, str) else None,
             usage=usage if isinstance(usage, dict) else {},
         )
 
@@ -153,7 +153,7 @@ def _chat(body: Json) -> Reply:
     if not texts.reasoning:
         texts.add(_text_of(message, "reasoning_content") or _text_of(message, "reasoning"), "reasoning")
     reply = texts.reply(choice.get("finish_reason"), body.get("model"), body.get("usage"))
-    return replace(reply, first_token=first_token.of_chat(choice.get("logprobs")))
+    return replace(reply, first_token=first_token.first_token_logprobs(choice.get("logprobs")))
 
 
 def _responses(body: Json) -> Reply:
@@ -163,8 +163,8 @@ def _responses(body: Json) -> Reply:
             texts.add(item.get("content"), "reasoning" if item.get("phase") == "commentary" else None)
         elif item.get("type") == "reasoning":
             texts.add(item.get("summary") or item.get("content"), "reasoning")
-    why = body.get("incomplete_details")
-    reason = why.get("reason") if isinstance(why, dict) else None
+    details = body.get("incomplete_details")
+    reason = details.get("reason") if isinstance(details, dict) else None
     return texts.reply(reason or body.get("status"), body.get("model"), body.get("usage"))
 
 
@@ -178,15 +178,17 @@ def _anthropic(body: Json) -> Reply:
 
 def _gemini(body: Json) -> Reply:
     texts, feedback = _Texts(), body.get("promptFeedback")
-    blocked = feedback.get("blockReason") if isinstance(feedback, dict) else None
-    candidate = {} if blocked else _objects(body, "candidates")[0]
+    block_reason = feedback.get("blockReason") if isinstance(feedback, dict) else None
+    candidate = {} if block_reason else _objects(body, "candidates")[0]
     content = candidate.get("content")
     parts = content.get("parts") if isinstance(content, dict) else None
     for part in parts if isinstance(parts, list) else ():
         if isinstance(part, dict) and isinstance(part.get("text"), str):
             texts.add(part["text"], "reasoning" if part.get("thought") is True else "text")
-    reply = texts.reply(blocked or candidate.get("finishReason"), body.get("modelVersion"), body.get("usageMetadata"))
-    return reply if not blocked else replace(reply, ending="refused")  # nothing was generated, for any reason
+    reply = texts.reply(
+        block_reason or candidate.get("finishReason"), body.get("modelVersion"), body.get("usageMetadata")
+    )
+    return reply if not block_reason else replace(reply, ending="refused")  # nothing was generated, for any reason
 
 
 _READERS: Mapping[Dialect, Callable[[Json], Reply]] = {

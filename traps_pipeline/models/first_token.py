@@ -9,14 +9,15 @@ from typing import Any
 
 from traps_pipeline.protocol.regimes import BY_NAME
 
-MOST = 20  # alternatives kept; providers give no more
+MAX_ALTERNATIVES = 20  # alternatives kept; providers give no more
 ROUNDING = 1e-3  # above 0, which some providers round a certain token to
 
 
-def of_chat(logprobs: Any) -> dict[str, float]:
+def first_token_logprobs(logprobs: Any) -> dict[str, float]:
     """Return the alternatives for the first token that contains a letter or a digit.
 
-    Quotes, stars and white space begin no answer. logprobs: of a choice of OpenAI's chat API; empty if missing.
+    Quotes, stars and white space begin no answer. logprobs: the field of a choice in OpenAI's chat API; the result is
+    empty without it.
     """
     for place in _objects(logprobs.get("content")) if isinstance(logprobs, dict) else []:
         if any(character.isalnum() for character in str(place.get("token"))):
@@ -28,8 +29,10 @@ def stored_alternatives(alternatives: Mapping[str, float], regime: object) -> st
     """Return alternatives as stored, likeliest first; None if the regime uses none."""
     if not alternatives or regime not in BY_NAME or not BY_NAME[str(regime)].first_token:
         return None
-    likeliest = sorted(alternatives.items(), key=lambda one: -one[1])[: MOST + 1]  # the sampled token may be unlikely
-    return json.dumps({token: round(logprob, 6) for token, logprob in likeliest}, ensure_ascii=False)
+    top_alternatives = sorted(alternatives.items(), key=lambda one: -one[1])[
+        : MAX_ALTERNATIVES + 1
+    ]  # the sampled token may be unlikely
+    return json.dumps({token: round(logprob, 6) for token, logprob in top_alternatives}, ensure_ascii=False)
 
 
 def _alternative(entry: Mapping[str, Any]) -> tuple[str, float] | None:

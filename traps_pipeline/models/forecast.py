@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from traps_pipeline.ledger.rows import AVERAGED, Totals
+from traps_pipeline.ledger.rows import AVERAGED_COLUMNS, Totals
 from traps_pipeline.models.budget import BYTES_A_TOKEN, OVERHEAD_TOKENS
 from traps_pipeline.models.media_tokens import expected_clip_tokens
 from traps_pipeline.models.registry import Entry, ModelEntry, load_accounts
@@ -50,10 +50,10 @@ class Forecast:
 
 def experience(totals: Iterable[Totals]) -> Experience:
     """Return means over one participant's ledger rows."""
-    joined = Totals()
+    sum_of_totals = Totals()
     for part in totals:
-        joined.join(part)
-    return Experience(*(joined.mean(column) for column in AVERAGED))
+        sum_of_totals.join(part)
+    return Experience(*(sum_of_totals.mean(column) for column in AVERAGED_COLUMNS))
 
 
 def forecast(entry: Entry, calls: int, seen: Experience) -> Forecast:
@@ -68,9 +68,9 @@ def forecast(entry: Entry, calls: int, seen: Experience) -> Forecast:
         low, expected = cost(prompt, LOW_SHARE * completion), cost(prompt, completion)
         dollars = (calls * low, calls * expected, calls * max(expected, cost(most_prompt, entry.max_tokens)))
     account = load_accounts()[str(entry.account)]
-    paced = [calls / account.requests_per_minute] if account.requests_per_minute else [0.0]
+    paced_minutes = [calls / account.requests_per_minute] if account.requests_per_minute else [0.0]
     if account.tokens_per_minute:
-        paced.append(calls * (prompt + entry.max_tokens) / account.tokens_per_minute)
+        paced_minutes.append(calls * (prompt + entry.max_tokens) / account.tokens_per_minute)
     latency_s = seen.latency_s or entry.expected_latency_s or FIRST_TOKEN_S + completion / TOKENS_A_S
     waves = max(1.0, calls / entry.limits.concurrency) if calls else 0.0
     return Forecast(
@@ -79,24 +79,24 @@ def forecast(entry: Entry, calls: int, seen: Experience) -> Forecast:
         prompt_tokens=round(calls * prompt),
         completion_tokens=round(calls * completion),
         dollars=dollars,
-        minutes=max(waves * latency_s / 60, *paced),
+        minutes=max(waves * latency_s / 60, *paced_minutes),
         account=str(entry.account),
-        paced_minutes=max(paced),
+        paced_minutes=max(paced_minutes),
         batch_price=account.batch_price,
     )
 
 
 def minutes_of(forecasts: Iterable[Forecast]) -> float:
     """Return parallel calls' minutes: the slowest participant's, or an account's pace."""
-    rows, shared = list(forecasts), dict[str, float]()
+    rows, minutes_by_account = list(forecasts), dict[str, float]()
     for row in rows:
-        shared[row.account] = shared.get(row.account, 0.0) + row.paced_minutes
-    return max([row.minutes for row in rows] + [*shared.values()], default=0.0)
+        minutes_by_account[row.account] = minutes_by_account.get(row.account, 0.0) + row.paced_minutes
+    return max([row.minutes for row in rows] + [*minutes_by_account.values()], default=0.0)
 
 
 def _clip_tokens(entry: Entry) -> tuple[float, float]:
     """Return the prompt tokens of a clip: expected, and maximum."""
     if not isinstance(entry, ModelEntry) or entry.media is None:
         return 0.0, 0.0
-    most = entry.tokens_per_frame * (entry.media.uniform or entry.media.most)
-    return min(expected_clip_tokens(entry), most), most
+    max_tokens = entry.tokens_per_frame * (entry.media.uniform or entry.media.most)
+    return min(expected_clip_tokens(entry), max_tokens), max_tokens

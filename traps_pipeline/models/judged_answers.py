@@ -33,10 +33,10 @@ def normalise(text: str) -> str:
 def read_object(text: str) -> dict[str, Any] | None:
     """Return a text's JSON object, fenced or not; None if it is none or repeats a key."""
     try:
-        parsed = json.loads(strip_fence(text), object_pairs_hook=_unique)
+        value = json.loads(strip_fence(text), object_pairs_hook=_unique)
     except (ValueError, RecursionError):
         return None
-    return parsed if isinstance(parsed, dict) else None
+    return value if isinstance(value, dict) else None
 
 
 def leading_object(text: str) -> str:

@@ -146,7 +146,7 @@ def load_panel(name: str, path: Path = JUDGES_FILE) -> tuple[JudgeEntry, ...]:
     """Return a panel's judges (three, or one). Raises TrapsError naming the file."""
     panels, judges = load_panels(path), load_judges(path)
     if not name:
-        raise TrapsError(f"no panel is named: {how_to_name_a_panel(path)}")
+        raise TrapsError(f"no panel is named: {panel_advice(path)}")
     if name not in panels:
         raise TrapsError(f"{path}: no panel {name!r}; it has {', '.join(panels)}{did_you_mean(name, panels)}")
     seats = panels[name]
@@ -164,10 +164,10 @@ def load_panels(path: Path = JUDGES_FILE) -> dict[str, Any]:
     panels = read_mapping(path).get("panels")
     if not isinstance(panels, dict):
         raise TrapsError(f"{path}: must hold a mapping `panels:`")
-    return {**panels, **user_registry.together().panels} if path == JUDGES_FILE else panels
+    return {**panels, **user_registry.all_additions().panels} if path == JUDGES_FILE else panels
 
 
-def how_to_name_a_panel(path: Path = JUDGES_FILE) -> str:
+def panel_advice(path: Path = JUDGES_FILE) -> str:
     """Return instructions for a command without a panel."""
     return (
         f"write `panel: NAME` into the experiment, or say --panel NAME; {path} has {', '.join(load_panels(path))} "
@@ -181,13 +181,13 @@ def require_panel(panel: str, models: Iterable[str], *, judged_by_rules: bool) -
     Rules judge models other than reference models only if the user says so.
     """
     load_panel(panel)
-    others = [model for model in models if not is_reference(model)]
-    if panel == RULES_PANEL and others and not judged_by_rules:
+    other_models = [model for model in models if not is_reference(model)]
+    if panel == RULES_PANEL and other_models and not judged_by_rules:
+        verb = " and others are" if len(other_models) > 5 else " are" if len(other_models) > 1 else " is"
         raise TrapsError(
-            f"panel {RULES_PANEL} is made for reference models, and {', '.join(others[:5])}"
-            f"{' and others are' if len(others) > 5 else ' are' if len(others) > 1 else ' is'} none: name a panel of "
-            "language models, or say --judged-by-rules (`judged_by_rules: true` in the experiment); every table and "
-            f"page then says `{BY_RULES}`"
+            f"panel {RULES_PANEL} is made for reference models, and {', '.join(other_models[:5])}{verb} none: "
+            "name a panel of language models, or say --judged-by-rules (`judged_by_rules: true` in the experiment); "
+            f"every table and page then says `{BY_RULES}`"
         )
 
 
@@ -200,8 +200,8 @@ def version_of_judges(seats: Iterable[Judge]) -> str:
     """Return the version of these judges, with their prompts and schemas."""
     judges = list[list[Any]]()
     for seat in seats:
-        more = [vote_prompt(seat, "abstention"), vote_schema(seat, "abstention")] if seat.premise else []
-        judges.append([seat.id, seat.endpoint, dict(seat.params), SCHEMAS, *(seat.thinking or ()), *more])
+        premise_parts = [vote_prompt(seat, "abstention"), vote_schema(seat, "abstention")] if seat.premise else []
+        judges.append([seat.id, seat.endpoint, dict(seat.params), SCHEMAS, *(seat.thinking or ()), *premise_parts])
     return digest([judges, prompt("judge_abstention"), prompt("judge_correctness")])[:16]
 
 

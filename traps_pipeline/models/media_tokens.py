@@ -14,9 +14,9 @@ from traps_pipeline.storage.media import Profile
 
 Size = tuple[int, int]  # width and height in pixels
 # OpenAI's tokens of an image and of each tile in it, by the beginning of a model's name.
-TILED = {"gpt-5": (70, 140), "gpt-4.1": (85, 170), "gpt-4o": (85, 170), "o1": (75, 150), "o3": (75, 150)}
+TILE_PRICES = {"gpt-5": (70, 140), "gpt-4.1": (85, 170), "gpt-4o": (85, 170), "o1": (75, 150), "o3": (75, 150)}
 # OpenAI's tokens of a patch. These names are looked at first.
-PATCHED = {"gpt-5-mini": 1.2, "gpt-5-nano": 2.46, "gpt-4.1-mini": 1.62, "gpt-4.1-nano": 2.46, "o4-mini": 1.72}
+PATCH_PRICES = {"gpt-5-mini": 1.2, "gpt-5-nano": 2.46, "gpt-4.1-mini": 1.62, "gpt-4.1-nano": 2.46, "o4-mini": 1.72}
 STAMP = 8  # Qwen3-VL: the time before two frames, and the marks around them
 
 
@@ -31,10 +31,10 @@ def openai_frame(model: str, size: Size) -> float | None:
     calculation discrepancy", 2026-06-17).
     """
     width, height = size
-    for name, each in PATCHED.items():
+    for name, patch_rule in PATCH_PRICES.items():
         if model.startswith(name):
-            return each * ceil(width / 32) * ceil(height / 32)
-    for name, (base, tile) in TILED.items():
+            return patch_rule * ceil(width / 32) * ceil(height / 32)
+    for name, (base, tile) in TILE_PRICES.items():
         if model.startswith(name):
             return base + tile * ceil(width / 512) * ceil(height / 512)
     return None
@@ -75,8 +75,8 @@ def expected_clip_tokens(entry: ModelEntry) -> float:
     media = entry.media
     if media is None:
         return 0.0
-    route, _, rest = str(entry.provider_id).partition("/")
-    model, size = rest.removeprefix("responses/"), media.size or (WIDTH, HEIGHT)
+    route, _, model_name = str(entry.provider_id).partition("/")
+    model, size = model_name.removeprefix("responses/"), media.size or (WIDTH, HEIGHT)
     counts: dict[str, Callable[[], float | None]] = {
         "openai": lambda: openai_frame(model, size),
         "gemini": lambda: gemini_frame(model, size, media.profile),

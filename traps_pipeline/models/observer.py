@@ -1,4 +1,4 @@
-"""Backend of the classical-vision observer, the leaderboard's upper-bound row."""
+"""Answer by classical vision (the observer), the leaderboard's upper-bound row."""
 
 from __future__ import annotations
 

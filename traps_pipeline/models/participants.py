@@ -31,8 +31,8 @@ from traps_pipeline.models.request import (
     Request,
     TransientError,
 )
-from traps_pipeline.models.traffic import Breaker, Gate, Meter
-from traps_pipeline.models.transport import watching
+from traps_pipeline.models.traffic import CircuitBreaker, ConnectionLimit, RateLimiter
+from traps_pipeline.models.transport import record_exchange
 from traps_pipeline.storage.study import Study
 
 Row = Mapping[str, Any]
@@ -48,23 +48,23 @@ class Participant:
 
     backend: Backend
     entry: Entry
-    gate: Gate
-    meter: Meter
-    breaker: Breaker
+    gate: ConnectionLimit
+    meter: RateLimiter
+    breaker: CircuitBreaker
 
 
 def allow_connections(count: int) -> None:
-    """Raise the open-file limit for so many connections. Raises TrapsError if denied."""
-    needed = count + FILES
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if soft == resource.RLIM_INFINITY or soft >= needed:
+    """Increase the open-file limit for these connections. Raises TrapsError if denied."""
+    n_needed = count + FILES
+    soft_limit, hard_limit = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft_limit == resource.RLIM_INFINITY or soft_limit >= n_needed:
         return
-    if hard != resource.RLIM_INFINITY and hard < needed:
+    if hard_limit != resource.RLIM_INFINITY and hard_limit < n_needed:
         raise TrapsError(
-            f"{count} connections at once need {needed} open files, and this shell allows {hard}: raise that "
-            f"(`ulimit -n {needed}`), or lower limits.concurrency of the models that are asked; nothing was sent"
+            f"{count} connections at once need {n_needed} open files, and this shell allows {hard_limit}: raise that "
+            f"(`ulimit -n {n_needed}`), or lower limits.concurrency of the models that are asked; nothing was sent"
         )
-    resource.setrlimit(resource.RLIMIT_NOFILE, (needed, hard))
+    resource.setrlimit(resource.RLIMIT_NOFILE, (n_needed, hard_limit))
 
 
 class Participants:
@@ -86,7 +86,7 @@ class Participants:
         self._entries, self._make, self._study = entries, make, study
         self._accounts = load_accounts() if accounts is None else accounts
         self._made: dict[str, Participant] = {}
-        self._meters: dict[str | None, Meter] = {}
+        self._meters: dict[str | None, RateLimiter] = {}
         self._connections = 0
 
     def __getitem__(self, name: str) -> Participant:
@@ -98,16 +98,16 @@ class Participants:
                 allow_connections(self._connections)
             account = self._accounts.get(entry.account or "")
             address = account.base_url if account else None
-            gate, breaker = Gate(entry.limits.concurrency), Breaker(name, address)
+            gate, breaker = ConnectionLimit(entry.limits.concurrency), CircuitBreaker(name, address)
             breaker.check()
             self._made[name] = Participant(self._make(entry), entry, gate, self._meter(entry.account), breaker)
         return self._made[name]
 
-    def _meter(self, account: str | None) -> Meter:
+    def _meter(self, account: str | None) -> RateLimiter:
         if account not in self._meters:
             limits = Account() if account is None else self._accounts[account]
             sharers = partial(self._sharers, account or "")
-            self._meters[account] = Meter(limits.requests_per_minute, limits.tokens_per_minute, sharers)
+            self._meters[account] = RateLimiter(limits.requests_per_minute, limits.tokens_per_minute, sharers)
         return self._meters[account]
 
 
@@ -135,27 +135,27 @@ async def attempt(
     outcome's cost includes what earlier attempts may have cost. None if halted before anything was spent.
     """
     limits, tokens = participant.entry.limits, most_tokens(participant.entry, request)
-    lost_usd, seconds, malformed = 0.0, 0.0, 0
+    lost_usd, seconds, n_malformed = 0.0, 0.0, 0
     for number in range(1, limits.retries + 2):
         async with participant.gate.connection():
             await participant.meter.admit(tokens.prompt + tokens.completion, allowed.halted)
             if allowed.halted():
-                return _given_up("interrupted", number - 1, seconds, lost_usd)
-            began = time.monotonic()
+                return _final_failure("interrupted", number - 1, seconds, lost_usd)
+            started_at = time.monotonic()
             try:
                 outcome = await _send(participant, request, allowed)
             except TransientError as error:
-                failure, seconds = error, time.monotonic() - began
+                failure, seconds = error, time.monotonic() - started_at
             except BudgetReached:
                 if lost_usd:  # record lost money in the ledger first; the next call meets the cap again
-                    return _given_up("budget", number - 1, seconds, lost_usd)
+                    return _final_failure("budget", number - 1, seconds, lost_usd)
                 raise
             else:
                 participant.gate.answered()
                 participant.breaker.connected()
                 if lost_usd:
                     outcome = replace(outcome, cost_usd=(outcome.cost_usd or 0.0) + lost_usd)
-                return outcome, number, time.monotonic() - began
+                return outcome, number, time.monotonic() - started_at
         if failure.kind == RATE_LIMITED:
             participant.gate.slow_down()
         if failure.kind == UNREACHABLE and not lost_usd:  # record what may be billed in the ledger first
@@ -163,19 +163,19 @@ async def attempt(
         elif failure.kind != UNREACHABLE:
             participant.breaker.connected()
         if failure.billed:
-            lost_usd += _believed(failure.cost_usd, worst_case_usd(participant.entry, request))
-        malformed += failure.kind == MALFORMED
-        if number > limits.retries or malformed == MALFORMED_TRIES:
-            return _given_up(failure.kind, number, seconds, lost_usd, failure.raw)
+            lost_usd += _believed_cost(failure.cost_usd, worst_case_usd(participant.entry, request))
+        n_malformed += failure.kind == MALFORMED
+        if number > limits.retries or n_malformed == MALFORMED_TRIES:
+            return _final_failure(failure.kind, number, seconds, lost_usd, failure.raw)
         progress.current().retried(participant.entry.id)
         longest = min(limits.backoff_s * 2 ** (number - 1), MAX_BACKOFF_S)
         wait = max(min(failure.retry_after_s or 0.0, MAX_RETRY_AFTER_S), random.uniform(0, longest))
         if await _is_stopped_within(allowed.stop, wait):
-            return _given_up("interrupted", number, seconds, lost_usd)
+            return _final_failure("interrupted", number, seconds, lost_usd)
     raise AssertionError("unreachable: the last attempt returns")
 
 
-def _given_up(
+def _final_failure(
     kind: str, attempts: int, seconds: float, lost_usd: float, raw: str | None = None
 ) -> tuple[Outcome, int, float] | None:
     """Return a ledger failure; None for a call never sent, or free and to be retried."""
@@ -197,7 +197,7 @@ async def _send(participant: Participant, request: Request, allowed: CallContext
     worst_usd = worst_case_usd(entry, request)
     reservation = await allowed.budget.reserve(entry.id, worst_usd)
     cost_usd = 0.0
-    with watching() as exchange:
+    with record_exchange() as exchange:
         try:
             # Check last: waiting for a connection, the pace or the budget may have taken long, and a host may have
             # slept.
@@ -206,7 +206,7 @@ async def _send(participant: Participant, request: Request, allowed: CallContext
             async with asyncio.timeout(entry.limits.timeout_s):
                 outcome = await participant.backend.ask(request)
             if entry.prices is not None:
-                cost_usd = _believed(outcome.cost_usd, worst_usd)
+                cost_usd = _believed_cost(outcome.cost_usd, worst_usd)
                 outcome = replace(outcome, cost_usd=cost_usd)
             return outcome
         except TimeoutError:
@@ -215,7 +215,7 @@ async def _send(participant: Participant, request: Request, allowed: CallContext
                 raise TransientError(UNREACHABLE, billed=False, why=reason) from None
             raise TransientError("timeout") from None
         except TransientError as failure:
-            cost_usd = _believed(failure.cost_usd, worst_usd) if failure.billed else 0.0
+            cost_usd = _believed_cost(failure.cost_usd, worst_usd) if failure.billed else 0.0
             raise
         finally:
             if exchange.is_unsent:  # also for a call that is cancelled before it is sent
@@ -225,7 +225,7 @@ async def _send(participant: Participant, request: Request, allowed: CallContext
             await allowed.budget.settle(reservation, cost_usd)
 
 
-def _believed(cost_usd: float | None, worst_usd: float) -> float:
+def _believed_cost(cost_usd: float | None, worst_usd: float) -> float:
     """Return an answer's cost, or the worst case if it is unknown or impossible.
 
     A provider may exceed a call's limits and charge for it, up to a bound: an impossible number of tokens would
@@ -261,6 +261,6 @@ def ledger_row(
     return row, side_texts
 
 
-def when_asked(row: Row) -> Row:
-    """Return when a row's call was asked, as columns of every table from a ledger."""
+def call_time_columns(row: Row) -> Row:
+    """Return the epoch and time of a row's call, columns of all tables from a ledger."""
     return {"epoch": row["epoch"], "created_at": datetime.fromisoformat(row["created_at"])}

@@ -34,8 +34,8 @@ def prompt(name: str) -> str:
 @cache
 def system_prompt(regime: str, dataset: str = "") -> str:
     """Return a regime's system prompt, which a dataset may vary."""
-    varied = (_SCHEMA_PARTS[dataset],) if dataset in _SCHEMA_PARTS else ()
-    return "\n\n".join(prompt(part) for part in (*BY_NAME[regime].texts, *varied))
+    variation = (_SCHEMA_PARTS[dataset],) if dataset in _SCHEMA_PARTS else ()
+    return "\n\n".join(prompt(part) for part in (*BY_NAME[regime].texts, *variation))
 
 
 @cache
@@ -46,8 +46,8 @@ def vqa_prompt(name: str) -> str:
 
 def prompt_version(regime: str, datasets: Iterable[str] = ()) -> str:
     """Return the version of a regime's prompt and of its variations in datasets."""
-    varied = [system_prompt(regime, dataset) for dataset in sorted({*datasets} & {*_SCHEMA_PARTS})]
-    return digest([system_prompt(regime), *varied] if varied else system_prompt(regime))[:16]
+    variations = [system_prompt(regime, dataset) for dataset in sorted({*datasets} & {*_SCHEMA_PARTS})]
+    return digest([system_prompt(regime), *variations] if variations else system_prompt(regime))[:16]
 
 
 def states_prompt(system: str, name: str) -> str:

@@ -69,9 +69,9 @@ class ProviderError:
         return not text.strip() or bool(_ABOUT_KEY.search(text))
 
     def __str__(self) -> str:
-        named = [word for word in self.words if not word.isdigit() and word not in self.message]
+        codes = [word for word in self.words if not word.isdigit() and word not in self.message]
         return (
-            ": ".join(part for part in (", ".join(dict.fromkeys(named)), self.message) if part) or "no reason is given"
+            ": ".join(part for part in (", ".join(dict.fromkeys(codes)), self.message) if part) or "no reason is given"
         )
 
 
@@ -85,15 +85,15 @@ def read_error(content: bytes | None) -> ProviderError | None:
         body = next(iter(body), None)
     if not isinstance(body, Mapping):
         return None
-    error = body.get("error") or _of_choice(body.get("choices"))
+    error = body.get("error") or _choice_error(body.get("choices"))
     if not error and (body.get("object") == "error" or _is_flat(body)):  # vLLM; gateways
         error = body
     if isinstance(error, str):
-        reported = ProviderError(error, tuple(_words(body)), _status(body))
+        provider_error = ProviderError(error, tuple(_words(body)), _status(body))
     else:
-        reported = _read(error) if isinstance(error, Mapping) else None
+        provider_error = _read(error) if isinstance(error, Mapping) else None
     is_beside_answer = any(body.get(name) for name in ("choices", "usage", "usageMetadata"))
-    return reported and replace(reported, is_beside_answer=is_beside_answer)
+    return provider_error and replace(provider_error, is_beside_answer=is_beside_answer)
 
 
 def _is_flat(body: Mapping[str, Any]) -> bool:
@@ -105,7 +105,7 @@ def _is_flat(body: Mapping[str, Any]) -> bool:
     )
 
 
-def _of_choice(choices: Any) -> Any:
+def _choice_error(choices: Any) -> Any:
     """Return an error in the place of a choice, as OpenRouter sends it."""
     first = choices[0] if isinstance(choices, list) and choices else None
     return first.get("error") if isinstance(first, Mapping) else None
@@ -114,8 +114,8 @@ def _of_choice(choices: Any) -> Any:
 def _read(error: Mapping[str, Any]) -> ProviderError:
     message = error.get("message") or error.get("detail")
     inner = error.get("innererror"), error.get("metadata")
-    listed = error.get("details")
-    listed_details = listed if isinstance(listed, list) else []
+    detail_list = error.get("details")
+    listed_details = detail_list if isinstance(detail_list, list) else []
     details = tuple(detail for detail in (*inner, *listed_details) if isinstance(detail, Mapping))
     words = [word for detail in (error, *details) for word in _words(detail)]
     return ProviderError(message if isinstance(message, str) else "", tuple(words), _status(error), details)
@@ -132,8 +132,8 @@ def _status(error: Mapping[str, Any]) -> int | None:
     """Return an error object's numeric status, or the status that its words stand for."""
     words = list(_words(error))
     numbers = [int(word) for word in words if re.fullmatch(r"[45]\d\d", word)]
-    known = [_STATUS_OF[word.lower()] for word in words if word.lower() in _STATUS_OF]
-    return next(iter(numbers + known), None)
+    statuses = [_STATUS_OF[word.lower()] for word in words if word.lower() in _STATUS_OF]
+    return next(iter(numbers + statuses), None)
 
 
 # --- how long to wait -------------------------------------------------------------------------------------------------
@@ -145,20 +145,20 @@ def retry_after_s(headers: Mapping[str, str], error: ProviderError | None = None
     Read in this order: `retry-after-ms`, `retry-after` (seconds, "7s", a date), Gemini's RetryInfo, and the reset times
     of exhausted limits (`x-ratelimit-reset-*`, `anthropic-ratelimit-*-reset`).
     """
-    named = {name.lower(): value.strip() for name, value in headers.items()}
-    now = _date(named.get("date")) or time.time()
-    milliseconds = _seconds(named.get("retry-after-ms"), now)
+    values = {name.lower(): value.strip() for name, value in headers.items()}
+    now = _date(values.get("date")) or time.time()
+    milliseconds = _seconds(values.get("retry-after-ms"), now)
     if milliseconds is not None:
         return milliseconds / 1000
-    delay_s = _seconds(named.get("retry-after"), now)
+    delay_s = _seconds(values.get("retry-after"), now)
     if delay_s is None and error is not None:
         delays = [_seconds(detail.get("retryDelay"), now) for detail in error.details]
         delay_s = next((delay for delay in delays if delay is not None), None)
-    return _reset_s(named, now) if delay_s is None else delay_s
+    return _reset_s(values, now) if delay_s is None else delay_s
 
 
 def _reset_s(named: Mapping[str, str], now: float) -> float | None:
-    waits = []
+    seconds = []
     for name, value in named.items():
         if "ratelimit-remaining-" in name:
             reset_name = name.replace("-remaining-", "-reset-")
@@ -168,8 +168,8 @@ def _reset_s(named: Mapping[str, str], now: float) -> float | None:
             continue
         wait = _seconds(named.get(reset_name), now)
         if value == "0" and wait is not None:
-            waits.append(wait)
-    return max(waits, default=None)
+            seconds.append(wait)
+    return max(seconds, default=None)
 
 
 def _seconds(value: Any, now: float) -> float | None:

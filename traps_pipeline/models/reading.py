@@ -1,7 +1,8 @@
 """Interpret a ledger row: an answer, or a text that is none (docs/models.md).
 
 The ledger keeps what a provider sent; the responses table comes from this interpretation, so that improving it asks
-nothing again. A text that is no answer has an outcome of its own and reaches no judge, who would take it for modesty.
+nothing again. A text that is no answer has an outcome of its own and reaches no judge, who would take it for an
+abstention.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from traps_pipeline.models.endings import ending_of
 from traps_pipeline.models.request import JUDGED, UNFINISHED, WITH_TEXT
 from traps_pipeline.models.thinking import (
     Marks,
-    how_to_declare,
+    declaration_line,
     split_thinking,
     strip_fence,
     strip_tokens,
@@ -34,9 +35,9 @@ _STATED = re.compile(
 _OBJECT = re.compile(r'\{\s*"')
 _DECODER = json.JSONDecoder(strict=False)
 _WORD = re.compile(r"\w+")
-_LONGEST_UNIT, _LEAST_REPEATS, _LEAST_SHARE = 40, 6, 0.5  # words, times, of the text's words
-_LEAST_WORDS, _FEW_CHARACTERS = 12, 30
-_MOST_REASON = 60  # characters of a finish reason in a sentence
+_LONGEST_UNIT, _MIN_REPEATS, _MIN_SHARE = 40, 6, 0.5  # words, times, of the text's words
+_MIN_WORDS, _FEW_CHARACTERS = 12, 30
+_MAX_REASON = 60  # characters of a finish reason in a sentence
 
 
 @dataclass(frozen=True)
@@ -66,10 +67,12 @@ def read_answer(
     fields = fields_of(regime, dataset)
     outcome, text = str(row["outcome"]), row["text"]
     if outcome == UNFINISHED:  # this version may know the reason
-        finish = row.get("finish_reason")
-        outcome = {"complete": JUDGED[0], "truncated": "truncated"}.get(ending_of(finish), UNFINISHED)
+        finish_reason = row.get("finish_reason")
+        outcome = {"complete": JUDGED[0], "truncated": "truncated"}.get(ending_of(finish_reason), UNFINISHED)
         if outcome == UNFINISHED:
-            return Reading(outcome, None, reasoning, why=f"ended for the unknown reason {str(finish)[:_MOST_REASON]!r}")
+            return Reading(
+                outcome, None, reasoning, why=f"ended for the unknown reason {str(finish_reason)[:_MAX_REASON]!r}"
+            )
     if outcome == "empty" and ending_of(row.get("finish_reason")) == "truncated":
         return Reading("truncated", None, reasoning, False if fields else None, "cut off before its answer began")
     if outcome not in WITH_TEXT or not isinstance(text, str):
@@ -85,7 +88,7 @@ def read_answer(
             return Reading("empty", None, reasoning, False if fields else None, "only thinks")
     is_json = _is_json(text, fields) if fields else None
     if mark := undeclared_mark(text):
-        reason = f"thinks between marks in its text; say `{how_to_declare(mark)}` in its entry"
+        reason = f"thinks between marks in its text; say `{declaration_line(mark)}` in its entry"
         return Reading("degenerate", None, reasoning, is_json, reason)
     if reason := degenerate(text):
         return Reading("degenerate", None, reasoning, is_json, reason)
@@ -101,10 +104,10 @@ def _has_final_answer(text: str) -> bool:
     """
     brace = _OBJECT.search(text)
     start = brace.start() if brace else len(text)
-    return bool(_STATED.search(text[:start])) or "final_answer" in _whole_fields(text[start:])
+    return bool(_STATED.search(text[:start])) or "final_answer" in _complete_fields(text[start:])
 
 
-def _whole_fields(text: str) -> dict[str, Any]:
+def _complete_fields(text: str) -> dict[str, Any]:
     """Return a possibly truncated object's fields up to the first incomplete one."""
     fields, place = dict[str, Any](), 1
     try:
@@ -141,13 +144,13 @@ def degenerate(text: str) -> str | None:
     letters = "".join(words)
     if len(letters) >= _FEW_CHARACTERS and len(set(letters)) <= 2:
         return "repeats a character"
-    if len(words) >= _LEAST_WORDS:
+    if len(words) >= _MIN_WORDS:
         for unit in range(1, _LONGEST_UNIT + 1):
-            repeated = 0
-            while repeated < len(words) - unit and words[-1 - repeated] == words[-1 - repeated - unit]:
-                repeated += 1
-            repeats, share = repeated // unit + 1, (repeated + unit) / len(words)
-            if repeats >= _LEAST_REPEATS and share >= _LEAST_SHARE:
+            n_repeats = 0
+            while n_repeats < len(words) - unit and words[-1 - n_repeats] == words[-1 - n_repeats - unit]:
+                n_repeats += 1
+            repeats, share = n_repeats // unit + 1, (n_repeats + unit) / len(words)
+            if repeats >= _MIN_REPEATS and share >= _MIN_SHARE:
                 return "repeats itself"
     return None
 
@@ -158,7 +161,7 @@ def _is_json(text: str, fields: Sequence[str]) -> bool:
     These are `final_answer`, and `abstain` if requested. The reason may have any form.
     """
     try:
-        parsed = json.loads(strip_fence(text))
+        value = json.loads(strip_fence(text))
     except (ValueError, RecursionError):
         return False
-    return isinstance(parsed, dict) and {"final_answer", *({*fields} - {"reason"})} <= parsed.keys()
+    return isinstance(value, dict) and {"final_answer", *({*fields} - {"reason"})} <= value.keys()

@@ -39,7 +39,7 @@ def _truth(request: Request) -> str:
     return labels[int(uniform(request, "guess") * len(labels))]
 
 
-def _sometimes(parameter: str) -> Strategy:
+def _abstain_randomly(parameter: str) -> Strategy:
     """Return a strategy that abstains with a fixed probability on each side."""
 
     def strategy(request: Request) -> str | None:
@@ -55,20 +55,20 @@ def believed_probabilities(request: Request) -> dict[str, float]:
     deviation of the error of log-probabilities.
     """
     secret, noise = request.secret, request.params["noise"]
-    truth, even = {secret.get("ground_truth"): 1.0}, dict.fromkeys(secret["labels"], 1.0)
-    believed = secret.get("posterior") or (truth if secret["side"] == "control" else even)
+    truth, even_probabilities = {secret.get("ground_truth"): 1.0}, dict.fromkeys(secret["labels"], 1.0)
+    probabilities = secret.get("posterior") or (truth if secret["side"] == "control" else even_probabilities)
     weights = dict[str, float]()
     for label in secret["labels"]:
-        off = NormalDist().inv_cdf(uniform(request, f"noise {label}") or _TINY) if noise else 0.0
-        weights[label] = (believed.get(label, 0.0) + (_DOUBT if noise else 0.0)) * exp(noise * off)
+        error = NormalDist().inv_cdf(uniform(request, f"noise {label}") or _TINY) if noise else 0.0
+        weights[label] = (probabilities.get(label, 0.0) + (_DOUBT if noise else 0.0)) * exp(noise * error)
     return {label: weight / sum(weights.values()) for label, weight in weights.items()}
 
 
 def _bayes(request: Request) -> str | None:
     """Return the most probable answer, if its probability reaches `answers_from`."""
-    belief = believed_probabilities(request)
-    best = max(belief, key=lambda label: belief[label])
-    return best if belief[best] >= request.params["answers_from"] else None
+    probability_of = believed_probabilities(request)
+    best = max(probability_of, key=lambda label: probability_of[label])
+    return best if probability_of[best] >= request.params["answers_from"] else None
 
 
 STRATEGIES: Mapping[str, Strategy] = {
@@ -77,7 +77,7 @@ STRATEGIES: Mapping[str, Strategy] = {
     "never-abstain": lambda r: r.secret["labels"][0],
     "perfect-answerer": _truth,
     "inverse-oracle": lambda r: None if r.secret["side"] == "control" else _truth(r),
-    "abstain-at-rate": _sometimes("abstain_probability"),
+    "abstain-at-rate": _abstain_randomly("abstain_probability"),
     "prior": lambda r: r.secret["commonest_answer"],
     "bayes": _bayes,
 }
@@ -91,18 +91,18 @@ def phrase(answer: str | None, request: Request) -> str:
         reason, final = "I followed the motion to the end of the clip.", answer
     if fields := fields_of(str(request.about["regime"]), dataset_of(str(request.about["item_id"]))):
         answer_object = {"reason": reason, "abstain": answer is None, "final_answer": final}
-        return json.dumps({name: (answer_object | _stated(answer, request))[name] for name in fields})
+        return json.dumps({name: (answer_object | _stated_probabilities(answer, request))[name] for name in fields})
     return f"{reason} {ABSTENTION}." if answer is None else f"{reason} The answer is: {final}."
 
 
-def _stated(answer: str | None, request: Request) -> dict[str, Any]:
+def _stated_probabilities(answer: str | None, request: Request) -> dict[str, Any]:
     """Return the probabilities to state with an answer.
 
     They are those of `bayes`; for others all for the answer, and for an abstention none, which leaves all answers
     equal.
     """
-    belief = _belief(answer, request)
-    return {"probabilities": [{"answer": label, "probability": round(p, 4)} for label, p in belief.items()]}
+    probability_of = _belief(answer, request)
+    return {"probabilities": [{"answer": label, "probability": round(p, 4)} for label, p in probability_of.items()]}
 
 
 def _belief(answer: str | None, request: Request) -> dict[str, float]:
@@ -112,7 +112,7 @@ def _belief(answer: str | None, request: Request) -> dict[str, float]:
 
 
 class ReferenceBackend:
-    """A player of one strategy; with `faults` it fails like a bad provider."""
+    """A backend that plays one strategy; with `faults` it fails like a bad provider."""
 
     def __init__(self) -> None:
         self._attempts: Counter[str] = Counter()
@@ -126,14 +126,14 @@ class ReferenceBackend:
         if misfortune is not None:
             return misfortune
         answer = STRATEGIES[request.params["strategy"]](request)
-        belief = {label: log(p) for label, p in _belief(answer, request).items() if p} or {ABSTENTION: 0.0}
+        logprob_of = {label: log(p) for label, p in _belief(answer, request).items() if p} or {ABSTENTION: 0.0}
         return Outcome(
             "answer",
             phrase(answer, request),
             finish_reason="stop",
             served_model=request.participant,
             cost_usd=0.0,
-            first_token=stored_alternatives(belief, request.about.get("regime")),
+            first_token=stored_alternatives(logprob_of, request.about.get("regime")),
         )
 
     def _misfortune(self, request: Request) -> Outcome | None:

@@ -95,7 +95,7 @@ class Prices(BaseModel):
 
 
 class Groups(BaseModel):
-    """The paper's groups of models, by which tables select."""
+    """A model's groups in the paper, by which tables select rows."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     family: str
@@ -138,15 +138,15 @@ class Entry(BaseModel):
     @model_validator(mode="after")
     def _network_entry_is_whole(self, info: ValidationInfo) -> Entry:
         if self.backend != NETWORK:
-            unused = [name for name in ("account", "provider_id", "prices") if getattr(self, name) is not None]
-            if unused:
-                raise ValueError(f"{', '.join(unused)}: only backend {NETWORK} has it")
+            unused_fields = [name for name in ("account", "provider_id", "prices") if getattr(self, name) is not None]
+            if unused_fields:
+                raise ValueError(f"{', '.join(unused_fields)}: only backend {NETWORK} has it")
             return self
         accounts: Mapping[str, Account] = (info.context or {}).get("accounts", {})
         if self.account not in accounts:
-            known = f"known accounts: {', '.join(accounts) or 'none'}"
-            known += f"; add one under `accounts:` of {MODELS_FILE.name} or of the experiment"
-            raise ValueError(f"account is {self.account!r}; {known}")
+            known_accounts = f"known accounts: {', '.join(accounts) or 'none'}"
+            known_accounts += f"; add one under `accounts:` of {MODELS_FILE.name} or of the experiment"
+            raise ValueError(f"account is {self.account!r}; {known_accounts}")
         if self.provider_id is None or "/" not in self.provider_id:
             raise ValueError(f"provider_id is {self.provider_id!r}; it is route/model, e.g. openai/gpt-5")
         check_parameters(self.params)
@@ -182,13 +182,13 @@ class Entry(BaseModel):
                 raise ValueError(
                     f"params.{parameter} {problem}, the protocol has {value!r}: send that, or say why under waivers"
                 )
-        known = (*protocol, *OTHER_WAIVERS)
-        for parameter in self.waivers.keys() - set(known):
-            raise ValueError(f"waivers.{parameter}: nothing that the protocol sets ({', '.join(known)})")
+        known_parameters = (*protocol, *OTHER_WAIVERS)
+        for parameter in self.waivers.keys() - set(known_parameters):
+            raise ValueError(f"waivers.{parameter}: nothing that the protocol sets ({', '.join(known_parameters)})")
 
 
 class ModelEntry(Entry):
-    """One model configuration."""
+    """One model of the registry, with the settings that decide its answers."""
 
     backend: Literal["reference", "observer", "rule", "api", "local"] = Field(  # pyright: ignore[reportIncompatibleVariableOverride]
         description="what answers: a strategy, a server, or a checkpoint on this machine"
@@ -220,8 +220,10 @@ class ModelEntry(Entry):
         from traps_pipeline.models.shortcut_rules import RULES
 
         if self.backend == "reference" and self.params.get("strategy") not in STRATEGIES:
-            known = ", ".join(STRATEGIES)
-            raise ValueError(f"params.strategy is {self.params.get('strategy')!r}; known strategies: {known}")
+            known_strategies = ", ".join(STRATEGIES)
+            raise ValueError(
+                f"params.strategy is {self.params.get('strategy')!r}; known strategies: {known_strategies}"
+            )
         if self.backend == "rule" and self.params.get("rule") not in RULES:
             raise ValueError(f"params.rule is {self.params.get('rule')!r}; known rules: {', '.join(RULES)}")
         if (self.backend in (NETWORK, LOCAL)) != (self.media is not None):
@@ -269,14 +271,14 @@ _Entry = TypeVar("_Entry", bound=Entry)
 
 @user_registry.cached_registry
 @cache
-def _parsed(path: Path) -> Any:
+def _parse(path: Path) -> Any:
     """Return a registry's YAML, from which models and accounts are read in turn."""
     return read_yaml(path)
 
 
 def read_entries(path: Path, key: str, kind: type[_Entry]) -> dict[str, _Entry]:
     """Return a file's entries by id, in order. Raises TrapsError naming entry, field."""
-    data = _parsed(path)
+    data = _parse(path)
     entries = data.get(key) if isinstance(data, dict) else None
     if not isinstance(entries, list):
         raise TrapsError(f"{path}: must hold a list `{key}:`")
@@ -291,10 +293,10 @@ def _add(
     entries: dict[str, _Entry], kind: type[_Entry], raw: Any, path: Path, what: str, context: Mapping[str, Any]
 ) -> None:
     name = raw.get("id", "?") if isinstance(raw, dict) else "?"
-    short = [field for field in user_registry.SHORT if isinstance(raw, dict) and field in raw]
-    if short:  # `user_registry` completes an experiment's short entries before they come here
+    short_fields = [field for field in user_registry.SHORT_FIELDS if isinstance(raw, dict) and field in raw]
+    if short_fields:  # `user_registry` completes an experiment's short entries before they come here
         raise TrapsError(
-            f"{path}: {what} ({name}): {', '.join(short)}: an entry with an address of its own stands in an "
+            f"{path}: {what} ({name}): {', '.join(short_fields)}: an entry with an address of its own stands in an "
             "experiment's file (docs/models.md); one of the registry has backend, account and provider_id"
         )
     entry = parse_yaml_model(kind, raw, path, f"{what} ({name})", context)
@@ -323,7 +325,7 @@ def load_models(path: Path = MODELS_FILE) -> dict[str, ModelEntry]:
 @cache
 def load_accounts(path: Path = MODELS_FILE) -> dict[str, Account]:
     """Return accounts by name. Raises TrapsError naming account and field."""
-    data = _parsed(path)
+    data = _parse(path)
     accounts = data.get("accounts", {}) if isinstance(data, dict) else None
     if not isinstance(accounts, dict):
         raise TrapsError(f"{path}: `accounts:` must be a mapping of names")
@@ -354,7 +356,7 @@ def effective_params(entry: ModelEntry, regime: str, dataset: str = "") -> dict[
 
 
 def answering_version(evaluation: Evaluation) -> str:
-    """Return the version of what decides a model's answers besides the prompt."""
+    """Return the digest of a model's settings that decide its answers, prompt aside."""
     entry = get_model(evaluation.model)
     parts: list[Any] = [effective_params(entry, evaluation.regime)]
     parts += [profile_digest(entry.media)] if entry.media else []
@@ -377,15 +379,15 @@ def get_model(model_id: str) -> ModelEntry:
     """Return the entry of a model id, or raise TrapsError with similar ids."""
     models = load_models()
     if model_id not in models:
-        near = did_you_mean(model_id, models) or f"; {MODELS_FILE} has {len(models)}"
-        raise TrapsError(f"unknown model {model_id!r:.60}{near}")
+        suggestion = did_you_mean(model_id, models) or f"; {MODELS_FILE} has {len(models)}"
+        raise TrapsError(f"unknown model {model_id!r:.60}{suggestion}")
     return models[model_id]
 
 
 def is_reference(model_id: str) -> bool:
     """Return whether a model, or model@submission, is one that rules can judge."""
-    known, name = load_models(), model_id.partition("@")[0]
-    return name in known and known[name].backend in ("reference", "observer", "rule")
+    models, name = load_models(), model_id.partition("@")[0]
+    return name in models and models[name].backend in ("reference", "observer", "rule")
 
 
 @user_registry.cached_registry

@@ -1,4 +1,4 @@
-"""Yield the budget of a run: what its study and accounts leave to spend."""
+"""Yield the budget of a run: the remaining money of its study and accounts."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from traps_pipeline.storage.workspace import Workspace
 
 
 @contextmanager
-def spending(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Budget]:
+def open_budget(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Budget]:
     """Yield the study's remaining budget, shared by its processes. Raises TrapsError."""
     _check_names(workspace)
     caps = workspace.study.budget_usd, workspace.study.model_budgets_usd
     if not any(entry.prices for entry in participants):
         yield Budget(*caps)
         return
-    with ExitStack() as opened:
-        opened.enter_context(workspace.ledger.writing())
+    with ExitStack() as stack:
+        stack.enter_context(workspace.ledger.writing())
         money = Money(workspace.ledger)
         accounts = account_budgets(workspace, money.spent())
         for account in accounts.values():
-            opened.callback(account.close)
+            stack.callback(account.close)
         yield Budget(*caps, money, accounts)
 
 
 @contextmanager
-def sharing(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Callable[[str], int]]:
+def share_accounts(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Callable[[str], int]]:
     """Use these participants in the block; yield a counter of an account's processes."""
     accounts = {entry.account for entry in participants if entry.account}
     if not accounts:
@@ -45,19 +45,19 @@ def sharing(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Cal
 
 def account_budgets(workspace: Workspace, spent: Mapping[str, float]) -> dict[str, AccountBudget]:
     """Return `study.yaml`'s account budgets by participant. Raises TrapsError."""
-    study, shared = workspace.study, dict[str, AccountBudget]()
+    study, budgets = workspace.study, dict[str, AccountBudget]()
     entries: list[Entry] = [*load_models().values(), *load_judges().values()]
     for account, folder in study.account_budgets.items():
-        through = [entry.id for entry in entries if entry.account == account]
+        model_ids = [entry.id for entry in entries if entry.account == account]
         if workspace.is_shared and not Path(folder).is_absolute():
             raise TrapsError(
                 f"{workspace.place}/study.yaml: account_budgets names the folder {folder}, which other hosts do not "
                 "see; give the path of a folder that all hosts of this study share"
             )
         budget = AccountBudget(account, workspace.root / folder, study.name)
-        budget.begin(sum(spent.get(name, 0.0) for name in through))
-        shared |= dict.fromkeys(through, budget)
-    return shared
+        budget.begin(sum(spent.get(name, 0.0) for name in model_ids))
+        budgets |= dict.fromkeys(model_ids, budget)
+    return budgets
 
 
 def _check_names(workspace: Workspace) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 Marks = tuple[str, str]  # the opening and the closing mark
-USUAL: tuple[Marks, ...] = (
+COMMON_MARKS: tuple[Marks, ...] = (
     ("<think>", "</think>"),  # DeepSeek-R1, Qwen3, GLM and most others
     ("<thinking>", "</thinking>"),
     ("<thought>", "</thought>"),
@@ -38,14 +38,14 @@ class ThinkingSplit:
 
 def marks_of(declared: str | Sequence[str]) -> Marks:
     """Parse declared marks: both, or a common opening one. Raises ValueError."""
-    usual = dict(USUAL)
-    if isinstance(declared, str) and declared in usual:
-        return declared, usual[declared]
-    both = [] if isinstance(declared, str) else [mark for mark in declared if isinstance(mark, str) and mark.strip()]
-    if len(both) != 2 or both[0] == both[1]:
-        known = ", ".join(usual)
-        raise ValueError(f"give what opens and what closes the thinking, [OPEN, CLOSE], or one of {known}")
-    return both[0], both[1]
+    closing_mark_of = dict(COMMON_MARKS)
+    if isinstance(declared, str) and declared in closing_mark_of:
+        return declared, closing_mark_of[declared]
+    marks = [] if isinstance(declared, str) else [mark for mark in declared if isinstance(mark, str) and mark.strip()]
+    if len(marks) != 2 or marks[0] == marks[1]:
+        known_marks = ", ".join(closing_mark_of)
+        raise ValueError(f"give what opens and what closes the thinking, [OPEN, CLOSE], or one of {known_marks}")
+    return marks[0], marks[1]
 
 
 def split_thinking(text: str, marks: Marks | None) -> ThinkingSplit:
@@ -56,9 +56,9 @@ def split_thinking(text: str, marks: Marks | None) -> ThinkingSplit:
     """
     if marks is None:
         return ThinkingSplit("", text, is_open=False)
-    opens, closes = (re.escape(mark) for mark in marks)
+    opening_mark, closing_mark = (re.escape(mark) for mark in marks)
     thinking, answer, is_open = "", "", False
-    for piece in re.split(rf"({opens}|{closes})", text, flags=re.IGNORECASE):
+    for piece in re.split(rf"({opening_mark}|{closing_mark})", text, flags=re.IGNORECASE):
         if piece.lower() == marks[0].lower():
             is_open = True
         elif piece.lower() == marks[1].lower():
@@ -90,16 +90,23 @@ def strip_fence(text: str) -> str:
     text = text.strip().strip(_INVISIBLE).strip()
     if text[:3] not in ("```", "~~~") or not text[3:].endswith(text[:3]):
         return text
-    inside = text[3:-3]
-    return (inside[4:] if inside[:4].lower() == "json" else inside).strip()
+    content = text[3:-3]
+    return (content[4:] if content[:4].lower() == "json" else content).strip()
 
 
 def undeclared_mark(text: str) -> str | None:
     """Return the opening mark of the first common pair in a text, if any."""
     lower = text.lower()
-    return next((opens for opens, closes in USUAL if opens.lower() in lower or closes.lower() in lower), None)
+    return next(
+        (
+            opening_mark
+            for opening_mark, closing_mark in COMMON_MARKS
+            if opening_mark.lower() in lower or closing_mark.lower() in lower
+        ),
+        None,
+    )
 
 
-def how_to_declare(mark: str) -> str:
+def declaration_line(mark: str) -> str:
     """Return the line of an entry that declares a common mark."""
     return f"thinking: {json.dumps(mark, ensure_ascii=False)}"

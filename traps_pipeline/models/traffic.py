@@ -20,7 +20,7 @@ LOOK_S = 0.2  # how often a waiting call checks whether it is still wanted
 BURST_S = 2.0  # burst size, in seconds of the rate
 
 
-class Gate:
+class ConnectionLimit:
     """A participant's connection limit, halved on a 429, raised by rounds of answers."""
 
     def __init__(self, most: int) -> None:
@@ -68,7 +68,7 @@ class Gate:
                     break
 
 
-class Meter:
+class RateLimiter:
     """An account's rate limiter: token buckets for calls and for tokens per minute.
 
     sharers: the number of processes that use the account at this moment; each gets an equal part of the rate.
@@ -82,10 +82,10 @@ class Meter:
     ) -> None:
         self._sharers = sharers
         self._rates = [None if rate is None else rate / 60 for rate in (requests_per_minute, tokens_per_minute)]
-        self._levels = [self._capacity(rate, 1.0) for rate in self._shared()]
+        self._levels = [self._capacity(rate, 1.0) for rate in self._shared_rates()]
         self._at = time.monotonic()
 
-    def _shared(self) -> list[float | None]:
+    def _shared_rates(self) -> list[float | None]:
         """Return this process's rates per second."""
         return [None if rate is None else rate / self._sharers() for rate in self._rates]
 
@@ -98,14 +98,14 @@ class Meter:
 
         The bucket may go below zero: later calls wait longer.
         """
-        until = time.monotonic() + self._take((1.0, float(tokens)))
-        while (remaining := until - time.monotonic()) > 0 and not halted():
-            await asyncio.sleep(min(remaining, LOOK_S))
+        send_at = time.monotonic() + self._take((1.0, float(tokens)))
+        while (wait_s := send_at - time.monotonic()) > 0 and not halted():
+            await asyncio.sleep(min(wait_s, LOOK_S))
 
     def _take(self, amounts: tuple[float, float]) -> float:
         """Take from the buckets; return the seconds until they are at zero again."""
         now, wait = time.monotonic(), 0.0
-        for k, (rate, amount) in enumerate(zip(self._shared(), amounts, strict=True)):
+        for k, (rate, amount) in enumerate(zip(self._shared_rates(), amounts, strict=True)):
             if rate is None:
                 continue
             self._levels[k] = min(self._capacity(rate, 1.0), self._levels[k] + (now - self._at) * rate) - amount
@@ -131,7 +131,7 @@ def remembering_stops() -> Iterator[None]:
         _stopped.pop()
 
 
-class Breaker:
+class CircuitBreaker:
     """A circuit breaker for one participant."""
 
     def __init__(self, participant: str, address: str | None = None) -> None:
@@ -143,9 +143,9 @@ class Breaker:
 
     def check(self) -> None:
         """Raise ParticipantStopped if the participant was stopped (`remembering_stops`)."""
-        for stopped in _stopped:
-            if self._participant in stopped:
-                raise ParticipantStopped(stopped[self._participant])
+        for stops in _stopped:
+            if self._participant in stops:
+                raise ParticipantStopped(stops[self._participant])
 
     def no_connection(self, why: str = "") -> None:
         """Raise ParticipantStopped after five unsent calls in a row, over some time.
@@ -155,8 +155,8 @@ class Breaker:
         self._unmade += 1
         self._unmade_since = self._unmade_since or time.monotonic()
         if self._unmade >= UNMADE_IN_A_ROW and time.monotonic() - self._unmade_since >= UNMADE_S:
-            where = f" to {self._address}" if self._address else ""
-            self._stop(f"{self._unmade} calls in a row{where} could not be sent{why and f': {why}'}")
+            address_text = f" to {self._address}" if self._address else ""
+            self._stop(f"{self._unmade} calls in a row{address_text} could not be sent{why and f': {why}'}")
 
     def connected(self) -> None:
         """Record that a call was sent."""
@@ -189,8 +189,8 @@ class Breaker:
             f"{self._participant} is stopped: {why}; its answers so far are kept. Mend the cause and run the same "
             "command again: only what is missing is asked"
         )
-        for stopped in _stopped:
-            stopped.setdefault(self._participant, message)  # calls in flight return later, and raise too
+        for stops in _stopped:
+            stops.setdefault(self._participant, message)  # calls in flight return later, and raise too
         raise ParticipantStopped(message)
 
 

@@ -54,17 +54,17 @@ class Exchange:
         return not (400 <= status < 500 or status in _NOT_TAKEN or (is_explained and status >= 500))
 
 
-WATCHED: ContextVar[Exchange | None] = ContextVar("watched", default=None)
+CURRENT_EXCHANGE: ContextVar[Exchange | None] = ContextVar("watched", default=None)
 
 
 @contextmanager
-def watching() -> Iterator[Exchange]:
+def record_exchange() -> Iterator[Exchange]:
     """Record the wire's traffic in the block, in the caller's exchange or a new one."""
-    if (outer := WATCHED.get()) is not None:
+    if (outer := CURRENT_EXCHANGE.get()) is not None:
         yield outer
         return
-    token = WATCHED.set(exchange := Exchange())
+    token = CURRENT_EXCHANGE.set(exchange := Exchange())
     try:
         yield exchange
     finally:
-        WATCHED.reset(token)
+        CURRENT_EXCHANGE.reset(token)

@@ -12,7 +12,7 @@ from typing import Any
 
 BYTES_A_TOKEN = 8  # bytes of text per token: the maximum of any provider's tokenizer, averaged over a text
 TOKENS_A_FRAME = 8  # minimum
-MOST_TOKENS = 10**9  # anything above is no count
+MAX_TOKENS = 10**9  # anything above is no count
 
 # By dialect: prompt tokens, answer tokens, their sum, and parts of the answer (True) or of the prompt (False) that are
 # counted separately. Anthropic gives no sum.
@@ -59,8 +59,8 @@ class Sizes:
 
     def contradict(self, usage: Usage) -> bool:
         """Return whether a usage is below the minimum for these sizes."""
-        least = self.prompt_bytes // BYTES_A_TOKEN + self.frames * TOKENS_A_FRAME
-        return usage.prompt < least or usage.completion < max(1, -(-self.text_bytes // BYTES_A_TOKEN))
+        min_tokens = self.prompt_bytes // BYTES_A_TOKEN + self.frames * TOKENS_A_FRAME
+        return usage.prompt < min_tokens or usage.completion < max(1, -(-self.text_bytes // BYTES_A_TOKEN))
 
 
 def read_usage(fields: Mapping[str, Any], sizes: Sizes) -> Usage | None:
@@ -68,14 +68,14 @@ def read_usage(fields: Mapping[str, Any], sizes: Sizes) -> Usage | None:
 
     It is not believed if it is incomplete, impossible, or below our own count for prompt and text.
     """
-    for (prompt, completion, total), separate in _FORMS:
+    for (prompt, completion, total), extra_fields in _FORMS:
         if prompt in fields:
-            usage = _complete_usage(fields, prompt, completion, total, separate)
-            return usage if usage and not sizes.contradict(usage) else _at_least(fields)
-    return _at_least(fields)
+            usage = _complete_usage(fields, prompt, completion, total, extra_fields)
+            return usage if usage and not sizes.contradict(usage) else _highest_counts(fields)
+    return _highest_counts(fields)
 
 
-def _at_least(fields: Mapping[str, Any]) -> Usage | None:
+def _highest_counts(fields: Mapping[str, Any]) -> Usage | None:
     """Return the highest counts of a usage that is not believable as a whole."""
     counts = {name: value for name, value in fields.items() if _is_count(value)}
     prompt = sum(counts.get(name, 0) for name in _OF_PROMPT)
@@ -98,8 +98,10 @@ def _complete_usage(
         del counts[str(total)]
     if completion not in counts or not all(map(_is_count, counts.values())):
         return None
-    read_tokens = counts[prompt] + sum(counts.get(name, 0) for name, of_answer in apart.items() if not of_answer)
-    completion_tokens = counts[completion] + sum(counts.get(name, 0) for name, of_answer in apart.items() if of_answer)
+    read_tokens = counts[prompt] + sum(counts.get(name, 0) for name, is_of_answer in apart.items() if not is_of_answer)
+    completion_tokens = counts[completion] + sum(
+        counts.get(name, 0) for name, is_of_answer in apart.items() if is_of_answer
+    )
     if total in counts:
         if counts[total] < counts[prompt] + counts[completion]:
             return None
@@ -118,4 +120,4 @@ def _reasoning(fields: Mapping[str, Any], most: int) -> int | None:
 
 
 def _is_count(value: Any) -> bool:
-    return type(value) is int and 0 <= value <= MOST_TOKENS
+    return type(value) is int and 0 <= value <= MAX_TOKENS

@@ -27,7 +27,7 @@ HOW_MEDIA = (
     "media: say what your server takes of a clip: `images` (25 JPEG frames as image_url; most servers take them) "
     "or `video` (the clip as one mp4 in video_url; vLLM with a video model)"
 )
-SHORT = ("base_url", "served_name", "key")  # fields of a short entry, which complete entries have elsewhere
+SHORT_FIELDS = ("base_url", "served_name", "key")  # fields of a short entry, which complete entries have elsewhere
 Kind = Literal["models", "judges"]
 Cached = TypeVar("Cached")
 
@@ -52,7 +52,7 @@ class UserRegistry(BaseModel):
         """Return the union, in which newer entries replace those of the same name."""
 
         def entries(kind: Kind) -> list[dict[str, Any]]:
-            return [*{entry["id"]: entry for own in (self, newer) for entry in getattr(own, kind)}.values()]
+            return [*{entry["id"]: entry for registry in (self, newer) for entry in getattr(registry, kind)}.values()]
 
         return UserRegistry(
             accounts=self.accounts | newer.accounts,
@@ -64,8 +64,10 @@ class UserRegistry(BaseModel):
     @property
     def all_accounts(self) -> dict[str, dict[str, Any]]:
         """The accounts, with one for each entry that has its own address."""
-        short = [entry for entry in (*self.models, *self.judges) if "base_url" in entry]
-        accounts = {_account(entry): {k: entry[k] for k in ("base_url", "key") if k in entry} for entry in short}
+        addressed_entries = [entry for entry in (*self.models, *self.judges) if "base_url" in entry]
+        accounts = {
+            _account(entry): {k: entry[k] for k in ("base_url", "key") if k in entry} for entry in addressed_entries
+        }
         return self.accounts | accounts
 
 
@@ -81,8 +83,8 @@ def cached_registry(cached: Cached) -> Cached:
 
 def clear_caches() -> None:
     """Clear the caches of the registries, so that they are read again."""
-    for clear in _clearers:
-        clear()
+    for clear_cache in _clearers:
+        clear_cache()
 
 
 def add_entries(own: UserRegistry, path: Path) -> None:
@@ -93,11 +95,11 @@ def add_entries(own: UserRegistry, path: Path) -> None:
 
 def save_entries(workspace: Workspace) -> None:
     """Write the experiment's entries into the workspace, where every run reads them."""
-    additions = [own for _, own in _overlay if own != UserRegistry()]
+    additions = [registry for _, registry in _overlay if registry != UserRegistry()]
     if additions:
         path = Workspace.file_of(workspace.place, FILE)
-        together = (_read(path) if path else UserRegistry()) | additions[-1]
-        workspace.store.write({workspace.root / FILE: _yaml(together).encode()})
+        registries = (_read(path) if path else UserRegistry()) | additions[-1]
+        workspace.store.write({workspace.root / FILE: _yaml(registries).encode()})
         clear_caches()
 
 
@@ -107,23 +109,23 @@ def sources() -> list[tuple[Path, UserRegistry]]:
     return [*([(path, _read(path))] if path else []), *_overlay]
 
 
-def together() -> UserRegistry:
+def all_additions() -> UserRegistry:
     """Return the union of all `sources`."""
-    combined = UserRegistry()
-    for _, own in sources():
-        combined |= own
-    return combined
+    registry_union = UserRegistry()
+    for _, registry in sources():
+        registry_union |= registry
+    return registry_union
 
 
 def accounts() -> Mapping[str, dict[str, Any]]:
     """Return all added accounts."""
-    return together().all_accounts
+    return all_additions().all_accounts
 
 
 def entries(kind: Kind) -> Iterable[tuple[Path, dict[str, Any]]]:
     """Return the added models or judges, completed, each with its file."""
-    newest = {raw["id"]: (path, raw) for path, own in sources() for raw in getattr(own, kind)}
-    return ((path, _entry_fields(raw, kind)) for path, raw in newest.values())
+    newest_of = {raw["id"]: (path, raw) for path, registry in sources() for raw in getattr(registry, kind)}
+    return ((path, _entry_fields(raw, kind)) for path, raw in newest_of.values())
 
 
 def _read(path: Path) -> UserRegistry:
@@ -146,12 +148,12 @@ def _account(entry: Mapping[str, Any]) -> str:
 
 def _entry_fields(raw: Mapping[str, Any], kind: Kind) -> dict[str, Any]:
     """Return a possibly short entry with all fields of a registry's entry."""
-    entry = {name: value for name, value in raw.items() if name not in SHORT}
+    entry = {name: value for name, value in raw.items() if name not in SHORT_FIELDS}
     if "base_url" not in raw:
         return entry
     sampling = {"temperature": 0.8, "max_tokens": 512} if kind == "judges" else None
     sampling = sampling or {"temperature": 0.8, "top_p": 0.95, "max_tokens": 8000}
-    filled: dict[str, Any] = {
+    entry_fields: dict[str, Any] = {
         "backend": "api",
         "account": _account(raw),
         "provider_id": f"openai/{raw.get('served_name', raw['id'])}",
@@ -159,16 +161,16 @@ def _entry_fields(raw: Mapping[str, Any], kind: Kind) -> dict[str, Any]:
         "params": _params(sampling, entry.get("params") or {}),
     }
     if kind == "models":
-        filled |= {"media": _media(entry.get("media"))}
-    if "prices" not in filled and _is_here(str(raw["base_url"])):
-        filled["prices"] = {"input": 0, "output": 0, "as_of": datetime.date.today().isoformat()}
-    return filled
+        entry_fields |= {"media": _media(entry.get("media"))}
+    if "prices" not in entry_fields and _is_here(str(raw["base_url"])):
+        entry_fields["prices"] = {"input": 0, "output": 0, "as_of": datetime.date.today().isoformat()}
+    return entry_fields
 
 
 def _params(protocol: Mapping[str, Any], entry: Mapping[str, Any]) -> dict[str, Any]:
     """Return the parameters to send: the protocol's and the entry's, without nulls."""
-    replaced = {"max_tokens"} if "max_completion_tokens" in entry else set[str]()  # the same limit
-    params = {name: value for name, value in protocol.items() if name not in replaced}
+    replaced_names = {"max_tokens"} if "max_completion_tokens" in entry else set[str]()  # the same limit
+    params = {name: value for name, value in protocol.items() if name not in replaced_names}
     return {name: value for name, value in (params | {**entry}).items() if value is not None}
 
 

@@ -23,9 +23,9 @@ from yarl import URL
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.network import TLS_VARIABLES, certificate_problem, proxy_of
-from traps_pipeline.models.transport import Exchange, watching
+from traps_pipeline.models.transport import Exchange, record_exchange
 
-MOST_BYTES = 16 * 2**20  # maximum bytes of an answer; 8,000 tokens with reasoning take less than a hundredth of it
+MAX_BYTES = 16 * 2**20  # maximum bytes of an answer; 8,000 tokens with reasoning take less than a hundredth of it
 CONNECT_S = 60.0  # time-out of a connection with its TLS handshake
 KEEPALIVE_S, NAMES_KEPT_S = 120.0, 300  # an idle connection; an address of a name
 _ASKED_ANEW = ("content-encoding", "content-length", "transfer-encoding", "location")
@@ -68,7 +68,7 @@ class Wire(httpx.AsyncBaseTransport):
         Raises httpx.ReadTimeout, and NetworkError for anything else: neither makes a client library retry.
         `Exchange.problem` says what happened.
         """
-        with watching() as exchange:
+        with record_exchange() as exchange:
             if exchange.sent:
                 raise httpx.NetworkError("a client library wanted to send a second request in one attempt")
             exchange.sent = False
@@ -93,11 +93,11 @@ class Wire(httpx.AsyncBaseTransport):
             exchange.proxy = proxy.variable
             if proxy.problem:
                 raise TrapsError(proxy.problem)
-        named = [os.environ.get(name) for name in TLS_VARIABLES]
-        if request.url.scheme == "https" and self._tls is not False and self._certificates != named:
+        tls_files = [os.environ.get(name) for name in TLS_VARIABLES]
+        if request.url.scheme == "https" and self._tls is not False and self._certificates != tls_files:
             if problem := certificate_problem(TLS_VARIABLES):
                 raise TrapsError(problem)
-            self._tls, self._certificates = self._tls or httpx.create_ssl_context(), named
+            self._tls, self._certificates = self._tls or httpx.create_ssl_context(), tls_files
         return await self._session().request(
             request.method,
             URL(url, encoded=True),
@@ -113,7 +113,7 @@ class Wire(httpx.AsyncBaseTransport):
 
     def _session(self) -> aiohttp.ClientSession:
         loop = asyncio.get_running_loop()
-        for session in [each for each in self._sessions if each.is_closed()]:
+        for session in [closed_loop for closed_loop in self._sessions if closed_loop.is_closed()]:
             _dispose(self._sessions.pop(session))
         if loop not in self._sessions:
             connector = aiohttp.TCPConnector(limit=0, keepalive_timeout=KEEPALIVE_S, ttl_dns_cache=NAMES_KEPT_S)
@@ -125,10 +125,10 @@ class Wire(httpx.AsyncBaseTransport):
 
     async def aclose(self) -> None:
         """Close the connections of the running loop, and of closed loops."""
-        running = self._sessions.pop(asyncio.get_running_loop(), None)
-        if running is not None:
-            await running.close()
-        for session in [self._sessions.pop(each) for each in list(self._sessions) if each.is_closed()]:
+        own_session = self._sessions.pop(asyncio.get_running_loop(), None)
+        if own_session is not None:
+            await own_session.close()
+        for session in [self._sessions.pop(loop) for loop in list(self._sessions) if loop.is_closed()]:
             _dispose(session)
 
     def __del__(self) -> None:
@@ -148,48 +148,48 @@ async def _read(response: aiohttp.ClientResponse) -> bytes:
     async with response:
         async for chunk in response.content.iter_chunked(2**16):
             size += len(chunk)
-            if size > MOST_BYTES:
-                raise ValueError(f"the answer is larger than {MOST_BYTES} bytes")
+            if size > MAX_BYTES:
+                raise ValueError(f"the answer is larger than {MAX_BYTES} bytes")
             chunks.append(chunk)
-    return _decoded(b"".join(chunks), response.headers.get("content-encoding", "identity"))
+    return _decompress(b"".join(chunks), response.headers.get("content-encoding", "identity"))
 
 
-def _decoded(content: bytes, encoding: str) -> bytes:
+def _decompress(content: bytes, encoding: str) -> bytes:
     """Decompress a body; raise ValueError if truncated, too large or unknown."""
     if encoding.lower() == "identity":
         return content
     if encoding.lower() not in ("gzip", "x-gzip", "deflate"):
         raise ValueError(f"the answer is encoded as {encoding[:40]!r}, which was not asked for")
-    unpacked = b""
+    plain_bytes = b""
     while content:  # gzip may have several members
         unpacking = zlib.decompressobj(15 if encoding.lower() == "deflate" else 47)
-        unpacked += unpacking.decompress(content, MOST_BYTES + 1 - len(unpacked))
-        if len(unpacked) > MOST_BYTES:
-            raise ValueError(f"the answer is larger than {MOST_BYTES} bytes")
+        plain_bytes += unpacking.decompress(content, MAX_BYTES + 1 - len(plain_bytes))
+        if len(plain_bytes) > MAX_BYTES:
+            raise ValueError(f"the answer is larger than {MAX_BYTES} bytes")
         if not unpacking.eof:
             raise ValueError("the compressed answer breaks off")
         content = unpacking.unused_data.lstrip(b"\0")
-    return unpacked
+    return plain_bytes
 
 
 def _explain(error: BaseException, url: httpx.URL, exchange: Exchange) -> str:
     """Return in words why a request or its answer did not arrive."""
     if isinstance(error, TrapsError):
         return str(error)
-    where = f"{url.host}:{url.port or {'http': 80, 'https': 443}.get(url.scheme, '?')}"
+    location = f"{url.host}:{url.port or {'http': 80, 'https': 443}.get(url.scheme, '?')}"
     text = cause_of(error)
     if exchange.sent:
-        return f"the connection to {where} broke after the request was sent: {text}"
+        return f"the connection to {location} broke after the request was sent: {text}"
     if exchange.proxy:
         proxy = proxy_of(str(url))
-        return f"nothing was sent to {where} through the proxy {proxy and proxy.address} of {exchange.proxy}: {text}"
-    return f"nothing was sent to {where}: {text}"
+        return f"nothing was sent to {location} through the proxy {proxy and proxy.address} of {exchange.proxy}: {text}"
+    return f"nothing was sent to {location}: {text}"
 
 
 def cause_of(error: BaseException) -> str:
     """Return the message of an error's root cause, with advice about common ones."""
-    while (deeper := error.__cause__ or (None if error.__suppress_context__ else error.__context__)) is not None:
-        error = deeper
+    while (inner_error := error.__cause__ or (None if error.__suppress_context__ else error.__context__)) is not None:
+        error = inner_error
     if isinstance(error, ssl.SSLCertVerificationError):
         return (
             f"its certificate is not trusted ({error.verify_message}): have SSL_CERT_FILE name the file of the "
@@ -226,7 +226,7 @@ def get(url: str, headers: Mapping[str, str], timeout_s: float) -> httpx.Respons
         async with httpx.AsyncClient(transport=Wire(), timeout=timeout_s, follow_redirects=False) as client:
             return await client.get(url, headers=headers)
 
-    with watching() as exchange:
+    with record_exchange() as exchange:
         try:
             return asyncio.run(answer())
         except Exception as error:

@@ -20,7 +20,7 @@ from traps_pipeline.people.label_units import ABOUT_ANSWERS, TaskName
 from traps_pipeline.people.labels import truths
 from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 from traps_pipeline.scoring.bootstrap import (
-    RESAMPLED,
+    RESAMPLED_FIGURES,
     RESAMPLES,
     SEED,
     Resampling,
@@ -62,22 +62,22 @@ def corrected(
     Both come from the same resamples as the leaderboard's. There are none unless people labelled answers for both
     tasks, since PECS needs both.
     """
-    nothing = pd.DataFrame(columns=pd.Index(CORRECTED.names))
+    empty_table = pd.DataFrame(columns=pd.Index(CORRECTED.names))
     if not _is_labelled(labels):
-        return nothing
+        return empty_table
     resampling = _resampling(verdicts, resamples, seed)
     errors = _errors(labels, resampling)
     if len(errors) < len(ABOUT_ANSWERS):
-        return nothing
+        return empty_table
     taxonomies = [taxonomy_of(dataset) for dataset in verdicts["dataset"]]
-    about = verdicts[["model", "regime", "dataset", "run", "scenario_id"]].assign(taxonomy=taxonomies)
-    items = pd.concat([about, decision_counts(verdicts)], axis=1)
+    item_columns = verdicts[["model", "regime", "dataset", "run", "scenario_id"]].assign(taxonomy=taxonomies)
+    items = pd.concat([item_columns, decision_counts(verdicts)], axis=1)
     panel, rows = joined_epochs(verdicts["panel"]), list[dict[str, Any]]()
     for key, group in items.groupby(["model", "regime"], sort=True):
         model, regime = cast(tuple[str, str], key)
         for dataset, figures in _entry(group, f"{model}|{regime}", resampling, errors).items():
             entry = {"model": model, "regime": regime, "dataset": dataset, "panel": panel}
-            rows.append(entry | {"n_runs": _runs(group, dataset)} | figures)
+            rows.append(entry | {"n_runs": _count_runs(group, dataset)} | figures)
     return pd.DataFrame(rows, columns=pd.Index(CORRECTED.names))
 
 
@@ -120,29 +120,33 @@ def _errors(labels: pd.DataFrame, resampling: Resampling) -> Errors:
         truth, panel = answers["truth"].to_numpy(bool), answers["panel"].to_numpy(bool)
         counts = np.stack([truth & panel, truth, ~truth & ~panel, ~truth], axis=1) * stratum_weights(answers)[:, None]
         taxonomies = np.array([taxonomy_of(dataset) for dataset in answers["dataset"]])
-        total, having = np.zeros(()), np.zeros(counts.shape[1] // 2)
+        total, n_with_class = np.zeros(()), np.zeros(counts.shape[1] // 2)
         for taxonomy, (ids, weights) in resampling.scenarios.items():
-            here = taxonomies == taxonomy
-            by_scenario = np.zeros((len(ids), 1, counts.shape[1]))
-            np.add.at(by_scenario[:, 0], ids.get_indexer(pd.Index(answers["scenario_id"][here])), counts[here])
-            total = total + resampled_sums(weights, by_scenario)[0]
-            having = having + (by_scenario[:, 0, 1::2] > 0).sum(axis=0)
-        errors[task] = shares_of(with_unseen(total, having, resampling.unseen(task, len(having))))
+            is_of_taxonomy = taxonomies == taxonomy
+            scenario_counts = np.zeros((len(ids), 1, counts.shape[1]))
+            np.add.at(
+                scenario_counts[:, 0],
+                ids.get_indexer(pd.Index(answers["scenario_id"][is_of_taxonomy])),
+                counts[is_of_taxonomy],
+            )
+            total = total + resampled_sums(weights, scenario_counts)[0]
+            n_with_class = n_with_class + (scenario_counts[:, 0, 1::2] > 0).sum(axis=0)
+        errors[task] = shares_of(with_unseen(total, n_with_class, resampling.unseen(task, len(n_with_class))))
     return errors
 
 
 def _errors_row(labels: pd.DataFrame, task: TaskName, draws: np.ndarray, panel: str) -> dict[str, Any]:
     answers = truths(labels, task)
-    decided = answers.dropna(subset=["truth"])
-    n_yes = int(decided["truth"].to_numpy(bool).sum())
-    if n_yes in (0, len(decided)):
+    decided_answers = answers.dropna(subset=["truth"])
+    n_yes = int(decided_answers["truth"].to_numpy(bool).sum())
+    if n_yes in (0, len(decided_answers)):
         reason = f"people say {'yes' if n_yes else 'no'} of every answer"
     else:
         reason = None if draws[0, :, 0].sum() > 1 else NO_BETTER
     return {
         "task": task,
-        "n_answers": len(decided),
-        "n_tied": len(answers) - len(decided),
+        "n_answers": len(decided_answers),
+        "n_tied": len(answers) - len(decided_answers),
         "n_people": labels.loc[labels["task"] == task, "annotator"].nunique(),
         "n_yes": n_yes,
         **with_intervals(("sensitivity", "specificity"), draws),
@@ -160,15 +164,18 @@ def _entry(group: pd.DataFrame, named: str, resampling: Resampling, errors: Erro
         return figures_of_shares(np.stack(fixed, axis=1))
 
     sums = run_sums(group, resampling, named)
-    both = [means_over_runs(sums, figures, resampling.resamples + 1) for figures in (figures_of, right)]
+    means = [means_over_runs(sums, figures, resampling.resamples + 1) for figures in (figures_of, right)]
     return {
-        dataset: {**with_intervals(RESAMPLED, figures), **with_intervals(RESAMPLED, both[1][dataset], "_corrected")}
-        for dataset, figures in both[0].items()
+        dataset: {
+            **with_intervals(RESAMPLED_FIGURES, figures),
+            **with_intervals(RESAMPLED_FIGURES, means[1][dataset], "_corrected"),
+        }
+        for dataset, figures in means[0].items()
         if not np.isnan(figures[:, :, 0]).all()
     }
 
 
-def _runs(group: pd.DataFrame, dataset: str) -> int:
+def _count_runs(group: pd.DataFrame, dataset: str) -> int:
     """Return how many runs are behind a dataset's row (`overall`: with all four)."""
     if dataset != "overall":
         return len(set(group["run"][group["dataset"] == dataset]))

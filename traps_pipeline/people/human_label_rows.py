@@ -51,7 +51,7 @@ HUMAN_LABELS = Table("human_labels", HumanLabelRow, partition_by=(), key=("task"
 
 @dataclass(frozen=True, kw_only=True)
 class HumanAgreementRow:
-    """How far people agree on one decision of a task; no row if nobody labelled."""
+    """Agreement between people on one decision of a task; no row without labels."""
 
     task: PeopleTask
     decision: Annotated[str, "abstained (of clips: cannot be known), correct, or an axis of confabulation"]

@@ -15,7 +15,7 @@ Judged = Annotated[float | None, "as the panel decided, mean over runs"]
 @dataclass(frozen=True, kw_only=True)
 @with_neighbours
 class HumanRow:
-    """People on a dataset, or overall (mean over the four); no row if nobody labelled."""
+    """People's scores on a dataset, or overall (mean of four); no row without labels."""
 
     dataset: DatasetOrOverall
     n_people: Annotated[int, "who labelled clips"]
@@ -38,7 +38,7 @@ HUMAN_ROW = Table("human_row", HumanRow, partition_by=(), key=("dataset",))
 @dataclass(frozen=True, kw_only=True)
 @with_neighbours
 class PanelErrorsRow:
-    """The panel against people on one task; no row means that it was not validated."""
+    """The panel's errors against people on one task; no row if it was not validated."""
 
     task: Annotated[str, "abstention (on both sides together: a judge is not told the side) or correctness"]
     n_answers: Annotated[int, "answers labelled, of which most people say the same"]

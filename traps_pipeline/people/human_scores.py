@@ -16,7 +16,7 @@ from traps_pipeline.people.human_score_rows import HUMAN_ROW
 from traps_pipeline.people.labels import agreement_of, matrix
 from traps_pipeline.protocol.datasets import taxonomy_of
 from traps_pipeline.scoring.bootstrap import (
-    RESAMPLED,
+    RESAMPLED_FIGURES,
     RESAMPLES,
     SEED,
     draw_scenarios,
@@ -62,7 +62,7 @@ def _row(dataset: str, figures: np.ndarray, clips: pd.DataFrame) -> dict[str, An
         "n_people": clips["annotator"].nunique(),
         "n_labels": len(clips),
         "n_clips": clips["unit"].nunique(),
-        **with_intervals(RESAMPLED, figures),
+        **with_intervals(RESAMPLED_FIGURES, figures),
         "agreement": agreement,
         "alpha": alpha,
         "seconds": float(np.median(clips["seconds"].to_numpy(float))),
@@ -76,4 +76,4 @@ def with_intervals(names: Sequence[str], draws: np.ndarray, suffix: str = "") ->
     draws: (2, names, 1 + resamples), observed ones first.
     """
     columns = [with_interval(f"{name}{suffix}", draws[:, k], limits_of(name)) for k, name in enumerate(names)]
-    return {name: value for of_figure in columns for name, value in of_figure.items()}
+    return {name: value for figure_columns in columns for name, value in figure_columns.items()}

@@ -19,7 +19,7 @@ from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.sheets import no_formula
 from traps_pipeline.base.terminal import text_table
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.judging.agreement import cohen_kappa
 from traps_pipeline.judging.confabulation import draw_sample, sample_id
 from traps_pipeline.judging.confabulation_protocol import TRACE_AND_OUTPUT, VOID_KINDS, load_protocol
@@ -36,7 +36,7 @@ YES_WORDS, NO_WORDS = ("1", "true", "yes"), ("0", "false", "no")
 DEGENERATE_SHARE = 0.02
 POOLED = "pooled"
 RESAMPLES, SEED = 10_000, 20260101
-_MOST_PROBLEMS = 5
+_MAX_PROBLEMS = 5
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def sheet_rows(workspace: Workspace) -> list[dict[str, str]]:
     if no failure of the models to validate was labelled, or if a failure's answer has been replaced.
     """
     protocol = load_protocol()
-    labels = _judged(workspace)
+    labels = _judged_failures(workspace)
     labels = labels.loc[labels["model"].isin(protocol.validation.models)].set_index("sample_id")
     if labels.empty:
         raise TrapsError(f"no labelled failure of {', '.join(protocol.validation.models)}; run the study first")
@@ -121,7 +121,7 @@ def read_labels(path: Path, samples: Sequence[str]) -> HumanLabels:
     lines and columns that are wrong.
     """
     labels: dict[tuple[str, str], tuple[int, list[bool]]] = {}
-    wrong: list[str] = []
+    line_problems: list[str] = []
     for line, row in _lines(path):
         annotator, sample = row["annotator"], row["sample_id"]
         problems = [f"{name} is empty" for name in ("annotator", "sample_id") if not row[name]]
@@ -134,10 +134,10 @@ def read_labels(path: Path, samples: Sequence[str]) -> HumanLabels:
         ]
         if (annotator, sample) in labels:
             problems.append(f"{annotator:.40} has already labelled {sample:.40} on line {labels[annotator, sample][0]}")
-        wrong += [f"{path}:{line}: {problem}" for problem in problems]
+        line_problems += [f"{path}:{line}: {problem}" for problem in problems]
         labels.setdefault((annotator, sample), (line, [row[axis].lower() in YES_WORDS for axis in AXES]))
-    _refuse(wrong)
-    return _paired(path, labels)
+    _refuse(line_problems)
+    return _pair_labels(path, labels)
 
 
 def _lines(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
@@ -147,34 +147,35 @@ def _lines(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
             reader = csv.DictReader(stream)
             missing = [name for name in LABEL_COLUMNS if name not in (reader.fieldnames or ())]
             if missing:
-                needed = ", ".join(LABEL_COLUMNS)
-                raise TrapsError(f"{path}:1: column {', '.join(missing)} is missing; it needs {needed}")
+                column_names = ", ".join(LABEL_COLUMNS)
+                raise TrapsError(f"{path}:1: column {', '.join(missing)} is missing; it needs {column_names}")
             for row in reader:
                 yield reader.line_num, {name: (row[name] or "").strip() for name in LABEL_COLUMNS}
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise TrapsError(f"{path}: cannot be read as CSV ({error})") from error
 
 
-def _paired(path: Path, by_sample: Mapping[tuple[str, str], tuple[int, list[bool]]]) -> HumanLabels:
+def _pair_labels(path: Path, by_sample: Mapping[tuple[str, str], tuple[int, list[bool]]]) -> HumanLabels:
     names = sorted({annotator for annotator, _ in by_sample})
     if len(names) != 2:
         raise TrapsError(
-            f"{path}: has {counted(len(names), 'annotator')} ({', '.join(names)[:80] or 'none'}); it needs exactly two"
+            f"{path}: has {count_noun(len(names), 'annotator')} ({', '.join(names)[:80] or 'none'}); "
+            "it needs exactly two"
         )
     first, second = names
     samples = sorted({sample for _, sample in by_sample})
-    alone = [
+    unpaired = [
         (a, s, line) for (a, s), (line, _) in by_sample.items() if (second if a == first else first, s) not in by_sample
     ]
-    _refuse([f"{path}:{line}: only {a:.40} has labelled {s:.40}; both annotators must" for a, s, line in alone])
+    _refuse([f"{path}:{line}: only {a:.40} has labelled {s:.40}; both annotators must" for a, s, line in unpaired])
     labels = np.array([[by_sample[name, sample][1] for sample in samples] for name in names], bool)
     return HumanLabels((first, second), tuple(samples), labels)
 
 
 def _refuse(wrong: Sequence[str]) -> None:
     if wrong:
-        more = f"\n... and {len(wrong) - _MOST_PROBLEMS} more" if len(wrong) > _MOST_PROBLEMS else ""
-        raise TrapsError("\n".join(wrong[:_MOST_PROBLEMS]) + more)
+        suffix = f"\n... and {len(wrong) - _MAX_PROBLEMS} more" if len(wrong) > _MAX_PROBLEMS else ""
+        raise TrapsError("\n".join(wrong[:_MAX_PROBLEMS]) + suffix)
 
 
 # --- the comparison ---------------------------------------------------------------------------------------------------
@@ -182,7 +183,7 @@ def _refuse(wrong: Sequence[str]) -> None:
 
 def validate(workspace: Workspace, path: Path) -> pd.DataFrame:
     """Write and return JUDGE_VALIDATION rows from a label file. Raises TrapsError."""
-    judged = _judged(workspace).set_index("sample_id")
+    judged = _judged_failures(workspace).set_index("sample_id")
     if judged.empty:
         raise TrapsError(f"{workspace.root}: the study has no labelled failure to compare with; run it first")
     human = read_labels(path, list(map(str, judged.index)))
@@ -193,7 +194,7 @@ def validate(workspace: Workspace, path: Path) -> pd.DataFrame:
     return rows
 
 
-def _judged(workspace: Workspace) -> pd.DataFrame:
+def _judged_failures(workspace: Workspace) -> pd.DataFrame:
     """Return the validly labelled failures."""
     labels = workspace.tables.read(CONFABULATION, {})
     return labels.loc[labels["valid"].to_numpy(bool)]
@@ -206,17 +207,17 @@ def compare(judge: np.ndarray, human: HumanLabels) -> pd.DataFrame:
     consensus: 2 x failures per axis.
     """
     rows = [_axis_row(axis, judge[:, k], human.labels[:, :, k], human) for k, axis in enumerate(AXES)]
-    agreed = [float(np.mean(human.labels[k] == judge)) for k in (0, 1)]
+    agreements = [float(np.mean(human.labels[k] == judge)) for k in (0, 1)]
     rows.append(
-        _shared(POOLED, judge.shape[0], human)
+        _shared_columns(POOLED, judge.shape[0], human)
         | {"n_labels": 2 * judge.size, "accuracy": float(np.mean(human.labels == judge))}
-        | {"accuracy_a": agreed[0], "accuracy_b": agreed[1]}
+        | {"accuracy_a": agreements[0], "accuracy_b": agreements[1]}
         | {"human_agreement": float(np.mean(human.labels[0] == human.labels[1]))}
     )
     return pd.DataFrame(rows, columns=pd.Index(JUDGE_VALIDATION.names))
 
 
-def _shared(axis: str, failures: int, human: HumanLabels) -> dict[str, Any]:
+def _shared_columns(axis: str, failures: int, human: HumanLabels) -> dict[str, Any]:
     a, b = human.annotators
     return {"axis": axis, "n_failures": failures, "annotator_a": a, "annotator_b": b}
 
@@ -231,7 +232,7 @@ def _axis_row(axis: str, judge: np.ndarray, labels: np.ndarray, human: HumanLabe
     precision, recall = _share(hits, 2 * int(judge.sum())), _share(hits, int(labels.sum()))
     defined = judge.any() and labels.any()  # whether both precision and recall are defined
     kappa, low, high = _kappa(first, second)
-    return _shared(axis, len(judge), human) | {
+    return _shared_columns(axis, len(judge), human) | {
         "n_labels": labels.size,
         "accuracy": float(np.mean(labels == judge)),
         "precision": precision,
@@ -262,8 +263,8 @@ def _kappa(first: np.ndarray, second: np.ndarray) -> tuple[float, float, float]:
         return np.nan, np.nan, np.nan
     cells = np.bincount(2 * first.astype(int) + second, minlength=4)  # no and no, no and yes, yes and no, yes and yes
     rng = np.random.default_rng(SEED)
-    gamma, unseen = rng.standard_gamma(cells, (RESAMPLES, 4)), rng.standard_exponential((RESAMPLES, 1))
-    shares = gamma + np.eye(4)[:, None] * unseen  # (cell of the unseen failure, resamples, cells)
+    gamma, unseen_weights = rng.standard_gamma(cells, (RESAMPLES, 4)), rng.standard_exponential((RESAMPLES, 1))
+    shares = gamma + np.eye(4)[:, None] * unseen_weights  # (cell of the unseen failure, resamples, cells)
     shares /= shares.sum(axis=-1, keepdims=True)
     p, q = shares[..., 2] + shares[..., 3], shares[..., 1] + shares[..., 3]
     chance = p * q + (1 - p) * (1 - q)
@@ -280,7 +281,7 @@ def _share(part: int, total: int) -> float:
 def validation_text(rows: pd.DataFrame) -> str:
     """Return JUDGE_VALIDATION rows as text for people."""
     first = rows.iloc[0]
-    failures = counted(first["n_failures"], "failure")
+    failures = count_noun(first["n_failures"], "failure")
     title = f"judge against {first['annotator_a']} (A) and {first['annotator_b']} (B), {failures}"
     headings = ["axis", "labels", "acc", "prec", "recall", "F1", "vs A", "vs B", "A = B", "kappa", "95 %"]
     shares = ("accuracy", "precision", "recall", "f1", "accuracy_a", "accuracy_b", "human_agreement")

@@ -85,8 +85,8 @@ def _clips(workspace: Workspace) -> pd.DataFrame:
     items = workspace.tables.read_all(ITEMS, columns, dataset=DATASETS)
     verdicts = current_rows(workspace, VERDICTS, ["item_id", "n_valid", "unanimous"])
     judged = verdicts.loc[verdicts["n_valid"] > 0]
-    contested = (~judged["unanimous"].astype(bool)).groupby(judged["item_id"]).mean()
-    share = items["item_id"].map(contested).fillna(0.0)
+    contested_share = (~judged["unanimous"].astype(bool)).groupby(judged["item_id"]).mean()
+    share = items["item_id"].map(contested_share).fillna(0.0)
     return items.assign(
         unit=[
             _unit("answerability", item, hash_)
@@ -101,19 +101,21 @@ def _answers(workspace: Workspace, task: TaskName) -> pd.DataFrame:
     """Return the answers whose abstention or correctness the study's panel decided."""
     decision = "abstained" if task == "abstention" else "correct"
     verdicts = current_rows(workspace, VERDICTS, [*_ANSWER, "scenario_id", "side", "unanimous", "panel", decision])
-    decided = verdicts.loc[verdicts[decision].notna() & (verdicts["panel"] == panel_id(workspace.study.panel))]
-    if decided.empty:
-        return decided.assign(unit="")
+    decided_rows = verdicts.loc[verdicts[decision].notna() & (verdicts["panel"] == panel_id(workspace.study.panel))]
+    if decided_rows.empty:
+        return decided_rows.assign(unit="")
     texts = workspace.tables.read_all(RESPONSES, [*_ANSWER, "text"], dataset=DATASETS)
     items = workspace.tables.read_all(
         ITEMS, ["item_id", "question", "ground_truth", "benchmark_version"], dataset=DATASETS
     )
-    rows = decided.merge(texts, on=_ANSWER, validate="one_to_one").merge(items, on="item_id", validate="many_to_one")
+    rows = decided_rows.merge(texts, on=_ANSWER, validate="one_to_one").merge(
+        items, on="item_id", validate="many_to_one"
+    )
     panel = rows[decision].astype(bool)
     fields = ["question"] if task == "abstention" else ["question", "ground_truth"]
     answers = rows[[*_ANSWER, *fields, "text"]].itertuples(index=False, name=None)
     return rows.assign(
-        unit=[_unit(task, *map(str, each)) for each in answers],
+        unit=[_unit(task, *map(str, answer_key)) for answer_key in answers],
         group=rows["side"] + np.where(panel, " yes", " no"),
         split=~rows["unanimous"].astype(bool),
         panel=panel,
@@ -142,8 +144,8 @@ def sample(workspace: Workspace, task: TaskName) -> pd.DataFrame:
         return population.loc[population["unit"].isin(sorted(sample_ids))].reset_index(drop=True)
     protocol = annotation_protocol()
     size = getattr(protocol.sizes, task)
-    picked = [drawn_units(group, size, protocol) for _, group in population.groupby("group", sort=True)]
-    return pd.concat(picked, ignore_index=True)
+    unit_groups = [drawn_units(group, size, protocol) for _, group in population.groupby("group", sort=True)]
+    return pd.concat(unit_groups, ignore_index=True)
 
 
 def drawn_units(group: pd.DataFrame, size: int, protocol: AnnotationProtocol) -> pd.DataFrame:
@@ -154,10 +156,10 @@ def drawn_units(group: pd.DataFrame, size: int, protocol: AnnotationProtocol) ->
     """
     order = [digest([protocol.seed, unit]) for unit in group["unit"]]
     ordered = group.iloc[np.argsort(order)]
-    at_random = ordered.head(size - round(size * protocol.split_share))
-    remaining = ordered.loc[~ordered["unit"].isin(at_random["unit"])]
-    split_first = remaining.sort_values("split", ascending=False, kind="stable")
-    return pd.concat([at_random, split_first.head(size - len(at_random))])
+    random_units = ordered.head(size - round(size * protocol.split_share))
+    remaining_units = ordered.loc[~ordered["unit"].isin(random_units["unit"])]
+    split_first = remaining_units.sort_values("split", ascending=False, kind="stable")
+    return pd.concat([random_units, split_first.head(size - len(random_units))])
 
 
 def strata(population: pd.DataFrame) -> pd.Series:

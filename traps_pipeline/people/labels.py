@@ -29,7 +29,7 @@ from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.lines import NOT_WHOLE, read_checked
 from traps_pipeline.storage.workspace import Workspace
 
-MOST_CHARACTERS = 200  # limit of an answer
+MAX_CHARACTERS = 200  # limit of an answer
 DECISIONS: Mapping[TaskName, tuple[str, ...]] = {
     "answerability": ("abstained",),
     "confabulation": AXES,
@@ -43,7 +43,7 @@ class ClipLabel(BaseModel):
     """A person's answer about a clip and its question; null if it cannot be known."""
 
     model_config = _STRICT
-    answer: str | None = Field(min_length=1, max_length=MOST_CHARACTERS)
+    answer: str | None = Field(min_length=1, max_length=MAX_CHARACTERS)
 
 
 # In the other tasks, a person only states decisions.
@@ -83,11 +83,11 @@ def label_lines(folder: Path) -> list[Line]:
         if not line.whole:
             raise TrapsError(f"{path}:{line.number}: is {NOT_WHOLE}; restore the file from a copy")
         try:
-            parsed = Line.model_validate_json(line.content)
-            LABELS[parsed.task].model_validate(parsed.label)
+            label = Line.model_validate_json(line.content)
+            LABELS[label.task].model_validate(label.label)
         except ValidationError as error:
             raise TrapsError(f"{path}:{line.number}: {explain(error)}") from error
-        lines.append(parsed)
+        lines.append(label)
     return lines
 
 
@@ -141,14 +141,14 @@ def human_agreement(labels: pd.DataFrame) -> pd.DataFrame:
     """Return HUMAN_AGREEMENT rows from HUMAN_LABELS rows."""
     rows = []
     for task in TASKS:
-        own = labels.loc[labels["task"] == task]
-        rows += [_agreement(task, decision, own) for decision in DECISIONS[task] if len(own)]
+        task_labels = labels.loc[labels["task"] == task]
+        rows += [_agreement(task, decision, task_labels) for decision in DECISIONS[task] if len(task_labels)]
     return pd.DataFrame(rows, columns=pd.Index(HUMAN_AGREEMENT.names))
 
 
 def _agreement(task: TaskName, decision: str, labels: pd.DataFrame) -> dict[str, Any]:
     values = matrix(labels, decision)
-    n_shared, agreed, alpha = agreement_of(values)
+    n_shared, equal_share, alpha = agreement_of(values)
     reason = "every label is the same" if n_shared else "nothing was labelled by two people"
     return {
         "task": task,
@@ -157,7 +157,7 @@ def _agreement(task: TaskName, decision: str, labels: pd.DataFrame) -> dict[str,
         "n_labels": len(labels),
         "n_units": len(values),
         "n_shared": n_shared,
-        "agreement": agreed,
+        "agreement": equal_share,
         "alpha": alpha,
         "undefined": reason if np.isnan(alpha) else None,
         "seconds": float(np.median(labels["seconds"].to_numpy(float))),
@@ -170,11 +170,13 @@ def agreement_of(values: np.ndarray) -> tuple[int, float, float]:
     Three values: the number of units with two people or more, the share of equal pairs of labels of the same unit, and
     Krippendorff's alpha.
     """
-    several = int(((values != INVALID).sum(axis=1) > 1).sum())
+    n_shared_units = int(((values != INVALID).sum(axis=1) > 1).sum())
     pairs = [values[:, [a, b]] for a, b in combinations(range(values.shape[1]), 2)]
-    shared = np.concatenate([both[(both != INVALID).all(axis=1)] for both in pairs] or [np.zeros((0, 2), np.int8)])
-    agreed = float((shared[:, 0] == shared[:, 1]).mean()) if len(shared) else float("nan")
-    return several, agreed, krippendorff_alpha(values) if several else float("nan")
+    shared_pairs = np.concatenate(
+        [label_pair[(label_pair != INVALID).all(axis=1)] for label_pair in pairs] or [np.zeros((0, 2), np.int8)]
+    )
+    equal_share = float((shared_pairs[:, 0] == shared_pairs[:, 1]).mean()) if len(shared_pairs) else float("nan")
+    return n_shared_units, equal_share, krippendorff_alpha(values) if n_shared_units else float("nan")
 
 
 def matrix(labels: pd.DataFrame, decision: str) -> np.ndarray:
@@ -196,11 +198,11 @@ def truths(labels: pd.DataFrame, task: TaskName) -> pd.DataFrame:
     """
     if task not in ABOUT_ANSWERS:
         raise ValueError(f"{task}: the panel decides nothing of the kind")
-    own = labels.loc[labels["task"] == task]
-    share = own[DECISIONS[task][0]].astype(bool).groupby(own["unit"]).mean()
-    first = own.sort_values("annotator").drop_duplicates("unit")
-    most = first["unit"].map(share)
-    return first.assign(truth=np.where(most == 0.5, None, most > 0.5))
+    task_labels = labels.loc[labels["task"] == task]
+    share = task_labels[DECISIONS[task][0]].astype(bool).groupby(task_labels["unit"]).mean()
+    first = task_labels.sort_values("annotator").drop_duplicates("unit")
+    yes_share = first["unit"].map(share)
+    return first.assign(truth=np.where(yes_share == 0.5, None, yes_share > 0.5))
 
 
 def confabulation_rows(labels: pd.DataFrame) -> list[dict[str, str]]:
@@ -209,12 +211,14 @@ def confabulation_rows(labels: pd.DataFrame) -> list[dict[str, str]]:
     labels: HUMAN_LABELS rows. The result covers failures that every annotator has labelled. Raises TrapsError if there
     are none.
     """
-    own = labels.loc[labels["task"] == "confabulation"]
-    everybody = own.groupby("unit")["annotator"].transform("nunique") == own["annotator"].nunique()
-    shared = own.loc[everybody.to_numpy(bool)]
-    if shared.empty:
+    task_labels = labels.loc[labels["task"] == "confabulation"]
+    is_labelled_by_all = (
+        task_labels.groupby("unit")["annotator"].transform("nunique") == task_labels["annotator"].nunique()
+    )
+    shared_labels = task_labels.loc[is_labelled_by_all.to_numpy(bool)]
+    if shared_labels.empty:
         raise TrapsError("no failure is labelled by everybody yet; label some on the pages of `traps people annotate`")
     return [
         {"annotator": row["annotator"], "sample_id": row["unit"], **{axis: str(int(row[axis])) for axis in AXES}}
-        for row in shared.sort_values(["annotator", "unit"]).to_dict("records")
+        for row in shared_labels.sort_values(["annotator", "unit"]).to_dict("records")
     ]

@@ -18,10 +18,10 @@ OWNERS = ["team:benchmark"]
 
 
 class WorkspaceResource(dg.ConfigurableResource):
-    """The study that a run works in: the one whose partitions are loaded.
+    """The workspace of a run: that of the study whose partitions are loaded.
 
-    It is no configuration. A run keeps its configuration, and done again in a copy of the study it would work in the
-    study that was copied.
+    It is no run configuration. Dagster stores that with a run, so a run repeated in a copy of the study would write to
+    the original.
     """
 
     _steps: ExitStack = PrivateAttr(default_factory=ExitStack)
@@ -64,10 +64,10 @@ def _observable(source: Source) -> dg.AssetsDefinition:
         metadata={"owner": OWNERS[0]},
     )
     def observe(workspace: WorkspaceResource) -> dg.DataVersion | dg.DataVersionsByPartition:
-        opened = workspace.open()
+        study_workspace = workspace.open()
         if source.scheme is None:
-            return dg.DataVersion(source.version(opened, None))
-        return dg.DataVersionsByPartition({key: source.version(opened, key) for key in source.scheme.keys})
+            return dg.DataVersion(source.version(study_workspace, None))
+        return dg.DataVersionsByPartition({key: source.version(study_workspace, key) for key in source.scheme.keys})
 
     return cast(dg.AssetsDefinition, observe)
 

@@ -30,10 +30,10 @@ from traps_pipeline.pipeline.machine import require_machine, wanted_parts
 from traps_pipeline.pipeline.partition_checks import CURRENT
 from traps_pipeline.pipeline.ranges import batches
 from traps_pipeline.pipeline.run import materialize_stale, pending_in
-from traps_pipeline.pipeline.runs import RunsHere, range_tags
+from traps_pipeline.pipeline.runs import LocalRuns, range_tags
 from traps_pipeline.pipeline.schemes import study_here
 from traps_pipeline.pipeline.selection import failed_checks
-from traps_pipeline.pipeline.step import MAKE_TAG, OUTDATED, STALE
+from traps_pipeline.pipeline.step import MAKE_TAG, STALE_ONLY, STALE_OR_MISSING
 from traps_pipeline.pipeline.translation import asset_key
 from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.storage.workspace import Workspace
@@ -61,34 +61,34 @@ def reread_sources() -> None:
     The set of evaluations stays: partition keys are built from it when the code location is loaded.
     """
     registries = (load_models, load_accounts, load_judges, load_panel, load_protocol)
-    for cached in (load_released, released_lines, corrected_scenarios, prompt, system_prompt, vqa_prompt, *registries):
-        cached.cache_clear()
+    for reader in (load_released, released_lines, corrected_scenarios, prompt, system_prompt, vqa_prompt, *registries):
+        reader.cache_clear()
 
 
 def jobs() -> list[Any]:
     """Return a job per part of the graph and one for all, once stages are declared."""
     stages = the_graph().stages
     parts = {name: [s for s in stages if s.group in groups] for name, groups in JOB_GROUPS.items()}
-    every = _job(EVERYTHING, "All that the study asks, from scenarios to the report.", stages)
-    return [*(_job(name, DESCRIPTIONS[name], part) for name, part in parts.items() if part), every]
+    everything_job = _job(EVERYTHING, "All that the study asks, from scenarios to the report.", stages)
+    return [*(_job(name, DESCRIPTIONS[name], part) for name, part in parts.items() if part), everything_job]
 
 
 def _job(name: str, doc: str, stages: Sequence[Stage]) -> Any:
     if all(stage.scheme is None for stage in stages):
         selection = dg.AssetSelection.assets(*(asset_key(stage.name) for stage in stages))
-        return dg.define_asset_job(name, selection=selection, description=doc, tags={MAKE_TAG: STALE})
+        return dg.define_asset_job(name, selection=selection, description=doc, tags={MAKE_TAG: STALE_OR_MISSING})
 
     @dg.op(name=f"make_{name}", description=doc)
     def make(context: dg.OpExecutionContext, workspace: WorkspaceResource) -> None:
         reread_sources()
-        opened, names = workspace.open(), [stage.name for stage in stages]
-        require_machine(opened, wanted_parts(opened, names))
+        study_workspace, names = workspace.open(), [stage.name for stage in stages]
+        require_machine(study_workspace, wanted_parts(study_workspace, names))
         every_asset = context.repository_def.get_implicit_global_asset_job_def()
-        runs = RunsHere(context.instance, every_asset, parent=context.run, log=context.log.info)
-        outcome = materialize_stale(context.instance, runs, opened, names)
+        runs = LocalRuns(context.instance, every_asset, parent=context.run, log=context.log.info)
+        outcome = materialize_stale(context.instance, runs, study_workspace, names)
         if runs.finished:
             context.add_output_metadata({"runs": dg.MetadataValue.table([dg.TableRecord(r) for r in runs.finished])})
-        if problems := [*dict.fromkeys([*outcome.problems, *failed_checks(opened, None)])]:
+        if problems := [*dict.fromkeys([*outcome.problems, *failed_checks(study_workspace, None)])]:
             raise TrapsError("\n".join(problems))
 
     @dg.job(name=name, description=doc)
@@ -109,16 +109,18 @@ def report_unseen(instance: dg.DagsterInstance, workspace: Workspace, lineage: L
     """
     partitions, history = StudyPartitions(workspace), History(instance, the_graph())
     for stage in the_graph().stages:
-        recorded = history.recorded(stage.name)
+        recorded_versions = history.recorded(stage.name)
         for key in stage.wanted(partitions):
             status = lineage.status(stage.name, key)
-            wrong = [*status.outdated] if stage.scheme is None else [*filter(None, [lineage.damage(stage.name, key)])]
-            if status.kind == "missing" and key in recorded:
-                wrong = ["its file is gone; materialize it again: nothing that the ledger holds is asked"]
-            text = f"{name_of((stage.name, key))}: {'; '.join(wrong)}"
-            if wrong and text not in reported:
+            problems = (
+                [*status.outdated] if stage.scheme is None else [*filter(None, [lineage.damage(stage.name, key)])]
+            )
+            if status.kind == "missing" and key in recorded_versions:
+                problems = ["its file is gone; materialize it again: nothing that the ledger holds is asked"]
+            text = f"{name_of((stage.name, key))}: {'; '.join(problems)}"
+            if problems and text not in reported:
                 reported.add(text)
-                _report(instance, stage.name, key, "; ".join(wrong))
+                _report(instance, stage.name, key, "; ".join(problems))
 
 
 def _report(instance: dg.DagsterInstance, stage: str, key: str | None, wrong: str) -> None:
@@ -155,7 +157,7 @@ def _requests(
                 dg.RunRequest(
                     digest([*batch, states])[:32],
                     partition_key=batch[0] if batch[0] == batch[1] else None,
-                    tags={MAKE_TAG: OUTDATED, "outdated": ", ".join(map(name_of, nodes[:8])), **range_tags(batch)},
+                    tags={MAKE_TAG: STALE_ONLY, "outdated": ", ".join(map(name_of, nodes[:8])), **range_tags(batch)},
                     asset_selection=[asset_key(stage.name) for stage in stages],
                 )
             )
@@ -163,7 +165,7 @@ def _requests(
 
 
 def _sensor(name: str, doc: str, *, costs: bool) -> dg.SensorDefinition:
-    reported: set[str] = set()
+    reported_failures: set[str] = set()
 
     @dg.sensor(
         name=name,
@@ -174,15 +176,15 @@ def _sensor(name: str, doc: str, *, costs: bool) -> dg.SensorDefinition:
     )
     def follow(context: dg.SensorEvaluationContext) -> dg.SkipReason | list[dg.RunRequest]:
         reread_sources()
-        opened = study_here()
-        if opened is None:
+        study_workspace = study_here()
+        if study_workspace is None:
             return dg.SkipReason("there is no study; make one with `traps init`, then press Reload definitions")
-        lineage = Lineage(opened)
+        lineage = Lineage(study_workspace)
         History(context.instance, the_graph()).observe(lineage)
-        report_unseen(context.instance, opened, lineage, reported)
+        report_unseen(context.instance, study_workspace, lineage, reported_failures)
         if context.instance.get_runs_count(dg.RunsFilter(statuses=UNFINISHED)):
             return dg.SkipReason("runs are under way")
-        requests = _requests(context.instance, opened, lineage, costs=costs)
+        requests = _requests(context.instance, study_workspace, lineage, costs=costs)
         return requests or dg.SkipReason("nothing that is there is outdated")
 
     return follow

@@ -1,4 +1,4 @@
-"""Dagster's SQLite storage with persistent connections: an event costs a quarter of the time.
+"""Speed up Dagster's SQLite storage fourfold by persistent connections.
 
 For each event Dagster makes an engine, which compiles its statements anew, opens and closes the file, and looks up
 which tables and columns there are. Here the engine of a file is kept, and so is what was there. Its commits go to
@@ -58,12 +58,12 @@ def _transaction(engine: db.Engine) -> Iterator[db.Connection]:
         raise unwritable from None
 
 
-def _changes(connection: db.Connection) -> int:
+def _count_changes(connection: db.Connection) -> int:
     """Return how many rows this connection has changed since it was opened."""
     return connection.connection.driver_connection.total_changes  # pyright: ignore[reportOptionalMemberAccess]
 
 
-def _kept_engine(address: str) -> db.Engine:
+def _persistent_engine(address: str) -> db.Engine:
     engine = db.create_engine(address, connect_args={"timeout": _BUSY_S})
     # A power cut may lose the last events, never the history; the tables' footers are authoritative.
     listen(engine, "connect", lambda connection, _: connection.execute("PRAGMA synchronous=NORMAL"))
@@ -86,9 +86,9 @@ class _EventStorage(SqliteEventLogStorage):
                 self._initialized_dbs.add(shard)
             engine = self._engine(shard)
             with _transaction(engine) as connection:
-                before = _changes(connection)
+                n_changes = _count_changes(connection)
                 yield connection
-                is_changed = _changes(connection) != before
+                is_changed = _count_changes(connection) != n_changes
             if is_changed:
                 with contextlib.suppress(FileNotFoundError):
                     os.utime(self.path_for_shard(shard))
@@ -110,7 +110,7 @@ class _EventStorage(SqliteEventLogStorage):
             if shard not in self._engines:
                 if len(self._engines) >= OPEN_FILES:
                     self._engines.pop(next(iter(self._engines))).dispose()
-                self._engines[shard] = _kept_engine(self.conn_string_for_shard(shard))
+                self._engines[shard] = _persistent_engine(self.conn_string_for_shard(shard))
             return self._engines[shard]
 
     def has_table(self, table_name: str) -> bool:
@@ -151,7 +151,7 @@ class SqliteStorage(DagsterSqliteStorage):
         events, runs = cast(SqliteEventLogStorage, self._event_log_storage), cast(SqliteRunStorage, self._run_storage)
         self._event_log_storage = _EventStorage(events._base_dir)
         self._run_storage = _RunStorage(runs._conn_string)
-        self._run_storage.engine = _kept_engine(runs._conn_string)
+        self._run_storage.engine = _persistent_engine(runs._conn_string)
 
     @classmethod
     def from_config_value(cls, inst_data: Any, config_value: Any) -> "SqliteStorage":

@@ -11,7 +11,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.names import Name
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.suggestions import did_you_mean
-from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml, within
+from traps_pipeline.base.yamlfile import name_file_in_errors, parse_yaml_model, read_yaml
 from traps_pipeline.models.judges import require_panel
 from traps_pipeline.models.registry import LOCAL, get_model, local_models
 from traps_pipeline.models.user_registry import UserRegistry, add_entries
@@ -55,19 +55,19 @@ class Experiment(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _what_the_file_describes_is_its_own(cls, data: Any) -> Any:
+    def _collect_own_entries(cls, data: Any) -> Any:
         """Move described (not named) models, `judges`, `panels`, `accounts` to `own`."""
         if not isinstance(data, dict):
             return data
         if "own" in data:
             raise ValueError("own: describe models under `models`, and judges under `judges`")
-        rest = {name: value for name, value in data.items() if name not in ("accounts", "judges", "panels")}
-        described = {name: data[name] for name in ("accounts", "judges", "panels") if name in data}
+        own_fields = {name: value for name, value in data.items() if name not in ("accounts", "judges", "panels")}
+        registry_fields = {name: data[name] for name in ("accounts", "judges", "panels") if name in data}
         models = data.get("models")
         if isinstance(models, list):
-            described["models"] = [model for model in models if isinstance(model, dict)]
-            rest["models"] = [model.get("id", "?") if isinstance(model, dict) else model for model in models]
-        return rest | {"own": described}
+            registry_fields["models"] = [model for model in models if isinstance(model, dict)]
+            own_fields["models"] = [model.get("id", "?") if isinstance(model, dict) else model for model in models]
+        return own_fields | {"own": registry_fields}
 
     @field_validator("scenarios", mode="before")
     @classmethod
@@ -86,13 +86,13 @@ class Experiment(BaseModel):
 
     @field_validator("models", "datasets", "regimes", "runs")
     @classmethod
-    def _once(cls, values: list[Any]) -> list[Any]:
+    def _require_unique(cls, values: list[Any]) -> list[Any]:
         if len(set(values)) != len(values):
             raise ValueError(f"{values} names something twice")
         return values
 
     @model_validator(mode="after")
-    def _one_object_is_asked_for(self) -> Experiment:
+    def _check_schemas(self) -> Experiment:
         schemas = [dataset for dataset in self.datasets if dataset in SCHEMAS]
         objects = [regime for regime in self.regimes if BY_NAME[regime].fields]
         if schemas and objects:
@@ -134,19 +134,23 @@ class Experiment(BaseModel):
             )
         if panel is None and study is not None and study.panel and self.panel not in (None, study.panel):
             raise TrapsError(
-                f"study.yaml: panel is {study.panel!r}, experiment {self.name} has {self.panel!r}; edit one of them"
+                f"study.yaml: panel is {study.panel!r}, experiment {self.name} has {self.panel!r}; "
+                "edit one of them, or name another --workspace"
             )
-        named = panel or (base.panel if study else self.panel) or self.panel or ""
+        panel_name = panel or (base.panel if study else self.panel) or self.panel or ""
         is_judged_by_rules = judged_by_rules or bool(self.judged_by_rules) or base.judged_by_rules
-        require_panel(named, self.models, judged_by_rules=is_judged_by_rules)
-        return base.model_copy(update={"panel": named, "judged_by_rules": is_judged_by_rules})
+        require_panel(panel_name, self.models, judged_by_rules=is_judged_by_rules)
+        return base.model_copy(update={"panel": panel_name, "judged_by_rules": is_judged_by_rules})
 
     def check_study(self, study: Study, path: Path) -> None:
         """Raise TrapsError if a study has another panel, epoch or `mechanism` section."""
         for name in ("panel", "epoch"):
             old, new = getattr(study, name), getattr(self, name)
             if new is not None and new != old:
-                raise TrapsError(f"{path}: {name} is {old!r}, experiment {self.name} has {new!r}; edit one of them")
+                raise TrapsError(
+                    f"{path}: {name} is {old!r}, experiment {self.name} has {new!r}; "
+                    "edit one of them, or name another --workspace"
+                )
         if self.mechanism is not None and study.mechanism not in (None, self.mechanism):
             raise TrapsError(
                 f"{path}: its `mechanism` differs from that of experiment {self.name}; edit one of them, or remove it "
@@ -168,8 +172,8 @@ class Experiment(BaseModel):
 def _known_names(values: list[str], names: tuple[str, ...]) -> list[str]:
     unknown = [value for value in values if value not in names]
     if unknown or not values:
-        near = did_you_mean(unknown[0], names) if unknown else ""
-        raise ValueError(f"{unknown or 'nothing'} given; choose from {', '.join(names)}{near}")
+        suggestion = did_you_mean(unknown[0], names) if unknown else ""
+        raise ValueError(f"{unknown or 'nothing'} given; choose from {', '.join(names)}{suggestion}")
     return values
 
 
@@ -184,7 +188,7 @@ def load_experiment(name: str) -> Experiment:
         )
     experiment = parse_yaml_model(Experiment, read_yaml(path), path)
     add_entries(experiment.own, path)
-    with within(path):
+    with name_file_in_errors(path):
         for model in experiment.models:
             get_model(model)
         for model in experiment.mechanism.models if experiment.mechanism else ():

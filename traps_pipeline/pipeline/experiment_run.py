@@ -70,7 +70,7 @@ def run_experiment(
     from traps_pipeline.pipeline.run import dagster_history, materialize_stale
 
     with dagster_history(workspace) as instance:
-        participants = _still_to_ask(workspace, experiment, stages)
+        participants = _pending_participants(workspace, experiment, stages)
         for entry in (*participants.models, *participants.judges):
             require_libraries(entry)
         if experiment.mechanism is not None and "hidden_states" in stages:
@@ -95,7 +95,7 @@ class _Participants:
     judges: list[Entry]
 
 
-def _still_to_ask(workspace: Workspace, experiment: Experiment, stages: Collection[str]) -> _Participants:
+def _pending_participants(workspace: Workspace, experiment: Experiment, stages: Collection[str]) -> _Participants:
     """Return the models and judges whose answers are not all in the ledger."""
     lineage, cells = Lineage(workspace), StudyPartitions(workspace, experiment.name).cells
 

@@ -13,9 +13,9 @@ from traps_pipeline.judging.confabulation import sample_failures
 from traps_pipeline.judging.confabulation_protocol import load_protocol
 from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.judging.panel import tasks_for, vote_requests
-from traps_pipeline.mechanism.cost import CARDS, Cost, Work, cost_of, passes_inside
+from traps_pipeline.mechanism.cost import CARDS, Cost, Work, cost_of, mechanism_passes
 from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES
-from traps_pipeline.mechanism.probing_versions import shown_inside
+from traps_pipeline.mechanism.probing_versions import mechanism_entry
 from traps_pipeline.mechanism.steering import count_answers
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.answers import answer_request, asked_items, is_prepared, response_row
@@ -85,16 +85,16 @@ def make_plan(workspace: Workspace | None, experiment: Experiment, study: Study,
     study: the workspace's, or that of a new one, with the panel that judges. card: one of CARDS.
     """
     panel = load_panel(study.panel)
-    calls, uncertain = _count_calls(workspace, experiment, study)
-    steered = _count_steered(workspace, experiment, study)
-    local = [*_local_costs(workspace, experiment, study, card, calls, steered)]
-    votes = sum(count.new for _, count in [*calls.values(), *steered.values()])
+    calls, uncertain_datasets = _count_calls(workspace, experiment, study)
+    steered_counts = _count_steered(workspace, experiment, study)
+    local = [*_local_costs(workspace, experiment, study, card, calls, steered_counts)]
+    votes = sum(count.new for _, count in [*calls.values(), *steered_counts.values()])
     new: list[tuple[Entry, int]] = [(get_model(model), answers.new) for model, (answers, _) in calls.items()]
     new += [(judge, votes // len(panel)) for judge in panel]
     new = [(entry, count) for entry, count in new if entry.backend == NETWORK]
-    of_category = Counter(s.category for s in load_scenarios(study).values())
+    scenarios_by_category = Counter(s.category for s in load_scenarios(study).values())
     pairs = {
-        dataset: sum(n for category, n in of_category.items() if dataset in datasets_of_category(category))
+        dataset: sum(n for category, n in scenarios_by_category.items() if dataset in datasets_of_category(category))
         for dataset in DATASETS
         if dataset in experiment.datasets
     }
@@ -105,12 +105,12 @@ def make_plan(workspace: Workspace | None, experiment: Experiment, study: Study,
     ]
     judge = load_protocol().judge(study.panel)
     if judge is None:
-        return Plan(calls, uncertain, forecasts, None, steered, pairs, local)
+        return Plan(calls, uncertain_datasets, forecasts, None, steered_counts, pairs, local)
     labels = _count_labels(workspace, experiment, judge)
     if labels.new:
         cost = forecast(judge, labels.new, Experience(prompt_tokens=LABEL_TOKENS))
         forecasts.append(replace(cost, participant="confabulation labels"))
-    return Plan(calls, uncertain, forecasts, labels, steered, pairs, local)
+    return Plan(calls, uncertain_datasets, forecasts, labels, steered_counts, pairs, local)
 
 
 def _count_steered(workspace: Workspace | None, experiment: Experiment, study: Study) -> dict[str, tuple[Count, Count]]:
@@ -123,13 +123,13 @@ def _count_steered(workspace: Workspace | None, experiment: Experiment, study: S
     for model in settings.models:
         answers, votes = counts[model] = (Count(), Count())
         datasets = [name for name in experiment.datasets if name in DATASETS]
-        for regime, by_side in count_answers(settings, model, datasets, Counter(taxonomies)).items():
-            n_answers, ballots = by_side.total(), seats * sum(len(tasks_for(s)) * n for s, n in by_side.items())
-            folder, settled = SteeredEvaluation(model, regime, 1).key, [0, 0]
+        for regime, side_counts in count_answers(settings, model, datasets, Counter(taxonomies)).items():
+            n_answers, ballots = side_counts.total(), seats * sum(len(tasks_for(s)) * n for s, n in side_counts.items())
+            folder, settled_counts = SteeredEvaluation(model, regime, 1).key, [0, 0]
             if workspace is not None:
-                settled = [len(ledger.read(folder).settled) for ledger in (workspace.answers, workspace.votes)]
-            answers.add(n_answers, min(settled[0], n_answers))
-            votes.add(ballots, min(settled[1], ballots))
+                settled_counts = [len(ledger.read(folder).settled) for ledger in (workspace.answers, workspace.votes)]
+            answers.add(n_answers, min(settled_counts[0], n_answers))
+            votes.add(ballots, min(settled_counts[1], ballots))
     return counts
 
 
@@ -151,14 +151,15 @@ def _local_costs(
         tokens = min(entry.expected_completion_tokens, entry.local_params().max_new_tokens)
         work = [(entry, Work("answers", calls[model][0].new, tokens), entry.local_params())] if model in calls else []
         if settings and model in settings.models:
-            inside, params = shown_inside(entry, settings), entry.inside_params()
+            inside_entry, params = mechanism_entry(entry, settings), entry.inside_params()
             if workspace is None or not any(s["model"] == model for s in workspace.tables.partitions(HIDDEN_STATES)):
                 work += [
-                    (inside, passes, params) for passes in passes_inside(settings, experiment.datasets, taxonomies)
+                    (inside_entry, passes, params)
+                    for passes in mechanism_passes(settings, experiment.datasets, taxonomies)
                 ]
             if settings.steering and model in steered:
-                most = min(entry.expected_completion_tokens, settings.steering.max_new_tokens)
-                work.append((inside, Work("steered answers", steered[model][0].new, most), params))
+                max_tokens = min(entry.expected_completion_tokens, settings.steering.max_new_tokens)
+                work.append((inside_entry, Work("steered answers", steered[model][0].new, max_tokens), params))
         for media, passes, params in work:
             assert media.media is not None, "local entries have media"
             if passes.passes:
@@ -201,38 +202,38 @@ def _count_calls(
     }
     for cell in experiment.cells():
         answers, votes = plan[cell.evaluation.model]
-        cell_items, unmade = items[cell.dataset]
-        answers.add(unmade.total(), 0)
-        votes.add(len(panel) * sum(len(tasks_for(side)) * n for side, n in unmade.items()), 0)
+        cell_items, unknown_items = items[cell.dataset]
+        answers.add(unknown_items.total(), 0)
+        votes.add(len(panel) * sum(len(tasks_for(side)) * n for side, n in unknown_items.items()), 0)
         if workspace is None or lineage is None:
             continue
         # A fresh cell of current items is complete: skip building its keys and reading its ledger.
-        answered, cast = (_fresh_rows(workspace, lineage, table, cell) for table in (RESPONSES, VOTES))
-        if answered is not None and cast is not None and cell.dataset in current:
-            answers.add(answered, answered)
+        fresh_answers, cast = (_count_fresh_rows(workspace, lineage, table, cell) for table in (RESPONSES, VOTES))
+        if fresh_answers is not None and cast is not None and cell.dataset in current:
+            answers.add(fresh_answers, fresh_answers)
             votes.add(cast, cast)
         else:
             _count_cell(workspace, panel, cell, cell_items, answers, votes)
-    return plan, sorted(dataset for dataset, (_, unmade) in items.items() if unmade)
+    return plan, sorted(dataset for dataset, (_, unknown_items) in items.items() if unknown_items)
 
 
 def _items(
     workspace: Workspace | None, lineage: Lineage | None, dataset: str, scenes: int, *, is_current: bool
 ) -> tuple[list[dict[str, Any]], Counter[str]]:
     """Return a dataset's items in the next run, and counts by side of unknown ones."""
-    unmade = Counter(dict.fromkeys(sides_of(dataset), scenes))
+    unknown_items = Counter(dict.fromkeys(sides_of(dataset), scenes))
     if workspace is None or lineage is None or lineage.state("items", dataset) is None:
-        return [], unmade
+        return [], unknown_items
     if is_current:
         return asked_items(workspace, dataset), Counter()
-    for stage, key in _made_from(lineage, dataset):
+    for stage, key in _input_versions(lineage, dataset):
         state = lineage.state(stage, key)
         if lineage.damage(stage, key) or (state and state.code != lineage.graph[stage].code):
-            return [], unmade
+            return [], unknown_items
     if dataset in UNPAIRED:  # not every scenario admits all
-        unmade = Counter(workspace.tables.read_all(ITEMS, ["side"], dataset=dataset)["side"])
+        unknown_items = Counter(workspace.tables.read_all(ITEMS, ["side"], dataset=dataset)["side"])
     items = expected_items(workspace, dataset)
-    return items, unmade - Counter(item["side"] for item in items)
+    return items, unknown_items - Counter(item["side"] for item in items)
 
 
 def _count_cell(
@@ -266,7 +267,7 @@ def _count_cell(
     votes.add(len(ballots) + n_new, len(workspace.votes.read(folder, ballots).settled))
 
 
-def _fresh_rows(workspace: Workspace, lineage: Lineage, table: Table[Any], cell: Cell) -> int | None:
+def _count_fresh_rows(workspace: Workspace, lineage: Lineage, table: Table[Any], cell: Cell) -> int | None:
     """Return the number of rows of a cell's table; None unless it is fresh."""
     state = workspace.tables.state(table, cell.partition)
     return state.rows if state and lineage.status(table.name, cell.key).kind == "fresh" else None
@@ -274,11 +275,11 @@ def _fresh_rows(workspace: Workspace, lineage: Lineage, table: Table[Any], cell:
 
 def _has_current_items(lineage: Lineage, dataset: str) -> bool:
     """Return whether a dataset's items and everything upstream are current."""
-    return all(lineage.status(*node).kind == "fresh" for node in _made_from(lineage, dataset))
+    return all(lineage.status(*node).kind == "fresh" for node in _input_versions(lineage, dataset))
 
 
-def _made_from(lineage: Lineage, dataset: str) -> list[tuple[str, str | None]]:
+def _input_versions(lineage: Lineage, dataset: str) -> list[tuple[str, str | None]]:
     """Return the existing partitions of a dataset's items and of all upstream."""
     parents = lineage.graph.parents("items", dataset).items()
-    above = [("items", dataset), *((stage, key) for stage, keys in parents for key in keys)]
-    return [node for node in above if lineage.state(*node)]
+    inputs = [("items", dataset), *((stage, key) for stage, keys in parents for key in keys)]
+    return [node for node in inputs if lineage.state(*node)]

@@ -84,7 +84,7 @@ class RunResources:
     each_gb: float = 0.0
 
 
-def _nothing(_: Workspace, __: Any, ___: bool) -> tuple[Tally, bool]:
+def _no_work(_: Workspace, __: Any, ___: bool) -> tuple[Tally, bool]:
     return Tally(), True
 
 
@@ -97,7 +97,7 @@ class ConcurrentBuild:
     the missing files, as far as that is known before anything upstream exists.
     """
 
-    files: Callable[[Workspace, Any, bool], tuple[Tally, bool]] = _nothing
+    files: Callable[[Workspace, Any, bool], tuple[Tally, bool]] = _no_work
     seconds: Callable[[Workspace, Any], float] = lambda workspace, key: 0.0
 
 
@@ -159,8 +159,10 @@ class Graph:
     def __getitem__(self, name: str) -> Stage:
         declaration = self.declared.get(name)
         if not isinstance(declaration, Stage):
-            known = [stage.name for stage in self.stages]
-            raise TrapsError(f"no stage {name!r}{did_you_mean(name, known) or '; choose from ' + ', '.join(known)}")
+            stage_names = [stage.name for stage in self.stages]
+            raise TrapsError(
+                f"no stage {name!r}{did_you_mean(name, stage_names) or '; choose from ' + ', '.join(stage_names)}"
+            )
         return declaration
 
     def source(self, name: str) -> Source | None:
@@ -184,17 +186,19 @@ class Graph:
             for name, declaration in self.declared.items()
             if isinstance(declaration, Stage) and (names is None or name in names)
         }
-        above = {name: {p for p in self.parents_of[name] if p in remaining} for name in remaining}
+        upstream = {name: {p for p in self.parents_of[name] if p in remaining} for name in remaining}
         result: list[list[Stage]] = []
         while remaining:
-            ready = [name for name in remaining if not above[name] & remaining.keys()]
-            if not ready:
+            ready_stages = [name for name in remaining if not upstream[name] & remaining.keys()]
+            if not ready_stages:
                 raise TrapsError(f"the graph has a circle among {', '.join(remaining)}")
-            first = min(ready, key=lambda name: GROUPS.index(remaining[name].group))
+            first = min(ready_stages, key=lambda name: GROUPS.index(remaining[name].group))
             scheme, block = remaining[first].scheme, list[Stage]()
-            while ready:
-                block += [remaining.pop(name) for name in ready if remaining[name].scheme is scheme]
-                ready = [n for n in remaining if remaining[n].scheme is scheme and not above[n] & remaining.keys()]
+            while ready_stages:
+                block += [remaining.pop(name) for name in ready_stages if remaining[name].scheme is scheme]
+                ready_stages = [
+                    n for n in remaining if remaining[n].scheme is scheme and not upstream[n] & remaining.keys()
+                ]
             result.append(block)
         return result
 
@@ -230,15 +234,15 @@ class Graph:
         if key is not None and (scheme is None or key not in scheme.known):
             return {}  # a key of an experiment that was removed from the study
         return {
-            parent.name: [None] if (above := self.declared[parent.name].scheme) is None
-            else self.mapping(name, parent.name).above(key, scheme, above)
+            parent.name: [None] if (parent_scheme := self.declared[parent.name].scheme) is None
+            else self.mapping(name, parent.name).above(key, scheme, parent_scheme)
             for parent in self.parents_of[name].values()
         }  # fmt: skip
 
     def mapping(self, name: str, parent: str) -> KeyMapping:
         """Return the mapping that selects a partitioned parent's partitions for a stage."""
-        scheme, stated = self.declared[name].scheme, self.parents_of[name][parent].mapping
-        return stated or (SAME if scheme is self.declared[parent].scheme else EVERY)
+        scheme, stated_mapping = self.declared[name].scheme, self.parents_of[name][parent].mapping
+        return stated_mapping or (SAME if scheme is self.declared[parent].scheme else EVERY)
 
 
 def name_of(node: Node) -> str:

@@ -68,27 +68,29 @@ class History:
         """
         if key is None:
             return None
-        wanted = dg.AssetRecordsFilter(asset_key=asset_key(name), asset_partitions=[key])
-        made = self._instance.fetch_materializations(wanted, limit=1).records
-        return next((CheckTarget(storage_id=r.storage_id, run_id=r.run_id, timestamp=r.timestamp) for r in made), None)
+        record_filter = dg.AssetRecordsFilter(asset_key=asset_key(name), asset_partitions=[key])
+        records = self._instance.fetch_materializations(record_filter, limit=1).records
+        return next(
+            (CheckTarget(storage_id=r.storage_id, run_id=r.run_id, timestamp=r.timestamp) for r in records), None
+        )
 
     def observe(self, lineage: Lineage, sources: Iterable[str] | None = None) -> list[Node]:
         """Report versions of sources (default: all) that Dagster lacks; return these."""
-        changed = list[Node]()
+        changed_sources = list[Node]()
         for name in self._graph.sources if sources is None else sources:
             now = {key: str(lineage.version(name, key)) for key in self._graph.keys(name)}
             slot = (Path(self._instance.root_directory), name)
             if _OBSERVED.get(slot) == now:
                 continue
-            recorded = self.recorded(name)
+            recorded_versions = self.recorded(name)
             for key, version in now.items():
-                if recorded.get(key) != version:
+                if recorded_versions.get(key) != version:
                     tags = {_VERSION: version, _USER: "true"}
                     event = dg.AssetObservation(asset_key(name), partition=key, tags=tags)
                     self._instance.report_runless_asset_event(event)
-                    changed.append((name, key))
+                    changed_sources.append((name, key))
             _OBSERVED[slot] = now
-        return changed
+        return changed_sources
 
     def _fetch(self, name: str) -> Callable[..., dg.EventRecordsResult]:
         source = self._graph.source(name) is not None

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Literal
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.pipeline.graph import Graph, Stage, name_of, the_graph
 from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.storage.parquet import State
@@ -27,7 +27,9 @@ DAMAGED = "damaged"  # the version of damaged data
 
 def failed_calls(count: int) -> str:
     """Return the number of a partition's failed calls, with the remedy, in words."""
-    return f"{counted(count, 'call')} failed; a new run of this partition asks {'it' if count == 1 else 'them'} again"
+    return (
+        f"{count_noun(count, 'call')} failed; a new run of this partition asks {'it' if count == 1 else 'them'} again"
+    )
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,7 @@ class Lineage:
             (parent, k)
             for parent, keys in self.graph.parents(stage, key).items()
             for k in keys
-            if (there := self._there(parent)) is None or k in there
+            if (parent_keys := self._there(parent)) is None or k in parent_keys
         ]
         versions = {name_of(node): self.version(*node) for node in nodes}
         return {name: version for name, version in versions.items() if version is not None}
@@ -97,16 +99,16 @@ class Lineage:
             if self.graph.source(parent) is not None:
                 continue
             wanted_keys = [k for k in keys if k in self._wanted(parent)]
-            wrong = {k: reason for k in wanted_keys if (reason := self._unusable(parent, k, current))}
+            reason_by_key = {k: reason for k in wanted_keys if (reason := self._unusable(parent, k, current))}
             need = stage.parents[parent].need
-            if need == "none" or (need == "some" and len(wrong) < len(wanted_keys)):
-                wrong = {
-                    k: reason for k, reason in wrong.items() if self.damage(parent, k)
+            if need == "none" or (need == "some" and len(reason_by_key) < len(wanted_keys)):
+                reason_by_key = {
+                    k: reason for k, reason in reason_by_key.items() if self.damage(parent, k)
                 }  # it would be read with the rest
-            if wrong:
-                first, reason = next(iter(wrong.items()))
-                more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
-                return f"{name_of((parent, first))} {reason}{more}"
+            if reason_by_key:
+                first, reason = next(iter(reason_by_key.items()))
+                suffix = f" (and {len(reason_by_key) - 1} more)" if len(reason_by_key) > 1 else ""
+                return f"{name_of((parent, first))} {reason}{suffix}"
             if need == "some" and not wanted_keys:
                 return f"the study wants no {parent}"
         return ""
@@ -117,21 +119,23 @@ class Lineage:
         That is so if an upstream partition is outdated, has been lost since this one was made, or is missing; paid
         parents that are not required do not count.
         """
-        of_stage = self.graph[name].parents
+        stage_parents = self.graph[name].parents
         parents = {
             parent: keys
             for parent, keys in self.graph.parents(name, key).items()
             if not self.graph.source(parent)
-            and not (of_stage[parent].need == "none" and self.graph[parent].cost == "money")
+            and not (stage_parents[parent].need == "none" and self.graph[parent].cost == "money")
         }
-        above = [(parent, k) for parent, keys in parents.items() for k in keys if k in self._wanted(parent)]
+        upstream = [(parent, k) for parent, keys in parents.items() for k in keys if k in self._wanted(parent)]
         state = self.state(name, key)
-        gone = (
-            node for node in above if state and name_of(node) in state.inputs and self.status(*node).kind == "missing"
+        lost_parents = (
+            node
+            for node in upstream
+            if state and name_of(node) in state.inputs and self.status(*node).kind == "missing"
         )
         return (
-            any(self.status(*node).outdated for node in above)
-            or any(gone)  # otherwise figures would be rebuilt from fewer inputs than before
+            any(self.status(*node).outdated for node in upstream)
+            or any(lost_parents)  # otherwise figures would be rebuilt from fewer inputs than before
             or bool(self.blocked(name, key, current=True))
         )
 

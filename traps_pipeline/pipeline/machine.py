@@ -22,8 +22,8 @@ from traps_pipeline.storage.workspace import Workspace
 if TYPE_CHECKING:
     import dagster as dg
 
-LEAST_GB = 0.1  # less would run out before the first tables are written
-MOST_PARTITIONS = 5  # partitions in a sentence
+MIN_GB = 0.1  # less would run out before the first tables are written
+MAX_PARTITIONS = 5  # partitions in a sentence
 CLIPS = "mp4"  # the kind of a stage that renders
 
 Parts = Mapping[str, Sequence[str | None]]  # by stage: the partitions that a run is to make
@@ -38,20 +38,20 @@ def wanted_parts(workspace: Workspace, stages: Collection[str], experiment: str 
 def parts_of_run(context: dg.AssetExecutionContext, stage: Stage, partitions: StudyPartitions) -> Parts:
     """Return stages of a Dagster run that share a step's partitions, with wanted keys."""
     keys = {str(key) for key in context.partition_keys} if stage.scheme else {None}
-    selected = context.run.asset_selection or context.job_def.asset_layer.executable_asset_keys
-    names = {key.path[-1] for key in selected}
-    alike = [
+    asset_keys = context.run.asset_selection or context.job_def.asset_layer.executable_asset_keys
+    names = {key.path[-1] for key in asset_keys}
+    same_partitions = [
         candidate for candidate in the_graph().stages if candidate.name in names and candidate.scheme is stage.scheme
     ]
-    return {candidate.name: [key for key in candidate.wanted(partitions) if key in keys] for candidate in alike}
+    return {
+        candidate.name: [key for key in candidate.wanted(partitions) if key in keys] for candidate in same_partitions
+    }
 
 
-def why_nothing(keys: Sequence[str | None], tags: Mapping[str, str], workspace: Workspace) -> str:
+def nothing_to_do_reason(keys: Sequence[str | None], tags: Mapping[str, str], workspace: Workspace) -> str:
     """Return in words why a run whose keys are all unwanted has nothing to do."""
     if keys:
-        return (
-            f"no experiment in {workspace.root / 'study.yaml'} asks for {', '.join(map(str, keys[:MOST_PARTITIONS]))}"
-        )
+        return f"no experiment in {workspace.root / 'study.yaml'} asks for {', '.join(map(str, keys[:MAX_PARTITIONS]))}"
     first, last = (tags.get(f"dagster/asset_partition_range_{end}", "its end") for end in ("start", "end"))
     return f"no partition lies between {first} and {last}; exchange the two"
 
@@ -63,12 +63,12 @@ def require_machine(workspace: Workspace, parts: Parts) -> None:
     first that is missing or that a variable breaks. A study whose clips exist needs no OpenGL, and one whose answers
     and votes exist needs no network.
     """
-    check_disk(workspace.root, LEAST_GB)
+    check_disk(workspace.root, MIN_GB)
     if any(entry.backend == NETWORK for entry in _asked_entries(workspace, parts)):
         check_network()
     graph = the_graph()
     drawing = ((graph[name].shared, key) for name, keys in parts.items() for key in keys if CLIPS in graph[name].kinds)
-    if any(shared is not None and shared.seconds(workspace, key) > 0 for shared, key in drawing):
+    if any(build is not None and build.seconds(workspace, key) > 0 for build, key in drawing):
         ClipCache.of_user()
         _check_rendering(*opengl_variables().items())
 

@@ -7,11 +7,11 @@ from contextlib import closing
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.progress import Tally
-from traps_pipeline.base.workers import kept_workers
+from traps_pipeline.base.workers import keep_workers
 from traps_pipeline.pipeline.graph import ConcurrentBuild, Stage
 from traps_pipeline.pipeline.history import History
 from traps_pipeline.pipeline.lineage import Lineage
-from traps_pipeline.storage.leases import alone
+from traps_pipeline.storage.leases import hold_lease
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
@@ -39,7 +39,7 @@ class PartitionMaker:
             for key in inputs:
                 yield from self._make_partition(key, Tally())
         else:
-            yield from self._beside_others(self._stage.shared, inputs)
+            yield from self._make_concurrently(self._stage.shared, inputs)
 
     def _side_by_side(self, keys: Sequence[str | None]) -> Iterator[tuple[str | None, StageOutput]]:
         pending = [*keys]
@@ -68,25 +68,25 @@ class PartitionMaker:
 
     # --- beside other runs --------------------------------------------------------------------------------------------
 
-    def _beside_others(self, shared: ConcurrentBuild, inputs: Inputs) -> Iterator[tuple[str | None, StageOutput]]:
+    def _make_concurrently(self, shared: ConcurrentBuild, inputs: Inputs) -> Iterator[tuple[str | None, StageOutput]]:
         """Make files beside other runs, then build the partition as its lease holder."""
-        store, later, lineage = self._workspace.store, dict[str | None, Tally](), Lineage(self._workspace)
+        store, postponed, lineage = self._workspace.store, dict[str | None, Tally](), Lineage(self._workspace)
         self._made_at = {key: lineage.made_at(self._stage.name, key) for key in inputs}
-        with kept_workers():
+        with keep_workers():
             for key in inputs:
                 tally = Tally()
                 is_whole = self._make_files(shared, key, tally, wait=False)
                 lease = store.lease(f"{self._stage.name}/{key}") if is_whole else None
                 if lease is None:
-                    later[key] = tally
+                    postponed[key] = tally
                     continue
                 with closing(lease):
-                    if not self._takes_over(key, inputs[key], tally):
+                    if not self._adopt(key, inputs[key], tally):
                         yield from self._make_partition(key, tally)
-            for key, tally in later.items():
+            for key, tally in postponed.items():
                 if key not in self.unmade and self._make_files(shared, key, tally, wait=True):
-                    with alone(store, f"{self._stage.name}/{key}"):
-                        if not self._takes_over(key, inputs[key], tally):
+                    with hold_lease(store, f"{self._stage.name}/{key}"):
+                        if not self._adopt(key, inputs[key], tally):
                             yield from self._make_partition(key, tally)
 
     def _make_files(self, shared: ConcurrentBuild, key: str | None, tally: Tally, *, wait: bool) -> bool:
@@ -99,7 +99,7 @@ class PartitionMaker:
         tally.add(count)
         return is_whole
 
-    def _takes_over(self, key: str | None, inputs: Mapping[str, str], tally: Tally) -> bool:
+    def _adopt(self, key: str | None, inputs: Mapping[str, str], tally: Tally) -> bool:
         """Return whether another run built and reported a partition of equal inputs."""
         stage, lineage = self._stage, Lineage(self._workspace)
         state = lineage.state(stage.name, key)

@@ -39,17 +39,17 @@ def visible_metadata(value: Any) -> Any:
     if isinstance(value, dg.MetadataValue):  # a path, a number, an asset; some are tuples
         return value
     if isinstance(value, Mapping):
-        return {visible_metadata(key): visible_metadata(each) for key, each in value.items()}
-    return [visible_metadata(each) for each in value] if isinstance(value, list | tuple) else value
+        return {visible_metadata(key): visible_metadata(member) for key, member in value.items()}
+    return [visible_metadata(member) for member in value] if isinstance(value, list | tuple) else value
 
 
 def tally_metadata(stage: Stage, tally: Tally) -> dict[str, int]:
-    """Return a run's work on a partition, one number an entry, since Dagster plots numbers.
+    """Return a run's work on a partition, one number per entry for Dagster's plots.
 
     Zeros are left out where a stage never does such work.
     """
-    asks = {"asked", "cached", "errors"} if stage.cost else set()
-    return {WORDS[name]: count for name, count in vars(tally).items() if count or name in asks}
+    paid_counts = {"asked", "cached", "errors"} if stage.cost else set()
+    return {WORDS[name]: count for name, count in vars(tally).items() if count or name in paid_counts}
 
 
 def tally_of(metadata: Mapping[str, dg.MetadataValue]) -> Tally:
@@ -76,19 +76,22 @@ def preview(table: Table, output: StageOutput) -> dict[str, dg.TableMetadataValu
     import pandas as pd
 
     content = cast(Any, output.content)
-    if ranked := next((name for name in RANKED if name in table.names), None):
+    if rank_column := next((name for name in RANKED if name in table.names), None):
         frame = content if hasattr(content, "head") else pd.DataFrame(content, columns=pd.Index(table.names))
-        ordered = frame.dropna(subset=[ranked]).sort_values(ranked, ascending=False, kind="stable")
-        best, worst = ordered.head(PREVIEWED), ordered.iloc[PREVIEWED:].tail(PREVIEWED)
-        samples = {f"best by {ranked}": best.to_dict("records"), f"worst by {ranked}": worst.to_dict("records")}
+        ordered = frame.dropna(subset=[rank_column]).sort_values(rank_column, ascending=False, kind="stable")
+        best_rows, worst_rows = ordered.head(PREVIEWED), ordered.iloc[PREVIEWED:].tail(PREVIEWED)
+        samples = {
+            f"best by {rank_column}": best_rows.to_dict("records"),
+            f"worst by {rank_column}": worst_rows.to_dict("records"),
+        }
     else:
         first = content[:PREVIEWED]
         samples = {
             "first rows": first.to_dict("records") if hasattr(content, "head") else [asdict(row) for row in first]
         }
     preview_rows = [row for rows in samples.values() for row in rows]
-    telling = [c.name for c in table.columns if _is_telling(c.type, [row.get(c.name) for row in preview_rows])]
-    names = [*table.key, *([ranked] if ranked else []), *telling]
+    shown_columns = [c.name for c in table.columns if _is_telling(c.type, [row.get(c.name) for row in preview_rows])]
+    names = [*table.key, *([rank_column] if rank_column else []), *shown_columns]
     names = [name for name in dict.fromkeys(names) if name not in table.partition_by]
     tables = {
         title: [dg.TableRecord({name: _plain(row.get(name)) for name in names}) for row in rows]

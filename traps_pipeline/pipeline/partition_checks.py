@@ -22,7 +22,7 @@ CURRENT = "current"  # the check that every stage has
 CURRENT_DOC = "The partition is complete, made from the current inputs, and no call of it failed."
 REACHED = "a budget is reached"  # in a check's metadata
 STILL = "still failing"  # in a check's metadata: set for a partition that the run did not touch
-MOST_NAMED = 12  # unmade partitions named in an error
+MAX_NAMED = 12  # unmade partitions named in an error
 
 
 class StageChecks:
@@ -43,9 +43,9 @@ class StageChecks:
         """Evaluate parents whose content was altered, before anything is built from them."""
         for parent, keys in self._graph.parents(self._stage.name, key).items():
             if self._graph.source(parent) is None:
-                for above in keys:
-                    if damage := lineage.damage(parent, above):
-                        yield from evaluations(self._history, parent, above, {CURRENT: {"damaged": damage}})
+                for parent_key in keys:
+                    if damage := lineage.damage(parent, parent_key):
+                        yield from evaluations(self._history, parent, parent_key, {CURRENT: {"damaged": damage}})
 
     def test(self, key: str | None, output: StageOutput) -> Mapping[str, Mapping[str, Any]]:
         """Test a partition just written by every check, and return what each finds wrong.
@@ -58,7 +58,7 @@ class StageChecks:
             wrong |= {"damaged": damage} if damage else {}
         if output.tally.errors:
             wrong["failed"] = failed_calls(output.tally.errors)
-        found: dict[str, Mapping[str, Any]] = {CURRENT: wrong}
+        failures: dict[str, Mapping[str, Any]] = {CURRENT: wrong}
         for check in stage.checks:
             problems = check.wrong(self._workspace, key, output)
             file = self._workspace.failed_check(stage.name, check.name, key)
@@ -66,12 +66,12 @@ class StageChecks:
                 self._workspace.store.write({file: json.dumps(problems, default=str).encode()})
             else:
                 self._workspace.store.remove([file])
-            found[check.name] = {"failing": json.loads(json.dumps(problems, default=str))} if problems else {}
-        return found
+            failures[check.name] = {"failing": json.loads(json.dumps(problems, default=str))} if problems else {}
+        return failures
 
     def of_made(self, key: str | None, found: Mapping[str, Mapping[str, Any]]) -> Iterator[dg.AssetCheckEvaluation]:
         """Evaluate every check of a partition, after its event, from what `test` found."""
-        self._failing |= {(check, key): wrong for check, wrong in found.items() if wrong}
+        self._failing |= {(check, key): failure for check, failure in found.items() if failure}
         yield from evaluations(self._history, self._stage.name, key, found)
 
     def of_unmade(self, key: str | None, error: TrapsError) -> Iterator[dg.AssetCheckEvaluation]:
@@ -79,7 +79,7 @@ class StageChecks:
         yield from self.of_made(key, {CURRENT: {"not made": str(error), REACHED: isinstance(error, BudgetReached)}})
 
     def of_fresh(self, key: str | None) -> Iterator[dg.AssetCheckEvaluation]:
-        """Evaluate the checks that a partition passes which is fresh, so that this run does not build it.
+        """Evaluate the passing checks of a fresh partition, which this run does not build.
 
         Dagster awaits an evaluation from the run, and would say that the check was skipped, or failed to execute.
         """
@@ -98,8 +98,8 @@ class StageChecks:
                 state = lineage.state(name, key)
                 if state is not None and state.failed:
                     self._failing[CURRENT, key] = {STILL: failed_calls(state.failed)}
-        for (check, key), wrong in self._failing.items():
-            yield from evaluations(self._history, name, key, {check: wrong})
+        for (check, key), failure in self._failing.items():
+            yield from evaluations(self._history, name, key, {check: failure})
 
 
 def raise_for_run(context: dg.AssetExecutionContext, graph: Graph, last: str) -> None:
@@ -107,36 +107,39 @@ def raise_for_run(context: dg.AssetExecutionContext, graph: Graph, last: str) ->
 
     An error in an upstream step would have made Dagster skip everything downstream, including what is sound.
     """
-    above, failed = graph.above([last]), dict[tuple[str, Node], dg.AssetCheckEvaluation]()
-    of_type = dg.DagsterEventType.ASSET_CHECK_EVALUATION
-    for entry in context.instance.all_logs(context.run.run_id, of_type=of_type):
+    upstream, failed = graph.above([last]), dict[tuple[str, Node], dg.AssetCheckEvaluation]()
+    event_type = dg.DagsterEventType.ASSET_CHECK_EVALUATION
+    for entry in context.instance.all_logs(context.run.run_id, of_type=event_type):
         event = entry.get_dagster_event().asset_check_evaluation_data
         node = (event.asset_key.path[-1], event.partition)
-        if node[0] in above and STILL not in event.metadata:
+        if node[0] in upstream and STILL not in event.metadata:
             failed[event.check_name, node] = event
-    alike: dict[tuple[str, str], list[str]] = {}  # by stage and message: each reason is reported once
+    messages_by_reason: dict[tuple[str, str], list[str]] = {}  # by stage and message: each reason is reported once
     for (check, node), event in failed.items():
         for line in _lines(check, node, event):
-            alike.setdefault((node[0], line.replace(name_of(node), "")), []).append(line)
-    if alike:
-        lines = [f"{first} (and {len(more)} more)" if more else first for first, *more in alike.values()]
-        rest = [f"... and {len(lines) - MOST_NAMED} more"] if len(lines) > MOST_NAMED else []
-        reached = any(e.metadata[REACHED].value for e in failed.values() if REACHED in e.metadata)
-        raise (BudgetReached if reached else TrapsError)("\n".join([*lines[:MOST_NAMED], *rest]))
+            messages_by_reason.setdefault((node[0], line.replace(name_of(node), "")), []).append(line)
+    if messages_by_reason:
+        lines = [
+            f"{first} (and {len(repeats)} more)" if repeats else first
+            for first, *repeats in messages_by_reason.values()
+        ]
+        suffix_lines = [f"... and {len(lines) - MAX_NAMED} more"] if len(lines) > MAX_NAMED else []
+        is_budget_reached = any(e.metadata[REACHED].value for e in failed.values() if REACHED in e.metadata)
+        raise (BudgetReached if is_budget_reached else TrapsError)("\n".join([*lines[:MAX_NAMED], *suffix_lines]))
 
 
 def evaluations(
     history: History, stage: str, key: str | None, found: Mapping[str, Mapping[str, Any]]
 ) -> Iterator[dg.AssetCheckEvaluation]:
-    """Yield the evaluation of each check of a partition by what it found wrong."""
+    """Yield the evaluation of each check of a partition, from the checks' failures."""
     target = history.check_target(stage, key)
-    for check, wrong in found.items():
+    for check, failure in found.items():
         yield dg.AssetCheckEvaluation(
             asset_key=asset_key(stage),
             check_name=check,
-            passed=not wrong,
+            passed=not failure,
             partition=key,
-            metadata=visible_metadata(wrong),
+            metadata=visible_metadata(failure),
             target_materialization_data=target,
         )
 

@@ -93,7 +93,7 @@ class ByDimension:
         assert key is not None and below is not None, "both sides have partitions"
         if len(above.dimensions) == 1:
             return [key.split(SEPARATOR)[[*below.dimensions].index(self.name)]]
-        keys = [[key] if name == self.name else every for name, every in above.dimensions.items()]
+        keys = [[key] if name == self.name else dimension_keys for name, dimension_keys in above.dimensions.items()]
         return [*map(SEPARATOR.join, product(*keys))]
 
 

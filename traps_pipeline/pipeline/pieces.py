@@ -31,8 +31,9 @@ _DATE = (1980, 1, 1, 0, 0, 0)  # date of every member, so that equal pieces give
 
 @dataclass(frozen=True)
 class Piece:
-    """One part of an asset. reads: the stages and sources whose versions decide whether it is rebuilt.
+    """One part of an asset.
 
+    reads: the stages and sources whose versions decide whether it is rebuilt.
     inputs: returns what it shows of them, as JSON; if their versions have changed, it is rebuilt only if this has, too.
     is_shared: whether all studies have the same; it is then built once per user.
     """
@@ -49,26 +50,26 @@ def make_pieces(
 ) -> tuple[dict[str, bytes], list[str]]:
     """Return all pieces' content, and names of those rebuilt for new inputs or code."""
     path = workspace.reports / ".state" / f"{stage}.pieces.zip"
-    former = _read(workspace.store.here(path).read_bytes()) if workspace.store.has(path) else {}
-    versions, shared = Lineage(workspace).inputs(stage, None), _SharedPieces(stage)
-    inputs, contents, remade = dict[str, Digests](), dict[str, bytes](), list[str]()
+    previous_pieces = _read(workspace.store.here(path).read_bytes()) if workspace.store.has(path) else {}
+    versions, shared_pieces = Lineage(workspace).inputs(stage, None), _SharedPieces(stage)
+    inputs, contents, rebuilt_names = dict[str, Digests](), dict[str, bytes](), list[str]()
     for number, piece in enumerate(pieces):
         progress.current().tick(stage, "parts", number, len(pieces))
         read_versions = {name: version for name, version in versions.items() if name.partition("/")[0] in piece.reads}
-        digests, content = former.get(piece.name, (("", ""), b""))
-        of_versions = shown = digest([code, read_versions])
-        if digests[0] == of_versions:
-            shown = digests[1]
+        digests, content = previous_pieces.get(piece.name, (("", ""), b""))
+        versions_digest = inputs_digest = digest([code, read_versions])
+        if digests[0] == versions_digest:
+            inputs_digest = digests[1]
         elif piece.inputs is not None:
-            shown = digest([code, piece.inputs()])
-        if digests[1] != shown:
-            content = shared.get(piece, shown) if piece.is_shared else piece.make()
-            remade.append(piece.name)
-        inputs[piece.name], contents[piece.name] = (of_versions, shown), content
-    shared.save()
-    if inputs != {name: digests for name, (digests, _) in former.items()}:
+            inputs_digest = digest([code, piece.inputs()])
+        if digests[1] != inputs_digest:
+            content = shared_pieces.get(piece, inputs_digest) if piece.is_shared else piece.make()
+            rebuilt_names.append(piece.name)
+        inputs[piece.name], contents[piece.name] = (versions_digest, inputs_digest), content
+    shared_pieces.save()
+    if inputs != {name: digests for name, (digests, _) in previous_pieces.items()}:
         workspace.store.write({path: _archive(inputs, contents)})
-    return contents, remade
+    return contents, rebuilt_names
 
 
 class _SharedPieces:
@@ -90,8 +91,8 @@ class _SharedPieces:
                 self._pieces = _read(self._path.read_bytes())
         inputs_digest = digest([inputs, *self._libraries])
         inputs_digests = (inputs_digest, inputs_digest)
-        known, content = self._pieces.get(piece.name, (("", ""), b""))
-        if known != inputs_digests:
+        digests, content = self._pieces.get(piece.name, (("", ""), b""))
+        if digests != inputs_digests:
             content = piece.make()
             self._pieces[piece.name], self._is_new = (inputs_digests, content), True
         return content
@@ -122,7 +123,8 @@ def _read(data: bytes) -> dict[str, tuple[Digests, bytes]]:
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             inputs = {
-                name: (str(versions), str(shown)) for name, (versions, shown) in json.loads(archive.read(NOTES)).items()
+                name: (str(versions), str(inputs_digest))
+                for name, (versions, inputs_digest) in json.loads(archive.read(NOTES)).items()
             }
             return {name: (digests, archive.read(name)) for name, digests in inputs.items()}  # checks each CRC
     except (zipfile.BadZipFile, ValueError, KeyError, TypeError):

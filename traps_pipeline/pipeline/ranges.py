@@ -48,10 +48,10 @@ def batches(scheme: Partitioning | None, keys: Sequence[str | None]) -> Iterator
     if scheme is None or not keys:
         yield from ((key, key) for key in keys)
         return
-    grid, by_row = _Grid.of(scheme), dict[int, list[int]]()
+    grid, columns_by_row = _Grid.of(scheme), dict[int, list[int]]()
     for row, column in grid.cells(keys):
-        by_row.setdefault(row, []).append(column)
-    spans = sorted((span, row) for row, numbers in by_row.items() for span in _spans(numbers))
+        columns_by_row.setdefault(row, []).append(column)
+    spans = sorted((span, row) for row, numbers in columns_by_row.items() for span in _spans(numbers))
     for (left, right), group in groupby(spans, key=lambda pair: pair[0]):
         for top, bottom in _spans([row for _, row in group]):
             yield grid.range(top, bottom, left, right)
@@ -83,9 +83,9 @@ def cut(scheme: Partitioning | None, keys: Sequence[str | None], most: int) -> l
     is_wanted = np.zeros((len(grid.rows), len(grid.columns)), bool)
     for row, column in grid.cells(keys):
         is_wanted[row, column] = True
-    heads = np.array([name.partition("__")[0] for name in grid.columns])
-    by_model = most < len({*heads[is_wanted.any(axis=0)]})
-    return [grid.range(*corners) for corners in _parts(is_wanted, heads, 0, 0, most, by_model=by_model)]
+    model_names = np.array([name.partition("__")[0] for name in grid.columns])
+    is_by_model = most < len({*model_names[is_wanted.any(axis=0)]})
+    return [grid.range(*corners) for corners in _parts(is_wanted, model_names, 0, 0, most, by_model=is_by_model)]
 
 
 def _parts(
@@ -125,8 +125,8 @@ def _halves(sizes: np.ndarray, cuts: np.ndarray, better: set[int], count: int) -
     total = int(sizes.sum())
     first = np.cumsum(sizes)[cuts - 1]
     shares = np.clip(np.rint(count * first / total), 1, count - 1).astype(int)
-    largest = np.maximum(first / shares, (total - first) / (count - shares))
-    best = min(range(len(cuts)), key=lambda n: (largest[n], int(cuts[n]) not in better, abs(2 * first[n] - total)))
+    larger_load = np.maximum(first / shares, (total - first) / (count - shares))
+    best = min(range(len(cuts)), key=lambda n: (larger_load[n], int(cuts[n]) not in better, abs(2 * first[n] - total)))
     return int(cuts[best]), int(shares[best])
 
 
@@ -142,6 +142,6 @@ def shared_out(
         return cut(scheme, keys, 1) * count
     runs = dict.fromkeys(keys, 1)
     for _ in range(count - len(keys)):
-        neediest = max(keys, key=lambda key: seconds[key] / runs[key])
-        runs[neediest] += 1
+        busiest_key = max(keys, key=lambda key: seconds[key] / runs[key])
+        runs[busiest_key] += 1
     return [(key, key) for turn in range(max(runs.values())) for key in keys if runs[key] > turn]

@@ -1,4 +1,4 @@
-"""Materialize what is missing or stale, one Dagster run per block of stages."""
+"""Materialize missing or stale partitions, one Dagster run per block of stages."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from traps_pipeline.pipeline.graph import Stage, the_graph
 from traps_pipeline.pipeline.history import History
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.pipeline.runs import HOST_TAG, PID_TAG, Runs, this_host
-from traps_pipeline.pipeline.step import EXPERIMENT_TAG, MAKE_TAG, STALE, to_make
+from traps_pipeline.pipeline.step import EXPERIMENT_TAG, MAKE_TAG, STALE_OR_MISSING, to_make
 from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.storage.several_hosts import several_hosts
 from traps_pipeline.storage.workspace import Workspace
 
 
 @dataclass
-class WalkResult:
-    """A walk's problems in sentences, whether a budget ended it, and its seconds."""
+class MaterializationResult:
+    """The problems of `materialize_stale`, whether a budget ended it, and its seconds."""
 
     problems: list[str] = field(default_factory=list)
     over_budget: bool = False
@@ -46,17 +46,17 @@ def dagster_history(workspace: Workspace) -> Iterator[dg.DagsterInstance]:
     anew, and so does an unreadable one, which is kept beside it: the tables are authoritative. Raises TrapsError if the
     history cannot be read or written.
     """
-    home = Path(os.environ.get("DAGSTER_HOME") or workspace.dagster_home)
-    require_history_path(home)
+    dagster_home = Path(os.environ.get("DAGSTER_HOME") or workspace.dagster_home)
+    require_history_path(dagster_home)
     try:
         workspace.locks.mkdir(parents=True, exist_ok=True)
         with (workspace.locks / "dagster.lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
-            instance = _opened(workspace, home)
+            instance = _open_history(workspace, dagster_home)
         with instance:
             for run in instance.get_runs(dg.RunsFilter(statuses=[dg.DagsterRunStatus.STARTED])):
-                here = run.tags.get(HOST_TAG) == this_host()
-                if here and PID_TAG in run.tags and not _is_alive(int(run.tags[PID_TAG])):
+                is_this_host = run.tags.get(HOST_TAG) == this_host()
+                if is_this_host and PID_TAG in run.tags and not _is_alive(int(run.tags[PID_TAG])):
                     instance.report_run_failed(run, "its process was killed; what it had asked and made is kept")
             yield instance
     except BrokenPipeError:
@@ -70,15 +70,15 @@ def dagster_history(workspace: Workspace) -> Iterator[dg.DagsterInstance]:
         else:
             raise
         raise TrapsError(
-            f"{home}: Dagster's history cannot be read or written ({reason}); {hint} and run the same command again: "
-            "tables are whole, no answer is lost"
+            f"{dagster_home}: Dagster's history cannot be read or written ({reason}); {hint} and run the same command "
+            "again: tables are whole, no answer is lost"
         ) from error
 
 
-def _opened(workspace: Workspace, home: Path) -> dg.DagsterInstance:
+def _open_history(workspace: Workspace, home: Path) -> dg.DagsterInstance:
     from sqlalchemy.exc import DatabaseError, OperationalError
 
-    for again in (False, True):
+    for is_retry in (False, True):
         if workspace.is_on_cluster and home == workspace.dagster_home:
             settings = several_hosts().dagster_yaml(workspace)
             write_text(home / "dagster.yaml", yaml.safe_dump(settings, sort_keys=False))
@@ -90,14 +90,16 @@ def _opened(workspace: Workspace, home: Path) -> dg.DagsterInstance:
         except OperationalError:
             raise  # a full disk or another process's lock: the history is intact
         except DatabaseError as error:
-            if again or ("not a database" not in str(error) and "malformed" not in str(error)):
+            if is_retry or ("not a database" not in str(error) and "malformed" not in str(error)):
                 raise
-            aside = home / f"broken-{time.strftime('%Y%m%dT%H%M%S')}"
+            backup = home / f"broken-{time.strftime('%Y%m%dT%H%M%S')}"
             for name in ("history", "schedules", "storage"):
                 if (home / name).exists():
-                    aside.mkdir(exist_ok=True)
-                    (home / name).rename(aside / name)
-            progress.current().note(f"{home}: Dagster's history was damaged; it lies in {aside.name}, a new one begins")
+                    backup.mkdir(exist_ok=True)
+                    (home / name).rename(backup / name)
+            progress.current().note(
+                f"{home}: Dagster's history was damaged; it lies in {backup.name}, a new one begins"
+            )
         else:
             return instance
     raise AssertionError("unreachable: the second try returns or raises")
@@ -107,8 +109,8 @@ def _instance(home: Path, *, is_captured: bool) -> dg.DagsterInstance:
     """Open a folder's instance; is_captured: keep steps' output, as other hosts must."""
     if is_captured:
         return dg.DagsterInstance.from_config(str(home))
-    silent = {"module": "dagster._core.storage.noop_compute_log_manager", "class": "NoOpComputeLogManager"}
-    return dg.DagsterInstance.local_temp(str(home), overrides={"compute_logs": silent})
+    no_logs = {"module": "dagster._core.storage.noop_compute_log_manager", "class": "NoOpComputeLogManager"}
+    return dg.DagsterInstance.local_temp(str(home), overrides={"compute_logs": no_logs})
 
 
 def _is_alive(pid: int) -> bool:
@@ -130,14 +132,16 @@ def pending_in(
     """
     pending: dict[str, list[str | None]] = {}
     for stage in block:
-        recorded = history.recorded(stage.name)
-        every = stage.wanted(partitions)
-        keys = [k for k in every if to_make(lineage, recorded, stage.name, k, existing=existing)]
+        recorded_versions = history.recorded(stage.name)
+        wanted_keys = stage.wanted(partitions)
+        keys = [k for k in wanted_keys if to_make(lineage, recorded_versions, stage.name, k, existing=existing)]
         keys = [k for k in keys if not (existing and lineage.waits(stage.name, k))]
         if keys or lineage.graph.parents_of[stage.name].keys() & pending.keys():
             pending[stage.name] = keys
-    every = lineage.graph.keys(block[0].name)
-    return [lineage.graph[name] for name in pending], [k for k in every if any(k in keys for keys in pending.values())]
+    wanted_keys = lineage.graph.keys(block[0].name)
+    return [lineage.graph[name] for name in pending], [
+        k for k in wanted_keys if any(k in keys for keys in pending.values())
+    ]
 
 
 def materialize_stale(
@@ -147,20 +151,20 @@ def materialize_stale(
     stages: Collection[str],
     *,
     experiment: str | None = None,
-) -> WalkResult:
+) -> MaterializationResult:
     """Materialize missing or stale partitions of these stages, or of one experiment.
 
     KeyboardInterrupt propagates.
     """
-    outcome, began, graph = WalkResult(), time.monotonic(), the_graph()
+    outcome, started_at, graph = MaterializationResult(), time.monotonic(), the_graph()
     history, partitions = History(instance, graph), StudyPartitions(workspace, experiment)
-    tags = {MAKE_TAG: STALE} | ({EXPERIMENT_TAG: experiment} if experiment else {})
+    tags = {MAKE_TAG: STALE_OR_MISSING} | ({EXPERIMENT_TAG: experiment} if experiment else {})
     with remembering_stops():
         for block in graph.blocks([name for name in stages if graph[name].wanted(partitions)]):
             pending, keys = pending_in(block, Lineage(workspace), history, partitions)
-            for of_range in runs.make(pending, runs.ranges(pending, keys), tags):
-                outcome.problems += of_range.problems
-                outcome.over_budget |= of_range.over_budget
+            for range_outcome in runs.make(pending, runs.ranges(pending, keys), tags):
+                outcome.problems += range_outcome.problems
+                outcome.over_budget |= range_outcome.over_budget
     outcome.problems = [*dict.fromkeys(outcome.problems)]
-    outcome.seconds = time.monotonic() - began
+    outcome.seconds = time.monotonic() - started_at
     return outcome

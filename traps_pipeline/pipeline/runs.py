@@ -49,7 +49,7 @@ class Runs(ABC):
         """Materialize the stages in these ranges; KeyboardInterrupt propagates."""
 
 
-class RunsHere(Runs):
+class LocalRuns(Runs):
     """Runs of the job of all assets in this process; parent: the run that starts them."""
 
     def __init__(

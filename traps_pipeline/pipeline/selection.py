@@ -1,4 +1,4 @@
-"""Decide what a run must materialize, if anything, from tables' footers alone.
+"""Select the partitions that a run must materialize, from tables' footers alone.
 
 Nothing here imports Dagster or opens its history, so `traps run` with nothing to do ends before either.
 """
@@ -31,10 +31,10 @@ def stages_until(until: str | None) -> set[str]:
     graph = the_graph()
     if until is None:
         return {stage.name for stage in graph.stages}
-    known = [stage.name for stage in graph.stages]
-    if unknown := [name for name in until.split(",") if name not in known]:
-        near = did_you_mean(unknown[0], known) or f"; choose from {', '.join(known)}"
-        raise TrapsError(f"--until {', '.join(unknown)}: no such stage{near}")
+    stage_names = [stage.name for stage in graph.stages]
+    if unknown := [name for name in until.split(",") if name not in stage_names]:
+        suggestion = did_you_mean(unknown[0], stage_names) or f"; choose from {', '.join(stage_names)}"
+        raise TrapsError(f"--until {', '.join(unknown)}: no such stage{suggestion}")
     return graph.above(until.split(","))
 
 
@@ -53,18 +53,18 @@ def require_work(workspace: Workspace, experiment: str, until: str | None) -> No
 def failed_checks(workspace: Workspace, experiment: str | None) -> list[str]:
     """Return failed checks of wanted partitions, from this or any earlier run."""
     failing: dict[tuple[str, str], list[str]] = {}
-    for check, of_stage, partition, _ in failing_checks(workspace):
-        failing.setdefault((of_stage, partition), []).append(check)
+    for check, stage_name, partition, _ in failing_checks(workspace):
+        failing.setdefault((stage_name, partition), []).append(check)
     partitions, problems = StudyPartitions(workspace, experiment), []
     for stage in the_graph().stages if failing else ():
         for key in stage.wanted(partitions):
             for check in sorted(failing.get((stage.name, key or stage.name), ())):
                 details = workspace.failure(stage.name, check, key)
-                problems.append(f"check {check} of {name_of((stage.name, key))} does not pass: {_unquoted(details)}")
+                problems.append(f"check {check} of {name_of((stage.name, key))} does not pass: {_unquote(details)}")
     return problems
 
 
-def _unquoted(details: str) -> str:
+def _unquote(details: str) -> str:
     return details[1:-1] if details[:1] == details[-1:] == '"' else details
 
 
@@ -82,9 +82,9 @@ def note_versions(workspace: Workspace, stages: Collection[str], experiment: str
         for name in sorted(stages)
         for key in graph[name].wanted(partitions)
     }
-    former = _read_note(workspace)
-    if former.get("history") == history:  # keep versions of other stages or experiments
-        versions = former["versions"] | versions
+    previous_note = _read_note(workspace)
+    if previous_note.get("history") == history:  # keep versions of other stages or experiments
+        versions = previous_note["versions"] | versions
     note = json.dumps({"history": history, "versions": versions})
     workspace.store.write({workspace.dagster_home / _NOTE: note.encode()})
 
@@ -94,9 +94,9 @@ def is_nothing_to_do(workspace: Workspace, stages: Collection[str], experiment: 
     note = _read_note(workspace)
     if not note or note.get("history") != _history_state(workspace):
         return False
-    lineage, partitions, known = Lineage(workspace), StudyPartitions(workspace, experiment), note["versions"]
+    lineage, partitions, noted_versions = Lineage(workspace), StudyPartitions(workspace, experiment), note["versions"]
     return all(
-        known.get(name_of((name, key))) == lineage.version(name, key) is not None
+        noted_versions.get(name_of((name, key))) == lineage.version(name, key) is not None
         and lineage.status(name, key).kind == "fresh"
         for name in stages
         for key in lineage.graph[name].wanted(partitions)
@@ -114,9 +114,9 @@ def _read_note(workspace: Workspace) -> dict[str, Any]:
 
 def _history_state(workspace: Workspace) -> list[Any] | None:
     """Return path, sizes and times of Dagster's history; None if it is no local file."""
-    home = Path(os.environ.get("DAGSTER_HOME") or workspace.dagster_home)
-    index = home / _HISTORY
+    dagster_home = Path(os.environ.get("DAGSTER_HOME") or workspace.dagster_home)
+    index = dagster_home / _HISTORY
     if workspace.is_shared or not index.is_file():
         return None
     states = [path.stat() for path in (index, index.with_name(index.name + "-wal")) if path.exists()]
-    return [str(home.resolve()), *([state.st_size, state.st_mtime_ns] for state in states if state.st_size)]
+    return [str(dagster_home.resolve()), *([state.st_size, state.st_mtime_ns] for state in states if state.st_size)]

@@ -98,13 +98,16 @@ def stage(
             output = function(workspace, key)
             return output if isinstance(output, StageOutput) or isinstance(table, str) else _with_preview(table, output)
 
-        above = [declared if isinstance(declared, Parent) else of(declared) for declared in parents]
-        declared = Stage(
+        upstream = [
+            upstream_or_parent if isinstance(upstream_or_parent, Parent) else of(upstream_or_parent)
+            for upstream_or_parent in parents
+        ]
+        upstream_or_parent = Stage(
             name=table if isinstance(table, str) else table.name,
             table=None if isinstance(table, str) else table,
             make=function if side_by_side else make,
             group=group,
-            parents={parent.name: parent for parent in above},
+            parents={parent.name: parent for parent in upstream},
             doc=_result(_doc(function)),
             scheme=scheme,
             checks=checks,
@@ -117,8 +120,8 @@ def stage(
             shared=shared,
             side_by_side=side_by_side,
         )
-        _declare(declared)
-        return declared
+        _declare(upstream_or_parent)
+        return upstream_or_parent
 
     return declare
 

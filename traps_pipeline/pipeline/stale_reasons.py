@@ -8,7 +8,7 @@ from typing import Any
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.suggestions import did_you_mean
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.answers import answer_request, with_posteriors
@@ -37,14 +37,14 @@ def explain(workspace: Workspace, item_id: str) -> dict[str, Any]:
         truth = current["ground_truth"] if current["side"] == "control" else "none, it is void"
         clip = str(workspace.resolve(current["clip"]))
         explanation |= {"question": current["question"], "ground_truth": truth, "clip": clip}
-    answered = workspace.answers.naming(item_id)
+    rows_by_evaluation = workspace.answers.naming(item_id)
     for model, entry in load_models().items():
         for regime in REGIMES:
             for run in range(1, entry.runs + 1):
                 evaluation = Evaluation(model, regime, run)
-                if evaluation.key not in answered:
+                if evaluation.key not in rows_by_evaluation:
                     continue
-                rows = [row for row in answered[evaluation.key].rows.values() if _about(row) == item_id]
+                rows = [row for row in rows_by_evaluation[evaluation.key].rows.values() if _item_id_of(row) == item_id]
                 if not rows:
                     continue
                 request = answer_request(workspace, entry, current, evaluation) if current else None
@@ -58,7 +58,7 @@ def explain(workspace: Workspace, item_id: str) -> dict[str, Any]:
                     }
                 )
     if current is None and not explanation["evaluations"]:
-        raise TrapsError(_unknown(workspace, item_id))
+        raise TrapsError(_unknown_reason(workspace, item_id))
     return explanation
 
 
@@ -68,11 +68,11 @@ def lines_of(explanation: Mapping[str, Any]) -> Iterator[str]:
         yield f"question: {explanation['question']}"
         yield f"ground truth: {explanation['ground_truth']}"
         yield f"clip: {explanation['clip']}"
-    for each in explanation["evaluations"]:
-        yield f"{each['evaluation']}: {each['state']}"
-        for answer in each["answers"]:
+    for evaluation in explanation["evaluations"]:
+        yield f"{evaluation['evaluation']}: {evaluation['state']}"
+        for answer in evaluation["answers"]:
             yield f"    {answer['outcome']}: {_short(answer['text']) if answer['text'] else answer['error'] or ''}"
-        for vote in each["votes"]:
+        for vote in evaluation["votes"]:
             decision = vote["abstained"] if vote["task"] == "abstention" else vote["correct"]
             word = "invalid" if not vote["valid"] else "yes" if decision else "no"
             yield f"    {vote['judge']} on {vote['task']}: {word} ({vote['rationale'] or vote['invalid_reason']})"
@@ -80,7 +80,7 @@ def lines_of(explanation: Mapping[str, Any]) -> Iterator[str]:
         yield "no model has been asked this item"
 
 
-def _unknown(workspace: Workspace, item_id: str) -> str:
+def _unknown_reason(workspace: Workspace, item_id: str) -> str:
     """Return why an item is unknown, with the nearest one."""
     item_ids = workspace.tables.read_all(ITEMS, ["item_id"])["item_id"]
     if item_ids.empty:
@@ -106,29 +106,29 @@ def _rows_about(
     return [row for place in places for row in data.slice(place, 1).to_pylist()]
 
 
-def _about(row: Mapping[str, Any]) -> Any:
+def _item_id_of(row: Mapping[str, Any]) -> Any:
     return row["components"]["about"]["item_id"]
 
 
 def _current_item(workspace: Workspace, dataset: str, item_id: str) -> dict[str, Any] | None:
     if workspace.tables.state(ITEMS, {"dataset": dataset}) is None:
         return None
-    named = _rows_about(workspace, ITEMS, {"dataset": dataset}, item_id)
-    return next(iter(with_posteriors(workspace, dataset, named)), None)
+    rows = _rows_about(workspace, ITEMS, {"dataset": dataset}, item_id)
+    return next(iter(with_posteriors(workspace, dataset, rows)), None)
 
 
 def _state(rows: list[dict[str, Any]], wanted: Mapping[str, Any] | None) -> str:
-    newest = max(rows, key=lambda row: row["created_at"])
+    newest_row = max(rows, key=lambda row: row["created_at"])
     if wanted is None:
-        times = counted(len(rows), "time")
+        times = count_noun(len(rows), "time")
         return f"asked {times}; the item is no longer in the benchmark, its answers stay in the ledger"
     for row in rows:
         if row["components"] == dict(wanted):
             return f"answered {row['created_at'][:19]} ({row['outcome']}), key {row['key'][:12]}: still stands"
-    old = newest["components"]
-    changed = [name for name in sorted(old.keys() | wanted.keys()) if old.get(name) != wanted.get(name)]
-    parts = [f"{name}: {_short(old.get(name))} -> {_short(wanted.get(name))}" for name in changed]
-    return f"will be asked again; changed since {newest['created_at'][:19]}: {'; '.join(parts)}"
+    old = newest_row["components"]
+    changed_parts = [name for name in sorted(old.keys() | wanted.keys()) if old.get(name) != wanted.get(name)]
+    parts = [f"{name}: {_short(old.get(name))} -> {_short(wanted.get(name))}" for name in changed_parts]
+    return f"will be asked again; changed since {newest_row['created_at'][:19]}: {'; '.join(parts)}"
 
 
 def _short(value: Any) -> str:

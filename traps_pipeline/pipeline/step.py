@@ -19,11 +19,11 @@ from dagster._core.definitions.source_asset import SYSTEM_METADATA_KEY_SOURCE_AS
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.redaction import redacted
+from traps_pipeline.base.redaction import redact_exception
 from traps_pipeline.pipeline.graph import Stage, the_graph
 from traps_pipeline.pipeline.history import History
 from traps_pipeline.pipeline.lineage import Lineage, write_report_state
-from traps_pipeline.pipeline.machine import parts_of_run, require_machine, why_nothing
+from traps_pipeline.pipeline.machine import nothing_to_do_reason, parts_of_run, require_machine
 from traps_pipeline.pipeline.making import PartitionMaker
 from traps_pipeline.pipeline.metadata import partition_metadata, tally_metadata, visible_metadata
 from traps_pipeline.pipeline.partition_checks import StageChecks, raise_for_run
@@ -33,7 +33,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 MAKE_TAG, EXPERIMENT_TAG = "traps/make", "traps/experiment"  # tags of runs: what to build, for which experiment
 BACKFILL_TAG = "dagster/backfill"  # tag of a backfill's run: a run with nothing to do must not end the backfill
-STALE, OUTDATED = "stale", "outdated"  # MAKE_TAG: what is not fresh; what is there and not fresh
+STALE_OR_MISSING, STALE_ONLY = "stale", "outdated"  # values of MAKE_TAG: the partitions to build
 # In an event's metadata: nobody asks for the partition; another run has built it.
 UNWANTED, TAKEN = "not wanted", "taken over"
 RESUMED_ELSEWHERE = 5  # the exit code of a process whose run another process has resumed
@@ -55,16 +55,16 @@ def run_step(stage: Stage, context: dg.AssetExecutionContext, workspace: Workspa
     made_result: dg.MaterializeResult | None = None
     for key, output in step.make():
         version = step.write(key, output)
-        found = step.checks.test(key, output)
+        failures = step.checks.test(key, output)
         progress.current().partition(stage.name, key or "", output.tally, is_empty=not len(output.content))
         metadata = partition_metadata(workspace, stage, output)
         if stage.scheme is None:
-            yield from step.checks.of_made(key, found)
+            yield from step.checks.of_made(key, failures)
             metadata = visible_metadata(metadata)
             made_result = dg.MaterializeResult(metadata=metadata, data_version=dg.DataVersion(version))
         else:
             yield step.history.event(stage, key, version, step.provenance, metadata)
-            yield from step.checks.of_made(key, found)
+            yield from step.checks.of_made(key, failures)
     yield from step.tell_taken()
     yield from step.tell_fresh()
     yield from step.tell_unmade()
@@ -98,19 +98,19 @@ class _Step:
         if MAKE_TAG in self.tags:
             return
         if self.stage.scheme and not self._wanted and BACKFILL_TAG not in self.tags:
-            reason = why_nothing(self._unwanted, self.tags, self.workspace)
+            reason = nothing_to_do_reason(self._unwanted, self.tags, self.workspace)
             raise TrapsError(f"{self.stage.name}: nothing is made: {reason}")
-        about = {UNWANTED: f"nothing is made: no experiment in {self.workspace.root / 'study.yaml'} asks for it"}
+        metadata = {UNWANTED: f"nothing is made: no experiment in {self.workspace.root / 'study.yaml'} asks for it"}
         for key in self._unwanted:
-            yield self.history.event(self.stage, key, UNWANTED, self.provenance, about)
+            yield self.history.event(self.stage, key, UNWANTED, self.provenance, metadata)
 
     def to_make(self) -> list[str | None]:
         """Return the wanted keys, or those among them that the run's tag selects."""
         if MAKE_TAG not in self.tags:
             return self._wanted
-        recorded, existing = self.history.recorded(self.stage.name), self.tags[MAKE_TAG] == OUTDATED
+        recorded_versions, existing = self.history.recorded(self.stage.name), self.tags[MAKE_TAG] == STALE_ONLY
         name, lineage = self.stage.name, self.lineage
-        keys = [k for k in self._wanted if to_make(lineage, recorded, name, k, existing=existing)]
+        keys = [k for k in self._wanted if to_make(lineage, recorded_versions, name, k, existing=existing)]
         # A partition that waits for an upstream one would be built twice.
         return [k for k in keys if not (existing and lineage.waits(name, k))]
 
@@ -145,8 +145,8 @@ class _Step:
         """Report partitions that other runs have built."""
         for key, (version, tally) in self._maker.taken.items():
             progress.current().partition(self.stage.name, key or "", tally)
-            about = {TAKEN: "made by another run meanwhile", **tally_metadata(self.stage, tally)}
-            yield self.history.event(self.stage, key, version, self.provenance, about)
+            metadata = {TAKEN: "made by another run meanwhile", **tally_metadata(self.stage, tally)}
+            yield self.history.event(self.stage, key, version, self.provenance, metadata)
 
     def tell_fresh(self) -> Iterator[dg.AssetCheckEvaluation]:
         """Report partitions of this run that need not be built."""
@@ -157,12 +157,12 @@ class _Step:
 
     def tell_unmade(self) -> Iterator[dg.AssetCheckEvaluation]:
         """Report partitions that could not be built or fail a check, now or before."""
-        unmade = self._maker.unmade
-        if unmade:
+        reason_by_key = self._maker.unmade
+        if reason_by_key:
             end_if_resumed(self.context.instance, self.context.run.run_id, _ATTEMPTS[self.context.run.run_id])
-        for key, error in unmade.items():
+        for key, error in reason_by_key.items():
             yield from self.checks.of_unmade(key, error)
-        yield from self.checks.still_failing(self.lineage, {*self._inputs, *unmade} - self._maker.taken.keys())
+        yield from self.checks.still_failing(self.lineage, {*self._inputs, *reason_by_key} - self._maker.taken.keys())
 
     def hand_on(self, result: dg.MaterializeResult | None) -> Iterator[dg.Output | dg.MaterializeResult]:
         """Yield the result of an asset without partitions, or outputs that write no event.
@@ -177,8 +177,8 @@ class _Step:
 
     def stages_below(self) -> set[str]:
         """Return the stages of this run that are directly downstream of this one."""
-        selected = self.context.run.asset_selection or self.context.job_def.asset_layer.executable_asset_keys
-        return self.graph.below(self.stage.name) & {key.path[-1] for key in selected}
+        asset_keys = self.context.run.asset_selection or self.context.job_def.asset_layer.executable_asset_keys
+        return self.graph.below(self.stage.name) & {key.path[-1] for key in asset_keys}
 
 
 def guard_events(events: Events, context: dg.AssetExecutionContext) -> Events:
@@ -192,7 +192,7 @@ def guard_events(events: Events, context: dg.AssetExecutionContext) -> Events:
             yield from events
             report.end_stage()
     except Exception as error:
-        if (without_keys := redacted(error)) is error:
+        if (without_keys := redact_exception(error)) is error:
             raise
         raise without_keys from None
     except (KeyboardInterrupt, dg.DagsterExecutionInterruptedError):

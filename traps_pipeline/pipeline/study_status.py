@@ -29,19 +29,19 @@ class StageStatus:
         """
         groups = dict[str, list[str]]()
         for key, reasons in self.stale.items():
-            shared = [reason.replace(f"/{key} ", " ") for reason in reasons]
-            groups.setdefault("; ".join(shared), []).append(key)
+            general_reasons = [reason.replace(f"/{key} ", " ") for reason in reasons]
+            groups.setdefault("; ".join(general_reasons), []).append(key)
         return groups | ({"not made yet": [*self.missing]} if self.missing else {})
 
 
 def stage_statuses(workspace: Workspace, lineage: Lineage, experiment: str | None) -> Iterator[StageStatus]:
-    """Yield each stage's status over what the study, or one experiment, wants."""
+    """Yield each stage's status over the partitions that a study or experiment wants."""
     partitions = StudyPartitions(workspace, experiment)
     for stage in lineage.graph.stages:
         statuses = {key or stage.name: lineage.status(stage.name, key) for key in stage.wanted(partitions)}
-        stale = {key: status.reasons for key, status in statuses.items() if status.kind == "stale"}
+        stale_reasons = {key: status.reasons for key, status in statuses.items() if status.kind == "stale"}
         missing = [key for key, status in statuses.items() if status.kind == "missing"]
-        yield StageStatus(stage.name, len(statuses) - len(stale) - len(missing), stale, missing)
+        yield StageStatus(stage.name, len(statuses) - len(stale_reasons) - len(missing), stale_reasons, missing)
 
 
 def failing_checks(workspace: Workspace) -> Iterator[tuple[str, str, str, str]]:

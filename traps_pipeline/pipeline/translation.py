@@ -26,10 +26,10 @@ def asset_key(name: str) -> dg.AssetKey:
 
 @cache
 def _prefix() -> tuple[str, ...]:
-    home, workspace = os.environ.get("DAGSTER_HOME"), study_here()
+    dagster_home, workspace = os.environ.get("DAGSTER_HOME"), study_here()
     if workspace is not None and (workspace.is_shared or workspace.is_on_cluster):
         return (workspace.study.name,)  # several studies may share its database and its history
-    if workspace is None or not home or Path(home).resolve() == workspace.dagster_home.resolve():
+    if workspace is None or not dagster_home or Path(dagster_home).resolve() == workspace.dagster_home.resolve():
         return ()
     return (workspace.study.name,) if workspace.study.name else ()
 
@@ -58,7 +58,7 @@ def _mapping(mapping: KeyMapping) -> dg.PartitionMapping:
         case ByDimension():
             return dg.MultiToSingleDimensionPartitionMapping(mapping.name)
         case Pairs():
-            return dg.StaticPartitionMapping({key: [*below] for key, below in mapping.below.items()})
+            return dg.StaticPartitionMapping({key: [*downstream] for key, downstream in mapping.below.items()})
         case FixedKeys():
             return dg.SpecificPartitionsPartitionMapping([*mapping.keys])
         case _:

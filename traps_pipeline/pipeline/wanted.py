@@ -1,4 +1,4 @@
-"""Compute the wanted partitions: what a study's experiments ask of its scenarios.
+"""Compute the wanted partitions, which a study's experiments ask of its scenarios.
 
 Partition keys, `traps run`, `traps status`, Dagster's buttons and its automation all use this module, so nothing asks a
 model that no experiment of the study names.
@@ -39,10 +39,10 @@ class StudyPartitions:
     def __init__(self, workspace: Workspace | None, experiment: str | None = None) -> None:
         self._workspace = workspace
         if workspace is None:
-            every = Asked(
+            all_asked = Asked(
                 datasets=(*DATASETS, *UNPAIRED), models=tuple(load_models()), regimes=REGIMES, runs=(), mechanism=True
             )
-            self._asked: Sequence[Asked] = [every]
+            self._asked: Sequence[Asked] = [all_asked]
         else:
             self._asked = [e for name, e in workspace.study.experiments.items() if experiment in (None, name)]
 
@@ -74,33 +74,33 @@ class StudyPartitions:
         return bool({*self.datasets} & {*DATASETS})
 
     def _datasets(self, experiments: Iterable[Asked]) -> list[str]:
-        present = {dataset for category in self._present for dataset in all_datasets_of(category)}
-        named = {dataset for experiment in experiments for dataset in experiment.datasets}
-        return [dataset for dataset in (*DATASETS, *UNPAIRED) if dataset in present & named]
+        possible_datasets = {dataset for category in self._present for dataset in all_datasets_of(category)}
+        asked_datasets = {dataset for experiment in experiments for dataset in experiment.datasets}
+        return [dataset for dataset in (*DATASETS, *UNPAIRED) if dataset in possible_datasets & asked_datasets]
 
     @cached_property
     def evaluations(self) -> list[Evaluation]:
         """Every requested model, regime and run, in the registry's order."""
-        named = {e for experiment in self._asked for e in _evaluations(experiment)}
+        asked_evaluations = {e for experiment in self._asked for e in _evaluations(experiment)}
         place = {model: number for number, model in enumerate(load_models())}
-        return sorted(named, key=lambda e: (place[e.model], REGIMES.index(e.regime), e.run))
+        return sorted(asked_evaluations, key=lambda e: (place[e.model], REGIMES.index(e.regime), e.run))
 
     @cached_property
     def cells(self) -> list[str]:
         """Keys of the requested cells."""
-        named = {
+        asked_cells = {
             Cell(dataset, evaluation).key
             for experiment in self._asked
             for dataset in self._datasets([experiment])
             for evaluation in _evaluations(experiment)
         }
-        every = (Cell(dataset, evaluation).key for dataset, evaluation in product(self.datasets, self.evaluations))
-        return [key for key in every if key in named]
+        all_cells = (Cell(dataset, evaluation).key for dataset, evaluation in product(self.datasets, self.evaluations))
+        return [key for key in all_cells if key in asked_cells]
 
     # --- inside local models ------------------------------------------------------------------------------------------
 
     @cached_property
-    def _inside(self) -> tuple[list[str], MechanismSettings | None] | None:
+    def _mechanism(self) -> tuple[list[str], MechanismSettings | None] | None:
         """Datasets (no arms) and settings of mechanistic analyses, or None without any."""
         if self._workspace is None:
             return [*DATASETS], None
@@ -112,19 +112,19 @@ class StudyPartitions:
     @cached_property
     def has_mechanism(self) -> bool:
         """Whether any mechanistic analysis is requested."""
-        return self._inside is not None
+        return self._mechanism is not None
 
     @cached_property
     def steers(self) -> bool:
         """Whether models are steered."""
-        return self._inside is not None and (self._inside[1] is None or self._inside[1].steering is not None)
+        return self._mechanism is not None and (self._mechanism[1] is None or self._mechanism[1].steering is not None)
 
     @cached_property
     def patched_prompt(self) -> str | None:
         """The VQA prompt under which activations are patched; None without patching."""
-        if self._inside is None:
+        if self._mechanism is None:
             return None
-        settings = self._inside[1]
+        settings = self._mechanism[1]
         if settings is None:
             return PROBE_PROMPT
         return settings.patching.prompt if settings.patching else None
@@ -132,14 +132,14 @@ class StudyPartitions:
     @cached_property
     def has_sentences(self) -> bool:
         """Whether log-probabilities of abstentions are computed."""
-        return self._inside is not None and (self._inside[1] is None or bool(self._inside[1].sentences))
+        return self._mechanism is not None and (self._mechanism[1] is None or bool(self._mechanism[1].sentences))
 
     @cached_property
     def probed(self) -> list[str]:
         """Datasets whose hidden states are extracted."""
-        datasets = self._inside[0] if self._inside else []
+        datasets = self._mechanism[0] if self._mechanism else []
         asked_datasets = self._datasets(experiment for experiment in self._asked if experiment.mechanism)
-        existing = {*datasets, *(arm for arm in PROBED_ARMS if self._inside and arm in asked_datasets)}
+        existing = {*datasets, *(arm for arm in PROBED_ARMS if self._mechanism and arm in asked_datasets)}
         existing |= {
             dataset for dataset, origin in ((ANSWERABLE, "occlusion"), (TIME_SWAPPED, "chaotic")) if origin in existing
         }
@@ -148,9 +148,9 @@ class StudyPartitions:
     @cached_property
     def extractions(self) -> list[Extraction]:
         """Local models under the VQA prompts for which states are extracted."""
-        if self._inside is None:
+        if self._mechanism is None:
             return []
-        settings = self._inside[1]
+        settings = self._mechanism[1]
         models = local_models() if settings is None else [*settings.models]
         return [Extraction(model, p) for model in models for p in (settings.prompts if settings else VQA_PROMPTS)]
 
@@ -163,15 +163,15 @@ class StudyPartitions:
     @cached_property
     def probed_prompts(self) -> tuple[str, ...]:
         """VQA prompts whose states probes are fitted on."""
-        settings = self._inside[1] if self._inside else None
+        settings = self._mechanism[1] if self._mechanism else None
         return settings.probes.prompts if settings else (PROBE_PROMPT,)
 
     @cached_property
     def steered(self) -> list[str]:
         """`model__directionregime__inferenceregime` of every steered evaluation."""
-        if self._inside is None or not self.steers:
+        if self._mechanism is None or not self.steers:
             return []
-        settings = self._inside[1]
+        settings = self._mechanism[1]
         if settings is None:
             runs = product(local_models(), VQA_PROMPTS, VQA_PROMPTS)
         else:
@@ -182,7 +182,7 @@ class StudyPartitions:
     @cached_property
     def steering(self) -> list[str]:
         """Keys of the steering cells."""
-        datasets = self._inside[0] if self._inside else []
+        datasets = self._mechanism[0] if self._mechanism else []
         return [SteeringCell.parse(f"{dataset}|{run}").key for dataset, run in product(datasets, self.steered)]
 
 

@@ -50,18 +50,18 @@ def serve_with_dagster(host: str, port: int, token: str) -> NoReturn:
         workspace.write_text(yaml.safe_dump({"load_from": [location]}), encoding="utf-8")
         code_server = ("dagster", "code-server", "start", "-m", _MODULE, "--location-name", _MODULE)
         try:
-            started = {_start(*code_server, "--socket", address, "--log-level", "warning"): "code server"}
-            _wait_for_socket(address, started)
-            started[_start(__name__, str(workspace), host, str(port), token=token)] = "web server"
-            started[_start("dagster._daemon", "run", "-w", str(workspace))] = "daemon"
-            pid, code = process_tree.wait_for(started)
+            name_of = {_start(*code_server, "--socket", address, "--log-level", "warning"): "code server"}
+            _wait_for_socket(address, name_of)
+            name_of[_start(__name__, str(workspace), host, str(port), token=token)] = "web server"
+            name_of[_start("dagster._daemon", "run", "-w", str(workspace))] = "daemon"
+            pid, code = process_tree.wait_for(name_of)
         except KeyboardInterrupt:
             print(f"stopping: runs store their calls in flight, within {STOP_S:.0f} s; {AGAIN}", file=sys.stderr)
             raise
         finally:
             process_tree.stop_descendants(STOP_S)
     raise TrapsError(
-        f"Dagster's {started[pid]} ended by itself (exit code {code}), and all others with it: its lines stand above"
+        f"Dagster's {name_of[pid]} ended by itself (exit code {code}), and all others with it: its lines stand above"
     )
 
 
@@ -89,8 +89,8 @@ def study_route(workspace: Workspace) -> Route:
         path = PurePosixPath(request.path_params["path"])
         if path.parts[0] in SERVED_FOLDERS and not any(part.startswith(".") for part in path.parts):
             file = workspace.resolve(path.as_posix())
-            inside = file.resolve().is_relative_to((workspace.root / path.parts[0]).resolve())
-            if inside and file.is_file():
+            is_inside = file.resolve().is_relative_to((workspace.root / path.parts[0]).resolve())
+            if is_inside and file.is_file():
                 return FileResponse(file)
         return PlainTextResponse(f"the study has no file {path}; materialize the asset that makes it\n", 404)
 

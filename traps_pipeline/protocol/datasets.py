@@ -83,17 +83,17 @@ def datasets_of_category(category: str) -> tuple[str, str]:
 
 def arms_of(taxonomy: str) -> tuple[str, ...]:
     """Return the arms that scenarios of a taxonomy may have."""
-    return tuple(arm for arm in beside_of(taxonomy) if arm in ARMS)
+    return tuple(arm for arm in extra_datasets_of(taxonomy) if arm in ARMS)
 
 
-def beside_of(taxonomy: str) -> tuple[str, ...]:
+def extra_datasets_of(taxonomy: str) -> tuple[str, ...]:
     """Return the arms and variations that scenarios of a taxonomy may have."""
     return tuple(name for name in UNPAIRED if _ONE_TAXONOMY.get(name, taxonomy) == taxonomy)
 
 
 def all_datasets_of(category: str) -> tuple[str, ...]:
     """Return all datasets, with arms and variations, of a category's scenarios."""
-    return (*datasets_of_category(category), *beside_of(taxonomy_of_category(category)))
+    return (*datasets_of_category(category), *extra_datasets_of(taxonomy_of_category(category)))
 
 
 def dataset_of(item_id: str) -> str:

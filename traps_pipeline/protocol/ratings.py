@@ -49,8 +49,8 @@ class Ratings:
         """
         keys = [*self.answer]
         judged = self.answers.loc[self.answers["task"].isin(tasks), keys]
-        merged = items[keys].merge(judged.assign(row=judged.index), on=keys, how="left", validate="many_to_one")
-        rows = merged["row"].to_numpy(float)
+        item_rows = items[keys].merge(judged.assign(row=judged.index), on=keys, how="left", validate="many_to_one")
+        rows = item_rows["row"].to_numpy(float)
         is_judged = ~np.isnan(rows)
         values = np.full((len(items), len(self.judges)), INVALID, np.int8)
         values[is_judged] = self.values[rows[is_judged].astype(np.int64)]
@@ -67,7 +67,7 @@ def ratings(votes: pd.DataFrame, judges: Sequence[str] | None = None, answer: Se
 
     seats = tuple(sorted(votes["judge"].unique()) if judges is None else judges)
     votes = votes.loc[votes["judge"].isin(seats)].reset_index(drop=True)
-    rows, first = _grouped(votes, [*answer, "task"])
+    rows, first = _group_votes(votes, [*answer, "task"])
     values = np.full((len(first), len(seats)), INVALID, np.int8)
     has_vote = np.zeros(values.shape, bool)
     places = rows, pd.Index(seats).get_indexer(pd.Index(votes["judge"]))
@@ -75,18 +75,18 @@ def ratings(votes: pd.DataFrame, judges: Sequence[str] | None = None, answer: Se
     answers = votes.loc[first, [*answer, "epoch", "benchmark_version"]].reset_index(drop=True)
     first_votes = votes.loc[first, ["task", "side"]]
     answers["task"] = np.where(first_votes["task"] == "correctness", "correctness", first_votes["side"] + "_abstention")
-    complete = has_vote.all(axis=1)
-    return Ratings(answers.loc[complete].reset_index(drop=True), values[complete], seats, answer)
+    is_complete = has_vote.all(axis=1)
+    return Ratings(answers.loc[is_complete].reset_index(drop=True), values[is_complete], seats, answer)
 
 
-def _grouped(votes: pd.DataFrame, by: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+def _group_votes(votes: pd.DataFrame, by: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     """Return each vote's group (votes,), and each group's first vote (groups,)."""
     import pandas as pd
 
     code = np.zeros(len(votes), np.int64)
     for name in by:
-        own, known = pd.factorize(votes[name])
-        code = code * max(len(known), 1) + own
+        codes, levels = pd.factorize(votes[name])
+        code = code * max(len(levels), 1) + codes
     _, first, rows = np.unique(code, return_index=True, return_inverse=True)
     return rows.ravel(), first
 
@@ -105,7 +105,7 @@ def majority(values: np.ndarray) -> np.ndarray:
     return np.where(is_yes, YES, np.where(is_no, NO, INVALID)).astype(np.int8)
 
 
-def decided(votes: np.ndarray) -> pd.arrays.BooleanArray:
+def vote_decisions(votes: np.ndarray) -> pd.arrays.BooleanArray:
     """Return the votes as true (YES), false (NO) and null (INVALID)."""
     import pandas as pd
 

@@ -11,9 +11,9 @@ from typing import Literal
 class Regime:
     """A system prompt, of files of `assets/prompts`, and its answer format.
 
-    fields: of the JSON object that an answer must be; none: free text. states: the texts under which hidden states are
-    read (docs/spec.md 7.1); none: no states are read under this regime. marker: of a model's point in the landscape.
-    first_token: whether the log-probabilities of the answer's first token are stored and scored.
+    fields: fields of the JSON object that an answer must be; none: free text. states: the texts under which hidden
+    states are read (docs/spec.md 7.1); none: no states are read under this regime. marker: marker of a model's point in
+    the landscape. first_token: whether the log-probabilities of the answer's first token are stored and scored.
     """
 
     name: str

@@ -63,6 +63,6 @@ def dictionary(tables: Sequence[Table[Any]], places: Mapping[str, str], canary: 
         parts.append(f"Key: {', '.join(f'`{name}`' for name in table.key)}.\n\n")
         parts.append("| column | type | may be null | meaning |\n| --- | --- | --- | --- |\n")
         for column in table.columns:
-            null = "yes" if column.nullable else "no"
-            parts.append(f"| `{column.name}` | {column.type_name} | {null} | {column.doc} |\n")
+            nullable_word = "yes" if column.nullable else "no"
+            parts.append(f"| `{column.name}` | {column.type_name} | {nullable_word} | {column.doc} |\n")
     return "".join(parts)

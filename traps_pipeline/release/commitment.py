@@ -21,11 +21,11 @@ from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
 from traps_pipeline.base.terminal import plain
-from traps_pipeline.base.workers import kept_workers
+from traps_pipeline.base.workers import keep_workers
 from traps_pipeline.base.yamlfile import explain, read_lines
 from traps_pipeline.benchmark.records import load_release, load_released, parse_record
 from traps_pipeline.scenes.draw.sample import load_tallies, sample_family
-from traps_pipeline.scenes.parts.difficulty import USUAL, Difficulty
+from traps_pipeline.scenes.parts.difficulty import DEFAULT_DIFFICULTY, Difficulty
 from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory
 
 _HEX = r"^[0-9a-f]{64}$"
@@ -41,9 +41,9 @@ class _Strict(BaseModel):
 class Commitment(_Strict):
     """The public file.
 
-    draws: scenarios by family. look: the varied parts of the look, by family. difficulty: of every scene. seed: digest
-    of the seed. specs: digest of each record. made_with: machine and libraries, which may affect the arithmetic of a
-    draw.
+    draws: scenarios by family. look: the varied parts of the look, by family. difficulty: settings of every scene.
+    seed: digest of the seed. specs: digest of each record. made_with: machine and libraries, which may affect the
+    arithmetic of a draw.
     """
 
     format: Literal[1] = 1
@@ -52,7 +52,7 @@ class Commitment(_Strict):
     canary: str
     draws: dict[str, int]
     look: dict[str, list[str]] = {}
-    difficulty: Difficulty = USUAL
+    difficulty: Difficulty = DEFAULT_DIFFICULTY
     seed: str = Field(pattern=_HEX)
     specs: dict[str, str] = Field(min_length=1)
     made_with: dict[str, str]
@@ -66,19 +66,19 @@ class Reveal(_Strict):
     nonce: str = Field(pattern=_HEX)
 
 
-def _sealed_seed(reveal: Reveal, draws: Mapping[str, int]) -> str:
+def _seal_seed(reveal: Reveal, draws: Mapping[str, int]) -> str:
     return digest(["seed", reveal.nonce, reveal.seed, dict(draws)])
 
 
-def _sealed_spec(reveal: Reveal, spec: SceneSpec) -> str:
+def _seal_spec(reveal: Reveal, spec: SceneSpec) -> str:
     return digest(["spec", reveal.nonce, spec.scenario_id, spec.spec_hash])
 
 
 def commit(benchmark: Path, commitment: Path, reveal: Path) -> Commitment:
     """Commit to a benchmark: write the public file, and the secret one for its owner.
 
-    benchmark: of `traps benchmark sample`. Raises TrapsError if the folder is no such benchmark, or of several seeds,
-    and if either file exists.
+    benchmark: folder that `traps benchmark sample` wrote. Raises TrapsError if the folder is no such benchmark, or of
+    several seeds, and if either file exists.
     """
     for path in (commitment, reveal):
         if path.exists():
@@ -98,9 +98,9 @@ def commit(benchmark: Path, commitment: Path, reveal: Path) -> Commitment:
         draws=draws,
         look={name: tally.look for name, tally in sorted(tallies.items())},
         difficulty=difficulty,
-        seed=_sealed_seed(secret, draws),
-        specs={id_: _sealed_spec(secret, spec) for id_, spec in sorted(specs.items())},
-        made_with=_made_with(),
+        seed=_seal_seed(secret, draws),
+        specs={id_: _seal_spec(secret, spec) for id_, spec in sorted(specs.items())},
+        made_with=_arithmetic(),
     )
     write_text(reveal, secret.model_dump_json(indent=1) + "\n")
     reveal.chmod(0o600)
@@ -108,7 +108,7 @@ def commit(benchmark: Path, commitment: Path, reveal: Path) -> Commitment:
     return published
 
 
-def _made_with() -> dict[str, str]:
+def _arithmetic() -> dict[str, str]:
     return {"machine": platform.machine(), **{name: version(name) for name in _LIBRARIES}}
 
 
@@ -163,19 +163,19 @@ def revealed_specs(folder: Path) -> dict[str, SceneSpec]:
 def broken_seals(commitment: Commitment, reveal: Reveal, specs: Mapping[str, SceneSpec]) -> list[str]:
     """Return how records differ from the commitment, one sentence each, seed first."""
     problems = []
-    if _sealed_seed(reveal, commitment.draws) != commitment.seed:
+    if _seal_seed(reveal, commitment.draws) != commitment.seed:
         problems.append("the revealed seed, number or composition is not the one that was committed")
     for id_ in sorted({*commitment.specs, *specs}):
         if id_ not in specs:
             problems.append(f"{id_}: was committed and is not there")
         elif id_ not in commitment.specs:
             problems.append(f"{id_}: was not committed")
-        elif _sealed_spec(reveal, specs[id_]) != commitment.specs[id_]:
+        elif _seal_spec(reveal, specs[id_]) != commitment.specs[id_]:
             problems.append(f"{id_}: is not the record that was committed")
     return problems
 
 
-def drawn_again(
+def redraw_records(
     commitment: Commitment,
     reveal: Reveal,
     *,
@@ -184,7 +184,7 @@ def drawn_again(
 ) -> dict[str, SceneSpec]:
     """Redraw the revealed seed's records. Raises TrapsError for an unfillable family."""
     with TemporaryDirectory(prefix="traps-") as folder:
-        with kept_workers():
+        with keep_workers():
             for family, count in commitment.draws.items():
                 report(f"drawing {count} of {family} again")
                 try:
@@ -210,8 +210,10 @@ def is_same_scene(spec: SceneSpec, other: SceneSpec) -> bool:
     return spec.model_dump(exclude={*_OF_ARITHMETIC}) == other.model_dump(exclude={*_OF_ARITHMETIC})
 
 
-def other_arithmetic(commitment: Commitment) -> str:
+def arithmetic_differences(commitment: Commitment) -> str:
     """Return how machine and libraries differ from the commitment's, if they do."""
-    here = _made_with()
-    names = [name for name in here if commitment.made_with.get(name) != here[name]]
-    return ", ".join(f"{name} {commitment.made_with.get(name, 'unknown')} there, {here[name]} here" for name in names)
+    own_machine = _arithmetic()
+    names = [name for name in own_machine if commitment.made_with.get(name) != own_machine[name]]
+    return ", ".join(
+        f"{name} {commitment.made_with.get(name, 'unknown')} there, {own_machine[name]} here" for name in names
+    )

@@ -97,7 +97,7 @@ def lite_of(items: Iterable[Mapping[str, Any]]) -> set[str]:
 
 def pair_rows(content: Content) -> list[PairRow]:
     """Return one row per pair, sorted by id. Raises TrapsError for a missing side."""
-    lite, rows, pairs = lite_of(content.items), list[PairRow](), dict[str, dict[str, Mapping[str, Any]]]()
+    lite_scenarios, rows, pairs = lite_of(content.items), list[PairRow](), dict[str, dict[str, Mapping[str, Any]]]()
     for row in content.items:
         if row["dataset"] in DATASETS:
             pairs.setdefault(row["pair_id"], {})[row["side"]] = row
@@ -105,18 +105,27 @@ def pair_rows(content: Content) -> list[PairRow]:
         if len(sides) < 2:
             raise TrapsError(f"{pair_id}: only its {next(iter(sides))} is there; make items again")
         control, void = sides["control"], sides["void"]
-        shared = ("pair_id", "dataset", "scenario_id", "taxonomy", "category", "sub_scenario", "labels", "aliases")
-        shared += ("answer_type", "ground_truth", "benchmark_version")
+        shared_columns = (
+            "pair_id",
+            "dataset",
+            "scenario_id",
+            "taxonomy",
+            "category",
+            "sub_scenario",
+            "labels",
+            "aliases",
+        )
+        shared_columns += ("answer_type", "ground_truth", "benchmark_version")
         rows.append(
             PairRow(
-                **{name: control[name] for name in shared},
+                **{name: control[name] for name in shared_columns},
                 control_item_id=control["item_id"],
                 void_item_id=void["item_id"],
                 control_file_name=control["clip"],
                 void_file_name=void["clip"],
                 control_question=control["question"],
                 void_question=void["question"],
-                lite=control["scenario_id"] in lite,
+                lite=control["scenario_id"] in lite_scenarios,
                 canary=content.release.canary,
             )
         )
@@ -125,12 +134,12 @@ def pair_rows(content: Content) -> list[PairRow]:
 
 def item_rows(content: Content) -> list[ReleasedItemRow]:
     """Return one row per item, sorted by id."""
-    lite = lite_of(content.items)
+    lite_scenarios = lite_of(content.items)
     return [
         ReleasedItemRow(
             **row,
             file_name=row["clip"].removeprefix(_CLIPS),
-            lite=row["scenario_id"] in lite,
+            lite=row["scenario_id"] in lite_scenarios,
             canary=content.release.canary,
         )
         for row in content.items
@@ -171,10 +180,12 @@ def _certificates(spec: SceneSpec, canary: str) -> Iterable[CertificateRow]:
     import numpy as np
 
     record_evidence, claim = stored_evidence(spec), Claim.of_record(spec)
-    nothing = np.empty((0, 0), np.float32)  # words are certified without a trajectory
+    empty_trajectory = np.empty((0, 0), np.float32)  # words are certified without a trajectory
     for certificate in certificates_for(spec.void_kind):
         words = certificate.about == "words"
-        evidence = {**certificate.measured(pair_of(spec, nothing, nothing))} if words else record_evidence
+        evidence = (
+            {**certificate.measured(pair_of(spec, empty_trajectory, empty_trajectory))} if words else record_evidence
+        )
         failure = certificate.failure(evidence, claim)
         numbers = {n.name: evidence[n.name] for n in certificate.numbers if n.name in evidence}
         yield CertificateRow(

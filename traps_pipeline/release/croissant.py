@@ -70,7 +70,7 @@ _RAI: Mapping[str, Any] = {
 
 def croissant(root: Path, manifest: Mapping[str, Any], tables: Sequence[Table[Any]], places: Mapping[str, str]) -> str:
     """Return the JSON-LD description of a folder that already holds the tables."""
-    described: dict[str, Any] = {
+    document: dict[str, Any] = {
         "@context": _CONTEXT,
         "@type": "sc:Dataset",
         "name": manifest["name"],
@@ -89,7 +89,7 @@ def croissant(root: Path, manifest: Mapping[str, Any], tables: Sequence[Table[An
         "distribution": [*_files(root, tables, places), _clips()],
         "recordSet": [_record_set(table, places[table.name]) for table in tables],
     }
-    return json.dumps(described, indent=1, ensure_ascii=False) + "\n"
+    return json.dumps(document, indent=1, ensure_ascii=False) + "\n"
 
 
 def _creator(manifest: Mapping[str, Any]) -> str:
@@ -133,13 +133,13 @@ def _record_set(table: Table[Any], place: str) -> dict[str, Any]:
 
 
 def _field(table: Table[Any], column: StoredColumn, place: str) -> dict[str, Any]:
-    listed = {"isArray": True, "arrayShape": "-1"} if column.type == list[str] else {}
+    array_properties = {"isArray": True, "arrayShape": "-1"} if column.type == list[str] else {}
     return {
         "@type": "cr:Field",
         "@id": f"{table.name}/{column.name}",
         "name": column.name,
         "description": column.doc,
         "dataType": _TYPES[column.type],
-        **listed,
+        **array_properties,
         "source": {"fileObject": {"@id": place}, "extract": {"column": column.name}},
     }

@@ -53,8 +53,8 @@ class Options:
     """Options of a release.
 
     arms: published beside the pairs. held_out: the file of the key that gives items opaque names, beside which their
-    answers are written; None to publish the answers. date: of the publication, YYYY-MM-DD. commitment: a file of `traps
-    benchmark commit`.
+    answers are written; None to publish the answers. date: date of publication, YYYY-MM-DD. commitment: a file of
+    `traps benchmark commit`.
     """
 
     arms: Sequence[str] = ()
@@ -100,13 +100,13 @@ def write_release(content: Content, target: Path, options: Options) -> ReleaseSu
     if options.held_out is not None and options.held_out.is_relative_to(target):  # before removing a former release
         raise TrapsError(f"{options.held_out}: lies in the folder that is published; keep the key elsewhere")
     _clear(target)
-    folder = _Folder(target, anonymous if options.anonymous else str)
+    folder = _Folder(target, anonymize if options.anonymous else str)
     answers = None
     if options.held_out is None:
         _open_tables(folder, content)
         clips = dict(content.clips)
     else:
-        answers = _held_out_tables(folder, content, options.held_out)
+        answers = _write_held_out_tables(folder, content, options.held_out)
         clips = {rows_of.held_out_clip(row["media_digest"]): content.clips[row["clip"]] for row in content.items}
     folder.table(PROMPTS, rows_of.prompt_rows(content.release.canary))
     for name, source in sorted(clips.items()):
@@ -122,9 +122,9 @@ def _clear(target: Path) -> None:
 
     if not (target / CHECKSUMS).is_file():
         return
-    strangers = sorted({*released_files(target)} - {*read_checksums(target)})
-    if strangers:
-        raise TrapsError(f"{target / strangers[0]}: is no file of the release there; move it away")
+    foreign_files = sorted({*released_files(target)} - {*read_checksums(target)})
+    if foreign_files:
+        raise TrapsError(f"{target / foreign_files[0]}: is no file of the release there; move it away")
     for name in (*released_files(target), CHECKSUMS, SIGNATURE):
         (target / name).unlink(missing_ok=True)
 
@@ -137,7 +137,7 @@ def _open_tables(folder: _Folder, content: Content) -> None:
     folder.table(SPLITS, rows_of.split_rows(content))
 
 
-def _held_out_tables(folder: _Folder, content: Content, key_file: Path) -> Path:
+def _write_held_out_tables(folder: _Folder, content: Content, key_file: Path) -> Path:
     """Write the items without their answers, and the answers beside the key."""
     key = held_out_key(key_file, make=True)
     folder.table(HELD_OUT_ITEMS, rows_of.held_out_rows(content, key))
@@ -161,7 +161,7 @@ def _pages(folder: _Folder, content: Content, options: Options) -> None:
         folder.text(COMMITMENT, options.commitment.read_text(encoding="utf-8"))
     manifest = {
         "format": FORMAT,
-        **_about(content),
+        **_description(content),
         "held_out": options.held_out is not None,
         "anonymous": options.anonymous,
         "date": options.date,
@@ -175,7 +175,7 @@ def _pages(folder: _Folder, content: Content, options: Options) -> None:
     folder.text(CROISSANT, croissant(folder.root, manifest, tables, PLACES))
 
 
-def _about(content: Content) -> dict[str, Any]:
+def _description(content: Content) -> dict[str, Any]:
     """Return name, version and canary of the release, and the version of each dataset."""
     return {**content.release.model_dump(), "versions": content.versions}
 
@@ -191,7 +191,7 @@ ANONYMOUS_CITATION = {
 }
 
 
-def identifying() -> dict[str, str]:
+def identity_texts() -> dict[str, str]:
     """Return texts that identify the authors, with replacements for blind review."""
     data = yaml.safe_load((ROOT / CITATION).read_text(encoding="utf-8"))
     paper = data["preferred-citation"]
@@ -201,8 +201,8 @@ def identifying() -> dict[str, str]:
     return words | {", ".join(names): "Anonymous authors"} | dict.fromkeys(names, "Anonymous authors")
 
 
-def anonymous(text: str) -> str:
+def anonymize(text: str) -> str:
     """Return a text without the authors' identity, even across line breaks."""
-    for words, instead in identifying().items():
-        text = re.sub(r"\s+".join(map(re.escape, words.split())), instead, text)
+    for words, replacement in identity_texts().items():
+        text = re.sub(r"\s+".join(map(re.escape, words.split())), replacement, text)
     return text

@@ -95,7 +95,7 @@ CERTIFICATES = Table("certificates", CertificateRow, partition_by=(), key=("scen
 
 @dataclass(frozen=True, kw_only=True)
 class SplitRow:
-    """That a scenario belongs to a split."""
+    """The membership of a scenario in a split."""
 
     split: Annotated[str, "test (all of the folder), or lite (200 scenarios that keep most of a ranking)"]
     scenario_id: shared.ScenarioId

@@ -17,7 +17,7 @@ import yaml
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes, write_text
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.benchmark.records import Release, load_release
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.models.registry import is_reference
@@ -72,11 +72,11 @@ def write_results(workspace: Workspace, target: Path, dataset: str, who: Attribu
     files = []
     for model, rows in overall.groupby("model", sort=True):
         entries = [{str(k): v for k, v in row.items()} for row in rows.to_dict("records")]
-        when = max(times[str(model)])
-        hub = [_hub_entry(row, dataset, when) for row in entries]
+        evaluated_at = max(times[str(model)])
+        hub = [_hub_entry(row, dataset, evaluated_at) for row in entries]
         files.append(f"{HUB}/{model}.yaml")
         write_text(target / files[-1], yaml.safe_dump(hub, sort_keys=False, allow_unicode=True))
-        record = _ever_record(str(model), entries, dataset, who, when, release)
+        record = _every_eval_record(str(model), entries, dataset, who, evaluated_at, release)
         name = uuid.UUID(digest(record)[:32], version=4)  # in the form of the random ids that the collection asks for
         files.append(f"{EVER}/{release.name}/{who.developer_of(str(model))}/{model}/{name}.json")
         write_text(target / files[-1], json.dumps(record, indent=1, ensure_ascii=False) + "\n")
@@ -85,7 +85,7 @@ def write_results(workspace: Workspace, target: Path, dataset: str, who: Attribu
 
 
 def _hub_entry(row: Row, dataset: str, when: pd.Timestamp) -> dict[str, Any]:
-    runs, version = counted(row["n_runs"], "run"), row["benchmark_version"]
+    runs, version = count_noun(row["n_runs"], "run"), row["benchmark_version"]
     notes = f"PECS (0 to 1), mean of {runs}; panel {row['panel']}; benchmark {version}"
     return {
         "dataset": {"id": dataset, "task_id": f"traps_{row['regime']}"},
@@ -95,7 +95,7 @@ def _hub_entry(row: Row, dataset: str, when: pd.Timestamp) -> dict[str, Any]:
     }
 
 
-def _ever_record(
+def _every_eval_record(
     model: str, rows: list[dict[str, Any]], dataset: str, who: Attribution, when: pd.Timestamp, release: Release
 ) -> dict[str, Any]:
     seconds = str(int(when.timestamp()))
@@ -117,11 +117,11 @@ def _ever_record(
             "developer": who.developer_of(model),
             "additional_details": _UNKNOWN,
         },
-        "evaluation_results": [result for row in rows for result in _ever_results(row, dataset, release)],
+        "evaluation_results": [result for row in rows for result in _every_eval_results(row, dataset, release)],
     }
 
 
-def _ever_results(row: Row, dataset: str, release: Release) -> Iterator[dict[str, Any]]:
+def _every_eval_results(row: Row, dataset: str, release: Release) -> Iterator[dict[str, Any]]:
     for name, metric in METRIC_WORDS.items():
         score: dict[str, Any] = {"score": float(row[name]), "details": {"panel": row["panel"], "epoch": row["epoch"]}}
         low, high = row[f"{name}_ci_low"], row[f"{name}_ci_high"]

@@ -26,7 +26,7 @@ def sign(folder: Path, private_key: Path) -> Path:
     library, path = _library(), folder / SIGNATURE
     try:
         config = library.signing.Config().use_elliptic_key_signer(private_key=private_key)
-        config.set_hashing_config(_hashing(library, path)).sign(folder, path)
+        config.set_hashing_config(_hashing_config(library, path)).sign(folder, path)
     except (ValueError, TypeError, OSError) as error:
         raise TrapsError(
             f"{private_key}: cannot sign ({plain(error)[:200]}); give a private elliptic key in PEM, e.g. of `openssl "
@@ -42,11 +42,11 @@ def check_signature(folder: Path, public_key: Path) -> str:
         raise TrapsError(f"{path}: is missing, so that there is nothing to verify; leave --key out")
     try:
         config = library.verifying.Config().use_elliptic_key_verifier(public_key=public_key)
-        config.set_hashing_config(_hashing(library, path)).verify(folder, path)
+        config.set_hashing_config(_hashing_config(library, path)).verify(folder, path)
     except (ValueError, TypeError, OSError) as error:
         return f"{SIGNATURE}: is not of this key over these files ({plain(error)[:300]})"
     return ""
 
 
-def _hashing(library: Any, signature: Path) -> Any:
+def _hashing_config(library: Any, signature: Path) -> Any:
     return library.hashing.Config().set_ignored_paths(paths=[signature], ignore_git_paths=False)

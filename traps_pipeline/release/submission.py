@@ -41,8 +41,8 @@ if TYPE_CHECKING:
 
 ABOUT = "submission.json"
 TABLES: Mapping[str, Table[Any]] = {f"{t.name}.parquet": t for t in (ITEMS, RESPONSES, VOTES, METRICS, LEADERBOARD)}
-MOST_FILE_BYTES, MOST_TABLE_BYTES, MOST_ROWS = 2 * 2**30, 4 * 2**30, 20_000_000
-MOST_ABOUT_BYTES = 2**20
+MAX_FILE_BYTES, MAX_TABLE_BYTES, MAX_ROWS = 2 * 2**30, 4 * 2**30, 20_000_000
+MAX_ABOUT_BYTES = 2**20
 _DATE = (1980, 1, 1, 0, 0, 0)
 _NO_ZIP = (zipfile.BadZipFile, zlib.error, ValueError, RuntimeError, EOFError, OverflowError, NotImplementedError)
 
@@ -65,7 +65,7 @@ class SubmittedJudge(_Strict):
 class About(_Strict):
     """The contents of `submission.json`.
 
-    panel: name of the panel. prompts: version of each regime's. versions: of the code that made the tables. files:
+    panel: name of the panel. prompts: version of each regime's. versions: code versions of the tables. files:
     SHA-256 of each table.
     """
 
@@ -124,7 +124,7 @@ def pack(workspace: Workspace, target: Path, name: str) -> About:
         for seat in load_panel(study.panel)
     ]
     try:
-        about = About(
+        description = About(
             name=name,
             benchmark=load_release().name,
             version=load_release().version,
@@ -137,8 +137,8 @@ def pack(workspace: Workspace, target: Path, name: str) -> About:
         )
     except ValidationError as error:
         raise TrapsError(f"--name {name!r:.100}: {explain(error)}; use lower-case letters, digits, - and .") from error
-    write_bytes(target, _zipped({ABOUT: about.model_dump_json(indent=1).encode() + b"\n", **content}))
-    return about
+    write_bytes(target, _zip({ABOUT: description.model_dump_json(indent=1).encode() + b"\n", **content}))
+    return description
 
 
 def table_bytes(table: Table[Any], frame: pd.DataFrame) -> bytes:
@@ -153,7 +153,7 @@ def table_bytes(table: Table[Any], frame: pd.DataFrame) -> bytes:
     return buffer.getvalue()
 
 
-def _zipped(content: Mapping[str, bytes]) -> bytes:
+def _zip(content: Mapping[str, bytes]) -> bytes:
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         for name, data in content.items():
@@ -170,8 +170,8 @@ def read_submission(path: Path) -> Submission:
     """Return a submission. Raises TrapsError for anything unexpected in the file."""
     try:
         size = path.stat().st_size
-        if size > MOST_FILE_BYTES:
-            raise TrapsError(f"{path}: has {size} bytes, at most {MOST_FILE_BYTES} are read; submit models one by one")
+        if size > MAX_FILE_BYTES:
+            raise TrapsError(f"{path}: has {size} bytes, at most {MAX_FILE_BYTES} are read; submit models one by one")
         with zipfile.ZipFile(path) as archive:
             content = _members(path, archive)
     except OSError as error:
@@ -181,12 +181,14 @@ def read_submission(path: Path) -> Submission:
     except _NO_ZIP as error:
         raise TrapsError(f"{path}: is no submission ({plain(error)[:200]}); get it again") from error
     try:
-        about = About.model_validate_json(content[ABOUT])
+        description = About.model_validate_json(content[ABOUT])
     except ValidationError as error:
         raise TrapsError(f"{path}: {ABOUT}: {explain(error)}; pack it again with `traps publish submit`") from error
-    altered = [file for file in TABLES if about.files.get(file) != hashlib.sha256(content[file]).hexdigest()]
+    altered_tables = [
+        file for file in TABLES if description.files.get(file) != hashlib.sha256(content[file]).hexdigest()
+    ]
     frames = {file: _frame(path, file, content[file]) for file in TABLES}
-    return Submission(path, about, frames, tuple(altered))
+    return Submission(path, description, frames, tuple(altered_tables))
 
 
 def _members(path: Path, archive: zipfile.ZipFile) -> dict[str, bytes]:
@@ -200,8 +202,8 @@ def _members(path: Path, archive: zipfile.ZipFile) -> dict[str, bytes]:
             raise TrapsError(
                 f"{path}: {entry.filename} is compressed or encrypted; pack it with `traps publish submit`"
             )
-        if entry.filename == ABOUT and entry.file_size > MOST_ABOUT_BYTES:
-            raise TrapsError(f"{path}: {ABOUT} has {entry.file_size} bytes, at most {MOST_ABOUT_BYTES} are read")
+        if entry.filename == ABOUT and entry.file_size > MAX_ABOUT_BYTES:
+            raise TrapsError(f"{path}: {ABOUT} has {entry.file_size} bytes, at most {MAX_ABOUT_BYTES} are read")
     return {entry.filename: archive.read(entry) for entry in entries}
 
 
@@ -214,7 +216,7 @@ def _frame(path: Path, file: str, content: bytes) -> pd.DataFrame:
     try:
         parquet = pq.ParquetFile(pa.BufferReader(content))
         groups = [parquet.metadata.row_group(i) for i in range(parquet.metadata.num_row_groups)]
-        if parquet.metadata.num_rows > MOST_ROWS or sum(g.total_byte_size for g in groups) > MOST_TABLE_BYTES:
+        if parquet.metadata.num_rows > MAX_ROWS or sum(g.total_byte_size for g in groups) > MAX_TABLE_BYTES:
             raise TrapsError(f"{path}: {file} is too large ({parquet.metadata.num_rows} rows)")
         schema = table.arrow_schema()
         if parquet.schema_arrow.names != schema.names or parquet.schema_arrow.types != schema.types:

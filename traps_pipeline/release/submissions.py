@@ -13,7 +13,7 @@ import pandas as pd
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes, write_text
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.models.judges import id_of_judges
 from traps_pipeline.release.released_rows import SUBMITTED
 from traps_pipeline.release.submission import Submission, read_submission, table_bytes
@@ -43,8 +43,8 @@ class AcceptedSubmission:
     def group(self) -> tuple[str, str]:
         """The items' digest and the panel, which submissions ranked together share."""
         items = self.submission.table(ITEMS)
-        about = self.submission.about
-        return digest(sorted(items["item_hash"]))[:16], id_of_judges(about.panel, about.judges)
+        description = self.submission.about
+        return digest(sorted(items["item_hash"]))[:16], id_of_judges(description.panel, description.judges)
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class RankedGroup:
     @property
     def title(self) -> str:
         """The common properties of its entries, in words."""
-        return f"Benchmark {self.versions}, {counted(self.n_items, 'item')} ({self.items[:8]}), panel {self.panel}"
+        return f"Benchmark {self.versions}, {count_noun(self.n_items, 'item')} ({self.items[:8]}), panel {self.panel}"
 
 
 @dataclass
@@ -91,16 +91,18 @@ def gather(paths: Iterable[Path], release: Path | None = None, say: Callable[[st
             board.refused.append(RefusedSubmission(path.name, [str(error)]))
             say(f"{path}: refused")
             continue
-        verified = verify(submission, release)
-        if verified.problems:
-            board.refused.append(RefusedSubmission(path.name, verified.problems))
+        verification = verify(submission, release)
+        if verification.problems:
+            board.refused.append(RefusedSubmission(path.name, verification.problems))
         else:
-            board.accepted.append(AcceptedSubmission(submission, verified))
-        say(f"{path}: {'refused' if verified.problems else 'verified'}")
+            board.accepted.append(AcceptedSubmission(submission, verification))
+        say(f"{path}: {'refused' if verification.problems else 'verified'}")
     names = Counter(entry.name for entry in board.accepted)
-    twice = [name for name, n in names.items() if n > 1]
-    if twice:
-        raise TrapsError(f"two submissions are called {twice[0]!r}; pack one of them again with another --name")
+    repeated_names = [name for name, n in names.items() if n > 1]
+    if repeated_names:
+        raise TrapsError(
+            f"two submissions are called {repeated_names[0]!r}; pack one of them again with another --name"
+        )
     if not board.accepted:
         reason = "; ".join(f"{entry.name}: {entry.problems[0]}" for entry in board.refused[:3])
         raise TrapsError(f"no submission holds, so there is nothing to rank ({reason})")

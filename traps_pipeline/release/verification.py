@@ -40,7 +40,7 @@ from traps_pipeline.scoring.scores import Scores, score
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.tables import Table, records
 
-MOST_SENTENCES = 10  # sentences per kind; further ones are counted
+MAX_SENTENCES = 10  # sentences per kind; further ones are counted
 CLOSE = 1e-9  # tolerance: linear algebra of another machine may differ in the last digits
 _ITEM_COLUMNS = ("side", "pair_id", "dataset", "benchmark_version")  # columns that an answer has from its item
 Row = Mapping[str, Any]
@@ -64,9 +64,9 @@ class Verification:
         """Record a check and its problems: keep the first ones and count the others."""
         problems = list(complaints)
         self.checked.append(topic)
-        self.problems += problems[:MOST_SENTENCES]
-        if len(problems) > MOST_SENTENCES:
-            self.problems.append(f"... and {len(problems) - MOST_SENTENCES} more of this kind")
+        self.problems += problems[:MAX_SENTENCES]
+        if len(problems) > MAX_SENTENCES:
+            self.problems.append(f"... and {len(problems) - MAX_SENTENCES} more of this kind")
 
 
 def verify(submission: Submission, release: Path | None = None) -> Verification:
@@ -74,26 +74,26 @@ def verify(submission: Submission, release: Path | None = None) -> Verification:
 
     Raises TrapsError for an unreadable release.
     """
-    verified = Verification()
+    verification = Verification()
     items = {row["item_id"]: row for row in records(submission.table(ITEMS))}
     answers, votes = records(submission.table(RESPONSES)), records(submission.table(VOTES))
-    verified.look("tables", (f"{file}: is not the table that was packed" for file in submission.altered))
-    verified.look("items", _wrong_items(items.values()))
-    verified.look("prompts", _wrong_prompts(submission))
-    verified.look("answers", _wrong_answers(answers, items))
-    verified.look("panel", _wrong_panel(submission, votes))
+    verification.look("tables", (f"{file}: is not the table that was packed" for file in submission.altered))
+    verification.look("items", _wrong_items(items.values()))
+    verification.look("prompts", _wrong_prompts(submission))
+    verification.look("answers", _wrong_answers(answers, items))
+    verification.look("panel", _wrong_panel(submission, votes))
     is_judged_by_rules = all(seat.backend == RULE for seat in submission.about.judges)
-    verified.look("votes", _wrong_votes(submission, votes, answers, items))
-    _numbers(verified, submission)
+    verification.look("votes", _wrong_votes(submission, votes, answers, items))
+    _numbers(verification, submission)
     if release is None:
-        verified.unchecked.append("items and clips against a release: name its folder with --release")
+        verification.unchecked.append("items and clips against a release: name its folder with --release")
     else:
-        verified.look("items and clips against the release", _strangers(items, release))
-    verified.unchecked.append("that the answers are the model's: only who asked it knows")
-    verified.unchecked.append("that the clips named by digest are those that the model was sent")
+        verification.look("items and clips against the release", _foreign_items(items, release))
+    verification.unchecked.append("that the answers are the model's: only who asked it knows")
+    verification.unchecked.append("that the clips named by digest are those that the model was sent")
     if not is_judged_by_rules:
-        verified.unchecked.append("that the judges cast these votes: asking language models again needs their keys")
-    return verified
+        verification.unchecked.append("that the judges cast these votes: asking language models again needs their keys")
+    return verification
 
 
 # --- items and prompts ------------------------------------------------------------------------------------------------
@@ -126,9 +126,9 @@ def released_items(release: Path) -> dict[str, tuple[str, str]]:
     from traps_pipeline.release.checksums import altered_files
     from traps_pipeline.release.content import CLIPS
 
-    altered = altered_files(release)
-    if altered:
-        raise TrapsError(f"{release}: is not what was released: {altered[0]}")
+    problems = altered_files(release)
+    if problems:
+        raise TrapsError(f"{release}: is not what was released: {problems[0]}")
     items = {}
     for number, line in read_lines(release / CLIPS / "metadata.jsonl"):
         row = json.loads(line)
@@ -140,16 +140,16 @@ def released_items(release: Path) -> dict[str, tuple[str, str]]:
     return items
 
 
-def _strangers(items: Mapping[str, Row], release: Path) -> Iterator[str]:
-    released = released_items(release)
+def _foreign_items(items: Mapping[str, Row], release: Path) -> Iterator[str]:
+    released_digests = released_items(release)
     for id_, row in items.items():
-        if id_ not in released:
+        if id_ not in released_digests:
             yield f"item {id_}: is not in the release"
-        elif released[id_][1] != row["media_digest"]:
+        elif released_digests[id_][1] != row["media_digest"]:
             yield f"item {id_}: its clip is not the released one"
-        elif released[id_][0] != row["item_hash"]:
+        elif released_digests[id_][0] != row["item_hash"]:
             yield f"item {id_}: its question, choices or answer are not the released ones"
-    missing_ids = sorted(id_ for id_ in released if id_.partition(":")[0] in DATASETS and id_ not in items)
+    missing_ids = sorted(id_ for id_ in released_digests if id_.partition(":")[0] in DATASETS and id_ not in items)
     for id_ in missing_ids:
         yield f"item {id_}: is in the release and was not asked"
 
@@ -157,7 +157,7 @@ def _strangers(items: Mapping[str, Row], release: Path) -> Iterator[str]:
 # --- answers and votes ------------------------------------------------------------------------------------------------
 
 
-def _named(row: Row) -> str:
+def _row_name(row: Row) -> str:
     return f"{row['model']} ({row['regime']}, run {row['run']}) on {row['item_id']}"
 
 
@@ -166,16 +166,16 @@ def _wrong_answers(answers: Sequence[Row], items: Mapping[str, Row]) -> Iterator
     for row in answers:
         item = items.get(row["item_id"])
         if item is None:
-            yield f"answer of {_named(row)}: there is no such item"
+            yield f"answer of {_row_name(row)}: there is no such item"
             continue
         items_of.setdefault((row["dataset"], row["model"], row["regime"], row["run"]), set()).add(row["item_id"])
         if any(row[name] != item[name] for name in _ITEM_COLUMNS):
-            yield f"answer of {_named(row)}: its pair, side, dataset or version is not its item's"
+            yield f"answer of {_row_name(row)}: its pair, side, dataset or version is not its item's"
         text = row["text"] or ""
         if (row["outcome"] in JUDGED) != bool(text.strip()):
-            yield f"answer of {_named(row)}: outcome {row['outcome']!r} does not go with its text"
+            yield f"answer of {_row_name(row)}: outcome {row['outcome']!r} does not go with its text"
         elif row["outcome"] in JUDGED and (reason := degenerate(text)):
-            yield f"answer of {_named(row)}: {reason}, so it is none"
+            yield f"answer of {_row_name(row)}: {reason}, so it is none"
     expected = dict[str, set[str]]()
     for id_, item in items.items():
         expected.setdefault(item["dataset"], set()).add(id_)
@@ -185,19 +185,19 @@ def _wrong_answers(answers: Sequence[Row], items: Mapping[str, Row]) -> Iterator
 
 
 def _wrong_panel(submission: Submission, votes: Sequence[Row]) -> Iterator[str]:
-    about = submission.about
-    own = id_of_judges(about.panel, about.judges)
-    for panel in sorted({row["panel"] for row in votes} - {own}):
-        yield f"panel {panel!r:.100}: these judges and this version's prompts are {own}"
-    if RULE in {seat.backend for seat in about.judges} and not about.judged_by_rules:
+    description = submission.about
+    own_id = id_of_judges(description.panel, description.judges)
+    for panel in sorted({row["panel"] for row in votes} - {own_id}):
+        yield f"panel {panel!r:.100}: these judges and this version's prompts are {own_id}"
+    if RULE in {seat.backend for seat in description.judges} and not description.judged_by_rules:
         for model in sorted({row["model"] for row in votes}):
             if not is_reference(model):
                 yield f"model {model!r:.100}: rules judged it, which are made for reference models, and nobody says so"
-    for judge in sorted({row["judge"] for row in votes} - {seat.id for seat in about.judges}):
+    for judge in sorted({row["judge"] for row in votes} - {seat.id for seat in description.judges}):
         yield f"judge {judge!r:.100}: sits in no panel of the submission"
-    rules = [seat for seat in about.judges if seat.backend == RULE]
+    rules = [seat for seat in description.judges if seat.backend == RULE]
     if rules and any(seat.params != {"rules": RULES_VERSION} for seat in rules):
-        yield f"panel {about.panel!r}: its rules are of another version than {RULES_VERSION}"
+        yield f"panel {description.panel!r}: its rules are of another version than {RULES_VERSION}"
 
 
 def _wrong_votes(
@@ -212,31 +212,31 @@ def _wrong_votes(
         key = (row["item_id"], row["model"], row["regime"], row["run"])
         answer, item, seat = texts.get(key), items.get(row["item_id"]), seats.get(row["judge"])
         if answer is None or item is None or seat is None or row["task"] not in tasks_for(item["side"]):
-            yield f"vote of {row['judge']!r:.60} on {row['task']!r:.40} of {_named(row)}: there is nothing to judge"
+            yield f"vote of {row['judge']!r:.60} on {row['task']!r:.40} of {_row_name(row)}: there is nothing to judge"
             continue
         cast.setdefault(key, set()).add((row["task"], row["judge"]))
         cell = Cell(row["dataset"], Evaluation(row["model"], row["regime"], row["run"]))
         request = vote_request(seat, row["task"], cell, item, answer["text"])
         if request.key != row["vote_key"]:
-            yield f"answer of {_named(row)}: is not the text, or not to the question, that {seat.id} judged"
+            yield f"answer of {_row_name(row)}: is not the text, or not to the question, that {seat.id} judged"
             continue
-        wrong = _other_vote(row, item, _cast_again(str(row["task"]), request.user) if seat.backend == RULE else None)
-        if wrong:
-            yield f"vote of {seat.id} on {row['task']} of {_named(row)}: {wrong}"
+        problem = _vote_difference(row, item, _recast(str(row["task"]), request.user) if seat.backend == RULE else None)
+        if problem:
+            yield f"vote of {seat.id} on {row['task']} of {_row_name(row)}: {problem}"
     for key, row in texts.items():
         item = items.get(row["item_id"])
         expected = {(task, judge) for task in tasks_for(item["side"]) for judge in seats} if item else set()
         for task, judge in sorted(expected - cast.get(key, set())):
-            yield f"vote of {judge} on {task} of {_named(row)}: is missing"
+            yield f"vote of {judge} on {task} of {_row_name(row)}: is missing"
 
 
 @cache
-def _cast_again(task: str, user: str) -> Outcome:
+def _recast(task: str, user: str) -> Outcome:
     """Return what the rules make of a request: they read its text and its task alone."""
     return asyncio.run(RuleJudge().ask(Request("rules", RULE, {}, "", user, {"task": task})))
 
 
-def _other_vote(row: Row, item: Row, again: Outcome | None) -> str:
+def _vote_difference(row: Row, item: Row, again: Outcome | None) -> str:
     """Return how a vote differs from the correct one; wrong kinds decide nothing."""
     try:
         return _difference(row, item, again)
@@ -251,16 +251,24 @@ def _difference(row: Row, item: Row, again: Outcome | None) -> str:
         vote = parse_vote(row["task"], {"outcome": again.kind, "text": again.text}, item)
         expected = {decision: vote.decision}
         expected |= {name: getattr(vote, name) for name in ("extracted_value", "valid", "invalid_reason")}
-        wrong = [name for name, value in expected.items() if row[name] != value]
-        return f"{wrong[0]} is {row[wrong[0]]!r:.40}, its rules say {expected[wrong[0]]!r:.40}" if wrong else ""
+        wrong_columns = [name for name, value in expected.items() if row[name] != value]
+        return (
+            f"{wrong_columns[0]} is {row[wrong_columns[0]]!r:.40}, its rules say {expected[wrong_columns[0]]!r:.40}"
+            if wrong_columns
+            else ""
+        )
     if not row["valid"]:
         return "is invalid and decides nothing, yet has a decision" if row[decision] is not None else ""
     if row[decision] is None:
         return "is valid and has no decision"
     if decision == "correct":
         labels, aliases = list(item["labels"]), json.loads(item["aliases"])
-        own = is_correct(row["extracted_value"], item["ground_truth"], item["answer_type"], labels, aliases)
-        return "" if own == row["correct"] else f"correct is {row['correct']}, its extracted value gives {own}"
+        own_decision = is_correct(row["extracted_value"], item["ground_truth"], item["answer_type"], labels, aliases)
+        return (
+            ""
+            if own_decision == row["correct"]
+            else f"correct is {row['correct']}, its extracted value gives {own_decision}"
+        )
     return ""
 
 
@@ -281,11 +289,11 @@ def _numbers(verified: Verification, submission: Submission) -> None:
     except (TrapsError, ValueError, KeyError, TypeError) as error:
         verified.problems.append(f"no number can be computed: {error}")
         return
-    verified.look("metrics", _other_numbers(METRICS, submission.table(METRICS), verified.scored.metrics))
-    verified.look("leaderboard", _other_numbers(LEADERBOARD, submission.table(LEADERBOARD), verified.scored.board))
+    verified.look("metrics", _number_differences(METRICS, submission.table(METRICS), verified.scored.metrics))
+    verified.look("leaderboard", _number_differences(LEADERBOARD, submission.table(LEADERBOARD), verified.scored.board))
 
 
-def _other_numbers(table: Table[Any], stated: pd.DataFrame, recomputed: pd.DataFrame) -> Iterator[str]:
+def _number_differences(table: Table[Any], stated: pd.DataFrame, recomputed: pd.DataFrame) -> Iterator[str]:
     key = list(table.key)
     frames = (stated, recomputed)
     stated_rows, own_rows = ({tuple(row[k] for k in key): row for row in records(frame)} for frame in frames)

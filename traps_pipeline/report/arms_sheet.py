@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.protocol.datasets import ARMS, OCCLUDER_DOSES, OCCLUDER_LOOKS
-from traps_pipeline.report.contact_sheet import SampledClip, sampled, telling_times
+from traps_pipeline.report.contact_sheet import SampledClip, sample_clip, telling_times
 from traps_pipeline.report.writing import figure_style, new_figure
 from traps_pipeline.video.encode import decode
 
@@ -66,14 +66,14 @@ def _moments(clip: Path) -> np.ndarray:
 def _rows(sides: pd.DataFrame, arms: pd.DataFrame, scenario: str, root: Path, times: np.ndarray) -> Iterator[Row]:
     """Yield control and void, then arms to be answered, then arms to be abstained on."""
     pair = sides.loc[sides["scenario_id"] == scenario].sort_values("side")
-    own = arms.loc[arms["scenario_id"] == scenario].sort_values(["side", "arm"])
-    for row in (*pair.to_dict("records"), *own.to_dict("records")):
+    scenario_arms = arms.loc[arms["scenario_id"] == scenario].sort_values(["side", "arm"])
+    for row in (*pair.to_dict("records"), *scenario_arms.to_dict("records")):
         frames, times_s = decode(root / str(row["clip"]))
         truth = row["ground_truth"]
         name = str(row.get("arm") or row["side"])
         right = "must be abstained on" if row["side"] == "void" else f"must be answered: {truth}"
         right = f"no void, {truth} shows through" if name in OCCLUDER_DOSES else right
-        yield Row(name, right, str(row["question"]), sampled(frames, times_s, times))
+        yield Row(name, right, str(row["question"]), sample_clip(frames, times_s, times))
 
 
 def _sheet(scenario: str, rows: list[Row], times: np.ndarray) -> Figure:
@@ -81,8 +81,8 @@ def _sheet(scenario: str, rows: list[Row], times: np.ndarray) -> Figure:
 
     Frames after a clip's end are hatched.
     """
-    _, tall, wide, _ = rows[0].clip.frames.shape
-    row_in = FRAME_IN * tall / wide + GAP_IN
+    _, frame_height, frame_width, _ = rows[0].clip.frames.shape
+    row_in = FRAME_IN * frame_height / frame_width + GAP_IN
     width, height = WORDS_IN + MOMENTS * (FRAME_IN + GAP_IN), HEAD_IN + len(rows) * row_in
     with figure_style():
         figure = new_figure(width, height, 150, layout=None)
@@ -96,7 +96,7 @@ def _sheet(scenario: str, rows: list[Row], times: np.ndarray) -> Figure:
         for k, row in enumerate(rows):
             top = height - HEAD_IN - k * row_in
             words: dict[str, Any] = {"va": "top", "linespacing": 1.3, "parse_math": False}
-            lines = [row.right, *_own_words(row, rows[0])]
+            lines = [row.right, *_changed_question(row, rows[0])]
             name = row.name.replace("_", " ")
             figure.text(0.1 / width, (top - 0.2) / height, name, size=9, weight="bold", **words)
             figure.text(0.1 / width, (top - 0.42) / height, "\n".join(lines), size=7.5, color=SOFT, **words)
@@ -108,7 +108,7 @@ def _sheet(scenario: str, rows: list[Row], times: np.ndarray) -> Figure:
     return figure
 
 
-def _own_words(row: Row, control: Row) -> list[str]:
+def _changed_question(row: Row, control: Row) -> list[str]:
     """Return the question of a row whose question differs from the control's."""
     if row.question == control.question:
         return []

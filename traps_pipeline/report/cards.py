@@ -94,8 +94,8 @@ def table_card(report: TableReport, sources: Sources, address: Address | None = 
     run = [table for table in tables if len(table.rows) or table.none]
     if not run:
         return Card(name, title, why=tables[0].why)
-    absent = [f"{table.title}: {table.absence}" for table in tables if table not in run]
-    return Card(name, title, _fragment("tables", own=tables_html(run, title, address), absent=absent, published={}))
+    absences = [f"{table.title}: {table.absence}" for table in tables if table not in run]
+    return Card(name, title, _fragment("tables", own=tables_html(run, title, address), absent=absences, published={}))
 
 
 def paper_card(report: TableReport | FigureReport, sources: Sources) -> Card:
@@ -106,10 +106,10 @@ def paper_card(report: TableReport | FigureReport, sources: Sources) -> Card:
         except NotRun:
             pictures = {}
         return Card(_name(report), report.title, _fragment("figures", pictures=pictures, alt=report.title))
-    published = {"As the paper prints it": printed} if (printed := report.as_printed()) else {}
+    published = {"As the paper prints it": printed_tables} if (printed_tables := report.as_printed()) else {}
     if report.recomputed:
         published["Recomputed from the published tables"] = report.tables(sources.paper)
-    tables = {words: tables_html(each, "", None) for words, each in published.items()}
+    tables = {words: tables_html(table_group, "", None) for words, table_group in published.items()}
     return Card(_name(report), report.title, _fragment("tables", own=[], absent=[], published=tables))
 
 
@@ -147,7 +147,7 @@ def picture_card(picture: Picture) -> Card:
         images = [_picture(name, figure, picture.kind) for name, figure in picture.figures().items()]
     except NotRun as reason:
         return Card(picture.name, picture.title, why=str(reason))
-    pictures = {f"{k}" if k > 1 else "": each for k, each in enumerate(images, 1)}
+    pictures = {f"{k}" if k > 1 else "": image for k, image in enumerate(images, 1)}
     return Card(picture.name, picture.title, _fragment("figures", pictures=pictures, alt=picture.title))
 
 

@@ -61,7 +61,7 @@ class TableReport:
 
     @property
     def published(self) -> bool:
-        """Whether the paper has anything to show here."""
+        """Whether the paper has such a table."""
         return bool(self.paper or self.recomputed)
 
     def tables(self, results: Results) -> list[PrintedTable]:
@@ -71,38 +71,41 @@ class TableReport:
         return results.kept[self.name]
 
     def _tables(self, results: Results) -> list[PrintedTable]:
-        from traps_pipeline.report.tables.table_columns import printed
+        from traps_pipeline.report.tables.table_columns import printed_columns
 
         if not results.is_study and not self.recomputed:
             return []
         remarks = [results.judged_by] if _is_judged(self.reads) else []
-        with_columns = ((t, printed(results, t.rows, t.columns)) for t in self.make(results))
+        with_columns = ((t, printed_columns(results, t.rows, t.columns)) for t in self.make(results))
         tables = [replace(table, columns=columns, notes=[*remarks, *table.notes]) for table, columns in with_columns]
         return [table for table in tables if results.is_study or table.name in self.recomputed]
 
     def as_printed(self) -> list[PrintedTable]:
-        """Return the paper's own tables, and figures that only its text states."""
+        """Return the paper's tables as printed, with figures that only its text states."""
         from traps_pipeline.report.printed_tables import in_text
 
-        of_paper = _function(f"printed_tables.{self.paper}")() if self.paper else []
-        return [*of_paper, *in_text(self.name)]
+        paper_tables = _function(f"printed_tables.{self.paper}")() if self.paper else []
+        return [*paper_tables, *in_text(self.name)]
 
     def files(self, results: Results) -> dict[str, bytes]:
-        """Return files by path below `tables`; for the paper below `tables/published` and `tables/recomputed`."""
+        """Return files by path; the paper's are in `tables/published` and `recomputed`."""
         from traps_pipeline.report.writing import table_files
 
         if results.is_study:
             parts = {"tables": self.tables(results)}
         else:
             parts = {f"tables/{PAPER}": self.as_printed(), f"tables/{RECOMPUTED}": self.tables(results)}
-        named = [(folder, file) for folder, tables in parts.items() for t in tables for file in table_files(t).items()]
-        return {f"{folder}/{name}": content for folder, (name, content) in named}
+        folder_files = [
+            (folder, file) for folder, tables in parts.items() for t in tables for file in table_files(t).items()
+        ]
+        return {f"{folder}/{name}": content for folder, (name, content) in folder_files}
 
 
 @dataclass(frozen=True)
 class FigureReport:
-    """A figure. reads: the stages whose tables it uses; published: whether the paper prints its numbers.
+    """A figure.
 
+    reads: the stages whose tables it uses; published: whether the paper prints its numbers.
     frames: the frames of `Results` that it draws, if it is to be drawn again only when these change.
     """
 
@@ -133,7 +136,7 @@ class FigureReport:
         return f"{self.finding(results)} {self.doc}".strip()
 
     def inputs(self, results: Results) -> list[str]:
-        """Return the frames that it draws, and the words of those that were refused and of those who judged."""
+        """Return the frames that it draws, with refusals and judges, as text."""
         frames: list[pd.DataFrame] = [getattr(results, name) for name in self.frames]
         return [repr(rows.to_dict("split")) for rows in frames] + [repr(results.refused), results.judged_by]
 

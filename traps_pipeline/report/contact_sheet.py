@@ -28,8 +28,8 @@ class Layout:
     """Widths (inches) and texts of a pair.
 
     The defaults fit the width of a printed page, on which no text may be smaller than 6 points. header: room for the
-    words above its frames; letters: of a question per line; questions: maximum lines of each question; ids: whether its
-    scenario is named; moments: frames per clip; columns: pairs side by side.
+    words above its frames; letters: letters of a question per line; questions: maximum lines of each question; ids:
+    whether its scenario is named; moments: frames per clip; columns: pairs side by side.
     """
 
     block: float = 1.98
@@ -78,8 +78,10 @@ def pairs_figure(items: pd.DataFrame, root: Path, layout: Layout = PAGE) -> Figu
             row, column = divmod(k, columns)
             left = column * (layout.block + layout.gap) + 0.8 * layout.gap
             top = height - 0.1 - sum(rows[:row]) - layout.header
-            tall = layout.block * ratio_of(block[0])
-            axes = figure.add_axes((left / width, (top - tall) / height, layout.block / width, tall / height))
+            block_height = layout.block * ratio_of(block[0])
+            axes = figure.add_axes(
+                (left / width, (top - block_height) / height, layout.block / width, block_height / height)
+            )
             draw_pair(axes, pair, *block, layout)
     return figure
 
@@ -101,11 +103,11 @@ def six_pairs(items: pd.DataFrame) -> pd.DataFrame:
 
 def whole_pairs(items: pd.DataFrame) -> list[pd.DataFrame]:
     """Return complete pairs as frames of two rows indexed by side, occlusion first."""
-    complete = items.loc[items.groupby("pair_id")["side"].transform("nunique") == 2]
-    complete = complete.assign(place=complete["dataset"].map(DATASETS.index)).sort_values(
+    complete_items = items.loc[items.groupby("pair_id")["side"].transform("nunique") == 2]
+    complete_items = complete_items.assign(place=complete_items["dataset"].map(DATASETS.index)).sort_values(
         ["place", "sub_scenario", "pair_id"]
     )
-    return [pair.set_index("side") for _, pair in complete.groupby("pair_id", sort=False)]
+    return [pair.set_index("side") for _, pair in complete_items.groupby("pair_id", sort=False)]
 
 
 def moments_of(pair: pd.DataFrame, root: Path, moments: int) -> tuple[SampledClip, SampledClip, np.ndarray]:
@@ -113,7 +115,7 @@ def moments_of(pair: pd.DataFrame, root: Path, moments: int) -> tuple[SampledCli
     control, times_s = decode(root / str(pair.at["control", "clip"]))
     void, void_at = decode(root / str(pair.at["void", "clip"]))
     times = telling_times(control, times_s, moments)
-    return sampled(control, times_s, times), sampled(void, void_at, times), times
+    return sample_clip(control, times_s, times), sample_clip(void, void_at, times), times
 
 
 def telling_times(frames: np.ndarray, at: np.ndarray, moments: int) -> np.ndarray:
@@ -123,11 +125,13 @@ def telling_times(frames: np.ndarray, at: np.ndarray, moments: int) -> np.ndarra
     time is also included.
     """
     visible_frames = len(before_occluder(frames))
-    closed = [len(at) - 1] if visible_frames < len(at) and moments > 3 else []
-    return at[np.append(np.linspace(0, visible_frames - 1, moments - len(closed)).round(), closed).astype(int)]
+    closed_indices = [len(at) - 1] if visible_frames < len(at) and moments > 3 else []
+    return at[
+        np.append(np.linspace(0, visible_frames - 1, moments - len(closed_indices)).round(), closed_indices).astype(int)
+    ]
 
 
-def sampled(frames: np.ndarray, at: np.ndarray, times: np.ndarray) -> SampledClip:
+def sample_clip(frames: np.ndarray, at: np.ndarray, times: np.ndarray) -> SampledClip:
     """Return the frames nearest to the times; a clip ends a frame after its last one."""
     step = float(at[1] - at[0]) if len(at) > 1 else 0.0
     end = float(at[-1]) + step
@@ -156,7 +160,7 @@ def draw_pair(
         for k in range(moments):
             left = k * (width + GAP)
             if k < clip.known:
-                canvas[top : top + height, left : left + width] = _fitted(clip.frames[k], height, width)
+                canvas[top : top + height, left : left + width] = _fit(clip.frames[k], height, width)
                 continue
             hatch = {"hatch": "////", "facecolor": "#f2f4f7", "edgecolor": "#c3c9d2", "linewidth": 0.5}
             axes.add_patch(Rectangle((left, top), width - 1, height - 1, **hatch))
@@ -174,11 +178,13 @@ def draw_pair(
 
 def _draw_header(axes: Axes, pair: pd.DataFrame, layout: Layout) -> None:
     """Draw scenario and ground truth in bold, and the questions below them."""
-    by_side = {side: str(pair.at[side, "question"]) for side in ("control", "void")}
-    is_same = by_side["control"] == by_side["void"]
-    questions = [by_side["control"]] if is_same else [f"{side}: {question}" for side, question in by_side.items()]
-    fit = {"max_lines": layout.questions, "placeholder": " …"}
-    lines = [line for question in questions for line in textwrap.wrap(question, layout.letters, **fit)]
+    question_of = {side: str(pair.at[side, "question"]) for side in ("control", "void")}
+    is_same = question_of["control"] == question_of["void"]
+    questions = (
+        [question_of["control"]] if is_same else [f"{side}: {question}" for side, question in question_of.items()]
+    )
+    wrap_options = {"max_lines": layout.questions, "placeholder": " …"}
+    lines = [line for question in questions for line in textwrap.wrap(question, layout.letters, **wrap_options)]
     truth = pair.at["control", "ground_truth"]
     scenario, sub_scenario, dataset = (pair.at["control", c] for c in ("scenario_id", "sub_scenario", "dataset"))
     title = f"{sub_scenario} ({dataset})"
@@ -198,7 +204,7 @@ def _draw_header(axes: Axes, pair: pd.DataFrame, layout: Layout) -> None:
     )
 
 
-def _fitted(frame: np.ndarray, height: int, width: int) -> np.ndarray:
+def _fit(frame: np.ndarray, height: int, width: int) -> np.ndarray:
     """Return the frame resized to the control's size, so that clips align."""
     if frame.shape[:2] == (height, width):
         return frame

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from traps_pipeline.base.terminal import plain
-from traps_pipeline.base.wording import counted, in_percent
+from traps_pipeline.base.wording import count_noun, in_percent
 from traps_pipeline.protocol.datasets import SHORT
 from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.report.figures.expression_figures import SCORES, orders, scored_items
@@ -24,7 +24,7 @@ _CELL = ["regime", "target", "layer", "unit", "dose", "side"]
 _POSITIONS = {"changed": "changed visual tokens", "unchanged": "unchanged visual tokens", "last": "the last token"}
 
 
-def _joined(sentences: Callable[[Results], Iterator[str]]) -> Callable[[Results], str]:
+def _join_sentences(sentences: Callable[[Results], Iterator[str]]) -> Callable[[Results], str]:
     return lambda results: " ".join(sentences(results))
 
 
@@ -33,7 +33,7 @@ def _models(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
         yield plain(str(model)), group
 
 
-@_joined
+@_join_sentences
 def states_and_output(results: Results) -> Iterator[str]:
     """Yield how many answered voids states and output detect, and their AUROC."""
     for model, group in _models(scored_items(results)):
@@ -43,19 +43,20 @@ def states_and_output(results: Results) -> Iterator[str]:
             yield f"{model} answered no void under standard: nothing is encoded and not expressed."
             continue
         encoded, expressed = (int((voids[name] > 0).sum()) for name in ("own", "margin"))
-        wrongly = int((controls["own"] > 0).sum())
+        n_wrong = int((controls["own"] > 0).sum())
         areas = [orders(part) for _, part in group.groupby("dataset", sort=False, observed=True)]
         means = {
             name: sum(area[name] for area in areas) / len(areas) for name in areas[0] if all(name in a for a in areas)
         }
         yield (
-            f"{model} answered {counted(len(voids), 'void')} under standard: its states put {encoded} of them among "
-            f"voids (and {wrongly} of {counted(len(controls), 'control')}), its output {expressed}; as orders of sides "
-            f"(AUROC, mean of datasets): {', '.join(f'{SCORES[name]} {mean:.2f}' for name, mean in means.items())}."
+            f"{model} answered {count_noun(len(voids), 'void')} under standard: its states put {encoded} of them among "
+            f"voids (and {n_wrong} of {count_noun(len(controls), 'control')}), its output {expressed}; as orders of "
+            f"sides (AUROC, mean of datasets): "
+            f"{', '.join(f'{SCORES[name]} {mean:.2f}' for name, mean in means.items())}."
         )
 
 
-@_joined
+@_join_sentences
 def lens(results: Results) -> Iterator[str]:
     """Yield how far voids lie above controls, by prompt, at the last two layers."""
     for model, group in _models(results.lens):
@@ -78,15 +79,18 @@ def lens(results: Results) -> Iterator[str]:
         )
 
 
-@_joined
+@_join_sentences
 def probe_baselines(results: Results) -> Iterator[str]:
     """Yield on how many pairs, within and across datasets, states beat all baselines."""
     for model, group in _models(beside(results)):
         states, noise, spread = (group[name].to_numpy(float) for name in ("value", "noise", "noise_spread"))
-        beaten = np.column_stack([group[[*SHORTCUTS, "output margin"]].to_numpy(float), noise + 2 * spread])
-        above, across = states > np.fmax.reduce(beaten, axis=1), (group["source"] != group["target"]).to_numpy(bool)
+        baseline_scores = np.column_stack([group[[*SHORTCUTS, "output margin"]].to_numpy(float), noise + 2 * spread])
+        is_above, across = (
+            states > np.fmax.reduce(baseline_scores, axis=1),
+            (group["source"] != group["target"]).to_numpy(bool),
+        )
         counts = [
-            f"{np.count_nonzero(above & kind)} of {counted(int(np.count_nonzero(kind)), noun)}"
+            f"{np.count_nonzero(is_above & kind)} of {count_noun(int(np.count_nonzero(kind)), noun)}"
             for kind, noun in ((across, "pair"), (~across, "dataset"))
         ]
         yield (
@@ -95,7 +99,7 @@ def probe_baselines(results: Results) -> Iterator[str]:
         )
 
 
-@_joined
+@_join_sentences
 def gate_arrows(results: Results) -> Iterator[str]:
     """Yield the default gate's effect on PECS, and the best gate on other features."""
     rows = results.gate
@@ -103,17 +107,17 @@ def gate_arrows(results: Results) -> Iterator[str]:
     for model, group in _models(rows.loc[rows["pecs"].notna()]):
         for regime, part in group.groupby("regime", sort=False, observed=True):
             gates = {row["features"]: row for row in part.to_dict("records")}
-            by_states = gates.pop("states", None)
-            if by_states is None or not gates:
+            states_gates = gates.pop("states", None)
+            if states_gates is None or not gates:
                 continue
             best = max(gates.values(), key=lambda row: row["pecs"])
             yield (
-                f"{model} under {regime}: a gate on states takes PECS from {by_states['plain_pecs']:.2f} to "
-                f"{by_states['pecs']:.2f}, the best other gate ({best['features']}) to {best['pecs']:.2f}."
+                f"{model} under {regime}: a gate on states takes PECS from {states_gates['plain_pecs']:.2f} to "
+                f"{states_gates['pecs']:.2f}, the best other gate ({best['features']}) to {best['pecs']:.2f}."
             )
 
 
-@_joined
+@_join_sentences
 def doses_among_nulls(results: Results) -> Iterator[str]:
     """Yield where directions of each prompt's states exceed 19 of 20 draws of all nulls."""
     rows = results.nulls
@@ -126,7 +130,7 @@ def doses_among_nulls(results: Results) -> Iterator[str]:
             best = max(ahead, key=lambda row: row["effect"], default=None)
             yield (
                 f"{model}: void directions of {directions} states do more than 19 of 20 draws of every null in "
-                f"{len(ahead)} of {counted(len(cells), 'cell')}" + (f", most of all {_cell(best)}." if best else ".")
+                f"{len(ahead)} of {count_noun(len(cells), 'cell')}" + (f", most of all {_cell(best)}." if best else ".")
             )
 
 
@@ -139,7 +143,7 @@ def _cell(row: Mapping[Any, Any]) -> str:
     )
 
 
-@_joined
+@_join_sentences
 def patching(results: Results) -> Iterator[str]:
     """Yield the positions with the largest effect at first and last layer."""
     rows = results.patching

@@ -49,7 +49,7 @@ from traps_pipeline.report.writing import (
     table_markdown,
     table_text,
 )
-from traps_pipeline.scoring.analyses import of_several_runs
+from traps_pipeline.scoring.analyses import null_single_deviations
 from traps_pipeline.scoring.metrics import joined_epochs
 from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.tables import records
@@ -138,43 +138,43 @@ def leaderboards(
     The ranking is of `overall`, or the board's first dataset if no model has all four. An entry without a row comes
     last. notes: further notes of the first table. brief: only the first table of each panel, with fewer columns.
     """
-    tables = [table for suffix, part in _by_panel(board) for table in _of_one_panel(part, robust, brief, suffix)]
+    tables = [table for suffix, part in _rows_by_panel(board) for table in _panel_tables(part, robust, brief, suffix)]
     return [replace(tables[0], notes=[*tables[0].notes, *notes]), *tables[1:]]
 
 
-def _by_panel(board: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
+def _rows_by_panel(board: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
     """Return rows by panel, with their tables' suffix; entries of several come last."""
     if board.empty:
         return [("", board)]
-    of_entry = board.groupby(["model", "regime"])["panel"].transform(joined_epochs)
-    panels = sorted(set(of_entry), key=lambda names: (names.count("+"), names))
-    return [(f"_{number}" if number else "", board.loc[of_entry == name]) for number, name in enumerate(panels)]
+    entry_panels = board.groupby(["model", "regime"])["panel"].transform(joined_epochs)
+    panels = sorted(set(entry_panels), key=lambda names: (names.count("+"), names))
+    return [(f"_{number}" if number else "", board.loc[entry_panels == name]) for number, name in enumerate(panels)]
 
 
-def _of_one_panel(board: pd.DataFrame, robust: pd.DataFrame | None, brief: bool, suffix: str) -> list[PrintedTable]:
+def _panel_tables(board: pd.DataFrame, robust: pd.DataFrame | None, brief: bool, suffix: str) -> list[PrintedTable]:
     datasets = set(board["dataset"])
-    ranked = next((name for name in TITLES if name in datasets), "overall")
-    other_datasets = [name for name in DATASETS if name in datasets and name != ranked]
-    others = [
+    ranked_dataset = next((name for name in TITLES if name in datasets), "overall")
+    other_datasets = [name for name in DATASETS if name in datasets and name != ranked_dataset]
+    other_tables = [
         _leaderboard(board.loc[board["dataset"] == name], name, [], {}, brief, suffix)
         for name in ([] if brief else other_datasets)
     ]
     rows = []
-    if robust is not None and ranked == "overall":
+    if robust is not None and ranked_dataset == "overall":
         rows = records(robust)
     row_of = {(row["model"], row["regime"]): row for row in rows}
     entries = {*zip(board["model"], board["regime"], strict=True)}
     row_of = {key: row for key, row in row_of.items() if key in entries}
-    return [_leaderboard(board, ranked, other_datasets, row_of, brief, suffix), *others]
+    return [_leaderboard(board, ranked_dataset, other_datasets, row_of, brief, suffix), *other_tables]
 
 
 def legend(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> dict[str, str]:
     """Return the entries of LEGEND for the board's columns and marks."""
-    needed = {column.heading: field for column, field in OPTIONAL.items()}
-    needed |= {INCOMPLETE_MARK: "incomplete", BROKEN_MARK: "is_broken"}
-    absent = {term for term, field in needed.items() if not (board.loc[:, field] > 0).any()}
-    absent |= {*ROBUST_TERMS} if robust is None or robust.empty else set()
-    return {term: meaning for term, meaning in LEGEND.items() if term not in absent}
+    optional_terms = {column.heading: field for column, field in OPTIONAL.items()}
+    optional_terms |= {INCOMPLETE_MARK: "incomplete", BROKEN_MARK: "is_broken"}
+    unused_terms = {term for term, field in optional_terms.items() if not (board.loc[:, field] > 0).any()}
+    unused_terms |= {*ROBUST_TERMS} if robust is None or robust.empty else set()
+    return {term: meaning for term, meaning in LEGEND.items() if term not in unused_terms}
 
 
 def provenance(board: pd.DataFrame) -> str:
@@ -191,19 +191,21 @@ def judged_by(board: pd.DataFrame) -> str:
     """Return a sentence that names the panels, and warns against comparing them."""
     panels = _distinct(board["panel"].unique(), "+")
     names = [_panel_in_words(panel) for panel in panels]
-    several = len(panels) > 1
-    sentence = f"Judged by the panel{'s' * several} {' and '.join(names) or NONE}"
-    sentence += "; figures of different panels are not ranked or compared" * several
+    has_several_panels = len(panels) > 1
+    sentence = f"Judged by the panel{'s' * has_several_panels} {' and '.join(names) or NONE}"
+    sentence += "; figures of different panels are not ranked or compared" * has_several_panels
     rows = board[["panel", "model"]].drop_duplicates().itertuples(index=False, name=None)
-    by_rules = sorted({model for panel, model in rows if is_judged_by_rules(panel, model)})
-    names_shown = ", ".join(by_rules[:5]) + (f" and {len(by_rules) - 5} more" if len(by_rules) > 5 else "")
-    return f"{sentence}." + (f" {BY_RULES[0].upper()}{BY_RULES[1:]}: {names_shown}." if by_rules else "")
+    rule_judged_models = sorted({model for panel, model in rows if is_judged_by_rules(panel, model)})
+    names_shown = ", ".join(rule_judged_models[:5]) + (
+        f" and {len(rule_judged_models) - 5} more" if len(rule_judged_models) > 5 else ""
+    )
+    return f"{sentence}." + (f" {BY_RULES[0].upper()}{BY_RULES[1:]}: {names_shown}." if rule_judged_models else "")
 
 
 def _panel_in_words(panel: str) -> str:
     name, _, version = panel.partition("@")
-    alone = ", one judge, so that nothing is known of agreement" if version.endswith(ONE_JUDGE) else ""
-    return f"{name} (version {version.removesuffix(ONE_JUDGE)}{alone})"
+    one_judge_note = ", one judge, so that nothing is known of agreement" if version.endswith(ONE_JUDGE) else ""
+    return f"{name} (version {version.removesuffix(ONE_JUDGE)}{one_judge_note})"
 
 
 def _distinct(values: Iterable[Any], separator: str) -> list[str]:
@@ -230,8 +232,8 @@ def _leaderboard(
     if brief:
         columns = [replace(c, spread="") for c in columns if c.field not in ("n_runs", "epoch", "benchmark_version")]
     else:
-        mixed = board["panel"].str.contains("+", regex=False).any()
-        notes = ["not ranked: each entry is of several panels" if mixed else "ranked by PECS", *notes]
+        is_mixed = board["panel"].str.contains("+", regex=False).any()
+        notes = ["not ranked: each entry is of several panels" if is_mixed else "ranked by PECS", *notes]
     return PrintedTable(
         f"leaderboard_{dataset}{suffix}", TITLES[dataset], rows, columns, notes, "this study has no leaderboard yet",
         _trace,
@@ -243,9 +245,9 @@ def _leaderboard(
 def _with_robust(rows: pd.DataFrame, beside: Robust) -> pd.DataFrame:
     """Return the rows with ROBUST_COLUMNS as printed."""
     robust_rows = [beside.get((row["model"], row["regime"])) for row in rows.to_dict("records")]
-    printed = {"conjunction": percent, "robust": fraction, "inference_acc": percent}
+    formats = {"conjunction": percent, "robust": fraction, "inference_acc": percent}
     return rows.assign(
-        **{name: [as_(row[name]) if row else NOT_RUN for row in robust_rows] for name, as_ in printed.items()}
+        **{name: [as_(row[name]) if row else NOT_RUN for row in robust_rows] for name, as_ in formats.items()}
     )
 
 
@@ -258,8 +260,8 @@ def _notes_on_arms(beside: Robust) -> list[str]:
         f"{', '.join(names) if len(entries) > 1 else 'all'} over {len(arms)} of {len(ARMS)} arms: {', '.join(arms)}"
         for arms, names in entries.items()
     ]
-    refused = dict.fromkeys(row["refused"] for row in beside.values() if row["refused"])
-    return [*notes, *(f"no conjunction and no robust figure: {reason}" for reason in refused)]
+    refusals = dict.fromkeys(row["refused"] for row in beside.values() if row["refused"])
+    return [*notes, *(f"no conjunction and no robust figure: {reason}" for reason in refusals)]
 
 
 def _trace(row: Mapping[str, Any], field: str) -> SourceItems | None:
@@ -274,22 +276,24 @@ def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.Dat
     Without a row of the dataset, counts are sums over all rows.
     """
     rows, entries = [], dict[tuple[str, str], dict[str, dict[str, Any]]]()
-    for row in of_several_runs(board).to_dict("records"):
+    for row in null_single_deviations(board).to_dict("records"):
         entries.setdefault((row["model"], row["regime"]), {})[row["dataset"]] = row
-    for by_dataset in entries.values():
-        main = by_dataset.get(dataset)
-        counted = list(by_dataset.values()) if main is None else [main]
-        entry: dict[str, Any] = {name: counted[0][name] for name in ("model", "regime")} | (main or {})
-        summed = ("n_pairs", "n_missing", "n_refused", "n_empty", "n_truncated", "n_unfinished", "n_degenerate")
-        entry |= {n: sum(row[n] for row in counted) for n in (*summed, "n_unread", "n_not_json", "n_rejects")}
-        entry["mark"] = _mark(main) if main else ""
-        entry["n_mark"] = INCOMPLETE_MARK if any(row["incomplete"] for row in counted) else ""
-        entry["model_mark"] = BROKEN_MARK if any(row["is_broken"] for row in counted) else ""
+    for dataset_rows in entries.values():
+        main_row = dataset_rows.get(dataset)
+        counted_rows = list(dataset_rows.values()) if main_row is None else [main_row]
+        entry: dict[str, Any] = {name: counted_rows[0][name] for name in ("model", "regime")} | (main_row or {})
+        summed_columns = ("n_pairs", "n_missing", "n_refused", "n_empty", "n_truncated", "n_unfinished", "n_degenerate")
+        entry |= {
+            n: sum(row[n] for row in counted_rows) for n in (*summed_columns, "n_unread", "n_not_json", "n_rejects")
+        }
+        entry["mark"] = _mark(main_row) if main_row else ""
+        entry["n_mark"] = INCOMPLETE_MARK if any(row["incomplete"] for row in counted_rows) else ""
+        entry["model_mark"] = BROKEN_MARK if any(row["is_broken"] for row in counted_rows) else ""
         entry["missing_mark"] = MISSING_MARK if entry["n_missing"] else ""
-        entry["ci"] = (main and interval(main)) or NONE
-        entry["bounds"] = _bounds(main) if main and main["n_missing"] else ""
+        entry["ci"] = (main_row and interval(main_row)) or NONE
+        entry["bounds"] = _bounds(main_row) if main_row and main_row["n_missing"] else ""
         for name in others:
-            row = by_dataset.get(name)
+            row = dataset_rows.get(name)
             entry |= {name: row["pecs"], f"{name}_mark": _mark(row)} if row else {}
         rows.append(entry)
     columns = [column.name for column in LEADERBOARD.columns]
@@ -318,6 +322,6 @@ def _bounds(row: Mapping[str, Any]) -> str:
 def _rank(entry: Mapping[str, Any]) -> tuple[bool, float, str, int]:
     """Return the sort key: best PECS first, nulls last, ties by model and regime."""
     pecs = float(entry.get("pecs", float("nan")))
-    null = pecs != pecs
+    is_null = pecs != pecs
     regimes = (*REGIMES, entry["regime"])
-    return null, 0.0 if null else -pecs, entry["model"], regimes.index(entry["regime"])
+    return is_null, 0.0 if is_null else -pecs, entry["model"], regimes.index(entry["regime"])

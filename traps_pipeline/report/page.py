@@ -35,17 +35,17 @@ def report_html(
     every number links to the items behind it. notes: those below the leaderboard; terms: words of the legend.
     """
     boards = leaderboards(board, robust, notes)
-    ranked = [table for table in boards if table.title == boards[0].title]  # one per panel
+    ranked_tables = [table for table in boards if table.title == boards[0].title]  # one per panel
     other_cards = [
         Card(table.name, f"Leaderboard, {table.title.lower()}", environment().get_template("tables.html.j2").render(
             own=tables_html([table], table.title, address), absent=[], published={}))
-        for table in boards if table not in ranked
+        for table in boards if table not in ranked_tables
     ]  # fmt: skip
     run = [[card for card in cards if card.html] for cards in (figures, pictures, [*other_cards, *tables])]
-    absent: dict[str, list[str]] = {}
+    names_by_reason: dict[str, list[str]] = {}
     for card in (*figures, *pictures, *tables):
         if not card.html:
-            absent.setdefault(card.why, []).append(card.title)
+            names_by_reason.setdefault(card.why, []).append(card.title)
     script = (TEMPLATES / "report.js").read_text(encoding="utf-8")
     return (
         environment()
@@ -55,12 +55,16 @@ def report_html(
             provenance=provenance(board),
             explorer=explorer,
             findings=findings,
-            boards=[{**table, "title": each.title} for each in ranked for table in tables_html([each], "", address)],
+            boards=[
+                {**table, "title": ranked_table.title}
+                for ranked_table in ranked_tables
+                for table in tables_html([ranked_table], "", address)
+            ],
             first=[card for card in run[0] if card.name == FIRST_CARD],
             figures=[card for card in run[0] if card.name != FIRST_CARD],
             pictures=run[1],
             appendix=run[2],
-            absent={reason: list(dict.fromkeys(titles)) for reason, titles in absent.items()},
+            absent={reason: list(dict.fromkeys(titles)) for reason, titles in names_by_reason.items()},
             shown={"leaderboard", *(card.name for cards in run for card in cards)},
             legend={**legend(board, robust), **(terms or {})},
             script=script,

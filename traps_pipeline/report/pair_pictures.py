@@ -44,17 +44,17 @@ class Picture:
 
     def figures(self) -> Mapping[str, Figure]:
         """Return figures by file name. Raises NotRun, or TrapsError for a damaged clip."""
-        return _of_whole_clips(self.make)
+        return _require_clips(self.make)
 
     def shown(self) -> Any:
         """Return `inputs`. Raises TrapsError for a damaged clip."""
-        return _of_whole_clips(self.inputs)
+        return _require_clips(self.inputs)
 
 
 Found = TypeVar("Found")
 
 
-def _of_whole_clips(find: Callable[[], Found]) -> Found:
+def _require_clips(find: Callable[[], Found]) -> Found:
     try:
         return find()
     except DamagedClip as error:
@@ -80,15 +80,15 @@ class PairPictures:
     def all(self) -> list[Picture]:
         """Return all pictures."""
         visual = self.items.loc[self.items["dataset"].isin(["occlusion", "chaotic"])] if len(self.items) else self.items
-        six = six_pairs(self.items) if len(self.items) else self.items
+        pair_items = six_pairs(self.items) if len(self.items) else self.items
         example = worked_example(self.workspace)
         inputs = [_as_json(example.pair), example.model, example.words] if example else []
         return [
             Picture("worked_example", "Worked example: a pair, the answers, the panel’s reading, the verdicts",
                     lambda: {"worked_example": self._example(example)},
                     ("items", "responses", "votes", "verdicts"), lambda: inputs),
-            Picture("six_pairs", "Six pairs: control above, void below", lambda: {"six_pairs": self._six(six)},
-                    ("items",), lambda: _as_json(six)),
+            Picture("six_pairs", "Six pairs: control above, void below", lambda: {"six_pairs": self._six(pair_items)},
+                    ("items",), lambda: _as_json(pair_items)),
             Picture("arms", "One scenario with its arms", self._arms, ("items", "arms"),
                     lambda: [_as_json(self.arms), _as_json(visual) if len(self.arms) else ""]),
             Picture("shortcuts", "How well one cue alone separates control from void (0.5 is chance)",
@@ -118,13 +118,13 @@ class PairPictures:
         """The table of `benchmark.shortcuts`; unchanged results come from a cache."""
         from traps_pipeline.benchmark.shortcuts import shortcuts
 
-        kept, store = self.workspace.reports / ".state" / "shortcuts.json", self.workspace.store
+        cache_path, store = self.workspace.reports / ".state" / "shortcuts.json", self.workspace.store
         cache: dict[str, list[float]] = {}
         with suppress(ValueError):  # a damaged file counts as none
-            cache = json.loads(store.here(kept).read_text(encoding="utf-8")) if store.has(kept) else {}
+            cache = json.loads(store.here(cache_path).read_text(encoding="utf-8")) if store.has(cache_path) else {}
         clips = self.workspace.bring(self.items["clip"]) if len(self.items) else self.workspace.root
         table = shortcuts(self.items, self.workspace.tables.read_all(VIDEOS), clips, cache)
-        store.write({kept: json.dumps(cache).encode()})
+        store.write({cache_path: json.dumps(cache).encode()})
         return table
 
     def _shortcuts(self) -> Figure:

@@ -32,11 +32,11 @@ def board_tables(workspace: Workspace) -> list[TextTable]:
     """Return the leaderboard from the tables, one per panel; none without pairs."""
     from traps_pipeline.people.human_score_rows import HUMAN_ROW, PANEL_ERRORS
     from traps_pipeline.report.leaderboard_page import leaderboard_tables
-    from traps_pipeline.report.tables.human_tables import said_by_people
+    from traps_pipeline.report.tables.human_tables import people_notes
     from traps_pipeline.scoring.score_rows import LEADERBOARD, ROBUST
 
     board = workspace.tables.read_all(LEADERBOARD)
     if board.empty:
         return []
-    notes = said_by_people(workspace.tables.read_all(HUMAN_ROW), workspace.tables.read_all(PANEL_ERRORS))
+    notes = people_notes(workspace.tables.read_all(HUMAN_ROW), workspace.tables.read_all(PANEL_ERRORS))
     return leaderboard_tables(board, workspace.tables.read_all(ROBUST), notes)

@@ -26,13 +26,13 @@ REGIME, SUB = Column("regime", "Regime", look="tag"), Column("sub_scenario", "Su
 PATH, TYPE = Column("path", "Source → target"), Column("transfer_type", "Transfer type")
 
 
-def of_paper(name: str, rows: pd.DataFrame, columns: Sequence[Column]) -> PrintedTable:
+def paper_table(name: str, rows: pd.DataFrame, columns: Sequence[Column]) -> PrintedTable:
     """Return the paper's table `name`, with title, place and notes of `tables.csv`."""
-    (about,) = as_printed("tables").query("name == @name").to_dict("records")
-    where = f"as the paper prints it (line {about['line']} of its LaTeX source)"
-    notes = [where, *([str(about["note"])] if about["note"] else [])]
+    (table_row,) = as_printed("tables").query("name == @name").to_dict("records")
+    source_note = f"as the paper prints it (line {table_row['line']} of its LaTeX source)"
+    notes = [source_note, *([str(table_row["note"])] if table_row["note"] else [])]
     return PrintedTable(
-        name, str(about["title"]), rows.reset_index(drop=True), columns, notes,
+        name, str(table_row["title"]), rows.reset_index(drop=True), columns, notes,
         dash="not given in the paper", deviation="± standard deviation over three runs",
     )  # fmt: skip
 
@@ -57,19 +57,19 @@ def in_text(card: str) -> list[PrintedTable]:
 def overall() -> list[PrintedTable]:
     """Return all sixteen models under the three regimes."""
     rows = as_printed("overall")
-    wide: pd.DataFrame = rows.loc[:, ["model"]].drop_duplicates()
+    table_rows: pd.DataFrame = rows.loc[:, ["model"]].drop_duplicates()
     columns = [MODEL]
     for regime in PRINTED_REGIMES:
         names = {field: f"{regime}_{field}" for field in SHARES}
         part = rows.loc[rows["regime"] == regime, ["model", *names]]
-        wide = wide.merge(part.rename(columns=names), on="model")
+        table_rows = table_rows.merge(part.rename(columns=names), on="model")
         columns += figures({names[field]: f"{heading}, {regime}" for field, heading in SHARES.items()})
-    return [of_paper("overall", wide, columns)]
+    return [paper_table("overall", table_rows, columns)]
 
 
 def replication_overall() -> list[PrintedTable]:
     """Return the two replication families, with one decimal."""
-    return [of_paper("replication_overall", as_printed("replication_overall"), [MODEL, REGIME, *figures(SHARES)])]
+    return [paper_table("replication_overall", as_printed("replication_overall"), [MODEL, REGIME, *figures(SHARES)])]
 
 
 def _cells(group: str) -> pd.DataFrame:
@@ -89,15 +89,15 @@ def _cells_of(cells: pd.DataFrame, dataset: str, regime: str) -> pd.DataFrame:
 def per_dataset() -> list[PrintedTable]:
     """Return PECS of the fourteen main-family models by dataset and regime."""
     cells = _cells("main")
-    wide: pd.DataFrame = cells.loc[:, ["model"]].drop_duplicates()
+    table_rows: pd.DataFrame = cells.loc[:, ["model"]].drop_duplicates()
     columns = [MODEL]
     for dataset in DATASETS:
         for regime in PRINTED_REGIMES:
             name = f"{dataset}_{regime}"
             part = _cells_of(cells, dataset, regime).loc[:, ["model", "pecs"]].rename(columns={"pecs": name})
-            wide = wide.merge(part, on="model")
+            table_rows = table_rows.merge(part, on="model")
             columns += figures({name: f"{TITLES[dataset]}, {regime[0].upper()}"})
-    return [of_paper("per_dataset", wide, columns)]
+    return [paper_table("per_dataset", table_rows, columns)]
 
 
 def expanded() -> list[PrintedTable]:
@@ -105,14 +105,14 @@ def expanded() -> list[PrintedTable]:
     cells = _cells("main")
     columns = [MODEL, *figures({field: SHARES[field] for field in ("acc_pct", "false_abs_pct", "abs_rec_pct", "pecs")})]
     keys = [(dataset, regime) for dataset in DATASETS for regime in PRINTED_REGIMES]
-    return [of_paper(f"expanded_{'_'.join(key)}", _cells_of(cells, *key), columns) for key in keys]
+    return [paper_table(f"expanded_{'_'.join(key)}", _cells_of(cells, *key), columns) for key in keys]
 
 
 def replication_per_dataset() -> list[PrintedTable]:
     """Return the two replication families on each dataset under each regime."""
     keys = [(m, d, r) for m in models_of(group="replication") for d in DATASETS for r in PRINTED_REGIMES]
     cells = with_titles(_cells("replication").set_index(["model", "dataset", "regime"]).loc[keys].reset_index())
-    return [of_paper("replication_per_dataset", cells, [MODEL, DATASET, REGIME, *figures(SHARES)])]
+    return [paper_table("replication_per_dataset", cells, [MODEL, DATASET, REGIME, *figures(SHARES)])]
 
 
 def visual_textual() -> list[PrintedTable]:
@@ -126,7 +126,7 @@ def visual_textual() -> list[PrintedTable]:
         rows[gap] = ["∞" if text == "inf" else f"{text}×" for text in rows[gap]]
         kinds = {f"{taxonomy}_visual_pct": "Vis. %", f"{taxonomy}_textual_pct": "Text %", gap: "Gap"}
         columns += figures({field: f"{taxonomy.capitalize()}, {word}" for field, word in kinds.items()})
-    return [of_paper("visual_textual", rows, columns)]
+    return [paper_table("visual_textual", rows, columns)]
 
 
 def naive() -> list[PrintedTable]:
@@ -134,21 +134,21 @@ def naive() -> list[PrintedTable]:
     rows = as_printed("pecs_vs_naive")
     rows = with_titles(rows.assign(false_abs_pct=rows["false_abs_pct"] + "%"))
     names = {"naive": "Naive", "pecs": "PECS", "false_abs_pct": "FA"}
-    return [of_paper("pecs_naive", rows, [MODEL, DATASET, *figures(names)])]
+    return [paper_table("pecs_naive", rows, [MODEL, DATASET, *figures(names)])]
 
 
 def degenerate() -> list[PrintedTable]:
     """Return six strategies whose PECS is 0, and why."""
     columns = figures({"acc": "Acc", "false_abs": "FA", "abs_rec": "AR", "j": "J"})
     columns = [Column("strategy", "Strategy"), *columns, Column("why", "Why PECS = 0")]
-    return [of_paper("degenerate_strategies", as_printed("degenerate_strategies"), columns)]
+    return [paper_table("degenerate_strategies", as_printed("degenerate_strategies"), columns)]
 
 
 def occlusion_sub_scenarios() -> list[PrintedTable]:
     """Return the fifteen occlusion sub-scenarios."""
     names = {"acc_pct": "Acc", "false_abs_pct": "FA", "abs_rec_pct": "AR", "guided_abs_rec_pct": "G-AR"}
     columns = [SUB, Column("answer_type", "Answer type"), *figures(names)]
-    return [of_paper("occlusion_sub_scenarios", as_printed("occlusion_subscenarios"), columns)]
+    return [paper_table("occlusion_sub_scenarios", as_printed("occlusion_subscenarios"), columns)]
 
 
 def chaotic_sub_scenarios() -> list[PrintedTable]:
@@ -160,8 +160,8 @@ def chaotic_sub_scenarios() -> list[PrintedTable]:
     uplift = {"abs_rec_pct": "Standard, AR", "false_abs_pct": "Standard, FA"}
     uplift |= {"guided_abs_rec_pct": "Guided, AR", "guided_false_abs_pct": "Guided, FA"}
     return [
-        of_paper("chaotic_sub_scenarios", rows, columns),
-        of_paper("chaotic_guided_uplift", rows, [SUB, *figures(uplift)]),
+        paper_table("chaotic_sub_scenarios", rows, columns),
+        paper_table("chaotic_guided_uplift", rows, [SUB, *figures(uplift)]),
     ]
 
 
@@ -172,7 +172,7 @@ def models() -> list[PrintedTable]:
     """Return the sixteen models by the paper's names."""
     words = {"name": "Name", "type": "Type", "input": "Input", "notes": "Notes"}
     columns = [MODEL, *(Column(field, heading) for field, heading in words.items())]
-    return [of_paper("models", as_printed("models"), columns)]
+    return [paper_table("models", as_printed("models"), columns)]
 
 
 def composition() -> list[PrintedTable]:
@@ -184,14 +184,14 @@ def composition() -> list[PrintedTable]:
     total = {"title": "Total", "label": "", "void_source": "", "n": "1,404", "question_type": ""}
     rows = pd.concat([rows, pd.DataFrame([total])], ignore_index=True)
     columns = [DATASET, Column("label", "Sub-scenario"), Column("void_source", "Void source"), *figures({"n": "N"})]
-    return [of_paper("composition", rows, [*columns, Column("question_type", "Question type")])]
+    return [paper_table("composition", rows, [*columns, Column("question_type", "Question type")])]
 
 
 def hyperparameters() -> list[PrintedTable]:
     """Return the parameters that all models and all judges are sent."""
     columns = [Column("parameter", "Parameter"), *figures({"model_calls": "VLM calls", "judge_calls": "Judge calls"})]
     rows = as_printed("hyperparameters").replace({"judge_calls": {"": "–"}})
-    return [of_paper("hyperparameters", rows, columns)]
+    return [paper_table("hyperparameters", rows, columns)]
 
 
 def agreement() -> list[PrintedTable]:
@@ -199,7 +199,7 @@ def agreement() -> list[PrintedTable]:
     rows = as_printed("judge_agreement")
     rows = with_titles(rows.assign(unanimous_pct=rows["unanimous_pct"] + "%"))
     columns = [DATASET, Column("task", "Judge task"), *figures({"unanimous_pct": "Unan.", "fleiss_kappa": "κ"})]
-    return [of_paper("judge_agreement", rows, columns)]
+    return [paper_table("judge_agreement", rows, columns)]
 
 
 def validation() -> list[PrintedTable]:
@@ -208,7 +208,7 @@ def validation() -> list[PrintedTable]:
     rows["human_kappa"] = [value or "–*" for value in rows["human_kappa"]]
     names = {"acc": "Acc", "precision": "Prec", "recall": "Rec", "f1": "F1"}
     names |= {"human_agree_pct": "% agree", "human_kappa": "Cohen’s κ"}
-    return [of_paper("judge_validation", rows, [Column("category", "Category"), *figures(names)])]
+    return [paper_table("judge_validation", rows, [Column("category", "Category"), *figures(names)])]
 
 
 def confabulation() -> list[PrintedTable]:
@@ -216,8 +216,8 @@ def confabulation() -> list[PrintedTable]:
     rows = as_printed("confabulation_taxonomy")
     names = {"hp_pct": "HP", "ii_pct": "II", "hp_and_ii_pct": "HP∩II", "es_pct": "ES", "doubt_pct": "Doubt"}
     rows[[*names]] = rows[[*names]] + "%"
-    rows["model"] = rows["model"] + ["†" if where == "trace" else "" for where in rows["doubt_read_from"]]
-    return [of_paper("confabulation", rows, [MODEL, *figures({"n": "n", **names})])]
+    rows["model"] = rows["model"] + ["†" if evidence == "trace" else "" for evidence in rows["doubt_read_from"]]
+    return [paper_table("confabulation", rows, [MODEL, *figures({"n": "n", **names})])]
 
 
 # --- probes, directions and steering ----------------------------------------------------------------------------------
@@ -227,20 +227,20 @@ def probes() -> list[PrintedTable]:
     """Return probe transfer of the three families by pair, and means by transfer type."""
     pairs = _paths(as_printed("probe_transfer"))
     pairs["best_layer"] = "L" + pairs["best_layer"]
-    wide: pd.DataFrame = pairs.loc[:, ["transfer_type", "path"]].drop_duplicates()
+    table_rows: pd.DataFrame = pairs.loc[:, ["transfer_type", "path"]].drop_duplicates()
     columns, words = [TYPE, PATH], {"best_layer": "layer", "auroc": "AUC", "auroc_confabulated": "Cf"}
     for model in STEERED:
         names = {f"{model}_{field}": f"{model}, {word}" for field, word in words.items()}
         part = pairs.query("model == @model").add_prefix(f"{model}_").rename(columns={f"{model}_path": "path"})
-        wide = wide.merge(part[["path", *names]], on="path")
+        table_rows = table_rows.merge(part[["path", *names]], on="path")
         columns += figures(names)
     means = as_printed("probe_means")
     means["both"] = means["auroc"] + " / " + means["auroc_confabulated"]
-    by_type = means.pivot(index="transfer_type", columns="model", values="both")
-    by_type = by_type.loc[[*dict.fromkeys(means["transfer_type"])]].reset_index()
+    means_by_type = means.pivot(index="transfer_type", columns="model", values="both")
+    means_by_type = means_by_type.loc[[*dict.fromkeys(means["transfer_type"])]].reset_index()
     return [
-        of_paper("probe_transfer", wide, columns),
-        of_paper("probe_means", by_type, [TYPE, *figures({model: model for model in STEERED})]),
+        paper_table("probe_transfer", table_rows, columns),
+        paper_table("probe_means", means_by_type, [TYPE, *figures({model: model for model in STEERED})]),
     ]
 
 
@@ -249,9 +249,9 @@ def cosines() -> list[PrintedTable]:
     rows = as_printed("cosine_qwen")
     order = [*dict.fromkeys(rows["source"])]
     rows["cosine"] = rows["cosine"].str.replace("-", "−")
-    wide = rows.pivot(index="source", columns="other", values="cosine").loc[order].reset_index()
+    table_rows = rows.pivot(index="source", columns="other", values="cosine").loc[order].reset_index()
     columns = [Column("source", "Direction"), *figures({name: name for name in order})]
-    return [of_paper("cosines", wide, columns)]
+    return [paper_table("cosines", table_rows, columns)]
 
 
 def steering() -> list[PrintedTable]:
@@ -262,23 +262,23 @@ def steering() -> list[PrintedTable]:
 def _regimes() -> PrintedTable:
     import pandas as pd
 
-    short = {"standard": "Std", "guided": "Gui", "oc": "Oc-family", "ch": "Ch-family"}
+    short_names = {"standard": "Std", "guided": "Gui", "oc": "Oc-family", "ch": "Ch-family"}
     rows: dict[tuple[str, str], dict[str, str]] = {}
     for row in as_printed("steering_regime").to_dict("records"):
         family = str(row["direction_family"])
-        first = short[row["direction_regime"] if family == "all" else family]
-        second = short[row["inference_regime"]] if family == "all" else "guided inf."
+        first = short_names[row["direction_regime"] if family == "all" else family]
+        second = short_names[row["inference_regime"]] if family == "all" else "guided inf."
         sides = [f"{row[f'{side}_alpha0']}→{row[f'{side}_alpha10']}" for side in ("control", "void")]
         rows.setdefault((first, second), {})[str(row["model"])] = " / ".join(sides)
     table = pd.DataFrame([{"directions": d, "inference": i, **cells} for (d, i), cells in rows.items()])
     names = {model: f"{model} ({layer})" for model, layer in STEERED.items()}
     columns = [Column("directions", "Dir."), Column("inference", "Inf."), *figures(names)]
-    return of_paper("steering_regimes", table, columns)
+    return paper_table("steering_regimes", table, columns)
 
 
 def _top() -> PrintedTable:
     columns = [PATH, TYPE, *figures({"control_abstention_pct": "Ctrl ↑", "void_abstention_pct": "Void ↓"})]
-    return of_paper("steering_top", _paths(as_printed("steering_alpha10_qwen")), columns)
+    return paper_table("steering_top", _paths(as_printed("steering_alpha10_qwen")), columns)
 
 
 def _domains() -> PrintedTable:
@@ -287,21 +287,21 @@ def _domains() -> PrintedTable:
     shares = {"same_domain_pct": "Same-dom.", "cross_domain_pct": "Cross-dom."}
     rows[[*shares]] = rows[[*shares]] + "%"
     columns = [Column("direction", "Direction"), Column("target", "Target"), *figures(shares)]
-    return of_paper("steering_domains", rows, columns)
+    return paper_table("steering_domains", rows, columns)
 
 
 def _dose(family: str) -> PrintedTable:
     rows = _paths(as_printed(f"steering_dose_{family}"))
-    wide: pd.DataFrame = rows.loc[:, ["path"]].drop_duplicates()
+    table_rows: pd.DataFrame = rows.loc[:, ["path"]].drop_duplicates()
     sides = {"C": "control_abstention_pct", "V": "void_abstention_pct"}
     # The first family's table alternates the sides at each alpha; the other has all controls first.
     order = [(letter, alpha) for alpha in ALPHAS for letter in sides]
     order = order if family == "qwen" else sorted(order, key=lambda pair: pair[0])
     for letter, alpha in order:
         part = rows.loc[rows["alpha"] == alpha, ["path", sides[letter]]]
-        wide = wide.merge(part.rename(columns={sides[letter]: f"{letter}{alpha}"}), on="path")
+        table_rows = table_rows.merge(part.rename(columns={sides[letter]: f"{letter}{alpha}"}), on="path")
     names = {f"{letter}{alpha}": f"{letter}, α {alpha}" for letter, alpha in order}
-    return of_paper(f"steering_dose_{family}", wide, [PATH, *figures(names)])
+    return paper_table(f"steering_dose_{family}", table_rows, [PATH, *figures(names)])
 
 
 def _paths(rows: pd.DataFrame) -> pd.DataFrame:

@@ -28,7 +28,7 @@ from traps_pipeline.report.pair_pictures import PairPictures
 from traps_pipeline.report.printed_tables import audit_table
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.study_findings import study_findings
-from traps_pipeline.report.tables.human_tables import said_by_people
+from traps_pipeline.report.tables.human_tables import people_notes
 from traps_pipeline.report.terms import INSIDE_TERMS
 from traps_pipeline.report.writing import NotRun, environment, figure_files, table_files
 from traps_pipeline.storage.workspace import Workspace
@@ -39,7 +39,9 @@ PAPER = "paper"  # the chapter of the paper's cards, which use only `assets/publ
 
 @dataclass(frozen=True)
 class Part:
-    """A card before it is built. reads: its stages; inputs: returns what it shows of them, as JSON; null for all."""
+    """A card before it is built.
+
+    reads: its stages; inputs: returns what it shows of them, as JSON; null for all."""
 
     chapter: str
     name: str
@@ -89,7 +91,7 @@ def report_files(
     study: Results, cards: Sequence[tuple[str, Card]], address: Address | None = explorer_address
 ) -> dict[str, bytes]:
     """Return report page and leaderboard (Markdown, JSON lines) by path, from cards."""
-    remarks = said_by_people(study.human_row, study.panel_errors)
+    remarks = people_notes(study.human_row, study.panel_errors)
     paper = {card.name: card.html for chapter, card in cards if chapter == PAPER}
     figures, pictures, tables = (
         [replace(card, paper=paper.get(card.name, "")) for chapter, card in cards if chapter == name]
@@ -115,14 +117,14 @@ def export(workspace: Workspace, target: Path, say: Callable[[str], None] = lamb
     Each file is written atomically, `index.html`, which lists them, last. say: receives a line per file.
     """
     sources, paths = Sources(workspace), list[str]()
-    for path, content in _exported(sources, say):
+    for path, content in _export_reports(sources, say):
         write_bytes(target / path, content)
         paths.append(path)
     write_bytes(target / INDEX, _index(paths).encode())
     return len(paths) + 1
 
 
-def _exported(sources: Sources, say: Callable[[str], None]) -> Iterator[tuple[str, bytes]]:
+def _export_reports(sources: Sources, say: Callable[[str], None]) -> Iterator[tuple[str, bytes]]:
     for source in (sources.study, sources.paper):
         for report in [r for r in (*TABLE_REPORTS, *FIGURE_REPORTS) if source.is_study or r.published]:
             yield from report.files(source).items()

@@ -10,7 +10,7 @@ import pandas as pd
 
 from traps_pipeline.mechanism.mechanism_rows import COSINES, PROBES, STEERING_EFFECTS
 from traps_pipeline.protocol.datasets import LONG
-from traps_pipeline.report.result_frames import CELL_COLUMNS, RATE_COLUMNS, SUB_COLUMNS, Results, joined
+from traps_pipeline.report.result_frames import CELL_COLUMNS, RATE_COLUMNS, SUB_COLUMNS, Results, concat_frames
 from traps_pipeline.scoring import analyses
 from traps_pipeline.scoring.metrics import joined_epochs
 from traps_pipeline.scoring.published import published, published_cells
@@ -23,7 +23,7 @@ _AXES = ("hp", "ii", "hp_and_ii", "es", "doubt")
 
 
 def _cells(results: Results) -> pd.DataFrame:
-    cells = joined([published_cells()])
+    cells = concat_frames([published_cells()])
     # A spread is printed where there were three runs, even if the model has fewer runs in other cells.
     cells["n_runs"] = np.where(cells["acc_std"].isna(), 1, 3)
     return cells.assign(n_missing=np.nan, incomplete=False).reindex(columns=pd.Index(CELL_COLUMNS))
@@ -49,20 +49,20 @@ def _rates(results: Results) -> pd.DataFrame:
         part[["visual", "textual"]] /= 100
         parts.append(part)
     means = {kind: (kind, "mean") for kind in ("visual", "textual")}
-    pooled = joined(parts).groupby(["model", "epoch"], sort=False).agg(**means).reset_index()
-    table = joined([*parts, pooled.assign(taxonomy="pooled")])
+    pooled_rates = concat_frames(parts).groupby(["model", "epoch"], sort=False).agg(**means).reset_index()
+    table = concat_frames([*parts, pooled_rates.assign(taxonomy="pooled")])
     table["gap"] = analyses.ratio(table["textual"], table["visual"])
     return table.reindex(columns=pd.Index(RATE_COLUMNS))
 
 
-def _none(*columns: str) -> pd.DataFrame:
+def _empty_frame(*columns: str) -> pd.DataFrame:
     """Return a frame without rows, for what the paper's tables do not determine."""
     return pd.DataFrame(columns=pd.Index(columns))
 
 
 def _sub_scenarios(results: Results) -> pd.DataFrame:
     occlusion, chaotic = published("occlusion_subscenarios"), published("chaotic_subscenarios")
-    table = joined([occlusion.assign(dataset="occlusion"), chaotic.assign(dataset="chaotic")])
+    table = concat_frames([occlusion.assign(dataset="occlusion"), chaotic.assign(dataset="chaotic")])
     table = table.rename(columns={"n": "n_pairs"})
     for name in [name for name in table if str(name).endswith("_pct")]:
         table[str(name).removesuffix("_pct")] = table[name] / 100
@@ -94,14 +94,16 @@ def _probes(results: Results) -> pd.DataFrame:
 def _cosines(results: Results) -> pd.DataFrame:
     """Return COSINES rows: qwen3-vl-8b's matrix, and other models' values in the text."""
     matrix = published("cosine_qwen").assign(model="qwen3-vl-8b")
-    few = published("other")
-    few = few.loc[few["id"].str.fullmatch(r"cos-(gemma|llava)-\w+-\w+")]
-    pairs = few["id"].str.split("-", n=2).str[2].str.split("-", expand=True)
-    few = few.assign(source=pairs[0], other=pairs[1], cosine=few["value"].astype(float))
-    mirrored = few.rename(columns={"source": "other", "other": "source"})
-    both = pd.concat([matrix, few, mirrored], ignore_index=True)
-    both = _long(both).rename(columns={"source": "dataset", "other": "other_dataset"})
-    return _as(COSINES, [both.assign(layer=_steered(both), prompt="standard", other_prompt="standard")])
+    other_figures = published("other")
+    other_figures = other_figures.loc[other_figures["id"].str.fullmatch(r"cos-(gemma|llava)-\w+-\w+")]
+    pairs = other_figures["id"].str.split("-", n=2).str[2].str.split("-", expand=True)
+    other_figures = other_figures.assign(source=pairs[0], other=pairs[1], cosine=other_figures["value"].astype(float))
+    mirrored_rows = other_figures.rename(columns={"source": "other", "other": "source"})
+    all_cosines = pd.concat([matrix, other_figures, mirrored_rows], ignore_index=True)
+    all_cosines = _long(all_cosines).rename(columns={"source": "dataset", "other": "other_dataset"})
+    return _as(
+        COSINES, [all_cosines.assign(layer=_steered_layers(all_cosines), prompt="standard", other_prompt="standard")]
+    )
 
 
 def _effects(results: Results) -> pd.DataFrame:
@@ -110,7 +112,9 @@ def _effects(results: Results) -> pd.DataFrame:
     gemma = published("steering_dose_gemma").assign(model="gemma-4-e4b", epoch="verification")
     rows = _long(pd.concat([qwen, gemma], ignore_index=True))
     rows = rows.rename(columns={"direction_regime": "directions", "inference_regime": "regime"})
-    rows = rows.assign(kind="void", unit="alpha", dose=rows["alpha"], signs="label", n=PAIRS, layer=_steered(rows))
+    rows = rows.assign(
+        kind="void", unit="alpha", dose=rows["alpha"], signs="label", n=PAIRS, layer=_steered_layers(rows)
+    )
     sides = [rows.assign(side=s, abstention=rows[f"{s}_abstention_pct"] / 100) for s in ("control", "void")]
     return _as(STEERING_EFFECTS, sides)
 
@@ -119,7 +123,7 @@ def _long(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.replace({name: LONG for name in ("source", "target", "other") if name in rows})
 
 
-def _steered(rows: pd.DataFrame) -> list[int]:
+def _steered_layers(rows: pd.DataFrame) -> list[int]:
     return [STEERED_LAYERS[model] for model in rows["model"]]
 
 
@@ -137,11 +141,13 @@ class PublishedResults(Results):
     cells = cached_property(_cells)
     overall = cached_property(_overall)
     rates = cached_property(_rates)
-    sub_cells = cached_property(lambda results: _none("model", "dataset", "regime", "scope", "abs_rec", "n_pairs"))
+    sub_cells = cached_property(
+        lambda results: _empty_frame("model", "dataset", "regime", "scope", "abs_rec", "n_pairs")
+    )
     sub_scenarios = cached_property(_sub_scenarios)
-    labels = cached_property(lambda results: _none("dataset", "sub_scenario", "label", "acc"))
+    labels = cached_property(lambda results: _empty_frame("dataset", "sub_scenario", "label", "acc"))
     confabulation = cached_property(_confabulation)
-    composition = cached_property(lambda results: _none("taxonomy", "category", "void", "n", "n_ill_posed"))
+    composition = cached_property(lambda results: _empty_frame("taxonomy", "category", "void", "n", "n_ill_posed"))
     probes = cached_property(_probes)
     cosines = cached_property(_cosines)
     effects = cached_property(_effects)

@@ -70,7 +70,7 @@ def own(what: str) -> cached_property[pd.DataFrame]:
     return cached_property(make)
 
 
-def of_table(table: Table) -> cached_property[pd.DataFrame]:
+def table_frame(table: Table) -> cached_property[pd.DataFrame]:
     """Return a frame that holds the rows of a table."""
     return cached_property(lambda results: results.rows(table))
 
@@ -86,7 +86,7 @@ class Results:
     judged_by = ""  # who judged, in words, for the notes of a study's tables and figures
     mechanism: MechanismSettings | None = None  # of a study that looks inside models
 
-    board = of_table(LEADERBOARD)
+    board = table_frame(LEADERBOARD)
     cells = own("CELL_COLUMNS, one row per (model, dataset, regime), averaged over runs.")
     overall = own(
         "One row per (model, regime) that has all four datasets: the columns of cells without dataset, and j; a study's"
@@ -96,40 +96,40 @@ class Results:
     sub_scenarios = own("SUB_COLUMNS: means over models, one row per sub-scenario.")
     sub_cells = own("One row per (model, dataset, regime) and sub-scenario (column scope).")
     labels = own("Mean Acc over models by the control's answer: dataset, sub_scenario, label, acc, n_pairs, n_models.")
-    agreement = of_table(AGREEMENT)
-    bias = of_table(JUDGE_BIAS)
-    leave_one_out = of_table(LEAVE_ONE_OUT)
-    robust = of_table(ROBUST)
-    hypotheses = of_table(HYPOTHESES)
-    graded = of_table(GRADED_CUTS)
-    contrasts = of_table(CONTRASTS)
-    regime_tests = of_table(REGIME_TESTS)
-    confabulation = of_table(CONFABULATION_PREVALENCE)
-    validation = of_table(JUDGE_VALIDATION)
-    human_row = of_table(HUMAN_ROW)
-    human_agreement = of_table(HUMAN_AGREEMENT)
-    panel_errors = of_table(PANEL_ERRORS)
-    corrected = of_table(CORRECTED)
+    agreement = table_frame(AGREEMENT)
+    bias = table_frame(JUDGE_BIAS)
+    leave_one_out = table_frame(LEAVE_ONE_OUT)
+    robust = table_frame(ROBUST)
+    hypotheses = table_frame(HYPOTHESES)
+    graded = table_frame(GRADED_CUTS)
+    contrasts = table_frame(CONTRASTS)
+    regime_tests = table_frame(REGIME_TESTS)
+    confabulation = table_frame(CONFABULATION_PREVALENCE)
+    validation = table_frame(JUDGE_VALIDATION)
+    human_row = table_frame(HUMAN_ROW)
+    human_agreement = table_frame(HUMAN_AGREEMENT)
+    panel_errors = table_frame(PANEL_ERRORS)
+    corrected = table_frame(CORRECTED)
     composition = own("taxonomy, category, void, n (well-posed pairs), n_ill_posed.")
-    prompted_probes = of_table(PROBES)  # under every prompt
-    prompted_baselines = of_table(PROBE_BASELINES)  # under every prompt
+    prompted_probes = table_frame(PROBES)  # under every prompt
+    prompted_baselines = table_frame(PROBE_BASELINES)  # under every prompt
     # PROBES rows under PROBE_PROMPT; the paper has only transfer, confabulated, shuffled, centroid_void.
-    probes = cached_property(lambda results: _of_probe_prompt(results.prompted_probes))
+    probes = cached_property(lambda results: _probe_prompt_rows(results.prompted_probes))
     cosines = own("COSINES rows at the steered layer of each model.")
     effects = own("STEERING_EFFECTS rows of the paper's protocol: void directions, doses in alpha, signs by label.")
-    baselines = cached_property(lambda results: _of_probe_prompt(results.prompted_baselines))
-    gate = of_table(GATE)
-    risk_coverage = of_table(RISK_COVERAGE)
-    patching = of_table(PATCHING)
+    baselines = cached_property(lambda results: _probe_prompt_rows(results.prompted_baselines))
+    gate = table_frame(GATE)
+    risk_coverage = table_frame(RISK_COVERAGE)
+    patching = table_frame(PATCHING)
     # STEERING_EFFECTS rows of datasets along their own directions and nulls, and `gaps`, the dose.
     own_effects = cached_property(lambda results: effects.own_effects(results.rows(STEERING_EFFECTS)))
-    nulls = of_table(STEERING_NULLS)
-    steering_pecs = of_table(STEERING_PECS)
-    shares = of_table(STEERING_SHARES)
+    nulls = table_frame(STEERING_NULLS)
+    steering_pecs = table_frame(STEERING_PECS)
+    shares = table_frame(STEERING_SHARES)
     steering_regimes = cached_property(lambda results: effects.regime_matrix(results.effects))
-    lens = of_table(LENS)
-    sentences = of_table(SENTENCES)
-    item_scores = of_table(ITEM_SCORES)  # under PROBE_PROMPT alone
+    lens = table_frame(LENS)
+    sentences = table_frame(SENTENCES)
+    item_scores = table_frame(ITEM_SCORES)  # under PROBE_PROMPT alone
     steering_families = cached_property(lambda results: effects.family_asymmetry(results.effects))
     steering_domains = cached_property(lambda results: effects.domains(results.effects))
     steering_layers = cached_property(lambda results: effects.sweep(results.effects))
@@ -162,7 +162,7 @@ class Results:
         )
 
 
-def _of_probe_prompt(rows: pd.DataFrame) -> pd.DataFrame:
+def _probe_prompt_rows(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.loc[rows["prompt"] == PROBE_PROMPT]
 
 
@@ -172,7 +172,7 @@ def datasets_of(cells: pd.DataFrame) -> list[str]:
     return [name for name in DATASETS if name in names]
 
 
-def joined(parts: Iterable[pd.DataFrame]) -> pd.DataFrame:
+def concat_frames(parts: Iterable[pd.DataFrame]) -> pd.DataFrame:
     """Return the concatenated parts; without parts, a frame without rows or columns."""
     import pandas as pd
 

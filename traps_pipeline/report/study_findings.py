@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, REGIMES, STANDARD
 from traps_pipeline.report.catalogue import FIGURE_REPORTS
 from traps_pipeline.report.result_frames import Results
@@ -40,12 +40,14 @@ def study_findings(results: Results) -> list[StudyFinding]:
     if not len(rows):
         return []
     references = models_of(group="reference")
-    shown = rows.loc[[model not in references for model in rows["model"]]]
-    shown = shown if len(shown) else rows
-    inside = [(report.name, report.finding(results)) for report in FIGURE_REPORTS] if results.mechanism else []
+    model_rows = rows.loc[[model not in references for model in rows["model"]]]
+    model_rows = model_rows if len(model_rows) else rows
+    figure_findings = [(report.name, report.finding(results)) for report in FIGURE_REPORTS] if results.mechanism else []
     return [
-        *_best(shown), *_abstention(shown), *_accuracy(shown), *_gaps(results, shown), *_separable(results, shown),
-        *_missing_answers(shown), *(StudyFinding(text, f"figure-{name}") for name, text in inside if text),
+        *_best(model_rows), *_abstention(model_rows), *_accuracy(model_rows), *_gaps(results, model_rows),
+        *_separable(results, model_rows),
+        *_missing_answers(model_rows),
+        *(StudyFinding(text, f"figure-{name}") for name, text in figure_findings if text),
     ]  # fmt: skip
 
 
@@ -55,23 +57,27 @@ def _best(rows: pd.DataFrame) -> Iterator[StudyFinding]:
         part = rows.loc[rows["regime"] == regime].sort_values(["pecs", "model"], ascending=[False, True])
         first = part.to_dict("records")[0]
         figure = fraction(first["pecs"])
-        equal, worse = (
+        equal, worse_rows = (
             [*part.loc[part["pecs"].map(fraction).eq(figure) == is_equal, "model"]] for is_equal in (True, False)
         )
-        best = "have the highest PECS," if len(equal) > 1 else "has the highest PECS," if worse else "has a PECS of"
+        best = (
+            "have the highest PECS," if len(equal) > 1 else "has the highest PECS," if worse_rows else "has a PECS of"
+        )
         text = f"Under {regime}, {_names(equal)} {best} {figure} {interval(first)}".strip()
-        if worse:
-            text += f", before {worse[0]} with {fraction(part.loc[part['model'] == worse[0], 'pecs'].iloc[0])}"
-        alike = ranks(first)
-        if len(equal) == 1 and "–" in alike:
-            text += f"; its rank may be {alike}, since contrasts do not separate it from others"
+        if worse_rows:
+            text += (
+                f", before {worse_rows[0]} with {fraction(part.loc[part['model'] == worse_rows[0], 'pecs'].iloc[0])}"
+            )
+        rank_range = ranks(first)
+        if len(equal) == 1 and "–" in rank_range:
+            text += f"; its rank may be {rank_range}, since contrasts do not separate it from others"
         yield StudyFinding(f"{text}.", "leaderboard")
 
 
 def _names(models: list[str]) -> str:
     """Return up to three names, and the number of others."""
-    first, more = models[:3], len(models) - 3
-    parts = [*first, f"{more} more"] if more > 0 else first
+    first, n_more = models[:3], len(models) - 3
+    parts = [*first, f"{n_more} more"] if n_more > 0 else first
     return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
 
 
@@ -90,9 +96,11 @@ def _abstention(rows: pd.DataFrame) -> Iterator[StudyFinding]:
 
 def _accuracy(rows: pd.DataFrame) -> Iterator[StudyFinding]:
     """Yield how guided prompting changes Acc and AbsRec of models with both regimes."""
-    wide = rows.loc[rows["regime"].isin(PROMPTING)].pivot(index="model", columns="regime", values=["acc", "abs_rec"])
-    if {*PROMPTING} <= {*wide.columns.get_level_values(1)} and len(wide := wide.dropna()):
-        changes = {name: wide[name][GUIDED] - wide[name][STANDARD] for name in ("acc", "abs_rec")}
+    by_regime = rows.loc[rows["regime"].isin(PROMPTING)].pivot(
+        index="model", columns="regime", values=["acc", "abs_rec"]
+    )
+    if {*PROMPTING} <= {*by_regime.columns.get_level_values(1)} and len(by_regime := by_regime.dropna()):
+        changes = {name: by_regime[name][GUIDED] - by_regime[name][STANDARD] for name in ("acc", "abs_rec")}
         acc, voids = (_points(changes[name]) for name in ("acc", "abs_rec"))
         yield StudyFinding(
             f"Guided prompting changes abstention on voids by {voids} points, and accuracy on controls by {acc}.",
@@ -103,24 +111,26 @@ def _accuracy(rows: pd.DataFrame) -> Iterator[StudyFinding]:
 def _gaps(results: Results, rows: pd.DataFrame) -> Iterator[StudyFinding]:
     """Yield visual against textual voids, and how much PECS may come from shortcuts."""
     rates = results.rates
-    pooled = rates.loc[rates["taxonomy"].eq("pooled") & rates["model"].isin(rows["model"])] if len(rates) else rates
-    pooled = pooled.dropna(subset=["visual", "textual"])
-    if len(pooled):
-        textual, visual = (percent(pooled[name].to_numpy(float).mean()) for name in ("textual", "visual"))
-        subject = f"the {len(pooled)} models" if len(pooled) > 1 else str(pooled["model"].iloc[0])
+    pooled_rates = (
+        rates.loc[rates["taxonomy"].eq("pooled") & rates["model"].isin(rows["model"])] if len(rates) else rates
+    )
+    pooled_rates = pooled_rates.dropna(subset=["visual", "textual"])
+    if len(pooled_rates):
+        textual, visual = (percent(pooled_rates[name].to_numpy(float).mean()) for name in ("textual", "visual"))
+        subject = f"the {len(pooled_rates)} models" if len(pooled_rates) > 1 else str(pooled_rates["model"].iloc[0])
         yield StudyFinding(
-            f"Asked plainly, {subject} abstain{'' if len(pooled) > 1 else 's'} on {textual} % of the questions about "
-            f"something that no clip shows, and on {visual} % of the clips whose outcome is hidden or cut off"
-            f"{' (means)' if len(pooled) > 1 else ''}.",
+            f"Asked plainly, {subject} abstain{'' if len(pooled_rates) > 1 else 's'} on {textual} % of the questions "
+            f"about something that no clip shows, and on {visual} % of the clips whose outcome is hidden or cut off"
+            f"{' (means)' if len(pooled_rates) > 1 else ''}.",
             "figure-visual_textual",
         )
     robust = results.robust
     robust = robust.loc[robust["model"].isin(rows["model"])].dropna(subset=["conjunction"]) if len(robust) else robust
     if len(robust):
-        most = robust.sort_values(["conjunction", "model"], ascending=[False, True]).to_dict("records")[0]
+        row = robust.sort_values(["conjunction", "model"], ascending=[False, True]).to_dict("records")[0]
         yield StudyFinding(
             f"Control, twin, void and crossed questions of one scene are all right in at most "
-            f"{percent(most['conjunction'])} % of the scenes ({most['model']} under {most['regime']}).",
+            f"{percent(row['conjunction'])} % of the scenes ({row['model']} under {row['regime']}).",
             "leaderboard",
         )
 
@@ -136,7 +146,7 @@ def _separable(results: Results, rows: pd.DataFrame) -> Iterator[StudyFinding]:
         if len(tested):
             count = int(tested["separable"].eq(True).sum())
             yield StudyFinding(
-                f"Of {counted(len(tested), 'difference')} of PECS between models under one regime, {count} "
+                f"Of {count_noun(len(tested), 'difference')} of PECS between models under one regime, {count} "
                 f"{'is' if count == 1 else 'are'} significant after Holm’s correction.",
                 "table-contrasts",
             )
@@ -146,10 +156,10 @@ def _missing_answers(rows: pd.DataFrame) -> Iterator[StudyFinding]:
     missing = int(np.nansum(rows["n_missing"].to_numpy(float)))
     if missing:
         answers = 2 * int((rows["n_pairs"].to_numpy(int) * rows["n_runs"].to_numpy(int)).sum())
-        most = rows.sort_values(["n_missing", "model"], ascending=[False, True]).to_dict("records")[0]
+        worst_row = rows.sort_values(["n_missing", "model"], ascending=[False, True]).to_dict("records")[0]
         yield StudyFinding(
-            f"Without text or majority: {missing:,} of {counted(answers, 'answer')}; {most['model']} under "
-            f"{most['regime']} lacks most, {int(most['n_missing'])}.",
+            f"Without text or majority: {missing:,} of {count_noun(answers, 'answer')}; {worst_row['model']} under "
+            f"{worst_row['regime']} lacks most, {int(worst_row['n_missing'])}.",
             "leaderboard",
         )
 

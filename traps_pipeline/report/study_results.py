@@ -7,10 +7,10 @@ from functools import cached_property
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.mechanism.effects import in_gaps
 from traps_pipeline.mechanism.mechanism_rows import COSINES, STEERING_EFFECTS
-from traps_pipeline.mechanism.shares import of_paper
+from traps_pipeline.mechanism.shares import paper_protocol_rows
 from traps_pipeline.models.judges import panel_id
 from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 from traps_pipeline.report.leaderboard_page import judged_by
@@ -19,7 +19,7 @@ from traps_pipeline.report.result_frames import (
     RATE_COLUMNS,
     SUB_COLUMNS,
     Results,
-    joined,
+    concat_frames,
 )
 from traps_pipeline.scoring import analyses
 from traps_pipeline.scoring.epochs import EpochMismatch
@@ -30,28 +30,30 @@ from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
 
-def _of_panel(results: StudyResults, rows: pd.DataFrame) -> pd.DataFrame:
+def _panel_rows(results: StudyResults, rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows that the tables' panel decided; panels are never shown together."""
     return rows.loc[rows["panel"] == results.panel].reset_index(drop=True)
 
 
 def _cells(results: StudyResults) -> pd.DataFrame:
-    return analyses.study_cells(_of_panel(results, results.board)).reindex(columns=pd.Index(CELL_COLUMNS))
+    return analyses.study_cells(_panel_rows(results, results.board)).reindex(columns=pd.Index(CELL_COLUMNS))
 
 
 def _overall(results: StudyResults) -> pd.DataFrame:
     intervals = [f"{name}_ci_{end}" for name in ("acc", "abs_rec", "false_abs", "j", "pecs") for end in ("low", "high")]
-    more = ["j", "j_std", *intervals, "rank", "rank_low", "rank_high"]
-    columns = [name for name in (*CELL_COLUMNS, *more) if name != "dataset"]
-    board = _of_panel(results, results.board)
+    extra_columns = ["j", "j_std", *intervals, "rank", "rank_low", "rank_high"]
+    columns = [name for name in (*CELL_COLUMNS, *extra_columns) if name != "dataset"]
+    board = _panel_rows(results, results.board)
     rows = board.loc[board["dataset"] == "overall", columns]
-    return analyses.of_several_runs(rows.reset_index(drop=True))
+    return analyses.null_single_deviations(rows.reset_index(drop=True))
 
 
 def _rates(results: StudyResults) -> pd.DataFrame:
     standard = results.cells.loc[results.cells["regime"] == "standard"]
     parts = [standard[standard["dataset"].map(taxonomy_of) == t] for t in analyses.TAXONOMIES] + [standard]
-    gaps = joined([gap for part in parts for gap in _gaps(results, part)]).reindex(columns=pd.Index(RATE_COLUMNS))
+    gaps = concat_frames([gap for part in parts for gap in _gaps(results, part)]).reindex(
+        columns=pd.Index(RATE_COLUMNS)
+    )
     place = {model: number for number, model in enumerate(standard["model"].unique())}
     gaps = gaps.drop_duplicates(["model", "taxonomy"])
     return gaps.sort_values("model", key=lambda models: models.map(place), kind="stable", ignore_index=True)
@@ -67,17 +69,17 @@ def _gaps(results: StudyResults, rows: pd.DataFrame) -> list[pd.DataFrame]:
             return [gap for part in models for gap in _gaps(results, part)]
         results.refused.setdefault("rates", []).append(str(error))
         return []
-    of_model = rows.groupby("model").agg(
+    model_means = rows.groupby("model").agg(
         n_pairs=("n_pairs", "sum"),
         n_missing=("n_missing", "sum"),
         n_runs=("n_runs", "min"),
         incomplete=("incomplete", "any"),
         epoch=("epoch", joined_epochs),
     )
-    return [gaps.merge(of_model, left_on="model", right_index=True, how="left", sort=False)]
+    return [gaps.merge(model_means, left_on="model", right_index=True, how="left", sort=False)]
 
 
-def _scoped(results: StudyResults, scope: str) -> pd.DataFrame:
+def _scoped_metrics(results: StudyResults, scope: str) -> pd.DataFrame:
     metrics = _without_references(results.metrics)
     if not len(metrics):
         return pd.DataFrame(columns=pd.Index([*CELL_COLUMNS, "scope"]))
@@ -85,7 +87,7 @@ def _scoped(results: StudyResults, scope: str) -> pd.DataFrame:
 
 
 def _sub_scenarios(results: StudyResults) -> pd.DataFrame:
-    items = joined([results.tables.read_all(ITEMS, ["sub_scenario", "answer_type"], dataset=DATASETS)])
+    items = concat_frames([results.tables.read_all(ITEMS, ["sub_scenario", "answer_type"], dataset=DATASETS)])
     types = items.drop_duplicates("sub_scenario").set_index("sub_scenario").loc[:, "answer_type"]
     rows = []
     for _, cells in results.sub_cells.groupby("scope", sort=True):
@@ -93,7 +95,7 @@ def _sub_scenarios(results: StudyResults) -> pd.DataFrame:
             rows.append(analyses.sub_scenarios(cells).assign(epoch=joined_epochs(cells["epoch"])))
         except EpochMismatch as error:
             results.refused.setdefault("sub_scenarios", []).append(str(error))
-    table = joined(rows).reindex(columns=pd.Index(SUB_COLUMNS))
+    table = concat_frames(rows).reindex(columns=pd.Index(SUB_COLUMNS))
     return table.assign(answer_type=table.loc[:, "sub_scenario"].map(types))
 
 
@@ -101,22 +103,24 @@ def _composition(results: StudyResults) -> pd.DataFrame:
     items = results.tables.read_all(ITEMS, ["dataset", "taxonomy", "category", "pair_id"], dataset=DATASETS)
     pairs = items.drop_duplicates("pair_id").assign(kind=lambda f: np.where(_ill_posed(f), "n_ill_posed", "n"))
     counts = pairs.pivot_table(index=["taxonomy", "category"], columns="kind", values="pair_id", aggfunc="count")
-    table = joined([counts.reindex(columns=["n", "n_ill_posed"]).reset_index()])
+    table = concat_frames([counts.reindex(columns=["n", "n_ill_posed"]).reset_index()])
     table["void"] = table.loc[:, "taxonomy"].map({"occlusion": "occluder", "chaotic": "truncation"})
     return table.sort_values("taxonomy", ascending=False, ignore_index=True)
 
 
 def _cosines(results: StudyResults) -> pd.DataFrame:
     rows, mechanism = results.rows(COSINES), results.mechanism
-    steered = {model: layers.steering for model, layers in mechanism.models.items()} if mechanism else {}
-    is_steered = [layer == steered.get(model) for layer, model in zip(rows["layer"], rows["model"], strict=True)]
+    steering_layers = {model: layers.steering for model, layers in mechanism.models.items()} if mechanism else {}
+    is_steered = [
+        layer == steering_layers.get(model) for layer, model in zip(rows["layer"], rows["model"], strict=True)
+    ]
     return rows.loc[is_steered].reset_index(drop=True)
 
 
 def _effects(results: StudyResults) -> pd.DataFrame:
     """Return the paper's protocol rows, with dose in class gaps and degenerate share."""
-    every = results.rows(STEERING_EFFECTS)
-    rows = in_gaps(of_paper(every), every)
+    all_effects = results.rows(STEERING_EFFECTS)
+    rows = in_gaps(paper_protocol_rows(all_effects), all_effects)
     answers = rows["n"].astype(float) + rows["n_missing"].astype(float)
     return rows.assign(broken=rows["degenerate"].astype(float) / answers)
 
@@ -137,13 +141,13 @@ class StudyResults(Results):
     source = "this study"
     is_study = True
     # METRICS rows of the pairs; arms enter no table or figure.
-    metrics = cached_property(lambda results: _of_panel(results, results.tables.read_all(METRICS, dataset=DATASETS)))
+    metrics = cached_property(lambda results: _panel_rows(results, results.tables.read_all(METRICS, dataset=DATASETS)))
     cells = cached_property(_cells)
     overall = cached_property(_overall)
     rates = cached_property(_rates)
-    sub_cells = cached_property(lambda results: _scoped(results, "sub_scenario"))
+    sub_cells = cached_property(lambda results: _scoped_metrics(results, "sub_scenario"))
     sub_scenarios = cached_property(_sub_scenarios)
-    labels = cached_property(lambda results: analyses.accuracy_by_label(_scoped(results, "label")))
+    labels = cached_property(lambda results: analyses.accuracy_by_label(_scoped_metrics(results, "label")))
     composition = cached_property(_composition)
     cosines = cached_property(_cosines)
     effects = cached_property(_effects)
@@ -156,20 +160,22 @@ class StudyResults(Results):
     @cached_property
     def panel(self) -> str:
         """The panel of all tables and figures: the study's, else the first that decided."""
-        decided = self.board if len(self.board) else self.tables.read_all(METRICS, ["panel"], dataset=DATASETS)
-        panels = sorted({*decided["panel"]}, key=lambda name: ("+" in name, name))
-        own = panel_id(self._panel)
-        return own if own in panels or not panels else panels[0]
+        judged_rows = self.board if len(self.board) else self.tables.read_all(METRICS, ["panel"], dataset=DATASETS)
+        panels = sorted({*judged_rows["panel"]}, key=lambda name: ("+" in name, name))
+        own_panel = panel_id(self._panel)
+        return own_panel if own_panel in panels or not panels else panels[0]
 
     @cached_property
     def judged_by(self) -> str:
         """See `Results.judged_by`."""
         if self.board.empty:
             return ""
-        sentence = judged_by(_of_panel(self, self.board)).rstrip(".")
-        unjudged = self.board.loc[self.board["panel"] != self.panel, "model"].unique()
+        sentence = judged_by(_panel_rows(self, self.board)).rstrip(".")
+        other_models = self.board.loc[self.board["panel"] != self.panel, "model"].unique()
         return sentence + (
-            f"; left out: {counted(len(unjudged), 'model')} with figures of other panels" if len(unjudged) else ""
+            f"; left out: {count_noun(len(other_models), 'model')} with figures of other panels"
+            if len(other_models)
+            else ""
         )
 
     def rows(self, table: Table) -> pd.DataFrame:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 SCENE = "seesaw_sorter"  # the paper's example
 FRAMES = Layout(block=3.0, header=0.62, gap=0.4, letters=64, questions=2, ids=True)
-WORDS_IN, LETTERS, MOST_LINES = 3.1, 66, 6  # width of the text column beside the frames
+WORDS_IN, LETTERS, MAX_LINES = 3.1, 66, 6  # width of the text column beside the frames
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,8 @@ def worked_example(workspace: Workspace) -> Example | None:
     words = {}
     for side in ("control", "void"):
         item = str(pair.at[side, "item_id"])
-        on_item = [vote for vote in votes if vote["item_id"] == item]
-        words[side] = reading(str(answers[item]["text"] or ""), on_item, rows[item])
+        item_votes = [vote for vote in votes if vote["item_id"] == item]
+        words[side] = reading(str(answers[item]["text"] or ""), item_votes, rows[item])
     return Example(pair, str(verdict["model"]), words)
 
 
@@ -64,15 +64,15 @@ def chosen_example(verdicts: pd.DataFrame) -> dict[Any, Any] | None:
     The control is correct and the void decided. Seesaws come first, then models that are no reference strategy, then
     voids abstained on.
     """
-    decided = verdicts.dropna(subset=["abstained"])
+    decided_verdicts = verdicts.dropna(subset=["abstained"])
     voids = {
         (row["pair_id"], row["model"], row["run"]): bool(row["abstained"])
-        for row in decided.loc[decided["side"] == "void"].to_dict("records")
+        for row in decided_verdicts.loc[decided_verdicts["side"] == "void"].to_dict("records")
     }
     references = models_of(group="reference")
     controls = [
         row
-        for row in decided.loc[decided["side"] == "control"].to_dict("records")
+        for row in decided_verdicts.loc[decided_verdicts["side"] == "control"].to_dict("records")
         if row["correct"] is True and not row["abstained"] and (row["pair_id"], row["model"], row["run"]) in voids
     ]
 
@@ -87,9 +87,9 @@ def chosen_example(verdicts: pd.DataFrame) -> dict[Any, Any] | None:
 def reading(answer: str, votes: Sequence[Mapping[Any, Any]], verdict: Mapping[Any, Any]) -> list[str]:
     """Return the lines beside a side's frames: answer, judges' votes, and verdict."""
     valid = [vote for vote in votes if vote["valid"]]
-    on_abstention = [vote for vote in valid if vote["task"] == "abstention"]
-    abstained = sum(bool(vote["abstained"]) for vote in on_abstention)
-    summary = f"an abstention for {abstained} of {counted(len(on_abstention), 'judge')}"
+    abstention_votes = [vote for vote in valid if vote["task"] == "abstention"]
+    abstained = sum(bool(vote["abstained"]) for vote in abstention_votes)
+    summary = f"an abstention for {abstained} of {count_noun(len(abstention_votes), 'judge')}"
     values = [str(vote["extracted_value"]) for vote in valid if vote["task"] == "correctness"]
     if values:
         summary += f"; they extract {', '.join(dict.fromkeys(values))}"
@@ -106,16 +106,18 @@ def example_figure(example: Example, root: Path) -> Figure:
     pair, words = example.pair, example.words
     with figure_style():
         block = moments_of(pair, root, FRAMES.moments)
-        tall = FRAMES.block * ratio_of(block[0])
-        height = tall + FRAMES.header + 0.35
+        block_height = FRAMES.block * ratio_of(block[0])
+        height = block_height + FRAMES.header + 0.35
         figure = new_figure(PAGE_IN, height, FRAMES.dpi, layout=None)
-        left, bottom = 0.8 * FRAMES.gap, height - FRAMES.header - tall - 0.05
-        axes = figure.add_axes((left / PAGE_IN, bottom / height, FRAMES.block / PAGE_IN, tall / height))
+        left, bottom = 0.8 * FRAMES.gap, height - FRAMES.header - block_height - 0.05
+        axes = figure.add_axes((left / PAGE_IN, bottom / height, FRAMES.block / PAGE_IN, block_height / height))
         draw_pair(axes, pair, *block, FRAMES)
         x = (left + FRAMES.block + 0.25) / PAGE_IN
-        figure.text(x, (bottom + tall + 0.12) / height, plain(example.model), size=7, weight="bold", parse_math=False)
-        for side, top in (("control", bottom + tall), ("void", bottom + tall / 2 - 0.03)):
-            fit: dict[str, Any] = {"max_lines": MOST_LINES, "placeholder": " …"}
-            lines = [line for part in words[side] for line in textwrap.wrap(plain(part), LETTERS, **fit)]
+        figure.text(
+            x, (bottom + block_height + 0.12) / height, plain(example.model), size=7, weight="bold", parse_math=False
+        )
+        for side, top in (("control", bottom + block_height), ("void", bottom + block_height / 2 - 0.03)):
+            wrap_options: dict[str, Any] = {"max_lines": MAX_LINES, "placeholder": " …"}
+            lines = [line for part in words[side] for line in textwrap.wrap(plain(part), LETTERS, **wrap_options)]
             figure.text(x, top / height, "\n".join(lines), size=6.2, va="top", linespacing=1.25, parse_math=False)
     return figure

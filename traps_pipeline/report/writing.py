@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.sheets import csv_bytes
-from traps_pipeline.base.terminal import TextTable, finalized, plain
+from traps_pipeline.base.terminal import TextTable, finalize_value, plain
 from traps_pipeline.report.latex_tables import latex, latex_of_plain, latex_table
 from traps_pipeline.report.numbers import NONE, as_numbers
 
@@ -183,7 +183,7 @@ class PrintedTable:
 
     @property
     def content(self) -> str:
-        """All that it prints, links and exports: two tables with equal content give the same files."""
+        """All that it prints, links and exports; equal content gives equal files."""
         words = [getattr(self, field.name) for field in fields(self) if field.name not in ("rows", "trace")]
         return repr([*words, [*self.rows.columns], self.records])
 
@@ -210,8 +210,8 @@ class PrintedTable:
         """The printed cells' numbers: columns and their spreads, then all other fields."""
         import pandas as pd
 
-        printed = [field for column in self.columns for field in (column.field, column.spread) if field]
-        fields = dict.fromkeys([*printed, *map(str, self.rows.columns)])
+        printed_fields = [field for column in self.columns for field in (column.field, column.spread) if field]
+        fields = dict.fromkeys([*printed_fields, *map(str, self.rows.columns)])
         data = self.rows.reindex(columns=pd.Index(list(fields)))
         words = {column.field for column in self.columns if column.unit == "text"}
         texts = [str(name) for name, kind in data.dtypes.items() if kind.kind == "O" and name not in words]
@@ -263,8 +263,8 @@ def _with_marks(column: Column, records: Sequence[Mapping[str, Any]]) -> list[st
     """Return heading and cells of a marked column: numbers right, marks after them."""
     marks = ["", *(column.parts(row)[2] for row in records)]
     numbers = _without_marks(replace(column, mark=""), records)
-    wide, widest = max(map(len, numbers)), max(map(len, marks))
-    return [f"{number:>{wide}} {mark:{widest}}" for number, mark in zip(numbers, marks, strict=True)]
+    number_width, mark_width = max(map(len, numbers)), max(map(len, marks))
+    return [f"{number:>{number_width}} {mark:{mark_width}}" for number, mark in zip(numbers, marks, strict=True)]
 
 
 def table_latex(table: PrintedTable) -> str:
@@ -318,7 +318,7 @@ def environment(folder: Path = TEMPLATES) -> jinja2.Environment:
     return jinja2.Environment(
         loader=jinja2.FileSystemLoader(folder),
         autoescape=True,
-        finalize=finalized,
+        finalize=finalize_value,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -337,13 +337,13 @@ def _parquet(table: PrintedTable) -> bytes:
 
     data = table.data
     texts = {c.field for c in table.columns if c.unit in ("text", "range")}
-    loose = [str(name) for name, kind in data.dtypes.items() if kind.kind == "O" and str(kind) == "object"]
-    numeric = {name for name in loose if name not in texts and not any(isinstance(v, str) for v in data[name])}
-    data = data.astype({name: "Float64" if name in numeric else "string" for name in loose})
+    object_columns = [str(name) for name, kind in data.dtypes.items() if kind.kind == "O" and str(kind) == "object"]
+    numeric = {name for name in object_columns if name not in texts and not any(isinstance(v, str) for v in data[name])}
+    data = data.astype({name: "Float64" if name in numeric else "string" for name in object_columns})
     arrow = pa.Table.from_pandas(data, preserve_index=False)
-    about = {"title": table.title, "notes": "\n".join(table.remarks), "absence": table.absence}
+    metadata = {"title": table.title, "notes": "\n".join(table.remarks), "absence": table.absence}
     stream = io.BytesIO()
-    pq.write_table(arrow.replace_schema_metadata(about), stream, compression="zstd")
+    pq.write_table(arrow.replace_schema_metadata(metadata), stream, compression="zstd")
     return stream.getvalue()
 
 
@@ -381,12 +381,12 @@ def freeze_layout(figure: Figure) -> None:
 
 def figure_bytes(figure: Figure, kind: str = "png") -> bytes:
     """Return the figure as a PDF, SVG, PNG or WebP file, the same on every call."""
-    undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": {"Software": None}}
+    no_dates = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": {"Software": None}}
     with figure_style():
         if figure.get_layout_engine() is not None:
             freeze_layout(figure)
         stream = io.BytesIO()
-        figure.savefig(stream, format=kind, metadata=undated.get(kind))  # pyright: ignore[reportArgumentType]
+        figure.savefig(stream, format=kind, metadata=no_dates.get(kind))  # pyright: ignore[reportArgumentType]
     return stream.getvalue()
 
 

@@ -1,4 +1,4 @@
-"""Scenes from parameters to encoded clips: build, simulate, render, encode, check.
+"""Turn scene parameters into encoded clips: build, simulate, render and check.
 
 MuJoCo reads MUJOCO_GL when it is first imported, so a GL that needs no display is chosen here, before any module of
 this package can import it; a caller's own choice stands.

@@ -1,7 +1,7 @@
-"""Registry of scene families by name: a file in `families` adds one.
+"""Register scene families by name: a file in `families` adds one.
 
-What would spoil a benchmark is refused: an unknown category, a question that two families have, a hidden element that
-is drawn depending on what is seen.
+A family that would spoil a benchmark is refused: an unknown category, a question that two families have, a hidden
+element that is drawn depending on what is seen.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def families() -> tuple[Family, ...]:
 
 @cache
 def fit_to_sample(name: str) -> Family:
-    """Return a family that scenarios may be drawn of.
+    """Return a family after checking that scenarios may be drawn from it.
 
     Raises TrapsError if another family has its question, or its hidden element depends on what is seen.
     """

@@ -1,4 +1,4 @@
-"""The observer: what classical vision answers from frames and the question.
+"""Answer questions from frames by classical vision (the observer).
 
 It shows that the benchmark is solvable from pixels. It finds the family by the words of the question, so a question
 that no family asks, an ill-posed one above all, is one it cannot answer.
@@ -23,7 +23,7 @@ def family_asking(question: str) -> Family | None:
 
 
 def observe(clip: Path, question: str, policy: FramePolicy = SAMPLED) -> str | None:
-    """Return the answer in a clip's frames, or None; made for 5 frames a second."""
+    """Return the observer's answer from frames (at 5 per second); None if unknown."""
     family = family_asking(question)
     if family is None or family.observe is None:
         return None

@@ -33,7 +33,7 @@ REASONING_PAIRS = (
     ("qwen3-vl-think", "qwen3-vl-instruct"),
 )
 REASONING_LADDER = ("gpt-5-nr", "gpt-5-medium", "gpt-5-high", "gpt-5-pro")
-HIDDEN = ("hidden_collision", "hidden_drop", "hidden_race")
+HIDDEN_SUB_SCENARIOS = ("hidden_collision", "hidden_drop", "hidden_race")
 _ENTRY = ["model", "dataset", "regime"]
 _EQUAL = 12  # decimals at which two means count as equal: below any printed digit, above rounding noise
 
@@ -43,13 +43,13 @@ _EQUAL = 12  # decimals at which two means count as equal: below any printed dig
 
 def study_cells(leaderboard: pd.DataFrame) -> pd.DataFrame:
     """Return cells from LEADERBOARD rows, with `_std` over runs, n_pairs, n_runs etc."""
-    rows = of_several_runs(leaderboard.loc[leaderboard["dataset"] != "overall"])
+    rows = null_single_deviations(leaderboard.loc[leaderboard["dataset"] != "overall"])
     spread = [f"{share}_std" for share in SHARES]
     columns = [*_ENTRY, "epoch", "n_pairs", "n_runs", "n_missing", "incomplete", *SHARES, *spread]
     return rows.loc[:, columns].reset_index(drop=True)
 
 
-def of_several_runs(rows: pd.DataFrame) -> pd.DataFrame:
+def null_single_deviations(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the rows, with deviations set to null where there was only one run."""
     spreads = [name for name in rows if name.endswith("_std")]
     return rows.assign(**{name: rows[name].where(rows["n_runs"] > 1) for name in spreads})
@@ -89,7 +89,7 @@ def overall(cells: pd.DataFrame) -> pd.DataFrame:
     Columns: model, regime, acc, abs_rec, false_abs, pecs. PECS is averaged too, not recomputed from the means. A
     (model, regime) that lacks one of the datasets in `cells` has no row, so that all rows average the same datasets.
     """
-    cells = _checked(cells)
+    cells = _check(cells)
     groups = cells.groupby(["model", "regime"], sort=False)
     complete_runs = cells.loc[groups["dataset"].transform("nunique") == cells["dataset"].nunique()]
     return _means(complete_runs.groupby(["model", "regime"], sort=False), SHARES).reset_index()
@@ -104,13 +104,13 @@ def uplift(cells: pd.DataFrame, means: pd.DataFrame | None = None) -> pd.DataFra
     """
     import pandas as pd
 
-    cells = _checked(cells)
+    cells = _check(cells)
     cells = cells.loc[cells["regime"].isin(PROMPTING)]
     require_one_epoch(cells.pivot(index=["model", "dataset"], columns="regime", values="epoch"), "uplift")
     rows = overall(cells) if means is None else means
     guided, standard = (rows[rows["regime"] == r].set_index("model")["abs_rec"] for r in (GUIDED, STANDARD))
-    both = [model for model in rows["model"].unique() if model in guided.index and model in standard.index]
-    return pd.DataFrame({"model": both, "ratio": ratio(guided.loc[both], standard.loc[both])})
+    models = [model for model in rows["model"].unique() if model in guided.index and model in standard.index]
+    return pd.DataFrame({"model": models, "ratio": ratio(guided.loc[models], standard.loc[models])})
 
 
 def spread(cells: pd.DataFrame, column: str = "pecs_std") -> pd.DataFrame:
@@ -147,12 +147,12 @@ def frontier(means: pd.DataFrame) -> pd.DataFrame:
     import pandas as pd
 
     means = means.dropna(subset=["acc", "j"])
-    best = [group.loc[~_dominated(group)] for _, group in means.groupby("regime", sort=False)]
+    best = [group.loc[~_is_dominated(group)] for _, group in means.groupby("regime", sort=False)]
     points = pd.DataFrame(pd.concat(best or [means]))
     return points.sort_values(["regime", "acc"], ascending=[True, False], ignore_index=True)
 
 
-def _dominated(points: pd.DataFrame) -> np.ndarray:
+def _is_dominated(points: pd.DataFrame) -> np.ndarray:
     """Return which rows another row dominates in (acc, j): (rows,) bool."""
     values = points[["acc", "j"]].round(_EQUAL).to_numpy(float)
     no_worse = (values[None] >= values[:, None]).all(-1)  # [i, k]: k is no worse than i in both
@@ -162,7 +162,7 @@ def _dominated(points: pd.DataFrame) -> np.ndarray:
 
 def naive_gap(cells: pd.DataFrame, threshold: float = 0.03) -> pd.DataFrame:
     """Return cells whose naive (Acc x AbsRec) exceeds PECS by a gap above `threshold`."""
-    cells = _checked(cells)
+    cells = _check(cells)
     cells["naive"] = cells["acc"] * cells["abs_rec"]
     cells["gap"] = cells["naive"] - cells["pecs"]
     return cells.loc[cells["gap"].round(_EQUAL) > threshold].reset_index(drop=True)
@@ -170,7 +170,7 @@ def naive_gap(cells: pd.DataFrame, threshold: float = 0.03) -> pd.DataFrame:
 
 def zero_boundary(cells: pd.DataFrame) -> pd.DataFrame:
     """Return cells with PECS 0: in no run are Acc and J both above 0."""
-    cells = _checked(cells)
+    cells = _check(cells)
     return cells.loc[cells["pecs"] == 0].reset_index(drop=True)
 
 
@@ -182,14 +182,14 @@ def degenerate_strategies() -> pd.DataFrame:
     """
     import pandas as pd
 
-    some = 0.2  # an arbitrary share: it is the same on both sides
+    share = 0.2  # an arbitrary share: it is the same on both sides
     rows = [
         ("always-abstain", 0.0, 1.0, 1.0),
         ("never-abstain", np.nan, 0.0, 0.0),
         ("random-50", np.nan, 0.5, 0.5),
         ("perfect-answerer", 1.0, 0.0, 0.0),
         ("inverse-oracle", 0.0, 1.0, 0.0),
-        ("confidence-noise", np.nan, some, some),
+        ("confidence-noise", np.nan, share, share),
     ]
     table = pd.DataFrame(rows, columns=pd.Index(["strategy", "acc", "false_abs", "abs_rec"]))
     table["j"] = table["abs_rec"] - table["false_abs"]
@@ -212,7 +212,7 @@ def visual_textual_gap(cells: pd.DataFrame, taxonomies: Sequence[str] = TAXONOMI
     """
     import pandas as pd
 
-    cells = _checked(cells)
+    cells = _check(cells)
     sides = cells.assign(
         taxonomy=cells["dataset"].str.removesuffix("_ill_posed"),
         side=np.where(cells["dataset"].str.endswith("_ill_posed"), "textual", "visual"),
@@ -241,17 +241,17 @@ def pair_differences(cells: pd.DataFrame) -> pd.DataFrame:
     """
     import pandas as pd
 
-    cells = _checked(cells, datasets=(*DATASETS, "overall"))
-    by_model = cells.set_index(_ENTRY)
+    cells = _check(cells, datasets=(*DATASETS, "overall"))
+    indexed_cells = cells.set_index(_ENTRY)
     rows = []
-    for thinking, plain in REASONING_PAIRS:
-        if not {thinking, plain} <= set(cells["model"]):
+    for thinking, other in REASONING_PAIRS:
+        if not {thinking, other} <= set(cells["model"]):
             continue
-        sides = {name: by_model.loc[name] for name in (thinking, plain)}
+        sides = {name: indexed_cells.loc[name] for name in (thinking, other)}
         epochs = pd.DataFrame({name: side["epoch"] for name, side in sides.items()}).dropna()
-        require_one_epoch(epochs, f"{thinking} against {plain}")
-        change = (sides[thinking][SHARES] - sides[plain][SHARES]).loc[epochs.index].reset_index()
-        rows.append(change.assign(thinking=thinking, other=plain))
+        require_one_epoch(epochs, f"{thinking} against {other}")
+        change = (sides[thinking][SHARES] - sides[other][SHARES]).loc[epochs.index].reset_index()
+        rows.append(change.assign(thinking=thinking, other=other))
     columns = ["thinking", "other", "regime", "dataset", *SHARES]
     return pd.concat(rows, ignore_index=True).loc[:, columns] if rows else pd.DataFrame(columns=pd.Index(columns))
 
@@ -271,23 +271,27 @@ def sub_scenarios(cells: pd.DataFrame) -> pd.DataFrame:
     """
     import pandas as pd
 
-    cells = _checked(cells, more=["scope"])
+    cells = _check(cells, more=["scope"])
     rows = []
     for key, group in cells.groupby([cells["dataset"].str.removesuffix("_ill_posed"), "scope"]):
         taxonomy, scope = cast(tuple[str, str], key)
         visual, textual = group.loc[group["dataset"] == taxonomy], group.loc[group["dataset"] != taxonomy]
-        by_regime = {r: visual.loc[visual["regime"] == r].set_index("model") for r in PROMPTING}
-        standard, guided = (by_regime[r].dropna(subset=SHARES) for r in PROMPTING)
+        regime_rows = {r: visual.loc[visual["regime"] == r].set_index("model") for r in PROMPTING}
+        standard, guided = (regime_rows[r].dropna(subset=SHARES) for r in PROMPTING)
         textual_voids = textual.loc[textual["regime"] == "standard"].set_index("model").dropna(subset=["abs_rec"])
         epochs = pd.DataFrame(
             {"standard": standard["epoch"], "guided": guided["epoch"], "ill-posed": textual_voids["epoch"]}
         )
         require_one_epoch(epochs, f"sub-scenario {scope} of {taxonomy}")
-        both, common = (standard.index.intersection(side.index) for side in (guided, textual_voids))
-        change = (guided.loc[both, SHARES] - standard.loc[both, SHARES]).mean()
+        guided_models, common = (standard.index.intersection(side.index) for side in (guided, textual_voids))
+        change = (guided.loc[guided_models, SHARES] - standard.loc[guided_models, SHARES]).mean()
         row = {"dataset": taxonomy, "sub_scenario": scope, "n_pairs": visual["n_pairs"].max()}
         row |= {"n_models": len(standard)} | standard[SHARES].mean().to_dict()
-        row |= {"guided_n_models": len(guided), "uplift_n_models": len(both), "ill_posed_n_models": len(common)}
+        row |= {
+            "guided_n_models": len(guided),
+            "uplift_n_models": len(guided_models),
+            "ill_posed_n_models": len(common),
+        }
         row |= guided[SHARES].mean().add_prefix("guided_").to_dict()
         row |= {f"{share}_uplift": change[share] for share in ("abs_rec", "false_abs")}
         means = [pd.Series([side.loc[common, "abs_rec"].mean()]) for side in (textual_voids, standard)]
@@ -303,7 +307,7 @@ def hidden_against_others(table: pd.DataFrame, columns: Sequence[str] = ("abs_re
     Columns kind, n, and `columns`; n_pairs and n_missing are sums, if table has them. table has one row per occlusion
     sub-scenario with the column sub_scenario, as `sub_scenarios` returns it.
     """
-    kind = np.where(table["sub_scenario"].isin(HIDDEN), "hidden", "other")
+    kind = np.where(table["sub_scenario"].isin(HIDDEN_SUB_SCENARIOS), "hidden", "other")
     groups = table.groupby(kind)
     sums = {name: groups[name].sum(min_count=1) for name in ("n_pairs", "n_missing") if name in table}
     return _means(groups, columns).assign(n=groups.size(), **sums).rename_axis("kind").reset_index()
@@ -317,7 +321,7 @@ def accuracy_by_label(cells: pd.DataFrame) -> pd.DataFrame:
     """
     import pandas as pd
 
-    rows = _checked(cells, more=["scope"])
+    rows = _check(cells, more=["scope"])
     groups = rows.loc[rows["regime"] == "standard"].dropna(subset=["acc"]).groupby(["dataset", "scope"])
     columns = {"acc": groups["acc"].mean(), "n_pairs": groups["n_pairs"].max(), "n_models": groups["model"].nunique()}
     table = pd.DataFrame(columns | {"n_missing": groups["n_missing"].sum()})
@@ -345,14 +349,14 @@ def _means(groups: DataFrameGroupBy, columns: Sequence[str]) -> pd.DataFrame:
     return means.where(counts.eq(groups.size(), axis="index"))
 
 
-def _checked(cells: pd.DataFrame, more: Sequence[str] = (), datasets: Sequence[str] = DATASETS) -> pd.DataFrame:
+def _check(cells: pd.DataFrame, more: Sequence[str] = (), datasets: Sequence[str] = DATASETS) -> pd.DataFrame:
     """Return a copy of cells. Raises ValueError for lacking columns or repeated rows."""
     missing = [name for name in (*_ENTRY, *SHARES, "epoch", *more) if name not in cells]
     if missing:
         raise ValueError(f"cells lack the columns {missing}")
-    twice = cells.loc[cells.duplicated([*_ENTRY, *more])]
-    if len(twice):
-        first = twice.iloc[0]
+    repeated_cells = cells.loc[cells.duplicated([*_ENTRY, *more])]
+    if len(repeated_cells):
+        first = repeated_cells.iloc[0]
         raise ValueError(
             f"cells have two rows for {first['model']}, {first['dataset']}, {first['regime']}: average runs first"
         )

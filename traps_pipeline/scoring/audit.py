@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.protocol.datasets import LONG, transfer_type
 from traps_pipeline.scoring.analyses import SHARES, models_of, overall
 from traps_pipeline.scoring.claims import CLAIMS
@@ -65,11 +65,11 @@ def audit_text(findings: pd.DataFrame, everything: bool = False) -> str:
     lines = ["lines are those of the paper's LaTeX source"]
     for group, rows in findings.groupby("group", sort=False):
         counts = ", ".join(f"{n} {verdict}" for verdict, n in rows["verdict"].value_counts().items())
-        lines.append(f"{group}: {counted(len(rows), 'statement')}: {counts}")
-        listed = rows if everything or group == "claims" else rows.loc[rows["verdict"].isin([DIFFERS, DECLARED])]
-        for row in listed.to_dict("records"):
-            where = f" (line {row['line']})" if row["line"] else ""
-            lines.append(f"  {row['verdict']:<15} {row['statement']}{where}")
+        lines.append(f"{group}: {count_noun(len(rows), 'statement')}: {counts}")
+        listed_rows = rows if everything or group == "claims" else rows.loc[rows["verdict"].isin([DIFFERS, DECLARED])]
+        for row in listed_rows.to_dict("records"):
+            line_note = f" (line {row['line']})" if row["line"] else ""
+            lines.append(f"  {row['verdict']:<15} {row['statement']}{line_note}")
             lines.append(f"  {'':<15} published {row['published']}; recomputed {row['recomputed']}")
             lines += [f"  {'':<15} {row['reason']}"] if row["reason"] else []
     lines.append(counts_text(findings))
@@ -79,10 +79,10 @@ def audit_text(findings: pd.DataFrame, everything: bool = False) -> str:
 def counts_text(findings: pd.DataFrame) -> str:
     """Return a sentence with the counts of statements by verdict."""
     count = {verdict: np.count_nonzero(findings["verdict"] == verdict) for verdict in (*_AGREEING, DECLARED, DIFFERS)}
-    agreeing = sum(count[verdict] for verdict in _AGREEING)
+    n_agreeing = sum(count[verdict] for verdict in _AGREEING)
     return (
-        f"{len(findings)} statements: {agreeing} agree ({count[ROUNDING]} of them within rounding), {count[DECLARED]} "
-        f"differ as the paper declares, {count[DIFFERS]} disagree"
+        f"{len(findings)} statements: {n_agreeing} agree ({count[ROUNDING]} of them within rounding), "
+        f"{count[DECLARED]} differ as the paper declares, {count[DIFFERS]} disagree"
     )
 
 
@@ -92,14 +92,14 @@ def counts_text(findings: pd.DataFrame) -> str:
 def claims() -> Iterator[AuditFinding]:
     """Yield all statements of `claims.csv`. Raises KeyError without their arithmetic."""
     for claim in published("claims").to_dict("records"):
-        printed, recomputed = str(claim["published"]), CLAIMS[str(claim["id"])]()
-        is_same = _is_same_wording(printed, recomputed.words) if recomputed.agrees is None else recomputed.agrees
+        published_text, recomputed = str(claim["published"]), CLAIMS[str(claim["id"])]()
+        is_same = _is_same_wording(published_text, recomputed.words) if recomputed.agrees is None else recomputed.agrees
         verdict: Verdict = AGREES if is_same else DIFFERS
         reason = recomputed.reason if verdict == DIFFERS else ""
         if verdict == DIFFERS and recomputed.agrees is None:
-            reason = f"{_differences(printed, recomputed.words)}{'; ' + reason if reason else ''}"
+            reason = f"{_differences(published_text, recomputed.words)}{'; ' + reason if reason else ''}"
         statement, line = f"{claim['id']}: {claim['statement']}", str(claim["line"])
-        yield AuditFinding("claims", statement, printed, _shown(recomputed.words), verdict, reason, line)
+        yield AuditFinding("claims", statement, published_text, _trim_zeros(recomputed.words), verdict, reason, line)
 
 
 def _is_same_wording(printed: str, recomputed: str) -> bool:
@@ -136,7 +136,7 @@ def _differences(printed: str, recomputed: str) -> str:
     )
 
 
-def _shown(words: str) -> str:
+def _trim_zeros(words: str) -> str:
     """Return the words with trailing zeros of four-decimal numbers removed."""
     return re.sub(r"(\d\.\d*?[1-9])0+(?!\d)|(\d+)\.0+(?!\d)", r"\1\2", words) if re.search(r"\.\d{4}", words) else words
 
@@ -154,17 +154,21 @@ def overall_means() -> Iterator[AuditFinding]:
     """Yield the overall leaderboard against means of the per-dataset table, by cell."""
     cells = published_cells()
     own_means = overall(cells).set_index(["model", "regime"]).to_dict("index")
-    of_entry = dict(iter(cells.groupby(["model", "regime"])))
+    entry_cells = dict(iter(cells.groupby(["model", "regime"])))
     for row in published_overall().to_dict("records"):
         model, regime = row["model"], row["regime"]
         for share in SHARES:
             scale, digits, unit = (1, 3, 0.001) if share == "pecs" else (100, int(share == "false_abs"), 0.1)
             value, printed_value = float(own_means[model, regime][share]) * scale, float(row[share]) * scale
-            off, half_unit = abs(value - printed_value), 0.5 * 10.0**-digits
+            deviation, half_unit = abs(value - printed_value), 0.5 * 10.0**-digits
             verdict: Verdict = (
-                AGREES if off <= half_unit + _SLACK else ROUNDING if off <= half_unit + unit / 2 + _SLACK else DIFFERS
+                AGREES
+                if deviation <= half_unit + _SLACK
+                else ROUNDING
+                if deviation <= half_unit + unit / 2 + _SLACK
+                else DIFFERS
             )
-            parts = of_entry[model, regime][share] * scale
+            parts = entry_cells[model, regime][share] * scale
             sums = " + ".join(f"{part:.{3 if share == 'pecs' else 1}f}" for part in parts)
             reason = "" if verdict == AGREES else f"({sums}) / 4 = {value:.5g}, off by {value - printed_value:+.2g}"
             name = f"overall {share} of {model}, {regime}"
@@ -186,8 +190,8 @@ def pecs_factors() -> Iterator[AuditFinding]:
         shares = {name: float(cell[name]) for name in ("acc", "abs_rec", "false_abs", "pecs")}
         low, high = _pecs_range(cell, shares)
         naive = shares["acc"] * max(0.0, shares["abs_rec"] - shares["false_abs"])
-        inside = low - 0.0005 - _SLACK <= shares["pecs"] <= high + 0.0005 + _SLACK
-        verdict: Verdict = AGREES if abs(naive - shares["pecs"]) <= 0.0005 else ROUNDING if inside else DIFFERS
+        is_in_range = low - 0.0005 - _SLACK <= shares["pecs"] <= high + 0.0005 + _SLACK
+        verdict: Verdict = AGREES if abs(naive - shares["pecs"]) <= 0.0005 else ROUNDING if is_in_range else DIFFERS
         reason = (
             f"{shares['acc']:.3f} x ({shares['abs_rec']:.3f} - {shares['false_abs']:.3f}) = {naive:.4f}; runs and "
             f"rounding allow {low:.4f} to {high:.4f}"
@@ -205,10 +209,10 @@ def _pecs_range(cell: Mapping[Hashable, Any], shares: Mapping[str, float]) -> tu
         deviation = dict.fromkeys(deviation, 0.0)
     s_j = deviation["abs_rec"] + deviation["false_abs"]
     j_low, j_high = (shares["abs_rec"] - shares["false_abs"] + sign * 2 * half_unit for sign in (-1, 1))
-    most = (j_high + float(np.hypot(j_high, s_j))) / 2
+    upper_bound = (j_high + float(np.hypot(j_high, s_j))) / 2
     covariance = deviation["acc"] * s_j
     low = max(0.0, (shares["acc"] - half_unit) * max(0.0, j_low) - covariance)
-    return low, (shares["acc"] + half_unit) * most + covariance
+    return low, (shares["acc"] + half_unit) * upper_bound + covariance
 
 
 def gaps() -> Iterator[AuditFinding]:
@@ -216,16 +220,16 @@ def gaps() -> Iterator[AuditFinding]:
     for row in published("visual_vs_textual").to_dict("records"):
         for taxonomy in ("occlusion", "chaotic"):
             visual, textual = float(row[f"{taxonomy}_visual_pct"]), float(row[f"{taxonomy}_textual_pct"])
-            printed = float(row[f"{taxonomy}_gap"])
+            printed_gap = float(row[f"{taxonomy}_gap"])
             own_value = textual / visual if visual else np.inf
-            half_unit = 0.05 if printed < 10 and printed != round(printed) else 0.5
+            half_unit = 0.05 if printed_gap < 10 and printed_gap != round(printed_gap) else 0.5
             lowest, highest = (
                 (textual - 0.05) / (visual + 0.05),
                 (textual + 0.05) / (visual - 0.05) if visual > 0.05 else np.inf,
             )
-            agrees = own_value == printed or abs(own_value - printed) <= half_unit + _SLACK
-            reachable = lowest - half_unit <= printed <= highest + half_unit
-            verdict: Verdict = AGREES if agrees else ROUNDING if reachable else DIFFERS
+            agrees = own_value == printed_gap or abs(own_value - printed_gap) <= half_unit + _SLACK
+            is_reachable = lowest - half_unit <= printed_gap <= highest + half_unit
+            verdict: Verdict = AGREES if agrees else ROUNDING if is_reachable else DIFFERS
             reason = (
                 ""
                 if agrees
@@ -233,7 +237,7 @@ def gaps() -> Iterator[AuditFinding]:
             )
             name = f"textual over visual, {taxonomy}, {row['model']}"
             yield AuditFinding(
-                "gaps", name, f"{printed:g}", f"{own_value:.2f}", verdict, reason, _line("visual_textual")
+                "gaps", name, f"{printed_gap:g}", f"{own_value:.2f}", verdict, reason, _line("visual_textual")
             )
 
 
@@ -244,8 +248,10 @@ def probe_means() -> Iterator[AuditFinding]:
         pairs = published_rows("probe_transfer", model=row["model"], transfer_type=row["transfer_type"])
         for column, items in columns.items():
             mean = fmean(pair[column] for pair in pairs)
-            off = abs(mean - row[column])
-            verdict: Verdict = AGREES if off <= 0.0005 + _SLACK else ROUNDING if off <= 0.001 + _SLACK else DIFFERS
+            deviation = abs(mean - row[column])
+            verdict: Verdict = (
+                AGREES if deviation <= 0.0005 + _SLACK else ROUNDING if deviation <= 0.001 + _SLACK else DIFFERS
+            )
             name = f"four-path mean AUROC, {items}, {row['model']}, {row['transfer_type']}"
             figures = f"{row[column]:.3f}", f"{mean:.5g}"
             yield AuditFinding("probe means", name, *figures, verdict, line=_line("probe_means"))
@@ -255,13 +261,13 @@ def transfer_types() -> Iterator[AuditFinding]:
     """Yield printed transfer types against their definitions."""
     for name, table in (("probe_transfer", "probe_transfer"), ("steering_alpha10_qwen", "steering_top")):
         for row in published(name).to_dict("records"):
-            own_type, printed = transfer_type(LONG[row["source"]], LONG[row["target"]]), str(row["transfer_type"])
-            where = f"{name}: type of {row['source']} to {row['target']}" + (
+            own_type, printed_type = transfer_type(LONG[row["source"]], LONG[row["target"]]), str(row["transfer_type"])
+            location = f"{name}: type of {row['source']} to {row['target']}" + (
                 f", {row['model']}" if "model" in row else ""
             )
-            reason = "" if own_type == printed else f"{row['source']} and {row['target']} share the taxonomy"
-            verdict: Verdict = AGREES if own_type == printed else DIFFERS
-            yield AuditFinding("transfer types", where, printed, own_type, verdict, reason, _line(table))
+            reason = "" if own_type == printed_type else f"{row['source']} and {row['target']} share the taxonomy"
+            verdict: Verdict = AGREES if own_type == printed_type else DIFFERS
+            yield AuditFinding("transfer types", location, printed_type, own_type, verdict, reason, _line(table))
 
 
 def steering_means() -> Iterator[AuditFinding]:
@@ -271,22 +277,24 @@ def steering_means() -> Iterator[AuditFinding]:
     make the same comparison.)
     """
     prompts = {"direction_family": "all", "direction_regime": "standard", "inference_regime": "guided"}
-    (printed,) = published_rows("steering_regime", model="gemma-4-e4b", **prompts)
+    (printed_row,) = published_rows("steering_regime", model="gemma-4-e4b", **prompts)
     for side in ("control", "void"):
         for alpha in (0, 10):
-            printed_value = printed[f"{side}_alpha{alpha}"]
+            printed_value = printed_row[f"{side}_alpha{alpha}"]
             own_mean = fmean(
                 row[f"{side}_abstention_pct"] for row in published_rows("steering_dose_gemma", alpha=alpha)
             )
-            is_same, below = abs(own_mean - printed_value) <= 0.5 + _SLACK, own_mean < printed_value
-            verdict: Verdict = AGREES if is_same else DECLARED if below else DIFFERS
-            where = (
-                "as the paper declares of the verification run" if below else "though the paper says that it lies below"
+            is_same, is_below = abs(own_mean - printed_value) <= 0.5 + _SLACK, own_mean < printed_value
+            verdict: Verdict = AGREES if is_same else DECLARED if is_below else DIFFERS
+            location = (
+                "as the paper declares of the verification run"
+                if is_below
+                else "though the paper says that it lies below"
             )
             reason = (
                 ""
                 if is_same
-                else f"lies {abs(own_mean - printed_value):.3g} points {'below' if below else 'above'}, {where}"
+                else f"lies {abs(own_mean - printed_value):.3g} points {'below' if is_below else 'above'}, {location}"
             )
             statement = f"gemma-4-e4b: mean {side} abstention at alpha {alpha} over the eight paths"
             yield AuditFinding("steering", statement, f"{printed_value:g}", f"{own_mean:g}", verdict, reason, "1418")
@@ -299,11 +307,11 @@ def steering_families() -> Iterator[AuditFinding]:
     """
     rows = published("steering_regime").query("inference_regime == 'guided' and direction_regime != 'standard'")
     for model, group in rows.groupby("model", sort=False):
-        by_family = group.set_index("direction_family")
+        family_rows = group.set_index("direction_family")
         for side in ("control", "void"):
             column = f"{side}_alpha10"
-            printed_value = float(by_family.loc["all", column])
-            families = [float(by_family.loc[family, column]) for family in ("oc", "ch")]
+            printed_value = float(family_rows.loc["all", column])
+            families = [float(family_rows.loc[family, column]) for family in ("oc", "ch")]
             own_mean = sum(families) / 2
             # Three roundings to a whole.
             verdict: Verdict = AGREES if abs(own_mean - printed_value) <= 1 + _SLACK else DIFFERS
@@ -318,14 +326,14 @@ def steering_families() -> Iterator[AuditFinding]:
 def validation_scores() -> Iterator[AuditFinding]:
     """Yield the judge's F1 against printed precision and recall, within rounding."""
     for row in published("judge_validation").to_dict("records"):
-        precision, recall, printed = float(row["precision"]), float(row["recall"]), float(row["f1"])
+        precision, recall, printed_f1 = float(row["precision"]), float(row["recall"]), float(row["f1"])
         own_f1 = _f1(precision, recall)
         lowest, highest = _f1(precision - 0.005, recall - 0.005), _f1(min(1.0, precision + 0.005), recall + 0.005)
-        agrees = abs(own_f1 - printed) <= 0.005 + _SLACK
-        reachable = lowest - 0.005 <= printed <= highest + 0.005
-        verdict: Verdict = AGREES if agrees else ROUNDING if reachable else DIFFERS
+        agrees = abs(own_f1 - printed_f1) <= 0.005 + _SLACK
+        is_reachable = lowest - 0.005 <= printed_f1 <= highest + 0.005
+        verdict: Verdict = AGREES if agrees else ROUNDING if is_reachable else DIFFERS
         reason = "" if agrees else f"rounding of precision and recall allows {lowest:.3f} to {highest:.3f}"
-        figures = f"{printed:.2f}", f"{own_f1:.3f}"
+        figures = f"{printed_f1:.2f}", f"{own_f1:.3f}"
         yield AuditFinding("validation", f"F1, {row['category']}", *figures, verdict, reason, _line("judge_validation"))
 
 
@@ -339,9 +347,9 @@ def composition_sums() -> Iterator[AuditFinding]:
     for row in published_rows("composition"):
         counts[row["dataset"]] = counts.get(row["dataset"], 0) + row["n"]
     for taxonomy in ("occlusion", "chaotic"):
-        printed, own_count = counts[f"{taxonomy}_ill_posed"], counts[taxonomy]
-        verdict: Verdict = AGREES if own_count == printed else DIFFERS
-        words = str(printed), str(own_count)
+        printed_count, own_count = counts[f"{taxonomy}_ill_posed"], counts[taxonomy]
+        verdict: Verdict = AGREES if own_count == printed_count else DIFFERS
+        words = str(printed_count), str(own_count)
         yield AuditFinding("composition", f"pairs of {taxonomy}", *words, verdict, line=_line("composition"))
 
 

@@ -25,8 +25,8 @@ from traps_pipeline.scoring.metrics import COUNTS, decision_counts, pecs_of
 
 TAXONOMIES = ("occlusion", "chaotic")
 ENTRY = ["model", "regime", "dataset"]
-RESAMPLED = ("acc", "abs_rec", "false_abs", "j", "pecs")
-INTERVAL_COLUMNS = [f"{figure}_ci_{end}" for figure in RESAMPLED for end in ("low", "high")]
+RESAMPLED_FIGURES = ("acc", "abs_rec", "false_abs", "j", "pecs")
+INTERVAL_COLUMNS = [f"{figure}_ci_{end}" for figure in RESAMPLED_FIGURES for end in ("low", "high")]
 RESAMPLES, SEED = 10_000, 20260101
 _GRAIN = 256  # weights are multiples of 1/256, so that float32 sums of them are exact on every machine
 _LEVEL = 0.95
@@ -37,9 +37,9 @@ _IN_MEAN = 0.5**0.5  # of two taxonomies: their errors are independent, so squar
 class ResampledFigures:
     """The mean over runs of every figure, observed and in every resample.
 
-    entries: (model, regime, dataset or `overall`) of each row; observed: (entries, RESAMPLED) float64; values:
-    (entries, 2, RESAMPLED, resamples) float32, lower ends before upper ends. NaN where nothing is decided, and for an
-    `overall` entry without a run that has all four datasets.
+    entries: (model, regime, dataset or `overall`) of each row; observed: (entries, RESAMPLED_FIGURES) float64; values:
+    (entries, 2, RESAMPLED_FIGURES, resamples) float32, lower ends before upper ends. NaN where nothing is decided, and
+    for an `overall` entry without a run that has all four datasets.
     """
 
     entries: list[tuple[str, str, str]]
@@ -48,7 +48,7 @@ class ResampledFigures:
 
     def figure(self, name: str) -> np.ndarray:
         """Return the ends of one figure: (entries, 2, resamples)."""
-        return self.values[:, :, RESAMPLED.index(name)]
+        return self.values[:, :, RESAMPLED_FIGURES.index(name)]
 
 
 def resample(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED) -> ResampledFigures:
@@ -73,9 +73,11 @@ def resample(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEE
             entries.append((model, regime, dataset))
             observed.append(mean[1, :, 0])
             values.append(mean[..., 1:].astype(np.float32))  # half the memory, and the time of quantiles
-    nothing = np.zeros((0, 2, len(RESAMPLED), resamples), np.float32)
+    no_values = np.zeros((0, 2, len(RESAMPLED_FIGURES), resamples), np.float32)
     return ResampledFigures(
-        entries, np.array(observed).reshape(len(entries), len(RESAMPLED)), np.stack(values) if values else nothing
+        entries,
+        np.array(observed).reshape(len(entries), len(RESAMPLED_FIGURES)),
+        np.stack(values) if values else no_values,
     )
 
 
@@ -83,7 +85,7 @@ def intervals(resampled: ResampledFigures, level: float = _LEVEL) -> pd.DataFram
     """Return 95 % intervals (ENTRY, INTERVAL_COLUMNS) by entry, null where undecided."""
     ends = [
         interval(resampled.figure(name), resampled.observed[:, k], limits_of(name), level)
-        for k, name in enumerate(RESAMPLED)
+        for k, name in enumerate(RESAMPLED_FIGURES)
     ]
     table = pd.DataFrame(resampled.entries, columns=pd.Index(ENTRY))
     bounds = np.concatenate(ends, axis=-1) if resampled.entries else np.zeros((0, len(INTERVAL_COLUMNS)))
@@ -105,8 +107,8 @@ def interval(
     """
     low = np.fmin(quantile(ends[..., 0, :], (1 - level) / 2), observed)
     high = np.fmax(quantile(ends[..., 1, :], (1 + level) / 2), observed)
-    nothing = np.all(np.isnan(ends), axis=(-2, -1), keepdims=True)[..., 0]
-    return np.where(nothing, np.nan, np.clip(np.stack([low, high], axis=-1), *limits))
+    is_undefined = np.all(np.isnan(ends), axis=(-2, -1), keepdims=True)[..., 0]
+    return np.where(is_undefined, np.nan, np.clip(np.stack([low, high], axis=-1), *limits))
 
 
 def with_interval(name: str, ends: np.ndarray, limits: tuple[float, float]) -> dict[str, float]:
@@ -172,13 +174,13 @@ class Resampling:
 
 def draw_scenarios(items: pd.DataFrame, resamples: int, seed: int) -> Resampling:
     """Draw the weights of the scenarios of items (columns scenario_id, taxonomy)."""
-    by_taxonomy = {}
+    scenario_weights_of = {}
     for k, taxonomy in enumerate(TAXONOMIES):
         ids = pd.Index(sorted(items.loc[items["taxonomy"] == taxonomy, "scenario_id"].unique()))
         weights = np.random.default_rng([seed, k]).standard_exponential((resamples, len(ids)), np.float32)
         weights = np.ceil(weights * _GRAIN) / _GRAIN
-        by_taxonomy[taxonomy] = ids, np.concatenate([np.ones((1, len(ids)), np.float32), weights])
-    return Resampling(by_taxonomy, resamples, seed)
+        scenario_weights_of[taxonomy] = ids, np.concatenate([np.ones((1, len(ids)), np.float32), weights])
+    return Resampling(scenario_weights_of, resamples, seed)
 
 
 def resampled_sums(weights: np.ndarray, counts: np.ndarray) -> np.ndarray:
@@ -213,10 +215,10 @@ def shares_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:
     weigh less (_IN_MEAN).
     """
     decisions = sums.shape[-2] // 3
-    yes, decided = sums[..., 0 : 2 * decisions : 2, :], sums[..., 1 : 2 * decisions : 2, :]
-    unseen = sums[..., 2 * decisions :, :] * (_IN_MEAN if in_mean else 1.0)
+    yes, n_decided = sums[..., 0 : 2 * decisions : 2, :], sums[..., 1 : 2 * decisions : 2, :]
+    unseen_weights = sums[..., 2 * decisions :, :] * (_IN_MEAN if in_mean else 1.0)
     with np.errstate(invalid="ignore"):
-        return np.stack([yes, yes + unseen]) / (decided + unseen)
+        return np.stack([yes, yes + unseen_weights]) / (n_decided + unseen_weights)
 
 
 def ends_of_mean(values: pd.Series, resampling: Resampling, named: str) -> np.ndarray:
@@ -226,14 +228,14 @@ def ends_of_mean(values: pd.Series, resampling: Resampling, named: str) -> np.nd
     """
     sums = np.zeros((1, 2, 1 + resampling.resamples))
     for scenarios, weights in resampling.scenarios.values():
-        own = values.reindex(scenarios)
-        counts = np.stack([own.fillna(0.0), own.notna()], axis=1).astype(float)
+        scenario_values = values.reindex(scenarios)
+        counts = np.stack([scenario_values.fillna(0.0), scenario_values.notna()], axis=1).astype(float)
         sums += resampled_sums(weights, counts[:, None])
     return shares_of(with_unseen(sums, np.array([[len(values)]]), resampling.unseen(named, 1)))[:, 0, 0]
 
 
 def figures_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:
-    """Return scores from sums, (.., 9, resamples) -> (2, .., RESAMPLED, resamples).
+    """Return scores from sums, (.., 9, resamples) -> (2, .., RESAMPLED_FIGURES, resamples).
 
     The sums are those of COUNTS with an unseen scenario. in_mean: as in `shares_of`.
     """
@@ -241,7 +243,7 @@ def figures_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:
 
 
 def figures_of_shares(shares: np.ndarray) -> np.ndarray:
-    """Return scores, (2, .., 3, resamples) -> (2, .., RESAMPLED, resamples).
+    """Return scores, (2, .., 3, resamples) -> (2, .., RESAMPLED_FIGURES, resamples).
 
     The three are the ends of Acc, FalseAbs and AbsRec.
     """
@@ -266,7 +268,7 @@ def run_sums(group: pd.DataFrame, resampling: Resampling, named: str) -> dict[tu
     the items' unseen scenarios.
     """
     totals: dict[tuple[str, int], np.ndarray] = {}
-    having: dict[tuple[str, int], np.ndarray] = {}
+    n_with_decision: dict[tuple[str, int], np.ndarray] = {}
     values = group[COUNTS].to_numpy()
     items_of: dict[str, list[tuple[int, tuple[str, int], str]]] = {}  # plain lists: groups are small, and many
     columns = (group[name].tolist() for name in ("taxonomy", "dataset", "run", "scenario_id"))
@@ -282,17 +284,17 @@ def run_sums(group: pd.DataFrame, resampling: Resampling, named: str) -> dict[tu
         having_any = (counts[..., 1::2] > 0).sum(axis=0)
         for key, sums, n in zip(cells, resampled_sums(weights, counts), having_any, strict=True):
             totals[key] = totals.get(key, 0) + sums
-            having[key] = having.get(key, 0) + n
-    unseen = {
+            n_with_decision[key] = n_with_decision.get(key, 0) + n
+    unseen_weights = {
         dataset: resampling.unseen(f"{named}|{dataset}", len(COUNTS) // 2) for dataset in {name for name, _ in totals}
     }
-    return {key: with_unseen(sums, having[key], unseen[key[0]]) for key, sums in totals.items()}
+    return {key: with_unseen(sums, n_with_decision[key], unseen_weights[key[0]]) for key, sums in totals.items()}
 
 
 def means_over_runs(
     sums: Mapping[tuple[str, int], np.ndarray], figures: Callable[[np.ndarray, bool], np.ndarray], draws: int
 ) -> dict[str, np.ndarray]:
-    """Return dataset or `overall` -> mean over runs (2, RESAMPLED, draws).
+    """Return dataset or `overall` -> mean over runs (2, RESAMPLED_FIGURES, draws).
 
     sums: the `run_sums` of (dataset, run). figures: the function (`figures_of`) that computes figures from them.
     """
@@ -303,10 +305,10 @@ def means_over_runs(
         if any((dataset, run) in sums for run in runs)
     }
     complete_runs = [sums[d, run] for run in runs if all((d, run) in sums for d in DATASETS) for d in DATASETS]
-    nothing = np.full((2, len(RESAMPLED), draws), np.nan)
+    undefined = np.full((2, len(RESAMPLED_FIGURES), draws), np.nan)
     return {
         **means,
-        "overall": _mean([figures(own, True) for own in complete_runs]) if complete_runs else nothing,
+        "overall": _mean([figures(own, True) for own in complete_runs]) if complete_runs else undefined,
     }
 
 

@@ -56,16 +56,16 @@ def _naive_gap() -> Recomputed:
 
 def _zeros(regime: str) -> Recomputed:
     cells = _main_cells(regime)
-    at_zero = zero_boundary(cells)
-    cell = f" ({' '.join(at_zero.iloc[0][['model', 'dataset']])})" if len(at_zero) == 1 else ""
-    return Recomputed(f"{len(at_zero)} of {len(cells)}{cell}")
+    zero_cells = zero_boundary(cells)
+    cell = f" ({' '.join(zero_cells.iloc[0][['model', 'dataset']])})" if len(zero_cells) == 1 else ""
+    return Recomputed(f"{len(zero_cells)} of {len(cells)}{cell}")
 
 
 def _spread(models: Sequence[str]) -> Recomputed:
     cells = published_cells()
     model_cells = cells.loc[cells["model"].isin(models)]
     row = spread(model_cells).iloc[0]
-    quartiles = [f"{name} {r.q25:.4f}-{r.q75:.4f}" for name, r in _other_spreads(model_cells)]
+    quartiles = [f"{name} {r.q25:.4f}-{r.q75:.4f}" for name, r in _spreads_of_shares(model_cells)]
     return Recomputed(
         f"{row['q25']:.4f} to {row['q75']:.4f}",
         f"quartiles over the {int(row['n'])} cells with a spread; other metrics give {', '.join(quartiles)}, and PECS "
@@ -73,7 +73,7 @@ def _spread(models: Sequence[str]) -> Recomputed:
     )
 
 
-def _other_spreads(cells: pd.DataFrame) -> Iterator[tuple[str, pd.Series]]:
+def _spreads_of_shares(cells: pd.DataFrame) -> Iterator[tuple[str, pd.Series]]:
     for share in ("acc", "abs_rec", "false_abs"):
         yield share, spread(cells, f"{share}_std").iloc[0]
 
@@ -124,12 +124,15 @@ def _flash_thinking() -> Recomputed:
     return Recomputed(f"{float(change.min()):.2f} to {float(change.max()):.2f}")
 
 
-def _pooled(row: dict[str, Any], kind: str) -> float:
+def _mean_of_taxonomies(row: dict[str, Any], kind: str) -> float:
     return (row[f"occlusion_{kind}_pct"] + row[f"chaotic_{kind}_pct"]) / 2
 
 
 def _gap_median() -> Recomputed:
-    gaps = [_pooled(row, "textual") / _pooled(row, "visual") for row in published_rows("visual_vs_textual")]
+    gaps = [
+        _mean_of_taxonomies(row, "textual") / _mean_of_taxonomies(row, "visual")
+        for row in published_rows("visual_vs_textual")
+    ]
     return Recomputed(f"{median(gaps):.4f}")
 
 
@@ -140,14 +143,15 @@ def _family_gaps() -> Recomputed:
         if entry.id in rows:
             families.setdefault(entry.groups.family, []).append(rows[entry.id])
     gaps = {
-        family: sum(_pooled(row, "textual") for row in members) / sum(_pooled(row, "visual") for row in members)
+        family: sum(_mean_of_taxonomies(row, "textual") for row in members)
+        / sum(_mean_of_taxonomies(row, "visual") for row in members)
         for family, members in families.items()
     }
-    listed = ", ".join(f"{family} {value:.1f}" for family, value in gaps.items())
-    return Recomputed(f"{min(gaps.values()):.1f} to {max(gaps.values()):.1f}", listed)
+    ratio_text = ", ".join(f"{family} {value:.1f}" for family, value in gaps.items())
+    return Recomputed(f"{min(gaps.values()):.1f} to {max(gaps.values()):.1f}", ratio_text)
 
 
-def _by_regime(figure: str, models: Sequence[str]) -> dict[tuple[str, str], dict[str, float]]:
+def _figures_by_regime(figure: str, models: Sequence[str]) -> dict[tuple[str, str], dict[str, float]]:
     """Return the printed figure by (model, dataset) and regime."""
     shares: dict[tuple[str, str], dict[str, float]] = {}
     for row in published_rows("behavioral_per_dataset"):
@@ -164,13 +168,13 @@ def _means(cells: dict[tuple[str, str], dict[str, float]]) -> dict[str, dict[str
 
 
 def _ties() -> Recomputed:
-    cells = _by_regime("abs_rec_pct", models_of("main"))
+    cells = _figures_by_regime("abs_rec_pct", models_of("main"))
     ties = [" ".join(key) for key, cell in cells.items() if cell["guided"] <= cell["standard"]]
     return Recomputed(f"{len(ties)} ({'; '.join(ties)})")
 
 
 def _accuracy_kept() -> Recomputed:
-    cells = _by_regime("acc_pct", _video_native())
+    cells = _figures_by_regime("acc_pct", _video_native())
     means = _means(cells)
     counts = [
         sum(abs(row["guided"] - row["standard"]) <= 2 + 1e-9 for row in rows)
@@ -186,7 +190,9 @@ def _reported_above() -> Recomputed:
 
 def _above_contour() -> Recomputed:
     models = [*models_of("main"), *models_of("replication")]
-    acc, abs_rec, false_abs = (_means(_by_regime(f"{name}_pct", models)) for name in ("acc", "abs_rec", "false_abs"))
+    acc, abs_rec, false_abs = (
+        _means(_figures_by_regime(f"{name}_pct", models)) for name in ("acc", "abs_rec", "false_abs")
+    )
     products = {m: acc[m]["guided"] * (abs_rec[m]["guided"] - false_abs[m]["guided"]) / 1e4 for m in models}
     reason = f"gpt-5-high is at {products['gpt-5-high']:.3f} there; its reported PECS is .400"
     return Recomputed(f"{sum(value >= 0.4 for value in products.values())}", reason)
@@ -196,7 +202,7 @@ def _json_between() -> Recomputed:
     overall: dict[str, dict[str, float]] = {}
     for row in published_rows("overall"):
         overall.setdefault(row["model"], {})[row["regime"]] = row["pecs"]
-    cells = _by_regime("pecs", [*overall])
+    cells = _figures_by_regime("pecs", [*overall])
     counts = [
         sum(row["standard"] < row["json"] < row["guided"] for row in rows)
         for rows in (overall.values(), cells.values())
@@ -218,8 +224,8 @@ def _same_agreement() -> Recomputed:
         [(row["unanimous_pct"], row["fleiss_kappa"]) for row in rows if row["task"] != "void_abstention"]
         for rows in (published_rows("judge_agreement", dataset=name) for name in ("chaotic", "chaotic_ill_posed"))
     ]
-    listed = "; ".join(f"{share:g} % and {kappa:.3f}" for share, kappa in figures[0])
-    reason = f"both have {listed}, though the items, Acc and FalseAbs differ; the epoch is not stated"
+    figure_text = "; ".join(f"{share:g} % and {kappa:.3f}" for share, kappa in figures[0])
+    reason = f"both have {figure_text}, though the items, Acc and FalseAbs differ; the epoch is not stated"
     return Recomputed("different" if figures[0] != figures[1] else "equal to three digits", reason)
 
 
@@ -238,9 +244,9 @@ def _textual_ratio(sub_scenario: str) -> Recomputed:
     (row,) = published_rows("chaotic_subscenarios", sub_scenario=sub_scenario)
     visual, textual = row["abs_rec_pct"], row["abs_rec_ill_posed_pct"]
     low, high = (textual - 0.05) / (visual + 0.05), (textual + 0.05) / (visual - 0.05)
-    (printed,) = published_rows("other", id=f"{sub_scenario}-ratio")
-    half_unit = 0.05 if "." in printed["value"] else 0.5
-    agrees = low - half_unit <= float(printed["value"]) <= high + half_unit
+    (printed_row,) = published_rows("other", id=f"{sub_scenario}-ratio")
+    half_unit = 0.05 if "." in printed_row["value"] else 0.5
+    agrees = low - half_unit <= float(printed_row["value"]) <= high + half_unit
     return Recomputed(f"{textual / visual:.2f}", f"rounding of the rates allows {low:.1f} to {high:.1f}", agrees=agrees)
 
 
@@ -251,16 +257,16 @@ def _validated() -> Recomputed:
 
 
 def _es_scores() -> Recomputed:
-    positives, missed, labels, agreeing = 13, 8, 100, 92
+    positives, missed, labels, n_agreeing = 13, 8, 100, 92
     recall, accuracy = (positives - missed) / positives, 1 - missed / labels
     chance = (positives**2 + (labels - positives) ** 2) / labels**2
-    f1, kappa = 2 * recall / (1 + recall), (agreeing / labels - chance) / (1 - chance)
+    f1, kappa = 2 * recall / (1 + recall), (n_agreeing / labels - chance) / (1 - chance)
     return Recomputed(f"{accuracy:.4f} and {recall:.4f} and {f1:.4f} and {kappa:.4f}")
 
 
 def _reviewed() -> Recomputed:
-    kept, corrected, discarded = (text_figure(f"review-{kind}") for kind in ("kept", "corrected", "discarded"))
-    return Recomputed(f"{kept + corrected + discarded:g}")
+    n_kept, corrected, discarded = (text_figure(f"review-{kind}") for kind in ("kept", "corrected", "discarded"))
+    return Recomputed(f"{n_kept + corrected + discarded:g}")
 
 
 def _evaluated() -> Recomputed:

@@ -56,10 +56,10 @@ def _replication() -> Recomputed:
 
 
 def _replication_shift() -> Recomputed:
-    most = max(_shifts(GEMMA) + _shifts(LLAVA))
-    listed = ", ".join(f"{value:.3f}" for value in _shifts(GEMMA))
-    reason = f"the bound of line 386 is stated of {QWEN}; the three shifts of {GEMMA} are {listed}"
-    return Recomputed(f"{most:.3f}", reason, agrees=most <= 0.035)
+    largest_shift = max(_shifts(GEMMA) + _shifts(LLAVA))
+    shift_text = ", ".join(f"{value:.3f}" for value in _shifts(GEMMA))
+    reason = f"the bound of line 386 is stated of {QWEN}; the three shifts of {GEMMA} are {shift_text}"
+    return Recomputed(f"{largest_shift:.3f}", reason, agrees=largest_shift <= 0.035)
 
 
 def _across_domains() -> Recomputed:
@@ -100,18 +100,18 @@ def _families() -> Recomputed:
     return Recomputed(f"{occlusion} and {chaotic}")
 
 
-def _of_family(family: str, column: str, **where: object) -> list[float]:
+def _family_values(family: str, column: str, **where: object) -> list[float]:
     rows = published_rows("steering_dose_qwen", **where)
     return [row[column] for row in rows if row["source"].removesuffix("_ip") == family]
 
 
 def _chaotic_control() -> Recomputed:
-    most = max(_of_family("ch", "control_abstention_pct"))
-    return Recomputed(f"{most:g}", "ch_ip to ch has 36, 60 and 96, and ch_ip to oc has 6 at alpha 5")
+    largest_share = max(_family_values("ch", "control_abstention_pct"))
+    return Recomputed(f"{largest_share:g}", "ch_ip to ch has 36, 60 and 96, and ch_ip to oc has 6 at alpha 5")
 
 
 def _chaotic_void() -> Recomputed:
-    rates = _of_family("ch", "void_abstention_pct")
+    rates = _family_values("ch", "void_abstention_pct")
     return Recomputed(f"{min(rates):g} to {max(rates):g}", "only ch to oc stays there; ch_ip to oc falls from 46 to 28")
 
 
@@ -132,7 +132,7 @@ def _same_paths() -> Recomputed:
 
 def _alpha0_of_families() -> Recomputed:
     values = [
-        fmean(_of_family(family, f"{side}_abstention_pct", alpha=0))
+        fmean(_family_values(family, f"{side}_abstention_pct", alpha=0))
         for family in ("oc", "ch")
         for side in ("control", "void")
     ]

@@ -21,7 +21,7 @@ from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.scoring.bootstrap import (
     ENTRY,
-    RESAMPLED,
+    RESAMPLED_FIGURES,
     RESAMPLES,
     ResampledFigures,
     difference,
@@ -54,21 +54,26 @@ def contrasts(resampled: ResampledFigures, metrics: pd.DataFrame, verdicts: pd.D
     items_of, sizes = answered_items(verdicts), _scenarios(verdicts)
     rows: list[dict[str, Any]] = []
     for kind, dataset, left, right in _pairs([entry for entry in resampled.entries if entry in items_of]):
-        refused = refusal(items_of[(*left, dataset)], items_of[(*right, dataset)])
-        row = {"kind": kind, "dataset": dataset, "_regime": left[1] if kind == "models" else "", "refused": refused}
+        refusal_reason = refusal(items_of[(*left, dataset)], items_of[(*right, dataset)])
+        row = {
+            "kind": kind,
+            "dataset": dataset,
+            "_regime": left[1] if kind == "models" else "",
+            "refused": refusal_reason,
+        }
         row |= dict(zip(_SIDES, (*left, *right), strict=True))
         rows += [{**row, "figure": figure} for figure in CONTRASTED_FIGURES]
     places = {entry: row for row, entry in enumerate(resampled.entries)}
     means = means_over_runs(metrics).loc[:, [*CONTRASTED_FIGURES]].to_dict("index")
     for figure in CONTRASTED_FIGURES:
-        compared = [row for row in rows if row["figure"] == figure and row["refused"] is None]
-        for first in range(0, len(compared), _AT_ONCE):
-            part = compared[first : first + _AT_ONCE]
+        compared_rows = [row for row in rows if row["figure"] == figure and row["refused"] is None]
+        for first in range(0, len(compared_rows), _AT_ONCE):
+            part = compared_rows[first : first + _AT_ONCE]
             sides = [[(row[model], row[regime], row["dataset"]) for row in part] for model, regime in _SIDE_COLUMNS]
             draws = [resampled.figure(figure)[[places[entry] for entry in side]] for side in sides]
             observed = [[means.get(entry, {}).get(figure, np.nan) for entry in side] for side in sides]
-            of_rows = _differences(figure, draws, observed, [sizes[entry] for entry in sides[0]])
-            for row, columns in zip(part, of_rows, strict=True):
+            row_differences = _differences(figure, draws, observed, [sizes[entry] for entry in sides[0]])
+            for row, columns in zip(part, row_differences, strict=True):
                 row |= columns
     table = pd.DataFrame(rows, columns=pd.Index([*CONTRASTS.names, "_regime"]))
     table["p_holm"] = _holm_by(table, _FAMILY)
@@ -85,26 +90,35 @@ def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RE
     reason for a missing difference, if an item was answered in different epochs. Raises TrapsError if the two studies
     share no complete pair.
     """
-    sides = _whole_pairs_of_both(then, now)
+    sides = _common_pairs(then, now)
     if sides[0].empty:
         raise TrapsError("the two studies share no whole pair of the same model, regime and run")
     boards = [_standings(rows).add_suffix(suffix) for rows, suffix in zip(sides, ("_then", "_now"), strict=True)]
     board = boards[0].join(boards[1], how="inner").rename(columns={"n_pairs_now": "n_pairs"})
-    asked, drawn = [answered_items(rows) for rows in sides], [resample(rows, resamples) for rows in sides]
-    draws = [dict(zip(resampled.entries, resampled.values, strict=True)) for resampled in drawn]
+    items_of, resampled_figures = (
+        [answered_items(rows) for rows in sides],
+        [resample(rows, resamples) for rows in sides],
+    )
+    draws = [dict(zip(side_figures.entries, side_figures.values, strict=True)) for side_figures in resampled_figures]
     sizes = _scenarios(sides[1])
     rows = []
-    for entry, about in board.to_dict("index").items():
-        refused = refusal(asked[0][entry], asked[1][entry])
+    for entry, entry_columns in board.to_dict("index").items():
+        refusal_reason = refusal(items_of[0][entry], items_of[1][entry])
         for figure in CONTRASTED_FIGURES:
-            values = {f"{name}_{side}": about[f"{name}_{side}"] for name in VERSION_SIDES for side in ("then", "now")}
-            values |= {side: about[f"{figure}_{side}"] for side in ("then", "now")}
-            row = dict(zip(ENTRY, entry, strict=True)) | {"figure": figure, "n_pairs": about["n_pairs"], **values}
+            values = {
+                f"{name}_{side}": entry_columns[f"{name}_{side}"] for name in VERSION_SIDES for side in ("then", "now")
+            }
+            values |= {side: entry_columns[f"{figure}_{side}"] for side in ("then", "now")}
+            row = dict(zip(ENTRY, entry, strict=True)) | {
+                "figure": figure,
+                "n_pairs": entry_columns["n_pairs"],
+                **values,
+            }
             row["n_scenarios"] = sizes[entry]
-            if refused is None:
-                ends = [resampled[entry][None, :, RESAMPLED.index(figure)] for resampled in draws[::-1]]
+            if refusal_reason is None:
+                ends = [side_figures[entry][None, :, RESAMPLED_FIGURES.index(figure)] for side_figures in draws[::-1]]
                 row |= _differences(figure, ends, [[row["now"]], [row["then"]]], [sizes[entry]])[0]
-            rows.append(row | {"refused": refused})
+            rows.append(row | {"refused": refusal_reason})
     columns = [
         *ENTRY,
         "figure",
@@ -126,7 +140,7 @@ def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RE
     return table
 
 
-def _whole_pairs_of_both(then: pd.DataFrame, now: pd.DataFrame) -> list[pd.DataFrame]:
+def _common_pairs(then: pd.DataFrame, now: pd.DataFrame) -> list[pd.DataFrame]:
     """Return each study's rows of pairs (by model, regime, run) complete in both."""
     key = [*CELL, "pair_id"]
     common = then[[*key, "item_id"]].merge(now[[*key, "item_id"]], on=[*key, "item_id"])
@@ -153,18 +167,18 @@ def regime_tests(verdicts: pd.DataFrame) -> pd.DataFrame:
         ("control_abstention", "control", "abstained"),
         ("correctness", "control", "correct"),
     ):
-        by_cell = _decisions(verdicts.loc[verdicts["side"] == side], column)
-        for (dataset, model, run), decisions in sorted(by_cell.items()):
+        cell_decisions = _decisions(verdicts.loc[verdicts["side"] == side], column)
+        for (dataset, model, run), decisions in sorted(cell_decisions.items()):
             for left, right in combinations([r for r in REGIMES if r in decisions], 2):
                 sides = decisions[left], decisions[right]
-                both = sides[0].keys() & sides[1].keys()
-                only_left = sum(sides[0][item][0] and not sides[1][item][0] for item in both)
-                only_right = sum(sides[1][item][0] and not sides[0][item][0] for item in both)
+                common_items = sides[0].keys() & sides[1].keys()
+                only_left = sum(sides[0][item][0] and not sides[1][item][0] for item in common_items)
+                only_right = sum(sides[1][item][0] and not sides[0][item][0] for item in common_items)
                 row = {"dataset": dataset, "model": model, "run": run, "decision": decision}
-                row |= {"left_regime": left, "right_regime": right, "n": len(both)}
+                row |= {"left_regime": left, "right_regime": right, "n": len(common_items)}
                 row |= {"only_left": only_left, "only_right": only_right}
-                row["refused"] = refusal(*({item: of[item][1] for item in both} for of in sides))
-                if row["refused"] is None and both:
+                row["refused"] = refusal(*({item: of[item][1] for item in common_items} for of in sides))
+                if row["refused"] is None and common_items:
                     row["p"] = mcnemar_p(only_left, only_right)
                 rows.append(row)
     table = pd.DataFrame(rows, columns=pd.Index(REGIME_TESTS.names))
@@ -183,17 +197,17 @@ def _decisions(
     columns = ["dataset", "model", "run", "regime", "item_id", column, "epoch", "panel"]
     rows = verdicts[columns].assign(is_decided=verdicts[column].notna()).itertuples(index=False, name=None)
     for dataset, model, run, regime, item, decision, epoch, panel, is_decided in rows:
-        of_regime = decisions.setdefault((dataset, model, run), {}).setdefault(regime, {})
+        regime_decisions = decisions.setdefault((dataset, model, run), {}).setdefault(regime, {})
         if is_decided:
-            of_regime[item] = bool(decision), Origin(epoch, panel)
+            regime_decisions[item] = bool(decision), Origin(epoch, panel)
     return decisions
 
 
 def mcnemar_p(only_left: int, only_right: int) -> float:
     """Return McNemar's exact two-sided p from the items that differ in each direction."""
-    differing = only_left + only_right
-    tail = sum(comb(differing, k) for k in range(min(only_left, only_right) + 1))
-    return min(1.0, 2 * tail / 2**differing)
+    n_differing = only_left + only_right
+    tail = sum(comb(n_differing, k) for k in range(min(only_left, only_right) + 1))
+    return min(1.0, 2 * tail / 2**n_differing)
 
 
 def holm(p: np.ndarray) -> np.ndarray:
@@ -243,28 +257,28 @@ def _differences(
     p.
     """
     ends, apart = difference(*sides), np.asarray(observed[0]) - np.asarray(observed[1])
-    least, most = limits_of(figure)
-    bounds = interval(ends, apart, (least - most, most - least))
+    minimum, maximum = limits_of(figure)
+    bounds = interval(ends, apart, (minimum - maximum, maximum - minimum))
     rows = []
     for size, value, bound, (lower, upper) in zip(scenarios, apart, bounds, ends, strict=True):
         row = {"n_scenarios": size, "difference": value, "ci_low": bound[0], "ci_high": bound[1]}
         low, high = lower[~np.isnan(lower)], upper[~np.isnan(upper)]
         if len(low) and len(high):
-            row["p"] = min(1.0, max(2 * min(_beyond(low), _beyond(-high)), least_p(size)))
+            row["p"] = min(1.0, max(2 * min(_tail_share(low), _tail_share(-high)), least_p(size)))
         rows.append(row)
     return rows
 
 
-def _beyond(ends: np.ndarray) -> float:
+def _tail_share(ends: np.ndarray) -> float:
     """Return the share of ends at 0 or below, one added to their count.
 
     This is never below 1 / (resamples + 1), so no contrast of many models could be significant after Holm's correction.
     Therefore, if no end lies there, it is the tail of a normal distribution with the mean and standard error of the
     ends, if that is smaller.
     """
-    beyond = int((ends <= 0).sum())
-    share = (beyond + 1) / (len(ends) + 1)
-    if beyond:
+    n_beyond = int((ends <= 0).sum())
+    share = (n_beyond + 1) / (len(ends) + 1)
+    if n_beyond:
         return share
     error = float(ends.std())
     return min(share, erfc(float(ends.mean()) / error / sqrt(2) if error else inf) / 2)
@@ -275,10 +289,10 @@ def _separable(table: pd.DataFrame, family: Sequence[str]) -> pd.Series:
 
     Null if so few scenarios cannot make the smallest p of the family that small, and False if there is no p.
     """
-    compared = table.groupby(list(family))["p"].transform("count").to_numpy(float)
-    least = np.array([least_p(int(n)) if n == n else 0.0 for n in table["n_scenarios"].astype(float)])
+    n_compared = table.groupby(list(family))["p"].transform("count").to_numpy(float)
+    smallest_p = np.array([least_p(int(n)) if n == n else 0.0 for n in table["n_scenarios"].astype(float)])
     separable = pd.Series(table["p_holm"].astype(float) < SEPARABLE_BELOW, dtype="boolean")
-    return separable.mask(table["p"].notna() & (least * compared >= SEPARABLE_BELOW))
+    return separable.mask(table["p"].notna() & (smallest_p * n_compared >= SEPARABLE_BELOW))
 
 
 def _holm_by(table: pd.DataFrame, family: Sequence[str]) -> np.ndarray:

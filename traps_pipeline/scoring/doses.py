@@ -16,7 +16,7 @@ import pandas as pd
 
 from traps_pipeline.protocol.datasets import datasets_of_category
 from traps_pipeline.scoring.bootstrap import (
-    RESAMPLED,
+    RESAMPLED_FIGURES,
     RESAMPLES,
     SEED,
     Resampling,
@@ -145,15 +145,15 @@ def hypotheses(
     resampling = draw_scenarios(items, resamples, seed)
     rows: list[dict[str, Any]] = []
     for (model, regime), group in cast(Any, items.groupby(["model", "regime"], sort=True)):
-        asked = {*group["dataset"]}
-        for hypothesis in [one for one in HYPOTHESES if any(asked & {*dose.datasets} for dose in _variations(one))]:
-            by_dose = [(dose, _items_of(group, dose)) for dose in hypothesis.doses]
-            with_items = [(dose, its) for dose, its in by_dose if len(its)]
+        datasets = {*group["dataset"]}
+        for hypothesis in [one for one in HYPOTHESES if any(datasets & {*dose.datasets} for dose in _variations(one))]:
+            dose_items = [(dose, _items_of(group, dose)) for dose in hypothesis.doses]
+            with_items = [(dose, its) for dose, its in dose_items if len(its)]
             if {dose for dose, _ in with_items} & _variations(hypothesis):
-                reference = by_dose[0][1]
+                reference = dose_items[0][1]
                 dose_rows = [_row(hypothesis, dose, its, reference, resampling) for dose, its in with_items]
                 rows += [{"model": model, "regime": regime, "hypothesis": hypothesis.name, **row} for row in dose_rows]
-    return _beside_rules(pd.DataFrame(rows, columns=pd.Index(TABLE.names)))
+    return _with_rule_scores(pd.DataFrame(rows, columns=pd.Index(TABLE.names)))
 
 
 def _variations(hypothesis: Hypothesis) -> set[Dose]:
@@ -162,8 +162,8 @@ def _variations(hypothesis: Hypothesis) -> set[Dose]:
 
 
 def _items_of(group: pd.DataFrame, dose: Dose) -> pd.DataFrame:
-    in_dose = group["dataset"].isin(dose.datasets)
-    return group.loc[in_dose if dose.side is None else in_dose & (group["side"] == dose.side)]
+    is_in_dose = group["dataset"].isin(dose.datasets)
+    return group.loc[is_in_dose if dose.side is None else is_in_dose & (group["side"] == dose.side)]
 
 
 def _row(
@@ -171,17 +171,17 @@ def _row(
 ) -> dict[str, Any]:
     """Return the columns of a dose's row, except those of rules."""
     model, regime = (items[name].iloc[0] for name in ("model", "regime"))
-    named = f"{model}|{regime}|{hypothesis.name}"
-    figures = _figures(items, resampling, f"{named}|{dose.name}")
+    row_name = f"{model}|{regime}|{hypothesis.name}"
+    figures = _figures(items, resampling, f"{row_name}|{dose.name}")
     control = items["side"].eq("control").to_numpy()
-    decided = np.where(control, items["correct_of"] & items["false_abs_of"], items["abs_rec_of"])
+    is_decided = np.where(control, items["correct_of"] & items["false_abs_of"], items["abs_rec_of"])
     row: dict[str, Any] = {
         "dose": dose.name,
         "counts_as": dose.counts_as,
         "n_runs": items["run"].nunique(),
         "n_scenarios": items["scenario_id"].nunique(),
         "n_items": items["item_id"].nunique(),
-        "n_missing": int(len(items) - decided.sum()),
+        "n_missing": int(len(items) - is_decided.sum()),
         "compared": hypothesis.figure,
         "chance": float((1 / items.loc[control, "offered"]).mean()) if control.any() else None,
         "panel": joined_epochs(items["panel"]),
@@ -193,42 +193,42 @@ def _row(
         **dict.fromkeys(_ends("change")),
     }
     for name in SHARES:
-        row |= with_interval(name, figures[:, RESAMPLED.index(name)], limits_of(name))
-    row["value"] = _compared(hypothesis, figures)[1, 0]
+        row |= with_interval(name, figures[:, RESAMPLED_FIGURES.index(name)], limits_of(name))
+    row["value"] = _compared_figure(hypothesis, figures)[1, 0]
     if dose is hypothesis.doses[0] or reference.empty:
         return row
-    shared = reference.loc[reference["scenario_id"].isin(items["scenario_id"])]
-    own_items = items.loc[items["scenario_id"].isin(shared["scenario_id"])]
-    if shared.empty:
+    shared_items = reference.loc[reference["scenario_id"].isin(items["scenario_id"])]
+    own_items = items.loc[items["scenario_id"].isin(shared_items["scenario_id"])]
+    if shared_items.empty:
         return row
-    row["refused"] = _refusal(own_items, shared)
+    row["refused"] = _refusal(own_items, shared_items)
     if row["refused"] is None:
         names = (hypothesis.doses[0].name, dose.name)
-        before, after = (
-            _compared(hypothesis, _figures(some, resampling, f"{named}|{name}"))
-            for some, name in zip((shared, own_items), names, strict=True)
+        end_before, end_after = (
+            _compared_figure(hypothesis, _figures(rows, resampling, f"{row_name}|{name}"))
+            for rows, name in zip((shared_items, own_items), names, strict=True)
         )
-        row |= {"n_compared": own_items["scenario_id"].nunique(), "at_reference": before[1, 0]}
-        row |= with_interval("change", difference(after, before), _CHANGE)
+        row |= {"n_compared": own_items["scenario_id"].nunique(), "at_reference": end_before[1, 0]}
+        row |= with_interval("change", difference(end_after, end_before), _CHANGE)
     return row
 
 
 def _figures(items: pd.DataFrame, resampling: Resampling, named: str) -> np.ndarray:
-    """Return ends of RESAMPLED and of abstentions, (2, RESAMPLED + 1, draws).
+    """Return ends of RESAMPLED_FIGURES and of abstentions, (2, RESAMPLED_FIGURES + 1, draws).
 
     They are computed over all items of a run, then averaged over runs.
     """
     sums = run_sums(items.assign(dataset="all"), resampling, named)
-    by_run = []
-    for of_run in sums.values():
-        rows = dict(zip(_SUMS, of_run, strict=True))
-        both = [rows[f"false_abs{kind}"] + rows[f"abs_rec{kind}"] for kind in ("", "_of", "_unseen")]
-        by_run.append(np.concatenate([figures_of(of_run), shares_of(np.stack(both))], axis=1))
-    return np.mean(by_run, axis=0)
+    run_figures = []
+    for sums_of_run in sums.values():
+        rows = dict(zip(_SUMS, sums_of_run, strict=True))
+        abstention_sums = [rows[f"false_abs{kind}"] + rows[f"abs_rec{kind}"] for kind in ("", "_of", "_unseen")]
+        run_figures.append(np.concatenate([figures_of(sums_of_run), shares_of(np.stack(abstention_sums))], axis=1))
+    return np.mean(run_figures, axis=0)
 
 
-def _compared(hypothesis: Hypothesis, figures: np.ndarray) -> np.ndarray:
-    return figures[:, -1] if hypothesis.figure == "abstains" else figures[:, RESAMPLED.index("j")]
+def _compared_figure(hypothesis: Hypothesis, figures: np.ndarray) -> np.ndarray:
+    return figures[:, -1] if hypothesis.figure == "abstains" else figures[:, RESAMPLED_FIGURES.index("j")]
 
 
 def _ends(name: str) -> list[str]:
@@ -238,14 +238,14 @@ def _ends(name: str) -> list[str]:
 def _refusal(dose: pd.DataFrame, reference: pd.DataFrame) -> str | None:
     """Return why a dose and its reference are not comparable: epoch, panel or runs."""
     for word, column in (("epoch", "epoch"), ("panel", "panel")):
-        dose_epochs, reference_epochs = (joined_epochs(some[column]) for some in (dose, reference))
+        dose_epochs, reference_epochs = (joined_epochs(items[column]) for items in (dose, reference))
         if dose_epochs != reference_epochs or "+" in dose_epochs:
             return f"the dose is of {word} {dose_epochs}, its reference of {word} {reference_epochs}"
-    runs = [sorted(set(some["run"])) for some in (dose, reference)]
+    runs = [sorted(set(items["run"])) for items in (dose, reference)]
     return None if runs[0] == runs[1] else f"the dose has runs {runs[0]}, its reference has runs {runs[1]}"
 
 
-def _beside_rules(rows: pd.DataFrame) -> pd.DataFrame:
+def _with_rule_scores(rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows beside the shortcut rules' highest value and largest change.
 
     Each comes with its rule's name, for the same hypothesis and dose. A rule does not read the regime, so rows of
@@ -254,12 +254,12 @@ def _beside_rules(rows: pd.DataFrame) -> pd.DataFrame:
     of_rules = rows.loc[rows["model"].isin(RULES)].to_dict("records")
     remarks = []
     for row in rows.to_dict("records"):
-        matching = [
+        rule_scores = [
             rule_row for rule_row in of_rules if all(rule_row[name] == row[name] for name in ("hypothesis", "dose"))
         ]
         rule_rows = {
             rule_row["model"]: rule_row
-            for rule_row in sorted(matching, key=lambda rule_row: rule_row["regime"] == row["regime"])
+            for rule_row in sorted(rule_scores, key=lambda rule_row: rule_row["regime"] == row["regime"])
         }
         best, changing = (
             _best(rule_rows.values(), *fields) for fields in (("value", "rule"), ("change", "rule_changing"))
@@ -270,8 +270,8 @@ def _beside_rules(rows: pd.DataFrame) -> pd.DataFrame:
 
 def _best(rows: Iterable[Mapping[str, Any]], field: str, named: str) -> dict[str, Any]:
     """Return the rule with the highest value, or with the largest absolute change."""
-    known = [row for row in rows if row[field] is not None and row[field] == row[field]]
-    best = max(known, key=lambda row: abs(row[field]) if field == "change" else row[field], default=None)
+    known_rows = [row for row in rows if row[field] is not None and row[field] == row[field]]
+    best = max(known_rows, key=lambda row: abs(row[field]) if field == "change" else row[field], default=None)
     return {named: best and best["model"], f"rule_{field}": best and best[field]}
 
 
@@ -281,14 +281,14 @@ def wrong_rows(table: pd.DataFrame) -> int:
     A row is wrong if a share lies outside [0, 1], an interval is out of order, J is not AbsRec minus FalseAbs, or a
     change over all scenarios is not the difference of the two values.
     """
-    wrong = np.zeros(len(table), bool)
+    is_wrong = np.zeros(len(table), bool)
     for name in (*SHARES, "change"):
         figure, low, high = (table[column].to_numpy(float) for column in _ends(name))
-        least, most = _CHANGE if name == "change" else limits_of(name)
-        wrong |= (figure < least) | (figure > most) | (low > high) | (low < least) | (high > most)
+        minimum, maximum = _CHANGE if name == "change" else limits_of(name)
+        is_wrong |= (figure < minimum) | (figure > maximum) | (low > high) | (low < minimum) | (high > maximum)
     columns = ("j", "abs_rec", "false_abs", "change", "value", "at_reference")
-    j, abs_rec, false_abs, change, value, before = (table[name].to_numpy(float) for name in columns)
+    j, abs_rec, false_abs, change, value, reference_value = (table[name].to_numpy(float) for name in columns)
     are_complete = (table["n_compared"] == table["n_scenarios"]).fillna(False).to_numpy(bool)
-    wrong |= np.abs(j - (abs_rec - false_abs)) > 1e-12
-    wrong |= are_complete & (np.abs(change - (value - before)) > 1e-12)
-    return int(wrong.sum())
+    is_wrong |= np.abs(j - (abs_rec - false_abs)) > 1e-12
+    is_wrong |= are_complete & (np.abs(change - (value - reference_value)) > 1e-12)
+    return int(is_wrong.sum())

@@ -7,7 +7,7 @@ from functools import cache
 from typing import TYPE_CHECKING, NamedTuple
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.metrics import joined_epochs
 
@@ -35,15 +35,15 @@ def require_one_epoch(epochs: pd.DataFrame, figure: str) -> None:
     epochs has one row per comparison (its index names it, e.g. model and dataset) and one column per side; a null side
     is ignored. figure: its name in the message.
     """
-    mixed = epochs.loc[epochs.nunique(axis=1) > 1]
-    if mixed.empty:
+    mixed_rows = epochs.loc[epochs.nunique(axis=1) > 1]
+    if mixed_rows.empty:
         return
-    first = mixed.index[0]
+    first = mixed_rows.index[0]
     names = "/".join(first) if isinstance(first, tuple) else str(first)
-    sides = ", ".join(f"{side} from epoch {epoch!r}" for side, epoch in mixed.iloc[0].dropna().items())
-    more = f" (and {len(mixed) - 1} more)" if len(mixed) > 1 else ""
+    sides = ", ".join(f"{side} from epoch {epoch!r}" for side, epoch in mixed_rows.iloc[0].dropna().items())
+    suffix = f" (and {len(mixed_rows) - 1} more)" if len(mixed_rows) > 1 else ""
     raise EpochMismatch(
-        f"{figure}: {names} has {sides}{more}; figures of different epochs are never put in one ratio, contrast or "
+        f"{figure}: {names} has {sides}{suffix}; figures of different epochs are never put in one ratio, contrast or "
         "gap: evaluate both sides in one epoch, or leave this one out"
     )
 
@@ -57,11 +57,11 @@ def answered_items(verdicts: pd.DataFrame) -> dict[tuple[str, str, str], Answere
     columns = ["model", "regime", "dataset", "item_id", "epoch", "panel"]
     origins: dict[tuple[str, str, str], dict[str, Origin]] = {}
     joined = cache(_joined)  # thousands of items have one origin
-    for *cell, item, epoch, panel, in_overall in (
+    for *cell, item, epoch, panel, is_in_overall in (
         verdicts[columns].assign(whole=is_complete).drop_duplicates().itertuples(index=False, name=None)
     ):
         model, regime, dataset = cell
-        for scope in (dataset, "overall") if in_overall else (dataset,):
+        for scope in (dataset, "overall") if is_in_overall else (dataset,):
             items = origins.setdefault((model, regime, scope), {})
             items[item] = joined(items.get(item), Origin(epoch, panel))
     return dict(origins)
@@ -80,19 +80,21 @@ def refusal(left: Answered, right: Answered) -> str | None:
     panels = [sorted({origin.panel for origin in side.values()}) for side in (left, right)]
     if left == right and all(len(names) < 2 and "+" not in "".join(names) for names in panels):
         return None
-    alone = sorted(left.keys() ^ right.keys())
-    if alone:
-        return f"{_named(alone)} answered on one side alone; both sides of a contrast are of the same items"
-    mixed = sorted(item for item, origin in left.items() if right[item].epoch != origin.epoch)
-    if not mixed:
+    unpaired_items = sorted(left.keys() ^ right.keys())
+    if unpaired_items:
+        return (
+            f"{_name_first(unpaired_items)} answered on one side alone; both sides of a contrast are of the same items"
+        )
+    mixed_items = sorted(item for item, origin in left.items() if right[item].epoch != origin.epoch)
+    if not mixed_items:
         left_names, right_names = (" and ".join(names) for names in panels)
         judged = f"judged by {left_names} on one side and by {right_names} on the other"
         return f"{judged}; figures of different panels are not compared"
-    epochs = f"epoch {left[mixed[0]].epoch} against epoch {right[mixed[0]].epoch}"
-    return f"{_named(mixed)} of {epochs}; figures of different epochs are never put in one contrast"
+    epochs = f"epoch {left[mixed_items[0]].epoch} against epoch {right[mixed_items[0]].epoch}"
+    return f"{_name_first(mixed_items)} of {epochs}; figures of different epochs are never put in one contrast"
 
 
-def _named(items: list[str]) -> str:
+def _name_first(items: list[str]) -> str:
     """Return the first item with its dataset, and the number of others, in words."""
-    dataset, more = items[0].partition(":")[0], len(items) - 1
-    return f"{dataset}: {items[0]}" + (f" and {counted(more, 'more item')} are" if more else " is")
+    dataset, n_more = items[0].partition(":")[0], len(items) - 1
+    return f"{dataset}: {items[0]}" + (f" and {count_noun(n_more, 'more item')} are" if n_more else " is")

@@ -61,22 +61,22 @@ class GradedItem:
         name. None if it states none, names an answer twice, or sums to something else than 1.
         """
         entries = (read_object(text or "") or {}).get("probabilities")
-        stated = dict[str, float]()
+        probability_of = dict[str, float]()
         for entry in entries if isinstance(entries, list) else [None]:
             if not isinstance(entry, dict):
                 return None
             label, number = to_label(str(entry.get("answer")), self.labels, self.aliases), entry.get("probability")
             if isinstance(number, bool) or not isinstance(number, int | float) or not 0 <= number <= 1:
                 return None
-            if label is None or label in stated:
+            if label is None or label in probability_of:
                 return None
-            stated[label] = number
-        unstated = [label for label in self.labels if label not in stated]
-        remainder = 1 - sum(stated.values())
+            probability_of[label] = number
+        unstated = [label for label in self.labels if label not in probability_of]
+        remainder = 1 - sum(probability_of.values())
         if remainder < -SUM_WITHIN or (remainder > SUM_WITHIN and not unstated):
             return None
-        stated |= dict.fromkeys(unstated, max(0.0, remainder) / max(1, len(unstated)))
-        return {label: stated[label] / sum(stated.values()) for label in self.labels}
+        probability_of |= dict.fromkeys(unstated, max(0.0, remainder) / max(1, len(unstated)))
+        return {label: probability_of[label] / sum(probability_of.values()) for label in self.labels}
 
     def read_first_token(self, alternatives: object) -> dict[str, float] | None:
         """Return each answer's probability by first-token log-probabilities, if any.
@@ -91,13 +91,13 @@ class GradedItem:
         probability_of = dict.fromkeys(self.labels, 0.0)
         for token, logprob in json.loads(alternatives).items():
             start = token.strip().strip("\"'*`.,:").casefold()
-            matching = {label for name, label in names.items() if start and name.startswith(start)}
-            matching = {names[start]} if start in names else matching
-            if len(matching) == 1:
-                probability_of[matching.pop()] += exp(logprob)
+            labels = {label for name, label in names.items() if start and name.startswith(start)}
+            labels = {names[start]} if start in names else labels
+            if len(labels) == 1:
+                probability_of[labels.pop()] += exp(logprob)
         total = sum(probability_of.values())
-        rest = max(0.0, 1 - total) / len(probability_of)
-        return {label: (p + rest) / max(1.0, total) for label, p in probability_of.items()}
+        remaining_share = max(0.0, 1 - total) / len(probability_of)
+        return {label: (p + remaining_share) / max(1.0, total) for label, p in probability_of.items()}
 
 
 def graded(
@@ -109,17 +109,17 @@ def graded(
     seed: int = SEED,
 ) -> pd.DataFrame:
     """Return GRADED_CUTS rows from verdicts, votes, responses and items by id."""
-    labels, by_answer = _labels(votes, questions), responses.set_index(_ANSWER)
-    texts, first_tokens = by_answer["text"].to_dict(), by_answer["first_token"].to_dict()
+    labels, response_of = _labels(votes, questions), responses.set_index(_ANSWER)
+    texts, first_tokens = response_of["text"].to_dict(), response_of["first_token"].to_dict()
     rows = []
     for verdict in verdicts.to_dict("records"):
         key, item = tuple(verdict[name] for name in _ANSWER), questions[verdict["item_id"]]
         if "probabilities" in (fields_of(verdict["regime"]) or ()):
-            figures = _of_probabilities(item, item.read_probabilities(texts.get(key)))
+            figures = _probability_figures(item, item.read_probabilities(texts.get(key)))
         elif BY_NAME[verdict["regime"]].first_token:
-            figures = _of_probabilities(item, item.read_first_token(first_tokens.get(key)))
+            figures = _probability_figures(item, item.read_first_token(first_tokens.get(key)))
         else:
-            figures = _of_verdict(item, verdict["abstained"], labels.get(key))
+            figures = _verdict_figures(item, verdict["abstained"], labels.get(key))
         rows.append({**verdict, "taxonomy": "chaotic", "top": max(item.posterior.values()), **figures})
     if not rows:
         return pd.DataFrame(columns=pd.Index(GRADED_CUTS.names))
@@ -158,14 +158,14 @@ def _labels(votes: pd.DataFrame, questions: Mapping[str, GradedItem]) -> dict[tu
     return label_of
 
 
-def _of_verdict(item: GradedItem, abstained: object, label: str | None) -> dict[str, float]:
+def _verdict_figures(item: GradedItem, abstained: object, label: str | None) -> dict[str, float]:
     """Return the figures of a panel's decision; empty if it is undecided."""
     if pd.isna(cast(Any, abstained)) or (not abstained and label is None):
         return {}
-    return decided(item, None if abstained else label)
+    return answer_points(item, None if abstained else label)
 
 
-def _of_probabilities(item: GradedItem, stated: Mapping[str, float] | None) -> dict[str, float]:
+def _probability_figures(item: GradedItem, stated: Mapping[str, float] | None) -> dict[str, float]:
     """Return the figures of stated probabilities; empty if there are none.
 
     The policy that acts on them gives the most probable answer, if its probability is at least ANSWER_FROM.
@@ -173,25 +173,25 @@ def _of_probabilities(item: GradedItem, stated: Mapping[str, float] | None) -> d
     if stated is None:
         return {}
     likeliest = max(stated, key=lambda label: stated[label])
-    acts = decided(item, likeliest if stated[likeliest] >= ANSWER_FROM - _ROUNDING else None)
+    acts = answer_points(item, likeliest if stated[likeliest] >= ANSWER_FROM - _ROUNDING else None)
     return acts | {"brier": brier(item.posterior, stated), "stated": stated[_commonest(item.posterior)]}
 
 
-def decided(item: GradedItem, label: str | None) -> dict[str, float]:
+def answer_points(item: GradedItem, label: str | None) -> dict[str, float]:
     """Return an answer's expected points, and its regret split by reason.
 
     The regret is the loss against an ideal observer. label: None for an abstention.
     """
     posterior, even = item.posterior, dict.fromkeys(item.labels, 1 / len(item.labels))
-    best, believed = max(posterior.values()), 0.0 if label is None else posterior.get(label, 0.0)
+    best, probability = max(posterior.values()), 0.0 if label is None else posterior.get(label, 0.0)
     ideal, answers = max(0.0, expected_points(best)), label is not None
-    points = expected_points(believed) if answers else 0.0
+    points = expected_points(probability) if answers else 0.0
     return {
         "answers": float(answers),
-        "wrong": 1 - believed if answers else np.nan,
+        "wrong": 1 - probability if answers else np.nan,
         "points": points,
         "regret": ideal - points,
-        "regret_label": expected_points(best) - expected_points(believed) if answers else 0.0,
+        "regret_label": expected_points(best) - expected_points(probability) if answers else 0.0,
         "regret_rash": ideal - expected_points(best) if answers else 0.0,
         "regret_shy": 0.0 if answers else ideal,
         "abstains_right": np.nan if expected_points(best) > 0 else float(not answers),
@@ -250,9 +250,9 @@ def wrong_rows(table: pd.DataFrame) -> int:
     A row is wrong if a figure lies outside its limits or its interval, or if a regret is not the sum of its parts or
     not the distance to the ideal.
     """
-    wrong = (table["regret"] - table[[*PARTS]].sum(axis=1)).abs().to_numpy(float) > _ROUNDING
-    wrong |= (table["points"] + table["regret"] - table["points_ideal"]).abs().to_numpy(float) > _ROUNDING
-    for name, (least, most) in WITH_INTERVAL.items():
+    is_wrong = (table["regret"] - table[[*PARTS]].sum(axis=1)).abs().to_numpy(float) > _ROUNDING
+    is_wrong |= (table["points"] + table["regret"] - table["points_ideal"]).abs().to_numpy(float) > _ROUNDING
+    for name, (minimum, maximum) in WITH_INTERVAL.items():
         low, value, high = (table[f"{name}{end}"].to_numpy(float) for end in ("_ci_low", "", "_ci_high"))
-        wrong |= (low > value + _ROUNDING) | (value > high + _ROUNDING) | (low < least) | (high > most)
-    return int(wrong.sum())
+        is_wrong |= (low > value + _ROUNDING) | (value > high + _ROUNDING) | (low < minimum) | (high > maximum)
+    return int(is_wrong.sum())

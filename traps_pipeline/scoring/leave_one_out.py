@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.protocol.ratings import ABSTENTION, CORRECTNESS, decided, majority, ratings
+from traps_pipeline.protocol.ratings import ABSTENTION, CORRECTNESS, majority, ratings, vote_decisions
 from traps_pipeline.scoring.bootstrap import ENTRY
 from traps_pipeline.scoring.metrics import CELL, cell_metrics
 from traps_pipeline.scoring.score_rows import LEAVE_ONE_OUT
@@ -31,8 +31,10 @@ def leave_one_out(
     if not judged:
         return pd.DataFrame(columns=_COLUMNS)
     # All judges in one pass: a model without one of them is scored like a model of its own.
-    seats = [two.assign(model=f"{seat}|" + two["model"]) for seat, (_, two) in enumerate(judged)]
-    rows = _scored(pd.concat(seats, ignore_index=True))
+    seats = [
+        verdict_rows.assign(model=f"{seat}|" + verdict_rows["model"]) for seat, (_, verdict_rows) in enumerate(judged)
+    ]
+    rows = _standings_of(pd.concat(seats, ignore_index=True))
     names = [name.split("|", 1) for name in rows["model"]]
     rows = rows.assign(model=[model for _, model in names], without=[judged[int(seat)][0] for seat, _ in names])
     rows = rows.merge(panel, on=ENTRY, how="inner", validate="many_to_one")
@@ -54,10 +56,10 @@ def two_judge_verdicts(
     (abstention, _), (correctness, _) = cast.on(verdicts, ABSTENTION), cast.on(verdicts, CORRECTNESS)
     for seat, judge in enumerate(cast.judges):
         abstained, correct = (majority(np.delete(votes_on, seat, axis=1)) for votes_on in (abstention, correctness))
-        yield judge, verdicts.assign(abstained=decided(abstained), correct=decided(correct))
+        yield judge, verdicts.assign(abstained=vote_decisions(abstained), correct=vote_decisions(correct))
 
 
-def _scored(verdicts: pd.DataFrame) -> pd.DataFrame:
+def _standings_of(verdicts: pd.DataFrame) -> pd.DataFrame:
     """Return the standings of verdicts."""
     cells = [cell_metrics(rows, {}) for _, rows in verdicts.groupby("dataset", sort=True)]
     return standings(pd.concat(cells, ignore_index=True))

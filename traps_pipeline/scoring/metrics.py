@@ -21,8 +21,11 @@ BOUNDS = ["pecs_low", "pecs_high"]
 # The outcomes in each count of items. An item is answered if its answer is judged, even if the judges are undecided.
 BROKEN_COUNTS = {f"n_{name}": (name,) for name in ("empty", "truncated", "unfinished", "degenerate", "unread")}
 OUTCOMES = {"n_answered": JUDGED, "n_refused": ("refused",), **BROKEN_COUNTS, "n_errors": ("error", "malformed")}
-COUNTED = [*OUTCOMES, "n_not_json"]
-REJECTS = ["n_rejects", "n_rejects_answered"]  # counts of decisions that not every panel is asked for: null otherwise
+COUNT_COLUMNS = [*OUTCOMES, "n_not_json"]
+REJECTION_COLUMNS = [
+    "n_rejects",
+    "n_rejects_answered",
+]  # counts of decisions that not every panel is asked for: null otherwise
 # For each decision, how often it was yes (numerator) and how often it was made (denominator, `_of`); every figure is
 # computed from these six counts.
 COUNTS = ["correct", "correct_of", "false_abs", "false_abs_of", "abs_rec", "abs_rec_of"]
@@ -43,14 +46,14 @@ def decision_counts(verdicts: pd.DataFrame) -> pd.DataFrame:
 
     control = verdicts["side"].eq("control")
     abstained, correct = (verdicts[name].astype("boolean") for name in ("abstained", "correct"))
-    decided = abstained.notna()
+    is_decided = abstained.notna()
     counts = {
         "correct": control & correct.fillna(False),
         "correct_of": control & correct.notna(),
         "false_abs": control & abstained.fillna(False),
-        "false_abs_of": control & decided,
+        "false_abs_of": control & is_decided,
         "abs_rec": ~control & abstained.fillna(False),
-        "abs_rec_of": ~control & decided,
+        "abs_rec_of": ~control & is_decided,
     }
     return pd.DataFrame({name: flags.astype("int64") for name, flags in counts.items()})
 
@@ -75,9 +78,9 @@ def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]
     datasets = sorted(verdicts["dataset"].unique())
     if len(datasets) > 1:
         raise ValueError(f"verdicts of several datasets {datasets}: score one dataset at a time")
-    groups = _scoped(verdicts, scoped_by).groupby([*CELL, "scope"], sort=True)
-    sums = cast("pd.DataFrame", groups[[*COUNTS, "complete", *COUNTED]].sum())
-    sums[REJECTS] = groups[REJECTS].sum(min_count=1)
+    groups = _with_scopes(verdicts, scoped_by).groupby([*CELL, "scope"], sort=True)
+    sums = cast("pd.DataFrame", groups[[*COUNTS, "complete", *COUNT_COLUMNS]].sum())
+    sums[REJECTION_COLUMNS] = groups[REJECTION_COLUMNS].sum(min_count=1)
     sums["n_pairs"] = groups["pair_id"].nunique()
     sides = sides_of(datasets[0]) if datasets else ()
     sums["n_missing"] = len(sides) * sums["n_pairs"] - sums["complete"]
@@ -115,19 +118,19 @@ def joined_versions(versions: Iterable[str]) -> str:
     return " + ".join(sorted({part for version in versions for part in version.split(" + ")}))
 
 
-def _scoped(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]]) -> pd.DataFrame:
+def _with_scopes(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]]) -> pd.DataFrame:
     """Return verdicts with counts, once per scope: (1 + len(scoped_by)) x items rows."""
     import pandas as pd
 
     counts = decision_counts(verdicts)
-    on_control = verdicts["side"].eq("control")
-    complete = np.where(on_control, counts["correct_of"] & counts["false_abs_of"], counts["abs_rec_of"])
+    is_control = verdicts["side"].eq("control")
+    is_complete = np.where(is_control, counts["correct_of"] & counts["false_abs_of"], counts["abs_rec_of"])
     outcomes = {name: verdicts["outcome"].isin(kinds).astype("int64") for name, kinds in OUTCOMES.items()}
-    not_json = verdicts["is_json"].eq(False).astype("int64")
-    rejects = verdicts["rejects_premise"].astype("boolean").where(~on_control)
-    answered = rejects & ~verdicts["abstained"].astype("boolean").fillna(False)
-    rejections = {"n_rejects": rejects.astype("Int64"), "n_rejects_answered": answered.astype("Int64")}
-    flags = counts.assign(complete=complete, **outcomes, n_not_json=not_json, **rejections)
+    is_not_json = verdicts["is_json"].eq(False).astype("int64")
+    rejects_premise = verdicts["rejects_premise"].astype("boolean").where(~is_control)
+    is_answered = rejects_premise & ~verdicts["abstained"].astype("boolean").fillna(False)
+    rejections = {"n_rejects": rejects_premise.astype("Int64"), "n_rejects_answered": is_answered.astype("Int64")}
+    flags = counts.assign(complete=is_complete, **outcomes, n_not_json=is_not_json, **rejections)
     items = pd.concat([verdicts[[*CELL, "pair_id", "epoch", "panel", "benchmark_version"]], flags], axis=1)
     scopes = [pd.Series("all", index=items.index)]
     for prefix, columns in scoped_by.items():
@@ -157,13 +160,13 @@ def _bounds(sums: pd.DataFrame) -> dict[str, np.ndarray]:
     FalseAbs, so that these two are its exact extremes. If nothing is missing both equal PECS bit for bit.
     """
     pairs = sums["n_pairs"].to_numpy(float)
-    decided = {name: sums[name].to_numpy(float) for name in ("correct", "false_abs", "abs_rec")}
-    undecided = {name: pairs - sums[f"{name}_of"].to_numpy(float) for name in decided}
-    least = {name: decided[name] / pairs for name in decided}
-    most = {name: (decided[name] + undecided[name]) / pairs for name in decided}
+    yes_counts = {name: sums[name].to_numpy(float) for name in ("correct", "false_abs", "abs_rec")}
+    undecided_counts = {name: pairs - sums[f"{name}_of"].to_numpy(float) for name in yes_counts}
+    lower_bounds = {name: yes_counts[name] / pairs for name in yes_counts}
+    upper_bounds = {name: (yes_counts[name] + undecided_counts[name]) / pairs for name in yes_counts}
     return {
-        "pecs_low": pecs_of(least["correct"], least["abs_rec"] - most["false_abs"]),
-        "pecs_high": pecs_of(most["correct"], most["abs_rec"] - least["false_abs"]),
+        "pecs_low": pecs_of(lower_bounds["correct"], lower_bounds["abs_rec"] - upper_bounds["false_abs"]),
+        "pecs_high": pecs_of(upper_bounds["correct"], upper_bounds["abs_rec"] - lower_bounds["false_abs"]),
     }
 
 

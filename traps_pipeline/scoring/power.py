@@ -16,7 +16,7 @@ from statistics import NormalDist
 import numpy as np
 
 from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
-from traps_pipeline.scoring.bootstrap import RESAMPLED, TAXONOMIES, figures_of, interval, limits_of
+from traps_pipeline.scoring.bootstrap import RESAMPLED_FIGURES, TAXONOMIES, figures_of, interval, limits_of
 from traps_pipeline.scoring.contrasts import SEPARABLE_BELOW, least_p
 from traps_pipeline.scoring.metrics import pecs_of
 
@@ -42,9 +42,9 @@ class Shares:
 class Precision:
     """The precision of a study.
 
-    width: of the 95 % interval of PECS. difference: the smallest one between two models with independent answers that a
-    test at 5 % detects in 80 % of studies; among_all: the same after Holm's correction over the pairs of all models, if
-    it is tested first. Answers to the same items are correlated, which makes both smaller. None if not even a
+    width: width of PECS's 95 % interval. difference: the smallest one between two models with independent answers that
+    a test at 5 % detects in 80 % of studies; among_all: the same after Holm's correction over the pairs of all models,
+    if it is tested first. Answers to the same items are correlated, which makes both smaller. None if not even a
     difference of 1 is detected so often.
     """
 
@@ -77,13 +77,13 @@ def _studies(counts: Sequence[int], shares: Shares, seed: int) -> tuple[np.ndarr
     for n in counts:
         answers = rng.multinomial(n, np.outer(control, void).ravel(), size=STUDIES)
         gamma = rng.standard_gamma(answers[:, :, None], size=(STUDIES, 6, RESAMPLES))
-        unseen = rng.standard_exponential((3, RESAMPLES))
+        unseen_weights = rng.standard_exponential((3, RESAMPLES))
         observed += _pecs(answers[..., None], np.zeros((3, 1)), False)[:, 1, 0] / len(counts)
-        ends += _pecs(gamma, unseen, len(counts) > 1) / len(counts)
+        ends += _pecs(gamma, unseen_weights, len(counts) > 1) / len(counts)
     return observed, ends
 
 
-def _better(shares: Shares, by: float) -> Shares:
+def _raise_shares(shares: Shares, by: float) -> Shares:
     """Return shares of a PECS higher by `by`: abstain on more voids, then raise Acc."""
     goal = shares.pecs + by
     abs_rec = min(1.0, shares.false_abs + goal / shares.acc) if shares.acc else 1.0
@@ -104,10 +104,12 @@ def _detectable(
         return None
     smallest, (observed, ends) = 0.0, studies
     for seed in range(SEED + 1, SEED + 1 + ROUNDS):
-        better, better_ends = _studies(counts, _better(shares, smallest), seed)
+        better, better_ends = _studies(counts, _raise_shares(shares, smallest), seed)
         difference, low = better - observed, better_ends[:, 0] - ends[:, 1]
-        below = np.quantile(low.mean(axis=1, keepdims=True) - low, 1 - SEPARABLE_BELOW / 2 / comparisons)
-        smallest = float(difference.mean() - low.mean() + below + NormalDist().inv_cdf(POWER) * difference.std())
+        lower_half_width = np.quantile(low.mean(axis=1, keepdims=True) - low, 1 - SEPARABLE_BELOW / 2 / comparisons)
+        smallest = float(
+            difference.mean() - low.mean() + lower_half_width + NormalDist().inv_cdf(POWER) * difference.std()
+        )
     return smallest if smallest <= 1 else None
 
 
@@ -119,6 +121,8 @@ def _pecs(answers: np.ndarray, unseen: np.ndarray, in_mean: bool) -> np.ndarray:
     """
     all_pairs = answers.sum(axis=1)
     yes = answers[:, :2].sum(axis=1), answers[:, 2:4].sum(axis=1), answers[:, ::2].sum(axis=1)
-    sums = np.stack([part for own in yes for part in (own, all_pairs)], axis=1)
-    added = np.broadcast_to(unseen, (len(answers), *unseen.shape))
-    return np.moveaxis(figures_of(np.concatenate([sums, added], axis=1), in_mean)[:, :, RESAMPLED.index("pecs")], 0, 1)
+    sums = np.stack([part for n_yes in yes for part in (n_yes, all_pairs)], axis=1)
+    unseen_draws = np.broadcast_to(unseen, (len(answers), *unseen.shape))
+    return np.moveaxis(
+        figures_of(np.concatenate([sums, unseen_draws], axis=1), in_mean)[:, :, RESAMPLED_FIGURES.index("pecs")], 0, 1
+    )

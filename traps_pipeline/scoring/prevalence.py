@@ -45,5 +45,5 @@ def _row(model: str, group: pd.DataFrame) -> dict[str, Any]:
         yes = np.array([valid[[*axes]].to_numpy().all(axis=1).sum()], float)
         (low,), (high,) = wilson(yes, np.array([len(valid)], float))
         row |= {name: yes[0] / len(valid) if len(valid) else np.nan, f"{name}_low": low, f"{name}_high": high}
-    joined = {"evidence": "+", "judge": "+", "benchmark_version": " + "}
-    return row | {name: separator.join(sorted(set(group[name]))) for name, separator in joined.items()}
+    separators = {"evidence": "+", "judge": "+", "benchmark_version": " + "}
+    return row | {name: separator.join(sorted(set(group[name]))) for name, separator in separators.items()}

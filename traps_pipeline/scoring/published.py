@@ -53,8 +53,8 @@ def published_cells() -> pd.DataFrame:
     """
     rows = published("behavioral_per_dataset")
     cells = rows.loc[:, ["model", "dataset", "regime", "epoch", "n_pairs"]]
-    for share, printed in _RENAMED.items():
-        cells[share], cells[f"{share}_std"] = rows[printed] / 100, rows[f"{share}_std"] / 100
+    for share, printed_column in _RENAMED.items():
+        cells[share], cells[f"{share}_std"] = rows[printed_column] / 100, rows[f"{share}_std"] / 100
     cells["pecs"], cells["pecs_std"] = rows["pecs"], rows["pecs_std"]
     return cells
 
@@ -65,7 +65,7 @@ def published_overall() -> pd.DataFrame:
     Columns: model, regime, acc, abs_rec, false_abs, pecs.
     """
     rows = published("overall")
-    shares = {share: rows[printed] / 100 for share, printed in _RENAMED.items()}
+    shares = {share: rows[printed_column] / 100 for share, printed_column in _RENAMED.items()}
     return rows.loc[:, ["model", "regime"]].assign(**shares, pecs=rows["pecs"])
 
 
@@ -80,6 +80,6 @@ def _read(name: str, texts: bool = False) -> pd.DataFrame:
 
     path = PUBLISHED / f"{name}.csv"
     if not path.is_file():
-        known = ", ".join(sorted(file.stem for file in PUBLISHED.glob("*.csv")))
-        raise TrapsError(f"no published table {name!r}; known: {known}")
+        file_names = ", ".join(sorted(file.stem for file in PUBLISHED.glob("*.csv")))
+        raise TrapsError(f"no published table {name!r}; known: {file_names}")
     return pd.read_csv(path, dtype=str, keep_default_na=False) if texts else pd.read_csv(path)

@@ -24,7 +24,7 @@ from traps_pipeline.protocol.datasets import (
     is_ill_posed,
 )
 from traps_pipeline.scoring.bootstrap import (
-    RESAMPLED,
+    RESAMPLED_FIGURES,
     RESAMPLES,
     SEED,
     Resampling,
@@ -59,8 +59,8 @@ def robust(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED)
     for key, group in items.groupby(["model", "regime"], sort=True):
         runs, arms = _runs_and_arms(group)
         if runs:
-            in_entry = group["run"].isin(runs) & group["dataset"].isin([*DATASETS, *arms])
-            entries[key] = arms, group.loc[in_entry]
+            is_in_entry = group["run"].isin(runs) & group["dataset"].isin([*DATASETS, *arms])
+            entries[key] = arms, group.loc[is_in_entry]
     if not entries:
         return pd.DataFrame(columns=pd.Index(ROBUST.names))
     # A scenario is drawn with its items in all datasets and arms.
@@ -108,15 +108,15 @@ def _row(items: pd.DataFrame, named: str, arms: Sequence[str], resampling: Resam
     row: dict[str, Any] = {
         "n_runs": len(runs),
         "n_items": max(rows["item_id"].nunique() for rows in runs.values()),
-        "n_missing": _missing_decisions(items),
+        "n_missing": _count_missing(items),
         "n_conjunction": max(n for _, n in conjunctions),
         "epoch": joined_epochs(items["epoch"]),
         "panel": joined_epochs(items["panel"]),
         "benchmark_version": joined_versions(items["benchmark_version"]),
         "refused": _refusal(items),
     }
-    for name, by_run in figures.items():
-        ends = np.mean(by_run, axis=0)
+    for name, run_values in figures.items():
+        ends = np.mean(run_values, axis=0)
         # Without an unseen scenario both ends are the figure, the upper one with J clipped.
         columns = with_interval(name, ends, (0.0, 1.0))
         row |= dict.fromkeys(columns) if row["refused"] else columns
@@ -129,14 +129,14 @@ def _row(items: pd.DataFrame, named: str, arms: Sequence[str], resampling: Resam
 def robust_ends(cells: Mapping[str, np.ndarray], scenarios: Mapping[str, int]) -> np.ndarray:
     """Return a run's ends of the robust score, (2, draws); NaN without robust arms.
 
-    cells: the ends of RESAMPLED, (2, RESAMPLED, draws), of the four datasets and the robust arms. scenarios: the number
-    of scenarios in each of them.
+    cells: the ends of RESAMPLED_FIGURES, (2, RESAMPLED_FIGURES, draws), of the four datasets and the robust arms.
+    scenarios: the number of scenarios in each of them.
     """
     arms = {arm: min(1.0, scenarios[arm] / FULL_KIND) for arm in cells if arm in ROBUST_ARMS}
     pairs = np.mean([cells[dataset] for dataset in DATASETS], axis=0)
 
     def mean_over_kinds(figure: str, weights: Mapping[str, float]) -> np.ndarray:
-        position = RESAMPLED.index(figure)
+        position = RESAMPLED_FIGURES.index(figure)
         kinds = [pairs[:, position], *(cells[arm][:, position] for arm in weights)]
         return np.average(kinds, axis=0, weights=[1.0, *weights.values()])
 
@@ -160,11 +160,11 @@ def conjunction_of(items: pd.DataFrame) -> pd.Series:
     decision_table = decision_table.loc[decision.isin(CONJUNCTION)]
     decisions = decision_table.groupby("scenario")["decision"].nunique()
     decision_table = decision_table.loc[decision_table["scenario"].isin(decisions.index[decisions == len(CONJUNCTION)])]
-    worst, undecided = (
+    lowest_decision, has_undecided = (
         decision_table.groupby("scenario")["right"].min(),
         decision_table["right"].isna().groupby(decision_table["scenario"]).any(),
     )
-    return worst.where((worst == 0) | ~undecided)
+    return lowest_decision.where((lowest_decision == 0) | ~has_undecided)
 
 
 def _conjunction(items: pd.DataFrame, resampling: Resampling, named: str) -> tuple[np.ndarray, int]:
@@ -174,23 +174,23 @@ def _conjunction(items: pd.DataFrame, resampling: Resampling, named: str) -> tup
 
     The ends are (2, draws).
     """
-    decided = conjunction_of(items).dropna()
-    return ends_of_mean(decided, resampling, named), len(decided)
+    decided_scenarios = conjunction_of(items).dropna()
+    return ends_of_mean(decided_scenarios, resampling, named), len(decided_scenarios)
 
 
-def _missing_decisions(items: pd.DataFrame) -> int:
+def _count_missing(items: pd.DataFrame) -> int:
     """Return the number of items, over runs, that lack a decision of their side."""
     control = items["side"] == "control"
-    decided = np.where(control, items["correct_of"] & items["false_abs_of"], items["abs_rec_of"])
-    return int(len(items) - decided.sum())
+    is_decided = np.where(control, items["correct_of"] & items["false_abs_of"], items["abs_rec_of"])
+    return int(len(items) - is_decided.sum())
 
 
 def _refusal(items: pd.DataFrame) -> str | None:
     """Return why no score may join pairs and arms (epochs or panels differ), or None."""
-    of_arms = items["dataset"].isin(ARMS)
+    is_arm = items["dataset"].isin(ARMS)
     if "+" in (panels := joined_epochs(items["panel"])):
         return f"judged by {panels.replace('+', ' and ')}; figures of different panels are never put in one figure"
-    pairs, arms = (joined_epochs(items.loc[rows, "epoch"]) for rows in (~of_arms, of_arms))
+    pairs, arms = (joined_epochs(items.loc[rows, "epoch"]) for rows in (~is_arm, is_arm))
     if pairs == arms and "+" not in pairs:
         return None
     return f"pairs of epoch {pairs}, arms of epoch {arms}; figures of different epochs are never put in one figure"
@@ -199,8 +199,8 @@ def _refusal(items: pd.DataFrame) -> str | None:
 def wrong_rows(table: pd.DataFrame) -> int:
     """Return how many ROBUST rows have a score outside [0, 1] or its interval."""
     shares = table[[*WITH_INTERVAL, "inference_acc", "inference_abstains"]].to_numpy(float)
-    wrong = ((shares < 0) | (shares > 1)).any(axis=1)
+    is_wrong = ((shares < 0) | (shares > 1)).any(axis=1)
     for name in WITH_INTERVAL:
         low, value, high = (table[f"{name}{end}"].to_numpy(float) for end in ("_ci_low", "", "_ci_high"))
-        wrong |= (low > value) | (value > high) | (low < 0) | (high > 1)
-    return int(wrong.sum())
+        is_wrong |= (low > value) | (value > high) | (low < 0) | (high > 1)
+    return int(is_wrong.sum())

@@ -266,7 +266,7 @@ class GradedRow:
 
     See docs/scoring.md, "Graded cuts".
 
-    All figures are what is expected by the posterior, the distribution over answers that the futures of a cut have.
+    All figures are expectations under the posterior, the distribution over answers that the futures of a cut have.
     """
 
     model: shared.Model

@@ -23,6 +23,6 @@ class Scores:
 def score(verdicts: pd.DataFrame) -> Scores:
     """Return METRICS and LEADERBOARD rows from the pairs' VERDICTS rows."""
     cells = pd.concat([cell_metrics(rows) for _, rows in verdicts.groupby("dataset", sort=True)], ignore_index=True)
-    resampled = resample(verdicts)
-    paired = contrasts(resampled, cells, verdicts)
-    return Scores(cells, leaderboard(cells, intervals(resampled), paired))
+    resampled_figures = resample(verdicts)
+    paired_contrasts = contrasts(resampled_figures, cells, verdicts)
+    return Scores(cells, leaderboard(cells, intervals(resampled_figures), paired_contrasts))

@@ -10,14 +10,14 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.protocol.datasets import DATASETS
-from traps_pipeline.scoring.bootstrap import ENTRY, RESAMPLED
+from traps_pipeline.scoring.bootstrap import ENTRY, RESAMPLED_FIGURES
 from traps_pipeline.scoring.metrics import (
     BOUNDS,
     BROKEN_COUNTS,
     CELL,
     CELL_FIGURES,
-    COUNTED,
-    REJECTS,
+    COUNT_COLUMNS,
+    REJECTION_COLUMNS,
     joined_epochs,
     joined_in_groups,
     joined_versions,
@@ -26,7 +26,7 @@ from traps_pipeline.scoring.metrics import (
 from traps_pipeline.scoring.score_rows import BROKEN_ABOVE, INCOMPLETE_BELOW, LEADERBOARD
 
 _RUN = ["model", "regime", "run"]
-_SUMMED = ["n_missing", "n_items", *COUNTED]
+_SUMMED = ["n_missing", "n_items", *COUNT_COLUMNS]
 
 
 def leaderboard(metrics: pd.DataFrame, intervals: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:
@@ -45,10 +45,10 @@ def standings(metrics: pd.DataFrame) -> pd.DataFrame:
     without a text count in no figure; if there are too many of them, the entry is `incomplete`.
     """
     groups = _runs(metrics).groupby(ENTRY, sort=True)
-    means = _by_group(groups, [*CELL_FIGURES, "pecs_by_family", *BOUNDS])
-    deviations = _by_group(groups, CELL_FIGURES, np.std)
+    means = _group_figure(groups, [*CELL_FIGURES, "pecs_by_family", *BOUNDS])
+    deviations = _group_figure(groups, CELL_FIGURES, np.std)
     sums = cast(pd.DataFrame, groups[_SUMMED].sum())
-    sums[REJECTS] = groups[REJECTS].sum(min_count=1)
+    sums[REJECTION_COLUMNS] = groups[REJECTION_COLUMNS].sum(min_count=1)
     board = means.join([deviations.add_suffix("_std"), sums])
     board["n_runs"] = groups["run"].nunique()
     board["n_pairs"] = groups["n_pairs"].max()
@@ -56,31 +56,31 @@ def standings(metrics: pd.DataFrame) -> pd.DataFrame:
     board["panel"] = joined_in_groups(groups, "panel", joined_epochs)
     board["benchmark_version"] = joined_in_groups(groups, "benchmark_version", joined_versions)
     board["answered"] = board["n_answered"] / board["n_items"]
-    board["incomplete"] = _anywhere(cast(pd.Series, board["answered"] < INCOMPLETE_BELOW))
+    board["incomplete"] = _spread_flags(cast(pd.Series, board["answered"] < INCOMPLETE_BELOW))
     board["broken"] = board[[*BROKEN_COUNTS]].sum(axis=1) / board["n_items"]
-    board["is_broken"] = _anywhere(cast(pd.Series, board["broken"] > BROKEN_ABOVE))
+    board["is_broken"] = _spread_flags(cast(pd.Series, board["broken"] > BROKEN_ABOVE))
     return board.reset_index()
 
 
 def means_over_runs(metrics: pd.DataFrame) -> pd.DataFrame:
     """Return CELL_FIGURES by ENTRY from METRICS rows, as on the leaderboard."""
-    return _by_group(_runs(metrics).groupby(ENTRY, sort=True), CELL_FIGURES)
+    return _group_figure(_runs(metrics).groupby(ENTRY, sort=True), CELL_FIGURES)
 
 
 def _runs(metrics: pd.DataFrame) -> pd.DataFrame:
     """Return METRICS rows with n_items, by model, regime, dataset (or overall), run."""
     cells = metrics.loc[metrics["scope"] == "all"]
-    cells = cells.assign(n_items=2 * cells["n_pairs"]).merge(_by_family(metrics), on=CELL, how="left")
+    cells = cells.assign(n_items=2 * cells["n_pairs"]).merge(_family_pecs(metrics), on=CELL, how="left")
     return pd.concat([cells, _overall_runs(cells)], ignore_index=True)
 
 
-def _by_family(metrics: pd.DataFrame) -> pd.DataFrame:
+def _family_pecs(metrics: pd.DataFrame) -> pd.DataFrame:
     """Return CELL and `pecs_by_family`: PECS of means that weigh families equally.
 
     The paper calls a family a sub-scenario.
     """
     families = metrics.loc[metrics["scope"].str.startswith("sub_scenario:")].groupby(CELL)
-    shares = _by_group(families, ["acc", "abs_rec", "false_abs"])
+    shares = _group_figure(families, ["acc", "abs_rec", "false_abs"])
     pecs = pecs_of(shares["acc"].to_numpy(float), (shares["abs_rec"] - shares["false_abs"]).to_numpy(float))
     return shares.assign(pecs_by_family=pecs)[["pecs_by_family"]].reset_index()
 
@@ -90,21 +90,21 @@ def _overall_runs(cells: pd.DataFrame) -> pd.DataFrame:
     groups = cells.groupby(_RUN, sort=True)
     complete_runs = cells.loc[groups["dataset"].transform("nunique") == len(DATASETS)].groupby(_RUN, sort=True)
     counts = cast(pd.DataFrame, complete_runs[["n_pairs", *_SUMMED]].sum())
-    counts[REJECTS] = complete_runs[REJECTS].sum(min_count=1)
-    overall = _by_group(complete_runs, [*CELL_FIGURES, "pecs_by_family", *BOUNDS]).join(counts)
+    counts[REJECTION_COLUMNS] = complete_runs[REJECTION_COLUMNS].sum(min_count=1)
+    overall = _group_figure(complete_runs, [*CELL_FIGURES, "pecs_by_family", *BOUNDS]).join(counts)
     overall["epoch"] = joined_in_groups(complete_runs, "epoch", joined_epochs)
     overall["panel"] = joined_in_groups(complete_runs, "panel", joined_epochs)
     overall["benchmark_version"] = joined_in_groups(complete_runs, "benchmark_version", joined_versions)
     return overall.reset_index().assign(dataset="overall")
 
 
-def _anywhere(wrong: pd.Series) -> pd.Series:
+def _spread_flags(wrong: pd.Series) -> pd.Series:
     """Return flags by ENTRY; those of `overall` are set if any dataset's is."""
     anywhere = cast(pd.Series, wrong.groupby(level=["model", "regime"]).transform("any")).astype(bool)
     return wrong | (anywhere & (wrong.index.get_level_values("dataset") == "overall"))
 
 
-def _by_group(groups: Any, columns: Sequence[str], figure: Callable[..., np.ndarray] = np.mean) -> pd.DataFrame:
+def _group_figure(groups: Any, columns: Sequence[str], figure: Callable[..., np.ndarray] = np.mean) -> pd.DataFrame:
     """Return a figure of each group's values in some columns, indexed by group.
 
     It is null if any value is null, so that no mean silently uses fewer values. Groups of one size are one array.
@@ -123,8 +123,8 @@ def _ranks(board: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:
 
     Null without PECS, and if the row is of several panels.
     """
-    known = contrasts["separable"].astype("boolean").fillna(False)
-    separable = contrasts.loc[(contrasts["kind"] == "models") & (contrasts["figure"] == "pecs") & known]
+    is_separable = contrasts["separable"].astype("boolean").fillna(False)
+    separable = contrasts.loc[(contrasts["kind"] == "models") & (contrasts["figure"] == "pecs") & is_separable]
     wins, losses = Counter[tuple[str, ...]](), Counter[tuple[str, ...]]()
     for row in separable.to_dict("records"):
         winner, loser = (row["left_model"], row["right_model"])[:: 1 if row["difference"] > 0 else -1]
@@ -137,14 +137,14 @@ def _ranks(board: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:
         "rank_low": pd.Series([1 + losses[entry] for entry in entries], board.index),
         "rank_high": peers.transform("count") - pd.Series([wins[entry] for entry in entries], board.index),
     }
-    ranked = board["pecs"].notna() & ~board["panel"].str.contains("+", regex=False)
-    return pd.DataFrame(ranks).where(ranked).astype("Int64")
+    is_ranked = board["pecs"].notna() & ~board["panel"].str.contains("+", regex=False)
+    return pd.DataFrame(ranks).where(is_ranked).astype("Int64")
 
 
 def wrong_intervals(board: pd.DataFrame) -> int:
     """Return how many intervals are out of order or outside their score's limits."""
-    wrong = 0
-    for figure in RESAMPLED:
+    n_wrong = 0
+    for figure in RESAMPLED_FIGURES:
         low, high = (board[f"{figure}_ci_{end}"].to_numpy(float) for end in ("low", "high"))
-        wrong += int(((low < (-1 if figure == "j" else 0)) | (low > high) | (high > 1)).sum())
-    return wrong
+        n_wrong += int(((low < (-1 if figure == "j" else 0)) | (low > high) | (high > 1)).sum())
+    return n_wrong

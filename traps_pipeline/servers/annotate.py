@@ -61,7 +61,7 @@ class Annotation:
     def __init__(self, workspace: Workspace) -> None:
         self.workspace = workspace
         self.samples = {task: self._sample(task) for task in TASKS}
-        if all(each.empty for each in self.samples.values()):
+        if all(sample.empty for sample in self.samples.values()):
             raise TrapsError(f"{workspace.root}: has no clips yet; run `traps run EXPERIMENT` in it first")
         self.store = LabelStore(workspace.labels)
 
@@ -101,10 +101,18 @@ class Annotation:
         belong to scenarios that they met in this sitting.
         """
         sample, shown_units = self.samples[task], self.store.shown(who)
-        waiting = [each.unit for each in shown_units if each.task == task and each.waits and each.unit in sample.index]
-        since = time.time() - 3600 * annotation_protocol().sitting_hours
-        met = {each.scenario_id for each in shown_units if each.at > since}  # in any task, since answers reveal clips
-        finished = {each.unit for each in shown_units if each.task == task} | {*self.store.labelled(who, task)}
+        waiting = [
+            shown_unit.unit
+            for shown_unit in shown_units
+            if shown_unit.task == task and shown_unit.waits and shown_unit.unit in sample.index
+        ]
+        sitting_start = time.time() - 3600 * annotation_protocol().sitting_hours
+        met = {
+            shown_unit.scenario_id for shown_unit in shown_units if shown_unit.at > sitting_start
+        }  # in any task, since answers reveal clips
+        finished = {shown_unit.unit for shown_unit in shown_units if shown_unit.task == task} | {
+            *self.store.labelled(who, task)
+        }
         blind = task != "answerability"
         open_units = (
             unit
@@ -118,10 +126,13 @@ class Annotation:
 
     def find(self, who: str, handle: str) -> tuple[TaskName, str]:
         """Return a person's task and unit behind a handle. Raises NotFound."""
-        for each in self.store.shown(who):
-            task = require_task(each.task)
-            if self.store.handle(who, each.task, each.unit) == handle and each.unit in self.samples[task].index:
-                return task, each.unit
+        for shown_unit in self.store.shown(who):
+            task = require_task(shown_unit.task)
+            if (
+                self.store.handle(who, shown_unit.task, shown_unit.unit) == handle
+                and shown_unit.unit in self.samples[task].index
+            ):
+                return task, shown_unit.unit
         raise NotFound("nothing of this name is shown to you")
 
     def record(self, who: str, sent: SubmittedLabel) -> None:
@@ -139,10 +150,10 @@ class Annotation:
     def reopen(self, who: str, name: str) -> None:
         """Show a task's last labelled unit again. Raises NotFound without one."""
         task = require_task(name)
-        labelled = [unit for unit in self.store.labelled(who, task) if unit in self.samples[task].index]
-        if not labelled:
+        labelled_units = [unit for unit in self.store.labelled(who, task) if unit in self.samples[task].index]
+        if not labelled_units:
             raise NotFound("you have labelled nothing here yet")
-        self.store.show(who, task, labelled[-1], str(self.samples[task].loc[labelled[-1], "scenario_id"]))
+        self.store.show(who, task, labelled_units[-1], str(self.samples[task].loc[labelled_units[-1], "scenario_id"]))
 
     def clip(self, who: str, handle: str) -> Path:
         """Return the clip behind a handle. Raises NotFound."""
@@ -179,11 +190,11 @@ class Annotation:
         """Return the page of the next unit, or one that says why there is none now."""
         unit = self.next_unit(who, task)
         finished, total = self.progress(who, task)
-        about = {"who": who, "tasks": self._tasks(who), "task": task, "title": TITLES[task], "done": finished}
+        page_values = {"who": who, "tasks": self._tasks(who), "task": task, "title": TITLES[task], "done": finished}
         if unit is None:
             hours = annotation_protocol().sitting_hours
-            return page("annotate_done.html.j2", **about, total=total, hours=f"{hours:g}")
-        return page("annotate.html.j2", **about, total=total, shown=self.shown(who, task, unit))
+            return page("annotate_done.html.j2", **page_values, total=total, hours=f"{hours:g}")
+        return page("annotate.html.j2", **page_values, total=total, shown=self.shown(who, task, unit))
 
     def _tasks(self, who: str) -> dict[TaskName, tuple[str, int, int]]:
         """Return title, labelled and total units of each task."""

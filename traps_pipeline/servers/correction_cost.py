@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.benchmark.corrections import Correction
 from traps_pipeline.benchmark.specs import wording_of
 from traps_pipeline.judging.panel import tasks_for
@@ -52,8 +52,8 @@ class CorrectionEffect:
     def sentence(self) -> str:
         """Return the counts in words."""
         money = "an unknown price" if self.dollars is None else f"about {self.dollars:.2f} USD"
-        calls = f"at most {counted(self.answers, 'answer')} and {counted(self.votes, 'vote')}"
-        cost_text = f"{counted(len(self.items), 'item')} to ask or judge again: {calls}, {money}"
+        calls = f"at most {count_noun(self.answers, 'answer')} and {count_noun(self.votes, 'vote')}"
+        cost_text = f"{count_noun(len(self.items), 'item')} to ask or judge again: {calls}, {money}"
         return cost_text + (f"; clips of {', '.join(self.rendered)} are rendered again" if self.rendered else "")
 
 
@@ -72,15 +72,15 @@ def correction_effect(workspace: Workspace, spec: Mapping[str, Any], correction:
     cost = CorrectionEffect(question=question, rendered=[spec["scenario_id"]] if renders else [])
     for model, dataset, evaluations in _evaluation_counts(workspace, spec["taxonomy"]):
         for side in SIDES:
-            of_ill_posed = is_ill_posed(dataset) and side == "void"
-            again = renders or (ill_posed if of_ill_posed else asked_again)
+            is_ill_posed_void = is_ill_posed(dataset) and side == "void"
+            is_asked_again = renders or (ill_posed if is_ill_posed_void else asked_again)
             item = f"{dataset}:{spec['scenario_id']}:{side}"
-            if again or (judged_again and side == "control"):
+            if is_asked_again or (judged_again and side == "control"):
                 cost.items += [] if item in cost.items else [item]
-                cost.votes += evaluations * seats * (len(tasks_for(side)) if again else 1)
-            if again:
+                cost.votes += evaluations * seats * (len(tasks_for(side)) if is_asked_again else 1)
+            if is_asked_again:
                 cost.answers += evaluations
-                cost.dollars = _plus(cost.dollars, _dollars(model, evaluations))
+                cost.dollars = _sum_or_none(cost.dollars, _dollars(model, evaluations))
     return cost
 
 
@@ -109,5 +109,5 @@ def _dollars(model: str, calls: int) -> float | None:
     return None if dollars is None else dollars[1]
 
 
-def _plus(left: float | None, right: float | None) -> float | None:
+def _sum_or_none(left: float | None, right: float | None) -> float | None:
     return None if left is None or right is None else left + right

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.video.encode import DamagedClip, decode
 
 PLACES = (0.0, 0.5, 1.0)  # positions of the compared frames, as shares of the clip
@@ -19,7 +19,7 @@ ALIKE_BELOW = 0.1  # share of differing bits below which two scenarios are near 
 
 @dataclass(frozen=True)
 class Neighbour:
-    """The most similar scenario, and the share of differing bits."""
+    """The most similar scenario, and the share of fingerprint bits that differ."""
 
     scenario_id: str
     distance: float
@@ -36,9 +36,9 @@ def fingerprint(clip: Path) -> np.ndarray:
     bits = []
     for place in PLACES:
         grey = cv2.cvtColor(frames[round(place * (len(frames) - 1))], cv2.COLOR_RGB2GRAY)
-        small = cv2.resize(grey, (SIDE + 1, SIDE), interpolation=cv2.INTER_AREA)
-        bits.append(small[:, 1:] > small[:, :-1])
-    return np.concatenate([each.ravel() for each in bits])
+        thumbnail = cv2.resize(grey, (SIDE + 1, SIDE), interpolation=cv2.INTER_AREA)
+        bits.append(thumbnail[:, 1:] > thumbnail[:, :-1])
+    return np.concatenate([part.ravel() for part in bits])
 
 
 def neighbours(prints: Mapping[str, np.ndarray], families: Mapping[str, str]) -> dict[str, Neighbour]:
@@ -87,9 +87,11 @@ class Comparison:
     @property
     def progress(self) -> str:
         """The progress in words; empty once it is done."""
-        return "" if self._found is not None else f"{len(self._prints)} of {counted(len(self._clips), 'clip')} compared"
+        return (
+            "" if self._found is not None else f"{len(self._prints)} of {count_noun(len(self._clips), 'clip')} compared"
+        )
 
     @property
     def found(self) -> Mapping[str, Neighbour]:
         """The near duplicates, once all scenarios are compared; empty until then."""
-        return {name: each for name, each in (self._found or {}).items() if each.distance < ALIKE_BELOW}
+        return {name: neighbour for name, neighbour in (self._found or {}).items() if neighbour.distance < ALIKE_BELOW}

@@ -101,7 +101,8 @@ class LabelStore:
                 "SELECT task, unit, scenario_id, at, waits FROM shown WHERE who = ? ORDER BY at", (who,)
             ).fetchall()
         return [
-            ShownUnit(task, unit, scenario, shown_at, bool(waits)) for task, unit, scenario, shown_at, waits in rows
+            ShownUnit(task, unit, scenario, shown_at, bool(is_waiting))
+            for task, unit, scenario, shown_at, is_waiting in rows
         ]
 
     def show(self, who: str, task: str, unit: str, scenario_id: str) -> None:

@@ -106,8 +106,8 @@ class Review:
     def observed(self) -> dict[str, str]:
         """The observer's answers under its first regime, by item."""
         rows = self.workspace.tables.read_all(RESPONSES, ["item_id", "model", "regime", "run", "text"])
-        own = rows.loc[rows["model"] == "observer"].sort_values(["item_id", "regime", "run"])
-        first = own.dropna(subset=["text"]).drop_duplicates("item_id")
+        observer_rows = rows.loc[rows["model"] == "observer"].sort_values(["item_id", "regime", "run"])
+        first = observer_rows.dropna(subset=["text"]).drop_duplicates("item_id")
         return {str(item): str(text) for item, text in zip(first["item_id"], first["text"], strict=True)}
 
     def spec(self, scenario_id: str) -> Record:
@@ -118,13 +118,13 @@ class Review:
 
     def reviewed(self) -> frozenset[str]:
         """Return the scenarios with a valid decision."""
-        last = {each.scenario_id: each for _, each in read_corrections()}
-        return frozenset(id_ for id_, each in last.items() if is_reviewed([each]))
+        last = {correction.scenario_id: correction for _, correction in read_corrections()}
+        return frozenset(id_ for id_, correction in last.items() if is_reviewed([correction]))
 
     def queue(self, name: QueueName) -> list[str]:
         """See `queue.queue`."""
-        alike = {id_: each.distance for id_, each in self.comparison.found.items()}
-        return queue(name, list(self.specs), self.reviewed(), self.flags, alike)
+        distances = {id_: neighbour.distance for id_, neighbour in self.comparison.found.items()}
+        return queue(name, list(self.specs), self.reviewed(), self.flags, distances)
 
     def decide(self, sent: Decision) -> None:
         """Append a decision. Raises NotFound, Refused and Conflict."""
@@ -141,8 +141,8 @@ class Review:
 
     def _free_id(self, family: str) -> str:
         """Return the first id from 9001 on that no scenario has ever had."""
-        used = {*load_released(), *(each.scenario_id for _, each in read_corrections())}
-        return next(name for k in count(9001) if (name := f"{family}-{k}") not in used)
+        used_ids = {*load_released(), *(correction.scenario_id for _, correction in read_corrections())}
+        return next(name for k in count(9001) if (name := f"{family}-{k}") not in used_ids)
 
     def undo(self, sent: Undo) -> None:
         """Take back the last decision. Raises NotFound, Refused and Conflict."""
@@ -160,9 +160,9 @@ class Review:
         return {"question": cost.question, "cost": cost.sentence()}
 
     def _correction(self, scenario_id: str, action: str, changes: Mapping[str, Any], why: str) -> Correction:
-        allowed = {*WORDS, "answer", "params"}
-        if set(changes) - allowed:
-            raise Refused(f"changes: {', '.join(sorted(set(changes) - allowed))} cannot be corrected here")
+        allowed_fields = {*WORDS, "answer", "params"}
+        if set(changes) - allowed_fields:
+            raise Refused(f"changes: {', '.join(sorted(set(changes) - allowed_fields))} cannot be corrected here")
         fields = {**changes, "scenario_id": scenario_id, "action": action, "why": why}
         try:
             return Correction.model_validate({**fields, "who": self.who, "when": date.today()})
@@ -187,10 +187,10 @@ class Review:
 
     def scenario_page(self, scenario_id: str, name: QueueName) -> str:
         """Return the page of one scenario."""
-        spec, waiting = self.spec(scenario_id), self.queue(name)
+        spec, scenarios = self.spec(scenario_id), self.queue(name)
         decisions = decisions_on(scenario_id)
-        place = waiting.index(scenario_id) if scenario_id in waiting else -1
-        alike = self.comparison.found.get(scenario_id)
+        place = scenarios.index(scenario_id) if scenario_id in scenarios else -1
+        neighbour = self.comparison.found.get(scenario_id)
         items = {side: f"{spec['taxonomy']}:{scenario_id}:{side}" for side in ("control", "void")}
         fields = {
             "scenario_id": scenario_id,
@@ -198,9 +198,9 @@ class Review:
             "queue": name,
             "fps": self.clips.get((scenario_id, "control"), {}).get("fps"),
             "clips": [side for side in ("control", "void", "twin") if (scenario_id, side) in self.clips],
-            "alike": alike.scenario_id if alike else "",
-            "before": waiting[place - 1] if place > 0 else "",
-            "after": next((each for each in waiting[place + 1 :] if each != scenario_id), ""),
+            "alike": neighbour.scenario_id if neighbour else "",
+            "before": scenarios[place - 1] if place > 0 else "",
+            "after": next((scenario for scenario in scenarios[place + 1 :] if scenario != scenario_id), ""),
             "params": json.loads(spec["params"]),
             "words": {word: _as_json(spec[word]) for word in ("question", "ill_posed_question", "labels")}
             | {"answer": spec["ground_truth"]},
@@ -218,10 +218,10 @@ class Review:
             labels=", ".join(spec["labels"]),
             certificate=[words for _, words in certificate_phrases(json.loads(spec["evidence"]))],
             observed={side: self.observed.get(item, "not asked") for side, item in items.items()},
-            alike=(alike, self.specs[alike.scenario_id]["question"]) if alike else None,
+            alike=(neighbour, self.specs[neighbour.scenario_id]["question"]) if neighbour else None,
             decisions=decisions,
             is_reviewed=is_reviewed(decisions),
-            queues={each: (MEANINGS[each], len(self.queue(each))) for each in QUEUES},
+            queues={queue_name: (MEANINGS[queue_name], len(self.queue(queue_name))) for queue_name in QUEUES},
             reviewed=len(self.reviewed() & set(self.specs)),
             total=len(self.specs),
             flags=self.flags.loc[scenario_id].to_dict() if scenario_id in self.flags.index else {},
@@ -235,7 +235,7 @@ class Review:
             effect=self.summary(),
             queue=name,
             comparing=self.comparison.progress if name == "alike" else "",
-            queues={each: (MEANINGS[each], len(self.queue(each))) for each in QUEUES},
+            queues={queue_name: (MEANINGS[queue_name], len(self.queue(queue_name))) for queue_name in QUEUES},
             reviewed=len(self.reviewed() & set(self.specs)),
             total=len(self.specs),
             commands=[command for name in self.workspace.study.experiments for command in self._commands(name)],
@@ -255,15 +255,15 @@ class Review:
         from traps_pipeline.video.encode import decode
 
         self.spec(scenario_id)
-        both = [decode(self.clip(scenario_id, side))[0] for side in ("control", "void")]
-        places = np.linspace(0, len(both[0]) - 1, STRIP_FRAMES).round().astype(int)
-        size = (STRIP_WIDTH, both[0].shape[1] * STRIP_WIDTH // both[0].shape[2])
+        side_frames = [decode(self.clip(scenario_id, side))[0] for side in ("control", "void")]
+        places = np.linspace(0, len(side_frames[0]) - 1, STRIP_FRAMES).round().astype(int)
+        size = (STRIP_WIDTH, side_frames[0].shape[1] * STRIP_WIDTH // side_frames[0].shape[2])
         blank = np.full((size[1], size[0], 3), 235, np.uint8)  # after the end of a clip
 
         def small(frames: np.ndarray, k: int) -> np.ndarray:
             return cv2.resize(frames[k], size, interpolation=cv2.INTER_AREA) if k < len(frames) else blank
 
-        rows = [np.hstack([small(frames, k) for k in places]) for frames in both]
+        rows = [np.hstack([small(frames, k) for k in places]) for frames in side_frames]
         _, jpeg = cv2.imencode(".jpg", np.ascontiguousarray(np.vstack(rows)[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 85])
         return jpeg.tobytes()
 

@@ -51,7 +51,7 @@ def new_app() -> FastAPI:
 
     @app.exception_handler(RequestValidationError)
     async def malformed(request: Request, error: RequestValidationError) -> Response:
-        fields = sorted({".".join(map(str, each["loc"][1:])) or "body" for each in error.errors()})
+        fields = sorted({".".join(map(str, error_details["loc"][1:])) or "body" for error_details in error.errors()})
         return JSONResponse({"error": f"not understood: {', '.join(fields)}"}, 400)
 
     return app
@@ -75,14 +75,14 @@ def script(*names: str) -> str:
 def study_file(workspace: Workspace, relative: str) -> Path:
     """Return a clip that the study's tables name. Raises NotFound for any other path."""
     path = workspace.resolve(relative)
-    inside = path.resolve().is_relative_to((workspace.root / "clips").resolve())
-    if not inside or not path.is_file():
+    is_inside = path.resolve().is_relative_to((workspace.root / "clips").resolve())
+    if not is_inside or not path.is_file():
         raise NotFound("the study has no such clip")
     return path
 
 
 @dataclass(frozen=True)
-class Listening:
+class ServerSettings:
     """A server's address, tokens and command.
 
     tokens: one token, or several tokens with the person of each. behind: the address of an HTTPS proxy in front, if
@@ -103,7 +103,7 @@ class Listening:
         return {person: f"{base}/?token={quote(token)}" for token, person in tokens.items()}
 
 
-def serve(app: FastAPI, listening: Listening) -> None:
+def serve(app: FastAPI, listening: ServerSettings) -> None:
     """Serve an app behind the guard until Ctrl-C, and print addresses with tokens."""
     import uvicorn
 

@@ -12,7 +12,7 @@ POLL_S = 0.2
 
 
 @contextmanager
-def alone(store: Store, name: str) -> Iterator[None]:
+def hold_lease(store: Store, name: str) -> Iterator[None]:
     """Hold a lease within the block; other processes wait. Raises TrapsError."""
     while (lease := store.lease(name)) is None:
         time.sleep(POLL_S)
@@ -36,5 +36,5 @@ def leased_ranges(store: Store, work: str, items: int, size: int) -> Generator[r
         with closing(lease):
             yield chunk
     for name, chunk in leases:
-        with alone(store, name):
+        with hold_lease(store, name):
             yield chunk

@@ -47,8 +47,8 @@ def read_checked(path: Path) -> Iterator[Line]:
     with path.open("rb") as stream:
         for number, line in enumerate(stream, start=1):
             if not line.endswith(b"\n"):  # the last one; that which lacks only its end, or has another one, is whole
-                ended = line + b"\n" if is_whole(line + b"\n") else line[:-1] + b"\n"
-                yield Line(number, ended, is_whole(ended), torn=not is_whole(ended))
+                full_line = line + b"\n" if is_whole(line + b"\n") else line[:-1] + b"\n"
+                yield Line(number, full_line, is_whole(full_line), torn=not is_whole(full_line))
             else:
                 yield Line(number, line, is_whole(line))
 

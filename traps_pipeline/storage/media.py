@@ -34,7 +34,7 @@ from traps_pipeline.video.encode import ENCODER, DamagedClip, decode, encode
 from traps_pipeline.video.policies import FramePolicy
 
 Profile = Literal["video", "images", "frames"]
-MOST = 25  # frames an API model sees, docs/spec.md 3.1
+MAX_FRAMES = 25  # frames an API model sees, docs/spec.md 3.1
 JPEG_QUALITY = 92
 CACHE_BYTES = 256 * 2**20
 _REVISION = 1  # raise it when picking, resizing or the container changes, so that all media are prepared anew
@@ -56,7 +56,7 @@ class MediaSpec(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
     profile: Profile
     fps: float | None = Field(default=None, gt=0, allow_inf_nan=False)
-    most: int = Field(default=MOST, ge=1)
+    most: int = Field(default=MAX_FRAMES, ge=1)
     uniform: int | None = Field(default=None, ge=1)
     size: tuple[int, int] | None = None
     fit: Literal["stretch", "crop"] = "stretch"
@@ -64,14 +64,16 @@ class MediaSpec(BaseModel):
 
     def content(self) -> dict[str, Any]:
         """Return the fields for a digest; fields added later count only if set."""
-        unused = {name for name in ("fit", "later") if getattr(self, name) == type(self).model_fields[name].default}
-        return self.model_dump(mode="json", exclude=unused)
+        default_fields = {
+            name for name in ("fit", "later") if getattr(self, name) == type(self).model_fields[name].default
+        }
+        return self.model_dump(mode="json", exclude=default_fields)
 
     @model_validator(mode="after")
     def _one_frame_policy(self) -> MediaSpec:
         if (self.fps is None) == (self.uniform is None):
             raise ValueError(f"give fps or uniform, {'one of them' if self.fps is None else 'not both'}")
-        if self.uniform is not None and self.most != MOST:
+        if self.uniform is not None and self.most != MAX_FRAMES:
             raise ValueError("most goes with fps; uniform says itself how many frames there are")
         if self.size is not None and min(self.size) < 1:
             raise ValueError(f"size is {self.size}; it is a width and a height in pixels")
@@ -104,9 +106,9 @@ class Frames:
 class Media:
     """A clip as it is sent.
 
-    path: the mp4, or the zip of JPEGs; None for profile frames, which `sample` returns. sha256: of the sent content
-    (the mp4; the JPEGs one after another; pixels and times), wherever the clip lies. times_s: seconds into the clip.
-    fps: playing speed of a video; None for other profiles. size_bytes: of the file, or of the pixels.
+    path: the mp4, or the zip of JPEGs; None for profile frames, which `sample` returns. sha256: digest of the sent
+    content (the mp4; the JPEGs one after another; pixels and times), wherever the clip lies. times_s: seconds into the
+    clip. fps: playing speed of a video; None for other profiles. size_bytes: size of the file, or of the pixels.
     """
 
     profile: Profile
@@ -171,9 +173,9 @@ class MediaStore:
         """
         note = self._note(clip_digest, spec)
         if note not in self._sound:
-            with _alone(note.parent):
+            with _lock_folder(note.parent):
                 self._bring(note, spec)
-                media = self._here(clip_digest, spec)
+                media = self._local_path(clip_digest, spec)
                 if media is None or not _is_complete(media):
                     media = _make(clip, clip_digest, spec, note)
                 self._store.keep([note] if media.path is None else [media.path, note])
@@ -186,13 +188,13 @@ class MediaStore:
         if note in self._sound:
             return self._sound[note]
         self._bring(note, spec)
-        return self._here(clip_digest, spec)
+        return self._local_path(clip_digest, spec)
 
     def _bring(self, note: Path, spec: MediaSpec) -> None:
         path = _file(note, spec.profile)
         self._store.bring([note] if path is None else [note, path])
 
-    def _here(self, clip_digest: str, spec: MediaSpec) -> Media | None:
+    def _local_path(self, clip_digest: str, spec: MediaSpec) -> Media | None:
         """Return the path of the media on this machine."""
         try:
             media = read_note(self._note(clip_digest, spec))
@@ -207,8 +209,8 @@ class MediaStore:
 
 def read_note(note: Path) -> Media:
     """Return the media that a note describes, or raise ValueError or OSError."""
-    (line, *more) = [*read_checked(note)] or [None]
-    if line is None or more or not line.whole:
+    (line, *other_lines) = [*read_checked(note)] or [None]
+    if line is None or other_lines or not line.whole:
         raise ValueError(f"{note}: {NOT_WHOLE}; delete it and run again: it is prepared anew")
     record: dict[str, Any] = json.loads(line.content)
     record.pop("sum")
@@ -234,17 +236,17 @@ def payload(media: Media) -> list[bytes]:
         raise TrapsError("media.profile frames is not sent as bytes; use video or images for a model behind an API")
     try:
         data = media.path.read_bytes()
-        parts = _unzipped(data) if media.profile == "images" else [data]
+        parts = _unzip(data) if media.profile == "images" else [data]
     except OSError as error:
-        raise _damaged(media.path, error.strerror or str(error)) from error
+        raise _damaged_clip(media.path, error.strerror or str(error)) from error
     except _NO_ZIP as error:
-        raise _damaged(media.path, str(error)) from error
+        raise _damaged_clip(media.path, str(error)) from error
     if len(data) != media.size_bytes or _sha256(parts) != media.sha256:
-        raise _damaged(media.path, f"{len(data)} of {media.size_bytes} bytes; truncated or altered")
+        raise _damaged_clip(media.path, f"{len(data)} of {media.size_bytes} bytes; truncated or altered")
     return parts
 
 
-def _damaged(path: Path, why: str) -> DamagedClip:
+def _damaged_clip(path: Path, why: str) -> DamagedClip:
     return DamagedClip(f"{path}: is not what was prepared ({why}); delete it and run again: it is prepared anew")
 
 
@@ -262,21 +264,21 @@ def _file(note: Path, profile: Profile) -> Path | None:
 def _make(clip: Path, clip_digest: str, spec: MediaSpec, note: Path) -> Media:
     """Pick and encode frames, write the file, and last the note with its digest."""
     _require(clip, clip_digest)
-    sampled = sample(clip, spec)
+    frames = sample(clip, spec)
     path, rate = _file(note, spec.profile), None
     if path is None:
-        header = str((sampled.frames.shape, sampled.times_s.tolist())).encode()
-        sha256, size = _sha256([header, sampled.frames.tobytes()]), sampled.frames.nbytes
+        header = str((frames.frames.shape, frames.times_s.tolist())).encode()
+        sha256, size = _sha256([header, frames.frames.tobytes()]), frames.frames.nbytes
     elif spec.profile == "video":
-        rate = _rate(clip, sampled, spec)
-        encode(list(sampled.frames), path, rate)
+        rate = _rate(clip, frames, spec)
+        encode(list(frames.frames), path, rate)
         sha256, size = file_digest(path), path.stat().st_size
     else:
-        jpegs = [_jpeg(frame) for frame in sampled.frames]
-        data = _zipped(jpegs)
+        jpegs = [_jpeg(frame) for frame in frames.frames]
+        data = _zip(jpegs)
         write_bytes(path, data)
         sha256, size = _sha256(jpegs), len(data)
-    times = tuple(sampled.times_s.tolist())
+    times = tuple(frames.times_s.tolist())
     media = Media(spec.profile, path, sha256, len(times), times, rate, size)
     write_bytes(note, line_with_checksum({name: value for name, value in asdict(media).items() if name != "path"}))
     return media
@@ -319,7 +321,7 @@ def _jpeg(frame: np.ndarray) -> bytes:
     return cv2.imencode(".jpg", frame[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
 
 
-def _zipped(jpegs: Sequence[bytes]) -> bytes:
+def _zip(jpegs: Sequence[bytes]) -> bytes:
     """Return an uncompressed zip of 00.jpg, 01.jpg, ..., the same bytes everywhere."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
@@ -330,7 +332,7 @@ def _zipped(jpegs: Sequence[bytes]) -> bytes:
     return buffer.getvalue()
 
 
-def _unzipped(data: bytes) -> list[bytes]:
+def _unzip(data: bytes) -> list[bytes]:
     """Return the entries of a zip in order, or raise one of `_NO_ZIP`."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
@@ -339,7 +341,7 @@ def _unzipped(data: bytes) -> list[bytes]:
 
 
 @contextmanager
-def _alone(folder: Path) -> Iterator[None]:
+def _lock_folder(folder: Path) -> Iterator[None]:
     """Hold a folder's lock, freed when its holder dies. Raises TrapsError."""
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -67,10 +67,10 @@ class StageOutput:
         return cast("pd.DataFrame", self.content)
 
 
-def joined(parts: Sequence[StageOutput]) -> StageOutput:
+def join_outputs(parts: Sequence[StageOutput]) -> StageOutput:
     """Join the outputs of a partition's parts: concatenate rows, add up the numbers."""
-    first, *later = parts
-    for later_part in later:
+    first, *other_parts = parts
+    for later_part in other_parts:
         first.tally.add(later_part.tally)
     rows = [row for part in parts for row in part.content]
     figures = {name: round(sum(part.shown[name] for part in parts), 6) for name in first.shown}
@@ -113,28 +113,30 @@ class TableStore:
         and code, the version of the code that made the rows. Raises TrapsError if a row breaks the schema, a key
         repeats or the disk is full; the partition's former file is then unchanged.
         """
-        data = self._checked(table, partition, rows)
+        data = self._arrow_of(table, partition, rows)
         version = content_version(data)
         state = State(version, dict(inputs), len(data), failed, code)
         footer, path = json.dumps(asdict(state)), self.path(table, partition)
         note = _note(footer, data.schema.names)
         columns = _COLUMNS + json.dumps(data.schema.names).encode()
-        content = sealed(data, {_FOOTER: footer.encode(), _COLUMNS.rstrip(b":"): columns})
+        content = seal_table(data, {_FOOTER: footer.encode(), _COLUMNS.rstrip(b":"): columns})
         self._store.write({path: content}, note=note, durable=True)
         return version
 
-    def _checked(self, table: Table[Row], partition: Mapping[str, Any], rows: Sequence[Row] | pd.DataFrame) -> pa.Table:
+    def _arrow_of(
+        self, table: Table[Row], partition: Mapping[str, Any], rows: Sequence[Row] | pd.DataFrame
+    ) -> pa.Table:
         import pyarrow as pa
 
         schema = table.arrow_schema()
-        listed = rows if isinstance(rows, Sequence) else None
-        kinds = () if listed is None else {cast("Any", type(row)) for row in listed}
-        names = {*map(str, rows)} if listed is None else {each.name for kind in kinds for each in fields(kind)}
+        row_list = rows if isinstance(rows, Sequence) else None
+        kinds = () if row_list is None else {cast("Any", type(row)) for row in row_list}
+        names = {*map(str, rows)} if row_list is None else {member.name for kind in kinds for member in fields(kind)}
         try:
             if names - set(schema.names):
                 raise ValueError(f"unknown columns {sorted(names - set(schema.names))}")
-            if listed is not None:  # a column at a time: a dictionary a row would be a copy of all
-                data = pa.table([_column(listed, field) for field in schema], schema=schema)
+            if row_list is not None:  # a column at a time: a dictionary a row would be a copy of all
+                data = pa.table([_column(row_list, field) for field in schema], schema=schema)
             else:
                 data = pa.Table.from_pandas(rows, schema=schema, preserve_index=False, safe=True)
                 data = data.replace_schema_metadata(None).cast(schema)
@@ -144,21 +146,20 @@ class TableStore:
             if not column.nullable and data[column.name].null_count:
                 raise TrapsError(f"table {table.name} {dict(partition)}: column {column.name} has missing values")
         for column, value in partition.items():
-            strays = {*data[column].unique().to_pylist()} - {value}
-            if strays:
+            if strays := {*data[column].unique().to_pylist()} - {value}:
                 raise TrapsError(
                     f"table {table.name} {dict(partition)}: column {column} also holds {sorted(map(str, strays))}"
                 )
         if not len(data):
             return data
         data = data.sort_by([(name, "ascending") for name in table.key])
-        before = None
+        previous_key = None
         for batch in data.select([*table.key]).to_batches(_ROWS_AT_ONCE):
             for key in zip(*(column.to_pylist() for column in batch.columns), strict=True):
-                if key == before:
-                    named = dict(zip(table.key, key, strict=True))
-                    raise TrapsError(f"table {table.name} {dict(partition)}: key {named} repeats")
-                before = key
+                if key == previous_key:
+                    key_values = dict(zip(table.key, key, strict=True))
+                    raise TrapsError(f"table {table.name} {dict(partition)}: key {key_values} repeats")
+                previous_key = key
         return data
 
     def state(self, table: Table, partition: Mapping[str, Any]) -> State | None:
@@ -222,9 +223,9 @@ class TableStore:
         """Return `read_all` as an Arrow table."""
         import pyarrow as pa
 
-        strangers = sorted(set(equal) - set(table.partition_by))
-        if strangers:
-            raise ValueError(f"table {table.name} is partitioned by {table.partition_by}, not by {strangers}")
+        unknown_columns = sorted(set(equal) - set(table.partition_by))
+        if unknown_columns:
+            raise ValueError(f"table {table.name} is partitioned by {table.partition_by}, not by {unknown_columns}")
         values = {c: v if isinstance(v, tuple | list) else [v] for c, v in equal.items()}
         parts = product(*(values.get(column, "*") for column in table.partition_by))
         patterns = ["/".join(map(str, part or [table.name])) + _SUFFIX for part in parts]
@@ -259,10 +260,10 @@ class TableStore:
 
 def write_sealed(path: Path, data: pa.Table, metadata: Mapping[bytes, bytes]) -> None:
     """Write a Parquet file atomically, with metadata and its digest in the footer."""
-    write_bytes(path, sealed(data, metadata), durable=True)
+    write_bytes(path, seal_table(data, metadata), durable=True)
 
 
-def sealed(data: pa.Table, metadata: Mapping[bytes, bytes]) -> bytes:
+def seal_table(data: pa.Table, metadata: Mapping[bytes, bytes]) -> bytes:
     """Return a Parquet file's bytes, with metadata and their digest in the footer."""
     import pyarrow.parquet as pq
 
@@ -318,10 +319,10 @@ def _sound_bytes(path: Path) -> pa.BufferReader:
     """
     import pyarrow as pa
 
-    return pa.BufferReader(_verified(path))
+    return pa.BufferReader(_verified_bytes(path))
 
 
-def _verified(path: Path) -> bytes:
+def _verified_bytes(path: Path) -> bytes:
     """Return a file's bytes, verified once until they change. Raises TrapsError."""
     with path.open("rb") as stream:
         content, stamp = stream.read(), _stamp(os.fstat(stream.fileno()))
@@ -336,11 +337,11 @@ def _verified(path: Path) -> bytes:
 def _footer_of(path: Path) -> tuple[State, list[str]]:
     """Return a file's footer and column names, cached until the file changes.
 
-    A run reads each of hundreds of footers dozens of times. Raises as `_verified`, or KeyError without a footer.
+    A run reads each of hundreds of footers dozens of times. Raises as `_verified_bytes`, or KeyError without a footer.
     """
     stamp = _stamp(path.stat())
     if (cached := _FOOTERS.get(path)) is None or cached[0] != stamp:
-        content = _verified(path)
+        content = _verified_bytes(path)
         if _COLUMNS in content:
             names = _json_behind(content, _COLUMNS)
         else:  # written before the names stood there
@@ -359,7 +360,7 @@ def _json_behind(content: bytes, mark: bytes, within: int = 0) -> Any:
     return json.JSONDecoder().raw_decode(text)[0]
 
 
-def altered(path: Path) -> str:
+def bytes_damage(path: Path) -> str:
     """Return what is wrong with the bytes of a table's file; empty if intact."""
     try:
         _sound_bytes(path)

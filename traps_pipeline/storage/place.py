@@ -9,7 +9,7 @@ from urllib.parse import urlsplit
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.names import LONGEST
+from traps_pipeline.base.names import MAX_NAME_LENGTH
 from traps_pipeline.base.paths import require_history_path, user_cache
 
 STUDY = "study.yaml"
@@ -35,8 +35,8 @@ def place_of(text: str) -> Place:
 
 def name_of(place: Place) -> str:
     """Return a unique name of a study: its folder's, and a digest of where it began."""
-    plain = re.sub(r"[^a-z0-9]+", "-", str(place).rpartition("/")[2].lower()).strip("-")[:LONGEST]
-    return f"{plain}-{digest(str(place))[:8]}".lstrip("-")
+    plain_name = re.sub(r"[^a-z0-9]+", "-", str(place).rpartition("/")[2].lower()).strip("-")[:MAX_NAME_LENGTH]
+    return f"{plain_name}-{digest(str(place))[:8]}".lstrip("-")
 
 
 def scratch_of(address: str) -> Path:

@@ -194,7 +194,7 @@ class FolderStore(Store):
 def _file_lease(folder: Path, name: str) -> Lease | None:
     """Lock a file, which is removed at the lease's end."""
     path = folder / name.replace("/", "-")
-    with writable(folder):
+    with require_writable(folder):
         descriptor = try_lock(path)
 
     def close() -> None:
@@ -221,7 +221,7 @@ def _names(folder: Sequence[str], pattern: str, *, is_file: bool) -> list[str]:
 
 
 @contextmanager
-def writable(folder: Path) -> Iterator[None]:
+def require_writable(folder: Path) -> Iterator[None]:
     """Raise TrapsError if a folder is not writable."""
     try:
         yield

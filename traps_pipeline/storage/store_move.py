@@ -12,14 +12,14 @@ from pathlib import Path
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.ledger.row_transfer import copy_ledger
 from traps_pipeline.storage.parquet import note_of
 from traps_pipeline.storage.place import STUDY, Place, scratch_of
 from traps_pipeline.storage.workspace import DATABASE, Workspace
 
 # Dagster's history, lock files, reports and labels belong to a machine, and the ledger is moved separately.
-STAYS = ("dagster", "ledger", "reports", "labels", STUDY)
+LOCAL_NAMES = ("dagster", "ledger", "reports", "labels", STUDY)
 AT_ONCE = 500  # files of one change
 MOVED_STUDY = "study.moved.yaml"  # the new name of the folder's study.yaml
 
@@ -32,9 +32,9 @@ def move_to_store(workspace: Workspace, address: Place) -> int:
     if not isinstance(address, str):
         raise TrapsError(f"{address}: is a folder; --store names an address in an object store, s3://BUCKET/STUDY")
     if workspace.is_shared or workspace.study.database:
-        where = workspace.place if workspace.is_shared else "a database"
+        destination = workspace.place if workspace.is_shared else "a database"
         raise TrapsError(
-            f"{workspace.place}: the study's ledger lies in {where}, and not in a folder; export it first "
+            f"{workspace.place}: the study's ledger lies in {destination}, and not in a folder; export it first "
             "(`traps study export-ledger`), take `database` from study.yaml, and import it again"
         )
     if Workspace.is_there(address):
@@ -55,12 +55,12 @@ def move_to_store(workspace: Workspace, address: Place) -> int:
 
 def _move_files(workspace: Workspace, target: Workspace) -> None:
     files = iter(
-        [p for p in workspace.store.below(workspace.root) if p.relative_to(workspace.root).parts[0] not in STAYS]
+        [p for p in workspace.store.below(workspace.root) if p.relative_to(workspace.root).parts[0] not in LOCAL_NAMES]
     )
     count = 0
-    while some := list(islice(files, AT_ONCE)):
-        moved = list[Path]()
-        for path in some:
+    while chunk := list(islice(files, AT_ONCE)):
+        moved_paths = list[Path]()
+        for path in chunk:
             destination = target.root / path.relative_to(workspace.root)
             if path.is_relative_to(workspace.tables.root):
                 try:
@@ -70,7 +70,7 @@ def _move_files(workspace: Workspace, target: Workspace) -> None:
                 continue
             destination.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, destination)
-            moved.append(destination)
-        target.store.keep(moved)
-        count += len(some)
-        progress.current().note(f"{counted(count, 'file')} copied to {target.place}")
+            moved_paths.append(destination)
+        target.store.keep(moved_paths)
+        count += len(chunk)
+        progress.current().note(f"{count_noun(count, 'file')} copied to {target.place}")

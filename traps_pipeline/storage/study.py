@@ -93,14 +93,14 @@ class SteeringSettings(BaseModel):
 
     @field_validator("alphas", "gaps")
     @classmethod
-    def _ascending(cls, values: tuple[float, ...]) -> tuple[float, ...]:
+    def _check_ascending(cls, values: tuple[float, ...]) -> tuple[float, ...]:
         if list(values) != sorted(set(values)):
             raise ValueError(f"{values} must ascend; alpha 0, the unsteered model, is always there")
         return values
 
 
 class GateSettings(BaseModel):
-    """Probe-gated abstention (docs/mechanism.md)."""
+    """The settings of probe-gated abstention (docs/mechanism.md)."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     false_abs: float = Field(default=0.05, gt=0, lt=1, description="of source controls, that conformal gates promise")
@@ -110,7 +110,7 @@ class GateSettings(BaseModel):
 
 
 class PatchingSettings(BaseModel):
-    """Activation patching between matched controls and voids (docs/mechanism.md)."""
+    """The settings of activation patching between controls and voids."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     pairs: int = Field(default=50, ge=1, description="pairs of each well-posed dataset, the first of a seeded order")
@@ -157,9 +157,9 @@ class MechanismSettings(BaseModel):
         missing = set(self.steering.direction_regimes if self.steering else ()) - set(self.prompts)
         if missing:
             raise ValueError(f"steering.direction_regimes: {sorted(missing)} are not among the prompts {self.prompts}")
-        unread = {*self.probes.prompts} - {*self.prompts, PROBE_PROMPT}
-        if unread:
-            raise ValueError(f"probes.prompts: {sorted(unread)} are not among the prompts {self.prompts}")
+        missing_prompts = {*self.probes.prompts} - {*self.prompts, PROBE_PROMPT}
+        if missing_prompts:
+            raise ValueError(f"probes.prompts: {sorted(missing_prompts)} are not among the prompts {self.prompts}")
         return self
 
     @field_validator("models")
@@ -232,7 +232,7 @@ class Study(BaseModel):
         return self.scenarios is not None or self.per_family is not None
 
     @model_validator(mode="after")
-    def _one_subset(self) -> Study:
+    def _check_subset(self) -> Study:
         if self.scenarios is not None and self.per_family is not None:
             raise ValueError("give scenarios or per_family, not both")
         return self

@@ -88,10 +88,10 @@ class Table(Generic[Row]):
     key: tuple[str, ...]
 
     def __post_init__(self) -> None:
-        strangers = {*self.partition_by, *self.key} - {field.name for field in fields(self.row_type)}  # pyright: ignore[reportArgumentType] - a dataclass
-        if strangers:
+        unknown_columns = {*self.partition_by, *self.key} - {field.name for field in fields(self.row_type)}  # pyright: ignore[reportArgumentType] - a dataclass
+        if unknown_columns:
             raise ValueError(
-                f"table {self.name}: {self.row_type.__name__} has no column {', '.join(sorted(strangers))}"
+                f"table {self.name}: {self.row_type.__name__} has no column {', '.join(sorted(unknown_columns))}"
             )
 
     @property
@@ -135,8 +135,8 @@ def _columns(row_type: type[Any]) -> Iterator[StoredColumn]:
         members = get_args(values) if isinstance(values, UnionType) else (values,)
         types = [member for member in members if member is not NoneType]
         if len(types) != 1 or types[0] not in TYPES or not isinstance(doc, str):
-            known = ", ".join(map(str, TYPES))
-            raise TypeError(f"{row_type.__name__}.{name}: a column holds one of {known}, or None, and has a text")
+            type_names = ", ".join(map(str, TYPES))
+            raise TypeError(f"{row_type.__name__}.{name}: a column holds one of {type_names}, or None, and has a text")
         yield StoredColumn(name, types[0], NoneType in members, doc)
 
 

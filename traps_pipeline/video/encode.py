@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.files import replacing
+from traps_pipeline.base.files import replace_file
 from traps_pipeline.video.policies import SAMPLED, FramePolicy
 
 # veryfast: 3 % larger than medium at the same quality, in half the time. mbtree is off since it is not deterministic in
@@ -50,7 +50,7 @@ def encode(frames: Sequence[np.ndarray], path: Path, fps: int) -> None:
     import av
     from av.error import FFmpegError
 
-    with replacing(path) as part:
+    with replace_file(path) as part:
         try:
             with av.open(str(part), "w", format="mp4", options={"movflags": "+faststart"}) as container:
                 stream = container.add_stream("libx264", rate=fps, options=ENCODER)
@@ -71,15 +71,15 @@ def decode(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
     try:
         with av.open(str(path)) as container:
-            declared = container.streams.video[0].frames
+            n_declared = container.streams.video[0].frames
             pairs = [(f.to_ndarray(format="rgb24"), float(f.time or 0.0)) for f in container.decode(video=0)]
     except (FFmpegError, OSError, IndexError) as error:  # IndexError: no video stream
         raise DamagedClip(
             f"{path}: cannot be decoded ({error}); delete the file and materialize videos again"
         ) from error
-    if not pairs or len(pairs) != declared:
+    if not pairs or len(pairs) != n_declared:
         raise DamagedClip(
-            f"{path}: holds {len(pairs)} of {declared} frames; delete the file and materialize videos again"
+            f"{path}: holds {len(pairs)} of {n_declared} frames; delete the file and materialize videos again"
         )
     return np.stack([p[0] for p in pairs]), np.array([p[1] for p in pairs])
 

@@ -12,7 +12,7 @@ class FramePolicy:
     """A grid of frames per second up to a number, or evenly spaced frames.
 
     Of a grid of `fps` frames a second, the first `most` are shown; `uniform` is the number of evenly spaced ones.
-    later: in the place of each, the frame so many frames after it, and the clip's last one where there is none.
+    later: shows instead of each frame the one this many frames later (at most the clip's last).
     """
 
     fps: float | None = None

@@ -20,7 +20,7 @@ from typing import Any
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.extras import require
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.models.local.checkpoint import (
     Checkpoint,
     find_checkpoint,
@@ -56,9 +56,9 @@ def load_local_model(entry: ModelEntry, *, inside: bool = False) -> LocalModel:
     require_device(device)
     checkpoint = find_checkpoint(params)
     require_no_code(checkpoint)
-    loading = ("dtype", "quantisation", "nf4_skip", "attn_implementation", "template", "video")
+    loading_params = ("dtype", "quantisation", "nf4_skip", "attn_implementation", "template", "video")
     key = digest(
-        [checkpoint.digest, str(checkpoint.folder), device, params.model_dump(mode="json", include={*loading})]
+        [checkpoint.digest, str(checkpoint.folder), device, params.model_dump(mode="json", include={*loading_params})]
     )
     with _LOADING:
         if key not in _LOADED:
@@ -76,10 +76,10 @@ def _make_room(checkpoint: Checkpoint, params: LocalParams, device: str) -> None
     """
     import torch
 
-    needed = weight_bytes(checkpoint.folder, params.dtype, params.quantisation)
+    needed_bytes = weight_bytes(checkpoint.folder, params.dtype, params.quantisation)
     loaded_keys = [key for key, model in _LOADED.items() if SPREAD in (device, model.device) or model.device == device]
     for key in loaded_keys:
-        if needed <= WEIGHTS_SHARE * free_bytes(device):
+        if needed_bytes <= WEIGHTS_SHARE * free_bytes(device):
             return
         del _LOADED[key]
         gc.collect()
@@ -91,11 +91,11 @@ def require_device(device: str) -> None:
     """Raise TrapsError if this machine has no such device."""
     import torch
 
-    exists = device in ("cpu", SPREAD) or (device == "mps" and torch.backends.mps.is_available())
+    is_available = device in ("cpu", SPREAD) or (device == "mps" and torch.backends.mps.is_available())
     if device.startswith("cuda"):
         number = int(device.partition(":")[2] or 0)
-        exists = torch.cuda.is_available() and number < torch.cuda.device_count()
-    if not exists:
+        is_available = torch.cuda.is_available() and number < torch.cuda.device_count()
+    if not is_available:
         raise TrapsError(
             f"device {device}: torch {torch.__version__} finds none on this machine; run where there is one, or say "
             "`device: cpu` in the entry, which changes nothing but the speed in float32"
@@ -128,7 +128,7 @@ def _load(checkpoint: Checkpoint, params: LocalParams, device: str) -> LocalMode
     unset = [*report["missing_keys"], *report["mismatched_keys"]]
     if unset:
         raise TrapsError(
-            f"checkpoint {checkpoint.name}: its files lack {counted(len(unset), 'weight')}, {unset[0]} first, which "
+            f"checkpoint {checkpoint.name}: its files lack {count_noun(len(unset), 'weight')}, {unset[0]} first, which "
             "would be random: download or save it again"
         )
     if not hasattr(processor, "video_token") or getattr(processor, "video_processor", None) is None:
@@ -145,16 +145,16 @@ def _load(checkpoint: Checkpoint, params: LocalParams, device: str) -> LocalMode
 
 def _require_packable(network: Any, name: str) -> None:
     """Raise TrapsError for modules that bitsandbytes cannot pack on a CPU (rows % 64)."""
-    odd = [
+    odd_layers = [
         part
         for part, module in network.named_modules()
         if type(module).__name__ == "Linear4bit" and module.in_features % NF4_CPU_BLOCK
     ]
-    if odd:
+    if odd_layers:
         raise TrapsError(
             f"checkpoint {name}: NF4 on a CPU wants modules {NF4_CPU_BLOCK} weights wide or a multiple of it, and "
-            f"{len(odd)}, {odd[0]} first, are not: name them, or what holds them, under nf4_skip beside the "
-            "entry's quantisation: nf4 (in params or in mechanism), or use a GPU"
+            f"{len(odd_layers)}, {odd_layers[0]} first, are not: name them, or what holds them, under nf4_skip beside "
+            "the entry's quantisation: nf4 (in params or in mechanism), or use a GPU"
         )
 
 

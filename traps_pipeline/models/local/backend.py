@@ -78,7 +78,7 @@ class LocalBackend:
             for answer in batch.answers:
                 answer.add_done_callback(batch.forget)
             try:
-                outcomes = await asyncio.get_running_loop().run_in_executor(self._worker, self._answers, batch)
+                outcomes = await asyncio.get_running_loop().run_in_executor(self._worker, self._answer_batch, batch)
             except Exception as error:  # noqa: BLE001 - raised by `ask` in each request's own task
                 for answer in batch.answers:
                     if not answer.done():
@@ -88,7 +88,7 @@ class LocalBackend:
                     if not answer.done():
                         answer.set_result(outcome)
 
-    def _answers(self, batch: _Batch) -> list[Outcome]:
+    def _answer_batch(self, batch: _Batch) -> list[Outcome]:
         """Load the model, sample frames and generate answers, in the worker thread."""
         from traps_pipeline.models.local.adapter import load_local_model
         from traps_pipeline.models.local.sampling import Sampling
@@ -103,19 +103,19 @@ class LocalBackend:
         sampling = None
         if self._params.temperature is not None and self._params.top_p is not None:
             sampling = Sampling(self._params.temperature, self._params.top_p, seeds(batch.requests))
-        generated = model.generate(prompts, self._params.max_new_tokens, sampling, stopped=batch.abandoned.is_set)
+        answers = model.generate(prompts, self._params.max_new_tokens, sampling, stopped=batch.abandoned.is_set)
         return [
             replace(
                 outcome(
-                    decoded.text,
-                    decoded.finish_reason,
-                    decoded.prompt_tokens,
-                    decoded.completion_tokens,
+                    answer.text,
+                    answer.finish_reason,
+                    answer.prompt_tokens,
+                    answer.completion_tokens,
                     model.served_model,
                 ),
-                first_token=stored_alternatives(decoded.first_token, request.about.get("regime")),
+                first_token=stored_alternatives(answer.first_token, request.about.get("regime")),
             )
-            for request, decoded in zip(batch.requests, generated, strict=True)
+            for request, answer in zip(batch.requests, answers, strict=True)
         ]
 
 

@@ -51,20 +51,20 @@ def pool(states: Tensor, pooling: Pooling, chosen: Tensor | None = None) -> Tens
 
 
 @contextmanager
-def capturing(
+def capture_states(
     blocks: Iterator[Module], norm: Module, pooling: Pooling, chosen: Tensor | None = None
 ) -> Iterator[CapturedStates]:
     """Keep the pooled states of passes within the block; remove all hooks afterwards."""
-    captured = CapturedStates()
+    states = CapturedStates()
 
     def embeddings(_: Module, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
-        captured.raw.append(pool(args[0] if args else kwargs["hidden_states"], pooling, chosen))
+        states.raw.append(pool(args[0] if args else kwargs["hidden_states"], pooling, chosen))
 
     def block(_: Module, __: Any, output: Any) -> None:
-        captured.raw.append(pool(first_tensor(output), pooling, chosen))
+        states.raw.append(pool(first_tensor(output), pooling, chosen))
 
     def keep_normed(_: Module, __: Any, output: Any) -> None:
-        captured.normed = pool(first_tensor(output), pooling, chosen)
+        states.normed = pool(first_tensor(output), pooling, chosen)
 
     with ExitStack() as hooks:
         for number, module in enumerate(blocks):
@@ -72,4 +72,4 @@ def capturing(
                 hooks.callback(module.register_forward_pre_hook(embeddings, with_kwargs=True).remove)
             hooks.callback(module.register_forward_hook(block).remove)
         hooks.callback(norm.register_forward_hook(keep_normed).remove)
-        yield captured
+        yield states

@@ -114,10 +114,10 @@ def require_no_code(checkpoint: Checkpoint) -> None:
         if path.stat().st_size <= _CONFIG_BYTES and _has_own_code(path):
             code.append(f"auto_map in {path.name}")
     if code:
-        more = f" and {len(code) - 1} more" if len(code) > 1 else ""
+        suffix = f" and {len(code) - 1} more" if len(code) > 1 else ""
         raise TrapsError(
-            f"checkpoint {checkpoint.name}: it brings code of its own ({code[0]}{more}), which never runs here: name a "
-            "checkpoint of a class that transformers has itself, or one that was saved again by such a class"
+            f"checkpoint {checkpoint.name}: it brings code of its own ({code[0]}{suffix}), which never runs here: name "
+            "a checkpoint of a class that transformers has itself, or one that was saved again by such a class"
         )
 
 
@@ -170,8 +170,10 @@ def free_bytes(device: str) -> float:
     if device.startswith("cuda"):
         import torch
 
-        cached = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)  # torch's cache can reuse it
-        return float(torch.cuda.mem_get_info(device)[0] + cached)
+        cached_bytes = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(
+            device
+        )  # torch's cache can reuse it
+        return float(torch.cuda.mem_get_info(device)[0] + cached_bytes)
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
     except OSError:
@@ -181,10 +183,10 @@ def free_bytes(device: str) -> float:
 
 def require_memory(checkpoint: Checkpoint, dtype: Dtype, quantisation: Quantisation, device: str) -> None:
     """Raise TrapsError if the weights alone do not fit."""
-    needed, free = weight_bytes(checkpoint.folder, dtype, quantisation), free_bytes(device)
-    if needed > free:
+    needed_bytes, free = weight_bytes(checkpoint.folder, dtype, quantisation), free_bytes(device)
+    if needed_bytes > free:
         raise TrapsError(
-            f"checkpoint {checkpoint.name}: its weights take about {needed / 1e9:.1f} GB as {dtype}"
+            f"checkpoint {checkpoint.name}: its weights take about {needed_bytes / 1e9:.1f} GB as {dtype}"
             f"{' in NF4' if quantisation == 'nf4' else ''}, and {free / 1e9:.1f} GB are free on {device}: free memory "
             "(another model of this run may hold it: ask one at a time), choose another device, or say quantisation: "
             "nf4 in the entry, which makes it another model"

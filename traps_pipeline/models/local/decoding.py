@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any, Protocol
 
-from traps_pipeline.models.first_token import MOST
+from traps_pipeline.models.first_token import MAX_ALTERNATIVES
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.prompt_batches import Prompt, collate
 from traps_pipeline.models.local.sampling import Sampling, SeededNucleus
@@ -78,7 +78,7 @@ class _FirstToken:
 
     def __call__(self, input_ids: Any, scores: Tensor) -> Tensor:
         if not self.likeliest:
-            values, tokens = scores.float().log_softmax(dim=-1).topk(min(MOST, scores.shape[-1]))
+            values, tokens = scores.float().log_softmax(dim=-1).topk(min(MAX_ALTERNATIVES, scores.shape[-1]))
             rows = zip(tokens.tolist(), values.tolist(), strict=True)
             self.likeliest = [dict(zip(*row, strict=True)) for row in rows]
         return scores

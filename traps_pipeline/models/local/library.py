@@ -45,12 +45,12 @@ def _declare_torchvision_operators() -> None:
     try:
         ctypes.CDLL(str(library))  # defines the operators itself
     except OSError:
-        declared = torch.library.Library("torchvision", "DEF")
-        declared.define("nms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
-        declared.define(
+        operator_library = torch.library.Library("torchvision", "DEF")
+        operator_library.define("nms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
+        operator_library.define(
             "qnms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor",
         )
-        _KEPT.append(declared)  # they are removed with the object
+        _KEPT.append(operator_library)  # they are removed with the object
 
 
 _KEPT: list[Any] = []

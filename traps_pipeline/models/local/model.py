@@ -13,8 +13,8 @@ import numpy as np
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.wording import counted
-from traps_pipeline.models.local.capture import Pooling, capturing
+from traps_pipeline.base.wording import count_noun
+from traps_pipeline.models.local.capture import Pooling, capture_states
 from traps_pipeline.models.local.checkpoint import Checkpoint, free_bytes
 from traps_pipeline.models.local.decoding import Steers, decode, steering_context
 from traps_pipeline.models.local.library import load_transformers
@@ -95,7 +95,7 @@ class LocalModel:
 
     @cached_property
     def identity(self) -> dict[str, Any]:
-        """What decides hidden states besides the prompt (no paths, no device), for keys."""
+        """Inputs of hidden states besides the prompt (no paths, no device), for keys."""
         return {
             "checkpoint_digest": self.checkpoint.digest,
             "class": type(self.network).__name__,
@@ -139,7 +139,7 @@ class LocalModel:
         frames: (N, H, W, 3) uint8 RGB, all of them shown. times_s: (N,) seconds into the clip, which models that read
         time stamps get exactly. Raises TrapsError if the chat template loses a part.
         """
-        text = self._rendered(system, user)
+        text = self._render(system, user)
         marks = [round(1000 * float(time)) for time in times_s]
         clock = {"total_num_frames": marks[-1] + 1, "fps": float(CLOCK_FPS), "frames_indices": marks,
                  "duration": marks[-1] / CLOCK_FPS, "height": frames.shape[1], "width": frames.shape[2]}  # fmt: skip
@@ -157,7 +157,7 @@ class LocalModel:
         inputs.pop("video_metadata", None)
         return Prompt(text, dict(inputs))
 
-    def _rendered(self, system: str, user: str) -> str:
+    def _render(self, system: str, user: str) -> str:
         content = [{"type": "video"}, {"type": "text", "text": user}]
         turns = [
             {"role": "system", "content": [{"type": "text", "text": system}]},
@@ -200,14 +200,14 @@ class LocalModel:
 
         mask = None if chosen is None else torch.from_numpy(chosen)
         if pooling == "answer":
-            prompt = self._answered(prompt, steering)
-        with steering_context(steering, self), capturing(iter(self.blocks), self.norm, pooling, mask) as captured:
+            prompt = self._with_first_token(prompt, steering)
+        with steering_context(steering, self), capture_states(iter(self.blocks), self.norm, pooling, mask) as states:
             self.forward(prompt)
-        assert captured.normed is not None and len(captured.raw) == self.n_layers + 1
-        rows = torch.stack([row.float().cpu() for row in (*captured.raw, captured.normed)]).numpy()
+        assert states.normed is not None and len(states.raw) == self.n_layers + 1
+        rows = torch.stack([row.float().cpu() for row in (*states.raw, states.normed)]).numpy()
         return States(rows[:-1], rows[-1])
 
-    def _answered(self, prompt: Prompt, steering: Steers | None) -> Prompt:
+    def _with_first_token(self, prompt: Prompt, steering: Steers | None) -> Prompt:
         """Return the prompt followed by the first token of its greedy answer."""
         return prompt.followed_by(self.generate([prompt], 1, steering=steering)[0].tokens)
 
@@ -229,20 +229,20 @@ class LocalModel:
         early. Raises TrapsError if a single prompt does not fit.
         """
         answers: dict[int, GeneratedAnswer] = {}
-        each = [self._row_bytes(prompt, max_new_tokens) for prompt in prompts]
-        for group in batches(prompts, each, MEMORY_SHARE * free_bytes(self.device)):
+        row_bytes = [self._row_bytes(prompt, max_new_tokens) for prompt in prompts]
+        for group in batches(prompts, row_bytes, MEMORY_SHARE * free_bytes(self.device)):
             pending = [group]
             while pending:
                 rows = pending.pop()
-                generated = self._fitting(prompts, rows, max_new_tokens, sampling, steering, stopped)
-                if generated is None:
+                fitting_answers = self._generate_fitting(prompts, rows, max_new_tokens, sampling, steering, stopped)
+                if fitting_answers is None:
                     middle = len(rows) // 2
                     pending += [rows[middle:], rows[:middle]]
                 else:
-                    answers.update(zip(rows, generated, strict=True))
+                    answers.update(zip(rows, fitting_answers, strict=True))
         return [answers[i] for i in range(len(prompts))]
 
-    def _fitting(
+    def _generate_fitting(
         self,
         prompts: Sequence[Prompt],
         rows: Sequence[int],
@@ -268,23 +268,23 @@ class LocalModel:
                 ) from None
         torch.cuda.empty_cache()  # outside the handler, where the failed pass has been freed
         progress.current().note(
-            f"{self.checkpoint.name}: {counted(len(rows), 'row')} need more than the memory, trying half of them"
+            f"{self.checkpoint.name}: {count_noun(len(rows), 'row')} need more than the memory, trying half of them"
         )
         return None
 
     def _answer(self, prompt: Prompt, tokens: list[int], first: Mapping[int, float]) -> GeneratedAnswer:
         eos = self.network.generation_config.eos_token_id
         ends = {eos} if isinstance(eos, int) else {*eos}
-        ended = next((i for i, token in enumerate(tokens) if token in ends), None)
-        own_tokens = tokens if ended is None else tokens[: ended + 1]
+        end_index = next((i for i, token in enumerate(tokens) if token in ends), None)
+        own_tokens = tokens if end_index is None else tokens[: end_index + 1]
         with self._processing:
             text = self.processor.tokenizer.decode(own_tokens, skip_special_tokens=True)
-            named = dict[str, float]()
+            logprob_of = dict[str, float]()
             for token, logprob in first.items():  # several may have one text
                 name = self.processor.tokenizer.decode([token])
-                named[name] = float(np.logaddexp(named.get(name, -np.inf), logprob))
-        finish = "length" if ended is None else "stop"
-        return GeneratedAnswer(text, prompt.n_tokens, len(own_tokens), finish, tuple(own_tokens), named)
+                logprob_of[name] = float(np.logaddexp(logprob_of.get(name, -np.inf), logprob))
+        finish_reason = "length" if end_index is None else "stop"
+        return GeneratedAnswer(text, prompt.n_tokens, len(own_tokens), finish_reason, tuple(own_tokens), logprob_of)
 
     def placed(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return inputs on the model's device, with pictures in its precision."""

@@ -37,9 +37,9 @@ class Prompt:
         import torch
 
         inputs = dict(self.inputs)
-        more = {"input_ids": list(tokens), "attention_mask": [1] * len(tokens)}  # else: of no modality
+        suffixes = {"input_ids": list(tokens), "attention_mask": [1] * len(tokens)}  # else: of no modality
         for name in self.sequences:
-            row = inputs[name].new_tensor(more.get(name, [0] * len(tokens)))
+            row = inputs[name].new_tensor(suffixes.get(name, [0] * len(tokens)))
             inputs[name] = torch.cat([inputs[name], row[None]], dim=1)
         return Prompt(self.text, inputs)
 
@@ -67,9 +67,9 @@ def collate(prompts: Sequence[Prompt], pad_token: int) -> dict[str, Tensor]:
 
 def batches(prompts: Sequence[Prompt], row_bytes: Sequence[float], room: float) -> Iterator[list[int]]:
     """Yield batches of prompt indices: same form, like length, within `room` (bytes)."""
-    by_form: defaultdict[Any, list[int]] = defaultdict(list)
+    rows_by_form: defaultdict[Any, list[int]] = defaultdict(list)
     for i in sorted(range(len(prompts)), key=lambda i: prompts[i].n_tokens):
-        by_form[prompts[i].form].append(i)
-    for rows in by_form.values():
-        most = max(1, int(room / row_bytes[rows[-1]]))
-        yield from (rows[k : k + most] for k in range(0, len(rows), most))
+        rows_by_form[prompts[i].form].append(i)
+    for rows in rows_by_form.values():
+        max_rows = max(1, int(room / row_bytes[rows[-1]]))
+        yield from (rows[k : k + max_rows] for k in range(0, len(rows), max_rows))

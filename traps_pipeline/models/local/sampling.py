@@ -40,10 +40,12 @@ class SeededNucleus:
         import torch
 
         probabilities, order = (scores.float() / self._sampling.temperature).softmax(dim=-1).sort(descending=True)
-        before = probabilities.cumsum(dim=-1) - probabilities
-        nucleus = probabilities.masked_fill(before >= self._sampling.top_p, 0.0)
-        upto = nucleus.cumsum(dim=-1)
-        uniform = torch.tensor([[stream.random()] for stream in self._streams], dtype=upto.dtype, device=upto.device)
-        place = torch.searchsorted(upto, uniform * upto[:, -1:], right=True)
+        preceding = probabilities.cumsum(dim=-1) - probabilities
+        nucleus = probabilities.masked_fill(preceding >= self._sampling.top_p, 0.0)
+        cumulative = nucleus.cumsum(dim=-1)
+        uniform = torch.tensor(
+            [[stream.random()] for stream in self._streams], dtype=cumulative.dtype, device=cumulative.device
+        )
+        place = torch.searchsorted(cumulative, uniform * cumulative[:, -1:], right=True)
         place = place.minimum((nucleus > 0).sum(dim=-1, keepdim=True) - 1)  # rounding must not leave the nucleus
         return torch.full_like(scores, -torch.inf).scatter_(1, order.gather(1, place), 0.0)

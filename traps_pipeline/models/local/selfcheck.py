@@ -40,7 +40,7 @@ def _prompt(model: LocalModel, folder: Path) -> Prompt:
 
 
 def check_family(family: Family, folder: Path) -> str:
-    """Build, save, reload and ask a checkpoint; return what happened in words.
+    """Build, save, reload and query a checkpoint; describe the result in words.
 
     Raises TrapsError, or any error of the library, if a step fails.
     """
@@ -50,9 +50,9 @@ def check_family(family: Family, folder: Path) -> str:
 
 
 def check_nf4(folder: Path) -> str:
-    """Load a tiny checkpoint in 4 bits, if possible; return what happened in words."""
-    if absent := missing("nf4"):
-        return f"{' and '.join(absent)} not installed (`{install_line('nf4')}`): entries in NF4 do not load"
+    """Load a tiny checkpoint in 4 bits, if possible; describe the result in words."""
+    if missing_modules := missing("nf4"):
+        return f"{' and '.join(missing_modules)} not installed (`{install_line('nf4')}`): entries in NF4 do not load"
     model = tiny_model("qwen3-vl", folder / "nf4", "nf4")
     model.forward_states(_prompt(model, folder))
     import bitsandbytes

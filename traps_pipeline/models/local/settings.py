@@ -38,11 +38,11 @@ class LocalParams(BaseModel):
 
     @model_validator(mode="after")
     def _sampling_is_whole(self) -> LocalParams:
-        declared = [name for name in ("temperature", "top_p") if getattr(self, name) is not None]
-        if self.do_sample and len(declared) != 2:
+        sampling_names = [name for name in ("temperature", "top_p") if getattr(self, name) is not None]
+        if self.do_sample and len(sampling_names) != 2:
             raise ValueError("do_sample: true needs temperature and top_p (1.0 for all tokens)")
-        if not self.do_sample and declared:
-            raise ValueError(f"do_sample: false is greedy, and {declared[0]} has no effect; leave it out")
+        if not self.do_sample and sampling_names:
+            raise ValueError(f"do_sample: false is greedy, and {sampling_names[0]} has no effect; leave it out")
         if self.nf4_skip and self.quantisation != "nf4":
             raise ValueError("nf4_skip goes with quantisation: nf4")
         return self

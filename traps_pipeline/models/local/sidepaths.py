@@ -1,4 +1,4 @@
-"""Name what a block reads besides the residual stream and its own cache.
+"""Name inputs of a block besides the residual stream and its own cache.
 
 Gemma 4 has two such paths, both of them arguments of its blocks. Its upper blocks compute no keys and values: each
 reads those of the last lower block with its kind of attention (`shared_kv_states`, a mapping by kind). And every block
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from torch.nn import Module
 
 Argument = Literal["shared_kv_states", "per_layer_input"]
-SHARED: Argument = "shared_kv_states"
+SHARED_KEYS: Argument = "shared_kv_states"
 PER_LAYER: Argument = "per_layer_input"
 # By configuration field: the blocks' argument for this path, and a description.
 _FIELDS: dict[str, tuple[Argument | None, str]] = {
-    "num_kv_shared_layers": (SHARED, "later blocks reuse keys and values of earlier ones"),
+    "num_kv_shared_layers": (SHARED_KEYS, "later blocks reuse keys and values of earlier ones"),
     "hidden_size_per_layer_input": (PER_LAYER, "every block reads the token's own embedding again"),
     "altup_num_inputs": (None, "blocks hand on several residual streams"),  # Gemma 3n
 }

@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from traps_pipeline.models.local.adapter import LocalModel, Prompt
 
 PARTS = ("system", "stamps", "visual", "question", "last")
-CHANGED = 0.05  # minimum mean absolute difference of a changed visual token's pixels, as the model reads them
+CHANGED_DIFFERENCE = (
+    0.05  # minimum mean absolute difference of a changed visual token's pixels, as the model reads them
+)
 # `<0.4 seconds>` of Qwen3-VL and `00:01` of Gemma 4; LLaVA-NeXT-Video writes no times.
 _STAMP = re.compile(r"<\d+(?:\.\d+)?seconds>|\d\d:\d\d(?!\d)")
 
@@ -36,7 +38,7 @@ def spans(model: LocalModel, prompt: Prompt, system: str, question: str) -> dict
         for token, is_visual in zip(ids, visual, strict=True)
     ]
     ends = np.cumsum([len(text) for text in texts])
-    starts, joined = ends - [len(text) for text in texts], "".join(texts)
+    starts, full_text = ends - [len(text) for text in texts], "".join(texts)
 
     def tokens(first: int, last: int) -> np.ndarray:
         return (starts < last) & (ends > first)
@@ -44,16 +46,16 @@ def spans(model: LocalModel, prompt: Prompt, system: str, question: str) -> dict
     masks = {name: np.zeros(len(ids), bool) for name in PARTS}
     masks["visual"] = visual
     for name, text in (("system", system), ("question", question)):
-        plain = _plain(text)
-        place = joined.rfind(plain) if name == "question" else joined.find(plain)
-        if place < 0 or not plain:
+        plain_text = _plain(text)
+        place = full_text.rfind(plain_text) if name == "question" else full_text.find(plain_text)
+        if place < 0 or not plain_text:
             raise TrapsError(
                 f"{model.checkpoint.name}: the {name} cannot be found among the tokens of its prompt; its tokenizer "
                 "changes texts, so positions cannot be chosen by part"
             )
-        masks[name] = tokens(place, place + len(plain)) & ~visual
-    between = int(np.flatnonzero(masks["system"])[-1]) + 1, int(np.flatnonzero(masks["question"])[0])
-    for first, last in _stamps(joined, int(starts[between[0]]), int(starts[between[1]])):
+        masks[name] = tokens(place, place + len(plain_text)) & ~visual
+    search_span = int(np.flatnonzero(masks["system"])[-1]) + 1, int(np.flatnonzero(masks["question"])[0])
+    for first, last in _stamps(full_text, int(starts[search_span[0]]), int(starts[search_span[1]])):
         masks["stamps"] |= tokens(first, last) & ~visual
     masks["last"][-1] = True
     for name in PARTS[:-1]:
@@ -79,9 +81,9 @@ def changed_tokens(first: Prompt, second: Prompt, visual: np.ndarray) -> np.ndar
     if not n_visual or len(pixels[0]) % n_visual:
         return None
     difference = (pixels[0].float() - pixels[1].float()).abs().mean(dim=1)
-    changed = np.zeros(len(visual), bool)
-    changed[visual] = (difference.reshape(n_visual, -1).amax(dim=1) > CHANGED).numpy()
-    return changed
+    is_changed = np.zeros(len(visual), bool)
+    is_changed[visual] = (difference.reshape(n_visual, -1).amax(dim=1) > CHANGED_DIFFERENCE).numpy()
+    return is_changed
 
 
 def _stamps(text: str, first: int, last: int) -> Iterator[tuple[int, int]]:

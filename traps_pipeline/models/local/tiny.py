@@ -28,7 +28,7 @@ Overrides = Mapping[str, Any]
 _HEADS = {"num_attention_heads": 4, "num_key_value_heads": 2, "head_dim": 16}
 _TEXT: dict[str, Any] = {"hidden_size": 64, "intermediate_size": 128, "num_hidden_layers": 4, **_HEADS}
 # Standard deviation of a random checkpoint's text weights, large enough for every prompt token to affect the answer.
-_SPREAD: dict[Family, float] = {"qwen3-vl": 0.2, "gemma-4": 0.02, "llava-next-video": 0.2}
+_WEIGHT_STD: dict[Family, float] = {"qwen3-vl": 0.2, "gemma-4": 0.02, "llava-next-video": 0.2}
 _VISION_SIZE = 32  # hidden size of the vision towers
 _STILL_PIXELS = 128 * 96  # pixels of an image: those of the pocket model's training frames
 
@@ -102,15 +102,15 @@ def build_tiny(
     import torch
 
     transformers = load_transformers()
-    wrapped = make_tokenizer(family, tokenizer)
+    fast_tokenizer = make_tokenizer(family, tokenizer)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        config = make_config(family, wrapped, {"initializer_range": _SPREAD[family], **(text or {})}, vision)
+        config = make_config(family, fast_tokenizer, {"initializer_range": _WEIGHT_STD[family], **(text or {})}, vision)
         model = transformers.AutoModelForImageTextToText.from_config(config)
-    model.generation_config.eos_token_id = wrapped.eos_token_id
-    model.generation_config.pad_token_id = wrapped.pad_token_id
+    model.generation_config.eos_token_id = fast_tokenizer.eos_token_id
+    model.generation_config.pad_token_id = fast_tokenizer.pad_token_id
     model.save_pretrained(folder)
-    make_processor(family, wrapped, video).save_pretrained(folder)
+    make_processor(family, fast_tokenizer, video).save_pretrained(folder)
     return folder
 
 
@@ -119,23 +119,25 @@ def make_tokenizer(family: Family, tokenizer: Tokenizer | None = None) -> Any:
     transformers = load_transformers()
     special = _SPECIAL[family]
     base = _byte_level() if tokenizer is None else tokenizer
-    named = {f"{name}_token": token for name, token in special.items()}
-    plain = {name: named.pop(name) for name in ("pad_token", "eos_token", "bos_token") if name in named}
-    wrapped = transformers.PreTrainedTokenizerFast(
+    special_tokens = {f"{name}_token": token for name, token in special.items()}
+    main_tokens = {
+        name: special_tokens.pop(name) for name in ("pad_token", "eos_token", "bos_token") if name in special_tokens
+    }
+    fast_tokenizer = transformers.PreTrainedTokenizerFast(
         tokenizer_object=base,
         padding_side="left",
-        extra_special_tokens=named,
+        extra_special_tokens=special_tokens,
         clean_up_tokenization_spaces=False,
-        **plain,
+        **main_tokens,
     )
     if "bos" in special:  # as the families' own tokenizers do, whether or not the chat template writes it too
         from tokenizers.processors import TemplateProcessing
 
         bos = special["bos"]
-        wrapped.backend_tokenizer.post_processor = TemplateProcessing(
-            single=f"{bos} $A", special_tokens=[(bos, wrapped.bos_token_id)]
+        fast_tokenizer.backend_tokenizer.post_processor = TemplateProcessing(
+            single=f"{bos} $A", special_tokens=[(bos, fast_tokenizer.bos_token_id)]
         )
-    return wrapped
+    return fast_tokenizer
 
 
 def _byte_level() -> Tokenizer:
@@ -153,16 +155,16 @@ def make_config(family: Family, tokenizer: Any, text: Overrides | None = None, v
     """Return the family's tiny configuration for a tokenizer, with overrides."""
     transformers = load_transformers()
     ids = {name: tokenizer.convert_tokens_to_ids(token) for name, token in _SPECIAL[family].items()}
-    shared = {"vocab_size": len(tokenizer), "pad_token_id": ids["pad"], "eos_token_id": ids["eos"]}
+    text_settings = {"vocab_size": len(tokenizer), "pad_token_id": ids["pad"], "eos_token_id": ids["eos"]}
     if "bos" in ids:
-        shared["bos_token_id"] = ids["bos"]
+        text_settings["bos_token_id"] = ids["bos"]
     match family:
         case "qwen3-vl":
-            return _qwen3_vl(transformers, ids, _TEXT | shared, text or {}, vision or {})
+            return _qwen3_vl(transformers, ids, _TEXT | text_settings, text or {}, vision or {})
         case "gemma-4":
-            return _gemma_4(transformers, ids, _TEXT | shared, text or {}, vision or {})
+            return _gemma_4(transformers, ids, _TEXT | text_settings, text or {}, vision or {})
         case "llava-next-video":
-            return _llava_next_video(transformers, ids, _TEXT | shared, text or {}, vision or {})
+            return _llava_next_video(transformers, ids, _TEXT | text_settings, text or {}, vision or {})
 
 
 def _qwen3_vl(transformers: Any, ids: Mapping[str, int], base: Overrides, text: Overrides, vision: Overrides) -> Any:
@@ -172,7 +174,7 @@ def _qwen3_vl(transformers: Any, ids: Mapping[str, int], base: Overrides, text: 
         "rope_parameters": {"rope_type": "default", "rope_theta": 10000.0, "mrope_section": [4, 2, 2]},
         **text,
     }
-    eyes = {
+    vision_config = {
         "depth": 2,
         "hidden_size": _VISION_SIZE,
         "intermediate_size": 64,
@@ -184,7 +186,7 @@ def _qwen3_vl(transformers: Any, ids: Mapping[str, int], base: Overrides, text: 
     }
     return transformers.Qwen3VLConfig(
         text_config=words,
-        vision_config=eyes,
+        vision_config=vision_config,
         image_token_id=ids["image"],
         video_token_id=ids["video"],
         vision_start_token_id=ids["vision_start"],
@@ -210,7 +212,7 @@ def _gemma_4(transformers: Any, ids: Mapping[str, int], base: Overrides, text: O
         "sliding_window": 64,
         **text,
     }
-    eyes = {
+    vision_config = {
         "hidden_size": _VISION_SIZE,
         "intermediate_size": 64,
         "num_hidden_layers": 2,
@@ -222,7 +224,7 @@ def _gemma_4(transformers: Any, ids: Mapping[str, int], base: Overrides, text: O
     }
     return transformers.Gemma4Config(
         text_config=words,
-        vision_config=eyes,
+        vision_config=vision_config,
         audio_config=None,
         boi_token_id=ids["boi"],
         eoi_token_id=ids["eoi"],
@@ -238,7 +240,7 @@ def _llava_next_video(
     transformers: Any, ids: Mapping[str, int], base: Overrides, text: Overrides, vision: Overrides
 ) -> Any:
     words = {**base, "max_position_embeddings": 4096, **text}
-    eyes = {
+    vision_config = {
         "model_type": "clip_vision_model",
         "hidden_size": _VISION_SIZE,
         "intermediate_size": 64,
@@ -251,10 +253,10 @@ def _llava_next_video(
     }
     return transformers.LlavaNextVideoConfig(
         text_config=transformers.LlamaConfig(**words),
-        vision_config=transformers.CLIPVisionConfig(**eyes),
+        vision_config=transformers.CLIPVisionConfig(**vision_config),
         image_token_index=ids["image"],
         video_token_index=ids["video"],
-        image_grid_pinpoints=[[eyes["image_size"], eyes["image_size"] * 2]],
+        image_grid_pinpoints=[[vision_config["image_size"], vision_config["image_size"] * 2]],
     )
 
 
@@ -264,14 +266,24 @@ def make_processor(family: Family, tokenizer: Any, video: Overrides | None = Non
     video_settings = dict(video or {})
     match family:
         case "qwen3-vl":
-            small = {"size": {"shortest_edge": 32 * 32, "longest_edge": 2 * 64 * 64}, "cap_pixels_per_frame": False}
-            eyes = transformers.Qwen3VLVideoProcessor(**small | video_settings)
-            still = {name: getattr(eyes, name) for name in ("patch_size", "image_mean", "image_std")}
-            still["size"] = {"shortest_edge": (2 * eyes.patch_size) ** 2, "longest_edge": _STILL_PIXELS}
+            video_sizes = {
+                "size": {"shortest_edge": 32 * 32, "longest_edge": 2 * 64 * 64},
+                "cap_pixels_per_frame": False,
+            }
+            video_processor = transformers.Qwen3VLVideoProcessor(**video_sizes | video_settings)
+            image_settings = {
+                name: getattr(video_processor, name) for name in ("patch_size", "image_mean", "image_std")
+            }
+            image_settings["size"] = {
+                "shortest_edge": (2 * video_processor.patch_size) ** 2,
+                "longest_edge": _STILL_PIXELS,
+            }
             return transformers.Qwen3VLProcessor(
-                image_processor=transformers.Qwen2VLImageProcessor(**still),  # a server may receive frames one by one
+                image_processor=transformers.Qwen2VLImageProcessor(
+                    **image_settings
+                ),  # a server may receive frames one by one
                 tokenizer=tokenizer,
-                video_processor=eyes,
+                video_processor=video_processor,
                 chat_template=_TEMPLATES[family],
             )
         case "gemma-4":

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from torch import Tensor
 
-MOST_BYTES = 2 * 2**30  # maximum bytes of cached features, on the model's device
+MAX_BYTES = 2 * 2**30  # maximum bytes of cached features, on the model's device
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class _Features:
 class ClipMemory:
     """Features of the latest clips; `passes` counts those that the tower encoded."""
 
-    most_bytes: int = MOST_BYTES
+    most_bytes: int = MAX_BYTES
     passes: int = 0
     _kept: OrderedDict[str, _Features] = field(default_factory=OrderedDict)
     _size: int = 0
@@ -57,7 +57,7 @@ class ClipMemory:
         @functools.wraps(original)  # the library inspects the names of its arguments
         def features(*given: Any, **named: Any) -> Any:
             arguments = dict(names.bind(*given, **named).arguments)
-            rest = arguments.pop("kwargs", {})
+            keyword_arguments = arguments.pop("kwargs", {})
             clips = _clips_of(arguments)
             if clips is None:
                 return original(*given, **named)
@@ -65,8 +65,8 @@ class ClipMemory:
             rows = {key: self._kept[key] for key in keys if key in self._kept}
             for key, clip in zip(keys, clips, strict=True):
                 if key not in rows:
-                    rows[key] = self._pass(original, key, {**arguments, **clip, **rest})
-            return self._joined([rows[key] for key in keys])
+                    rows[key] = self._pass(original, key, {**arguments, **clip, **keyword_arguments})
+            return self._join_features([rows[key] for key in keys])
 
         owner.get_video_features = features
         try:
@@ -84,7 +84,7 @@ class ClipMemory:
         self._keep(key, features)
         return features
 
-    def _joined(self, rows: list[_Features]) -> Any:
+    def _join_features(self, rows: list[_Features]) -> Any:
         """Return these clips' features in the form of the library's output."""
         import torch
 
@@ -115,9 +115,9 @@ def _clips_of(arguments: dict[str, Any]) -> list[dict[str, Tensor]] | None:
         ]
     counts, places = arguments.get("num_frames_per_video"), arguments.get("video_position_ids")
     if counts is not None and places is not None:  # Gemma 4: frames of all clips one after the other
-        each = zip(pixels.split(counts.tolist()), places.split(counts.tolist()), counts, strict=True)
+        clip_parts = zip(pixels.split(counts.tolist()), places.split(counts.tolist()), counts, strict=True)
         names = ("pixel_values_videos", "video_position_ids", "num_frames_per_video")
-        return [dict(zip(names, (part, place, count[None]), strict=True)) for part, place, count in each]
+        return [dict(zip(names, (part, place, count[None]), strict=True)) for part, place, count in clip_parts]
     if pixels.dim() == 5:  # LLaVA-NeXT-Video: a row a clip
         return [{"pixel_values_videos": row[None]} for row in pixels]
     return None

@@ -17,7 +17,7 @@ from traps_pipeline.benchmark.specs import (
 from traps_pipeline.pipeline.graph import Check, ConcurrentBuild, RunResources
 from traps_pipeline.pipeline.schemes import CATEGORY, DATASET, to_keys
 from traps_pipeline.pipeline.stage import is_declared, of, source, stage
-from traps_pipeline.protocol.datasets import all_datasets_of, beside_of, sides_of, taxonomy_of_category
+from traps_pipeline.protocol.datasets import all_datasets_of, extra_datasets_of, sides_of, taxonomy_of_category
 from traps_pipeline.storage.benchmark_tables import ARMS, ITEMS, SCENE_SPECS, VIDEOS
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
@@ -28,7 +28,7 @@ RENDERS = RunResources(
 _stage = partial(stage, group="benchmark")
 _source = partial(source, group="benchmark", kinds=["json"], scheme=CATEGORY)
 category_to_datasets = to_keys(CATEGORY, DATASET, all_datasets_of)
-category_to_arms = to_keys(CATEGORY, DATASET, lambda category: beside_of(taxonomy_of_category(category)))
+category_to_arms = to_keys(CATEGORY, DATASET, lambda category: extra_datasets_of(taxonomy_of_category(category)))
 
 
 @_source()
@@ -43,7 +43,7 @@ def corrections(workspace: Workspace, category: str) -> str:
     return corrections_version(workspace, category)
 
 
-def _of_specs(find: str) -> Callable[[Workspace, str | None, StageOutput], Any]:
+def _specs_check(find: str) -> Callable[[Workspace, str | None, StageOutput], Any]:
     """Return a check by what `find` (module.function of `benchmark`) finds wrong in the records of a table."""
     module, _, name = find.partition(".")
 
@@ -54,7 +54,7 @@ def _of_specs(find: str) -> Callable[[Workspace, str | None, StageOutput], Any]:
     return wrong
 
 
-_unbalanced = _of_specs("composition.problems")
+_unbalanced = _specs_check("composition.problems")
 
 
 @_stage(
@@ -75,20 +75,20 @@ _unbalanced = _of_specs("composition.problems")
             "control_certified",
             "By the evidence in each record, the control can be answered: its outcome is settled in time, with a "
             "margin, and legible.",
-            _of_specs("stored_evidence.unanswerable_controls"),
+            _specs_check("stored_evidence.unanswerable_controls"),
         ),
         Check(
             "void_certified",
             "By the evidence in each record, the void cannot be answered: the outcome is hidden without a trace and a "
             "twin has another answer (occlusion), or futures disagree (chaotic); nor can a control that an occluder "
             "closes be answered from its last frame. `traps benchmark certify` computes this again.",
-            _of_specs("stored_evidence.answerable_voids"),
+            _specs_check("stored_evidence.answerable_voids"),
         ),
         Check(
             "ill_posed_certified",
             "The inventory refutes each ill-posed question, or the question asks for what no video shows; neither "
             "holds for a well-posed question.",
-            _of_specs("stored_evidence.answerable_ill_posed"),
+            _specs_check("stored_evidence.answerable_ill_posed"),
         ),
         Check(
             "answers_balanced",
@@ -104,8 +104,8 @@ def scene_specs(workspace: Workspace, category: str) -> StageOutput:
 
     A scenario with corrected parameters is simulated here, once.
     """
-    rows, resolved = build_specs(workspace, category)
-    return StageOutput(rows, beside=resolved)
+    rows, resolved_scenarios = build_specs(workspace, category)
+    return StageOutput(rows, beside=resolved_scenarios)
 
 
 def _render(workspace: Workspace, category: str, wait: bool) -> tuple[Tally, bool]:
@@ -127,7 +127,7 @@ def _lost_clips(workspace: Workspace, category: str) -> list[str]:
     return [f"clip {path} is gone or damaged" for path in missing_clips(workspace, category)]
 
 
-def _alike(workspace: Workspace, key: str | None, output: StageOutput) -> list[str]:
+def _repeated_content(workspace: Workspace, key: str | None, output: StageOutput) -> list[str]:
     counts = Counter((row.side, row.frames_sha256) for row in output.rows(VIDEOS))
     return [row.path for row in output.rows(VIDEOS) if counts[row.side, row.frames_sha256] > 1]
 
@@ -147,7 +147,7 @@ def _alike(workspace: Workspace, key: str | None, output: StageOutput) -> list[s
             "Nothing decisive has a pixel, shadow included, in any checked frame of an occluded void.",
             lambda workspace, key, output: {id_: pixels for id_, pixels in output.beside.items() if pixels},
         ),
-        Check("clips_distinct", "No two clips of a category show the same frames.", _alike, blocks=False),
+        Check("clips_distinct", "No two clips of a category show the same frames.", _repeated_content, blocks=False),
     ],
 )
 def videos(workspace: Workspace, category: str) -> StageOutput:
@@ -189,7 +189,7 @@ def _lost_arms(workspace: Workspace, category: str) -> list[str]:
     kinds=["parquet", "mp4"],
     takes=RENDERS,
     shared=ConcurrentBuild(_film, _seconds_of_filming),
-    wants=lambda study, key: bool({*study.arms} & {*beside_of(taxonomy_of_category(str(key)))}),
+    wants=lambda study, key: bool({*study.arms} & {*extra_datasets_of(taxonomy_of_category(str(key)))}),
     lost=_lost_arms,
 )
 def arms(workspace: Workspace, category: str) -> StageOutput:
@@ -197,15 +197,15 @@ def arms(workspace: Workspace, category: str) -> StageOutput:
     from traps_pipeline.benchmark.filmed_arms import build_arms
 
     rows = build_arms(workspace, category)
-    admitted = sum(row.refused is None for row in rows)
-    return StageOutput(rows, shown={"admitted": admitted, "refused": len(rows) - admitted})
+    n_admitted = sum(row.refused is None for row in rows)
+    return StageOutput(rows, shown={"admitted": n_admitted, "refused": len(rows) - n_admitted})
 
 
 def _odd_pairs(workspace: Workspace, key: str | None, output: StageOutput) -> dict[str, list[str]]:
     sides: dict[str, list[str]] = {}
     for row in output.rows(ITEMS):
         sides.setdefault(row.pair_id, []).append(row.side)
-    return {pair: present for pair, present in sides.items() if tuple(sorted(present)) != sides_of(str(key))}
+    return {pair: pair_sides for pair, pair_sides in sides.items() if tuple(sorted(pair_sides)) != sides_of(str(key))}
 
 
 @_stage(

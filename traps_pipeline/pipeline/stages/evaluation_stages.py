@@ -5,7 +5,7 @@ from functools import partial
 from typing import Any, cast
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.wording import counted, in_percent
+from traps_pipeline.base.wording import count_noun, in_percent
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES, VoteRow
 from traps_pipeline.models.answer_rows import RESPONSES, ResponseRow
 from traps_pipeline.models.judges import panel_version
@@ -65,8 +65,8 @@ def _items_shown(workspace: Workspace, cell: Cell, rows: Sequence[ResponseRow | 
     e = cell.evaluation
     page, _, view = explorer_address(SourceItems(cell.dataset, e.model, e.regime)).partition("#")
     columns = ("item_id", "side", "outcome", "error", "attempts")
-    without = [row for row in rows if isinstance(row, ResponseRow) and row.outcome not in JUDGED]
-    records = [{name: str(getattr(row, name)) for name in columns} for row in without[:ITEMS_SHOWN]]
+    unanswered = [row for row in rows if isinstance(row, ResponseRow) and row.outcome not in JUDGED]
+    records = [{name: str(getattr(row, name)) for name in columns} for row in unanswered[:ITEMS_SHOWN]]
     table = {"without an answer": Records(records)} if records else {}
     reason = {"one item": f"traps why {rows[0].item_id}"} if rows else {}
     return {**table, "all items": StudyFile(workspace.relative(workspace.reports / page), view), **reason}
@@ -75,7 +75,7 @@ def _items_shown(workspace: Workspace, cell: Cell, rows: Sequence[ResponseRow | 
 def _answers_missing(workspace: Workspace, key: str | None, output: StageOutput) -> str:
     state = workspace.tables.state(ITEMS, {"dataset": Cell.parse(str(key)).dataset})
     n_items, n_rows = state.rows if state else 0, len(output.rows(RESPONSES))
-    return "" if n_rows == n_items else f"{counted(n_rows, 'row')} for {counted(n_items, 'item')}"
+    return "" if n_rows == n_items else f"{count_noun(n_rows, 'row')} for {count_noun(n_items, 'item')}"
 
 
 @_stage(
@@ -87,17 +87,19 @@ def _answers_missing(workspace: Workspace, key: str | None, output: StageOutput)
     side_by_side=True,
 )
 def responses(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
-    """Return a model's answers under a regime in a run, one row per item; answers in the ledger are reused."""
+    """Return a model's answers under a regime in a run, one row per item.
+
+    Answers in the ledger are reused."""
     from traps_pipeline.models.answers import collect_answers
 
     return _with_items(workspace, collect_answers(workspace, [Cell.parse(key) for key in keys]))
 
 
-def _many_invalid(workspace: Workspace, key: str | None, output: StageOutput) -> str:
+def _excess_of_invalid(workspace: Workspace, key: str | None, output: StageOutput) -> str:
     cast_votes = output.rows(VOTES)
     invalid = sum(not vote.valid for vote in cast_votes)
-    many = invalid > MAX_INVALID_SHARE * len(cast_votes)
-    return f"invalid: {invalid:,} of {counted(len(cast_votes), 'vote')}" if many else ""
+    is_too_many = invalid > MAX_INVALID_SHARE * len(cast_votes)
+    return f"invalid: {invalid:,} of {count_noun(len(cast_votes), 'vote')}" if is_too_many else ""
 
 
 @_stage(
@@ -109,7 +111,7 @@ def _many_invalid(workspace: Workspace, key: str | None, output: StageOutput) ->
         Check(
             "few_invalid_votes",
             f"At most {in_percent(MAX_INVALID_SHARE)} of a cell's votes break the judges' schema or are unread.",
-            _many_invalid,
+            _excess_of_invalid,
             blocks=False,
         )
     ],
@@ -123,9 +125,11 @@ def votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | Non
 
 
 def _verdicts_missing(workspace: Workspace, key: str | None, output: StageOutput) -> str:
-    answered = workspace.tables.state(RESPONSES, Cell.parse(str(key)).partition)
-    n_answers, n_verdicts = answered.rows if answered else 0, len(output.frame)
-    return "" if n_answers == n_verdicts else f"{counted(n_verdicts, 'verdict')} for {counted(n_answers, 'answer')}"
+    answers_state = workspace.tables.state(RESPONSES, Cell.parse(str(key)).partition)
+    n_answers, n_verdicts = answers_state.rows if answers_state else 0, len(output.frame)
+    return (
+        "" if n_answers == n_verdicts else f"{count_noun(n_verdicts, 'verdict')} for {count_noun(n_answers, 'answer')}"
+    )
 
 
 @_stage(

@@ -12,7 +12,7 @@ from traps_pipeline.pipeline.schemes import CELL, EXTRACTION, by_extraction, the
 from traps_pipeline.pipeline.stage import of, source, stage
 from traps_pipeline.pipeline.stages.evaluation_stages import responses, verdicts
 from traps_pipeline.pipeline.stages.mechanism_stages import (
-    ANSWERED,
+    ANSWERED_CELLS,
     GROUP,
     hidden_states,
     probe_items,
@@ -60,7 +60,7 @@ def _model(workspace: Workspace, key: str) -> tuple[ModelEntry, Extraction]:
     return examined_model(workspace, extraction.model), extraction
 
 
-def _examined(workspace: Workspace, key: str) -> "tuple[ModelEntry, StoredStates]":
+def _model_and_states(workspace: Workspace, key: str) -> "tuple[ModelEntry, StoredStates]":
     """Return the model of an extraction, and its stored states."""
     from traps_pipeline.mechanism.stored_states import StoredStates
 
@@ -71,7 +71,7 @@ def _examined(workspace: Workspace, key: str) -> "tuple[ModelEntry, StoredStates
 @_stage(
     tables.PROBE_BASELINES,  # on this machine, since the output margin needs the model's head
     code="2",
-    parents=[_STATES, of(probe_items, EVERY), of(verdicts, ANSWERED, need="none"), probing_settings],
+    parents=[_STATES, of(probe_items, EVERY), of(verdicts, ANSWERED_CELLS, need="none"), probing_settings],
     kinds=["parquet", "scikitlearn"],
     wants=lambda study, key: Extraction.parse(key).prompt in study.probed_prompts,
 )
@@ -79,7 +79,7 @@ def probe_baselines(workspace: Workspace, key: str) -> StageOutput:
     """Return probes on raw inputs, the output margin and noise instead of states."""
     from traps_pipeline.mechanism.baselines import baseline_rows
 
-    return StageOutput(baseline_rows(workspace, *_examined(workspace, key)))
+    return StageOutput(baseline_rows(workspace, *_model_and_states(workspace, key)))
 
 
 def _is_gated(partitions: StudyPartitions, key: str) -> bool:
@@ -106,7 +106,7 @@ def gate(workspace: Workspace, key: str) -> StageOutput:
     """
     from traps_pipeline.mechanism.gating import gate_rows
 
-    return StageOutput(gate_rows(workspace, *_examined(workspace, key)))
+    return StageOutput(gate_rows(workspace, *_model_and_states(workspace, key)))
 
 
 @_gates(tables.RISK_COVERAGE)
@@ -114,7 +114,7 @@ def risk_coverage(workspace: Workspace, key: str) -> StageOutput:
     """Return risk against coverage over four datasets, as a gate withholds answers."""
     from traps_pipeline.mechanism.gating import curve_rows
 
-    return StageOutput(curve_rows(workspace, *_examined(workspace, key)))
+    return StageOutput(curve_rows(workspace, *_model_and_states(workspace, key)))
 
 
 @_stage(tables.LENS, parents=[_STATES, probing_settings])
@@ -122,7 +122,7 @@ def lens(workspace: Workspace, key: str) -> StageOutput:
     """Return the output margin of stored states at every layer (final norm and head)."""
     from traps_pipeline.mechanism.lens import lens_rows
 
-    return StageOutput(lens_rows(workspace, *_examined(workspace, key)))
+    return StageOutput(lens_rows(workspace, *_model_and_states(workspace, key)))
 
 
 @_stage(
@@ -134,7 +134,7 @@ def item_scores(workspace: Workspace, key: str) -> StageOutput:
     """Return items' scores from states and output, with verdicts; probes are held-out."""
     from traps_pipeline.mechanism.item_scores import item_score_rows
 
-    return StageOutput(item_score_rows(workspace, *_examined(workspace, key)))
+    return StageOutput(item_score_rows(workspace, *_model_and_states(workspace, key)))
 
 
 def _has_sentences(partitions: StudyPartitions, key: str) -> bool:

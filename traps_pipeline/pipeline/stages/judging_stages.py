@@ -4,7 +4,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.wording import counted, in_percent
+from traps_pipeline.base.wording import count_noun, in_percent
 from traps_pipeline.judging.confabulation_protocol import load_protocol, protocol_digest
 from traps_pipeline.judging.judging_rows import AGREEMENT, CONFABULATION, JUDGE_BIAS, JUDGE_VALIDATION, VERDICTS, VOTES
 from traps_pipeline.models.judges import load_panel, panel_id
@@ -86,11 +86,11 @@ def leave_one_out(workspace: Workspace, _: None) -> "pd.DataFrame":
     return rows_of(current_rows(workspace, VERDICTS), cast, board, _panel(workspace))
 
 
-def _many_invalid(workspace: Workspace, key: str | None, output: StageOutput) -> str:
+def _excess_of_invalid(workspace: Workspace, key: str | None, output: StageOutput) -> str:
     labels = output.rows(CONFABULATION)
     invalid = sum(not label.valid for label in labels)
-    many = invalid > MAX_INVALID_SHARE * len(labels)
-    return f"invalid: {invalid:,} of {counted(len(labels), 'label')}" if many else ""
+    is_too_many = invalid > MAX_INVALID_SHARE * len(labels)
+    return f"invalid: {invalid:,} of {count_noun(len(labels), 'label')}" if is_too_many else ""
 
 
 _SAMPLED = these_keys(CELL, [c.key for m in load_protocol().models for c in load_protocol().cells(m)])
@@ -110,7 +110,7 @@ _SAMPLED = these_keys(CELL, [c.key for m in load_protocol().models for c in load
         Check(
             "few_invalid_labels",
             f"At most {in_percent(MAX_INVALID_SHARE)} of the labels break the schema.",
-            _many_invalid,
+            _excess_of_invalid,
             blocks=False,
         )
     ],

@@ -5,7 +5,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.progress import Tally
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.mechanism import probing_versions as versions
 from traps_pipeline.mechanism.mechanism_rows import (
     COSINES,
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 GROUP = "mechanism"
 _stage, _source = partial(stage, group=GROUP), partial(source, group=GROUP, kinds=["yaml"])
 # Cells of the local models' answers under Standard in run 1: their verdicts tell confabulated voids.
-ANSWERED = these_keys(CELL, [Cell(d, Evaluation(m, "standard", 1)).key for d in DATASETS for m in local_models()])
+ANSWERED_CELLS = these_keys(CELL, [Cell(d, Evaluation(m, "standard", 1)).key for d in DATASETS for m in local_models()])
 _OCCLUSION = to_keys(CATEGORY, PROBED, lambda key: [ANSWERABLE] if taxonomy_of_category(key) == "occlusion" else [])
 
 
@@ -74,7 +74,7 @@ def steering_settings(workspace: Workspace, key: str) -> str:
     return versions.steering_version(workspace, key)
 
 
-def _probed_from(dataset: str) -> list[str]:
+def _probed_datasets(dataset: str) -> list[str]:
     return [dataset, TIME_SWAPPED] if dataset == "chaotic" else [dataset]
 
 
@@ -86,7 +86,11 @@ def steers(partitions: StudyPartitions, key: str | None) -> bool:
 @_stage(
     PROBE_ITEMS,
     code="2",
-    parents=[of(items, to_keys(DATASET, PROBED, _probed_from)), of(scene_specs, _OCCLUSION), of(videos, _OCCLUSION)],
+    parents=[
+        of(items, to_keys(DATASET, PROBED, _probed_datasets)),
+        of(scene_specs, _OCCLUSION),
+        of(videos, _OCCLUSION),
+    ],
     scheme=PROBED,
 )
 def probe_items(workspace: Workspace, dataset: str) -> StageOutput:
@@ -132,14 +136,18 @@ def _outside_shares(workspace: Workspace, key: str | None, output: StageOutput) 
         figures = (row.value, row.low, row.high)
         return any(f is not None and f == f and not -1e-9 <= f <= 1 + 1e-9 for f in figures)
 
-    wrong = sum(is_wrong(row) for row in output.rows(PROBES))
-    return f"{counted(wrong, 'row')} with a share outside 0 to 1" if wrong else ""
+    n_wrong = sum(is_wrong(row) for row in output.rows(PROBES))
+    return f"{count_noun(n_wrong, 'row')} with a share outside 0 to 1" if n_wrong else ""
 
 
 @_stage(
     PROBES,
     code="3",
-    parents=[of(hidden_states, by_extraction, need="some"), of(verdicts, ANSWERED, need="none"), probing_settings],
+    parents=[
+        of(hidden_states, by_extraction, need="some"),
+        of(verdicts, ANSWERED_CELLS, need="none"),
+        probing_settings,
+    ],
     scheme=EXTRACTION,
     kinds=["parquet", "scikitlearn"],
     takes=RunResources(memory_gb=1.0, each_gb=0.5),
@@ -201,8 +209,8 @@ def steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | 
         cell = SteeringCell.parse(key)
         entry = examined_model(workspace, cell.evaluation.model)
         along = {cell.directions: saved_directions(workspace, Extraction(entry.id, cell.directions))}
-        for finished, output in collect_steered(workspace, entry, [cell], along):
-            yield finished.key, output
+        for finished_cell, output in collect_steered(workspace, entry, [cell], along):
+            yield finished_cell.key, output
 
 
 @_stage(
@@ -217,11 +225,11 @@ def steering_votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[
     """Yield the panel's votes on steered answers: abstention, and correct controls."""
     from traps_pipeline.mechanism.steering import collect_steering_votes
 
-    for finished, output in collect_steering_votes(workspace, [SteeringCell.parse(key) for key in keys]):
-        yield finished.key, output
+    for finished_cell, output in collect_steering_votes(workspace, [SteeringCell.parse(key) for key in keys]):
+        yield finished_cell.key, output
 
 
-def _judged(workspace: Workspace) -> "tuple[pd.DataFrame, pd.DataFrame]":
+def _answers_and_votes(workspace: Workspace) -> "tuple[pd.DataFrame, pd.DataFrame]":
     """Return the steered answers, and the votes on them."""
     from traps_pipeline.mechanism.shares import VOTE_COLUMNS
 
@@ -236,7 +244,7 @@ def steering_effects(workspace: Workspace, _: None) -> list[SteeringEffectRow]:
     """Return abstention by path, kind of direction, layer, strength and side."""
     from traps_pipeline.mechanism.shares import effect_rows
 
-    return effect_rows(*_judged(workspace))
+    return effect_rows(*_answers_and_votes(workspace))
 
 
 @_stage(STEERING_SHARES, code="4", parents=_STEERING_PARENTS, wants=steers)
@@ -244,4 +252,4 @@ def steering_shares(workspace: Workspace, _: None) -> list[SteeringShareRow]:
     """Return abstention over the paths of a set, with intervals by scenario."""
     from traps_pipeline.mechanism.shares import share_rows
 
-    return share_rows(*_judged(workspace))
+    return share_rows(*_answers_and_votes(workspace))

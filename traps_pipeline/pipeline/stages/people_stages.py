@@ -72,8 +72,8 @@ def _labels_and_verdicts(workspace: Workspace) -> "tuple[pd.DataFrame, pd.DataFr
     """Return all HUMAN_LABELS rows, and the VERDICTS rows of the study's panel."""
     labels = workspace.tables.read(HUMAN_LABELS, {})
     judged = current_rows(workspace, VERDICTS, dataset=DATASETS if len(labels) else ())  # verdicts are many
-    own = judged.loc[judged["panel"] == panel_id(workspace.study.panel)]
-    return labels, own.reset_index(drop=True)
+    panel_verdicts = judged.loc[judged["panel"] == panel_id(workspace.study.panel)]
+    return labels, panel_verdicts.reset_index(drop=True)
 
 
 _VALIDATION_PARENTS = (human_labels, of(verdicts, need="none"), judges)

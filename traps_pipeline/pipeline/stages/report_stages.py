@@ -57,10 +57,10 @@ def report_page(workspace: Workspace, _: None) -> StageOutput:
         )
         for p in parts
     ]
-    contents, remade = make_pieces(workspace, "report_page", code_of(GROUP), pieces)
+    contents, rebuilt_names = make_pieces(workspace, "report_page", code_of(GROUP), pieces)
     files = report_files(sources.study, [(name.partition("/")[0], Card.read(data)) for name, data in contents.items()])
     figures = {
-        "made again": f"{len(remade)} of {len(pieces)}: {', '.join(remade[:NAMES]) or 'none'}",
+        "made again": f"{len(rebuilt_names)} of {len(pieces)}: {', '.join(rebuilt_names[:NAMES]) or 'none'}",
         "leaderboard": Markdown(files[MARKDOWN].decode()),
     }
     return StageOutput(files | {BOARD_FILE: board_bytes(board_tables(workspace))}, shown=figures)

@@ -42,7 +42,7 @@ def has_pairs(partitions: StudyPartitions, key: str | None) -> bool:
     return partitions.has_pairs
 
 
-def _none_of(find: str, noun: str) -> Callable[[Workspace, str | None, StageOutput], str]:
+def _zero_check(find: str, noun: str) -> Callable[[Workspace, str | None, StageOutput], str]:
     """Return a check that `find` (a module.function of `scoring`) counts no wrong row."""
 
     def wrong(workspace: Workspace, key: str | None, output: StageOutput) -> str:
@@ -61,7 +61,7 @@ def _none_of(find: str, noun: str) -> Callable[[Workspace, str | None, StageOutp
         Check(
             "shares_are_shares",
             "Acc, AbsRec and FalseAbs lie in [0, 1], PECS is Acc x max(0, J) and lies within its bounds.",
-            _none_of("metrics.wrong_figures", "figures"),
+            _zero_check("metrics.wrong_figures", "figures"),
         )
     ],
 )
@@ -75,7 +75,7 @@ def metrics(workspace: Workspace, dataset: str) -> StageOutput:
     return StageOutput(cell_metrics(judged))
 
 
-def _scored(workspace: Workspace, name: str) -> "tuple[pd.DataFrame, pd.DataFrame]":
+def _metrics_and_verdicts(workspace: Workspace, name: str) -> "tuple[pd.DataFrame, pd.DataFrame]":
     """Return METRICS rows of the pairs, without arms, and their VERDICTS rows."""
     cells = workspace.tables.read_all(METRICS, dataset=DATASETS)
     if cells.empty:
@@ -83,14 +83,14 @@ def _scored(workspace: Workspace, name: str) -> "tuple[pd.DataFrame, pd.DataFram
     return cells, current_rows(workspace, VERDICTS)
 
 
-def _resampled(judged: "pd.DataFrame") -> "ResampledFigures":
+def _bootstrap_of(judged: "pd.DataFrame") -> "ResampledFigures":
     """Return the bootstrap of verdicts, which one run needs twice: for the contrasts, then for the leaderboard."""
     from traps_pipeline.scoring.bootstrap import resample
 
-    kept = [figures for rows, figures in _RESAMPLED if rows.equals(judged)]
+    cached_figures = [figures for rows, figures in _RESAMPLED if rows.equals(judged)]
     _RESAMPLED.clear()  # after the second time the memory is free again
-    if kept:
-        return kept[0]
+    if cached_figures:
+        return cached_figures[0]
     _RESAMPLED.append((judged, resample(judged)))
     return _RESAMPLED[0][1]
 
@@ -107,11 +107,11 @@ def contrasts(workspace: Workspace, _: None) -> StageOutput:
     """Return paired differences of models and regimes, with intervals and Holm's p."""
     from traps_pipeline.scoring.contrasts import contrasts as paired
 
-    cells, judged = _scored(workspace, "contrasts")
-    table = paired(_resampled(judged), cells, judged)
-    separable, refused = table["separable"].to_numpy(bool, na_value=False), len(table.loc[table["refused"].notna()])
+    cells, judged = _metrics_and_verdicts(workspace, "contrasts")
+    table = paired(_bootstrap_of(judged), cells, judged)
+    separable, n_refused = table["separable"].to_numpy(bool, na_value=False), len(table.loc[table["refused"].notna()])
     separable_overall = table.loc[separable & (table["dataset"] == "overall")]
-    figures = {"contrasts": rows_shown(separable_overall), "separable": int(separable.sum()), "refused": refused}
+    figures = {"contrasts": rows_shown(separable_overall), "separable": int(separable.sum()), "refused": n_refused}
     return StageOutput(table, shown=figures)
 
 
@@ -120,7 +120,7 @@ def regime_tests(workspace: Workspace, _: None) -> "pd.DataFrame":
     """Return McNemar's exact test of two regimes, by dataset, model, run and decision."""
     from traps_pipeline.scoring.contrasts import regime_tests as mcnemar
 
-    return mcnemar(_scored(workspace, "regime_tests")[1])
+    return mcnemar(_metrics_and_verdicts(workspace, "regime_tests")[1])
 
 
 @_stage(
@@ -130,7 +130,7 @@ def regime_tests(workspace: Workspace, _: None) -> "pd.DataFrame":
         Check(
             "intervals_ordered",
             "Every interval is ordered and lies in [0, 1], or for J in [-1, 1].",
-            _none_of("standings.wrong_intervals", "intervals"),
+            _zero_check("standings.wrong_intervals", "intervals"),
         )
     ],
     wants=has_pairs,
@@ -141,8 +141,8 @@ def leaderboard(workspace: Workspace, _: None) -> StageOutput:
     from traps_pipeline.scoring.bootstrap import intervals
     from traps_pipeline.scoring.standings import leaderboard as rank
 
-    cells, judged = _scored(workspace, "leaderboard")
-    board = rank(cells, intervals(_resampled(judged)), workspace.tables.read(CONTRASTS, {}))
+    cells, judged = _metrics_and_verdicts(workspace, "leaderboard")
+    board = rank(cells, intervals(_bootstrap_of(judged)), workspace.tables.read(CONTRASTS, {}))
     overall = board.loc[board["dataset"] == "overall", "pecs"].to_numpy(float)
     best = {"best overall PECS": float(overall.max())} if len(overall) else {}
     return StageOutput(board, shown={"leaderboard": Markdown(leaderboard_markdown(board))} | best)
@@ -153,7 +153,9 @@ def leaderboard(workspace: Workspace, _: None) -> StageOutput:
     parents=_SCORED,
     checks=[
         Check(
-            "robust_rows_hold", "Figures lie in [0, 1] and in their intervals.", _none_of("robust.wrong_rows", "rows")
+            "robust_rows_hold",
+            "Figures lie in [0, 1] and in their intervals.",
+            _zero_check("robust.wrong_rows", "rows"),
         )
     ],
     wants=has_pairs,
@@ -178,7 +180,7 @@ def robust(workspace: Workspace, _: None) -> "pd.DataFrame":
         Check(
             "doses_hold",
             "Shares lie in [0, 1], J in [-1, 1], changes in [-2, 2], and intervals are ordered.",
-            _none_of("doses.wrong_rows", "rows"),
+            _zero_check("doses.wrong_rows", "rows"),
         )
     ],
 )
@@ -192,8 +194,8 @@ def hypotheses(workspace: Workspace, _: None) -> "pd.DataFrame":
 
     judged = current_rows(workspace, VERDICTS, dataset=DATASETS_READ)
     rows = workspace.tables.read_all(ITEMS, ["item_id", "labels"], dataset=DATASETS_READ)
-    offered = {str(id_): len(labels) for id_, labels in zip(rows["item_id"], rows["labels"], strict=True)}
-    return by_dose(judged, offered)
+    n_labels = {str(id_): len(labels) for id_, labels in zip(rows["item_id"], rows["labels"], strict=True)}
+    return by_dose(judged, n_labels)
 
 
 @_stage(
@@ -207,7 +209,7 @@ def hypotheses(workspace: Workspace, _: None) -> "pd.DataFrame":
         Check(
             "graded_rows_hold",
             "Figures lie in their limits and intervals; regret is the sum of its parts, and what the ideal earns more.",
-            _none_of("graded.wrong_rows", "rows"),
+            _zero_check("graded.wrong_rows", "rows"),
         )
     ],
 )

@@ -29,7 +29,7 @@ def evaluation(regime: str) -> Any:
     samples = [
         Sample(
             id=item["item_id"],
-            input=[ChatMessageSystem(content=system), ChatMessageUser(content=[*_shown(item), _text(item)])],
+            input=[ChatMessageSystem(content=system), ChatMessageUser(content=[*_media_content(item), _text(item)])],
             target=item["ground_truth"] or "",
             metadata={"item_id": item["item_id"], "dataset": item["dataset"], "side": item["side"], "regime": regime},
         )
@@ -46,7 +46,7 @@ def evaluation(regime: str) -> Any:
     )
 
 
-def _shown(item: dict[str, Any]) -> list[Any]:
+def _media_content(item: dict[str, Any]) -> list[Any]:
     paths = [str(path) for path in media_of(item)]
     if paths[0].endswith(".mp4"):
         return [ContentVideo(video=path, format="mp4") for path in paths]

@@ -78,19 +78,22 @@ def figures(judged: Iterable[PanelDecision]) -> dict[str, float | None]:
     """
     rows = list(judged)
     results: dict[str, float | None] = {}
-    by_dataset = {name: _of_dataset([row for row in rows if row.dataset == name]) for name in DATASETS}
-    for name, of_dataset in by_dataset.items():
+    figures_of = {name: _dataset_figures([row for row in rows if row.dataset == name]) for name in DATASETS}
+    for name, dataset_figures in figures_of.items():
         if any(row.dataset == name for row in rows):
-            results |= {f"{name}_{figure}": of_dataset[figure] for figure in RUN_FIGURES}
+            results |= {f"{name}_{figure}": dataset_figures[figure] for figure in RUN_FIGURES}
     for figure in RUN_FIGURES:
-        values = [of_dataset[figure] for of_dataset in by_dataset.values()]
-        decided = [value for value in values if value is not None]
-        results[figure] = sum(decided) / len(DATASETS) if len(decided) == len(DATASETS) else None
-    undecided = [row for row in rows if row.abstained is None or (row.side == "control" and row.correct is None)]
-    return results | {"missing": float(len(undecided)), "unread": float(sum(row.outcome == UNREAD for row in rows))}
+        values = [dataset_figures[figure] for dataset_figures in figures_of.values()]
+        values_present = [value for value in values if value is not None]
+        results[figure] = sum(values_present) / len(DATASETS) if len(values_present) == len(DATASETS) else None
+    undecided_rows = [row for row in rows if row.abstained is None or (row.side == "control" and row.correct is None)]
+    return results | {
+        "missing": float(len(undecided_rows)),
+        "unread": float(sum(row.outcome == UNREAD for row in rows)),
+    }
 
 
-def _of_dataset(rows: list[PanelDecision]) -> dict[str, float | None]:
+def _dataset_figures(rows: list[PanelDecision]) -> dict[str, float | None]:
     acc = _share([row.correct for row in rows if row.side == "control"])
     false_abs = _share([row.abstained for row in rows if row.side == "control"])
     abs_rec = _share([row.abstained for row in rows if row.side == "void"])
@@ -100,5 +103,5 @@ def _of_dataset(rows: list[PanelDecision]) -> dict[str, float | None]:
 
 
 def _share(decisions: list[bool | None]) -> float | None:
-    decided = [decision for decision in decisions if decision is not None]
-    return sum(decided) / len(decided) if decided else None
+    decided_values = [decision for decision in decisions if decision is not None]
+    return sum(decided_values) / len(decided_values) if decided_values else None

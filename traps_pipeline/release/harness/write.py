@@ -61,16 +61,16 @@ def write_harness(release: Path, target: Path, media: MediaSpec = MEDIA_SETTINGS
         raise TrapsError(
             f"{target}: holds other files, or what a stopped harness left; give an empty or a new folder, or delete it"
         )
-    wrong = altered_files(release)
-    if wrong:
-        raise TrapsError(f"{release}: is not what was released: {wrong[0]}")
+    problems = altered_files(release)
+    if problems:
+        raise TrapsError(f"{release}: is not what was released: {problems[0]}")
     manifest = json.loads((release / MANIFEST).read_text(encoding="utf-8"))
     if manifest["held_out"]:
         raise TrapsError(f"{release}: is a held-out set, whose answers only its owner can score")
     package = target / PACKAGE
     items = _items(release, package, media)
     prompts = [json.loads(line) for _, line in read_lines(release / "prompts.jsonl")]
-    about = {
+    description = {
         **{name: manifest[name] for name in ("name", "version", "canary", "versions")},
         "panel": panel_id(RULES_PANEL),
         "media": media.model_dump(mode="json", exclude_none=True),
@@ -78,13 +78,13 @@ def write_harness(release: Path, target: Path, media: MediaSpec = MEDIA_SETTINGS
         "parameters": {name: value for name, (_, value) in PROTOCOL.items()},
         "items": digest(sorted(items)),
     }
-    write_text(package / ABOUT, json.dumps(about, indent=1, ensure_ascii=False) + "\n")
+    write_text(package / ABOUT, json.dumps(description, indent=1, ensure_ascii=False) + "\n")
     for source in _COPIED:
         write_text(package / Path(source).name, rewritten_source((_CODE / source).read_text(encoding="utf-8")))
     write_text(package / "__init__.py", f'"""The items, panel and metric of {manifest["name"]}."""\n')
     write_text(target / "traps_task.py", _TASK)
     write_text(target / "pyproject.toml", _PYPROJECT.format(version=manifest["version"].partition("+")[0]))
-    _lmms(target, about)
+    _lmms(target, description)
     return len(items)
 
 
@@ -95,20 +95,25 @@ def rewritten_source(source: str) -> str:
 
 def _items(release: Path, package: Path, media: MediaSpec) -> list[str]:
     """Write items and their media; return the digests of the items."""
-    store, prepared, lines, hashes = MediaStore(package / ".prepared"), dict[str, list[str]](), list[str](), list[str]()
+    store, media_paths, lines, hashes = (
+        MediaStore(package / ".prepared"),
+        dict[str, list[str]](),
+        list[str](),
+        list[str](),
+    )
     for _, line in read_lines(release / CLIPS / "metadata.jsonl"):
         row: dict[str, Any] = json.loads(line)
         if row["dataset"] not in DATASETS:
             continue
         clip = row["media_digest"]
-        if clip not in prepared:
+        if clip not in media_paths:
             media_sent = store.prepare(release / CLIPS / row["file_name"], clip, media)
-            prepared[clip] = []
+            media_paths[clip] = []
             for number, part in enumerate(payload(media_sent)):
                 name = f"{MEDIA}/{clip[:32]}" + (f"/{number:02d}.jpg" if media.profile == "images" else ".mp4")
                 write_bytes(package / name, part)
-                prepared[clip].append(name)
-        item = {name: row[name] for name in _ITEM_FIELDS} | {"media": prepared[clip]}
+                media_paths[clip].append(name)
+        item = {name: row[name] for name in _ITEM_FIELDS} | {"media": media_paths[clip]}
         lines.append(json.dumps(item, ensure_ascii=False) + "\n")
         hashes.append(row["item_hash"])
     write_text(package / ITEMS, "".join(lines))

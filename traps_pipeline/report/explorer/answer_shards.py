@@ -71,8 +71,8 @@ class StudyAnswers:
         """Yield the shards, in order, without splitting a pair."""
         item_of = self.decisions["item"].to_numpy()
         pairs = self.items["pair_id"].to_numpy()
-        begins = [0, *(np.flatnonzero(pairs[1:] != pairs[:-1]) + 1).tolist(), len(pairs)]
-        rows = np.searchsorted(item_of, begins)
+        starts = [0, *(np.flatnonzero(pairs[1:] != pairs[:-1]) + 1).tolist(), len(pairs)]
+        rows = np.searchsorted(item_of, starts)
         votes = np.searchsorted(self.votes["answer"].to_numpy(), rows)
         first = 0
         for k in range(1, len(rows)):
@@ -80,8 +80,8 @@ class StudyAnswers:
             if rows[k] > rows[first] and (last or rows[k + 1] - rows[first] > SHARD_ROWS):
                 texts = self.texts.slice(rows[first], rows[k] - rows[first])
                 cast = self.votes.slice(votes[first], votes[k] - votes[first])
-                own = pc.subtract(cast["answer"], pa.scalar(int(rows[first]), pa.int32()))
-                yield Shard(int(rows[first]), texts, cast.set_column(0, "answer", own))
+                shard_rows = pc.subtract(cast["answer"], pa.scalar(int(rows[first]), pa.int32()))
+                yield Shard(int(rows[first]), texts, cast.set_column(0, "answer", shard_rows))
                 first = k
 
 
@@ -102,20 +102,20 @@ def study_items(workspace: Workspace) -> pd.DataFrame:
 def study_answers(workspace: Workspace) -> StudyAnswers:
     """Return answers to current items, with votes. Raises TrapsError without items."""
     items = study_items(workspace)
-    responses = _of_items(workspace, RESPONSES, ("outcome", "epoch", *_TEXTS), items)
+    responses = _item_rows(workspace, RESPONSES, ("outcome", "epoch", *_TEXTS), items)
     evaluations = _evaluations(responses)
-    responses = _sorted(_keyed(responses, evaluations))
+    responses = _sort(_with_key(responses, evaluations))
     keys = responses["key"].to_numpy()
-    decided = ("outcome", "abstained", "correct", "unanimous")
-    verdicts = _keyed(_of_items(workspace, VERDICTS, decided, items), evaluations)
+    decision_columns = ("outcome", "abstained", "correct", "unanimous")
+    verdicts = _with_key(_item_rows(workspace, VERDICTS, decision_columns, items), evaluations)
     judged = verdicts["key"].to_numpy()
     positions = np.full(len(items) * max(len(evaluations), 1), -1, np.int64)
     positions[judged] = np.arange(len(judged))
     places = positions[keys]
     judged_as = pc.take(verdicts["outcome"], pa.array(places, mask=places < 0))
     is_unread = pc.fill_null(pc.equal(judged_as, UNREAD), False)
-    outcomes, outcome = _coded(pc.if_else(is_unread, judged_as, responses["outcome"]))
-    epochs, epoch = _coded(responses["epoch"])
+    outcomes, outcome = _encode_column(pc.if_else(is_unread, judged_as, responses["outcome"]))
+    epochs, epoch = _encode_column(responses["epoch"])
     decisions = {
         "item": keys // max(len(evaluations), 1),
         "evaluation": keys % max(len(evaluations), 1),
@@ -125,7 +125,7 @@ def study_answers(workspace: Workspace) -> StudyAnswers:
         "correct": _decision(verdicts["correct"], places),
         "unanimous": _decision(verdicts["unanimous"], places) == YES,
     }
-    votes = _keyed(_of_items(workspace, VOTES, (*_VOTES, *_VOTE_TEXTS), items), evaluations)
+    votes = _with_key(_item_rows(workspace, VOTES, (*_VOTES, *_VOTE_TEXTS), items), evaluations)
     positions[:] = -1
     positions[keys] = np.arange(len(keys))
     votes = votes.append_column("answer", pa.array(positions[votes["key"].to_numpy()].astype(np.int32)))
@@ -142,7 +142,7 @@ def study_answers(workspace: Workspace) -> StudyAnswers:
     )
 
 
-def _of_items(workspace: Workspace, table: Table, columns: Sequence[str], items: pd.DataFrame) -> pa.Table:
+def _item_rows(workspace: Workspace, table: Table, columns: Sequence[str], items: pd.DataFrame) -> pa.Table:
     """Return the rows whose item is in `items`; their column `item` is its index."""
     rows = workspace.tables.read_arrow(table, ["item_id", *_EVALUATION, *columns])
     place = pc.index_in(rows["item_id"], value_set=pa.array(items["item_id"].tolist(), pa.string()))
@@ -152,25 +152,25 @@ def _of_items(workspace: Workspace, table: Table, columns: Sequence[str], items:
 
 def _evaluations(responses: pa.Table) -> list[Evaluation]:
     """Return evaluations with answers by model, regime (benchmark's order) and run."""
-    distinct = responses.group_by([*_EVALUATION]).aggregate([]).to_pylist()
-    evaluations = [Evaluation(row["model"], row["regime"], row["run"]) for row in distinct]
+    distinct_rows = responses.group_by([*_EVALUATION]).aggregate([]).to_pylist()
+    evaluations = [Evaluation(row["model"], row["regime"], row["run"]) for row in distinct_rows]
     return sorted(evaluations, key=lambda e: (e.model, REGIMES.index(e.regime), e.run))
 
 
-def _keyed(rows: pa.Table, evaluations: Sequence[Evaluation]) -> pa.Table:
+def _with_key(rows: pa.Table, evaluations: Sequence[Evaluation]) -> pa.Table:
     """Return rows of known evaluations with `key`, the index of item and evaluation."""
-    own = pc.binary_join_element_wise(*(rows[name].cast(pa.string()) for name in _EVALUATION), "|")
-    known = pa.array([f"{e.model}|{e.regime}|{e.run}" for e in evaluations], pa.string())
-    evaluation = pc.fill_null(pc.index_in(own, value_set=known), -1).to_numpy().astype(np.int64)
+    row_keys = pc.binary_join_element_wise(*(rows[name].cast(pa.string()) for name in _EVALUATION), "|")
+    evaluation_keys = pa.array([f"{e.model}|{e.regime}|{e.run}" for e in evaluations], pa.string())
+    evaluation = pc.fill_null(pc.index_in(row_keys, value_set=evaluation_keys), -1).to_numpy().astype(np.int64)
     key = rows["item"].to_numpy() * max(len(evaluations), 1) + evaluation
     return rows.append_column("key", pa.array(key)).filter(pa.array(evaluation >= 0))
 
 
-def _sorted(rows: pa.Table) -> pa.Table:
+def _sort(rows: pa.Table) -> pa.Table:
     return rows.sort_by([("key", "ascending")])
 
 
-def _coded(column: pa.ChunkedArray) -> tuple[list[str], np.ndarray]:
+def _encode_column(column: pa.ChunkedArray) -> tuple[list[str], np.ndarray]:
     """Return the distinct values of a column, sorted, and each row's index among them."""
     values = sorted(column.unique().to_pylist())
     return values, pc.index_in(column, value_set=pa.array(values, pa.string())).to_numpy()
@@ -178,5 +178,5 @@ def _coded(column: pa.ChunkedArray) -> tuple[list[str], np.ndarray]:
 
 def _decision(column: pa.ChunkedArray, rows: np.ndarray) -> np.ndarray:
     """Return the column at these rows as NO, YES or NONE; NONE where the row is -1."""
-    filled = pc.fill_null(column.cast(pa.int8()), NONE)
-    return np.append(filled.to_numpy(), NONE)[rows]
+    codes = pc.fill_null(column.cast(pa.int8()), NONE)
+    return np.append(codes.to_numpy(), NONE)[rows]

@@ -33,7 +33,7 @@ from traps_pipeline.report.explorer.answer_shards import StudyAnswers, study_ans
 from traps_pipeline.report.explorer.scenario_words import certificate_phrases, closes_frame, intervention
 from traps_pipeline.report.leaderboard_page import legend, provenance
 from traps_pipeline.report.published_results import PublishedResults
-from traps_pipeline.report.tables.human_tables import said_by_people
+from traps_pipeline.report.tables.human_tables import people_notes
 from traps_pipeline.report.tables.table_columns import entries
 from traps_pipeline.report.terms import ARM_TITLES, MARKS, TITLES
 from traps_pipeline.report.writing import environment
@@ -92,7 +92,7 @@ def write_site(workspace: Workspace, folder: Path, *, clips: bool = True) -> Sit
     written last. clips: include clips, as hard links if the file system allows it, else as copies. Raises TrapsError if
     the folder holds something else, or the study has no items.
     """
-    former = _former_files(folder)
+    previous_files = _former_files(folder)
     answers, scenarios = study_answers(workspace), _scenarios(workspace)
     names = _clip_names(answers.items, scenarios) if clips else []
     existing = {name for name in names if workspace.resolve(name).is_file()}
@@ -104,11 +104,11 @@ def write_site(workspace: Workspace, folder: Path, *, clips: bool = True) -> Sit
         summary.clip_bytes += _put_clip(workspace.resolve(name), folder / name)
         summary.clips += 1
     manifest = json.dumps(sorted([*files, *existing]), indent=0).encode()
-    write_bytes(folder / MANIFEST, json.dumps(sorted({*files, *existing, *former}), indent=0).encode())
+    write_bytes(folder / MANIFEST, json.dumps(sorted({*files, *existing, *previous_files}), indent=0).encode())
     for name, content in files.items():  # the index comes last
         write_bytes(folder / name, content)
         summary.files, summary.bytes = summary.files + 1, summary.bytes + len(content)
-    for name in sorted(former - {*files, *existing}):
+    for name in sorted(previous_files - {*files, *existing}):
         (folder / name).unlink(missing_ok=True)
     write_bytes(folder / MANIFEST, manifest)
     return summary
@@ -130,12 +130,12 @@ def _former_files(folder: Path) -> set[str]:
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return set()
     try:
-        listed = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+        manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         raise TrapsError(
             f"{folder}: holds something that is no site; name a folder that is empty, or does not exist yet"
         ) from None
-    return {name for name in listed if isinstance(name, str) and _is_inside(name)}
+    return {name for name in manifest if isinstance(name, str) and _is_inside(name)}
 
 
 def _is_inside(name: str) -> bool:
@@ -213,7 +213,7 @@ def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_c
         "leaderboard": records(board),
         "robust": records(robust),
         "people": records(human_row),
-        "said": said_by_people(human_row, workspace.tables.read_all(PANEL_ERRORS)),
+        "said": people_notes(human_row, workspace.tables.read_all(PANEL_ERRORS)),
         "published": records(published.loc[:, ["model", "regime", "dataset", "epoch", *_PUBLISHED]]),
         "legend": legend(board, robust) if len(board) else {},
         "marks": MARKS,
@@ -228,7 +228,7 @@ def _scenarios(workspace: Workspace) -> list[dict[str, Any]]:
     rows = []
     for spec in sorted(specs.to_dict("records"), key=lambda row: row["scenario_id"]):
         twin, evidence = json.loads(spec["twin"]), json.loads(spec["evidence"])
-        of_control, of_twin = (clips.get((spec["scenario_id"], side)) for side in ("control", "twin"))
+        control_clip, twin_clip = (clips.get((spec["scenario_id"], side)) for side in ("control", "twin"))
         rows.append(
             {
                 "scenario_id": spec["scenario_id"],
@@ -236,9 +236,9 @@ def _scenarios(workspace: Workspace) -> list[dict[str, Any]]:
                 "labels": [*spec["labels"]],
                 "certificate": [words for _, words in certificate_phrases(evidence)],
                 "twin_answer": twin["ground_truth"],
-                "twin_clip": of_twin["path"] if of_twin else None,
-                "fps": of_control["fps"] if of_control else None,
-                "shown_at": _seconds(closes_frame(spec), of_control),
+                "twin_clip": twin_clip["path"] if twin_clip else None,
+                "fps": control_clip["fps"] if control_clip else None,
+                "shown_at": _seconds(closes_frame(spec), control_clip),
             }
         )
     return rows
@@ -254,8 +254,8 @@ def _seconds(closes: int | None, clip: Mapping[str, Any] | None) -> float | None
 
 def _clip_names(items: pd.DataFrame, scenarios: Iterable[Mapping[str, Any]]) -> list[str]:
     """Return the clips that pages show, without names that lead out of the folder."""
-    named = {*items["clip"], *(row["twin_clip"] for row in scenarios)}
-    return sorted(name for name in named if name and Path(name).parts[0] == CLIPS and _is_inside(name))
+    clip_names = {*items["clip"], *(row["twin_clip"] for row in scenarios)}
+    return sorted(name for name in clip_names if name and Path(name).parts[0] == CLIPS and _is_inside(name))
 
 
 def _digest(contents: Mapping[str, Mapping[str, Any]]) -> str:
@@ -306,7 +306,7 @@ def parquet_text(table: pa.Table) -> str:
 def data_script(name: str, version: str, content: Mapping[str, Any]) -> bytes:
     """Return the script of one data file, which calls the page's `TRAPS_DATA`.
 
-    version: of the whole site, so that a page never mixes files of two. content: JSON values; Parquet is
+    version: version of the whole site, so that a page never mixes files of two. content: JSON values; Parquet is
     `parquet_text`.
     """
     # "<" cannot close a script element, should a host inline the file; JSON knows the escape.

@@ -43,7 +43,7 @@ def visual_textual(results: Results) -> Figure:
 def _draw_rates(axes: Axes, rates: pd.DataFrame) -> None:
     look = looks(rates["model"])
     axes.plot([0, 100], [0, 100], color=SOFT, linewidth=0.7, linestyle=(0, (4, 2.5)), zorder=1)
-    for row in rates.loc[_averaged(rates)].to_dict("records"):
+    for row in rates.loc[_average(rates)].to_dict("records"):
         colour, marker = look[row["model"]]
         axes.scatter(
             100 * row["visual"], 100 * row["textual"], s=22, marker=marker, facecolors=colour, edgecolors=colour,
@@ -54,7 +54,7 @@ def _draw_rates(axes: Axes, rates: pd.DataFrame) -> None:
     axes.set_title("above the line: textual voids are noticed more", weight="normal", size=7)
 
 
-def _averaged(rates: pd.DataFrame) -> pd.Series | pd.DataFrame:
+def _average(rates: pd.DataFrame) -> pd.Series | pd.DataFrame:
     """Return which rows pool a model's taxonomies, or are of its only taxonomy."""
     models = rates.loc[rates["taxonomy"] == "pooled", "model"]
     return rates["taxonomy"].eq("pooled") | ~rates["model"].isin(models)
@@ -62,8 +62,12 @@ def _averaged(rates: pd.DataFrame) -> pd.Series | pd.DataFrame:
 
 def _draw_families(axes: Axes, rates: pd.DataFrame) -> None:
     """Draw both rates as means over a family's models."""
-    used = rates.loc[_averaged(rates)]
-    means = used.assign(family=used["model"].map(family_of)).groupby("family")[["visual", "textual"]].mean()
+    averaged_rates = rates.loc[_average(rates)]
+    means = (
+        averaged_rates.assign(family=averaged_rates["model"].map(family_of))
+        .groupby("family")[["visual", "textual"]]
+        .mean()
+    )
     names = [name for name in families() if name in means.index]
     at = np.arange(len(names))
     for k, (kind, hatch) in enumerate((("visual", ""), ("textual", "/////"))):
@@ -94,8 +98,8 @@ def abs_rec_by_model(results: Results) -> Figure:
     overall = results.overall
     rows = overall.loc[overall["regime"].isin(PROMPTING) & overall["abs_rec"].notna()]
     if not len(rows):
-        why = "no model has all four datasets" if len(results.cells) else results.why("cells")
-        raise NotRun(why)
+        reason = "no model has all four datasets" if len(results.cells) else results.why("cells")
+        raise NotRun(reason)
     sides: dict[tuple[str, str], Any] = {(r["model"], r["regime"]): r for r in rows.to_dict("records")}
     models = sorted(
         {m for m, _ in sides}, key=lambda m: (_abs_rec(sides, m, "standard"), _abs_rec(sides, m, "guided"), m)
@@ -106,8 +110,8 @@ def abs_rec_by_model(results: Results) -> Figure:
         axes = figure.add_subplot()
         for k, model in enumerate(models):
             colour, marker = look[model]
-            both = [100 * sides[model, r]["abs_rec"] for r in PROMPTING if (model, r) in sides]
-            axes.plot(both, [k] * len(both), color=colour, linewidth=0.9, zorder=2)
+            percentages = [100 * sides[model, r]["abs_rec"] for r in PROMPTING if (model, r) in sides]
+            axes.plot(percentages, [k] * len(percentages), color=colour, linewidth=0.9, zorder=2)
             for regime, face in (("standard", "white"), ("guided", colour)):
                 row = sides.get((model, regime))
                 if row is None:
@@ -139,9 +143,9 @@ def doubt(results: Results) -> Figure:
     The gain is its AbsRec minus the other's: a dot for each dataset, and a large marker for the mean. Both figures must
     be of one epoch; other pairs are left out, and the title gives the reason.
     """
-    points, refused = doubt_points(results)
+    points, refusals = doubt_points(results)
     if not len(points):
-        raise NotRun(refused or _no_doubt(results))
+        raise NotRun(refusals or _no_doubt(results))
     look = looks(points["thinking"])
     with figure_style():
         figure = new_figure(COLUMN_IN, 2.6)
@@ -178,14 +182,14 @@ def doubt_points(results: Results) -> tuple[pd.DataFrame, str]:
 
     labels = results.confabulation.set_index("model") if len(results.confabulation) else pd.DataFrame()
     rates = results.rates.loc[results.rates["taxonomy"] != "pooled"]
-    rows, refused = [], []
+    rows, refusals = [], []
     for thinking, base in analyses.REASONING_PAIRS:
         sides = {m: rates.loc[rates["model"] == m].set_index("taxonomy") for m in (thinking, base)}
         if thinking not in labels.index or not all(len(side) for side in sides.values()):
             continue
         epochs = {str(labels.at[thinking, "epoch"])} | {e for side in sides.values() for e in side["epoch"]}
         if len(epochs) > 1:
-            refused.append(f"{thinking}: doubt and AbsRec are of epochs {', '.join(sorted(epochs))}")
+            refusals.append(f"{thinking}: doubt and AbsRec are of epochs {', '.join(sorted(epochs))}")
             continue
         for dataset in TITLES:
             taxonomy, kind = taxonomy_of(dataset), "textual" if dataset.endswith("_ill_posed") else "visual"
@@ -193,4 +197,4 @@ def doubt_points(results: Results) -> tuple[pd.DataFrame, str]:
                 gain = sides[thinking].at[taxonomy, kind] - sides[base].at[taxonomy, kind]
                 row = {"thinking": thinking, "other": base, "dataset": dataset, "doubt": labels.at[thinking, "doubt"]}
                 rows.append({**row, "gain": gain})
-    return pd.DataFrame(rows), "; ".join(refused)
+    return pd.DataFrame(rows), "; ".join(refusals)

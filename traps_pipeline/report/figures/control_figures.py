@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.mechanism.directions import NULLS
 from traps_pipeline.protocol.datasets import DATASETS, SHORT
 from traps_pipeline.protocol.regimes import PROMPTING
-from traps_pipeline.report.figures.looks import arrow, frame_plane, from_to, legend_key
+from traps_pipeline.report.figures.looks import arrow, frame_plane, legend_key, range_text
 from traps_pipeline.report.result_frames import Results, datasets_of
 from traps_pipeline.report.tables.control_reports import beside
-from traps_pipeline.report.tables.inside_columns import SHORTCUTS, few, why
+from traps_pipeline.report.tables.inside_columns import SHORTCUTS, few_marks, why
 from traps_pipeline.report.tables.patching_tables import SITES
 from traps_pipeline.report.terms import TITLES
 from traps_pipeline.report.writing import (
@@ -58,7 +58,7 @@ def probe_baselines(results: Results) -> Figure:
         for ax, model in zip(axes, models, strict=True):
             _baselines(ax, rows.loc[rows["model"] == model])
             sides = rows.loc[rows["model"] == model, ["n_voids", "n_controls"]].astype(int).to_numpy()
-            ax.set_title(f"{plain(model)[:40]}, {from_to(sides.min(), sides.max())} items a side", size=7.5)
+            ax.set_title(f"{plain(model)[:40]}, {range_text(sides.min(), sides.max())} items a side", size=7.5)
             ax.set_ylabel("AUROC")
         handles = [legend_key("states, layer chosen without the target", INK, "o", "-")]
         looks = zip(_BASELINES.items(), COLOURS, strict=False)
@@ -70,10 +70,10 @@ def probe_baselines(results: Results) -> Figure:
 
 def _baselines(ax: Axes, rows: pd.DataFrame) -> None:
     order = [(s, t) for s in DATASETS for t in sorted(DATASETS, key=lambda t: (t != s, DATASETS.index(t)))]
-    by_pair = {(row["source"], row["target"]): row for row in rows.to_dict("records")}
-    pairs = [pair for pair in order if pair in by_pair]
+    row_of = {(row["source"], row["target"]): row for row in rows.to_dict("records")}
+    pairs = [pair for pair in order if pair in row_of]
     for x, pair in enumerate(pairs):
-        row = by_pair[pair]
+        row = row_of[pair]
         if row["noise_spread"] == row["noise_spread"]:
             low, high = row["noise"] - 2 * row["noise_spread"], row["noise"] + 2 * row["noise_spread"]
             ax.plot([x, x], [max(low, 0), min(high, 1)], color=GRID, linewidth=7, solid_capstyle="butt", zorder=1)
@@ -84,8 +84,8 @@ def _baselines(ax: Axes, rows: pd.DataFrame) -> None:
     ax.axhline(0.5, color=GRID, linewidth=0.8, zorder=0.5)
     names = ["itself" if s == t else f"{SHORT[s]}→{SHORT[t]}" for s, t in pairs]
     names = [SHORT[s] if s == t else n for n, (s, t) in zip(names, pairs, strict=True)]
-    marked = [f"{name} {by_pair[pair]['mark']}".strip() for name, pair in zip(names, pairs, strict=True)]
-    ax.set_xticks(range(len(pairs)), marked)
+    marked_names = [f"{name} {row_of[pair]['mark']}".strip() for name, pair in zip(names, pairs, strict=True)]
+    ax.set_xticks(range(len(pairs)), marked_names)
     ax.tick_params(axis="x", labelrotation=60, length=0)
     ax.set_ylim(-0.03, 1.05)
 
@@ -162,36 +162,39 @@ def patching(results: Results) -> Figure:
     rows = rows.loc[(rows["source"] == "pair") & rows["attributed"].notna()]
     rows = rows.loc[(rows["site"] != "residual") | (rows["group"] != "all")]  # 1 by construction, and never patched
     if not len(rows):
-        absent = "the experiment asks for no `patching`" if results.is_study else "the paper patches nothing"
-        raise NotRun(absent)
+        reason = "the experiment asks for no `patching`" if results.is_study else "the paper patches nothing"
+        raise NotRun(reason)
     sites = [site for site in SITES if site in set(rows["site"])]
     cases = dict.fromkeys(zip(rows["model"], rows["dataset"], rows["into"], strict=True))
-    alone = len(sites) == 1  # then cases are columns; otherwise a row has the sites of one case
-    across = min(2, len(cases)) if alone else len(sites)
+    has_one_site = len(sites) == 1  # then cases are columns; otherwise a row has the sites of one case
+    across = min(2, len(cases)) if has_one_site else len(sites)
     panels = [(case, site) for case in cases for site in sites]
     lines = -(-len(panels) // across)
     with figure_style():
         figure = new_figure(PAGE_IN, 0.3 + 1.9 * lines)
         axes = figure.subplots(lines, across, squeeze=False)
         images = []
-        for place, (ax, ((model, dataset, into), site)) in enumerate(zip(axes.flat, panels, strict=False)):
-            chosen = (rows["model"] == model) & (rows["dataset"] == dataset) & (rows["into"] == into)
-            part = rows.loc[chosen & (rows["site"] == site)]
+        for place, (ax, ((model, dataset, patched_side), site)) in enumerate(zip(axes.flat, panels, strict=False)):
+            is_in_panel = (rows["model"] == model) & (rows["dataset"] == dataset) & (rows["into"] == patched_side)
+            part = rows.loc[is_in_panel & (rows["site"] == site)]
             if not len(part):
                 ax.set_axis_off()
                 continue
             images.append(_effects(ax, part))
             n = int(part["n"].max())
-            if alone:
+            if has_one_site:
                 ax.set_title(
-                    f"{plain(model)[:20]}: {TITLES[dataset].lower()}, into the {into}, {counted(n, 'pair')}", size=7
+                    f"{plain(model)[:20]}: {TITLES[dataset].lower()}, into the {patched_side}, {count_noun(n, 'pair')}",
+                    size=7,
                 )
                 continue
             if place < across:
                 ax.set_title(SITES[site], size=7.5)
             if place % across == 0:
                 ax.set_ylabel(
-                    f"{plain(model)[:20]}: {TITLES[dataset].lower()},\ninto the {into}, {counted(n, 'pair')}", size=7
+                    f"{plain(model)[:20]}: {TITLES[dataset].lower()},\n"
+                    f"into the {patched_side}, {count_noun(n, 'pair')}",
+                    size=7,
                 )
         for ax in axes.flat[len(panels) :]:
             ax.set_axis_off()
@@ -203,17 +206,19 @@ def _effects(ax: Axes, part: pd.DataFrame) -> Any:
     from matplotlib.patches import Rectangle
 
     values = part.assign(value=part["effect"].fillna(part["attributed"]), measured=part["effect"].notna().astype(float))
-    wide = values.pivot_table(index="group", columns="layer", values="value", observed=True).reindex([*GROUPS])
-    wide = wide.dropna(how="all")
-    measured = values.pivot_table(index="group", columns="layer", values="measured", observed=True).reindex(wide.index)
-    values = wide.to_numpy(float)
+    effect_grid = values.pivot_table(index="group", columns="layer", values="value", observed=True).reindex([*GROUPS])
+    effect_grid = effect_grid.dropna(how="all")
+    measured_grid = values.pivot_table(index="group", columns="layer", values="measured", observed=True).reindex(
+        effect_grid.index
+    )
+    values = effect_grid.to_numpy(float)
     image = ax.imshow(values, cmap="PuOr", vmin=-1, vmax=1, aspect="auto")
-    ax.set_xticks(range(values.shape[1]), [str(layer) for layer in wide.columns])
-    ax.set_yticks(range(len(wide)), [str(name) for name in wide.index])
+    ax.set_xticks(range(values.shape[1]), [str(layer) for layer in effect_grid.columns])
+    ax.set_yticks(range(len(effect_grid)), [str(name) for name in effect_grid.index])
     ax.set_xlabel("layer (0: embeddings)")
     ax.tick_params(length=0)
     ax.spines[:].set_visible(False)
-    for row, column in np.argwhere(measured.to_numpy(float) > 0):
+    for row, column in np.argwhere(measured_grid.to_numpy(float) > 0):
         ax.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, fill=False, edgecolor=INK, linewidth=0.8))
     if values.shape[1] <= 12:
         for (row, column), value in np.ndenumerate(values):
@@ -248,8 +253,8 @@ def doses_among_nulls(results: Results) -> Figure:
             for ax, dataset in zip(line, datasets, strict=True):
                 part = of.loc[of["target"] == dataset]
                 _dose(ax, part, colour)
-                own = part.loc[part["kind"] == "void"].assign(mark=few(part.loc[part["kind"] == "void"], "n"))
-                n = from_to(int(own["n"].min()), int(own["n"].max())) + max(own["mark"])
+                own = part.loc[part["kind"] == "void"].assign(mark=few_marks(part.loc[part["kind"] == "void"], "n"))
+                n = range_text(int(own["n"].min()), int(own["n"].max())) + max(own["mark"])
                 ranks = _p_values(results.nulls, kinds, str(model), str(directions), str(regime), dataset)
                 ax.set_title("\n".join([f"{SHORT[dataset]}, {directions}→{regime}", f"n {n}", *ranks]), size=6)
             line[0].set_ylabel(f"{plain(str(model))[:14]}\nabstained, %")
@@ -284,14 +289,14 @@ def _dose(ax: Axes, rows: pd.DataFrame, colour: dict[str, str]) -> None:
         void = of.loc[of["kind"] == "void"].sort_values("gaps").drop_duplicates("gaps")
         ax.plot(void["gaps"], 100 * void["abstention"].astype(float), color=ink, linestyle=line, marker=marker,
                 markersize=3.2, linewidth=1.0, clip_on=False)  # fmt: skip
-        for place, null in enumerate(NULLS):
-            nulls = of.loc[(of["kind"] == null) & (of["dose"] > 0)]
+        for place, null_kind in enumerate(NULLS):
+            nulls = of.loc[(of["kind"] == null_kind) & (of["dose"] > 0)]
             if not len(nulls):
                 continue
             top = float(nulls["gaps"].iloc[0])
             at = top * (1.25 + 0.14 * place + (0.55 if side == "void" else 0))
             counts = (100 * nulls["abstention"].astype(float)).round(6).value_counts()
-            ax.scatter([at] * len(counts), counts.index, s=3 + 1.6 * counts.to_numpy(), color=colour[null],
+            ax.scatter([at] * len(counts), counts.index, s=3 + 1.6 * counts.to_numpy(), color=colour[null_kind],
                        marker=marker, linewidths=0, clip_on=False)  # fmt: skip
             ax.axvline(1.12 * top, color=GRID, linewidth=0.7, zorder=0)
             doses = [dose for dose in sorted(set(void["gaps"])) if dose == 0 or dose >= top / 4]

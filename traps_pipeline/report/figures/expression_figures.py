@@ -65,10 +65,12 @@ def scored_items(results: Results) -> pd.DataFrame:
 
     `sentence`: by how much an abstention is likelier than the model's own answer (nats per token, or NaN).
     """
-    rows, read = results.item_scores, results.sentences
-    read = read.loc[read["prompt"] == STANDARD, ["model", "item_id", "abstention", "own"]]
-    read = read.assign(sentence=read["abstention"].astype(float) - read["own"].astype(float))
-    rows = rows.merge(read[["model", "item_id", "sentence"]], on=["model", "item_id"], how="left")
+    rows, sentence_rows = results.item_scores, results.sentences
+    sentence_rows = sentence_rows.loc[sentence_rows["prompt"] == STANDARD, ["model", "item_id", "abstention", "own"]]
+    sentence_rows = sentence_rows.assign(
+        sentence=sentence_rows["abstention"].astype(float) - sentence_rows["own"].astype(float)
+    )
+    rows = rows.merge(sentence_rows[["model", "item_id", "sentence"]], on=["model", "item_id"], how="left")
     return rows.loc[rows["margin"].notna() & rows["own"].notna()].reset_index(drop=True)
 
 

@@ -1,4 +1,4 @@
-"""Draw abstention and stated probability on graded cuts against the true one."""
+"""Draw abstention and stated probability on graded cuts against true probability."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from traps_pipeline.protocol.regimes import ANSWER_FROM, REGIMES
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.graded_tables import WHY_EMPTY
-from traps_pipeline.report.tables.table_columns import ordered
+from traps_pipeline.report.tables.table_columns import sort_rows
 from traps_pipeline.report.writing import COLOURS, MARKERS, PAGE_IN, SOFT, NotRun, figure_style, new_figure, plain
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ def graded(results: Results) -> Figure:
     from matplotlib.lines import Line2D
 
     rows = results.graded
-    rows = ordered(rows.loc[rows["scope"] != "all"], ["model", "regime", "top"])
+    rows = sort_rows(rows.loc[rows["scope"] != "all"], ["model", "regime", "top"])
     if not len(rows):
         raise NotRun(WHY_EMPTY)
     models, regimes = list(dict.fromkeys(rows["model"])), sorted(set(rows["regime"]), key=REGIMES.index)

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 AXES = {"hp": "HP", "ii": "II", "hp_and_ii": "HP and II", "es": "ES", "doubt": "Doubt"}
 GOOD, BAD = "the more the better", "the less the better"  # two colour scales
 HATCHES = ("", "/////", "xxxx", ".....", "-----")
-MOST_MODELS = 12  # maximum legible columns of a heatmap on a page's width
+MAX_MODELS = 12  # maximum legible columns of a heatmap on a page's width
 
 
 def sub_scenarios(results: Results) -> Figure:
@@ -52,14 +52,14 @@ def sub_scenarios(results: Results) -> Figure:
     rows = rows.assign(order=rows["dataset"] != "occlusion").sort_values(
         ["order", "abs_rec", "sub_scenario"], ascending=[True, False, True]
     )
-    panels = _by_model(results, rows) or _means(rows)
+    panels = _model_panels(results, rows) or _means(rows)
     names = [plain(name).replace("_", " ") for name in rows["sub_scenario"]]
     with figure_style():
         figure = new_figure(PAGE_IN, 1.35 + 0.17 * len(rows))
-        wide = [len(panel.columns) for panel in panels]
-        axes = figure.subplots(1, len(panels), sharey=True, squeeze=False, width_ratios=wide)[0]
-        first = int((~rows["order"]).sum())
-        scales = {panel.scale: _draw_grid(ax, panel, names, first) for ax, panel in zip(axes, panels, strict=True)}
+        column_counts = [len(panel.columns) for panel in panels]
+        axes = figure.subplots(1, len(panels), sharey=True, squeeze=False, width_ratios=column_counts)[0]
+        n_before = int((~rows["order"]).sum())
+        scales = {panel.scale: _draw_grid(ax, panel, names, n_before) for ax, panel in zip(axes, panels, strict=True)}
         for scale, image in scales.items():
             figure.colorbar(image, ax=list(axes), label=f"{scale}, %", shrink=0.6, aspect=30, pad=0.01)
     return figure
@@ -75,27 +75,27 @@ class Panel:
     scale: str = GOOD
 
 
-def _by_model(results: Results, rows: pd.DataFrame) -> list[Panel]:
+def _model_panels(results: Results, rows: pd.DataFrame) -> list[Panel]:
     """Return the panels of standard and of guided, one column per model."""
     cells = results.sub_cells
     cells = cells.loc[cells["dataset"].isin(analyses.TAXONOMIES)]
     models_here = [model for model in load_models() if model in set(cells["model"])]
     video = [m for m in analyses.models_of(media="video", group="main") if m in models_here]
-    models = (video or models_here)[:MOST_MODELS]
+    models = (video or models_here)[:MAX_MODELS]
     panels = []
     for regime in PROMPTING:
         part = cells.loc[(cells["regime"] == regime) & cells["model"].isin(models)]
         if len(part):
-            wide = part.pivot(index=["dataset", "scope"], columns="model", values="abs_rec")
+            abs_rec_grid = part.pivot(index=["dataset", "scope"], columns="model", values="abs_rec")
             index = list(zip(rows["dataset"], rows["sub_scenario"], strict=True))
-            values = 100 * wide.reindex(index=index, columns=models).to_numpy(float)
+            values = 100 * abs_rec_grid.reindex(index=index, columns=models).to_numpy(float)
             panels.append(Panel(f"AbsRec, {regime}", models, values))
     return panels
 
 
 def _means(rows: pd.DataFrame) -> list[Panel]:
-    good = {"abs_rec": "AbsRec, standard", "guided_abs_rec": "AbsRec, guided", "acc": "Acc"}
-    of = {GOOD: good, BAD: {"false_abs": "FalseAbs"}}
+    good_columns = {"abs_rec": "AbsRec, standard", "guided_abs_rec": "AbsRec, guided", "acc": "Acc"}
+    of = {GOOD: good_columns, BAD: {"false_abs": "FalseAbs"}}
     titles = {GOOD: "means over models", BAD: ""}
     return [Panel(titles[s], [*names.values()], 100 * rows[[*names]].to_numpy(float), s) for s, names in of.items()]
 
@@ -127,8 +127,8 @@ def confabulation(results: Results) -> Figure:
     """
     rows = results.confabulation
     if not len(rows):
-        why = "no judge of confabulation is configured for this study’s panel" if results.is_study else ""
-        raise NotRun(why or results.why("confabulation"))
+        reason = "no judge of confabulation is configured for this study’s panel" if results.is_study else ""
+        raise NotRun(reason or results.why("confabulation"))
     at, width = np.arange(len(rows)), 0.16
     with figure_style():
         figure = new_figure(PAGE_IN, 2.5)
@@ -172,15 +172,15 @@ def shortcut_figure(table: pd.DataFrame) -> Figure:
         for k, cue in enumerate(cues):
             rows = table.loc[table["cue"] == cue].set_index("dataset")
             at = [datasets.index(str(name)) + 0.17 * (k - (len(cues) - 1) / 2) for name in rows.index]
-            share, half = rows["accuracy"].to_numpy(float), rows["half_width"].to_numpy(float)
-            ends = np.minimum(half, share), np.minimum(half, 1 - share)  # no share is below 0 or above 1
+            share, half_width = rows["accuracy"].to_numpy(float), rows["half_width"].to_numpy(float)
+            ends = np.minimum(half_width, share), np.minimum(half_width, 1 - share)  # no share is below 0 or above 1
             axes.errorbar(
                 share, at, xerr=np.vstack(ends), fmt=MARKERS[k], color=COLOURS[k], markersize=4,
                 linestyle="none", linewidth=0.8, label=cue, clip_on=False, zorder=3,
             )  # fmt: skip
-        least = min([0.4, *(table["accuracy"] - table["half_width"])])
+        lowest_value = min([0.4, *(table["accuracy"] - table["half_width"])])
         axes.set(
-            xlim=(max(0.0, least) - 0.02, 1.02),
+            xlim=(max(0.0, lowest_value) - 0.02, 1.02),
             ylim=(len(datasets) - 0.5, -0.5),
             xlabel="share of sides predicted correctly",
         )

@@ -25,17 +25,17 @@ class Label:
     colour: str
 
 
-def merged_labels(labels: Sequence[Label], axes: Axes) -> list[Label]:
+def merge_labels(labels: Sequence[Label], axes: Axes) -> list[Label]:
     """Join labels of coinciding points: one name per line, in a neutral colour."""
     size = np.array([np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())])
-    merged: list[Label] = []
+    result: list[Label] = []
     for label in labels:
-        twin = next((m for m in merged if np.hypot(*((m.x - label.x, m.y - label.y) / size)) < SAME_POINT), None)
+        twin = next((m for m in result if np.hypot(*((m.x - label.x, m.y - label.y) / size)) < SAME_POINT), None)
         if twin is None:
-            merged.append(label)
+            result.append(label)
         else:
-            merged[merged.index(twin)] = Label(twin.x, twin.y, f"{twin.text}\n{label.text}", "#1b1f27")
-    return merged
+            result[result.index(twin)] = Label(twin.x, twin.y, f"{twin.text}\n{label.text}", "#1b1f27")
+    return result
 
 
 def place_labels(axes: Axes, labels: Sequence[Label], markers: np.ndarray) -> None:
@@ -48,8 +48,8 @@ def place_labels(axes: Axes, labels: Sequence[Label], markers: np.ndarray) -> No
 
     pixel = axes.figure.dpi / 72  # pixels a point: offsets are in points, boxes in pixels
     room = np.array([axes.bbox.extents])
-    obstacles = _around(axes.transData.transform(markers), 3 * pixel)
-    lines = _around(_along_lines(axes, pixel), 0.5 * pixel)
+    obstacles = _squares(axes.transData.transform(markers), 3 * pixel)
+    lines = _squares(_line_pixels(axes, pixel), 0.5 * pixel)
     offsets = _offsets()
     distance = np.hypot(*offsets.T)
     halo = [withStroke(linewidth=1.2, foreground="white")]
@@ -63,8 +63,8 @@ def place_labels(axes: Axes, labels: Sequence[Label], markers: np.ndarray) -> No
         boxes = _boxes(
             axes.transData.transform((label.x, label.y)) + offsets * pixel, offsets, size + np.array([4, 1]) * pixel
         )
-        outside = np.prod(boxes[0, 2:] - boxes[0, :2]) - _overlap(boxes, room)
-        area = 10 * (_overlap(boxes, obstacles) + outside) + 2 * _overlap(boxes, lines)
+        outside_area = np.prod(boxes[0, 2:] - boxes[0, :2]) - _overlap(boxes, room)
+        area = 10 * (_overlap(boxes, obstacles) + outside_area) + 2 * _overlap(boxes, lines)
         best = int(np.argmin(area / pixel**2 + distance))
         dx, dy = offsets[best]
         note.set(position=(dx, dy), ha=_side(dx, "left", "right"), va=_side(dy, "bottom", "top"))
@@ -94,12 +94,12 @@ def _boxes(anchors: np.ndarray, offsets: np.ndarray, size: np.ndarray) -> np.nda
     return np.hstack([low, low + size])
 
 
-def _around(spots: np.ndarray, half: float) -> np.ndarray:
+def _squares(spots: np.ndarray, half: float) -> np.ndarray:
     """Return extents (n, 4) of squares around positions (n, 2)."""
     return np.hstack([spots - half, spots + half])
 
 
-def _along_lines(axes: Axes, step: float) -> np.ndarray:
+def _line_pixels(axes: Axes, step: float) -> np.ndarray:
     """Return pixels (n, 2), `step` apart, along the lines that join a model's points."""
     points = [np.empty((0, 2))]
     for line in axes.lines:

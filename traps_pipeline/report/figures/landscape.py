@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from traps_pipeline.protocol.regimes import BY_NAME, GUIDED, PROMPTING, REGIMES, STANDARD
-from traps_pipeline.report.figures.label_placement import LINES, Label, merged_labels, place_labels, short
+from traps_pipeline.report.figures.label_placement import LINES, Label, merge_labels, place_labels, short
 from traps_pipeline.report.figures.looks import arrow, family_of, frame_plane, legend_key, looks
 from traps_pipeline.report.result_frames import Results, datasets_of
 from traps_pipeline.report.terms import INCOMPLETE_MARK, TITLES
@@ -49,7 +49,7 @@ def landscape_figure(points: pd.DataFrame, scope: str) -> Figure:
         figure = new_figure(COLUMN_IN, 3.7)
         axes = figure.add_subplot()
         frame_plane(axes, points, f"Acc, {scope.lower()}", intervals=True)
-        labels = merged_labels(_draw_models(axes, points), axes)
+        labels = merge_labels(_draw_models(axes, points), axes)
         guided = points.loc[points["regime"] == GUIDED]
         _draw_frontier(axes, guided)
         _draw_rings(axes, guided)
@@ -60,28 +60,28 @@ def landscape_figure(points: pd.DataFrame, scope: str) -> Figure:
 
 
 def reasoning(results: Results) -> Figure:
-    """Return arrows from less to more thinking models, under standard and guided."""
+    """Return arrows from each model to the one that thinks more, under both prompts."""
     points = results.overall
     chains = [list(reversed(pair)) for pair in analyses.REASONING_PAIRS] + [list(analyses.REASONING_LADDER)]
     chains = [[m for m in chain if m in set(points["model"])] for chain in chains]
     chains = [chain for chain in chains if len(chain) > 1]
     if not chains:
-        why = "no reasoning pair has all four datasets" if results.is_study else results.why("cells")
-        raise NotRun(why)
-    named = points.loc[points["model"].isin([m for chain in chains for m in chain])]
+        reason = "no reasoning pair has all four datasets" if results.is_study else results.why("cells")
+        raise NotRun(reason)
+    chain_points = points.loc[points["model"].isin([m for chain in chains for m in chain])]
     with figure_style():
         figure = new_figure(PAGE_IN, 3.5)
         panels = figure.subplots(1, 2, sharey=True)
-        labels = [_draw_chains(axes, named.loc[named["regime"] == regime], chains) for axes, regime in
+        labels = [_draw_chains(axes, chain_points.loc[chain_points["regime"] == regime], chains) for axes, regime in
                   zip(panels, PROMPTING, strict=True)]  # fmt: skip
         for axes, regime in zip(panels, PROMPTING, strict=True):
-            frame_plane(axes, named, "Acc, overall")
+            frame_plane(axes, chain_points, "Acc, overall")
             axes.set_title(f"{regime} (filled: thinks most)", weight="normal", size=7.5)
         panels[1].set_ylabel("")
         freeze_layout(figure)
         for axes, names, regime in zip(panels, labels, PROMPTING, strict=True):
-            at = named.loc[named["regime"] == regime, ["j", "acc"]].to_numpy(float)
-            place_labels(axes, merged_labels(names, axes), at)
+            at = chain_points.loc[chain_points["regime"] == regime, ["j", "acc"]].to_numpy(float)
+            place_labels(axes, merge_labels(names, axes), at)
     return figure
 
 
@@ -105,9 +105,9 @@ def _draw_models(axes: Axes, points: pd.DataFrame) -> list[Label]:
         for zorder, regime in enumerate(REGIMES, start=3):
             if regime in at:
                 axes.scatter(*at[regime], zorder=zorder, clip_on=False, **styles[BY_NAME[regime].marker])
-        named = next(regime for regime in (GUIDED, *at) if regime in at)
-        _draw_intervals(axes, rows.loc[rows["regime"] == named].to_dict("records")[0], colour)
-        x, y = at[named]
+        shown_regime = next(regime for regime in (GUIDED, *at) if regime in at)
+        _draw_intervals(axes, rows.loc[rows["regime"] == shown_regime].to_dict("records")[0], colour)
+        x, y = at[shown_regime]
         mark = f" {INCOMPLETE_MARK}" if bool(rows["incomplete"].fillna(False).astype(bool).any()) else ""
         labels.append(Label(x, y, short(str(model)) + mark, colour))
     return labels
@@ -116,12 +116,12 @@ def _draw_models(axes: Axes, points: pd.DataFrame) -> list[Label]:
 def _draw_intervals(axes: Axes, row: Mapping[Any, Any], colour: str) -> None:
     """Draw the 95 % intervals of J and Acc, clipped to possible values, if known."""
     style: dict[str, Any] = {"color": colour, "linewidth": 0.6, "alpha": 0.55, "zorder": 1.8, "clip_on": False}
-    for name, least in (("j", -1.0), ("acc", 0.0)):
+    for name, lower_limit in (("j", -1.0), ("acc", 0.0)):
         low, high = row.get(f"{name}_ci_low", np.nan), row.get(f"{name}_ci_high", np.nan)
         if low is None or high is None or not np.isfinite([low, high]).all():
             continue
-        ends, other = (max(least, low), min(1.0, high)), row["acc" if name == "j" else "j"]
-        axes.plot(*((ends, (other, other)) if name == "j" else ((other, other), ends)), **style)
+        ends, other_value = (max(lower_limit, low), min(1.0, high)), row["acc" if name == "j" else "j"]
+        axes.plot(*((ends, (other_value, other_value)) if name == "j" else ((other_value, other_value), ends)), **style)
 
 
 def _draw_frontier(axes: Axes, guided: pd.DataFrame) -> None:
@@ -168,13 +168,13 @@ def _draw_chains(axes: Axes, points: pd.DataFrame, chains: list[list[str]]) -> l
     at = {row["model"]: (float(row["j"]), float(row["acc"])) for row in points.to_dict("records")}
     look, labels = looks(at), []
     for chain in chains:
-        present = [model for model in chain if model in at and np.isfinite(at[model]).all()]
-        for start, end in pairwise(present):
+        drawn_models = [model for model in chain if model in at and np.isfinite(at[model]).all()]
+        for start, end in pairwise(drawn_models):
             axes.plot(*np.array([at[start], at[end]]).T, linewidth=0, zorder=LINES)
             arrow(axes, at[start], at[end], look[end][0])
-        for k, model in enumerate(present):
+        for k, model in enumerate(drawn_models):
             colour, marker = look[model]
-            face = colour if k == len(present) - 1 else "white"  # filled: the member that thinks most
+            face = colour if k == len(drawn_models) - 1 else "white"  # filled: the member that thinks most
             axes.scatter(*at[model], s=20, marker=marker, facecolors=face, edgecolors=colour, linewidths=0.9, zorder=4)
             labels.append(Label(*at[model], short(model), colour))
     return labels

@@ -26,23 +26,25 @@ def family_of(model: str) -> str:
 
 def families() -> list[str]:
     """Return all families: the paper's, then the registry's others, then `own`."""
-    known = [entry.groups for entry in load_models().values()]
-    order = [g.family for g in known if g.group != "reference"] + [g.family for g in known if g.group == "reference"]
+    model_groups = [entry.groups for entry in load_models().values()]
+    order = [g.family for g in model_groups if g.group != "reference"] + [
+        g.family for g in model_groups if g.group == "reference"
+    ]
     return list(dict.fromkeys([*order, OWN]))
 
 
 def family_colour(family: str) -> str:
     """Return the colour of a family in every figure; reference strategies are grey."""
-    others = [name for name in families() if name != REFERENCE]
-    return COLOURS[-1] if family == REFERENCE else COLOURS[others.index(family) % (len(COLOURS) - 1)]
+    other_families = [name for name in families() if name != REFERENCE]
+    return COLOURS[-1] if family == REFERENCE else COLOURS[other_families.index(family) % (len(COLOURS) - 1)]
 
 
 def looks(models: Iterable[str]) -> dict[str, tuple[str, str]]:
     """Return each model's colour (its family's) and marker (13 differ per family)."""
-    known = dict.fromkeys([*load_models(), *sorted(set(models))])
-    colours = {model: family_colour(family_of(model)) for model in known}
-    alike = {colour: [m for m in known if colours[m] == colour] for colour in COLOURS}
-    return {m: (colours[m], MARKERS[alike[colours[m]].index(m) % len(MARKERS)]) for m in set(models)}
+    model_names = dict.fromkeys([*load_models(), *sorted(set(models))])
+    colours = {model: family_colour(family_of(model)) for model in model_names}
+    models_by_colour = {colour: [m for m in model_names if colours[m] == colour] for colour in COLOURS}
+    return {m: (colours[m], MARKERS[models_by_colour[colours[m]].index(m) % len(MARKERS)]) for m in set(models)}
 
 
 def frame_plane(axes: Axes, points: pd.DataFrame, ylabel: str, *, intervals: bool = False) -> None:
@@ -50,21 +52,23 @@ def frame_plane(axes: Axes, points: pd.DataFrame, ylabel: str, *, intervals: boo
 
     At least half of each axis is shown. intervals: whether the limits include the points' 95 % intervals.
     """
-    acc, j = (_values(points, name, least, intervals=intervals) for name, least in (("acc", 0.0), ("j", -1.0)))
+    acc, j = (
+        _values(points, name, lower_limit, intervals=intervals) for name, lower_limit in (("acc", 0.0), ("j", -1.0))
+    )
     low, high = _limits(acc, 0.0, 0.0)
     left, right = _limits(j, min([-0.08, *(j - 0.08)]), 0.3)
     axes.set(xlim=(left, right + 0.03), ylim=(low - 0.03, high + 0.03), xlabel="J = AbsRec − FalseAbs", ylabel=ylabel)
     axes.locator_params(axis="x", nbins=6)
     axes.axvline(0, color="#98a2b3", linewidth=0.8, zorder=0.5)
     edge: dict[str, Any] = {"annotation_clip": False, "va": "center", "color": SOFT, "size": 6}
-    labelled = right + 0.05 * (right - left)
+    label_edge = right + 0.05 * (right - left)
     for pecs in np.arange(1, 10) / 10:
         j = np.linspace(max(pecs / high, 1e-3), right, 200)
         if pecs / right <= high:
             axes.plot(j, pecs / j, color=GRID, linewidth=0.6, zorder=0.4)
             if pecs / right >= low:
-                axes.annotate(f"{pecs:.1f}", (right, pecs / right), (labelled, pecs / right), **edge)
-    axes.annotate("PECS", (right, high), (labelled, high + 0.035), **edge)
+                axes.annotate(f"{pecs:.1f}", (right, pecs / right), (label_edge, pecs / right), **edge)
+    axes.annotate("PECS", (right, high), (label_edge, high + 0.035), **edge)
 
 
 def _values(points: pd.DataFrame, name: str, least: float, *, intervals: bool) -> np.ndarray:
@@ -100,6 +104,6 @@ def arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float], colo
     axes.annotate("", end, start, arrowprops=style, zorder=2.5, annotation_clip=False)
 
 
-def from_to(low: int, high: int) -> str:
+def range_text(low: int, high: int) -> str:
     """Return `5`, or `5 to 16`."""
     return f"{low}" if low == high else f"{low} to {high}"

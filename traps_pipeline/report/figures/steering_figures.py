@@ -11,7 +11,7 @@ import numpy as np
 from traps_pipeline.mechanism import effects
 from traps_pipeline.mechanism.transfer_paths import PATH_SETS, STEERING_PATHS, TRANSFER, TRANSFER_TYPES, path_name
 from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed, taxonomy_of, transfer_type
-from traps_pipeline.report.figures.looks import from_to, legend_key
+from traps_pipeline.report.figures.looks import legend_key, range_text
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.inside_columns import why
 from traps_pipeline.report.tables.probe_tables import best_layers
@@ -66,14 +66,14 @@ def probe_curves(results: Results) -> Figure:
         for line, model in zip(axes, models, strict=True):
             for ax, crossing in zip(line, CROSSING, strict=True):
                 _curves(ax, curves.loc[curves["model"] == model], crossing)
-                _shuffled_band(ax, rows.loc[(rows["analysis"] == "shuffled") & (rows["model"] == model)])
+                _draw_shuffled_band(ax, rows.loc[(rows["analysis"] == "shuffled") & (rows["model"] == model)])
                 ax.set_title(f"{plain(model)[:24]}: {crossing}", size=7.5)
             line[0].set_ylabel("AUROC on the target")
         for ax in axes[-1]:
             ax.set_xlabel("layer (0: embeddings)")
         axes[0, 0].set_ylim(min(0.35, float(curves["value"].min()) - 0.03), 1.02)
-        shuffled = _bar_key("labels shuffled, mean ± 2 sd", 7, GRID)
-        _legend(figure, legend_key("layer chosen without the target", SOFT, "o", markerfacecolor="white"), shuffled)
+        shuffled_key = _bar_key("labels shuffled, mean ± 2 sd", 7, GRID)
+        _legend(figure, legend_key("layer chosen without the target", SOFT, "o", markerfacecolor="white"), shuffled_key)
     return figure
 
 
@@ -85,18 +85,18 @@ def _curves(ax: Axes, curves: pd.DataFrame, crossing: str) -> None:
         if transfer_type(source, target) != crossing:
             continue
         curve = curve.sort_values("layer")
-        every = max(1, len(curve) // 8)
+        marker_step = max(1, len(curve) // 8)
         style: dict[str, Any] = {"color": COLOUR[source], "marker": MARKER[target], "markersize": 3.2}
-        line: dict[str, Any] = {**style, "linestyle": LINE[source], "linewidth": 0.9, "markevery": every}
+        line: dict[str, Any] = {**style, "linestyle": LINE[source], "linewidth": 0.9, "markevery": marker_step}
         ax.plot(curve["layer"], curve["value"], **line)
-        chosen = curve.loc[curve["chosen"]]
+        chosen_layers = curve.loc[curve["chosen"]]
         style |= {"markersize": 5, "markerfacecolor": "white", "linestyle": "none"}
-        ax.plot(chosen["layer"], chosen["value"], **style)
+        ax.plot(chosen_layers["layer"], chosen_layers["value"], **style)
     ax.axhline(0.5, color=GRID, linewidth=0.8, zorder=0.5)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
-def _shuffled_band(ax: Axes, rows: pd.DataFrame) -> None:
+def _draw_shuffled_band(ax: Axes, rows: pd.DataFrame) -> None:
     if not len(rows) or rows.loc[:, "layer"].isna().any():
         return
     at = rows.groupby("layer").agg(mean=("value", "mean"), spread=("spread", "mean"))
@@ -112,8 +112,8 @@ def confabulated_strip(results: Results) -> Figure:
     """
     rows = best_layers(results.probes)
     if not len(rows) or rows.loc[:, "cf_value"].isna().all():
-        absent = "no dataset has confabulated voids" if len(rows) else why(results)
-        raise NotRun(absent)
+        reason = "no dataset has confabulated voids" if len(rows) else why(results)
+        raise NotRun(reason)
     models = list(dict.fromkeys(rows["model"]))
     with figure_style():
         figure = new_figure(PAGE_IN, 2.5)
@@ -124,8 +124,11 @@ def confabulated_strip(results: Results) -> Figure:
         lowest = np.nanmin(rows[["best_value", "cf_value"]].to_numpy(float))
         axes[0].set(ylim=(min(0.45, lowest - 0.04), 1.03), ylabel="AUROC on the target")
         chance = legend_key("chance", SOFT, line=(0, (4, 2.5)), linewidth=0.8)
-        hollow, filled = legend_key("all samples", SOFT, "o", markerfacecolor="white"), legend_key("Cf→Cf", SOFT, "o")
-        _legend(figure, hollow, filled, _bar_key("median of Cf→Cf"), chance)
+        hollow_key, filled_key = (
+            legend_key("all samples", SOFT, "o", markerfacecolor="white"),
+            legend_key("Cf→Cf", SOFT, "o"),
+        )
+        _legend(figure, hollow_key, filled_key, _bar_key("median of Cf→Cf"), chance)
     return figure
 
 
@@ -167,30 +170,30 @@ def dose_response(results: Results) -> Figure:
         pairs = axes.reshape(-1, 2)
         for pair, ((model, path_set), part) in zip(pairs, panels.items(), strict=False):
             for ax, side, sign in zip(pair, ("control", "void"), ("+α on controls", "−α on voids"), strict=True):
-                _mean_band(ax, _of_panel(results.shares, part, path_set, side))
+                _mean_band(ax, _panel_shares(results.shares, part, path_set, side))
                 _doses(ax, part, side, KEY_PATHS if path_set == "transfer" else STEERING_PATHS)
-                ax.set_title(f"{plain(model)[:20]}\n{sign}, {SETS[path_set]}{_answers(part, side)}", size=6.5)
+                ax.set_title(f"{plain(model)[:20]}\n{sign}, {SETS[path_set]}{_count_answers(part, side)}", size=6.5)
                 ax.set_xlabel("α")
         for ax in pairs[len(panels) :].flat:
             ax.set_axis_off()
         for line in axes:
             line[0].set_ylabel("abstained, %")
         axes[0, 0].set_ylim(-4, 104)
-        more = [_bar_key("mean, 95 % by scenario")] if len(results.shares) else []
-        _legend(figure, *more, colours={d: FAMILY_COLOUR[taxonomy_of(d)] for d in DATASETS})
+        interval_key = [_bar_key("mean, 95 % by scenario")] if len(results.shares) else []
+        _legend(figure, *interval_key, colours={d: FAMILY_COLOUR[taxonomy_of(d)] for d in DATASETS})
     return figure
 
 
-def _answers(part: pd.DataFrame, side: str) -> str:
+def _count_answers(part: pd.DataFrame, side: str) -> str:
     """Return the number of answers behind a marker."""
     counts = part[f"{side}_n"].dropna().astype(int) if f"{side}_n" in part else []
-    return f", n {from_to(min(counts), max(counts))}" if len(counts) else ""
+    return f", n {range_text(min(counts), max(counts))}" if len(counts) else ""
 
 
-def _of_panel(shares: pd.DataFrame, part: pd.DataFrame, path_set: str, side: str) -> pd.DataFrame:
+def _panel_shares(shares: pd.DataFrame, part: pd.DataFrame, path_set: str, side: str) -> pd.DataFrame:
     """Return the shares over a panel's paths along void directions, by alpha."""
-    of_side = shares.loc[(shares["path_set"] == path_set) & (shares["side"] == side)]
-    return of_side.merge(part[[*effects.CELL, "kind"]].drop_duplicates()).sort_values("alpha")
+    side_shares = shares.loc[(shares["path_set"] == path_set) & (shares["side"] == side)]
+    return side_shares.merge(part[[*effects.CELL, "kind"]].drop_duplicates()).sort_values("alpha")
 
 
 def _mean_band(ax: Axes, shares: pd.DataFrame) -> None:
@@ -239,7 +242,7 @@ def cosine_heatmaps(results: Results) -> Figure:
     if not len(rows):
         raise NotRun(why(results))
     panels = [(str(key[0]), str(key[1]), part) for key, part in rows.groupby(["model", "prompt"], sort=False)]  # pyright: ignore[reportIndexIssue]
-    several = len({prompt for _, prompt, _ in panels}) > 1
+    has_several_prompts = len({prompt for _, prompt, _ in panels}) > 1
     columns = min(3, len(panels))
     lines = -(-len(panels) // columns)
     with figure_style():
@@ -247,7 +250,7 @@ def cosine_heatmaps(results: Results) -> Figure:
         axes = figure.subplots(lines, columns, squeeze=False)
         images = [_heatmap(ax, part) for ax, (_, _, part) in zip(axes.flat, panels, strict=False)]
         for ax, (model, prompt, _) in zip(axes.flat, panels, strict=False):
-            ax.set_title(f"{plain(model)[:26]}\n{prompt} prompt" if several else plain(model)[:26], size=7)
+            ax.set_title(f"{plain(model)[:26]}\n{prompt} prompt" if has_several_prompts else plain(model)[:26], size=7)
         for ax in axes.flat[len(panels) :]:
             ax.set_axis_off()
         figure.colorbar(images[-1], ax=list(axes.flat), label="cosine", shrink=0.85, aspect=25, pad=0.01)
@@ -256,17 +259,17 @@ def cosine_heatmaps(results: Results) -> Figure:
 
 def _heatmap(ax: Axes, part: pd.DataFrame) -> Any:
     names = [TITLES[name].replace(", ill", ",\nill") for name in DATASETS]
-    by_pair = {(row["dataset"], row["other_dataset"]): row for row in part.to_dict("records")}
+    row_of = {(row["dataset"], row["other_dataset"]): row for row in part.to_dict("records")}
     values, texts = np.full((4, 4), np.nan), dict[tuple[int, ...], str]()
-    for (row, one), (column, other) in product(enumerate(DATASETS), repeat=2):
-        at = by_pair.get((one, other), {})
-        cleaned = row < column and _known(at.get("disattenuated"))
-        figure = at.get("split_half" if row == column else "disattenuated" if cleaned else "cosine")
-        if not _known(figure):
+    for (row, row_dataset), (column, column_dataset) in product(enumerate(DATASETS), repeat=2):
+        at = row_of.get((row_dataset, column_dataset), {})
+        is_corrected = row < column and _is_known(at.get("disattenuated"))
+        figure = at.get("split_half" if row == column else "disattenuated" if is_corrected else "cosine")
+        if not _is_known(figure):
             texts[row, column] = "1" if row == column else "–"
             continue
         values[row, column] = np.nan if row == column else figure
-        star = "*" if cleaned and _known(at["low"]) and at["low"] * at["high"] > 0 else ""
+        star = "*" if is_corrected and _is_known(at["low"]) and at["low"] * at["high"] > 0 else ""
         texts[row, column] = f"{figure:.2f}{star}".replace("-", "−")
     image = ax.imshow(values, cmap="PuOr", vmin=-COSINE_SCALE, vmax=COSINE_SCALE)
     ax.set_facecolor("#f2f4f7")
@@ -280,5 +283,5 @@ def _heatmap(ax: Axes, part: pd.DataFrame) -> Any:
     return image
 
 
-def _known(value: Any) -> bool:
+def _is_known(value: Any) -> bool:
     return value is not None and value == value

@@ -22,16 +22,16 @@ from traps_pipeline.report.tables.table_columns import (
     SHARES,
     J,
     cell_trace,
-    counted,
+    combined_counts,
     entries,
     epochs,
     frame,
-    marked,
     marks,
     no_overall,
-    ordered,
     rightly_empty,
-    together,
+    sort_rows,
+    with_counts,
+    with_marks,
     with_titles,
 )
 from traps_pipeline.report.terms import SIDE_OF
@@ -47,7 +47,7 @@ NAIVE_THRESHOLD = 0.03
 
 def visual_textual(results: Results) -> list[PrintedTable]:
     """Return standard AbsRec on visual and ill-posed voids and its ratio by taxonomy."""
-    rates = marked(results.rates)
+    rates = with_marks(results.rates)
     rows = rates.drop_duplicates("model", keep="last").loc[
         :, ["model", *COUNTED, "mark"]
     ]  # the pooled row is a model's last
@@ -88,37 +88,44 @@ def _rate_trace(row: Mapping[str, Any], field: str) -> SourceItems:
 
 def uplift(results: Results) -> list[PrintedTable]:
     """Return AbsRec under both prompts, its ratio, and PECS; datasets weigh equally."""
-    rows, refused, both = [], [], PROMPTING
-    for model, means in marked(results.overall).groupby("model", sort=False):
-        sides = {row["regime"]: row for row in means.to_dict("records") if row["regime"] in both}
-        if len(sides) < len(both):
+    rows, refusals, regimes = [], [], PROMPTING
+    for model, means in with_marks(results.overall).groupby("model", sort=False):
+        sides = {row["regime"]: row for row in means.to_dict("records") if row["regime"] in regimes}
+        if len(sides) < len(regimes):
             continue
         try:
             (ratio,) = analyses.uplift(results.cells.loc[results.cells["model"] == model], means)["ratio"]
         except EpochMismatch as error:
-            refused.append(str(error))
+            refusals.append(str(error))
             continue
         reason = results.refusal("overall", (str(model), "standard"), (str(model), "guided"))
         if reason is not None:
-            refused.append(f"{model}: {reason}")
+            refusals.append(f"{model}: {reason}")
             continue
-        row = {"model": model, "ratio": ratio, "epoch": sides["standard"]["epoch"], **together([*sides.values()])}
+        row = {
+            "model": model,
+            "ratio": ratio,
+            "epoch": sides["standard"]["epoch"],
+            **combined_counts([*sides.values()]),
+        }
         for regime, side in sides.items():
             row |= {f"{regime}_{name}": side[name] for name in ("abs_rec", "false_abs", "pecs", "mark")}
         rows.append(row)
-    table = marked(frame(rows, ["model", "ratio", *COUNTED])).sort_values("ratio", ascending=False, ignore_index=True)
+    table = with_marks(frame(rows, ["model", "ratio", *COUNTED])).sort_values(
+        "ratio", ascending=False, ignore_index=True
+    )
     columns = [
         MODEL,
-        *(Column(f"{r}_abs_rec", f"AbsRec %, {r}", "percent") for r in both),
+        *(Column(f"{r}_abs_rec", f"AbsRec %, {r}", "percent") for r in regimes),
         Column("ratio", "Ratio", "ratio", digits=2, mark="mark"),
-        *(Column(f"{r}_false_abs", f"FalseAbs %, {r}", "percent") for r in both),
-        *(Column(f"{r}_pecs", f"PECS, {r}", "fraction", mark=f"{r}_mark") for r in both),
+        *(Column(f"{r}_false_abs", f"FalseAbs %, {r}", "percent") for r in regimes),
+        *(Column(f"{r}_pecs", f"PECS, {r}", "fraction", mark=f"{r}_mark") for r in regimes),
         *COUNTS,
     ]
     notes = [epochs(results.cells), "equal-weight means over the four datasets; ∞ where only standard is 0"]
-    notes += [*marks(table), *refused]
-    why = "no model has standard and guided on all four datasets"
-    return [PrintedTable("guided_uplift", "Guided against standard", table, columns, notes, why, _regime_trace)]
+    notes += [*marks(table), *refusals]
+    absence = "no model has standard and guided on all four datasets"
+    return [PrintedTable("guided_uplift", "Guided against standard", table, columns, notes, absence, _regime_trace)]
 
 
 def _regime_trace(row: Mapping[str, Any], field: str) -> SourceItems:
@@ -129,16 +136,16 @@ def _regime_trace(row: Mapping[str, Any], field: str) -> SourceItems:
 def naive(results: Results) -> list[PrintedTable]:
     """Return guided cells by Acc x AbsRec minus PECS; the product ignores FalseAbs."""
     cells = results.cells.loc[results.cells["regime"] == GUIDED]
-    rows = marked(analyses.naive_gap(cells, -np.inf)).dropna(subset=["gap"])
-    above = analyses.naive_gap(cells, NAIVE_THRESHOLD)
+    rows = with_marks(analyses.naive_gap(cells, -np.inf)).dropna(subset=["gap"])
+    gap_cells = analyses.naive_gap(cells, NAIVE_THRESHOLD)
     rows = with_titles(rows.sort_values("gap", ascending=False, ignore_index=True, kind="stable"))
     columns = [
         MODEL, DATASET, SHARES[0], SHARES[1], SHARES[2], PECS,
         Column("naive", "Naive", "fraction"), Column("gap", "Naive − PECS", "fraction"), *COUNTS, EPOCH,
     ]  # fmt: skip
     notes = [
-        f"guided; Naive = Acc × AbsRec of the means over runs; {len(above)} of {len(rows)} cells differ by more than "
-        f"{NAIVE_THRESHOLD}",
+        f"guided; Naive = Acc × AbsRec of the means over runs; {len(gap_cells)} of {len(rows)} cells differ by more "
+        f"than {NAIVE_THRESHOLD}",
         epochs(cells),
         *marks(rows),
     ]
@@ -151,7 +158,7 @@ def naive(results: Results) -> list[PrintedTable]:
 
 def zero_boundary(results: Results) -> list[PrintedTable]:
     """Return cells with PECS 0: voids not told from controls, or Acc 0."""
-    rows = ordered(with_titles(marked(analyses.zero_boundary(results.cells))), ["regime", "dataset", "model"])
+    rows = sort_rows(with_titles(with_marks(analyses.zero_boundary(results.cells))), ["regime", "dataset", "model"])
     columns = [MODEL, DATASET, REGIME, *SHARES, PECS, *COUNTS, EPOCH]
     n_cells = results.cells.groupby("regime", sort=False).size()
     zero = rows.groupby("regime").size().reindex(n_cells.index, fill_value=0)
@@ -164,7 +171,7 @@ def zero_boundary(results: Results) -> list[PrintedTable]:
 
 def frontier(results: Results) -> list[PrintedTable]:
     """Return the Pareto frontier in (Acc, J), averaged over datasets, by regime."""
-    rows = ordered(marked(analyses.frontier(results.overall)), ["regime"])
+    rows = sort_rows(with_marks(analyses.frontier(results.overall)), ["regime"])
     columns = [REGIME, MODEL, SHARES[0], J, PECS, *COUNTS]
     notes = ["no other model is as good in both Acc and J and better in one", epochs(results.cells), *marks(rows)]
     return [PrintedTable("frontier", "Pareto frontier", rows, columns, notes, no_overall(results, False), cell_trace)]
@@ -175,33 +182,33 @@ def reasoning(results: Results) -> list[PrintedTable]:
     import pandas as pd
 
     cells = entries(results)
-    rows, refused = [analyses.pair_differences(cells.iloc[:0])], []
+    rows, refusals = [analyses.pair_differences(cells.iloc[:0])], []
     for pair in analyses.REASONING_PAIRS:
         try:
             rows.append(analyses.pair_differences(cells.loc[cells["model"].isin(pair)]))
         except EpochMismatch as error:
-            refused.append(str(error))
+            refusals.append(str(error))
     table: pd.DataFrame = pd.concat(rows, ignore_index=True)
     reasons = [
         results.refusal(row["dataset"], *((row[member], row["regime"]) for member in ("thinking", "other")))
         for row in table.to_dict("records")
     ]
-    refused += sorted({reason for reason in reasons if reason})
+    refusals += sorted({reason for reason in reasons if reason})
     table = table.loc[[reason is None for reason in reasons]].reset_index(drop=True)
-    table = counted(table, cells, [(member, "regime", "dataset") for member in ("thinking", "other")])
-    table = ordered(with_titles(table), ["thinking", "regime", "dataset"])
+    table = with_counts(table, cells, [(member, "regime", "dataset") for member in ("thinking", "other")])
+    table = sort_rows(with_titles(table), ["thinking", "regime", "dataset"])
     columns = [
         Column("thinking", "Thinking"), Column("other", "Other"), REGIME, DATASET,
         *(Column(c.field, f"Δ {c.heading}", c.unit) for c in SHARES),
         Column("pecs", "Δ PECS", "fraction", mark="mark"), *COUNTS,
     ]  # fmt: skip
     notes = [epochs(results.cells), "thinking minus other; Δ of shares in points; missing: items of both models"]
-    notes += [*marks(table), *refused]
+    notes += [*marks(table), *refusals]
     trace: Trace = lambda row, field: SourceItems(  # noqa: E731
         row["dataset"] if row["dataset"] in DATASETS else "", row["thinking"], row["regime"], SIDE_OF.get(field, "")
     )
-    why = "no reasoning pair has both members evaluated on one dataset"
-    return [PrintedTable("reasoning_pairs", "Reasoning pairs", table, columns, notes, why, trace)]
+    absence = "no reasoning pair has both members evaluated on one dataset"
+    return [PrintedTable("reasoning_pairs", "Reasoning pairs", table, columns, notes, absence, trace)]
 
 
 TOO_FEW = "too few"
@@ -211,10 +218,10 @@ def contrasts(results: Results) -> list[PrintedTable]:
     """Return paired contrasts of overall PECS (Holm) between models and regimes."""
     rows = results.contrasts
     rows = rows.loc[(rows["dataset"] == "overall") & (rows["figure"] == "pecs")]
-    known = rows["separable"].map({True: "yes", False: "no"}).astype(object)
-    rows = rows.assign(separable=known.where(rows["separable"].notna(), TOO_FEW))
+    answer_words = rows["separable"].map({True: "yes", False: "no"}).astype(object)
+    rows = rows.assign(separable=answer_words.where(rows["separable"].notna(), TOO_FEW))
     rows = rows.sort_values(["kind", "p_holm", "left_model"], ignore_index=True, kind="stable")
-    rows = counted(rows, entries(results), [(f"{s}_model", f"{s}_regime", "dataset") for s in ("left", "right")])
+    rows = with_counts(rows, entries(results), [(f"{s}_model", f"{s}_regime", "dataset") for s in ("left", "right")])
     columns = [
         Column("left_model", "Left"), Column("left_regime", "Regime"), Column("right_model", "Right"),
         Column("right_regime", "Regime"), Column("difference", "Δ PECS", "fraction", mark="mark"),
@@ -233,7 +240,7 @@ def contrasts(results: Results) -> list[PrintedTable]:
 
 def regime_tests(results: Results) -> list[PrintedTable]:
     """Return McNemar's test of two regimes on equal items, by dataset, model and run."""
-    rows = ordered(with_titles(results.regime_tests), ["dataset", "model", "run", "decision"])
+    rows = sort_rows(with_titles(results.regime_tests), ["dataset", "model", "run", "decision"])
     columns = [
         DATASET, MODEL, Column("run", "Run", "count"), Column("decision", "Decision"),
         Column("left_regime", "Left"), Column("right_regime", "Right"), Column("n", "n", "count"),
@@ -251,9 +258,9 @@ def spreads(results: Results) -> list[PrintedTable]:
     families = {entry.id: entry.groups.family for entry in load_models().values()}
     rows = []
     for family, part in [*cells.assign(family=cells.loc[:, "model"].map(families)).groupby("family"), ("all", cells)]:
-        several = part.loc[part["n_runs"] > 1]
-        if len(several):
-            rows.append({"family": family, **analyses.spread(several).iloc[0].to_dict()})
+        repeated_cells = part.loc[part["n_runs"] > 1]
+        if len(repeated_cells):
+            rows.append({"family": family, **analyses.spread(repeated_cells).iloc[0].to_dict()})
     quartiles = {"q25": "25 %", "median": "Median", "q75": "75 %"}
     columns = [
         Column("family", "Family"),
@@ -276,10 +283,10 @@ def degenerate(results: Results) -> list[PrintedTable]:
     ]  # fmt: skip
     notes = ["in expectation; Acc is open where the strategy does not determine it, and PECS is still 0"]
     if results.is_study:
-        measured = results.overall.loc[results.overall["regime"] == "standard"]
+        measured_rows = results.overall.loc[results.overall["regime"] == "standard"]
         names = {"model": "strategy", **{name: f"measured_{name}" for name in ("j", "j_std", "pecs", "pecs_std")}}
-        measured = measured[[*names, *COUNTED]].rename(columns=names)
-        rows = marked(rows.merge(measured, on="strategy", how="left"))
+        measured_rows = measured_rows[[*names, *COUNTED]].rename(columns=names)
+        rows = with_marks(rows.merge(measured_rows, on="strategy", how="left"))
         columns += [
             Column("measured_j", "J, measured", "fraction", spread="measured_j_std"),
             Column("measured_pecs", "PECS, measured", "fraction", spread="measured_pecs_std", mark="mark"), *COUNTS,

@@ -17,9 +17,9 @@ from traps_pipeline.report.tables.inside_columns import (
     PROBE_KEY,
     SHORTCUTS,
     SIDES,
-    against,
+    best_baselines,
     by_features,
-    few,
+    few_marks,
     few_note,
     interval,
     path_names,
@@ -60,26 +60,28 @@ def beside(results: Results) -> pd.DataFrame:
     """
     import pandas as pd
 
-    selected = pd.DataFrame(
+    target_layers = pd.DataFrame(
         [(s, t, "held_out" if taxonomy_of(s) == taxonomy_of(t) else "transfer") for s in DATASETS for t in DATASETS],
         columns=pd.Index(["source", "target", "analysis"]),
     )
     probe = results.probes.loc[results.probes["chosen"].eq(True)]
-    return _with_baselines(results, probe.merge(selected, on=["source", "target", "analysis"]))
+    return _with_baselines(results, probe.merge(target_layers, on=["source", "target", "analysis"]))
 
 
 def look_alikes(results: Results) -> pd.DataFrame:
     """Return `beside` for look-alikes of voids, by probes of their own taxonomy."""
     probe = results.probes.loc[results.probes["chosen"].eq(True) & results.probes["target"].isin([*SOURCE_WORDS])]
-    own = [taxonomy_of(s) == probed_taxonomy(t) for s, t in zip(probe["source"], probe["target"], strict=True)]
-    return _with_baselines(results, probe.loc[own])
+    is_own_taxonomy = [
+        taxonomy_of(s) == probed_taxonomy(t) for s, t in zip(probe["source"], probe["target"], strict=True)
+    ]
+    return _with_baselines(results, probe.loc[is_own_taxonomy])
 
 
 def _with_baselines(results: Results, probe: pd.DataFrame) -> pd.DataFrame:
     probe = (probe if len(results.baselines) else probe.head(0)).astype({"prompt": object})
     states = probe[[*PROBE_KEY, "layer", "value", "low", "high", "n_voids", "n_controls"]]
     table = states.merge(by_features(results), on=PROBE_KEY, how="left")
-    return table.assign(mark=few(table, "n_voids", "n_controls"))
+    return table.assign(mark=few_marks(table, "n_voids", "n_controls"))
 
 
 _PROBE = (LAYER, Column("value", "States", "fraction", mark="mark"), *interval())
@@ -107,14 +109,14 @@ def _baseline_table(results: Results) -> PrintedTable:
         "pairs within a taxonomy and a dataset on itself: fitted without the scored scenario, controls included",
         *few_note(rows),
     ]
-    absent = why(results, "the paper has no such baselines")
+    reason = why(results, "the paper has no such baselines")
     title = "Probes beside their baselines"
-    return PrintedTable("probe_baselines", title, rows, columns, notes, absent, deviation=DRAWS)
+    return PrintedTable("probe_baselines", title, rows, columns, notes, reason, deviation=DRAWS)
 
 
 def _look_alikes(results: Results) -> PrintedTable:
     rows = look_alikes(results)
-    named = rows.assign(
+    table_rows = rows.assign(
         what=[SOURCE_WORDS[name] for name in rows["target"]],
         against=[OPPOSITES[name] for name in rows["analysis"]],
         path=short_names(rows["source"]),
@@ -130,9 +132,9 @@ def _look_alikes(results: Results) -> PrintedTable:
         "frame times of the other side: 1 for a probe that reads the frames, 0 for one that reads the time stamps",
         *few_note(rows),
     ]
-    absent = why(results, "the paper has no such items")
+    reason = why(results, "the paper has no such items")
     title = "What only looks like a void"
-    return PrintedTable("probe_look_alikes", title, named, columns, notes, absent, deviation=DRAWS)
+    return PrintedTable("probe_look_alikes", title, table_rows, columns, notes, reason, deviation=DRAWS)
 
 
 OPPOSITES = {"answerable_void": "voids", "answerable_control": "controls", "time_swapped": "its other side"}
@@ -153,7 +155,7 @@ def _dose(rows: pd.DataFrame) -> list[str]:
 
 def _nulls(results: Results) -> PrintedTable:
     rows = results.nulls
-    named = rows.assign(step=_dose(rows), dataset=short_names(rows["target"]), mark=few(rows, "n"))
+    table_rows = rows.assign(step=_dose(rows), dataset=short_names(rows["target"]), mark=few_marks(rows, "n"))
     columns = [
         MODEL, DIRECTIONS, INFERENCE, Column("dataset", "Dataset"), LAYER, DOSE, Column("side", "Side"),
         Column("null", "Null"), Column("effect", "Effect, points", "percent", mark="mark"),
@@ -165,21 +167,21 @@ def _nulls(results: Results) -> PrintedTable:
         "effect: more abstention on controls (+), less on voids (−), against the unsteered answers of the same items",
         "nulls are orthogonal to the void direction and have its length; p = (1 + draws at least as large) / "
         "(1 + draws), one-sided, not corrected for the number of rows",
-        *_ahead(rows),
-        *few_note(named),
+        *_extent_beyond_nulls(rows),
+        *few_note(table_rows),
     ]
-    absent = why(results, "the paper has no such nulls")
-    return PrintedTable("steering_nulls", "Void directions among their nulls", named, columns, notes, absent)
+    reason = why(results, "the paper has no such nulls")
+    return PrintedTable("steering_nulls", "Void directions among their nulls", table_rows, columns, notes, reason)
 
 
-def _ahead(rows: pd.DataFrame) -> list[str]:
+def _extent_beyond_nulls(rows: pd.DataFrame) -> list[str]:
     """Return where the void direction exceeds at least 95 % of its nulls, in words."""
     targets = rows.loc[rows["target"] != "all"]
     if targets.empty:
         return []
     count = int((20 * targets["n_at_least"] <= targets["draws"]).sum())
-    where = f"in {count} of {len(targets)} rows" if count else "nowhere"
-    return [f"the void direction is ahead of 19 of 20 draws {where}; one row in ten would be so by chance"]
+    extent = f"in {count} of {len(targets)} rows" if count else "nowhere"
+    return [f"the void direction is ahead of 19 of 20 draws {extent}; one row in ten would be so by chance"]
 
 
 MODEL_OF = ("model", "directions", "regime")
@@ -190,14 +192,16 @@ def _pecs(results: Results) -> PrintedTable:
 
     rows = results.steering_pecs
     rows = rows.loc[rows["source"] == rows["target"]]
-    unsteered = rows["dose"] == 0  # once per path: the unsteered model is the same in every unit and under all signs
-    named = pd.concat([rows.loc[unsteered].drop_duplicates([*MODEL_OF, "source", "target"]), rows.loc[~unsteered]])
-    rows = named.sort_values([*MODEL_OF, "source"], kind="stable", ignore_index=True)
-    named = rows.assign(
+    is_unsteered = rows["dose"] == 0  # once per path: the unsteered model is the same in every unit and under all signs
+    table_rows = pd.concat(
+        [rows.loc[is_unsteered].drop_duplicates([*MODEL_OF, "source", "target"]), rows.loc[~is_unsteered]]
+    )
+    rows = table_rows.sort_values([*MODEL_OF, "source"], kind="stable", ignore_index=True)
+    table_rows = rows.assign(
         step=_dose(rows),
         policy=[SIGNS[name] if dose else "not steered" for name, dose in zip(rows["signs"], rows["dose"], strict=True)],
         path=path_names(rows),
-        mark=few(rows, "n_controls", "n_voids"),
+        mark=few_marks(rows, "n_controls", "n_voids"),
     )
     columns = [
         MODEL, DIRECTIONS, INFERENCE, PATH, LAYER, Column("policy", "Signs"), DOSE,
@@ -210,10 +214,10 @@ def _pecs(results: Results) -> PrintedTable:
         "each dataset along its own direction; + on controls and − on voids needs the side of each item, which nobody "
         "has who uses a model",
         "degenerate: cut off, a phrase four times in a row, or another script or language than the unsteered answer",
-        *few_note(named),
+        *few_note(table_rows),
     ]
-    absent = why(results, "the paper prints no correctness of steered answers")
-    return PrintedTable("steering_pecs", "PECS of the steered model", named, columns, notes, absent)
+    reason = why(results, "the paper prints no correctness of steered answers")
+    return PrintedTable("steering_pecs", "PECS of the steered model", table_rows, columns, notes, reason)
 
 
 # --- the gate ---------------------------------------------------------------------------------------------------------
@@ -244,15 +248,15 @@ _GATE_NOTES = (
 def _gates(results: Results) -> pd.DataFrame:
     """Return gate rows; states, other datasets, mid threshold, all datasets first."""
     rows = results.gate
-    firsts = {"features": "states", **DEFAULT_GATE, "target": "all"}
-    later = {f"{name}_later": rows[name].astype(object) != first for name, first in firsts.items()}
-    rows = rows.assign(**later).sort_values(["model", "regime", *later], kind="stable", ignore_index=True)
+    first_values = {"features": "states", **DEFAULT_GATE, "target": "all"}
+    is_later = {f"{name}_later": rows[name].astype(object) != first for name, first in first_values.items()}
+    rows = rows.assign(**is_later).sort_values(["model", "regime", *is_later], kind="stable", ignore_index=True)
     return rows.assign(
-        mark=few(rows, "n_controls", "n_voids"),
+        mark=few_marks(rows, "n_controls", "n_voids"),
         layer=rows["layer"].where(rows["layer"] >= 0),  # a mean over datasets has no layer of its own
         dataset=short_names(rows["target"]),
         sources=[SOURCE_NAMES.get(name, name) for name in rows["source"]],
-    ).drop(columns=[*later])
+    ).drop(columns=[*is_later])
 
 
 def _gate_sources(results: Results) -> PrintedTable:
@@ -268,8 +272,8 @@ def _gate_sources(results: Results) -> PrintedTable:
         "conformal: at most 5 % of new source controls in expectation, or as the experiment says",
         *few_note(rows),
     ]
-    absent = why(results, "the paper gates nothing")
-    return PrintedTable("gate", "Probe-gated abstention", rows, columns, notes, absent)
+    reason = why(results, "the paper gates nothing")
+    return PrintedTable("gate", "Probe-gated abstention", rows, columns, notes, reason)
 
 
 def _gate_controls(results: Results) -> PrintedTable:
@@ -283,8 +287,8 @@ def _gate_controls(results: Results) -> PrintedTable:
         "and on an untrained model’s states",
         *few_note(rows),
     ]
-    absent = why(results, "the paper gates nothing")
-    return PrintedTable("gate_controls", "The gate beside its controls", rows, columns, notes, absent)
+    reason = why(results, "the paper gates nothing")
+    return PrintedTable("gate_controls", "The gate beside its controls", rows, columns, notes, reason)
 
 
 def _gate_answerable(results: Results) -> PrintedTable:
@@ -292,7 +296,7 @@ def _gate_answerable(results: Results) -> PrintedTable:
     rows = rows.loc[~rows["target"].isin([*SHORT, "all"]) & (rows["source"] == DEFAULT_GATE["source"])]
     rows = rows.loc[rows["target"].isin([*SOURCE_WORDS]) & (rows["target"] != "chaotic_time_swapped")]
     rows = rows.drop_duplicates(["model", "features", "threshold", "target"])  # gates know no regime here
-    rows = rows.assign(what=[SOURCE_WORDS[name] for name in rows["target"]], mark=few(rows, "n_controls"))
+    rows = rows.assign(what=[SOURCE_WORDS[name] for name in rows["target"]], mark=few_marks(rows, "n_controls"))
     columns = [
         MODEL, Column("features", "Features"), Column("threshold", "Threshold"), Column("what", "Items"),
         Column("false_abs", "Abstained on %", "percent", mark="mark"),
@@ -302,8 +306,8 @@ def _gate_answerable(results: Results) -> PrintedTable:
         "all of these items can be answered, so that every abstention of a gate is a false one",
         *few_note(rows, of="items"),
     ]
-    absent = why(results, "the paper gates nothing")
-    return PrintedTable("gate_answerable", "The gate on items that can be answered", rows, columns, notes, absent)
+    reason = why(results, "the paper gates nothing")
+    return PrintedTable("gate_answerable", "The gate on items that can be answered", rows, columns, notes, reason)
 
 
 def prompts(results: Results) -> pd.DataFrame:
@@ -316,24 +320,24 @@ def prompts(results: Results) -> pd.DataFrame:
     import pandas as pd
 
     keys = ["model", "dataset"]
-    plain = results.gate.loc[results.gate["target"].isin(DATASETS)].rename(columns={"target": "dataset"})
-    plain = plain.astype({"regime": object, "dataset": object})
-    table = plain.pivot_table(index=keys, columns="regime", values="plain_abs_rec", observed=True)
+    gate_rows = results.gate.loc[results.gate["target"].isin(DATASETS)].rename(columns={"target": "dataset"})
+    gate_rows = gate_rows.astype({"regime": object, "dataset": object})
+    table = gate_rows.pivot_table(index=keys, columns="regime", values="plain_abs_rec", observed=True)
     table = table.reindex(columns=pd.Index(PROMPTING)).add_prefix("said_")
     table["change"] = table["said_guided"] - table["said_standard"]
-    counted = {"n_answered": (plain, "n_voids")}
-    own = [results.prompted_probes.loc[results.prompted_probes["chosen"].eq(True)]]
-    own += [results.prompted_baselines.loc[results.prompted_baselines["features"] == "output margin"]]
-    for name, rows in zip(("probe", "margin"), own, strict=True):
+    count_columns = {"n_answered": (gate_rows, "n_voids")}
+    prompt_probes = [results.prompted_probes.loc[results.prompted_probes["chosen"].eq(True)]]
+    prompt_probes += [results.prompted_baselines.loc[results.prompted_baselines["features"] == "output margin"]]
+    for name, rows in zip(("probe", "margin"), prompt_probes, strict=True):
         rows = rows.loc[(rows["analysis"] == "held_out") & (rows["source"] == rows["target"])]
         rows = rows.rename(columns={"target": "dataset"}).astype({"prompt": object, "dataset": object})
-        wide = rows.pivot_table(index=keys, columns="prompt", values="value", observed=True)
-        table = table.join(wide.reindex(columns=pd.Index(PROMPTING)).add_prefix(f"{name}_"))
+        by_prompt = rows.pivot_table(index=keys, columns="prompt", values="value", observed=True)
+        table = table.join(by_prompt.reindex(columns=pd.Index(PROMPTING)).add_prefix(f"{name}_"))
         if name == "probe":
-            counted |= {count: (rows, count) for count in ("n_voids", "n_controls")}
-    for name, (rows, count) in counted.items():
+            count_columns |= {count: (rows, count) for count in ("n_voids", "n_controls")}
+    for name, (rows, count) in count_columns.items():
         table[name] = rows.groupby(keys)[count].min().reindex(table.index)
-    floor = against(results, "held_out").reset_index()
+    floor = best_baselines(results, "held_out").reset_index()
     floor = floor.loc[floor["source"] == floor["target"]].rename(columns={"target": "dataset"})
     return table.reset_index().merge(floor[[*keys, "raw", "raw_value", "noise", "noise_spread"]], on=keys, how="left")
 
@@ -342,8 +346,8 @@ def _prompts(results: Results) -> PrintedTable:
     rows = prompts(results)
     rows = rows.assign(
         name=short_names(rows["dataset"]),
-        said_mark=few(rows, "n_answered"),
-        probe_mark=few(rows, "n_voids", "n_controls"),
+        said_mark=few_marks(rows, "n_answered"),
+        probe_mark=few_marks(rows, "n_voids", "n_controls"),
     )
     columns = [
         MODEL, Column("name", "Dataset"), Column("said_standard", "AbsRec %, standard", "percent", mark="said_mark"),
@@ -362,6 +366,6 @@ def _prompts(results: Results) -> PrintedTable:
         _NOTES[1],
         *few_note(rows, "said_mark", "probe_mark"),
     ]
-    absent = why(results, "the paper prints no such figures")
+    reason = why(results, "the paper prints no such figures")
     title = "What the prompt changes, in answers and in states"
-    return PrintedTable("prompt_gate", title, rows, columns, notes, absent, deviation=DRAWS)
+    return PrintedTable("prompt_gate", title, rows, columns, notes, reason, deviation=DRAWS)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from traps_pipeline.protocol.regimes import ANSWER_FROM, WRONG_COSTS
 from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.tables.table_columns import MODEL, REGIME, figure_with_interval, ordered
+from traps_pipeline.report.tables.table_columns import MODEL, REGIME, figure_with_interval, sort_rows
 from traps_pipeline.report.writing import Column, PrintedTable, fraction
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ def graded(results: Results) -> list[PrintedTable]:
         f"{name}_shown": [figure_with_interval(row, name, two_digits) for row in rows.to_dict("records")]
         for name in ("points", "brier")
     }
-    rows = ordered(rows.assign(**columns_of), ["regime", "model"])
+    rows = sort_rows(rows.assign(**columns_of), ["regime", "model"])
     columns = [
         MODEL, REGIME, Column("n_items", "Cuts", "count"), Column("n_missing", "Missing", "count"),
         Column("coverage", "Answers %", "percent"), Column("risk", "Wrong %", "percent"),
@@ -43,9 +43,9 @@ def graded(results: Results) -> list[PrintedTable]:
 
 
 def _notes(rows: pd.DataFrame) -> list[str]:
-    most = rows.loc[rows["n_items"].idxmax()]
-    known = ("points_ideal", "points_best", "points_prior", "brier_ideal", "brier_even")
-    figures = {name: fraction(most[name], 2) for name in known}
+    largest_row = rows.loc[rows["n_items"].idxmax()]
+    reference_columns = ("points_ideal", "points_best", "points_prior", "brier_ideal", "brier_even")
+    figures = {name: fraction(largest_row[name], 2) for name in reference_columns}
     return [
         f"points a question: 1 for a right answer, -{WRONG_COSTS} for a wrong one, 0 for an abstention, as expected by "
         f"the cut's posterior; from a probability of {ANSWER_FROM:g} on an answer is worth its risk",

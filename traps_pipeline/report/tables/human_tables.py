@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.protocol.metric_words import METRIC_WORDS, SHARES
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.table_columns import (
@@ -14,7 +14,7 @@ from traps_pipeline.report.tables.table_columns import (
     REGIME,
     RUNS,
     figure_with_interval,
-    ordered,
+    sort_rows,
     with_titles,
 )
 from traps_pipeline.report.writing import NOT_RUN, Column, PrintedTable, fraction, percent
@@ -29,7 +29,7 @@ _PERCENT = (*SHARES, "sensitivity", "specificity")
 
 def people(results: Results) -> list[PrintedTable]:
     """Return people's scores by dataset, and their agreement on clips and answers."""
-    rows = ordered(with_titles(results.human_row), ["dataset"])
+    rows = sort_rows(with_titles(results.human_row), ["dataset"])
     rows = _with_intervals(rows, [*_FIGURES])
     figures = [Column(f"{field}_shown", heading, "range") for field, heading in _FIGURES.items()]
     columns = [
@@ -42,8 +42,8 @@ def people(results: Results) -> list[PrintedTable]:
         "labels of all people pooled; brackets: 95 % interval, Bayesian bootstrap over scenarios with one unseen",
         "agree, α: on whether the clip lets the question be answered",
     ]
-    agreement = ordered(results.human_agreement, ["task", "decision"])
-    of_tasks = [
+    agreement = sort_rows(results.human_agreement, ["task", "decision"])
+    task_notes = [
         Column("task", "Task"), Column("decision", "Decision"), Column("agreement", "Agree %", "percent"),
         Column("alpha", "Krippendorff’s α", "fraction", 2), Column("n_shared", "Labelled twice", "count"),
         Column("n_units", "Labelled", "count"), Column("seconds", "Seconds", "ratio"),
@@ -52,7 +52,7 @@ def people(results: Results) -> list[PrintedTable]:
     return [
         PrintedTable("people", "People", rows, columns, notes if len(rows) else [], BY_PEOPLE),
         PrintedTable(
-            "people_agreement", "Agreement of people", agreement, of_tasks, [], BY_PEOPLE,
+            "people_agreement", "Agreement of people", agreement, task_notes, [], BY_PEOPLE,
             dash="; ".join(undefined) or "undefined",
         ),
     ]  # fmt: skip
@@ -61,7 +61,7 @@ def people(results: Results) -> list[PrintedTable]:
 def judge_corrected(results: Results) -> list[PrintedTable]:
     """Return the panel against people, and the leaderboard corrected for its errors."""
     errors = _with_intervals(results.panel_errors, ["sensitivity", "specificity"])
-    of_panel = [
+    panel_notes = [
         Column("task", "Task"), Column("sensitivity_shown", "Sensitivity %", "range"),
         Column("specificity_shown", "Specificity %", "range"), Column("n_answers", "Answers", "count"),
         Column("n_yes", "People’s yes", "count"), Column("n_tied", "Tied", "count"),
@@ -70,7 +70,7 @@ def judge_corrected(results: Results) -> list[PrintedTable]:
     rows = results.corrected
     overall = rows.loc[rows["dataset"] == "overall"] if "overall" in set(rows["dataset"]) else rows
     entries = _with_intervals(overall, [f"{name}{end}" for name in _FIGURES for end in ("", "_corrected")])
-    entries = ordered(with_titles(entries), ["dataset", "model", "regime"])
+    entries = sort_rows(with_titles(entries), ["dataset", "model", "regime"])
     figures = [
         Column(f"{field}{end}_shown", f"{heading}{', corrected' if end else ''}", "range", group=not end)
         for field, heading in _FIGURES.items()
@@ -84,7 +84,7 @@ def judge_corrected(results: Results) -> list[PrintedTable]:
     reason = "not validated: people labelled no answers (run traps people annotate)"
     reasons = sorted(set(results.panel_errors["undefined"].dropna()))
     return [
-        PrintedTable("panel_errors", "The panel against people", errors, of_panel, reasons, reason),
+        PrintedTable("panel_errors", "The panel against people", errors, panel_notes, reasons, reason),
         PrintedTable(
             "judge_corrected", "Judged, and corrected for the panel’s errors", entries,
             [MODEL, REGIME, DATASET, *figures, RUNS], notes if len(entries) else [], reason,
@@ -94,36 +94,39 @@ def judge_corrected(results: Results) -> list[PrintedTable]:
 
 def _with_intervals(rows: pd.DataFrame, fields: list[str]) -> pd.DataFrame:
     """Return the rows with `FIELD_shown`: the figure and its interval as printed."""
-    columns = {f"{field}_shown": [_ranged(row, field) for row in rows.to_dict("records")] for field in fields}
+    columns = {f"{field}_shown": [_with_range(row, field) for row in rows.to_dict("records")] for field in fields}
     return rows.assign(**columns)
 
 
-def _ranged(row: Mapping[Any, Any], field: str) -> str:
+def _with_range(row: Mapping[Any, Any], field: str) -> str:
     return figure_with_interval(row, field, percent if field.removesuffix("_corrected") in _PERCENT else fraction)
 
 
-def said_by_people(human_row: pd.DataFrame, panel_errors: pd.DataFrame) -> list[str]:
+def people_notes(human_row: pd.DataFrame, panel_errors: pd.DataFrame) -> list[str]:
     """Return leaderboard notes: people's scores, and whether the panel was validated."""
-    return [f"people: {_score_of_people(human_row)}", f"the panel: {_validated(panel_errors)}"]
+    return [f"people: {_score_of_people(human_row)}", f"the panel: {_validation_note(panel_errors)}"]
 
 
 def _score_of_people(rows: pd.DataFrame) -> str:
     if rows.empty:
         return f"{NOT_RUN}, {BY_PEOPLE}"
-    by_dataset = {row["dataset"]: row for row in rows.to_dict("records")}
-    row = by_dataset.get("overall", {})
+    row_of = {row["dataset"]: row for row in rows.to_dict("records")}
+    row = row_of.get("overall", {})
     if not row or row["pecs"] != row["pecs"]:
         return f"{NOT_RUN} in full, since PECS needs labels of both sides of all four datasets"
-    figures = ", ".join(f"{heading.removesuffix(' %')} {_ranged(row, field)}" for field, heading in _FIGURES.items())
-    readers, clips_seen = counted(row["n_people"], "person", "people"), counted(row["n_clips"], "clip")
+    figures = ", ".join(
+        f"{heading.removesuffix(' %')} {_with_range(row, field)}" for field, heading in _FIGURES.items()
+    )
+    readers, clips_seen = count_noun(row["n_people"], "person", "people"), count_noun(row["n_clips"], "clip")
     return f"{figures} ({readers}, {clips_seen}, {row['seconds']:.0f} s a clip)"
 
 
-def _validated(rows: pd.DataFrame) -> str:
+def _validation_note(rows: pd.DataFrame) -> str:
     if rows.empty:
         return "not validated, people have labelled none of its answers (run traps people annotate)"
     remarks = [
-        f"{row['task']} sensitivity {_ranged(row, 'sensitivity')} %, specificity {_ranged(row, 'specificity')} %"
+        f"{row['task']} sensitivity {_with_range(row, 'sensitivity')} %, "
+        f"specificity {_with_range(row, 'specificity')} %"
         for row in rows.to_dict("records")
     ]
     remainder = " (the other task is not validated)" if len(remarks) == 1 else ""

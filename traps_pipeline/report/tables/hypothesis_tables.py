@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.tables.table_columns import MODEL, REGIME, figure_with_interval, ordered
+from traps_pipeline.report.tables.table_columns import MODEL, REGIME, figure_with_interval, sort_rows
 from traps_pipeline.report.writing import NONE, NOT_RUN, Column, PrintedTable, percent
 
 if TYPE_CHECKING:
@@ -62,9 +62,9 @@ def _hypothesis_table(rows: pd.DataFrame, hypothesis: Hypothesis) -> PrintedTabl
         notes.append(
             "through an occluder of these alphas the outcome is seen: FalseAbs is the share that abstains all the same"
         )
-    refused = doses.dropna(subset=["refused"]).to_dict("records")
-    notes += [f"{row['model']}, {row['dose']}: not compared, {row['refused']}" for row in refused]
-    rows = ordered(doses, ["model", "regime", "place"])
+    refusals = doses.dropna(subset=["refused"]).to_dict("records")
+    notes += [f"{row['model']}, {row['dose']}: not compared, {row['refused']}" for row in refusals]
+    rows = sort_rows(doses, ["model", "regime", "place"])
     name = f"hypothesis_{hypothesis.name.replace(' ', '_')}"
     return PrintedTable(name, _TITLES[hypothesis.name], rows, columns, notes if len(doses) else [], WHY_EMPTY)
 

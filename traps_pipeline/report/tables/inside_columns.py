@@ -45,7 +45,7 @@ def why(results: Results, of_paper: str = "") -> str:
     return NO_MECHANISM if results.is_study and results.mechanism is None else results.why("probes")
 
 
-def few(rows: pd.DataFrame, *counts: str) -> list[str]:
+def few_marks(rows: pd.DataFrame, *counts: str) -> list[str]:
     """Return each row's mark: a dagger if a known count is below FEW, else empty."""
     import pandas as pd
 
@@ -55,8 +55,8 @@ def few(rows: pd.DataFrame, *counts: str) -> list[str]:
 
 def few_note(rows: pd.DataFrame, *marks: str, of: str = "controls or voids") -> list[str]:
     """Return the mark's meaning if a row has it; `of` names the counted things."""
-    used = any((rows[name] == FEW_MARK).any() for name in marks or ("mark",) if name in rows)
-    return [f"{FEW_MARK} fewer than {FEW} {of}: the value says little"] if used else []
+    has_mark = any((rows[name] == FEW_MARK).any() for name in marks or ("mark",) if name in rows)
+    return [f"{FEW_MARK} fewer than {FEW} {of}: the value says little"] if has_mark else []
 
 
 def interval(prefix: str = "", unit: str = "fraction", digits: int | None = None) -> list[Column]:
@@ -82,13 +82,13 @@ def by_features(results: Results) -> pd.DataFrame:
     import pandas as pd
 
     rows = results.baselines
-    wide = rows.pivot_table(index=PROBE_KEY, columns="features", values="value", observed=True)
-    wide = wide.reindex(columns=pd.Index([*SHORTCUTS, "output margin", "noise"]))
+    by_feature = rows.pivot_table(index=PROBE_KEY, columns="features", values="value", observed=True)
+    by_feature = by_feature.reindex(columns=pd.Index([*SHORTCUTS, "output margin", "noise"]))
     spread = rows.loc[rows["features"] == "noise"].set_index(PROBE_KEY)["spread"]
-    return wide.join(spread.rename("noise_spread")).reset_index().astype(dict.fromkeys(PROBE_KEY, object))
+    return by_feature.join(spread.rename("noise_spread")).reset_index().astype(dict.fromkeys(PROBE_KEY, object))
 
 
-def against(results: Results, analysis: str) -> pd.DataFrame:
+def best_baselines(results: Results, analysis: str) -> pd.DataFrame:
     """Return BESIDE by model, source and target: best raw input, margin and noise."""
     import pandas as pd
 
@@ -96,15 +96,15 @@ def against(results: Results, analysis: str) -> pd.DataFrame:
     rows = rows.loc[rows["analysis"] == analysis].set_index(KEYS)
     raw = rows[[*SHORTCUTS]].astype(float)
     best = [best_name(row) for row in raw.to_dict("records")]
-    own = rows[["output margin", "noise", "noise_spread"]].rename(columns={"output margin": "margin"})
-    return pd.DataFrame({"raw": best, "raw_value": raw.max(axis=1)}, index=rows.index).join(own)
+    baseline_columns = rows[["output margin", "noise", "noise_spread"]].rename(columns={"output margin": "margin"})
+    return pd.DataFrame({"raw": best, "raw_value": raw.max(axis=1)}, index=rows.index).join(baseline_columns)
 
 
 def best_name(values: Mapping[Any, float]) -> str:
     """Return the feature of highest AUROC, NO_RAW if ≤ 0.5, empty if none is known."""
-    known = {str(name): value for name, value in values.items() if value == value}
-    best = max(known, key=lambda name: known[name], default="")
-    return NO_RAW if best and known[best] <= 0.5 else best
+    known_values = {str(name): value for name, value in values.items() if value == value}
+    best = max(known_values, key=lambda name: known_values[name], default="")
+    return NO_RAW if best and known_values[best] <= 0.5 else best
 
 
 def baseline_columns(results: Results, prefix: str = "", head: str = "") -> list[Column]:

@@ -15,7 +15,7 @@ from traps_pipeline.report.tables.table_columns import (
     N,
     cell_trace,
     epochs,
-    ordered,
+    sort_rows,
     with_titles,
 )
 from traps_pipeline.report.writing import Column, PrintedTable, SourceItems, Trace
@@ -29,7 +29,7 @@ def agreement(results: Results) -> list[PrintedTable]:
     rows = results.agreement
     pairs = rows.loc[rows["judges"] != "panel"].groupby(["dataset", "task"])["agreement"].min().rename("lowest_pair")
     rows = rows.loc[rows["judges"] == "panel"].merge(pairs.reset_index(), on=["dataset", "task"], how="left")
-    rows = ordered(with_titles(rows), ["dataset", "task"])
+    rows = sort_rows(with_titles(rows), ["dataset", "task"])
     columns = [
         DATASET, Column("task", "Task"), Column("agreement", "Unanimous %", "percent"),
         Column("fleiss_kappa", "Fleiss’ κ", "fraction"), Column("alpha", "Krippendorff’s α", "fraction"),
@@ -37,7 +37,7 @@ def agreement(results: Results) -> list[PrintedTable]:
         Column("invalid", "Invalid %", "percent", 2), Column("n_items", "n", "count"),
         Column("n_undecided", "Undecided", "count"),
     ]  # fmt: skip
-    notes = [epochs(rows), *_undefined(rows), "unanimous and κ over answers with three valid votes"]
+    notes = [epochs(rows), *_undefined_reasons(rows), "unanimous and κ over answers with three valid votes"]
     reason = results.why("agreement")
     return [PrintedTable("judge_agreement", "Agreement of the judges", rows, columns, notes, reason, _task_trace)]
 
@@ -46,14 +46,14 @@ def _task_trace(row: Mapping[str, Any], field: str) -> SourceItems:
     return SourceItems(row["dataset"], "", "", "void" if row["task"] == "void_abstention" else "control")
 
 
-def _undefined(rows: pd.DataFrame) -> list[str]:
+def _undefined_reasons(rows: pd.DataFrame) -> list[str]:
     reasons = [str(reason) for reason in rows["undefined"].dropna().unique()]
     return [f"undefined: {'; '.join(sorted(reasons))}"] if reasons else []
 
 
 def judge_bias(results: Results) -> list[PrintedTable]:
     """Return the bias of every judge against the panel, and PECS without that judge."""
-    bias = ordered(with_titles(results.bias), ["dataset", "task", "judge"])
+    bias = sort_rows(with_titles(results.bias), ["dataset", "task", "judge"])
     columns = [
         DATASET, Column("task", "Task"), Column("judge", "Judge"), Column("yes", "Yes %", "percent"),
         Column("panel_yes", "Panel’s yes %", "percent"), Column("bias", "Bias, points", "percent"),
@@ -66,8 +66,8 @@ def judge_bias(results: Results) -> list[PrintedTable]:
         if "overall" in set(leave_one_out["dataset"])
         else leave_one_out
     )
-    leave_one_out = ordered(with_titles(leave_one_out), ["model", "regime", "without"])
-    without = [
+    leave_one_out = sort_rows(with_titles(leave_one_out), ["model", "regime", "without"])
+    leave_one_out_columns = [
         MODEL, REGIME, DATASET, Column("without", "Without"),
         Column("pecs", "PECS of two", "fraction"), Column("pecs_panel", "PECS of three", "fraction"),
         Column("difference", "Difference", "fraction"), N, RUNS, MISSING,
@@ -77,7 +77,13 @@ def judge_bias(results: Results) -> list[PrintedTable]:
     return [
         PrintedTable("judge_bias", "Each judge against the panel", bias, columns, [epochs(bias)], reason, _task_trace),
         PrintedTable(
-            "leave_one_judge_out", "PECS without one judge", leave_one_out, without, notes, reason, cell_trace
+            "leave_one_judge_out",
+            "PECS without one judge",
+            leave_one_out,
+            leave_one_out_columns,
+            notes,
+            reason,
+            cell_trace,
         ),
     ]
 

@@ -20,11 +20,11 @@ from traps_pipeline.report.tables.table_columns import (
     cell_trace,
     epochs,
     interval,
-    marked,
     marks,
     no_overall,
-    ordered,
     ranks,
+    sort_rows,
+    with_marks,
     with_titles,
 )
 from traps_pipeline.report.terms import TITLES
@@ -47,7 +47,7 @@ def replication_overall(results: Results) -> list[PrintedTable]:
 
 
 def _overall(results: Results, name: str, title: str, replication: bool) -> PrintedTable:
-    rows = marked(results.overall)
+    rows = with_marks(results.overall)
     rows = rows.loc[rows["model"].isin(analyses.models_of(group="replication")) == replication]
     columns = [MODEL, REGIME, PECS, *SHARES, J]
     notes = [epochs(results.cells), "equal-weight mean over the four datasets", *marks(rows)]
@@ -56,8 +56,10 @@ def _overall(results: Results, name: str, title: str, replication: bool) -> Prin
         rows = rows.assign(ci=[interval(row) for row in records], ranks=[ranks(row) for row in records])
         columns[3:3] = [Column("ci", "95 % CI", "range"), Column("ranks", "Rank", "range")]
         notes.append("rank by PECS within the regime; 2–4: paired contrasts (Holm) do not separate these ranks")
-        printed = published_overall().loc[:, ["model", "regime", "pecs"]].rename(columns={"pecs": "published_pecs"})
-        rows = rows.merge(printed, on=["model", "regime"], how="left")
+        published_scores = (
+            published_overall().loc[:, ["model", "regime", "pecs"]].rename(columns={"pecs": "published_pecs"})
+        )
+        rows = rows.merge(published_scores, on=["model", "regime"], how="left")
         if rows["published_pecs"].notna().any():
             columns.append(Column("published_pecs", "published PECS", "fraction"))
             notes.append("published PECS: as printed in the paper, from its own benchmark and epochs")
@@ -70,7 +72,7 @@ def per_dataset(results: Results) -> list[PrintedTable]:
     """Return PECS of every model and regime on each dataset, and overall."""
     import pandas as pd
 
-    cells = marked(results.cells)
+    cells = with_marks(results.cells)
     cells = cells.loc[~cells["model"].isin(analyses.models_of(group="replication"))]
     index = ["model", "regime"]
     rows = cells[index].drop_duplicates()
@@ -82,7 +84,7 @@ def per_dataset(results: Results) -> list[PrintedTable]:
         heading = _n(TITLES[dataset], part[f"{dataset}_n"])
         columns.append(Column(dataset, heading, "fraction", spread=f"{dataset}_std", mark=f"{dataset}_mark"))
     names = {"pecs": "mean", "pecs_std": "mean_std", "mark": "mean_mark"}
-    overall = marked(results.overall).reindex(columns=pd.Index([*index, *names])).rename(columns=names)
+    overall = with_marks(results.overall).reindex(columns=pd.Index([*index, *names])).rename(columns=names)
     rows = rows.merge(overall, on=index, how="left")
     columns.append(Column("mean", "Mean", "fraction", spread="mean_std", mark="mean_mark"))
     rows = rows.sort_values("mean", ascending=False, na_position="last", ignore_index=True, kind="stable")
@@ -93,9 +95,9 @@ def per_dataset(results: Results) -> list[PrintedTable]:
 
 def replication_per_dataset(results: Results) -> list[PrintedTable]:
     """Return the replication families' figures on each dataset."""
-    cells = marked(results.cells)
+    cells = with_marks(results.cells)
     rows = cells.loc[cells["model"].isin(analyses.models_of(group="replication"))]
-    rows = ordered(with_titles(rows), ["model", "dataset", "regime"])
+    rows = sort_rows(with_titles(rows), ["model", "dataset", "regime"])
     columns = [MODEL, DATASET, REGIME, PECS, *SHARES, *COUNTS, EPOCH]
     notes = [epochs(rows), *marks(rows)]
     reason = "no model of the replication families"
@@ -105,13 +107,13 @@ def replication_per_dataset(results: Results) -> list[PrintedTable]:
 
 def _n(title: str, counts: pd.Series) -> str:
     """Return a heading with the number of pairs, if it is the same in all rows."""
-    known = counts.dropna().unique()
-    return f"{title} (n = {int(known[0])})" if len(known) == 1 else title
+    known_counts = counts.dropna().unique()
+    return f"{title} (n = {int(known_counts[0])})" if len(known_counts) == 1 else title
 
 
 def expanded(results: Results) -> list[PrintedTable]:
     """Return Acc, AbsRec, FalseAbs, PECS of every model, by dataset and regime."""
-    cells = marked(results.cells)
+    cells = with_marks(results.cells)
     tables = []
     for dataset in DATASETS:
         for regime in PAPER_REGIMES:

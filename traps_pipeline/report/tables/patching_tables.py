@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.tables.inside_columns import LAYER, few, few_note, interval, short_names
+from traps_pipeline.report.tables.inside_columns import LAYER, few_marks, few_note, interval, short_names
 from traps_pipeline.report.tables.table_columns import MODEL
 from traps_pipeline.report.writing import Column, PrintedTable
 
@@ -15,17 +15,17 @@ def patching(results: Results) -> list[PrintedTable]:
     rows = results.patching
     keys = ["model", "dataset", "into", "site", "layer", "group"]
     nulls = rows.loc[rows["source"] != "pair"]
-    wide = nulls.pivot_table(index=keys, columns="source", values="effect", observed=True)
+    null_grid = nulls.pivot_table(index=keys, columns="source", values="effect", observed=True)
     names = ["other scenario", "same side", "other times"]
-    own = rows.loc[(rows["source"] == "pair") & rows["effect"].notna()].astype(dict.fromkeys(keys, object))
-    table = own.merge(
-        wide.reindex(columns=names).reset_index().astype(dict.fromkeys(keys, object)), on=keys, how="left"
+    pair_effects = rows.loc[(rows["source"] == "pair") & rows["effect"].notna()].astype(dict.fromkeys(keys, object))
+    table = pair_effects.merge(
+        null_grid.reindex(columns=names).reset_index().astype(dict.fromkeys(keys, object)), on=keys, how="left"
     )
     table = table.assign(
         name=short_names(table["dataset"]),
         where=[SITES.get(site, site) for site in table["site"]],
         place=[[*SITES].index(site) if site in SITES else len(SITES) for site in table["site"]],
-        mark=few(table, "n"),
+        mark=few_marks(table, "n"),
     )
     table = table.sort_values(["model", "name", "into", "place"], kind="stable", ignore_index=True)
     columns = [
@@ -49,5 +49,5 @@ def patching(results: Results) -> list[PrintedTable]:
         "site, layer and positions whose estimates are largest",
         *few_note(table, of="pairs"),
     ]
-    absent = "the experiment asks for no `patching`" if results.is_study else "the paper patches nothing"
-    return [PrintedTable("patching", "Activation patching", table, columns, notes, absent)]
+    reason = "the experiment asks for no `patching`" if results.is_study else "the paper patches nothing"
+    return [PrintedTable("patching", "Activation patching", table, columns, notes, reason)]

@@ -20,10 +20,10 @@ from traps_pipeline.report.tables.inside_columns import (
     SHORTCUTS,
     SIDES,
     TYPE,
-    against,
     baseline_columns,
     baseline_notes,
-    few,
+    best_baselines,
+    few_marks,
     few_note,
     interval,
     short_names,
@@ -41,7 +41,12 @@ if TYPE_CHECKING:
 def probes(results: Results) -> list[PrintedTable]:
     """Return probes between datasets at best and chosen layers, Cf->Cf, and means."""
     pairs = _pairs(results)
-    tables = [_transfer(results, pairs), _confabulated(results, pairs), _means(results, pairs), _within_table(results)]
+    tables = [
+        _transfer(results, pairs),
+        _confabulated_table(results, pairs),
+        _means(results, pairs),
+        _within_table(results),
+    ]
     return [*tables, _layers(results), _catch(results)]
 
 
@@ -80,12 +85,12 @@ def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
     import pandas as pd
 
     def by_pair(analysis: str, chosen: Any) -> dict[tuple[str, ...], dict[str, Any]]:
-        matching = rows.loc[(rows["analysis"] == analysis) & chosen].drop_duplicates(KEYS)
-        return {tuple(row[key] for key in KEYS): row for row in matching.to_dict("records")}  # pyright: ignore[reportReturnType]
+        layer_rows = rows.loc[(rows["analysis"] == analysis) & chosen].drop_duplicates(KEYS)
+        return {tuple(row[key] for key in KEYS): row for row in layer_rows.to_dict("records")}  # pyright: ignore[reportReturnType]
 
     transfers = by_pair("transfer", rows["model"].notna())
-    known = rows["value"].notna()
-    figures = {name: by_pair(rule.analysis, rows[rule.flag].eq(True) & known) for name, rule in PAIR_FIGURES.items()}
+    is_known = rows["value"].notna()
+    figures = {name: by_pair(rule.analysis, rows[rule.flag].eq(True) & is_known) for name, rule in PAIR_FIGURES.items()}
     notes = [by_pair(name, rows["note"].notna()) for name in ("confabulated", "confabulated_held_out")]
     table = [
         dict(zip(KEYS, key, strict=True))
@@ -109,13 +114,13 @@ def _pairs(results: Results) -> pd.DataFrame:
     if not len(rows):
         return rows
     for prefix, analysis in BASELINES.items():
-        rows = rows.join(against(results, analysis).add_prefix(prefix), on=KEYS)
-    return _marked(rows)
+        rows = rows.join(best_baselines(results, analysis).add_prefix(prefix), on=KEYS)
+    return _with_marks(rows)
 
 
-def _marked(rows: pd.DataFrame) -> pd.DataFrame:
-    cf = few(rows, "cf_n_voids", "cf_n_controls")
-    return rows.assign(mark=few(rows, "best_n_voids", "best_n_controls"), cf_mark=cf)
+def _with_marks(rows: pd.DataFrame) -> pd.DataFrame:
+    cf = few_marks(rows, "cf_n_voids", "cf_n_controls")
+    return rows.assign(mark=few_marks(rows, "best_n_voids", "best_n_controls"), cf_mark=cf)
 
 
 def _transfer(results: Results, rows: pd.DataFrame) -> PrintedTable:
@@ -127,7 +132,7 @@ def _transfer(results: Results, rows: pd.DataFrame) -> PrintedTable:
         MODEL, PATH, TYPE, Column("best_layer", "Best layer", "count"),
         Column("best_value", "AUROC", "fraction", mark="mark"), *interval("best_"),
         Column("chosen_layer", "Chosen layer", "count"), Column("chosen_value", "AUROC there", "fraction"),
-        *_held_out(results), *baseline_columns(results), *([] if results.is_study else cf),
+        *_held_out_columns(results), *baseline_columns(results), *([] if results.is_study else cf),
         Column("best_n_voids", "Voids", "count"), Column("best_n_controls", "Controls", "count"),
     ]  # fmt: skip
     notes = [
@@ -142,12 +147,12 @@ def _transfer(results: Results, rows: pd.DataFrame) -> PrintedTable:
     return PrintedTable("probe_transfer", title, rows, columns, notes, why(results), dash=WHY_UNSHARED, deviation=DRAWS)
 
 
-def _confabulated(results: Results, pairs: pd.DataFrame) -> PrintedTable:
+def _confabulated_table(results: Results, pairs: pd.DataFrame) -> PrintedTable:
     rows = pairs.loc[pairs["cf_value"].notna()].reset_index(drop=True) if len(pairs) else pairs
-    silent = sorted({note for note in pairs["note"] if note}) if len(pairs) else []
+    gap_notes = sorted({note for note in pairs["note"] if note}) if len(pairs) else []
     columns = [
         MODEL, PATH, TYPE, Column("cf_layer", "Best layer", "count"),
-        Column("cf_value", "Cf→Cf", "fraction", mark="cf_mark"), *interval("cf_"), *_held_out(results, "cf_"),
+        Column("cf_value", "Cf→Cf", "fraction", mark="cf_mark"), *interval("cf_"), *_held_out_columns(results, "cf_"),
         Column("cf_own_layer", "Cf’s own layer", "count"), Column("cf_own_value", "Cf→Cf there", "fraction"),
         *baseline_columns(results, "cf_"), Column("cf_n_voids", "Cf voids", "count"),
         Column("cf_n_controls", "Controls", "count"),
@@ -156,16 +161,16 @@ def _confabulated(results: Results, pairs: pd.DataFrame) -> PrintedTable:
         "source and target have only the voids on which the model confabulated under standard in run 1, each with its "
         "control; best layer: that of all samples",
         *_shared_controls(results),
-        *silent,
+        *gap_notes,
         *baseline_notes(results),
         *few_note(rows, "cf_mark"),
     ]
-    absent = why(results, "the paper has these figures in its table of probe transfer")
+    reason = why(results, "the paper has these figures in its table of probe transfer")
     if results.is_study and len(results.probes):
-        absent = "; ".join(silent) or absent
+        reason = "; ".join(gap_notes) or reason
     title = "Probes on confabulated voids (Cf→Cf)"
     rows = rows if results.is_study else rows.head(0)
-    return PrintedTable("probe_confabulated", title, rows, columns, notes, absent, dash=WHY_UNSHARED, deviation=DRAWS)
+    return PrintedTable("probe_confabulated", title, rows, columns, notes, reason, dash=WHY_UNSHARED, deviation=DRAWS)
 
 
 def _means(results: Results, rows: pd.DataFrame) -> PrintedTable:
@@ -174,16 +179,19 @@ def _means(results: Results, rows: pd.DataFrame) -> PrintedTable:
         figures = [*(f"{name}_value" for name in PAIR_FIGURES), *baseline_names, "held_noise", "cf_held_noise"]
         sides = ("best_n_voids", "best_n_controls", "cf_n_voids", "cf_n_controls")
         by = (
-            dict[str, Any].fromkeys(figures, "mean") | {"raw": _listed, "cf_raw": _listed} | dict.fromkeys(sides, "min")
+            dict[str, Any].fromkeys(figures, "mean")
+            | {"raw": _names_by_frequency, "cf_raw": _names_by_frequency}
+            | dict.fromkeys(sides, "min")
         )
         groups = rows.groupby(["model", "transfer_type"], sort=False)
-        rows = _marked(groups.agg(by).assign(n_paths=groups.size()).reset_index())
+        rows = _with_marks(groups.agg(by).assign(n_paths=groups.size()).reset_index())
     columns = [
         MODEL, TYPE, Column("best_value", "AUROC", "fraction", mark="mark"),
         Column("chosen_value", "Chosen layer", "fraction", mark="mark"),
-        *_held_out(results), *baseline_columns(results),
+        *_held_out_columns(results), *baseline_columns(results),
         Column("cf_value", "Cf→Cf", "fraction", mark="cf_mark"),
-        Column("cf_own_value", "Cf→Cf, own layer", "fraction", mark="cf_mark"), *_held_out(results, "cf_", "Cf→Cf: "),
+        Column("cf_own_value", "Cf→Cf, own layer", "fraction", mark="cf_mark"),
+        *_held_out_columns(results, "cf_", "Cf→Cf: "),
         *baseline_columns(results, "cf_", "Cf→Cf: "), Column("n_paths", "Paths", "count"),
     ]  # fmt: skip
     notes = [*_shared_controls(results), *baseline_notes(results), *few_note(rows, "mark", "cf_mark")]
@@ -197,12 +205,12 @@ def _means(results: Results, rows: pd.DataFrame) -> PrintedTable:
     return PrintedTable("probe_means", title, rows, columns, notes, why(results), dash=WHY_UNSHARED, deviation=DRAWS)
 
 
-def _listed(names: pd.Series) -> str:
+def _names_by_frequency(names: pd.Series) -> str:
     """Return the names, each once, the most frequent first."""
     return ", ".join(name for name, _ in Counter(str(name) for name in names if name).most_common())
 
 
-def _held_out(results: Results, prefix: str = "", head: str = "") -> list[Column]:
+def _held_out_columns(results: Results, prefix: str = "", head: str = "") -> list[Column]:
     """Return columns of the held-out score and of the noise floor under its split."""
     if not results.is_study:
         return []
@@ -227,15 +235,15 @@ def _shared_controls(results: Results) -> list[str]:
 
 def _within_table(results: Results) -> PrintedTable:
     rows = results.probes
-    shuffled = rows.loc[rows["analysis"] == "shuffled"].groupby(["model", "source"], sort=False, dropna=False)
-    table = shuffled.agg(shuffled=("value", "mean"), spread=("spread", "mean")).reset_index()
+    shuffled_means = rows.loc[rows["analysis"] == "shuffled"].groupby(["model", "source"], sort=False, dropna=False)
+    table = shuffled_means.agg(shuffled=("value", "mean"), spread=("spread", "mean")).reset_index()
     best = rows.loc[(rows["analysis"] == "within") & rows["own_best"], ["model", "source", "layer", "value"]]
     table = table.merge(best, on=["model", "source"], how="left")
-    itself = rows.loc[(rows["analysis"] == "held_out") & (rows["source"] == rows["target"]) & rows["chosen"]]
-    itself = itself[["model", "source", "target", "value", "low", "high", "n_voids", "n_controls"]]
-    table = table.merge(itself.rename(columns={"value": "pooled"}), on=["model", "source"], how="left")
-    table = table.join(against(results, "held_out"), on=KEYS)
-    table = table.assign(dataset=short_names(table["source"]), mark=few(table, "n_voids", "n_controls"))
+    own_rows = rows.loc[(rows["analysis"] == "held_out") & (rows["source"] == rows["target"]) & rows["chosen"]]
+    own_rows = own_rows[["model", "source", "target", "value", "low", "high", "n_voids", "n_controls"]]
+    table = table.merge(own_rows.rename(columns={"value": "pooled"}), on=["model", "source"], how="left")
+    table = table.join(best_baselines(results, "held_out"), on=KEYS)
+    table = table.assign(dataset=short_names(table["source"]), mark=few_marks(table, "n_voids", "n_controls"))
     columns = [
         MODEL, Column("dataset", "Dataset"), Column("layer", "Best layer", "count"),
         Column("value", "AUROC", "fraction", mark="mark"),
@@ -252,8 +260,11 @@ def _within_table(results: Results) -> PrintedTable:
             *BASELINE_NOTES,
         ]
     notes += few_note(table)
-    title, over = "Probes within a dataset", "± standard deviation over shuffles of labels, or over draws of noise"
-    return PrintedTable("probe_within", title, table, columns, notes, why(results), deviation=over)
+    title, spread_note = (
+        "Probes within a dataset",
+        "± standard deviation over shuffles of labels, or over draws of noise",
+    )
+    return PrintedTable("probe_within", title, table, columns, notes, why(results), deviation=spread_note)
 
 
 def _catch(results: Results) -> PrintedTable:
@@ -265,7 +276,7 @@ def _catch(results: Results) -> PrintedTable:
     alarms = controls.agg(false_alarm=("value", "mean"), n_controls=("n_controls", "max"))
     table = table.join(alarms).reset_index()
     table = table.merge(_caught_beside(results), on=["model", "target", "sub_scenario"], how="left")
-    table = table.assign(dataset=short_names(table["target"]), mark=few(table, "n", "n_controls"))
+    table = table.assign(dataset=short_names(table["target"]), mark=few_marks(table, "n", "n_controls"))
     columns = [
         MODEL, Column("dataset", "Target"), Column("sub_scenario", "Sub-scenario"), LAYER,
         Column("rate", "Catch rate %", "percent", mark="mark"), Column("lowest", "lowest", "percent"),
@@ -308,14 +319,16 @@ def _caught_beside(results: Results) -> pd.DataFrame:
 
     keys = ["model", "target", "sub_scenario"]
     rows = _centroids(results.baselines).astype(dict.fromkeys(("model", "features", "analysis"), object))
-    wide = rows.pivot_table(index=[*keys, "features"], columns="analysis", values="value", observed=True)
-    wide = wide.reindex(columns=pd.Index(["centroid_void", "centroid_control"])).reset_index()
-    wide.columns = pd.Index([*keys, "features", "void", "control"])
-    order = wide.assign(above=wide["void"] - wide["control"]).sort_values("above", ascending=False, kind="stable")
+    by_analysis = rows.pivot_table(index=[*keys, "features"], columns="analysis", values="value", observed=True)
+    by_analysis = by_analysis.reindex(columns=pd.Index(["centroid_void", "centroid_control"])).reset_index()
+    by_analysis.columns = pd.Index([*keys, "features", "void", "control"])
+    order = by_analysis.assign(above=by_analysis["void"] - by_analysis["control"]).sort_values(
+        "above", ascending=False, kind="stable"
+    )
     raw = order.loc[order["features"].isin(SHORTCUTS)].drop_duplicates(keys).set_index(keys)
     table = raw[["features"]].rename(columns={"features": "raw"})
     kinds = {"raw": raw} | {
-        name: wide.loc[wide["features"] == features].set_index(keys)
+        name: by_analysis.loc[by_analysis["features"] == features].set_index(keys)
         for name, features in (("margin", "output margin"), ("noise", "noise"))
     }
     for name, part in kinds.items():
@@ -327,7 +340,7 @@ def _layers(results: Results) -> PrintedTable:
     table, notes = layer_curves(results.probes)
     columns = [
         MODEL, LAYER,
-        *(Column(name, f"without {short}", "fraction", mark=f"{name}_mark") for name, short in SHORT.items()
+        *(Column(name, f"without {short_name}", "fraction", mark=f"{name}_mark") for name, short_name in SHORT.items()
           if name in table),
         Column("n_at_top", "Own maxima", "count"),
     ]  # fmt: skip
@@ -338,8 +351,8 @@ def _layers(results: Results) -> PrintedTable:
         "chooses none of them",
         *notes,
     ]
-    absent = why(results, "the paper prints no curves")
-    return PrintedTable("probe_layers", "Layers chosen without the target’s labels", table, columns, notes, absent)
+    reason = why(results, "the paper prints no curves")
+    return PrintedTable("probe_layers", "Layers chosen without the target’s labels", table, columns, notes, reason)
 
 
 def layer_curves(rows: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
@@ -353,16 +366,18 @@ def layer_curves(rows: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
     parts, notes = [pd.DataFrame(columns=pd.Index(["model", "layer", "n_at_top"]))], list[str]()
     for model, group in rows.groupby("model", sort=False):
         curves = pair_curves({str(name): value for name, value in row.items()} for row in group.to_dict("records"))
-        within = group.loc[group["analysis"] == "within", ["source", "layer", "value"]]
-        if not curves or not len(within):
+        within_rows = group.loc[group["analysis"] == "within", ["source", "layer", "value"]]
+        if not curves or not len(within_rows):
             continue
-        part = within.assign(top=within["value"] >= within.groupby("source")["value"].transform("max") - ROUNDING)
+        part = within_rows.assign(
+            top=within_rows["value"] >= within_rows.groupby("source")["value"].transform("max") - ROUNDING
+        )
         part = part.groupby("layer")["top"].sum().rename("n_at_top").to_frame()
-        choices = {name: layer_choice(curves, name) for name in SHORT if name in set(within["source"])}
+        choices = {name: layer_choice(curves, name) for name in SHORT if name in set(within_rows["source"])}
         for name, choice in choices.items():
             part[name] = pd.Series(choice.curve)
             part[f"{name}_mark"] = ["*" if layer == choice.layer else "" for layer in part.index]
         parts.append(part.reset_index().assign(model=model))
-        tied = [f"{SHORT[name]} {len(choice.tied)}" for name, choice in choices.items()]
-        notes.append(f"{model}: layers with the highest mean, by the dataset left out: {', '.join(tied)}")
+        tie_notes = [f"{SHORT[name]} {len(choice.tied)}" for name, choice in choices.items()]
+        notes.append(f"{model}: layers with the highest mean, by the dataset left out: {', '.join(tie_notes)}")
     return pd.concat(parts, ignore_index=True), notes

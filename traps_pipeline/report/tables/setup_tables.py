@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.models.judges import load_judges
 from traps_pipeline.models.registry import Entry, ModelEntry, load_models
 from traps_pipeline.report.result_frames import Results
@@ -36,7 +36,7 @@ def _media_words(media: MediaSpec | None) -> str:
     if media is None:
         return ""
     frames = (
-        counted(media.uniform or 0, "evenly spaced frame")
+        count_noun(media.uniform or 0, "evenly spaced frame")
         if media.fps is None
         else f"{media.fps:g} fps, at most {media.most}"
     )
@@ -47,8 +47,8 @@ def hyperparameters(results: Results) -> list[PrintedTable]:
     """Return parameters sent to models and judges; protocol departures are marked."""
     judges = [*load_judges().values()]
     if results.is_study:
-        voted = set(results.bias["judge"])
-        judges = [judge for judge in judges if judge.id in voted]
+        voting_judges = set(results.bias["judge"])
+        judges = [judge for judge in judges if judge.id in voting_judges]
     rows = [_sent_params(entry, "model") for entry in _entries(results)] + [
         _sent_params(entry, "judge") for entry in judges
     ]
@@ -68,24 +68,24 @@ def hyperparameters(results: Results) -> list[PrintedTable]:
 
 
 def _sent_params(entry: Entry, role: str) -> dict[str, Any]:
-    named = ("temperature", "top_p", "max_tokens", "max_completion_tokens")
-    other_params = {name: value for name, value in entry.params.items() if name not in named}
+    common_names = ("temperature", "top_p", "max_tokens", "max_completion_tokens")
+    other_params = {name: value for name, value in entry.params.items() if name not in common_names}
     return {
         "id": entry.id,
         "role": role,
         "temperature": entry.params.get("temperature"),
         "top_p": entry.params.get("top_p"),
         "max_tokens": entry.max_tokens or None,
-        "other": ", ".join(f"{name}: {_flat(value)}" for name, value in sorted(other_params.items())),
+        "other": ", ".join(f"{name}: {_flatten(value)}" for name, value in sorted(other_params.items())),
         "concurrency": entry.limits.concurrency,
         "retries": entry.limits.retries,
         "waived": "; ".join(f"{name}: {reason}" for name, reason in sorted(entry.waivers.items())),
     }
 
 
-def _flat(value: Any) -> str:
+def _flatten(value: Any) -> str:
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{name}: {_flat(part)}" for name, part in value.items()) + "}"
+        return "{" + ", ".join(f"{name}: {_flatten(part)}" for name, part in value.items()) + "}"
     return str(value)
 
 

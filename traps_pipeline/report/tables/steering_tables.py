@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from traps_pipeline.base.wording import counted
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.mechanism import effects
 from traps_pipeline.mechanism.directions import KINDS
 from traps_pipeline.protocol.datasets import SHORT
@@ -21,7 +21,7 @@ from traps_pipeline.report.tables.inside_columns import (
     LAYER,
     PATH,
     TYPE,
-    few,
+    few_marks,
     interval,
     path_names,
     short_names,
@@ -47,13 +47,13 @@ def cosines(results: Results) -> list[PrintedTable]:
     order = [*SHORT]
     place, other_place = ([order.index(name) for name in rows[column]] for column in ("dataset", "other_dataset"))
     rows = rows.assign(step=np.subtract(other_place, place))
-    across = (rows["prompt"] == STANDARD) & (rows["other_prompt"] == GUIDED) & (rows["step"] == 0)
-    rows = rows.loc[((rows["prompt"] == rows["other_prompt"]) & (rows["step"] > 0)) | across]
-    own = ["model", "prompt", "dataset"]
-    halves = results.cosines.drop_duplicates(own).loc[:, [*own, "split_half"]]
+    is_across_prompts = (rows["prompt"] == STANDARD) & (rows["other_prompt"] == GUIDED) & (rows["step"] == 0)
+    rows = rows.loc[((rows["prompt"] == rows["other_prompt"]) & (rows["step"] > 0)) | is_across_prompts]
+    own_columns = ["model", "prompt", "dataset"]
+    halves = results.cosines.drop_duplicates(own_columns).loc[:, [*own_columns, "split_half"]]
     halves = halves.rename(columns={name: f"other_{name}" for name in ("prompt", "dataset", "split_half")})
     rows = rows.merge(halves, on=["model", "other_prompt", "other_dataset"], how="left")
-    rows = rows.assign(name=_named_directions(rows, ""), other=_named_directions(rows, "other_"))
+    rows = rows.assign(name=_direction_names(rows, ""), other=_direction_names(rows, "other_"))
     columns = [
         MODEL, LAYER, Column("name", "Direction"), Column("other", "Other"),
         Column("cosine", "Cosine", "fraction", 2), Column("disattenuated", "Disattenuated", "fraction", 2),
@@ -69,14 +69,14 @@ def cosines(results: Results) -> list[PrintedTable]:
     return [PrintedTable("cosines", "Cosines of void directions", rows, columns, notes, why(results))]
 
 
-def _named_directions(rows: pd.DataFrame, prefix: str) -> list[str]:
+def _direction_names(rows: pd.DataFrame, prefix: str) -> list[str]:
     pairs = zip(rows[f"{prefix}dataset"], rows[f"{prefix}prompt"], strict=True)
     return [f"{SHORT.get(dataset, dataset)}, {prompt}" for dataset, prompt in pairs]
 
 
 def _place(values: pd.Series) -> pd.Series:
     if values.name == "name":
-        return values.map({short: place for place, short in enumerate(SHORT.values())})
+        return values.map({short_name: place for place, short_name in enumerate(SHORT.values())})
     order = {"prompt": PROMPTING, "kind": KINDS}.get(str(values.name))
     return values if order is None else values.map(order.index)
 
@@ -105,8 +105,8 @@ def _shares(results: Results) -> PrintedTable:
         rows.loc[rows["side"] == side].set_index(keys)[["abstention", "low", "high", "n_answers", "n_scenarios"]]
         for side in ("control", "void")
     ]
-    wide = sides[0].add_prefix("control_").join(sides[1].add_prefix("void_"), how="outer").reset_index()
-    wide = wide.sort_values(keys, key=_place, ignore_index=True)
+    by_side = sides[0].add_prefix("control_").join(sides[1].add_prefix("void_"), how="outer").reset_index()
+    by_side = by_side.sort_values(keys, key=_place, ignore_index=True)
     columns = [MODEL, KIND, LAYER, ALPHA]
     for side in ("control", "void"):
         columns += [
@@ -118,8 +118,10 @@ def _shares(results: Results) -> PrintedTable:
         "mean over all paths and regimes; answers: distinct answers, each of which may belong to several paths",
         "from, to: 95 % interval from resampled scenarios, not answers; its width is 0 where all scenarios agree",
     ]
-    absent = why(results, "the paper prints no answers to resample")
-    return PrintedTable("steering_shares", "Steering in all, with intervals by scenario", wide, columns, notes, absent)
+    reason = why(results, "the paper prints no answers to resample")
+    return PrintedTable(
+        "steering_shares", "Steering in all, with intervals by scenario", by_side, columns, notes, reason
+    )
 
 
 def _regimes(results: Results, name: str, title: str) -> PrintedTable:
@@ -132,10 +134,10 @@ def _regimes(results: Results, name: str, title: str) -> PrintedTable:
         Column("void_top", "Void, α, %", "percent"), Column("n_paths", "Paths", "count"),
     ]  # fmt: skip
     notes = ["mean over the paths of a set; +α on controls, −α on voids", *_cell_notes(results)]
-    absent = why(results)
+    reason = why(results)
     if name.endswith("families") and len(results.effects):
-        absent = "no directions of the guided prompt were steered under guided inference"
-    return PrintedTable(name, title, rows, columns, notes, absent)
+        reason = "no directions of the guided prompt were steered under guided inference"
+    return PrintedTable(name, title, rows, columns, notes, reason)
 
 
 def _domains(results: Results) -> PrintedTable:
@@ -159,13 +161,13 @@ def _domains(results: Results) -> PrintedTable:
 def _top(results: Results) -> PrintedTable:
     rows = effects.paths(results.effects)
     rows = rows.loc[(rows["kind"] == "void") & (rows["alpha"] == rows.groupby("model")["alpha"].transform("max"))]
-    rows = _named(rows)
+    rows = _with_names(rows)
     columns = [MODEL, DIRECTIONS, INFERENCE, PATH, TYPE, ALPHA, *_in_gaps(results), *_SIDES, *_counts(results)]
     return PrintedTable("steering_top", "Steering at the largest α", rows, columns, _cell_notes(results), why(results))
 
 
 def _dose(results: Results) -> PrintedTable:
-    rows = _named(effects.paths(results.effects))
+    rows = _with_names(effects.paths(results.effects))
     columns = [MODEL, DIRECTIONS, INFERENCE, KIND, PATH, LAYER, ALPHA, *_in_gaps(results)]
     for side in _SIDES:
         columns += [side, *(interval(f"{side.field}_", "percent") if results.is_study else ())]
@@ -182,8 +184,8 @@ def _layers(results: Results) -> PrintedTable:
         Column("control", "Controls abstained on %", "percent"), Column("n_splits", "Splits", "count"),
     ]  # fmt: skip
     notes = ["each dataset’s direction on its own controls, mean over the four splits", *_cell_notes(results)]
-    absent = "only one layer was steered" if len(results.effects) else why(results)
-    table = PrintedTable("steering_layers", "Steering by layer", rows, columns, notes, absent)
+    reason = "only one layer was steered" if len(results.effects) else why(results)
+    table = PrintedTable("steering_layers", "Steering by layer", rows, columns, notes, reason)
     return rightly_empty(table, results.is_study and bool(len(results.effects)))
 
 
@@ -213,10 +215,10 @@ def _cell_notes(results: Results) -> list[str]:
     counts = results.effects["n"].dropna().to_numpy(int)
     if not len(counts):
         return []
-    notes = [f"n = {counted(int(counts.max()), 'answer')} per cell at most, one per scenario"]
+    notes = [f"n = {count_noun(int(counts.max()), 'answer')} per cell at most, one per scenario"]
     return notes + [CELLS_NOTE] * bool(results.is_study and counts.min() < FEW)
 
 
-def _named(rows: pd.DataFrame) -> pd.DataFrame:
-    marks = {f"{side}_mark": few(rows, f"{side}_n") for side in ("control", "void") if f"{side}_n" in rows}
+def _with_names(rows: pd.DataFrame) -> pd.DataFrame:
+    marks = {f"{side}_mark": few_marks(rows, f"{side}_n") for side in ("control", "void") if f"{side}_n" in rows}
     return rows.assign(path=path_names(rows), **marks).reset_index(drop=True)

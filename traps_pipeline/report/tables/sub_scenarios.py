@@ -14,8 +14,8 @@ from traps_pipeline.report.tables.table_columns import (
     SHARES,
     N,
     epochs,
-    marked,
     marks,
+    with_marks,
     with_titles,
 )
 from traps_pipeline.report.terms import SIDE_OF
@@ -35,7 +35,7 @@ def occlusion_sub_scenarios(results: Results) -> list[PrintedTable]:
         Column("kind", "Sub-scenarios"), Column("n", "Number", "count"),
         Column("abs_rec", "AbsRec %, standard", "percent"), Column("guided_abs_rec", "AbsRec %, guided", "percent"),
     ]  # fmt: skip
-    notes = [epochs(rows), "unweighted means over sub-scenarios", f"hidden: {', '.join(analyses.HIDDEN)}"]
+    notes = [epochs(rows), "unweighted means over sub-scenarios", f"hidden: {', '.join(analyses.HIDDEN_SUB_SCENARIOS)}"]
     if results.is_study:
         columns += [N, MISSING]
     title = "Hidden sub-scenarios against the others"
@@ -68,7 +68,7 @@ def chaotic_sub_scenarios(results: Results) -> list[PrintedTable]:
 
 def _sub_rows(results: Results, taxonomy: str) -> pd.DataFrame:
     rows = results.sub_scenarios
-    rows = marked(rows.loc[rows["dataset"] == taxonomy].assign(incomplete=False))
+    rows = with_marks(rows.loc[rows["dataset"] == taxonomy].assign(incomplete=False))
     return rows.sort_values(["acc", "sub_scenario"], ignore_index=True)
 
 
@@ -82,11 +82,11 @@ def _sub_table(results: Results, rows: pd.DataFrame, name: str, title: str) -> P
         Column("abs_rec_ill_posed", "AbsRec %, ill-posed", "percent"),
         Column("textual_over_visual", "Textual / visual", "ratio"), MISSING,
     ]  # fmt: skip
-    left_out = "; reference strategies left out where others were asked" if results.is_study else ""
-    notes = [epochs(rows), f"means over models{left_out}", "standard, where no regime is named"]
-    fewer = {"guided": "guided_n_models", "Δ": "uplift_n_models", "ill-posed": "ill_posed_n_models"}
-    if any(((rows[name] != rows["n_models"]) & (rows[name] > 0)).any() for name in fewer.values()):
-        columns += [Column(name, f"Models, {words}", "count") for words, name in fewer.items()]
+    omission_note = "; reference strategies left out where others were asked" if results.is_study else ""
+    notes = [epochs(rows), f"means over models{omission_note}", "standard, where no regime is named"]
+    count_columns = {"guided": "guided_n_models", "Δ": "uplift_n_models", "ill-posed": "ill_posed_n_models"}
+    if any(((rows[name] != rows["n_models"]) & (rows[name] > 0)).any() for name in count_columns.values()):
+        columns += [Column(name, f"Models, {words}", "count") for words, name in count_columns.items()]
     notes += marks(rows)
     taxonomy = "occlusion" if name.startswith("occlusion") else "chaotic"
     return PrintedTable(name, title, rows, columns, notes, results.why("sub_scenarios"), _sub_trace(taxonomy))

@@ -47,7 +47,7 @@ def cell_trace(row: Mapping[str, Any], field: str) -> SourceItems | None:
     return SourceItems(dataset if dataset in DATASETS else "", row["model"], row["regime"], side)
 
 
-def marked(rows: pd.DataFrame) -> pd.DataFrame:
+def with_marks(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the rows with `mark`: ‡ if incomplete, else † if items are missing."""
     incomplete = rows["incomplete"].eq(True).to_numpy(bool)
     missing = rows["n_missing"].fillna(0).to_numpy(float) > 0
@@ -59,7 +59,7 @@ def with_titles(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.assign(title=rows.loc[:, "dataset"].map(TITLES))
 
 
-def together(sides: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def combined_counts(sides: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return COUNTED of a comparison: fewest pairs and runs, sum of missing items."""
     if not sides:
         return dict.fromkeys(COUNTED)
@@ -68,17 +68,17 @@ def together(sides: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {**counts, "n_missing": missing, "incomplete": any(side["incomplete"] for side in sides)}
 
 
-def counted(rows: pd.DataFrame, entries: pd.DataFrame, sides: Sequence[Sequence[str]]) -> pd.DataFrame:
+def with_counts(rows: pd.DataFrame, entries: pd.DataFrame, sides: Sequence[Sequence[str]]) -> pd.DataFrame:
     """Return rows that compare entries, `marked` and with COUNTED.
 
     sides: their columns of model, regime, dataset.
     """
     import pandas as pd
 
-    by_key = {(e["model"], e["regime"], e["dataset"]): e for e in entries.to_dict("records")}
+    entry_of = {(e["model"], e["regime"], e["dataset"]): e for e in entries.to_dict("records")}
     keys = [[tuple(row[name] for name in side) for side in sides] for row in rows.to_dict("records")]
-    counts = [together([by_key[key] for key in of_row if key in by_key]) for of_row in keys]
-    return marked(rows.join(pd.DataFrame(counts, index=rows.index, columns=pd.Index(COUNTED))))
+    counts = [combined_counts([entry_of[key] for key in entry_keys if key in entry_of]) for entry_keys in keys]
+    return with_marks(rows.join(pd.DataFrame(counts, index=rows.index, columns=pd.Index(COUNTED))))
 
 
 def entries(results: Results) -> pd.DataFrame:
@@ -95,28 +95,28 @@ def marks(rows: pd.DataFrame) -> list[str]:
 
 def meanings(marks: Iterable[str]) -> list[str]:
     """Return the meaning of each of these marks, once."""
-    used = set(marks)
-    return [f"{mark} {meaning}" for mark, meaning in MARKS.items() if mark in used]
+    used_marks = set(marks)
+    return [f"{mark} {meaning}" for mark, meaning in MARKS.items() if mark in used_marks]
 
 
 def epochs(rows: pd.DataFrame) -> str:
     """Return a note on the only epoch, or on mixed ones; empty without rows."""
-    dated = rows.dropna(subset=["epoch"]) if "epoch" in rows else rows.iloc[:0]
-    single = sorted({part for epoch in dated["epoch"] for part in str(epoch).split("+")})
-    if len(single) <= 1:
-        return f"epoch {single[0]}" if single else ""
+    dated_rows = rows.dropna(subset=["epoch"]) if "epoch" in rows else rows.iloc[:0]
+    epoch_names = sorted({part for epoch in dated_rows["epoch"] for part in str(epoch).split("+")})
+    if len(epoch_names) <= 1:
+        return f"epoch {epoch_names[0]}" if epoch_names else ""
     groups: dict[str, list[str]] = {}
-    for key, part in dated.groupby("dataset", sort=False) if "dataset" in dated else []:
+    for key, part in dated_rows.groupby("dataset", sort=False) if "dataset" in dated_rows else []:
         names = " and ".join(sorted(set(part["epoch"].astype(str))))
         groups.setdefault(names, []).append(SHORT.get(str(key), str(key)))
-    most = max(groups, key=lambda name: len(groups[name]), default="")
-    parts = [f"{', '.join(keys)}: {epoch}" for epoch, keys in groups.items() if epoch != most]
+    main_epoch = max(groups, key=lambda name: len(groups[name]), default="")
+    parts = [f"{', '.join(keys)}: {epoch}" for epoch, keys in groups.items() if epoch != main_epoch]
     if not parts:
-        return f"mixed epochs ({' and '.join(single)})"
-    return f"mixed epochs ({'; '.join([*parts, f'else {most}'])})"
+        return f"mixed epochs ({' and '.join(epoch_names)})"
+    return f"mixed epochs ({'; '.join([*parts, f'else {main_epoch}'])})"
 
 
-def printed(results: Results, rows: pd.DataFrame, columns: Sequence[Column]) -> list[Column]:
+def printed_columns(results: Results, rows: pd.DataFrame, columns: Sequence[Column]) -> list[Column]:
     """Return the columns to show: all for a study, for the paper those that it prints."""
     is_complete = results.is_study or not len(rows)
     return [c for c in columns if is_complete or c.field not in rows or not rows.loc[:, c.field].isna().all()]
@@ -127,7 +127,7 @@ def best_first(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.sort_values("pecs", ascending=False, na_position="last", ignore_index=True, kind="stable")
 
 
-def ordered(rows: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
+def sort_rows(rows: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
     """Return rows sorted by columns; datasets, regimes, models in their own order."""
     orders: dict[str, Sequence[str]] = {"dataset": [*DATASETS, "overall"], "regime": REGIMES, "model": [*load_models()]}
 
@@ -146,8 +146,8 @@ def interval(row: Mapping[str, Any]) -> str:
 
 def figure_with_interval(row: Mapping[Any, Any], name: str, as_printed: Callable[[float], str]) -> str:
     """Return a figure as printed, with its interval in brackets where it has one."""
-    own, low, high = (as_printed(row[column]) for column in (name, f"{name}_ci_low", f"{name}_ci_high"))
-    return own if NONE in (own, low) else f"{own} [{low}, {high}]"
+    value, low, high = (as_printed(row[column]) for column in (name, f"{name}_ci_low", f"{name}_ci_high"))
+    return value if NONE in (value, low) else f"{value} [{low}, {high}]"
 
 
 def ranks(row: Mapping[str, Any]) -> str:

@@ -1,1 +1,1 @@
-"""Certificates of a pair: evidence, thresholds, and ensembles of possible futures."""
+"""Certify pairs: evidence, thresholds, and ensembles of possible futures."""

@@ -1,4 +1,4 @@
-"""Certificates of a pair: promises, evidence, and thresholds.
+"""Define the certificates of a pair: promises, evidence and thresholds.
 
 A certificate is one entry of `CERTIFICATES`. From there it is picked up by `resolve` (a draw that loses one is
 rejected, and what it measures goes into the record), by `certify` (all are measured again from the record and its two
@@ -97,7 +97,7 @@ def earliest_cut(physics: Physics) -> int:
 
 
 def least_entropy_bits(labels: int) -> float:
-    """Return the least entropy (bits) of an open cut, by the number of answers."""
+    """Return the minimum entropy (bits) of an open cut for a number of answers."""
     return MIN_ENTROPY_THREE_LABELS_BITS if labels == 3 else MIN_ENTROPY_BITS
 
 
@@ -105,14 +105,14 @@ def least_entropy_bits(labels: int) -> float:
 
 
 def certificates_for(kind: VoidKind, *about: About) -> list[Certificate]:
-    """Return the certificates of a kind of void, or those about something, in order."""
+    """Return a void kind's certificates in order; `about` selects some by subject."""
     return [c for c in CERTIFICATES if kind in c.kinds and (not about or c.about in about)]
 
 
 def pair_of(spec: SceneSpec, qpos: np.ndarray, twin: np.ndarray, *, frame_step: int = 1) -> Pair:
     """Return the pair of a record from its trajectories, (F, nq), without evidence.
 
-    frame_step: pixel certificates look at every so many frames (1: full rate; 2: the 5 FPS sample).
+    frame_step: step between the frames of pixel certificates (1: full rate; 2: the 5 FPS sample).
     """
     control = World.of_record(spec, qpos, frame_step=frame_step)
     void_frame = spec.void["hidden_from_frame" if spec.void_kind == "occluder" else "cut_frame"]
@@ -134,7 +134,7 @@ def futures_of(control: World, seed: int, cut: int | None = None) -> ensemble.Fu
 
 
 def stored_evidence(spec: SceneSpec) -> dict[str, Any]:
-    """Return a record's evidence, and what it says elsewhere of void and twin."""
+    """Return a record's evidence, with its other fields on void and twin."""
     evidence = spec.evidence | {"twin_answer": spec.twin.ground_truth}
     physics = Physics(**spec.physics)
     evidence |= _closes(spec.closes_frame, physics)
@@ -162,9 +162,9 @@ def _judge_outcome(e: Evidence, claim: Claim) -> Failures:
     settled_s = claim.end_s - e["commit_s"]
     if settled_s < COMMITTED_BEFORE_END_S - _NOISE_S:
         yield f"outcome {claim.answer!r} is committed only {settled_s:.1f} s before the end"
-    least = claim.family.min_margin_m
-    if not e["margin_m"] >= least:
-        yield f"outcome {claim.answer!r} has a margin of {e['margin_m']:.4f} m, below {least} m"
+    min_margin = claim.family.min_margin_m
+    if not e["margin_m"] >= min_margin:
+        yield f"outcome {claim.answer!r} has a margin of {e['margin_m']:.4f} m, below {min_margin} m"
 
 
 OUTCOME = Certificate(
@@ -193,7 +193,7 @@ def settled_outcome(family: Family, motion: Motion, params: Any) -> Outcome:
 
 
 def settled_answer(world: World) -> str | None:
-    """Return what a world ends in; None if it cannot be certified."""
+    """Return a world's final answer; None if it cannot be certified."""
     try:
         return settled_outcome(world.family, world.motion, world.params).label
     except Rejected:
@@ -326,7 +326,7 @@ IN_FRAME = Certificate(
 def legible_groups(
     family: Family, model: mujoco.MjModel, scene: Scene, motion: Motion, params: Any
 ) -> list[tuple[tuple[str, ...], float]]:
-    """Return groups of geoms with the least pixels of each at the control's end."""
+    """Return geom groups and the pixels that each must show at the control's end."""
     if family.legible is not None:
         return list(family.legible(motion, params))
     return [(decisive_geoms(model, [body]), LEGIBLE_PIXELS) for body in scene.decisive]
@@ -343,9 +343,9 @@ def _legible(pair: Pair) -> Evidence:
         frames = control.qpos[frames_shown]
         pixels_by_group = checks.least_visible(renderer, frames, groups)
     too_small = [
-        f"{pixels:.0f} of {least:.0f} pixels of {names[0]}"
-        for (names, least), pixels in zip(groups, pixels_by_group, strict=True)
-        if pixels < least
+        f"{pixels:.0f} of {min_pixels:.0f} pixels of {names[0]}"
+        for (names, min_pixels), pixels in zip(groups, pixels_by_group, strict=True)
+        if pixels < min_pixels
     ]
     return {"too_small": too_small, "least_visible_px": min(pixels_by_group)}
 
@@ -353,9 +353,11 @@ def _legible(pair: Pair) -> Evidence:
 def _judge_legible(e: Evidence, claim: Claim) -> Failures:
     if e.get("too_small"):
         yield f"too small at the end: {e['too_small'][0]}"
-    least = LEGIBLE_PIXELS if claim.family.legible is None else 1  # a family's own groups are told by `too_small` alone
-    if e["least_visible_px"] < least:
-        yield f"too small at the end: {e['least_visible_px']:.0f} of {least:.0f} pixels"
+    min_pixels = (
+        LEGIBLE_PIXELS if claim.family.legible is None else 1
+    )  # a family's own groups are told by `too_small` alone
+    if e["least_visible_px"] < min_pixels:
+        yield f"too small at the end: {e['least_visible_px']:.0f} of {min_pixels:.0f} pixels"
 
 
 LEGIBLE = Certificate(
@@ -399,24 +401,24 @@ ORDER = Certificate(
 # --- occlusion --------------------------------------------------------------------------------------------------------
 
 
-def _first_hidden(pair: Pair) -> int:
+def _first_hidden_frame(pair: Pair) -> int:
     """Return the first evidence frame from which the void hides what decides."""
     return -(-pair.void_from // pair.control.frame_step)
 
 
 def _hidden(pair: Pair) -> Evidence:
     return {
-        "past_panel_px": pair.control.past_occluder.leaked(_first_hidden(pair)),
+        "past_panel_px": pair.control.past_occluder.leaked(_first_hidden_frame(pair)),
         "hidden_from_s": pair.void_from / pair.control.physics.fps,
     }
 
 
 def _judge_hidden(e: Evidence, claim: Claim) -> Failures:
-    late = "the occluder does not hide the outcome before it is committed"
+    message = "the occluder does not hide the outcome before it is committed"
     if e.get("past_panel_px"):
-        yield f"{late}: {e['past_panel_px']:.0f} pixels of decisive bodies or the hidden element are seen past it"
+        yield f"{message}: {e['past_panel_px']:.0f} pixels of decisive bodies or the hidden element are seen past it"
     if e["hidden_from_s"] >= e["commit_s"]:
-        yield late
+        yield message
 
 
 HIDDEN = Certificate(
@@ -434,7 +436,11 @@ HIDDEN = Certificate(
 
 def _ablation(pair: Pair) -> Evidence:
     control = pair.control
-    return {"ablation_px": control.ablation_px(control.evidence_frames[_first_hidden(pair) :], control.concealed_geoms)}
+    return {
+        "ablation_px": control.ablation_px(
+            control.evidence_frames[_first_hidden_frame(pair) :], control.concealed_geoms
+        )
+    }
 
 
 def _judge_ablation(e: Evidence, claim: Claim) -> Failures:
@@ -458,8 +464,8 @@ ABLATION = Certificate(
 
 def _judge_answer_of_twin(e: Evidence, claim: Claim) -> Failures:
     if e["twin_answer"] in (None, claim.answer) or e["twin_answer"] != claim.twin_answer:
-        recorded = f"recorded {claim.twin_answer!r}, the scenario ends in {claim.answer!r}"
-        yield f"the twin ends in {e['twin_answer']!r}; {recorded}"
+        contradiction = f"recorded {claim.twin_answer!r}, the scenario ends in {claim.answer!r}"
+        yield f"the twin ends in {e['twin_answer']!r}; {contradiction}"
 
 
 def _twin_behind_occluder(pair: Pair) -> Evidence:
@@ -509,19 +515,21 @@ def _referents(pair: Pair) -> Evidence:
     scene, model, fps = control.scene, control.model, control.physics.fps / control.frame_step
     rigid = np.flatnonzero((model.body_weldid > 0) & ~is_carrier(model))
     bodies = {*(model.body(int(i)).name for i in rigid), *flexes(model)}
-    moving = {body for body in bodies if not body.startswith(DISTRACTOR)}  # which are neither named nor the cause
-    moves: dict[str, float] = {}
-    for body in sorted(moving):
+    moving_bodies = {
+        body for body in bodies if not body.startswith(DISTRACTOR)
+    }  # which are neither named nor the cause
+    seconds_moving: dict[str, float] = {}
+    for body in sorted(moving_bodies):
         pixels = control.pixels_of(decisive_geoms(model, [body]))
         places = control.camera.project(control.motion.pos(body)[:: control.frame_step])
-        moves[body] = checks.seen_moving(pixels, places, least_px=REFERENT_PIXELS, step_px=MOVES_PX) / fps
+        seconds_moving[body] = checks.seen_moving(pixels, places, least_px=REFERENT_PIXELS, step_px=MOVES_PX) / fps
     flag_px = [float(control.pixels_of([flag_of(phrase)]).min()) for phrase in scene.marks]
     visibility, least_px, least_s = {}, flag_px, []
     for noun in named_nouns(pair.claim.question, scene):
         nouns = (noun, *scene.shown_by.get(noun, ()))
         has_flag = any(phrase.split()[-1] in nouns for phrase in scene.marks)
-        moving_s = [moves[body] for body in moves if _is_called(body, nouns)]
-        static = [name for name in control.geoms if _is_called(name, nouns) and not _is_of(model, name, moving)]
+        moving_s = [seconds_moving[body] for body in seconds_moving if _is_called(body, nouns)]
+        static = [name for name in control.geoms if _is_called(name, nouns) and not _is_of(model, name, moving_bodies)]
         if has_flag:
             visibility[noun] = "marked"
         elif moving_s:
@@ -530,13 +538,13 @@ def _referents(pair: Pair) -> Evidence:
         else:
             least_px.append(float(control.pixels_of(static).min()))
             visibility[noun] = "in view" if least_px[-1] >= REFERENT_PIXELS else "hidden"
-    swept = swept_points(model, control.qpos[:: control.physics.fps // checks.SAMPLED_FPS])
+    swept_corners = swept_points(model, control.qpos[:: control.physics.fps // checks.SAMPLED_FPS])
     return {
         "referents": visibility,
         "referents_px": min(least_px, default=None),
         "referents_moving_s": None if not least_s else round(min(least_s), 3),
-        "cause_moving_s": round(max(moves.values(), default=0.0), 3),
-        "panel_covers": checks.swept_behind(control.camera, list(swept.reshape(-1, 8, 3)), control.occluder),
+        "cause_moving_s": round(max(seconds_moving.values(), default=0.0), 3),
+        "panel_covers": checks.swept_behind(control.camera, list(swept_corners.reshape(-1, 8, 3)), control.occluder),
     }
 
 
@@ -548,10 +556,10 @@ def _is_of(model: mujoco.MjModel, name: str, bodies: Collection[str]) -> bool:
 def _judge_referents(e: Evidence, claim: Claim) -> Failures:
     if not e["referents"]:
         yield "the question names nothing that is in the scene"
-    pixels, moving = e["referents_px"], e["referents_moving_s"]
+    pixels, moving_s = e["referents_px"], e["referents_moving_s"]
     if pixels is not None and pixels < REFERENT_PIXELS:
         yield f"something that the question names has {pixels:.0f} pixels in a void frame, {REFERENT_PIXELS:.0f} wanted"
-    for subject, seconds in (("something that the question names", moving), ("the cause", e["cause_moving_s"])):
+    for subject, seconds in (("something that the question names", moving_s), ("the cause", e["cause_moving_s"])):
         if seconds is not None and seconds < MOVING_S - _NOISE_S:
             yield f"{subject} is seen moving for {seconds:.1f} s, {MOVING_S} wanted"
 
@@ -610,26 +618,30 @@ def _open(pair: Pair) -> Evidence:
 
 
 def open_from_state(futures: ensemble.Futures, cut: int, claim: Claim) -> Evidence:
-    """Return the evidence of what the state at a cut leaves open."""
+    """Return evidence that the state at a cut leaves the outcome open."""
     counts = {label: n for label, n in futures.after(cut).items() if label is not None}
-    settled = sum(counts.values())
+    n_settled = sum(counts.values())
     return {
-        "cut_settled": settled,
-        "cut_top_share": max(counts.values(), default=0) / max(1, settled),
-        "cut_truth_share": counts.get(claim.answer or "", 0) / max(1, settled),
+        "cut_settled": n_settled,
+        "cut_top_share": max(counts.values(), default=0) / max(1, n_settled),
+        "cut_truth_share": counts.get(claim.answer or "", 0) / max(1, n_settled),
     }
 
 
 def _judge_open(e: Evidence, claim: Claim) -> Failures:
-    accepted, least, most = MIN_ACCEPTED, least_entropy_bits(claim.labels), TOP_SHARE
+    min_accepted, min_entropy, max_share = MIN_ACCEPTED, least_entropy_bits(claim.labels), TOP_SHARE
     if not e.get("same_physics", True):
-        accepted, least, most = ELSEWHERE_ACCEPTED, round(least - ELSEWHERE_LESS_BITS, 2), ELSEWHERE_TOP_SHARE
-    if e["accepted"] < accepted:
-        yield f"{e['accepted']} futures that look alike up to the cut have an outcome, {accepted} wanted"
-    if e["entropy_bits"] < least:
-        yield f"the futures disagree by {e['entropy_bits']:.2f} bits, {least} wanted"
-    if e["top_share"] > most:
-        yield f"the best guess is right in {e['top_share']:.1%} of the futures, at most {most:.0%} allowed"
+        min_accepted, min_entropy, max_share = (
+            ELSEWHERE_ACCEPTED,
+            round(min_entropy - ELSEWHERE_LESS_BITS, 2),
+            ELSEWHERE_TOP_SHARE,
+        )
+    if e["accepted"] < min_accepted:
+        yield f"{e['accepted']} futures that look alike up to the cut have an outcome, {min_accepted} wanted"
+    if e["entropy_bits"] < min_entropy:
+        yield f"the futures disagree by {e['entropy_bits']:.2f} bits, {min_entropy} wanted"
+    if e["top_share"] > max_share:
+        yield f"the best guess is right in {e['top_share']:.1%} of the futures, at most {max_share:.0%} allowed"
     if "cut_settled" in e and e.get("same_physics", True):
         yield from _judge_open_at_cut(e)
 
@@ -676,15 +688,15 @@ def _twin_of_cut(pair: Pair) -> Evidence:
         raise Rejected("nothing says from which start the twin comes")
     start, future = pair.futures.start(pair.rollout), pair.futures.rollout(pair.rollout)
     control, twin, cut = pair.control, pair.other_world, slice(0, pair.void_from)
-    shown = slice(0, pair.void_from, control.frame_step)
+    shown_frames = slice(0, pair.void_from, control.frame_step)
     apart_px = ensemble.deviation_px(control.model, control.camera, control.qpos[cut], twin.qpos[cut])
     with control.renderer() as renderer:
-        frames = list(renderer.frames(control.qpos[shown]))
-        _, largest = checks.differing_pixels(frames, renderer.frames(twin.qpos[shown]))
+        frames = list(renderer.frames(control.qpos[shown_frames]))
+        _, largest_difference = checks.differing_pixels(frames, renderer.frames(twin.qpos[shown_frames]))
     return {
         "twin_answer": settled_answer(twin),
         "twin_deviation_px": apart_px * fineness(control.params),
-        "twin_largest_difference": largest,
+        "twin_largest_difference": largest_difference,
         "start_off": float(np.abs(start.astype(np.float32) - twin.qpos[0]).max()),
         "rebuilt": future.qpos is not None and np.array_equal(future.qpos, twin.qpos),
         "rebuilt_answer": future.label,
@@ -729,20 +741,20 @@ def _closes(frame: int | None, physics: Physics) -> Evidence:
     return {"closes_s": frame / physics.fps, "looks_until_s": last_of_all(physics.n_frames, physics.fps) / physics.fps}
 
 
-def _closing(pair: Pair) -> Evidence:
+def _closing_evidence(pair: Pair) -> Evidence:
     control, fps = pair.control, pair.control.physics.fps
     if control.closing is None:
-        unread = {"read_answer": None, "read_s": None, "closed_px": None, "closed_change_px": None}
-        return {**_closes(None, control.physics), **unread}
+        no_reading = {"read_answer": None, "read_s": None, "closed_px": None, "closed_change_px": None}
+        return {**_closes(None, control.physics), **no_reading}
     outcome, end = control.outcome_read, control.closed_frames
     ablated = control.ablation_px(end, control.closed_geoms)
-    differing, _ = checks.differing_pixels(control.behind_occluder(end), pair.other_world.behind_occluder(end))
+    n_differing, _ = checks.differing_pixels(control.behind_occluder(end), pair.other_world.behind_occluder(end))
     return {
         **_closes(control.closing.frame, control.physics),
         "read_answer": outcome.label,
         "read_s": (control.closing.frame - outcome.commit_frame) / fps,
         "closed_px": float(control.pixels_of(control.closed_geoms, end).sum()),
-        "closed_change_px": ablated + differing,
+        "closed_change_px": ablated + n_differing,
     }
 
 
@@ -775,7 +787,7 @@ CLOSING = Certificate(
         *(Number(name, kept=False) for name in ("closes_s", "looks_until_s", "read_answer")),
         *(Number(name) for name in ("read_s", "closed_px", "closed_change_px")),
     ),
-    measure=_closing,
+    measure=_closing_evidence,
     judge=_judge_closing,
 )
 
@@ -791,7 +803,7 @@ def _uncut(world: World) -> World:
     return replace(world, physics=physics, qpos=simulated(*compile_scene(world.family, world.params, physics), physics))
 
 
-def _other_settings(pair: Pair) -> list[str]:
+def _setting_differences(pair: Pair) -> list[str]:
     """Return the settings of a pair that its worlds, in this order, do not give."""
     worlds, seed = (pair.control, pair.other_world), pair.claim.seed
     full_worlds = [_uncut(world) for world in worlds]
@@ -807,7 +819,7 @@ def _exchange(pair: Pair) -> Evidence:
     exchanged, first_failure = pair.exchanged, None
     world, twin = exchanged.control, exchanged.other_world
     evidence: dict[str, Any] = {}
-    exact = is_exchangeable(world.family) and world.same_physics and twin.same_physics
+    is_exact = is_exchangeable(world.family) and world.same_physics and twin.same_physics
     for certificate in certificates_for("occluder", "control") if is_exchangeable(world.family) else ():
         evidence |= certificate.measured(exchanged)
         failure = certificate.failure(evidence, exchanged.claim)
@@ -816,7 +828,7 @@ def _exchange(pair: Pair) -> Evidence:
     return {
         "twin_commit_s": world.outcome.commit_frame / world.physics.fps,
         "twin_read_answer": None if world.closing is None else world.outcome_read.label,
-        "other_settings": _other_settings(exchanged) if exact else [],
+        "other_settings": _setting_differences(exchanged) if is_exact else [],
         "lost_exchanged": first_failure,
     }
 
@@ -923,13 +935,13 @@ CERTIFICATES = (
 
 
 def table() -> str:
-    """Return the certificates as a Markdown table; OpenGL decides numbers in brackets."""
+    """Return the certificates as a Markdown table; OpenGL affects bracketed numbers."""
     lines = ["| certificate | promises | does not promise | stored |", "| --- | --- | --- | --- |"]
     for certificate in CERTIFICATES:
         kinds = {"occluder": " (occlusion)", "truncation": " (chaotic)"}
         kind = kinds[certificate.kinds[0]] if len(certificate.kinds) == 1 else ""
         numbers = [number for number in certificate.numbers if number.kept]
-        stored = ", ".join(f"`{number.name}`" if number.compared else f"[`{number.name}`]" for number in numbers)
-        cells = (f"`{certificate.name}`{kind}", certificate.promises, certificate.does_not_promise, stored)
+        stored_names = ", ".join(f"`{number.name}`" if number.compared else f"[`{number.name}`]" for number in numbers)
+        cells = (f"`{certificate.name}`{kind}", certificate.promises, certificate.does_not_promise, stored_names)
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)

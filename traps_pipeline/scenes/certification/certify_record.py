@@ -1,4 +1,4 @@
-"""Certification of a record from its two trajectories alone.
+"""Certify a record from its two trajectories alone.
 
 `certificates` defines them; `docs/scenes.md` says what each promises and what it does not.
 """
@@ -48,22 +48,22 @@ class Verdict:
 def certify(spec: SceneSpec, qpos: np.ndarray, twin: np.ndarray, *, frame_step: int = 1) -> Verdict:
     """Measure and judge all certificates of a record from its trajectories, (F, nq).
 
-    What is measured must also be what the record has stored of it. frame_step: pixel certificates look at every so
+    The measured evidence must also equal the stored evidence. frame_step: pixel certificates look at every so
     many frames (1: full rate; 2: the 5 FPS sample).
     """
     start_s = time.process_time()
     pair = pair_of(spec, qpos, twin, frame_step=frame_step)
-    same_physics = _same_physics(pair)
+    same_physics = _is_same_physics(pair)
     failures: dict[str, str] = {}
-    measured: dict[str, Any] = {}
+    evidence_so_far: dict[str, Any] = {}
     for certificate in certificates_for(spec.void_kind):
         try:
             evidence = certificate.measured(pair)
         except Rejected as impossible:
             failures[certificate.name] = str(impossible)
             continue
-        measured |= evidence
-        failure = certificate.failure(measured, pair.claim)
+        evidence_so_far |= evidence
+        failure = certificate.failure(evidence_so_far, pair.claim)
         failure = failure or certificate.contradiction(evidence, spec.evidence, exact=same_physics)
         if failure is not None:
             failures[certificate.name] = failure
@@ -72,7 +72,7 @@ def certify(spec: SceneSpec, qpos: np.ndarray, twin: np.ndarray, *, frame_step: 
         scenario_id=spec.scenario_id,
         family=spec.family,
         failures=failures,
-        measured=measured,
+        measured=evidence_so_far,
         same_physics=same_physics,
         control_end=control_end,
         void_end=void_end,
@@ -83,11 +83,11 @@ def certify(spec: SceneSpec, qpos: np.ndarray, twin: np.ndarray, *, frame_step: 
 
 def state_at_cut(qpos: np.ndarray, cut_frame: int) -> np.ndarray:
     """Return the last poses of a cut void, and their last change, shape (2 nq,)."""
-    last, before = qpos[cut_frame - 1], qpos[max(cut_frame - 2, 0)]  # a void of one frame shows no change
-    return np.concatenate([last, last - before])
+    last, previous_pose = qpos[cut_frame - 1], qpos[max(cut_frame - 2, 0)]  # a void of one frame shows no change
+    return np.concatenate([last, last - previous_pose])
 
 
-def _same_physics(pair: Pair) -> bool:
+def _is_same_physics(pair: Pair) -> bool:
     try:
         return pair.control.same_physics
     except Rejected:  # the certificate `physics` says why

@@ -1,4 +1,4 @@
-"""Futures of many starts that look the same as a control up to a cut.
+"""Simulate futures of starts that look like a control up to a cut.
 
 The initial state is perturbed far below what a pixel shows and simulated on. A rollout counts for a cut while it cannot
 be told from the control by eye. How many must count, and how they must disagree, is the certificate's (`certificates`).
@@ -36,7 +36,9 @@ THREADS = 2
 
 @dataclass(frozen=True)
 class Cut:
-    """A cut and what it leaves open. The void shows control frames [0:frame].
+    """A cut, with outcome counts of its futures.
+
+    The void shows the control frames [0:frame].
 
     accepted: rollouts with an outcome that look like the control up to the cut. unresolved: rollouts that look like it
     but are undecided at the end; they are no outcome of their own and count nowhere else.
@@ -103,16 +105,16 @@ class Futures:
 
     def batches(self) -> Iterator[list[Rollout]]:
         """Yield all rollouts so far after each batch of `BATCHES`."""
-        for tried in BATCHES:
-            if len(self._rollouts) < tried:
-                self._rollouts += self._roll_all(range(len(self._rollouts), tried))
-            yield self._rollouts[:tried]
+        for n_tried in BATCHES:
+            if len(self._rollouts) < n_tried:
+                self._rollouts += self._roll_all(range(len(self._rollouts), n_tried))
+            yield self._rollouts[:n_tried]
 
     def start(self, number: int) -> np.ndarray:
         """Return a start, (nq,) float64, drawn around the first row. Raises Rejected."""
         if not 0 <= number < TRIED:
             raise Rejected(f"there is no start {number}; there are {TRIED}")
-        return self._prepared.starts[number]
+        return self._prepare.starts[number]
 
     def rollout(self, number: int) -> Rollout:
         """Return the future of one start, simulated here to its end. Raises Rejected."""
@@ -133,13 +135,13 @@ class Futures:
     def _count_after(self, cut: int, count: int, beyond: int) -> Counter[str | None]:
         import mujoco
 
-        model, control = self._prepared.model, self._control
-        state, past = mujoco.MjData(model), np.empty((cut, model.nq))
-        state.qvel[:] = self._prepared.velocity
+        model, control = self._prepare.model, self._control
+        state, past_qpos = mujoco.MjData(model), np.empty((cut, model.nq))
+        state.qvel[:] = self._prepare.velocity
         for i in range(cut):
             if i:
                 mujoco.mj_step(model, state, control.physics.substeps)
-            past[i] = state.qpos
+            past_qpos[i] = state.qpos
         steps = np.random.default_rng([self._seed, count, cut]).normal(size=(count, 2, model.nv))
         unseen_step = unseen_steps(model, state, control.camera)
 
@@ -150,7 +152,7 @@ class Futures:
             mujoco.mj_integratePos(model, qpos, along_contacts(model, state, step[0] * unseen_step), 1.0)
             data.qpos[:] = qpos
             data.qvel += step[1] * unseen_step * math.sqrt(2) / READ_OVER_S
-            frames, outcome = past, None
+            frames, outcome = past_qpos, None
             for n_frames in (len(control.qpos) - cut, beyond):
                 if outcome is None and n_frames:
                     frames = np.concatenate([frames, np.empty((n_frames, model.nq))])
@@ -166,7 +168,7 @@ class Futures:
     def _settled_label(self, frames: np.ndarray) -> str | None:
         """Return the settled outcome of a trajectory (F, nq); None if undecided."""
         control = self._control
-        labels = control.family.outcome(replay(self._prepared.model, frames, control.physics), control.params).labels
+        labels = control.family.outcome(replay(self._prepare.model, frames, control.physics), control.params).labels
         return labels[-1] if last_run(labels) <= len(labels) - 1 - self._held_frames else None
 
     def _roll_all(self, numbers: range) -> list[Rollout]:
@@ -174,7 +176,7 @@ class Futures:
             return list(pool.map(self._roll, numbers))
 
     @cached_property
-    def _prepared(self) -> _Prepared:
+    def _prepare(self) -> _Prepared:
         import mujoco
 
         control = self._control
@@ -194,26 +196,29 @@ class Futures:
         """Simulate one start; give up if it parts before `first`, unless `to_end`."""
         import mujoco
 
-        control, prepared = self._control, self._prepared
-        shown, outline = prepared.shown, prepared.silhouette
-        data, scratch = mujoco.MjData(prepared.model), mujoco.MjData(prepared.model)
-        data.qpos[:], data.qvel[:] = prepared.starts[number], prepared.velocity
-        frames = np.empty((len(shown), prepared.model.nq))
-        parted = len(shown)
-        for i in range(len(shown)):
+        control, camera_view = self._control, self._prepare
+        shown_geoms, outline = camera_view.shown, camera_view.silhouette
+        data, scratch = mujoco.MjData(camera_view.model), mujoco.MjData(camera_view.model)
+        data.qpos[:], data.qvel[:] = camera_view.starts[number], camera_view.velocity
+        frames = np.empty((len(shown_geoms), camera_view.model.nq))
+        parted_frame = len(shown_geoms)
+        for i in range(len(shown_geoms)):
             frames[i] = data.qpos
-            if parted == len(shown) and np.abs(outline.pixels(data.qpos, scratch) - shown[i]).max() > self._alike_px:
-                parted = i
+            if (
+                parted_frame == len(shown_geoms)
+                and np.abs(outline.pixels(data.qpos, scratch) - shown_geoms[i]).max() > self._alike_px
+            ):
+                parted_frame = i
                 if i < self.first and not to_end:
-                    return Rollout(number, parted, None)
-            mujoco.mj_step(prepared.model, data, control.physics.substeps)
+                    return Rollout(number, parted_frame, None)
+            mujoco.mj_step(camera_view.model, data, control.physics.substeps)
         if not np.isfinite(frames).all():
-            return Rollout(number, parted, None)
-        return Rollout(number, parted, self._settled_label(frames), frames.astype(np.float32))
+            return Rollout(number, parted_frame, None)
+        return Rollout(number, parted_frame, self._settled_label(frames), frames.astype(np.float32))
 
 
 def at_cut(rollouts: Sequence[Rollout], frame: int, perturbation: float) -> Cut:
-    """Return what a cut at one frame leaves open."""
+    """Return the cut at a frame, with outcome counts of its futures."""
     lookalikes = [r for r in rollouts if r.parted >= frame]
     counts = Counter(r.label for r in lookalikes if r.label is not None)
     accepted = counts.total()
@@ -222,7 +227,7 @@ def at_cut(rollouts: Sequence[Rollout], frame: int, perturbation: float) -> Cut:
 
 
 def twin_of(rollouts: Sequence[Rollout], frame: int, truth: str | None) -> Rollout:
-    """Return the first accepted rollout at a cut that does not end in the truth."""
+    """Return the first accepted rollout at a cut that ends in another answer."""
     return next(r for r in rollouts if r.parted >= frame and r.label not in (None, truth))
 
 
@@ -247,19 +252,19 @@ def _perturbed_starts(model: mujoco.MjModel, start: np.ndarray, scale: float, se
 
 
 def unseen_steps(model: mujoco.MjModel, data: mujoco.MjData, camera: Camera) -> np.ndarray:
-    """Return the step (m, rad) of each degree of freedom that no viewer sees, (nv,).
+    """Return the invisible step (m, rad) of each degree of freedom, (nv,).
 
     It is one standard deviation: a body moves by UNSEEN_PX, and turns by so much at its furthest point.
     """
     import mujoco
 
     scales = np.empty(model.nv)
-    for joint in range(model.njnt):
-        body, dof = model.jnt_bodyid[joint], int(model.jnt_dofadr[joint])
+    for joint_id in range(model.njnt):
+        body, dof = model.jnt_bodyid[joint_id], int(model.jnt_dofadr[joint_id])
         geoms = model.geom_bodyid == body
         metres = UNSEEN_PX * camera.metres_a_pixel(data.xpos[body])
         radians = metres / (np.linalg.norm(model.geom_pos[geoms], axis=1) + model.geom_rbound[geoms]).max()
-        kind = model.jnt_type[joint]
+        kind = model.jnt_type[joint_id]
         if kind == mujoco.mjtJoint.mjJNT_FREE:
             scales[dof : dof + 6] = [metres] * 3 + [radians] * 3
         else:
@@ -292,9 +297,9 @@ class _Silhouette:
         import mujoco
 
         self._model, self._camera = model, camera
-        moving = np.flatnonzero(model.body_weldid[model.geom_bodyid] > 0)
-        ball = model.geom_type[moving] == mujoco.mjtGeom.mjGEOM_SPHERE
-        self._balls, self._solids = moving[ball], moving[~ball]
+        moving_geoms = np.flatnonzero(model.body_weldid[model.geom_bodyid] > 0)
+        ball = model.geom_type[moving_geoms] == mujoco.mjtGeom.mjGEOM_SPHERE
+        self._balls, self._solids = moving_geoms[ball], moving_geoms[~ball]
         signs = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, 8).T
         boxes = model.geom_aabb[self._solids]
         self._corners = boxes[:, None, :3] + signs * boxes[:, None, 3:]
@@ -314,5 +319,5 @@ class _Silhouette:
         rotation = data.geom_xmat[self._solids].reshape(-1, 3, 3)
         corners = np.einsum("gij,gkj->gki", rotation, self._corners) + data.geom_xpos[self._solids, None]
         outline = self._outline + data.geom_xpos[self._balls, None]
-        soft = [vertices(self._model, data, flex) for flex in range(self._model.nflex)]
-        return self._camera.project(np.concatenate([corners.reshape(-1, 3), outline.reshape(-1, 3), *soft]))
+        soft_vertices = [vertices(self._model, data, flex) for flex in range(self._model.nflex)]
+        return self._camera.project(np.concatenate([corners.reshape(-1, 3), outline.reshape(-1, 3), *soft_vertices]))

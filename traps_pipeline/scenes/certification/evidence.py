@@ -1,4 +1,4 @@
-"""Certificates as such: numbers measured of a pair, and a rule that judges them.
+"""Define certificates: numbers measured on a pair, and a rule that judges them.
 
 Measuring needs the pair. Judging is a pure function of numbers and of what the record claims, so that fresh evidence
 and stored evidence are judged alike.
@@ -25,7 +25,7 @@ Failures = Iterator[str]  # the failures, in words
 
 @dataclass(frozen=True)
 class Claim:
-    """What a record claims, which its evidence is held against besides thresholds.
+    """A record's claims, against which its evidence is judged besides thresholds.
 
     end_s: time of the control's last frame. labels: how many answers the question offers. seed: what is drawn of the
     pair follows from it.
@@ -42,7 +42,7 @@ class Claim:
 
     @staticmethod
     def of_record(spec: SceneSpec) -> Claim:
-        """Return what a record claims."""
+        """Return a record's claims."""
         physics = Physics(**spec.physics)
         return Claim(
             family=get_family(spec.family),
@@ -58,10 +58,10 @@ class Claim:
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """A pair to certify; a draw's has no void and no twin until they are chosen.
+    """A pair to certify; in a draw, void and twin are missing until they are chosen.
 
-    futures: of perturbed starts of the control. void_frame: from which the void shows nothing decisive: the first
-    hidden frame, or the cut. rollout: which of the futures the twin is (chaotic).
+    futures: those of perturbed starts of the control. void_frame: the first frame that shows nothing decisive, the
+    first hidden frame, or the cut. rollout: which of the futures the twin is (chaotic).
     """
 
     control: World
@@ -73,7 +73,7 @@ class Pair:
 
     @property
     def void_from(self) -> int:
-        """`void_frame`. Raises Rejected while there is no void."""
+        """The frame `void_frame`. Raises Rejected while there is no void."""
         if self.void_frame is None:
             raise Rejected("the pair has no void")
         return self.void_frame
@@ -152,7 +152,7 @@ class Certificate:
             return f"no evidence {missing}"
 
     def contradiction(self, evidence: Evidence, stored: Evidence, *, exact: bool) -> str | None:
-        """Return how new evidence contradicts the stored, None if it does not.
+        """Return how new evidence contradicts the stored evidence; None if it does not.
 
         exact: this machine's arithmetic is that of the one which stored it, so that not even the last digit may differ.
         """
@@ -168,12 +168,12 @@ class Certificate:
         return None
 
     def kept(self, evidence: Evidence) -> dict[str, Any]:
-        """Return what a record stores of the evidence."""
+        """Return the part of the evidence that a record stores."""
         return {n.name: n.stored(evidence[n.name]) for n in self.numbers if n.kept and n.name in evidence}
 
 
-def required(certificates: Iterable[Certificate], pair: Pair, evidence_so_far: Evidence) -> dict[str, Any]:
-    """Return evidence with that of some certificates. Raises Rejected at a failure."""
+def require_certificates(certificates: Iterable[Certificate], pair: Pair, evidence_so_far: Evidence) -> dict[str, Any]:
+    """Return evidence extended by some certificates. Raises Rejected if one fails."""
     evidence = dict(evidence_so_far)
     for certificate in certificates:
         evidence |= certificate.measured(pair)

@@ -1,1 +1,1 @@
-"""Draws of scenarios: sample, resolve, trim the occluder, close the control."""
+"""Draw scenarios: sample, resolve, trim the occluder, close the control."""

@@ -1,4 +1,4 @@
-"""Closing of controls: an occluder comes once the outcome has settled, and stays.
+"""Close controls: an occluder enters once the outcome has settled, and stays.
 
 So the last frame does not tell the answer, and a model must have watched. In an occlusion scene the occluder is that of
 the void: control and void then end in the same frames. In a chaotic scene it stands before the place of all outcomes
@@ -14,7 +14,7 @@ from dataclasses import asdict, replace
 from typing import Any
 
 from traps_pipeline.scenes.certification.certificates import CLOSING, LEGIBLE, ORDER, certificates_for
-from traps_pipeline.scenes.certification.evidence import Pair, VoidKind, required
+from traps_pipeline.scenes.certification.evidence import Pair, VoidKind, require_certificates
 from traps_pipeline.scenes.physics.simulate import swept_points
 from traps_pipeline.scenes.picture.camera import Closing, Occluder, fit_occluder
 from traps_pipeline.scenes.worlds.outcome import Rejected
@@ -28,23 +28,23 @@ def close_control(pair: Pair, seed: int, evidence: Mapping[str, Any]) -> tuple[P
     worlds = pair.control, pair.other_world
     for frame in moments(worlds[:1] if pair.control.occluder is None else worlds, seed):
         try:
-            return _certified(pair, Closing(frame, occluder_from(frame, *worlds)), evidence)
+            return _certify(pair, Closing(frame, occluder_from(frame, *worlds)), evidence)
         except Rejected:
             continue  # another moment may do
-    return _certified(pair, None, evidence)
+    return _certify(pair, None, evidence)
 
 
-def _certified(pair: Pair, closing: Closing | None, evidence: Mapping[str, Any]) -> tuple[Pair, dict[str, Any]]:
+def _certify(pair: Pair, closing: Closing | None, evidence: Mapping[str, Any]) -> tuple[Pair, dict[str, Any]]:
     """Return a pair whose control ends like this, and all evidence. Raises Rejected."""
     control, twin = replace(pair.control, closing=closing), replace(pair.other_world, closing=closing)
     ending = replace(pair, control=control, twin=twin)
     void_kind: VoidKind = "truncation" if control.occluder is None else "occluder"
     certificates = (LEGIBLE, ORDER, CLOSING, *certificates_for(void_kind, "worlds"))
-    return ending, required(certificates, ending, evidence)
+    return ending, require_certificates(certificates, ending, evidence)
 
 
 def record_of(pair: Pair) -> dict[str, Any] | None:
-    """Return how the control closes, in the form of a record."""
+    """Return a control's closing in the form that a record stores."""
     closing = pair.control.closing
     if closing is None:
         return None
@@ -57,5 +57,5 @@ def occluder_from(frame: int, control: World, *others: World) -> Occluder:
     if control.occluder is not None:
         return control.occluder
     boxes = control.scene.framed if control.scene.rest is None else (control.scene.rest,)
-    moving = [swept_points(world.model, world.qpos[frame:]) for world in (control, *others)]
-    return fit_occluder(control.camera, box_around([*moving, *(box.corners() for box in boxes)]))
+    swept_corners = [swept_points(world.model, world.qpos[frame:]) for world in (control, *others)]
+    return fit_occluder(control.camera, box_around([*swept_corners, *(box.corners() for box in boxes)]))

@@ -1,4 +1,4 @@
-"""Lookalikes among records: a family shall show many scenes, not one many times."""
+"""Find lookalikes among records, so that a family shows many different scenes."""
 
 from __future__ import annotations
 

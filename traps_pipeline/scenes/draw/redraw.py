@@ -1,4 +1,4 @@
-"""Redraws of released records, for another look or whatever rule is new.
+"""Redraw released records for a new look or a new rule.
 
 A record of an occlusion family is drawn again from the number of its draw (`draw_again`), which takes seconds. Where
 the record cost thousands of rollouts, and its new look moves neither camera nor occluder, the worlds stay and only what
@@ -49,7 +49,7 @@ def draw_again(
     report: Callable[[str], None] = lambda _: None,
     only: Collection[str] | None = None,
 ) -> dict[str, str]:
-    """Draw a family's records, or some ids, again by today's looks and rules.
+    """Redraw a family's records, or some ids, by the current looks and rules.
 
     Ids and ill-posed questions stay. Takes out those that are rejected now, so that `sample_family` fills their places,
     and returns the reasons by id.
@@ -57,7 +57,7 @@ def draw_again(
     return _rewrite(released, name, _draw_record_again, workers, report, only)
 
 
-def relook_family(
+def redraw_looks(
     released: Path, name: str, workers: int | None = None, report: Callable[[str], None] = lambda _: None
 ) -> dict[str, str]:
     """Give a family's records the look of their draw, and measure their pixels again.
@@ -66,10 +66,10 @@ def relook_family(
     """
     looks = get_family(name).looks
     assert set(looks) <= set(STILL), f"{name}: looks in {', '.join(looks)}, of which some move the camera"
-    return _rewrite(released, name, _relook_record, workers, report)
+    return _rewrite(released, name, _redraw_look, workers, report)
 
 
-def reask_family(released: Path, name: str) -> list[str]:
+def redraw_questions(released: Path, name: str) -> list[str]:
     """Replace ill-posed questions that lose the certificate `words`; return the ids."""
     seed, changed_ids = load_tallies(released)[name].seed, list[str]()
     lines = (released / f"{name}.jsonl").read_text(encoding="utf-8").splitlines()
@@ -96,24 +96,24 @@ def _rewrite(
     only: Collection[str] | None = None,
 ) -> dict[str, str]:
     """Change records of a family, take out those rejected, and return reasons by id."""
-    tally, rejected = load_tallies(released)[name], dict[str, str]()
+    tally, rejections = load_tallies(released)[name], dict[str, str]()
     lines = (released / f"{name}.jsonl").read_text(encoding="utf-8").splitlines()
     records = {spec.scenario_id: spec for spec in map(SceneSpec.model_validate_json, lines)}
-    chosen = [id_ for id_ in records if only is None or id_ in only]
-    jobs = [(records[id_], released / "trajectories", tally) for id_ in chosen]
-    for finished, ((spec, folder, _), result) in enumerate(run_in_order(change, jobs, workers), start=1):
+    chosen_ids = [id_ for id_ in records if only is None or id_ in only]
+    jobs = [(records[id_], released / "trajectories", tally) for id_ in chosen_ids]
+    for n_finished, ((spec, folder, _), result) in enumerate(run_in_order(change, jobs, workers), start=1):
         if isinstance(result, str):
-            rejected[spec.scenario_id] = result
+            rejections[spec.scenario_id] = result
         else:
             save_trajectory(folder, spec.scenario_id, result.qpos, result.twin)
             records[spec.scenario_id] = result.spec
-        report(f"{spec.scenario_id}: {rejected.get(spec.scenario_id, 'written again')}; {finished} of {len(jobs)}")
+        report(f"{spec.scenario_id}: {rejections.get(spec.scenario_id, 'written again')}; {n_finished} of {len(jobs)}")
     write_text(released / f"{name}.jsonl", "".join(map(record_line, records.values())))
     tallies = load_tallies(released)
     tallies[name] = replace(tallies[name], file=family_digest(name), look=sorted(get_family(name).looks))
     save_tallies(released, tallies)
-    take_out(released, {id_: rejection_kind(why) for id_, why in rejected.items()})
-    return rejected
+    take_out(released, {id_: rejection_kind(reason) for id_, reason in rejections.items()})
+    return rejections
 
 
 def _draw_record_again(job: _Job) -> Resolved | str:
@@ -123,14 +123,16 @@ def _draw_record_again(job: _Job) -> Resolved | str:
     result = try_draw(Draw(spec.family, tally.seed, spec.seed, frozenset(), looks, tally.difficulty))
     if isinstance(result, str):
         return result
-    worlds = [{field: value for field, value in each.params.items() if field != "look"} for each in (spec, result.spec)]
+    worlds = [
+        {field: value for field, value in world.params.items() if field != "look"} for world in (spec, result.spec)
+    ]
     if worlds[0] != worlds[1]:
         return "its draw gives another scene"
     names = {"scenario_id": spec.scenario_id, "ill_posed_question": spec.ill_posed_question}
     return Resolved(result.spec.model_copy(update=names), result.qpos, result.twin)
 
 
-def _relook_record(job: _Job) -> Resolved | str:
+def _redraw_look(job: _Job) -> Resolved | str:
     """Return a record with the look of its draw, or the certificate it then loses."""
     spec, folder, tally = job
     family, path = get_family(spec.family), folder / f"{spec.scenario_id}.npz"

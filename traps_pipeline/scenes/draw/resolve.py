@@ -1,6 +1,6 @@
-"""Resolution of parameters to a scenario: simulate, frame, choose void and twin.
+"""Resolve parameters to a scenario: simulate, frame, choose void and twin.
 
-`resolve` is the only way a record comes to be; it raises `Rejected` with the reason when the draw makes no good pair.
+Only `resolve` creates records; it raises `Rejected`, with the reason, for a draw without a valid pair.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from traps_pipeline.scenes.certification.certificates import (
     settled_answer,
 )
 from traps_pipeline.scenes.certification.ensemble import Cut, Futures, Rollout
-from traps_pipeline.scenes.certification.evidence import Claim, Evidence, Pair, VoidKind, required
+from traps_pipeline.scenes.certification.evidence import Claim, Evidence, Pair, VoidKind, require_certificates
 from traps_pipeline.scenes.draw.closing import close_control, record_of
 from traps_pipeline.scenes.draw.trim import trim_candidates
 from traps_pipeline.scenes.physics.kit import Family, Physics, Wording, params_to_dict
@@ -93,7 +93,11 @@ def resolve(
             ground_truth=twin.outcome.answer,
             trajectory_sha256=trajectory_digest(twin.qpos),
         ),
-        evidence={name: value for each in certificates_for(void_kind) for name, value in each.kept(evidence).items()},
+        evidence={
+            name: value
+            for certificate in certificates_for(void_kind)
+            for name, value in certificate.kept(evidence).items()
+        },
     )
     return Resolved(spec, control.qpos, twin.qpos)
 
@@ -102,10 +106,10 @@ def _certify_some_length(
     uncut: World, void_kind: VoidKind, wording: Wording, ill_posed_question: str, seed: int
 ) -> tuple[Pair, Mapping[str, Any]]:
     """Return the first pair with all certificates, and its evidence. Raises Rejected."""
-    rejected = Rejected("no other hidden element gives another outcome")
+    rejection = Rejected("no other hidden element gives another outcome")
     for worlds in [(uncut,)] if void_kind == "truncation" else _with_other_worlds(uncut):
         for n_frames in lengths(worlds, seed):
-            control, *others = (shortened(world, n_frames) for world in worlds)
+            control, *other_worlds = (shortened(world, n_frames) for world in worlds)
             end_s = (n_frames - 1) / control.physics.fps
             answer = control.outcome.label
             claim = Claim(
@@ -113,12 +117,14 @@ def _certify_some_length(
             )
             try:
                 pair = Pair(control, claim, futures_of(control, seed))
-                evidence = required(certificates_for(void_kind, "control"), pair, {})
-                candidates = trim_candidates(_with_twin(pair, None, others[0])) if others else _at_latest_cut(pair)
+                evidence = require_certificates(certificates_for(void_kind, "control"), pair, {})
+                candidates = (
+                    trim_candidates(_with_twin(pair, None, other_worlds[0])) if other_worlds else _at_latest_cut(pair)
+                )
                 return _first_certified(candidates, void_kind, seed, evidence)
             except Rejected as failure:
-                rejected = failure  # another length, or another world, may do
-    raise rejected
+                rejection = failure  # another length, or another world, may do
+    raise rejection
 
 
 def _control(family: Family, params: Any, physics: Physics) -> World:
@@ -133,13 +139,15 @@ def _first_certified(
     candidates: Iterable[Pair], void_kind: VoidKind, seed: int, evidence: Evidence
 ) -> tuple[Pair, Mapping[str, Any]]:
     """Return the first pair whose void, twin and closing certify. Raises Rejected."""
-    rejected = Rejected("there is no twin")
+    rejection = Rejected("there is no twin")
     for pair in candidates:
         try:
-            return close_control(pair, seed, required(certificates_for(void_kind, "void", "twin"), pair, evidence))
+            return close_control(
+                pair, seed, require_certificates(certificates_for(void_kind, "void", "twin"), pair, evidence)
+            )
         except Rejected as failure:
-            rejected = failure  # the next one may hide more, or be alike
-    raise rejected
+            rejection = failure  # the next one may hide more, or be alike
+    raise rejection
 
 
 # --- occlusion --------------------------------------------------------------------------------------------------------
@@ -208,7 +216,7 @@ def _is_hopeless(scouts: Sequence[Rollout], first: int) -> bool:
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON gives it back: lists, and numbers of Python."""
+    """Return a value as JSON would read it back: lists, and Python numbers."""
     if isinstance(value, dict):
         return {key: plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""Sampling of a family's scenarios, until its quotas are full, into records.
+"""Sample a family's scenarios into records until its quotas are full.
 
 Draws are numbered and independent, so they run on all cores; acceptance goes through them in order, so that the same
 seed gives the same scenarios. Every accepted scenario is written at once: a sampling that was stopped goes on.
@@ -25,7 +25,13 @@ from traps_pipeline.scenes.certification.certificates import settled_outcome
 from traps_pipeline.scenes.draw.likeness import excess_lookalike, frame_hash
 from traps_pipeline.scenes.draw.resolve import Resolved, resolve
 from traps_pipeline.scenes.family_registry import family_digest, family_names, fit_to_sample, get_family
-from traps_pipeline.scenes.parts.difficulty import USUAL, Difficulty, SceneDifficulty, draw_distractors, untakeable
+from traps_pipeline.scenes.parts.difficulty import (
+    DEFAULT_DIFFICULTY,
+    Difficulty,
+    SceneDifficulty,
+    draw_distractors,
+    unsupported_settings,
+)
 from traps_pipeline.scenes.parts.look import look_of_draw
 from traps_pipeline.scenes.parts.wording import draw_ill_posed
 from traps_pipeline.scenes.physics.kit import Family, Physics, Scene, Wording
@@ -35,7 +41,7 @@ from traps_pipeline.scenes.worlds.pace import LATEST_SHARE, out_of_pace, settles
 from traps_pipeline.scenes.worlds.shot import shown_points
 from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory, save_trajectory
 
-MOST_DRAWS = 40  # for each scenario wanted; a family that needs more is not worth its time
+MAX_DRAWS = 40  # for each scenario wanted; a family that needs more is not worth its time
 DRAWS = "draws.json"  # beside the records: how each family was drawn
 _MEASURED = re.compile(r"\d[\d.]*|'\w+'(?=\s)")  # numbers and answers in a reason, which differ from draw to draw
 _WORDED_DRAWS = 128  # questions by which the share of an answer is known
@@ -44,7 +50,7 @@ _NO_QUESTION = "?"  # stands for the ill-posed question until the scenario has i
 
 @dataclass
 class Tally:
-    """How a family was drawn. file: digest of the family's file, empty in old notes."""
+    """The counts of a family's draws. file: digest of its file, empty in old notes."""
 
     seed: int
     wanted: int
@@ -52,11 +58,11 @@ class Tally:
     rejected: Counter[str] = field(default_factory=Counter)
     file: str = ""
     look: list[str] = field(default_factory=list)
-    difficulty: Difficulty = USUAL
+    difficulty: Difficulty = DEFAULT_DIFFICULTY
 
 
 def load_tallies(released: Path) -> dict[str, Tally]:
-    """Return how each family's records were drawn, from `draws.json` beside them."""
+    """Return each family's tally of draws, from `draws.json` beside the records."""
     path = released / DRAWS
     if not path.is_file():
         return {}
@@ -71,18 +77,18 @@ def load_tallies(released: Path) -> dict[str, Tally]:
 
 def require_difficulty(names: Iterable[str], difficulty: Difficulty) -> None:
     """Raise TrapsError naming families that cannot be drawn with the settings."""
-    lacking = {name: untakeable(get_family(name), difficulty) for name in names}
-    lacking = {name: settings for name, settings in lacking.items() if settings}
-    if lacking:
-        told = "; ".join(f"{name}: no --{', no --'.join(settings)}" for name, settings in sorted(lacking.items()))
-        able = [name for name in family_names() if not untakeable(get_family(name), difficulty)]
+    unsupported = {name: unsupported_settings(get_family(name), difficulty) for name in names}
+    unsupported = {name: settings for name, settings in unsupported.items() if settings}
+    if unsupported:
+        advice = "; ".join(f"{name}: no --{', no --'.join(settings)}" for name, settings in sorted(unsupported.items()))
+        supporting = [name for name in family_names() if not unsupported_settings(get_family(name), difficulty)]
         raise TrapsError(
-            f"some families cannot be drawn like this ({told}): name others with --families: {', '.join(able)}"
+            f"some families cannot be drawn like this ({advice}): name others with --families: {', '.join(supporting)}"
         )
 
 
 def answer_quota(count: int, n_labels: float) -> int:
-    """Return how often one answer may occur among `count` scenarios of a family.
+    """Return the maximum count of one answer among `count` scenarios of a family.
 
     Under ten: once more than the even split, rounded up. Else 60 % of two answers, 1.5 times the fair share of more.
     """
@@ -92,7 +98,7 @@ def answer_quota(count: int, n_labels: float) -> int:
 
 
 def ill_posed_quota(taxonomy: str, count: int) -> int:
-    """Return how often an ill-posed text may occur: once, or in 5 % (chaotic)."""
+    """Return the maximum count of an ill-posed text: 1, or 5 % (chaotic)."""
     return 1 if taxonomy == "occlusion" else max(1, count // 20)
 
 
@@ -105,7 +111,7 @@ class Draw:
     number: int
     closed: frozenset[str]
     look: tuple[str, ...] = ()
-    difficulty: Difficulty = USUAL
+    difficulty: Difficulty = DEFAULT_DIFFICULTY
 
 
 def sample_family(
@@ -115,7 +121,7 @@ def sample_family(
     released: Path,
     *,
     look: Collection[str] = (),
-    difficulty: Difficulty = USUAL,
+    difficulty: Difficulty = DEFAULT_DIFFICULTY,
     workers: int | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> Tally:
@@ -144,8 +150,8 @@ def sample_family(
     answers = Counter(spec.ground_truth for spec in specs)
     texts = Counter(spec.ill_posed_question for spec in specs)
     hashes = {} if len(specs) == count else {spec.scenario_id: frame_hash(spec, records.qpos(spec)) for spec in specs}
-    occupied = {int(spec.scenario_id.rpartition("-")[2]) for spec in specs}
-    places = [place for place in range(1, count + 1) if place not in occupied]
+    taken_numbers = {int(spec.scenario_id.rpartition("-")[2]) for spec in specs}
+    places = [place for place in range(1, count + 1) if place not in taken_numbers]
     if not places:
         return tally
 
@@ -153,10 +159,10 @@ def sample_family(
         return _full_answers(answers, count, family, difficulty.longer)
 
     def jobs() -> Iterator[Draw]:
-        for number in range(tally.draws, MOST_DRAWS * count):
+        for number in range(tally.draws, MAX_DRAWS * count):
             yield Draw(name, seed, number, full_answers(), tuple(parts), difficulty)
 
-    reported: set[str] = set()  # kinds of rejections that the report has
+    reported_kinds: set[str] = set()  # kinds of rejections that the report has
     # A draw takes seconds, and those that were begun are waited for: no more than could all be wanted.
     results = run_in_order(try_draw, jobs(), workers, ahead=len(places))
     try:
@@ -169,16 +175,16 @@ def sample_family(
                 result = f"its first frame looks like that of another: {lookalike}"
             if isinstance(result, str):
                 tally.rejected[result.split(":")[0]] += 1
-                if rejection_kind(result) not in reported:  # so that a family that never passes says why at once
-                    reported.add(rejection_kind(result))
+                if rejection_kind(result) not in reported_kinds:  # so that a family that never passes says why at once
+                    reported_kinds.add(rejection_kind(result))
                     report(f"{name}: draw {draw.number + 1} is rejected: {result}")
                 continue
-            placed = _with_id(family, result, draw, places.pop(0), texts, count)
-            hashes[placed.spec.scenario_id] = picture_hash
-            answers[placed.spec.ground_truth] += 1
-            texts[placed.spec.ill_posed_question] += 1
-            records.append(placed, tally)
-            report(f"{placed.spec.scenario_id}: {placed.spec.ground_truth} after {tally.draws} draws")
+            placed_draw = _with_id(family, result, draw, places.pop(0), texts, count)
+            hashes[placed_draw.spec.scenario_id] = picture_hash
+            answers[placed_draw.spec.ground_truth] += 1
+            texts[placed_draw.spec.ill_posed_question] += 1
+            records.append(placed_draw, tally)
+            report(f"{placed_draw.spec.scenario_id}: {placed_draw.spec.ground_truth} after {tally.draws} draws")
             if not places:
                 records.sort()
                 return tally
@@ -189,12 +195,12 @@ def sample_family(
 
 
 def rejection_kind(reason: str) -> str:
-    """Return what a rejection has in common with others: no numbers, no details."""
+    """Return a rejection's reason without numbers or details, to count like ones."""
     return _MEASURED.sub("", reason.split(":")[0])
 
 
 class Records:
-    """Released files of a family; its place in `draws.json` vouches for the others."""
+    """Released files of a family, except its entry in `draws.json`."""
 
     def __init__(self, released: Path, family: str) -> None:
         self._released, self._family = released, family
@@ -216,9 +222,9 @@ class Records:
                 specs.append(SceneSpec.model_validate(json.loads(line)))
             except ValueError:  # a line that a kill tore
                 break
-        in_tally = [spec for spec in specs if spec.seed < tally.draws]
-        write_text(self._lines, "".join(record_line(spec) for spec in in_tally))
-        return in_tally
+        known_specs = [spec for spec in specs if spec.seed < tally.draws]
+        write_text(self._lines, "".join(record_line(spec) for spec in known_specs))
+        return known_specs
 
     def qpos(self, spec: SceneSpec) -> np.ndarray:
         """Return the trajectory of a record."""
@@ -258,9 +264,9 @@ def take_out(released: Path, reasons: Mapping[str, str]) -> None:
 def save_tallies(released: Path, tallies: Mapping[str, Tally]) -> None:
     """Write `draws.json`."""
     notes = dict[str, dict[str, Any]]()
-    for name, each in tallies.items():
-        notes[name] = {**vars(each), "rejected": dict(each.rejected), "difficulty": each.difficulty.settings()}
-        if each.difficulty == USUAL:
+    for name, tally in tallies.items():
+        notes[name] = {**vars(tally), "rejected": dict(tally.rejected), "difficulty": tally.difficulty.settings()}
+        if tally.difficulty == DEFAULT_DIFFICULTY:
             del notes[name]["difficulty"]
     write_text(released / DRAWS, json.dumps(notes, indent=1, sort_keys=True) + "\n")
 
@@ -271,12 +277,12 @@ def record_line(spec: SceneSpec) -> str:
 
 
 def _full_answers(answers: Counter[str], count: int, family: Family, longer: bool = False) -> frozenset[str]:
-    choices = _choices(family, longer)
+    choices = _mean_choices(family, longer)
     return frozenset(answer for answer, n in answers.items() if n >= answer_quota(count, choices[answer]))
 
 
 @cache
-def _choices(family: Family, longer: bool = False) -> Mapping[str, float]:
+def _mean_choices(family: Family, longer: bool = False) -> Mapping[str, float]:
     """Return how many choices each answer competes with, on average over many draws."""
     rng = np.random.default_rng(0)
     choices_by_draw = [family.word(family.draw(rng, longer), rng).labels for _ in range(_WORDED_DRAWS)]
@@ -284,22 +290,22 @@ def _choices(family: Family, longer: bool = False) -> Mapping[str, float]:
     for labels in choices_by_draw:
         for label in labels:
             shares[label] += 1 / len(labels) / len(choices_by_draw)
-    rare = float(len(choices_by_draw))  # an answer that none of them offers
-    return defaultdict(lambda: rare, {label: 1 / share for label, share in shares.items()})
+    n_choices = float(len(choices_by_draw))  # an answer that none of them offers
+    return defaultdict(lambda: n_choices, {label: 1 / share for label, share in shares.items()})
 
 
 def try_draw(draw: Draw) -> Resolved | str:
     """Return a draw, resolved, or the reason why it is rejected."""
     try:
-        drawn = scene_of_draw(draw)
+        drawn_scene = scene_of_draw(draw)
         return resolve(
             get_family(draw.family),
-            drawn.params,
-            drawn.wording,
+            drawn_scene.params,
+            drawn_scene.wording,
             _NO_QUESTION,
             scenario_id=f"{draw.family}-0000",
             seed=draw.number,
-            physics=drawn.physics,
+            physics=drawn_scene.physics,
         )
     except Rejected as rejected:
         return str(rejected)
@@ -307,7 +313,7 @@ def try_draw(draw: Draw) -> Resolved | str:
 
 @dataclass(frozen=True)
 class DrawnScene:
-    """What a draw gives before any pixel is looked at."""
+    """The result of a draw before any pixel is examined."""
 
     params: Any
     wording: Wording
@@ -317,7 +323,7 @@ class DrawnScene:
 def scene_of_draw(draw: Draw) -> DrawnScene:
     """Return the scene of a numbered draw.
 
-    Raises Rejected where its answer has its quota or cannot be certified.
+    Raises Rejected if the quota of its answer is full, or the answer cannot be certified.
     """
     family = get_family(draw.family)
     rng = np.random.default_rng([draw.seed, *draw.family.encode(), draw.number])
@@ -331,10 +337,12 @@ def scene_of_draw(draw: Draw) -> DrawnScene:
     if answer in draw.closed:
         raise Rejected(f"answer {answer!r} has its quota")
     if draw.difficulty.distractors:
-        own = np.random.default_rng([draw.seed, *draw.family.encode(), draw.number, *b"distractors"])
+        distractor_rng = np.random.default_rng([draw.seed, *draw.family.encode(), draw.number, *b"distractors"])
         duration_s = physics.duration_s * physics.speed
-        things = draw_distractors(own, draw.difficulty.distractors, scene, points, wording, params, duration_s)
-        params = replace(params, difficulty=SceneDifficulty(things, draw.difficulty.longer))
+        distractors = draw_distractors(
+            distractor_rng, draw.difficulty.distractors, scene, points, wording, params, duration_s
+        )
+        params = replace(params, difficulty=SceneDifficulty(distractors, draw.difficulty.longer))
     return DrawnScene(params, wording, physics)
 
 
@@ -352,20 +360,21 @@ def ill_posed_for(spec: SceneSpec, seed: int, texts: Counter[str], count: int) -
     """
     family = get_family(spec.family)
     inventory = family.build(family.params_from(spec.params), family.physics).inventory
-    most, place = ill_posed_quota(spec.taxonomy, count), int(spec.scenario_id.rpartition("-")[2])
+    quota, place = ill_posed_quota(spec.taxonomy, count), int(spec.scenario_id.rpartition("-")[2])
     rng = np.random.default_rng([seed, *spec.family.encode(), spec.seed, place])
-    return draw_ill_posed(spec.taxonomy, inventory, rng, lambda text: texts[text] < most)
+    return draw_ill_posed(spec.taxonomy, inventory, rng, lambda text: texts[text] < quota)
 
 
 def simulated_answer(family: Family, params: Any) -> str:
-    """Return what the control of a draw shows."""
+    """Return the answer that a draw's control shows."""
     return simulated_scene(family, params, family.physics)[0]
 
 
 def simulated_scene(family: Family, params: Any, physics: Physics) -> tuple[str, Scene, np.ndarray]:
-    """Return what a draw's control shows, in a second, before certificates cost more.
+    """Simulate a draw's control; return its answer, its scene and points to frame.
 
-    Also return the scene, and points around all that it shows or covers, (N, 3).
+    It takes a second, so it comes before the certificates. The points, (N, 3), surround everything that is shown or
+    covered. Raises Rejected if the outcome is undecided or settles too late.
     """
     model, scene = compile_scene(family, params, physics)
     qpos = simulated(model, scene, physics)
@@ -373,5 +382,5 @@ def simulated_scene(family: Family, params: Any, physics: Physics) -> tuple[str,
     settled_at = settles_share(outcome.commit_frame, len(qpos))
     if settled_at > LATEST_SHARE:  # where it settles too early the clip will end earlier
         raise Rejected(str(out_of_pace(settled_at)))
-    covered = () if scene.cover is None else (scene.cover.corners(),)
-    return outcome.answer, scene, np.concatenate([shown_points(model, scene, qpos), *covered])
+    cover_corners = () if scene.cover is None else (scene.cover.corners(),)
+    return outcome.answer, scene, np.concatenate([shown_points(model, scene, qpos), *cover_corners])

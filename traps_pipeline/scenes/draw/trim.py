@@ -1,4 +1,4 @@
-"""Trimming of occluders to what the twin needs.
+"""Trim occluders to the area that the twin needs.
 
 A family says what its occluder hides at the most, as a box (`Scene.cover`). How much of that must be hidden follows
 from the pair: where control and twin differ in any frame, where anything of the hidden element shows, and where
@@ -22,11 +22,11 @@ MARGINS_PX = (3, 9)  # around what must be hidden, to be tried one after the oth
 
 
 def trim_candidates(pair: Pair) -> Iterator[Pair]:
-    """Yield a pair behind ever larger occluders, of which each may lose a certificate."""
+    """Yield a pair with ever larger occluders, each of which may fail a certificate."""
     occluder = pair.control.occluder
     assert occluder is not None, "only an occluder can be trimmed"
-    needed = must_hide(pair)
-    occluders = [cut_to(occluder, pair.control.camera, needed, margin) for margin in MARGINS_PX]
+    needed_mask = must_hide(pair)
+    occluders = [cut_to(occluder, pair.control.camera, needed_mask, margin) for margin in MARGINS_PX]
     for smaller in dict.fromkeys((*occluders, occluder)):
         control, twin = (replace(world, occluder=smaller) for world in (pair.control, pair.other_world))
         yield replace(pair, control=control, twin=twin, void_frame=control.past_occluder.hidden_from())
@@ -34,20 +34,22 @@ def trim_candidates(pair: Pair) -> Iterator[Pair]:
 
 def must_hide(pair: Pair) -> np.ndarray:
     """Return the pixels (H, W) that an occluder must cover to hide what differs."""
-    needed, videos = np.zeros((HEIGHT, WIDTH), bool), list[list[np.ndarray]]()
+    needed_mask, videos = np.zeros((HEIGHT, WIDTH), bool), list[list[np.ndarray]]()
     for world in (pair.control, pair.other_world):
         settled_from = max(world.outcome.commit_frame - 1, 0)
         decisive = decisive_geoms(world.model, world.scene.decisive)
         with world.renderer(supersample=1) as renderer:  # a margin is left, and certificates judge
             frames = list(renderer.frames(world.qpos))
-            needed |= _differing(frames, renderer.frames(world.qpos, without=world.scene.hidden))
-            needed |= _differing(frames[settled_from:], renderer.frames(world.qpos[settled_from:], without=decisive))
+            needed_mask |= _differing_pixels(frames, renderer.frames(world.qpos, without=world.scene.hidden))
+            needed_mask |= _differing_pixels(
+                frames[settled_from:], renderer.frames(world.qpos[settled_from:], without=decisive)
+            )
         videos.append(frames)
-    return needed | _differing(*videos)
+    return needed_mask | _differing_pixels(*videos)
 
 
 def cut_to(occluder: Occluder, camera: Camera, needed: np.ndarray, margin_px: int) -> Occluder:
-    """Return the least occluder in its plane, and within it, around pixels (H, W)."""
+    """Return the smallest part of an occluder that covers the pixels (H, W)."""
     rows, columns = np.nonzero(needed)
     if not len(rows):
         return occluder
@@ -55,23 +57,23 @@ def cut_to(occluder: Occluder, camera: Camera, needed: np.ndarray, margin_px: in
     top, bottom = rows.min() - margin_px, rows.max() + 1 + margin_px
     ahead, across = _directions(occluder)
     corners = np.array([[x, y] for x in (left, right) for y in (top, bottom)], dtype=float)
-    on_plane = _on_plane(camera, corners, ahead, float(np.array(occluder.centre) @ ahead) - occluder.half[1])
-    side, middle = on_plane @ across, float(np.array(occluder.centre) @ across)
+    plane_points = _plane_points(camera, corners, ahead, float(np.array(occluder.centre) @ ahead) - occluder.half[1])
+    side, middle = plane_points @ across, float(np.array(occluder.centre) @ across)
     low, high = max(side.min(), middle - occluder.half[0]), min(side.max(), middle + occluder.half[0])
-    height = min(float(on_plane[:, 2].max()), 2 * occluder.half[2])
+    height = min(float(plane_points[:, 2].max()), 2 * occluder.half[2])
     centre = np.array(occluder.centre) + across * ((low + high) / 2 - middle)
     x, y = (round(float(v), 6) for v in centre[:2])
-    half = (round((high - low) / 2, 6), occluder.half[1], round(height / 2, 6))
-    return replace(occluder, centre=(x, y, half[2]), half=half)
+    half_size = (round((high - low) / 2, 6), occluder.half[1], round(height / 2, 6))
+    return replace(occluder, centre=(x, y, half_size[2]), half=half_size)
 
 
-def _differing(frames: Iterable[np.ndarray], counterparts: Iterable[np.ndarray]) -> np.ndarray:
+def _differing_pixels(frames: Iterable[np.ndarray], counterparts: Iterable[np.ndarray]) -> np.ndarray:
     """Return where any frame differs from its counterpart, on the grid of 480x360."""
     mask = np.zeros((HEIGHT, WIDTH), bool)
     for frame, counterpart in zip(frames, counterparts, strict=True):
-        differs = (frame != counterpart).any(axis=2)
-        fine = differs.shape[0] // HEIGHT
-        mask |= differs.reshape(HEIGHT, fine, WIDTH, fine).any(axis=(1, 3))
+        is_different = (frame != counterpart).any(axis=2)
+        scale = is_different.shape[0] // HEIGHT
+        mask |= is_different.reshape(HEIGHT, scale, WIDTH, scale).any(axis=(1, 3))
     return mask
 
 
@@ -81,11 +83,11 @@ def _directions(occluder: Occluder) -> tuple[np.ndarray, np.ndarray]:
     return np.array([np.cos(azimuth), np.sin(azimuth), 0.0]), np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
 
 
-def _on_plane(camera: Camera, pixels: np.ndarray, ahead: np.ndarray, front: float) -> np.ndarray:
+def _plane_points(camera: Camera, pixels: np.ndarray, ahead: np.ndarray, front: float) -> np.ndarray:
     """Return where lines of sight through pixels (N, 2) meet an upright plane, (N, 3)."""
     right, up, forward = camera.axes()
     focal = HEIGHT / 2 / np.tan(np.radians(camera.fovy_deg) / 2)
-    sideways, upwards = (pixels[:, 0] - WIDTH / 2) / focal, (HEIGHT / 2 - pixels[:, 1]) / focal
-    rays = forward + sideways[:, None] * right + upwards[:, None] * up
+    ray_x, ray_y = (pixels[:, 0] - WIDTH / 2) / focal, (HEIGHT / 2 - pixels[:, 1]) / focal
+    rays = forward + ray_x[:, None] * right + ray_y[:, None] * up
     eye = camera.position()
     return eye + rays * ((front - eye @ ahead) / (rays @ ahead))[:, None]

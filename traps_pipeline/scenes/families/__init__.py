@@ -1,1 +1,1 @@
-"""Scene families, one a file of the same name; docs/scenes.md says how to add one."""
+"""Define scene families, one per file; docs/scenes.md says how to add one."""

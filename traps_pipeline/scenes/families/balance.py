@@ -30,19 +30,19 @@ STIFFNESS = 1.6  # of the spring that pulls the beam level, in torques of the ba
 LEVEL_M = 0.06  # the ends of a balanced beam differ less in height
 TIPPED_DEG = 5.0  # in the picture
 OVER = 0.75  # of the tilt that it starts with: a beam that turns so far does not come back
-PLAY, PLAIN = apart("red", "green", "blue", "cyan", "purple"), shuffled("wood", "grey")
+PLAY_COLOURS, PLAIN_COLOURS = apart("red", "green", "blue", "cyan", "purple"), shuffled("wood", "grey")
 
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths from the pivot, direction +1: the ball drops on the left."""
+    """Parameters; lengths run from the pivot; at direction +1 the ball drops left."""
 
     direction: int = one_of(-1, 1)
-    ball_colour: str = PLAY()
-    beam_colour: str = PLAY()
-    counterweight_colour: str = PLAY()
-    shelf_colour: str = PLAIN()
-    board_colour: str = PLAIN()
+    ball_colour: str = PLAY_COLOURS()
+    beam_colour: str = PLAY_COLOURS()
+    counterweight_colour: str = PLAY_COLOURS()
+    shelf_colour: str = PLAIN_COLOURS()
+    board_colour: str = PLAIN_COLOURS()
     place: str = hidden("near", "even", "far")  # of the counterweight
     even_m: float = between(0.21, 0.24)  # where the counterweight keeps the ball in balance
     near_share: float = between(0.40, 0.50)  # of `even_m`, for the other two places
@@ -66,24 +66,24 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build shelf, beam, and the board that carries the beam and catches shadows."""
     course = Course(physics, p.direction)
-    r, side = p.radius_m, 1.7 * p.radius_m
+    r, half_width = p.radius_m, 1.7 * p.radius_m
     sin, cos = np.sin(np.radians(p.tilt_deg)), np.cos(np.radians(p.tilt_deg))
     drop_at = float(p.arm_m * cos - (BEAM_HALF_M + r) * sin)  # before the pivot, over the cup of the raised arm
     z = float(p.pivot_z_m + (p.half_beam_m * sin + (BEAM_HALF_M + CUP_M) * cos) + 0.03)  # the shelf clears that cup
     edge, stop = -drop_at - r - DROP_SLACK_M, -drop_at + r + DROP_SLACK_M
     occluder_at, end, high = -p.half_beam_m - 0.03, p.half_beam_m + 0.03, z + 2 * r + 0.02
-    start, deep, over = occluder_at - p.run_m, (-side, side), (z, z + 0.3 * r)
+    start, depth_span, wall_span = occluder_at - p.run_m, (-half_width, half_width), (z, z + 0.3 * r)
 
-    course.block("table", (start, occluder_at), deep, (0, z), p.shelf_colour)
-    course.block("shelf", (occluder_at, edge), deep, (z - 0.012, z), p.shelf_colour)
-    course.block("shelf_front", (start, edge), (-side, -side + 0.012), over, p.board_colour)
-    course.block("shelf_back", (start, edge), (side - 0.012, side), over, p.board_colour)
-    behind = (stop, stop + 0.012), (-0.6 * side, side), (z - 0.01, z + 1.5 * r)
-    backstop = course.block("backstop", *behind, p.shelf_colour)
+    course.block("table", (start, occluder_at), depth_span, (0, z), p.shelf_colour)
+    course.block("shelf", (occluder_at, edge), depth_span, (z - 0.012, z), p.shelf_colour)
+    course.block("shelf_front", (start, edge), (-half_width, -half_width + 0.012), wall_span, p.board_colour)
+    course.block("shelf_back", (start, edge), (half_width - 0.012, half_width), wall_span, p.board_colour)
+    backstop_box = (stop, stop + 0.012), (-0.6 * half_width, half_width), (z - 0.01, z + 1.5 * r)
+    backstop = course.block("backstop", *backstop_box, p.shelf_colour)
     backstop.priority, backstop.solref = 1, list(DEAD)
-    course.block("board", (occluder_at, end), (side, side + 0.015), (0, high), p.board_colour)
-    course.block("base", (-p.half_beam_m, p.half_beam_m), (-side - 0.02, side), (0, 0.025), "black")
-    axle = (-0.016, 0.016), (-0.05, side), (p.pivot_z_m - 0.016, p.pivot_z_m + 0.016)
+    course.block("board", (occluder_at, end), (half_width, half_width + 0.015), (0, high), p.board_colour)
+    course.block("base", (-p.half_beam_m, p.half_beam_m), (-half_width - 0.02, half_width), (0, 0.025), "black")
+    axle = (-0.016, 0.016), (-0.05, half_width), (p.pivot_z_m - 0.016, p.pivot_z_m + 0.016)
     course.block("axle", *axle, "white", solid=False)
     _add_beam(course, p)
     at = (start + 1.2 * r, 0, z + r)
@@ -93,8 +93,8 @@ def build(p: Params, physics: Physics) -> Scene:
         p,
         decisive=["beam"],
         hidden=["counterweight"],
-        cover=course.box((occluder_at, end), (-side - 0.02, side + 0.03), (0, high + 0.02), right=0.02),
-        in_view=[course.box((start, end), deep, (0, high))],
+        cover=course.box((occluder_at, end), (-half_width - 0.02, half_width + 0.03), (0, high + 0.02), right=0.02),
+        in_view=[course.box((start, end), depth_span, (0, high))],
         things=[f"{p.ball_colour} ball", f"{p.beam_colour} beam", "shelf", "counterweight", "cup"],
         also=["board", "base"],
         colours=["black", "white"],
@@ -103,24 +103,26 @@ def build(p: Params, physics: Physics) -> Scene:
 
 def _add_beam(course: Course, p: Params) -> None:
     """Add the hinged beam with cup and counterweight, at the counterweight's stop."""
-    d, half = p.direction, p.direction * float(np.radians(p.tilt_deg)) / 2
+    d, half_tilt = p.direction, p.direction * float(np.radians(p.tilt_deg)) / 2
     low, high = sorted((-2 * d * p.tilt_deg, 0.0))
     body = course.hinge("beam", (0, 0, p.pivot_z_m), damping=0.5, range_deg=(low, high))
-    body.quat = [float(np.cos(half)), 0.0, float(np.sin(half)), 0.0]
+    body.quat = [float(np.cos(half_tilt)), 0.0, float(np.sin(half_tilt)), 0.0]
     joint, ball_kg = body.first_joint(), float(BALL_DENSITY * 4 / 3 * np.pi * p.radius_m**3)
     joint.stiffness, joint.springref = [STIFFNESS * (ball_kg * 9.81 * p.arm_m), 0, 0], -d * p.tilt_deg
     add_box(body, "beam", (0, 0, 0), (p.half_beam_m, 0.03, BEAM_HALF_M), p.beam_colour, density=300)
 
-    inner, thin, felt = p.radius_m + 0.004, 0.005, Surface(2e-3, spinning=0.01, solref=DEAD)
+    inner, thickness, surface = p.radius_m + 0.004, 0.005, Surface(2e-3, spinning=0.01, solref=DEAD)
     for i, (dx, dy) in enumerate(((-1, 0), (1, 0), (0, -1), (0, 1))):
-        centre = (-d * p.arm_m + dx * (inner + thin), dy * (inner + thin), BEAM_HALF_M + CUP_M / 2)
-        size = (thin if dx else inner + 2 * thin, thin if dy else inner + 2 * thin, CUP_M / 2)
-        felt.on(add_box(body, f"cup_{i}", centre, size, "white", density=1))
+        centre = (-d * p.arm_m + dx * (inner + thickness), dy * (inner + thickness), BEAM_HALF_M + CUP_M / 2)
+        size = (thickness if dx else inner + 2 * thickness, thickness if dy else inner + 2 * thickness, CUP_M / 2)
+        surface.on(add_box(body, f"cup_{i}", centre, size, "white", density=1))
     size = p.counterweight_half_m
-    out = p.even_m * {"near": p.near_share, "even": 1.0, "far": p.far_share}[p.place]
-    balanced = ball_kg * p.arm_m / (p.even_m * 8 * size**3)  # density that keeps the ball in balance at `even_m`
-    at = (d * out, 0, BEAM_HALF_M + size)
-    add_box(body, "counterweight", at, (size, size, size), p.counterweight_colour, density=balanced)
+    counterweight_at = p.even_m * {"near": p.near_share, "even": 1.0, "far": p.far_share}[p.place]
+    balancing_density = (
+        ball_kg * p.arm_m / (p.even_m * 8 * size**3)
+    )  # density that keeps the ball in balance at `even_m`
+    at = (d * counterweight_at, 0, BEAM_HALF_M + size)
+    add_box(body, "counterweight", at, (size, size, size), p.counterweight_colour, density=balancing_density)
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
@@ -157,7 +159,7 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
 
 
 def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
-    """Predict the end from the swing: as far over as at first, or level if it slows."""
+    """Predict the end from the swing: still tipped over, or level if it slows."""
     slopes = [(_slope_deg(frame, slots["beam"], 200), _slope_deg(frame, "black", 100)) for frame in frames]
     tilts = [beam - base for beam, base in slopes if beam is not None and base is not None]
     if len(tilts) < 3 or abs(tilts[0]) < TIPPED_DEG:

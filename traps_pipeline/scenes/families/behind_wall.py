@@ -33,8 +33,8 @@ TRAY_M = 0.02  # lower than the lane, so that no ball rolls back behind the wall
 WALL_M = 0.03
 SILL_M = 0.045
 BALL_COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
-PLAY = apart(*BALL_COLOURS, "black", fits=lambda ball, wall: ball != "black")
-PLAIN = shuffled("wood", "grey", "white", "black", without="wall_colour")
+PLAY_COLOURS = apart(*BALL_COLOURS, "black", fits=lambda ball, wall: ball != "black")
+PLAIN_COLOURS = shuffled("wood", "grey", "white", "black", without="wall_colour")
 
 
 def _windows(rng: np.random.Generator, so_far: Drawn) -> tuple[float, float]:
@@ -45,14 +45,14 @@ def _windows(rng: np.random.Generator, so_far: Drawn) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths run from the wall's start, direction +1: to the right."""
+    """Parameters; lengths run from the wall's start; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
-    ball_colour: str = PLAY()
-    wall_colour: str = PLAY()
-    lane_colour: str = PLAIN()
-    tray_colour: str = PLAIN()
-    block_colour: str = PLAIN()
+    ball_colour: str = PLAY_COLOURS()
+    wall_colour: str = PLAY_COLOURS()
+    lane_colour: str = PLAIN_COLOURS()
+    tray_colour: str = PLAIN_COLOURS()
+    block_colour: str = PLAIN_COLOURS()
     wall_m: float = between(0.82, 0.92)
     blocked: bool = hidden(False, True)  # whether the block lies across the lane
     speed_m_s: float = between(0.62, 0.78)
@@ -72,16 +72,22 @@ def build(p: Params, physics: Physics) -> Scene:
     """Build a lane, a wall with windows and merlons before it, and a tray at its end."""
     course = Course(physics, p.direction)
     r, rail, front = p.radius_m, 0.012, -1.35 * p.radius_m - WALL_M
-    side, far = 1.25 * r, p.wall_m + p.tray_m
-    second, deep, rim = p.windows_m[1], (-side, side), TRAY_M + 0.6 * r
+    half_width, far_end = 1.25 * r, p.wall_m + p.tray_m
+    second, depth_span, rim = p.windows_m[1], (-half_width, half_width), TRAY_M + 0.6 * r
     bed = (second - 2.5 * r, second + 1.5 * r)  # rough: a ball that bounces off the block stays there
 
-    course.block("lane_in", (-p.run_m, bed[0]), deep, (0, DECK_M), p.lane_colour, Surface(1e-4))
-    course.block("lane_bed", bed, deep, (0, DECK_M), p.lane_colour, Surface(0.003))
-    course.block("lane_out", (bed[1], p.wall_m), deep, (0, DECK_M), p.lane_colour, Surface(1e-4))
-    course.block("tray", (p.wall_m, far), deep, (0, TRAY_M), p.tray_colour, Surface(0.004))
-    course.sides("tray", (p.wall_m, far), side, rail, (0, rim), p.tray_colour)
-    course.block("tray_end", (far, far + rail), (-side - rail, side + rail), (0, TRAY_M + 1.5 * r), p.tray_colour)
+    course.block("lane_in", (-p.run_m, bed[0]), depth_span, (0, DECK_M), p.lane_colour, Surface(1e-4))
+    course.block("lane_bed", bed, depth_span, (0, DECK_M), p.lane_colour, Surface(0.003))
+    course.block("lane_out", (bed[1], p.wall_m), depth_span, (0, DECK_M), p.lane_colour, Surface(1e-4))
+    course.block("tray", (p.wall_m, far_end), depth_span, (0, TRAY_M), p.tray_colour, Surface(0.004))
+    course.sides("tray", (p.wall_m, far_end), half_width, rail, (0, rim), p.tray_colour)
+    course.block(
+        "tray_end",
+        (far_end, far_end + rail),
+        (-half_width - rail, half_width + rail),
+        (0, TRAY_M + 1.5 * r),
+        p.tray_colour,
+    )
     _add_wall(course, p, (front, front + WALL_M))
     stop = second + 1.1 * r  # where the block's face is: the ball rests in the window
     across = (-0.8 * r, 0.8 * r) if p.blocked else (1.5 * r, 3.1 * r)
@@ -94,9 +100,9 @@ def build(p: Params, physics: Physics) -> Scene:
         p,
         decisive=["ball"],
         hidden=["block"],
-        cover=course.cover((p.mouth_m, far + rail), (front - 0.01, 3.1 * r), high),
+        cover=course.cover((p.mouth_m, far_end + rail), (front - 0.01, 3.1 * r), high),
         in_view=[
-            course.box((-p.run_m, far), (front, 3.1 * r), (0, high)),
+            course.box((-p.run_m, far_end), (front, 3.1 * r), (0, high)),
             course.box((0, p.wall_m), (front, 0), (0, p.height_m + 0.05)),
         ],
         things=[f"{p.ball_colour} ball", f"{p.wall_colour} wall", "lane", f"top of the {p.wall_colour} wall"],

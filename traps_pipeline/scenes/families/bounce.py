@@ -23,19 +23,19 @@ from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 FLOOR_M = 0.03  # top of the pad and of the tray
 WALL_HALF_M = 0.014
 LIVELY = 0.85  # share of its speed that a ball keeps on the lively pad
-PLAY, PLAIN = apart("red", "green", "blue", "yellow", "cyan", "purple"), shuffled("wood", "grey")
+PLAY_COLOURS, PLAIN_COLOURS = apart("red", "green", "blue", "yellow", "cyan", "purple"), shuffled("wood", "grey")
 
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths run from the table's edge, direction +1: to the right."""
+    """Parameters; lengths run from the table's edge; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
-    ball_colour: str = PLAY()
-    wall_colour: str = PLAY()
-    pad_colour: str = PLAY()
-    board_colour: str = PLAIN()
-    table_colour: str = PLAIN()
+    ball_colour: str = PLAY_COLOURS()
+    wall_colour: str = PLAY_COLOURS()
+    pad_colour: str = PLAY_COLOURS()
+    board_colour: str = PLAIN_COLOURS()
+    table_colour: str = PLAIN_COLOURS()
     lively: bool = hidden(False, True)
     radius_m: float = between(0.045, 0.055)
     speed_m_s: float = between(0.50, 0.66)
@@ -49,7 +49,7 @@ class Params:
 
     @property
     def wall_at_m(self) -> float:
-        """Where the wall stands: below the top of the bounce."""
+        """Position of the wall, below the top of the bounce."""
         fall_s = float(np.sqrt(2 * self.drop_m / 9.81))
         return (1 + LIVELY) * self.speed_m_s * fall_s + 0.3 * self.radius_m
 
@@ -57,20 +57,20 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build a table, then pad, wall and tray before a board that catches the shadows."""
     course = Course(physics, p.direction)
-    r, side, rim, top = p.radius_m, 1.7 * p.radius_m, 0.012, FLOOR_M + p.drop_m
-    near, far, end = p.wall_at_m - WALL_HALF_M, p.wall_at_m + WALL_HALF_M, p.wall_at_m + p.tray_m
-    deep, floor, over = (-side, side), (0, FLOOR_M), (0, FLOOR_M + p.wall_m)
+    r, half_width, rim, top = p.radius_m, 1.7 * p.radius_m, 0.012, FLOOR_M + p.drop_m
+    near_face, far_face, end = p.wall_at_m - WALL_HALF_M, p.wall_at_m + WALL_HALF_M, p.wall_at_m + p.tray_m
+    depth_span, floor, wall_span = (-half_width, half_width), (0, FLOOR_M), (0, FLOOR_M + p.wall_m)
     pad = Surface(1e-3, solref=(-50000.0, -22.0) if p.lively else DEAD, priority=2)
 
-    course.block("table", (-p.table_m, 0), deep, (0, top), p.table_colour)
-    for i, y in enumerate((-side, side - rim)):
+    course.block("table", (-p.table_m, 0), depth_span, (0, top), p.table_colour)
+    for i, y in enumerate((-half_width, half_width - rim)):
         course.block(f"table_rail_{i}", (-p.table_m, 0), (y, y + rim), (top, top + 0.3 * r), p.board_colour)
-    course.block("pad", (0, near), deep, floor, p.pad_colour, pad)
-    course.block("wall", (near, far), deep, over, p.wall_colour)
-    course.block("tray", (far, end), deep, floor, p.tray_colour, Surface(2e-3, solref=DEAD))
-    course.block("front_rail", (0, end), (-side - rim, -side), (0, FLOOR_M + 0.3 * r), p.table_colour)
-    course.block("end", (end, end + 0.02), (-side - rim, side), over, p.table_colour)
-    course.block("board", (0, end + 0.02), (side, side + 0.015), (0, top), p.board_colour)
+    course.block("pad", (0, near_face), depth_span, floor, p.pad_colour, pad)
+    course.block("wall", (near_face, far_face), depth_span, wall_span, p.wall_colour)
+    course.block("tray", (far_face, end), depth_span, floor, p.tray_colour, Surface(2e-3, solref=DEAD))
+    course.block("front_rail", (0, end), (-half_width - rim, -half_width), (0, FLOOR_M + 0.3 * r), p.table_colour)
+    course.block("end", (end, end + 0.02), (-half_width - rim, half_width), wall_span, p.table_colour)
+    course.block("board", (0, end + 0.02), (half_width, half_width + 0.015), (0, top), p.board_colour)
     course.ball("ball", (-p.table_m + 1.3 * r, 0, top + r), r, p.ball_colour, speed=p.speed_m_s)
     course.mark("wall", "wall")
     return course.scene(
@@ -78,8 +78,8 @@ def build(p: Params, physics: Physics) -> Scene:
         decisive=["ball"],
         hidden=["pad"],
         # The occluder begins a little beyond the edge: a ball just hidden has left the table.
-        cover=course.box((0.03, end + 0.02), (-side - rim, side + 0.03), (0, top + 0.02), right=0.02),
-        in_view=[course.box((-p.table_m, end), deep, (0, top))],
+        cover=course.box((0.03, end + 0.02), (-half_width - rim, half_width + 0.03), (0, top + 0.02), right=0.02),
+        in_view=[course.box((-p.table_m, end), depth_span, (0, top))],
         things=[f"{p.ball_colour} ball", f"{p.wall_colour} wall", "table", "tray", f"{p.pad_colour} pad"],
         also=["board"],
     )

@@ -26,7 +26,7 @@ GRAVITY = 9.81
 FLOOR_M = 0.02  # thickness of the pen's floor and of the basket's
 WALL_M = 0.012
 DEPTH_M = 0.17  # half of the pen's depth
-PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
+PLAY_COLOURS = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
 PARTS = ("ball", "pedestal", "basket")
 
 
@@ -44,14 +44,14 @@ def _step(rng: np.random.Generator, so_far: Drawn) -> float:
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths run from the pedestal's middle, direction +1: to the right."""
+    """Parameters; lengths run from the pedestal's middle; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
     radius_m: float = between(0.068, 0.080)
     basket_half_m: float = drawn_by(_basket_half)
-    ball_colour: str = PLAY()
-    basket_colour: str = PLAY()
-    pedestal_colour: str = PLAY()
+    ball_colour: str = PLAY_COLOURS()
+    basket_colour: str = PLAY_COLOURS()
+    pedestal_colour: str = PLAY_COLOURS()
     pedestal_m: float = between(0.28, 0.42)  # height of the pedestal that the ball starts from
     speed_along_m_s: float = between(1.20, 1.40)
     speed_up_m_s: float = between(3.3, 3.8)
@@ -64,39 +64,39 @@ class Params:
 
     @property
     def landing_m(self) -> float:
-        """Where the ball is when it is as high as the basket's sides."""
-        fall = self.pedestal_m + 0.01 - self.rim_m
+        """Position of the ball when it falls to the height of the basket's sides."""
+        fall_m = self.pedestal_m + 0.01 - self.rim_m
         up = self.speed_up_m_s
-        return self.speed_along_m_s * (up + (up * up + 2 * GRAVITY * fall) ** 0.5) / GRAVITY
+        return self.speed_along_m_s * (up + (up * up + 2 * GRAVITY * fall_m) ** 0.5) / GRAVITY
 
     @property
     def basket_m(self) -> float:
-        """Where the middle of the basket is."""
+        """Position of the basket's middle."""
         return self.landing_m + 0.02 + (0.0 if self.in_place else self.step_m)
 
     @property
     def pen_m(self) -> Span:
         """Ends of the pen, which holds both places of the basket and a ball beside it."""
-        aside = self.basket_half_m + 0.03
+        offset_m = self.basket_half_m + 0.03
         room = 2.9 * self.radius_m
-        low = self.landing_m + min(0.0, self.step_m) - (aside if self.step_m < 0 else max(room, aside))
-        high = self.landing_m + max(0.0, self.step_m) + (aside if self.step_m > 0 else max(room, aside)) + 0.04
+        low = self.landing_m + min(0.0, self.step_m) - (offset_m if self.step_m < 0 else max(room, offset_m))
+        high = self.landing_m + max(0.0, self.step_m) + (offset_m if self.step_m > 0 else max(room, offset_m)) + 0.04
         return low, high
 
 
 def build(p: Params, physics: Physics) -> Scene:
     """Build the pedestal, the pen with a high back and a low front, and the basket."""
     course = Course(physics, p.direction, Surface(0.004, solref=SOFT))
-    r, rim, deep, colour = p.radius_m, p.rim_m, (-DEPTH_M, DEPTH_M), p.pen_colour
+    r, rim, depth_span, colour = p.radius_m, p.rim_m, (-DEPTH_M, DEPTH_M), p.pen_colour
     course.block("pedestal", (-0.09, 0.09), (-0.09, 0.09), (0, p.pedestal_m), p.pedestal_colour)
     throw = (p.speed_along_m_s, p.speed_up_m_s)
     course.ball("ball", (0, 0, p.pedestal_m + 0.01 + r), r, p.ball_colour, thrown=throw, rolling=0.0002)
 
     low, high = p.pen_m
     pen = (low - WALL_M, high + WALL_M)
-    course.block("pen_floor", (low, high), deep, (0, FLOOR_M), colour)
-    course.block("pen_near", (pen[0], low), deep, (0, rim), colour)
-    course.block("pen_far", (high, pen[1]), deep, (0, rim + 0.12), colour)
+    course.block("pen_floor", (low, high), depth_span, (0, FLOOR_M), colour)
+    course.block("pen_near", (pen[0], low), depth_span, (0, rim), colour)
+    course.block("pen_far", (high, pen[1]), depth_span, (0, rim + 0.12), colour)
     course.block("pen_back", pen, (DEPTH_M, DEPTH_M + WALL_M), (0, rim), colour)
     top, middle, inner = FLOOR_M + rim, p.basket_m, DEPTH_M - 0.03
     basket = course.tray(
@@ -120,7 +120,7 @@ def build(p: Params, physics: Physics) -> Scene:
             pen, (-DEPTH_M, DEPTH_M + SHADOW_BACK * (rim + 0.2)), (0, rim + 0.20), right=SHADOW_RIGHT * (rim + 0.22)
         ),
         in_view=[
-            course.box(pen, deep, (0, rim + 0.12)),
+            course.box(pen, depth_span, (0, rim + 0.12)),
             course.box((-0.09, 0.09), (-0.09, 0.09), (0, p.pedestal_m)),
         ],
         things=[f"{p.ball_colour} ball", f"{p.basket_colour} basket", f"{p.pedestal_colour} pedestal", "pen"],
@@ -132,9 +132,9 @@ def outcome(motion: Motion, p: Params) -> Reading:
     """Read 'yes' while the low ball is between the basket's sides, 'no' beside them."""
     ball = motion.pos("ball")
     along = p.direction * ball[:, 0]
-    inside = p.basket_half_m - np.abs(along - p.basket_m)
+    inside_m = p.basket_half_m - np.abs(along - p.basket_m)
     down = (ball[:, 2] < 2 * FLOOR_M + 1.3 * p.radius_m) & (along > p.pen_m[0])
-    return Reading(side_while(down, inside), float(abs(inside[-1])))
+    return Reading(side_while(down, inside_m), float(abs(inside_m[-1])))
 
 
 def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
@@ -153,10 +153,10 @@ def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     if sides is None or len(flight) < 3:
         return None
     a, b, c = flight
-    falls, faster = c.y - b.y, c.y - 2 * b.y + a.y  # in a frame, and by how much more in the next
+    fall_px, gain_px = c.y - b.y, c.y - 2 * b.y + a.y  # in a frame, and by how much more in the next
     down = (sides[2] + sides[3]) / 2 - c.y
-    speed = falls + faster / 2
-    frames_on = (math.sqrt(max(speed**2 + 2 * faster * down, 0.0)) - speed) / faster if faster > 0 else 0.0
+    speed = fall_px + gain_px / 2
+    frames_on = (math.sqrt(max(speed**2 + 2 * gain_px * down, 0.0)) - speed) / gain_px if gain_px > 0 else 0.0
     return "yes" if _is_between(c.x + max(frames_on, 0.0) * (c.x - b.x), sides) else "no"
 
 

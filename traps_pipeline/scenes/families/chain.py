@@ -25,20 +25,23 @@ WALL_M = 0.012
 PEG_M = 0.008  # radius of the peg
 STILL_M = 0.01  # a ball that moves less than this any more is as good as at rest
 LIVELY = Surface(2e-5, sliding=0.02, solref=(-20000.0, -8.0))  # a ball that hands nearly all of its speed on
-PLAY, PLAIN = apart("red", "green", "blue", "yellow", "cyan", "purple"), shuffled("wood", "grey", "white")
+PLAY_COLOURS, PLAIN_COLOURS = (
+    apart("red", "green", "blue", "yellow", "cyan", "purple"),
+    shuffled("wood", "grey", "white"),
+)
 
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths run from the ramp's upper end, direction +1: to the right."""
+    """Parameters; lengths run from the ramp's upper end; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
-    striker_colour: str = PLAY()
-    row_colour: str = PLAY()
-    last_colour: str = PLAY()
-    box_colour: str = PLAY()
-    deck_colour: str = PLAIN()
-    ramp_colour: str = PLAIN()
+    striker_colour: str = PLAY_COLOURS()
+    row_colour: str = PLAY_COLOURS()
+    last_colour: str = PLAY_COLOURS()
+    box_colour: str = PLAY_COLOURS()
+    deck_colour: str = PLAIN_COLOURS()
+    ramp_colour: str = PLAIN_COLOURS()
     row: int = one_of(3, 4, longer=(5, 6))  # balls in the row, the last one included
     radius_m: float = between(0.046, 0.054)
     gap_m: float = between(0.030, 0.038)  # between two balls of the row
@@ -55,7 +58,7 @@ class Params:
 
     @property
     def balls_m(self) -> tuple[float, ...]:
-        """Where the balls of the row rest at first."""
+        """Initial positions of the row's balls."""
         first = self.ramp_m + self.ahead_m + self.radius_m
         return tuple(first + i * (2 * self.radius_m + self.gap_m) for i in range(self.row))
 
@@ -66,33 +69,37 @@ class Params:
 
     @property
     def box_at_m(self) -> float:
-        """Where the box begins."""
+        """Position at which the box begins."""
         return self.balls_m[-1] + self.radius_m + self.beyond_m
 
 
 def build(p: Params, physics: Physics) -> Scene:
     """Build ramp, step, deck with the row between low rims, and sunken box."""
     course = Course(physics, p.direction)
-    r, side, end = p.radius_m, 1.35 * p.radius_m, p.box_at_m + p.box_m
-    deep, outer = (-side, side), (-side - WALL_M, side + WALL_M)
-    on_deck, in_box = (p.ramp_m, p.box_at_m), (p.box_at_m, end)
+    r, half_width, end = p.radius_m, 1.35 * p.radius_m, p.box_at_m + p.box_m
+    depth_span, outer = (-half_width, half_width), (-half_width - WALL_M, half_width + WALL_M)
+    deck_span, box_span = (p.ramp_m, p.box_at_m), (p.box_at_m, end)
 
     ramp = SteppedRamp(p.ramp_m, p.slope_deg, DECK_M + STEP_M)
-    Surface(2e-5, priority=2).on(ramp.add(course, side, p.ramp_colour))
+    Surface(2e-5, priority=2).on(ramp.add(course, half_width, p.ramp_colour))
     LIVELY.on(course.ball("striker", ramp.at(p.start_m, r), r, p.striker_colour))
-    course.block("deck", on_deck, deep, (0, DECK_M), p.deck_colour, Surface(1.5e-3, sliding=0.4, priority=2))
-    course.block("box_floor", in_box, deep, (0, BOX_FLOOR_M), p.box_colour, Surface(2e-3, sliding=0.4, priority=2))
-    for name, across in (("rim_front", (outer[0], -side)), ("rim_back", (side, outer[1]))):
-        course.block(name, on_deck, across, (0, DECK_M + 0.25 * r), p.ramp_colour)
-        course.block(f"box_{name}", in_box, across, (0, DECK_M), p.box_colour)
+    course.block("deck", deck_span, depth_span, (0, DECK_M), p.deck_colour, Surface(1.5e-3, sliding=0.4, priority=2))
+    course.block(
+        "box_floor", box_span, depth_span, (0, BOX_FLOOR_M), p.box_colour, Surface(2e-3, sliding=0.4, priority=2)
+    )
+    for name, across in (("rim_front", (outer[0], -half_width)), ("rim_back", (half_width, outer[1]))):
+        course.block(name, deck_span, across, (0, DECK_M + 0.25 * r), p.ramp_colour)
+        course.block(f"box_{name}", box_span, across, (0, DECK_M), p.box_colour)
     wall = course.block("box_end", (end, end + WALL_M), outer, (0, DECK_M + r), p.box_colour)
     wall.priority = 3  # dead: the ball stays in the box
     for name, along in zip(p.balls, p.balls_m, strict=True):
         colour = p.last_colour if name == "last" else p.row_colour
         LIVELY.on(course.ball(name, (along, 0, DECK_M + r), r, colour))
     peg_at = p.balls_m[p.peg_after] + r + p.gap_m / 2
-    aside, half = 0.0 if p.blocked else side + WALL_M + 2 * PEG_M, (DECK_M + 1.9 * r) / 2
-    course.post("peg", (peg_at, aside, half), PEG_M, half, "black").priority = 3  # dead: the ball stops at it
+    peg_offset, peg_half_height = 0.0 if p.blocked else half_width + WALL_M + 2 * PEG_M, (DECK_M + 1.9 * r) / 2
+    course.post(
+        "peg", (peg_at, peg_offset, peg_half_height), PEG_M, peg_half_height, "black"
+    ).priority = 3  # dead: the ball stops at it
 
     high = DECK_M + 2 * r
     across = (outer[0] - 0.02, outer[1] + 4 * PEG_M + SHADOW_BACK * high)

@@ -21,23 +21,23 @@ from traps_pipeline.scenes.parts.questions import left_or_right
 from traps_pipeline.scenes.parts.readings import Reading, still_from, top_m
 from traps_pipeline.scenes.parts.vary import apart, between, drawn_by, hidden, in_front, one_of, several_between
 from traps_pipeline.scenes.parts.vision import blobs, colour_mask, is_occluder, largest, track
-from traps_pipeline.scenes.physics.kit import AnswerableQuestion, Motion, Physics, Scene, listed
+from traps_pipeline.scenes.physics.kit import AnswerableQuestion, Motion, Physics, Scene, list_choices
 
 STOP_AT = 2.9  # where the post stops the kicked ball's centre: behind the occluder, out of the domino's reach
 PUSH = 0.10  # how far the stopped ball has pushed into either branch
 SIDES = ("left", "right")
 FLATTER = 1.3  # times as high for its width, at least, is a domino that stands beside one that lies
-PLAY = apart("red", "green", "blue", "yellow", "cyan", "purple")
+PLAY_COLOURS = apart("red", "green", "blue", "yellow", "cyan", "purple")
 
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths without a unit in domino heights, angles from the row."""
+    """Parameters; unsuffixed lengths in domino heights; angles from the row."""
 
-    row_colour: str = PLAY()
-    ball_colour: str = PLAY()
-    left_colour: str = PLAY()
-    right_colour: str = PLAY()
+    row_colour: str = PLAY_COLOURS()
+    ball_colour: str = PLAY_COLOURS()
+    left_colour: str = PLAY_COLOURS()
+    right_colour: str = PLAY_COLOURS()
     branch: int = one_of(3, 4, longer=(5, 6))  # dominoes of either branch, the last one included
     height_m: float = between(0.17, 0.21)
     width: float = between(0.46, 0.52)
@@ -99,14 +99,14 @@ def build(p: Params, physics: Physics) -> Scene:
 
 def _add_branch(course: Course, p: Params, side: str, yaw: float, junction: float) -> None:
     """Add the dominoes of a branch, of which one may lie beside it, on the inner side."""
-    ahead, inwards = np.array([np.sin(yaw), np.cos(yaw)]), np.sign(yaw) * np.array([-np.cos(yaw), np.sin(yaw)])
+    ahead, inward = np.array([np.sin(yaw), np.cos(yaw)]), np.sign(yaw) * np.array([-np.cos(yaw), np.sin(yaw)])
     start = np.array([0.0, junction]) + (BALL - PUSH + p.thickness / 2) * ahead
     colours = [p.row_colour] * (p.branch - 1) + [p.left_colour if side == "left" else p.right_colour]
     for i, (name, colour) in enumerate(zip(p.bodies(side), colours, strict=True)):
-        at, lying = start + i * p.spacing * ahead, i == p.gap_index and side == p.gap_side
-        if lying:
-            at = at + (p.width + 0.15) * inwards
-        _add_domino(course, p, name, at, yaw, colour, lying=lying)
+        at, is_lying = start + i * p.spacing * ahead, i == p.gap_index and side == p.gap_side
+        if is_lying:
+            at = at + (p.width + 0.15) * inward
+        _add_domino(course, p, name, at, yaw, colour, lying=is_lying)
 
 
 def _add_domino(
@@ -114,15 +114,15 @@ def _add_domino(
 ) -> None:
     """Add a free domino at (across, along), its thickness along `yaw` from the row."""
     h = p.height_m
-    deep, high = (1.0, p.thickness) if lying else (p.thickness, 1.0)
+    depth, high = (1.0, p.thickness) if lying else (p.thickness, 1.0)
     place = (float(at[0]) * h, -float(at[1]) * h, (PLANK + high / 2) * h)
-    half = (p.width * h / 2, deep * h / 2, high * h / 2)
-    body = course.free_box(name, place, half, colour, density=500, sliding=0.2, solref=(0.006, 1))
+    half_size = (p.width * h / 2, depth * h / 2, high * h / 2)
+    body = course.free_box(name, place, half_size, colour, density=500, sliding=0.2, solref=(0.006, 1))
     body.quat = [float(np.cos(yaw / 2)), 0, 0, float(np.sin(yaw / 2))]
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
-    """Read the side on which alone the end domino falls, once the branches are still."""
+    """Read the side of the only end domino that falls, once the branches are still."""
     tops = np.stack([top_m(motion, f"end_{side}", p.height_m) for side in SIDES], axis=1) - PLANK * p.height_m
     rest_frame = still_from(*(motion.pos(body) for side in SIDES for body in p.bodies(side)), within_m=STILL_M)
     sides = [("left" if left else "right") if left != right else None for left, right in tops < p.height_m / 2]
@@ -130,45 +130,45 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading(labels, float(np.abs(tops[-1] - p.height_m / 2).min()))
 
 
-def _aside(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
+def _draw_aside(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
     """Draw a question: what starts the fall, or what falls first."""
     choices = tuple(str(c) for c in rng.permutation([p.row_colour, p.ball_colour, p.left_colour, p.right_colour]))
     if rng.integers(2):
-        question = f"What colour is the ball that sets off the row of dominoes: {listed(choices)}?"
+        question = f"What colour is the ball that sets off the row of dominoes: {list_choices(choices)}?"
         return AnswerableQuestion(question, choices, p.ball_colour)
-    question = f"What colour is the domino that falls first: {listed(choices)}?"
+    question = f"What colour is the domino that falls first: {list_choices(choices)}?"
     return AnswerableQuestion(question, choices, p.row_colour)
 
 
 def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
-    """Return the side whose end domino alone is no longer where it stood at first."""
-    standing = [_is_standing(frames, slots[side]) for side in SIDES]
-    if None in standing or standing[0] == standing[1]:
+    """Return the side of the only end domino that has left its initial place."""
+    is_standing = [_is_standing(frames, slots[side]) for side in SIDES]
+    if None in is_standing or is_standing[0] == is_standing[1]:
         return None
-    return "right" if standing[0] else "left"
+    return "right" if is_standing[0] else "left"
 
 
 def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
-    """Predict the side whose end domino alone has left its place or is about to."""
-    falls = []
+    """Predict the side of the only end domino that has left its place or will soon."""
+    predictions = []
     for colour in (slots["left"], slots["right"]):
         dominoes = blobs(colour_mask(frames[0], colour), 60)
-        falls.append(
+        predictions.append(
             any(
                 not is_upper_half_in_place(frames, colour, domino) or is_struck(frames, domino, 0.0)
                 for domino in dominoes
             )
         )
-    return None if falls[0] == falls[1] else "left" if falls[0] else "right"
+    return None if predictions[0] == predictions[1] else "left" if predictions[0] else "right"
 
 
 def look(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return the side whose end domino rests and is the flatter of the two."""
     ends = [end_of(track(frames, slots[side], 60)) for side in SIDES]
-    upright = [end.box[3] / end.box[2] for end in ends if end is not None]
-    if len(upright) < 2 or max(upright) < FLATTER * min(upright):
+    heights = [end.box[3] / end.box[2] for end in ends if end is not None]
+    if len(heights) < 2 or max(heights) < FLATTER * min(heights):
         return None
-    return SIDES[int(np.argmin(upright))]
+    return SIDES[int(np.argmin(heights))]
 
 
 def _is_standing(frames: np.ndarray, colour: str) -> bool | None:
@@ -193,7 +193,7 @@ FAMILY = scene_family(
         forms=["the {0} one", "{0} branch", "the {0} branch", "{1}", "{1} domino", "the {1} one"],
         colours=lambda p: (p.left_colour, p.right_colour),
     ),
-    asides=[_aside],
+    asides=[_draw_aside],
     observe=observe,
     foresee=foresee,
     look=look,

@@ -22,7 +22,7 @@ from traps_pipeline.scenes.parts.readings import Reading, still_from, top_m, yes
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, facing, hidden, one_of
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
-PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
+PLAY_COLOURS = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
 
 
 def _plank_colour(rng: np.random.Generator, so_far: Drawn) -> str:
@@ -32,14 +32,14 @@ def _plank_colour(rng: np.random.Generator, so_far: Drawn) -> str:
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths without a unit in domino heights, direction +1: right."""
+    """Parameters; unsuffixed lengths in domino heights; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
     concealed: int = one_of(3, 4, longer=(5, 6))  # dominoes after the hand-off, the last one included
-    first_colour: str = PLAY()
-    row_colour: str = PLAY()
-    last_colour: str = PLAY()
-    ball_colour: str = PLAY()
+    first_colour: str = PLAY_COLOURS()
+    row_colour: str = PLAY_COLOURS()
+    last_colour: str = PLAY_COLOURS()
+    ball_colour: str = PLAY_COLOURS()
     height_m: float = between(0.17, 0.21)
     width: float = between(0.54, 0.66)
     thickness: float = between(0.16, 0.20)

@@ -17,7 +17,7 @@ from traps_pipeline.scenes.parts import dominoes
 from traps_pipeline.scenes.parts.course import Course
 from traps_pipeline.scenes.parts.dominoes import Domino, Size
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import around, is_upper_half_in_place
+from traps_pipeline.scenes.parts.observers import is_upper_half_in_place, surrounding_slices
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, either, how_many, range_of
 from traps_pipeline.scenes.parts.readings import Reading, still_from, top_m
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, facing, is_longer, one_of
@@ -31,7 +31,7 @@ LONGER_RANGES: tuple[Ranges, ...] = (((1, 3), (4, 6), (7, 9)), ((2, 4), (5, 7), 
 UPRIGHT = 1.8  # times as high as wide is a domino that stands
 GIVES = 0.2  # of a domino's picture: so much of one changes that falls
 FALLEN = 0.6  # of a domino's height: a top below it belongs to a fallen domino
-PLAY = apart("red", "green", "blue", "yellow", "cyan", "purple")
+PLAY_COLOURS = apart("red", "green", "blue", "yellow", "cyan", "purple")
 
 
 def _ranges(rng: np.random.Generator, so_far: Drawn) -> Ranges:
@@ -50,12 +50,12 @@ def _gap_after(rng: np.random.Generator, so_far: Drawn) -> int:
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths without a unit in domino heights, direction +1: right."""
+    """Parameters; unsuffixed lengths in domino heights; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
-    first_colour: str = PLAY()
-    second_colour: str = PLAY()
-    ball_colour: str = PLAY()
+    first_colour: str = PLAY_COLOURS()
+    second_colour: str = PLAY_COLOURS()
+    ball_colour: str = PLAY_COLOURS()
     ranges: tuple[tuple[int, int], ...] = drawn_by(_ranges, longer=True)
     height_m: float = between(0.17, 0.21)
     width: float = between(0.54, 0.66)
@@ -119,44 +119,49 @@ def twins(p: Params) -> list[Params]:
 def outcome(motion: Motion, p: Params) -> Reading:
     """Read the choice for the number of low tops, once the second row is still."""
     tops = np.stack([top_m(motion, body, p.height_m) for body in p.second], axis=1) - dominoes.PLANK * p.height_m
-    fallen = (tops < FALLEN * p.height_m).sum(axis=1)
+    n_fallen = (tops < FALLEN * p.height_m).sum(axis=1)
     rest_frame = still_from(*(motion.pos(body) for body in p.second), within_m=dominoes.STILL_M)
-    labels = [range_of(p.ranges, int(n)) if i >= rest_frame else None for i, n in enumerate(fallen)]
+    labels = [range_of(p.ranges, int(n)) if i >= rest_frame else None for i, n in enumerate(n_fallen)]
     return Reading(labels, float(np.abs(tops[-1] - FALLEN * p.height_m).min()))
 
 
 def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
-    """Count the second row's dominoes less those that stand where they stood at first."""
+    """Count the second row's dominoes that no longer stand in their initial places."""
     colour = slots["second"]
-    before, close, after = (colour_mask(frames[i], colour) for i in (0, -3, -1))
-    standing = blobs(before, min_area=60)
-    ranges = _choices(slots, len(standing))
-    if ranges is None or after.sum() < 0.3 * before.sum() or (after != close).sum() > 0.1 * after.sum():
+    mask_before, close, mask_after = (colour_mask(frames[i], colour) for i in (0, -3, -1))
+    dominoes = blobs(mask_before, min_area=60)
+    ranges = _choices(slots, len(dominoes))
+    if (
+        ranges is None
+        or mask_after.sum() < 0.3 * mask_before.sum()
+        or (mask_after != close).sum() > 0.1 * mask_after.sum()
+    ):
         return None
-    return range_of(ranges, sum(not is_upper_half_in_place(frames, colour, domino) for domino in standing))
+    return range_of(ranges, sum(not is_upper_half_in_place(frames, colour, domino) for domino in dominoes))
 
 
 def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Count the second row's dominoes that are out of place or about to be struck."""
-    standing, change = blobs(colour_mask(frames[0], slots["second"]), min_area=60), motion_mask(frames)
-    ranges = _choices(slots, len(standing))
+    dominoes, change = blobs(colour_mask(frames[0], slots["second"]), min_area=60), motion_mask(frames)
+    ranges = _choices(slots, len(dominoes))
     if ranges is None:
         return None
-    falls = [
-        not is_upper_half_in_place(frames, slots["second"], domino) or change[around(domino, 0.0)].mean() > GIVES
-        for domino in standing
+    is_falling = [
+        not is_upper_half_in_place(frames, slots["second"], domino)
+        or change[surrounding_slices(domino, 0.0)].mean() > GIVES
+        for domino in dominoes
     ]
-    return range_of(ranges, sum(falls))
+    return range_of(ranges, sum(is_falling))
 
 
 def look(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
-    """Count the second row by the choices, less the dominoes that stand at the end."""
-    close, after = (colour_mask(frames[i], slots["second"]) for i in (-3, -1))
-    if "choices" not in slots or not after.any() or (after != close).sum() > 0.1 * after.sum():
+    """Count fallen dominoes: the choices' largest number less those that still stand."""
+    close, mask_after = (colour_mask(frames[i], slots["second"]) for i in (-3, -1))
+    if "choices" not in slots or not mask_after.any() or (mask_after != close).sum() > 0.1 * mask_after.sum():
         return None
     ranges = [[int(n) for n in choice.split("-")] for choice in choices_in(slots["choices"])]
-    stand = sum(domino.box[3] > UPRIGHT * domino.box[2] for domino in blobs(after, min_area=60))
-    return range_of(ranges, ranges[-1][1] - stand)
+    n_standing = sum(domino.box[3] > UPRIGHT * domino.box[2] for domino in blobs(mask_after, min_area=60))
+    return range_of(ranges, ranges[-1][1] - n_standing)
 
 
 def _choices(slots: Mapping[str, str], dominoes_seen: int) -> Sequence[Sequence[int]] | None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from traps_pipeline.scenes.parts.course import SOFT, Course, Surface, part_colours
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import carried_on, round_blob
+from traps_pipeline.scenes.parts.observers import extrapolate, round_blob
 from traps_pipeline.scenes.parts.questions import Aside, choice_of, either, left_or_right
 from traps_pipeline.scenes.parts.readings import Reading, side_while
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, in_front, one_of, shuffled
@@ -27,10 +27,10 @@ FLOOR_M = 0.02  # thickness of the bins' floors
 WALL_M = 0.014
 DEPTH_M = 0.15  # half of the bins' depth
 FELT = Surface(0.004, sliding=0.6, solref=SOFT)
-FREE = ("green", "yellow", "orange", "cyan", "purple")  # the bins are red and blue
+FREE_COLOURS = ("green", "yellow", "orange", "cyan", "purple")  # the bins are red and blue
 SLANTS = 0.8, 3.0  # rows a column, of the ridge's edges in the picture
 EDGE_PX = 60  # least length of the edges of either side
-PLAY, PLAIN = apart(*FREE), shuffled("grey", "black", "white")
+PLAY_COLOURS, PLAIN_COLOURS = apart(*FREE_COLOURS), shuffled("grey", "black", "white")
 
 
 def _offset(rng: np.random.Generator, so_far: Drawn) -> float:
@@ -40,13 +40,13 @@ def _offset(rng: np.random.Generator, so_far: Drawn) -> float:
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; drift: m/s to the right, cube_side +1: to the right of the bins."""
+    """Parameters; drift is in m/s to the right; cube_side +1 is right of the bins."""
 
     radius_m: float = between(0.068, 0.080)
-    ball_colour: str = PLAY()
-    cube_colour: str = PLAY()
-    wedge_colour: str = PLAIN()
-    back_colour: str = PLAIN()
+    ball_colour: str = PLAY_COLOURS()
+    cube_colour: str = PLAY_COLOURS()
+    wedge_colour: str = PLAIN_COLOURS()
+    back_colour: str = PLAIN_COLOURS()
     release_m: float = between(1.15, 1.35)  # height of the ball's centre in the first frame
     toss_m_s: float = between(2.0, 2.5)  # how fast it still rises then
     drift_m_s: float = between(-0.22, 0.22)
@@ -69,11 +69,11 @@ def build(p: Params, physics: Physics) -> Scene:
     """Build bins with a high back and a low front, a ridge of two boards, and a cube."""
     course = Course(physics, surface=FELT)
     r, end, high = p.radius_m, p.bin_m, p.ridge_m + 0.10
-    outer, deep = end + WALL_M, (-DEPTH_M, DEPTH_M)
+    outer, depth_span = end + WALL_M, (-DEPTH_M, DEPTH_M)
     bins = (("left", "red", (-end, 0), (-outer, -end)), ("right", "blue", (0, end), (end, outer)))
     for name, colour, floor, wall in bins:
-        course.block(f"{name}_floor", floor, deep, (0, FLOOR_M), colour)
-        course.block(f"{name}_end", wall, deep, (0, 0.24), colour)
+        course.block(f"{name}_floor", floor, depth_span, (0, FLOOR_M), colour)
+        course.block(f"{name}_end", wall, depth_span, (0, 0.24), colour)
         course.block(f"{name}_front", floor, (-DEPTH_M - WALL_M, -DEPTH_M), (0, FLOOR_M + 0.4 * r), colour)
     course.block("back", (-outer, outer), (DEPTH_M, DEPTH_M + WALL_M), (0, high), p.back_colour)
     half_board = (hypot(p.foot_m, p.ridge_m) / 2, DEPTH_M, 0.01)
@@ -82,9 +82,11 @@ def build(p: Params, physics: Physics) -> Scene:
         slope = side * atan2(p.ridge_m, p.foot_m)
         FELT.on(course.slab(f"ridge_{name}", middle, half_board, p.wedge_colour, falls_rad=slope))
 
-    beside = p.cube_side * (end + 0.20 + p.cube_m / 2 + (0.15 if p.cube_side > 0 else 0.0))
-    half = p.cube_m / 2
-    course.block("cube", (beside - half, beside + half), (-half, half), (0, p.cube_m), p.cube_colour)
+    cube_at = p.cube_side * (end + 0.20 + p.cube_m / 2 + (0.15 if p.cube_side > 0 else 0.0))
+    half_cube = p.cube_m / 2
+    course.block(
+        "cube", (cube_at - half_cube, cube_at + half_cube), (-half_cube, half_cube), (0, p.cube_m), p.cube_colour
+    )
     fall_s = (p.toss_m_s + (p.toss_m_s**2 + 2 * GRAVITY * (p.release_m - r - p.ridge_m)) ** 0.5) / GRAVITY
     start, throw = (-p.drift_m_s * fall_s, 0, p.release_m), (p.drift_m_s, p.toss_m_s)
     course.ball("ball", start, r, p.ball_colour, thrown=throw, rolling=0.0002).solref = list(SOFT)
@@ -101,7 +103,7 @@ def build(p: Params, physics: Physics) -> Scene:
         cover=course.box((-outer, outer), (front, DEPTH_M + 0.10), (0, high + 0.02), right=0.04),
         in_view=[
             course.box((-outer, outer), (front, DEPTH_M + WALL_M), (0, high)),
-            course.box((beside - half, beside + half), (-half, half), (0, p.cube_m)),
+            course.box((cube_at - half_cube, cube_at + half_cube), (-half_cube, half_cube), (0, p.cube_m)),
         ],
         things=things,
         also=["ridge", "wall", "side"],
@@ -115,8 +117,8 @@ def build(p: Params, physics: Physics) -> Scene:
 def outcome(motion: Motion, p: Params) -> Reading:
     """Read the side of the ridge that the ball is on, while it is below the top."""
     ball = motion.pos("ball")
-    past = ball[:, 0] - p.offset_m
-    return Reading(side_while(ball[:, 2] < p.ridge_m, past, "right", "left"), float(abs(past[-1])))
+    past_m = ball[:, 0] - p.offset_m
+    return Reading(side_while(ball[:, 2] < p.ridge_m, past_m, "right", "left"), float(abs(past_m[-1])))
 
 
 def _ask_colour(part: str, question: str) -> Aside:
@@ -124,8 +126,8 @@ def _ask_colour(part: str, question: str) -> Aside:
 
     def ask(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
         colours = [p.ball_colour, p.cube_colour]
-        third = next(str(c) for c in rng.permutation(FREE) if c not in colours)
-        return choice_of(question, lambda p: [*colours, third], lambda p: part_colours(p)[part])(p, rng)
+        third_colour = next(str(c) for c in rng.permutation(FREE_COLOURS) if c not in colours)
+        return choice_of(question, lambda p: [*colours, third_colour], lambda p: part_colours(p)[part])(p, rng)
 
     return ask
 
@@ -147,15 +149,15 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
 
 def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Predict the side of the ridge's top, seen by its edges, on which the ball lands."""
-    ball = carried_on([round_blob(frame, slots["ball"]) for frame in frames], 0.5)
+    ball = extrapolate([round_blob(frame, slots["ball"]) for frame in frames], 0.5)
     red, blue = (colour_mask(frames[0], colour) for colour in ("red", "blue"))
     bins = [largest(frames[0], colour) for colour in ("red", "blue")]
     if ball is None or bins[0] is None or bins[1] is None:
         return None
     left, right = np.flatnonzero(red.sum(axis=0) >= 4)[0], np.flatnonzero(blue.sum(axis=0) >= 4)[-1]
-    floor, wide = int(min(bins[0].y, bins[1].y)), int(right - left)
-    first = int(left + 0.2 * wide)
-    part = np.s_[max(0, floor - wide // 3) : floor, first : int(right - 0.2 * wide)]
+    floor, width = int(min(bins[0].y, bins[1].y)), int(right - left)
+    first = int(left + 0.2 * width)
+    part = np.s_[max(0, floor - width // 3) : floor, first : int(right - 0.2 * width)]
     halves = [np.nonzero(edges)[1] for edges in slanting_edges(frames[0], part, SLANTS)]
     if min(len(columns) for columns in halves) < EDGE_PX:
         return None

@@ -25,8 +25,8 @@ from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, uniform
 FLOOR_M = 0.02  # thickness of the cup's floor
 WALL_M = 0.014
 DEPTH_M = 0.12  # half of the funnel's and the cup's depth
-PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
-PLAIN = shuffled("grey", "black", "white")
+PLAY_COLOURS = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
+PLAIN_COLOURS = shuffled("grey", "black", "white")
 PARTS = ("ball", "shelf", "cup")
 
 
@@ -41,14 +41,14 @@ THROATS = together(_throats)
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; direction +1: to the right. The funnel is in the middle."""
+    """Parameters; the funnel is in the middle; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
-    ball_colour: str = PLAY()
-    cup_colour: str = PLAY()
-    shelf_colour: str = PLAY()
-    board_colour: str = PLAIN()
-    back_colour: str = PLAIN()
+    ball_colour: str = PLAY_COLOURS()
+    cup_colour: str = PLAY_COLOURS()
+    shelf_colour: str = PLAY_COLOURS()
+    board_colour: str = PLAIN_COLOURS()
+    back_colour: str = PLAIN_COLOURS()
     half_throat: float = THROATS()  # in ball radii: the hidden element
     other_half_throat: float = THROATS()  # what the twin has
     radius_m: float = between(0.058, 0.068)
@@ -72,21 +72,27 @@ def twins(p: Params) -> list[Params]:
 def build(p: Params, physics: Physics) -> Scene:
     """Build shelf on two legs, cup, and funnel before a back wall."""
     course = Course(physics, p.direction, Surface(0.003, sliding=0.5, solref=SOFT))
-    r, half, slope, deep = p.radius_m, p.cup_half_m, radians(p.slope_deg), (-DEPTH_M, DEPTH_M)
+    r, half_cup, slope, depth_span = p.radius_m, p.cup_half_m, radians(p.slope_deg), (-DEPTH_M, DEPTH_M)
     mouth = p.throat_at_m + p.board_m * sin(slope)  # height of the funnel's upper edges
-    narrow, wide = sorted((p.half_throat, p.other_half_throat))
-    rim = wide * r + p.board_m * cos(slope)  # half of the funnel's greatest width, whatever its throat
-    edge = -(rim - (wide - narrow) * r - 0.02)  # the shelf ends over the funnel's board, however narrow the throat
-    start, top, under = edge - p.run_m, mouth + p.rise_m, mouth + p.rise_m - 0.03
+    narrow_throat, wide_throat = sorted((p.half_throat, p.other_half_throat))
+    rim = wide_throat * r + p.board_m * cos(slope)  # half of the funnel's greatest width, whatever its throat
+    edge = -(
+        rim - (wide_throat - narrow_throat) * r - 0.02
+    )  # the shelf ends over the funnel's board, however narrow the throat
+    start, top, shelf_underside = edge - p.run_m, mouth + p.rise_m, mouth + p.rise_m - 0.03
 
-    course.block("shelf", (start - r, edge), (-0.08, 0.08), (under, top), p.shelf_colour, Surface(2e-5, solref=SOFT))
+    course.block(
+        "shelf", (start - r, edge), (-0.08, 0.08), (shelf_underside, top), p.shelf_colour, Surface(2e-5, solref=SOFT)
+    )
     for name, y in (("front", -0.07), ("back", 0.07)):
-        course.block(f"leg_{name}", (start - r, start - r + 0.03), (y - 0.015, y + 0.015), (0, under), p.shelf_colour)
+        course.block(
+            f"leg_{name}", (start - r, start - r + 0.03), (y - 0.015, y + 0.015), (0, shelf_underside), p.shelf_colour
+        )
     course.ball("ball", (start, 0, top + r), r, p.ball_colour, speed=p.speed_m_s)
     course.tray(
         "cup",
-        (-half, half),
-        deep,
+        (-half_cup, half_cup),
+        depth_span,
         (0, FLOOR_M),
         p.cup_colour,
         wall=WALL_M,
@@ -95,13 +101,13 @@ def build(p: Params, physics: Physics) -> Scene:
         back=p.cup_m,
         front=FLOOR_M + 0.4 * r,
     )
-    side, beyond = rim + 0.03, rim + 0.03 + 0.12  # shadows fall to the right: the wall is there to catch them
-    wall = (-side, beyond) if p.direction > 0 else (-beyond, side)
+    wall_inside, wall_at = rim + 0.03, rim + 0.03 + 0.12  # shadows fall to the right: the wall is there to catch them
+    wall = (-wall_inside, wall_at) if p.direction > 0 else (-wall_at, wall_inside)
     course.block("back", wall, (DEPTH_M, DEPTH_M + WALL_M), (0, mouth), p.back_colour)
     for name, sign in (("near", -1), ("far", 1)):
         # The faces of the boards, not their middles, meet the throat's width.
-        out = p.half_throat * r + p.board_m / 2 * cos(slope) + 0.008 * sin(slope)
-        middle = (sign * out, 0, p.throat_at_m + p.board_m / 2 * sin(slope) - 0.008 * cos(slope))
+        board_offset = p.half_throat * r + p.board_m / 2 * cos(slope) + 0.008 * sin(slope)
+        middle = (sign * board_offset, 0, p.throat_at_m + p.board_m / 2 * sin(slope) - 0.008 * cos(slope))
         size = (p.board_m / 2, DEPTH_M - 0.005, 0.008)
         board = course.slab(f"board_{name}", middle, size, p.board_colour, falls_rad=-sign * slope)
         Surface(0.002, sliding=0.4, solref=SOFT).on(board)
@@ -125,14 +131,14 @@ def outcome(motion: Motion, p: Params) -> Reading:
     """Read 'yes' while the ball is below the throat, 'no' while it is stuck above."""
     ball = motion.pos("ball")
     height = ball[:, 2] - p.throat_at_m
-    through = (height < -p.radius_m) & (np.abs(ball[:, 0]) < p.cup_half_m)
+    is_through = (height < -p.radius_m) & (np.abs(ball[:, 0]) < p.cup_half_m)
     end = float(height[-1])
     margin = -p.radius_m - end if end < 0 else (1 - p.half_throat) * p.radius_m
-    if through[-1]:
-        return Reading(["yes" if past else None for past in through], margin)
+    if is_through[-1]:
+        return Reading(["yes" if is_past else None for is_past in is_through], margin)
     is_at_rest = np.linalg.norm(ball - ball[-1], axis=1) < 0.5 * p.radius_m
     is_stuck = 0 < end < 2 * p.radius_m
-    return Reading(["no" if is_stuck and still else None for still in is_at_rest], margin)
+    return Reading(["no" if is_stuck and is_still else None for is_still in is_at_rest], margin)
 
 
 def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from traps_pipeline.scenes.parts.course import SHADOW_BACK, SHADOW_RIGHT, Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import carried_on, small_blob
+from traps_pipeline.scenes.parts.observers import extrapolate, small_blob
 from traps_pipeline.scenes.parts.questions import yes_no
 from traps_pipeline.scenes.parts.readings import Reading
 from traps_pipeline.scenes.parts.vary import apart, between, drawn_by, hidden, in_front, one_of, shuffled
@@ -27,25 +27,25 @@ WALL_M = 0.012
 HALF_PITCH = 1.4  # from the middle of the track to a lane's centre
 SWITCH = (2.6, 4.5)  # across and along the lanes, when it is turned
 ASIDE = 0.5  # of a ball's height in the picture: balls of different lanes are farther apart
-PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
-PLAIN = shuffled("wood", "grey", "white", "black")
+PLAY_COLOURS = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
+PLAIN_COLOURS = shuffled("wood", "grey", "white", "black")
 
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; pairs: first and second ball, lanes: -1 front, +1 back.
+    """Parameters; pairs are the first and second ball; lane -1 is front, +1 back.
 
-    direction: +1 if the first ball, which the switch may turn, rolls to the right. Lengths run along its way from the
+    direction: +1 if the first ball, which the switch may turn, rolls right. Lengths run along its way from the
     middle of the covered part.
     """
 
-    deck_colour: str = PLAIN()
-    rail_colour: str = PLAIN()
-    switch_colour: str = PLAIN()
+    deck_colour: str = PLAIN_COLOURS()
+    rail_colour: str = PLAIN_COLOURS()
+    switch_colour: str = PLAIN_COLOURS()
     direction: int = one_of(-1, 1)
     lanes: tuple[int, ...] = drawn_by(lambda rng, so_far: tuple(int(lane) for lane in rng.choice([-1, 1], 2)))
     turned: bool = hidden(False, True)  # whether the switch leads the first ball to the other lane
-    colours: tuple[str, ...] = PLAY(2)
+    colours: tuple[str, ...] = PLAY_COLOURS(2)
     speeds_m_s: tuple[float, ...] = drawn_by(lambda rng, so_far: (uniform(rng, 0.80, 0.92), uniform(rng, 0.62, 0.70)))
     radius_m: float = between(0.055, 0.062)
     run_m: float = between(0.64, 0.70)  # open track on either side
@@ -58,17 +58,17 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build a flat track with rails; each lane is closed where no ball enters."""
     course = Course(physics, p.direction)
-    r, half, side = p.radius_m, p.middle_m / 2, 2 * HALF_PITCH * p.radius_m
-    end, switch_at, length = half + p.run_m, -half + p.switch_m, float(np.hypot(*SWITCH)) * r
-    track, outer, up = (-end, end), (-side - WALL_M, side + WALL_M), (DECK_M, DECK_M + 1.1 * r)
+    r, half_middle, half_width = p.radius_m, p.middle_m / 2, 2 * HALF_PITCH * p.radius_m
+    end, switch_at, length = half_middle + p.run_m, -half_middle + p.switch_m, float(np.hypot(*SWITCH)) * r
+    track, outer, up = (-end, end), (-half_width - WALL_M, half_width + WALL_M), (DECK_M, DECK_M + 1.1 * r)
 
-    course.block("deck", track, (-side, side), (0, DECK_M), p.deck_colour)
-    course.block("wall_front", track, (outer[0], -side), (0, DECK_M + 0.5 * r), p.rail_colour)
-    course.block("wall_back", track, (side, outer[1]), (0, up[1]), p.rail_colour)
+    course.block("deck", track, (-half_width, half_width), (0, DECK_M), p.deck_colour)
+    course.block("wall_front", track, (outer[0], -half_width), (0, DECK_M + 0.5 * r), p.rail_colour)
+    course.block("wall_back", track, (half_width, outer[1]), (0, up[1]), p.rail_colour)
     course.block("rail_in", (-end, switch_at - 0.3 * r), (-0.004, 0.004), up, p.rail_colour)
     course.block("rail_out", (switch_at + length + 0.3 * r, end), (-0.004, 0.004), up, p.rail_colour)
-    for name, at, lane in (("stop_near", -half, p.lanes[0]), ("stop_far", half - 0.02, p.lanes[1])):
-        course.block(name, (at, at + 0.02), (-side, 0) if lane > 0 else (0, side), up, p.rail_colour)
+    for name, at, lane in (("stop_near", -half_middle, p.lanes[0]), ("stop_far", half_middle - 0.02, p.lanes[1])):
+        course.block(name, (at, at + 0.02), (-half_width, 0) if lane > 0 else (0, half_width), up, p.rail_colour)
     _add_switch(course, p, switch_at, length)
     for i, (start, speed) in enumerate(((1.5 * r - end, p.speeds_m_s[0]), (end - 1.5 * r, -p.speeds_m_s[1]))):
         at = (start, p.lanes[i] * HALF_PITCH * r, DECK_M + r)
@@ -82,7 +82,7 @@ def build(p: Params, physics: Physics) -> Scene:
         p,
         decisive=["ball_0", "ball_1"],
         hidden=["switch"],
-        cover=course.box((-half - 0.01, half + 0.01), across, (0, high), right=SHADOW_RIGHT * high),
+        cover=course.box((-half_middle - 0.01, half_middle + 0.01), across, (0, high), right=SHADOW_RIGHT * high),
         in_view=[course.box(track, outer, (0, high))],
         things=[*(f"{c} ball" for c in p.colours), "track", "front lane of the track", "back lane of the track"],
         also=["lane", "rail"],
@@ -113,13 +113,13 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading(labels, float(abs(ahead[-1])))
 
 
-def _shuffled_colours(p: Params, rng: np.random.Generator) -> Mapping[str, str]:
+def _shuffle_colours(p: Params, rng: np.random.Generator) -> Mapping[str, str]:
     """Return the two colours in random order."""
     first, second = (str(c) for c in rng.permutation(p.colours))
     return {"first": first, "second": second}
 
 
-def _aside(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
+def _ask_aside(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
     """Ask for one ball's side or lane (always drawn), or if both lanes are the same."""
     kind, i = rng.integers(3), int(rng.integers(2))
     if kind == 0:
@@ -151,28 +151,28 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
 def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Predict a collision: the balls are in one lane when they are side by side."""
     paths = [[small_blob(frame, slots[name]) for frame in frames] for name in ("first", "second")]
-    a, b = (carried_on(path, 0.0) for path in paths)
-    a_next, b_next = (carried_on(path, 1.0) for path in paths)
+    a, b = (extrapolate(path, 0.0) for path in paths)
+    a_next, b_next = (extrapolate(path, 1.0) for path in paths)
     if a is None or b is None or a_next is None or b_next is None:
         return None
     gap, closing = np.array([b.x - a.x, b.y - a.y]), np.array([b_next.x - a_next.x, b_next.y - a_next.y])
-    way = _along(paths)
-    if way is None:
+    direction = _direction(paths)
+    if direction is None:
         return None
-    aside = np.array([-way[1], way[0]])
-    if (gap @ way) * (closing @ way) < 0:  # they will have passed in the next frame
-        share = (gap @ way) / ((gap - closing) @ way)
+    normal = np.array([-direction[1], direction[0]])
+    if (gap @ direction) * (closing @ direction) < 0:  # they will have passed in the next frame
+        share = (gap @ direction) / ((gap - closing) @ direction)
         gap = gap + share * (closing - gap)
-    return "yes" if abs(gap @ aside) < ASIDE * max(a.box[3], b.box[3]) else "no"
+    return "yes" if abs(gap @ normal) < ASIDE * max(a.box[3], b.box[3]) else "no"
 
 
-def _along(paths: Sequence[Sequence[Blob | None]]) -> np.ndarray | None:
+def _direction(paths: Sequence[Sequence[Blob | None]]) -> np.ndarray | None:
     """Return the track's direction in the picture, from the balls' first places."""
     first, second = (next((blob for blob in path if blob), None) for path in paths)
     if first is None or second is None:
         return None
-    way = np.array([second.x - first.x, second.y - first.y])
-    return way / np.linalg.norm(way)
+    direction = np.array([second.x - first.x, second.y - first.y])
+    return direction / np.linalg.norm(direction)
 
 
 FAMILY = scene_family(
@@ -187,9 +187,9 @@ FAMILY = scene_family(
         "Do the two balls, the {first} one and the {second} one, bump into each other, yes or no?",
         yes=["they collide", "yes they collide", "they touch", "they bump into each other"],
         no=["they do not collide", "no they do not collide", "they pass each other", "they miss each other"],
-        fills=_shuffled_colours,
+        fills=_shuffle_colours,
     ),
-    asides=[_aside],
+    asides=[_ask_aside],
     observe=observe,
     foresee=foresee,
     min_margin_m=0.06,

@@ -26,19 +26,19 @@ WALL_M = 0.012
 COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
 EDGE_PX = 60  # least length of the plate's edges
 SLANTS = 0.36, 1.2  # rows a column, of the plate's edges in the picture
-PLAY, PLAIN = apart(*COLOURS), shuffled("wood", "grey", "white")
+PLAY_COLOURS, PLAIN_COLOURS = apart(*COLOURS), shuffled("wood", "grey", "white")
 
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; direction +1: to the right, tilt +1: the plate sheds to the right."""
+    """Parameters; direction +1 is right; at tilt +1 the plate sheds to the right."""
 
-    left_colour: str = PLAY()
-    right_colour: str = PLAY()
-    ball_colour: str = PLAY()
-    chute_colour: str = PLAIN()
-    board_colour: str = PLAIN()
-    plate_colour: str = PLAIN()
+    left_colour: str = PLAY_COLOURS()
+    right_colour: str = PLAY_COLOURS()
+    ball_colour: str = PLAY_COLOURS()
+    chute_colour: str = PLAIN_COLOURS()
+    board_colour: str = PLAIN_COLOURS()
+    plate_colour: str = PLAIN_COLOURS()
     direction: int = one_of(-1, 1)
     tilt: int = hidden(-1, 1)
     tilt_deg: float = between(30, 40)
@@ -62,21 +62,21 @@ def build(p: Params, physics: Physics) -> Scene:
     r, d, half_y, half_x = p.radius_m, p.direction, 1.5 * p.radius_m, p.bin_m + WALL_M
     bore, top = 1.2 * r, p.chute_m + p.chute_height_m  # half the chute's inner width; its upper end
     track = top - 2.4 * r  # two ball diameters below that
-    under, across, front = track - 0.02, (-half_y, half_y), (-half_y - WALL_M, -half_y)
+    track_underside, across, front = track - 0.02, (-half_y, half_y), (-half_y - WALL_M, -half_y)
 
     def along(a: float, b: float) -> Span:
         return (a, b) if d > 0 else (-b, -a)
 
-    far = -p.start_m - 0.08
-    run = along(far, -bore)
-    course.block("track", run, (-1.1 * r, 1.1 * r), (under, track), p.chute_colour)
+    far_end = -p.start_m - 0.08
+    run = along(far_end, -bore)
+    course.block("track", run, (-1.1 * r, 1.1 * r), (track_underside, track), p.chute_colour)
     for side in (-1, 1):
         y = side * 1.1 * r
-        course.block(f"rail_{side}", run, (y - 0.005, y + 0.005), (under, track + 0.35 * r), p.chute_colour)
-    course.block("post", along(far + 0.02, far + 0.06), (-0.02, 0.02), (0, under), p.chute_colour)
-    for name, side, upper in (("far", d, top), ("near", -d, under)):
+        course.block(f"rail_{side}", run, (y - 0.005, y + 0.005), (track_underside, track + 0.35 * r), p.chute_colour)
+    course.block("post", along(far_end + 0.02, far_end + 0.06), (-0.02, 0.02), (0, track_underside), p.chute_colour)
+    for name, side, upper_end in (("far", d, top), ("near", -d, track_underside)):
         x = side * (bore + WALL_M / 2)
-        course.block(f"chute_{name}", (x - WALL_M / 2, x + WALL_M / 2), across, (p.chute_m, upper), p.chute_colour)
+        course.block(f"chute_{name}", (x - WALL_M / 2, x + WALL_M / 2), across, (p.chute_m, upper_end), p.chute_colour)
     for name, y in (("front", -half_y - WALL_M), ("back", half_y)):
         width = (-bore - WALL_M, bore + WALL_M)
         course.block(f"chute_{name}", width, (y, y + WALL_M), (p.chute_m, top), p.chute_colour)
@@ -123,13 +123,13 @@ def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     left, right = (largest(frames[0], slots[side], 60) for side in ("left", "right"))
     if left is None or right is None or left.x > right.x:
         return None
-    middle, wide = (left.box[0] + left.box[2] + right.box[0]) / 2, (left.box[2] + right.box[2]) / 2
+    middle, width = (left.box[0] + left.box[2] + right.box[0]) / 2, (left.box[2] + right.box[2]) / 2
     floor = min(left.y, right.y)
-    part = np.s_[max(0, int(floor - 0.75 * wide)) : int(floor), int(middle - 0.4 * wide) : int(middle + 0.4 * wide)]
-    to_left, to_right = (int(edges.sum()) for edges in slanting_edges(frames[0], part, SLANTS))
-    if max(to_right, to_left) < EDGE_PX:
+    part = np.s_[max(0, int(floor - 0.75 * width)) : int(floor), int(middle - 0.4 * width) : int(middle + 0.4 * width)]
+    left_edges, right_edges = (int(edges.sum()) for edges in slanting_edges(frames[0], part, SLANTS))
+    if max(right_edges, left_edges) < EDGE_PX:
         return None
-    return "right" if to_right > to_left else "left"
+    return "right" if right_edges > left_edges else "left"
 
 
 FAMILY = scene_family(

@@ -29,7 +29,7 @@ from traps_pipeline.scenes.parts.vary import (
     shuffled,
 )
 from traps_pipeline.scenes.parts.vision import blobs, colour_mask
-from traps_pipeline.scenes.physics.kit import AnswerableQuestion, Motion, Physics, Scene, listed
+from traps_pipeline.scenes.physics.kit import AnswerableQuestion, Motion, Physics, Scene, list_choices
 
 DECK_M = 0.045  # height of the lanes; the tray lies lower, so that no ball rolls back into the tunnel
 TRAY_M = 0.015
@@ -37,8 +37,8 @@ ROUGH_BOARD_M = 0.10
 ARRIVING = 0.97  # share of its speed that a ball still has where the rough boards begin
 MIN_LEAD_S = 0.5  # a closer finish could fall between two sampled frames
 BALL_COLOURS = "red", "green", "blue", "yellow", "orange", "cyan", "purple"
-PLAY = apart(*BALL_COLOURS)
-PLAIN = shuffled("wood", "grey", "white")
+PLAY_COLOURS = apart(*BALL_COLOURS)
+PLAIN_COLOURS = shuffled("wood", "grey", "white")
 
 
 def _direction(rng: np.random.Generator, so_far: Drawn) -> int:
@@ -49,13 +49,13 @@ def _direction(rng: np.random.Generator, so_far: Drawn) -> int:
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters by lane, front lane first; direction +1: to the right."""
+    """Parameters by lane, front lane first; direction +1 is right."""
 
     direction: int = drawn_by(_direction, longer=True)
-    tunnel_colour: str = PLAIN()
-    deck_colour: str = PLAIN()
-    tray_colour: str = PLAIN()
-    colours: tuple[str, ...] = PLAY("lanes")
+    tunnel_colour: str = PLAIN_COLOURS()
+    deck_colour: str = PLAIN_COLOURS()
+    tray_colour: str = PLAIN_COLOURS()
+    colours: tuple[str, ...] = PLAY_COLOURS("lanes")
     speeds_m_s: tuple[float, ...] = several_between("lanes", 0.38, 0.48)
     starts_m: tuple[float, ...] = several_between("lanes", 0.04, 0.12)  # head start of each ball along its lane
     clear_lane: int = hidden_index("colours")  # the lane without a rough board
@@ -75,7 +75,7 @@ class Params:
 
     @property
     def exit_m(self) -> float:
-        """Where the tunnel ends, along the lanes."""
+        """Position of the tunnel's end along the lanes."""
         return self.run_m + self.tunnel_m
 
 
@@ -83,31 +83,31 @@ def build(p: Params, physics: Physics) -> Scene:
     """Build deck with rails, opaque tunnel, sunken tray."""
     course = Course(physics, p.direction)
     lanes, r, pitch, wall = len(p.colours), p.radius_m, 2.8 * p.radius_m, 0.012
-    side, roof, rim, end = lanes * pitch / 2, DECK_M + 2.6 * r, TRAY_M + 0.9 * r, p.exit_m + p.tray_m
-    deep, outer, tunnel = (-side, side), (-side - wall, side + wall), (p.run_m, p.exit_m)
+    half_width, roof, rim, end = lanes * pitch / 2, DECK_M + 2.6 * r, TRAY_M + 0.9 * r, p.exit_m + p.tray_m
+    depth_span, outer, tunnel = (-half_width, half_width), (-half_width - wall, half_width + wall), (p.run_m, p.exit_m)
     rough_at = p.run_m + p.mouth_m + 2 * r + 0.04  # no ball feels it before it is wholly behind the occluder
-    after = rough_at + ROUGH_BOARD_M
+    rough_end = rough_at + ROUGH_BOARD_M
 
-    course.block("deck_in", (-0.03, rough_at), deep, (0, DECK_M), p.deck_colour)
-    course.block("deck_out", (after, p.exit_m), deep, (0, DECK_M), p.deck_colour)
+    course.block("deck_in", (-0.03, rough_at), depth_span, (0, DECK_M), p.deck_colour)
+    course.block("deck_out", (rough_end, p.exit_m), depth_span, (0, DECK_M), p.deck_colour)
     for i in range(lanes + 1):
-        y = -side + i * pitch
+        y = -half_width + i * pitch
         across, up = (y - 0.004, y + 0.004), (DECK_M, DECK_M + 0.4 * r)
         course.block(f"rail_{i}", (-0.03, p.exit_m), across, up, p.tunnel_colour)
     for i, ball in enumerate(p.balls):
         y = (i - (lanes - 1) / 2) * pitch
         board = Surface(2e-5 if i == p.clear_lane else _roughness(p, i, physics))
-        course.block(f"board_{i}", (rough_at, after), (y - pitch / 2, y + pitch / 2), (0, DECK_M), "black", board)
+        course.block(f"board_{i}", (rough_at, rough_end), (y - pitch / 2, y + pitch / 2), (0, DECK_M), "black", board)
         course.ball(ball, (p.starts_m[i], y, DECK_M + r), r, p.colours[i], speed=p.speeds_m_s[i])
-    course.sides("tunnel", tunnel, side, wall, (0, roof), p.tunnel_colour)
+    course.sides("tunnel", tunnel, half_width, wall, (0, roof), p.tunnel_colour)
     course.block("tunnel_roof", tunnel, outer, (roof, roof + wall), p.tunnel_colour)
-    felt = Surface(4e-4)  # the balls come to rest in view
-    course.block("tray", (p.exit_m, end), deep, (0, TRAY_M), p.tray_colour, felt)
-    course.sides("tray", (p.exit_m, end), side, wall, (0, rim), p.tunnel_colour)
+    surface = Surface(4e-4)  # the balls come to rest in view
+    course.block("tray", (p.exit_m, end), depth_span, (0, TRAY_M), p.tray_colour, surface)
+    course.sides("tray", (p.exit_m, end), half_width, wall, (0, rim), p.tunnel_colour)
     course.block("tray_end", (end, end + wall), outer, (0, rim), p.tunnel_colour)
 
     along, up = (p.run_m + p.mouth_m, end + wall), (0, roof + wall)
-    across = (-side - wall - 0.02, side + wall + SHADOW_BACK * roof)
+    across = (-half_width - wall - 0.02, half_width + wall + SHADOW_BACK * roof)
     return course.scene(
         p,
         decisive=p.balls,
@@ -136,20 +136,20 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Return the ball seen first after it was out of sight, once all are seen again."""
     colours = colours_of_balls(frames, slots, BALL_COLOURS)
     returns = [_return_frame(frames, colour) for colour in colours]
-    returned = [frame for frame in returns if frame is not None]
-    if not returned or len(returned) < len(returns) or returned.count(min(returned)) > 1:
+    return_frames = [frame for frame in returns if frame is not None]
+    if not return_frames or len(return_frames) < len(returns) or return_frames.count(min(return_frames)) > 1:
         return None
-    return colours[returned.index(min(returned))]
+    return colours[return_frames.index(min(return_frames))]
 
 
 def _return_frame(frames: np.ndarray, colour: str) -> int | None:
     """Return the first frame with half of the ball after the tunnel, None if none."""
     areas = np.array([_ball_pixels(frame, colour) for frame in frames])
-    gone = np.flatnonzero(areas == 0)
-    if not gone.size or areas[-3:].min() == 0:
+    frames_out_of_sight = np.flatnonzero(areas == 0)
+    if not frames_out_of_sight.size or areas[-3:].min() == 0:
         return None
     half_seen = np.flatnonzero(areas >= np.median(areas[-3:]) / 2)
-    return int(half_seen[half_seen > gone[0]][0])
+    return int(half_seen[half_seen > frames_out_of_sight[0]][0])
 
 
 def _ball_pixels(frame: np.ndarray, colour: str) -> int:
@@ -173,9 +173,9 @@ def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     return first[0] if len(first) == 1 else None
 
 
-def _how_many(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
+def _ask_count(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
     numbers = ("2", "3") if len(p.colours) < 4 else ("3", "4")
-    question = f"How many balls roll into the tunnel, {listed(numbers)}?"
+    question = f"How many balls roll into the tunnel, {list_choices(numbers)}?"
     return AnswerableQuestion(question, numbers, str(len(p.colours)))
 
 
@@ -194,7 +194,7 @@ FAMILY = scene_family(
     ),
     asides=[
         comes_from("From which side do the balls roll in, left or right?"),
-        _how_many,
+        _ask_count,
         choice_of(
             "Which ball rolls in the lane nearest to the camera, {choices}?",
             choices=lambda p: p.colours,

@@ -16,7 +16,15 @@ from typing import Any
 import cv2
 import numpy as np
 
-from traps_pipeline.scenes.parts.board import WALL_M, Board, looking_on, peg_rows, place, round_ball, turned
+from traps_pipeline.scenes.parts.board import (
+    WALL_M,
+    Board,
+    camera_elevation,
+    peg_rows,
+    place,
+    round_ball,
+    turn_quaternion,
+)
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.questions import NUMBERS, Filled, Question, choice_of, either
 from traps_pipeline.scenes.parts.readings import Reading
@@ -30,7 +38,7 @@ from traps_pipeline.scenes.physics.kit import (
     View,
     add_box,
     distinct_colours,
-    listed,
+    list_choices,
     uniform,
 )
 
@@ -65,8 +73,8 @@ def _zones(rng: np.random.Generator, so_far: Drawn) -> tuple[Any, ...]:
     """Draw widths and colours of two or three zones, and the one that is asked for."""
     zones, width = int(rng.integers(2, 4)), uniform(rng, 1.10, 1.25)
     sides = so_far["sides"]
-    fall = sides[0] * (width / 2 - 0.52) if len(set(sides)) == 1 else 0.0  # about where the balls fall
-    edge = fall + float(rng.choice([-1, 1]) * rng.uniform(0.04, 0.17))
+    fall_at = sides[0] * (width / 2 - 0.52) if len(set(sides)) == 1 else 0.0  # about where the balls fall
+    edge = fall_at + float(rng.choice([-1, 1]) * rng.uniform(0.04, 0.17))
     edges = sorted([edge, edge - math.copysign(rng.uniform(0.22, 0.32), edge)]) if zones == 3 else [edge]
     widths = tuple(round(float(w), 4) for w in np.diff([-width / 2, *edges, width / 2]))
     return widths, distinct_colours(rng, zones, ZONE_COLOURS), int(rng.integers(zones))
@@ -81,7 +89,7 @@ ROWS, ZONES = peg_rows(5, 7), together(_zones)
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; per zone: width, colour, per ball: colour, side (-1: left), way."""
+    """Parameters; a zone has width and colour, a ball colour, side (-1: left), way."""
 
     rows: int = ROWS()
     peg_gap_m: float = ROWS()  # from peg to peg in a row
@@ -100,26 +108,26 @@ class Params:
     ball_colours: tuple[str, ...] = drawn_by(_ball_colours)
     slope_deg: float = between(10, 14)  # of the shelves
     azimuth_deg: float = between(86, 94)
-    elevation_deg: float = looking_on(-6, 6)
+    elevation_deg: float = camera_elevation(-6, 6)
 
     @property
     def width_m(self) -> float:
-        """Inside of the board."""
+        """Inner width of the board."""
         return sum(self.zone_widths_m)
 
     @property
     def edges_m(self) -> tuple[float, ...]:
-        """Where the zones begin and end, from the middle of the board, left to right."""
+        """Edges of the zones, left to right, from the middle of the board."""
         return tuple(float(x) for x in np.cumsum([-self.width_m / 2, *self.zone_widths_m]))
 
     @property
     def rim_m(self) -> float:
-        """Where the zones open, measured up the board."""
+        """Height of the zones' openings, measured up the board."""
         return SILL_M + ZONE_M
 
     @property
     def lip_m(self) -> float:
-        """Where the shelves end, measured up the board."""
+        """Height of the shelves' ends, measured up the board."""
         return self.rim_m + (self.rows + 0.6) * self.row_gap_m
 
     @property
@@ -138,7 +146,7 @@ class Params:
         return max(w for w, s in zip(self.ways_m, self.sides, strict=True) if s == side) + 1.4 * self.ball_radius_m
 
     def lip_x_m(self, side: int) -> float:
-        """Return where the upper face of a shelf ends, across the board."""
+        """Return the position across the board at which a shelf's upper face ends."""
         return side * (self.width_m / 2 - self.shelf_m(side) * math.cos(self.slope_rad))
 
 
@@ -181,14 +189,14 @@ def build(p: Params, physics: Physics) -> Scene:
 
 def _add_shelf(board: Board, p: Params, side: int) -> None:
     """Add a shelf from a side wall down towards the middle, as thick as a wall."""
-    slope, half = p.slope_rad, p.shelf_m(side) / 2
+    slope, half_length = p.slope_rad, p.shelf_m(side) / 2
     centre = (
-        p.lip_x_m(side) + side * (half * math.cos(slope) + WALL_M * math.sin(slope)),
-        p.lip_m + half * math.sin(slope) - WALL_M * math.cos(slope),
+        p.lip_x_m(side) + side * (half_length * math.cos(slope) + WALL_M * math.sin(slope)),
+        p.lip_m + half_length * math.sin(slope) - WALL_M * math.cos(slope),
         board.deep / 2,
     )
-    shelf = add_box(board.body, f"shelf_{side}", centre, (half, WALL_M, board.deep / 2), TRIM[p.board_colour])
-    shelf.friction, shelf.quat = list(FRICTION), turned(side * slope, 3)
+    shelf = add_box(board.body, f"shelf_{side}", centre, (half_length, WALL_M, board.deep / 2), TRIM[p.board_colour])
+    shelf.friction, shelf.quat = list(FRICTION), turn_quaternion(side * slope, 3)
 
 
 def _start(p: Params, ball: int) -> tuple[float, float]:
@@ -203,8 +211,8 @@ def outcome(motion: Motion, p: Params) -> Reading:
     places = [place(motion, f"ball_{i}", p.tilt_deg) for i in range(BALLS)]
     across, up = (np.stack(values, axis=1) for values in zip(*places, strict=True))
     low, high = p.edges_m[p.asked : p.asked + 2]
-    inside, down = (across > low) & (across < high), up < p.rim_m
-    labels = [str(i.sum()) if d.all() else None for i, d in zip(inside, down, strict=True)]
+    is_inside, down = (across > low) & (across < high), up < p.rim_m
+    labels = [str(i.sum()) if d.all() else None for i, d in zip(is_inside, down, strict=True)]
     walls = [x for x in (low, high) if abs(x) < 0.49 * p.width_m]
     return Reading(labels, float(min(p.rim_m - up[-1].max(), *(np.abs(across[-1] - x).min() for x in walls))))
 
@@ -215,7 +223,7 @@ def _counts(p: Params, rng: np.random.Generator) -> Filled:
     for label, number in zip(LABELS, NUMBERS, strict=False):
         noun = "ball" if label == "1" else "balls"
         aliases |= dict.fromkeys((number, f"{label} {noun}", f"{number} {noun}"), label)
-    return Filled(LABELS, aliases, {"choices": listed(LABELS), "zone": p.zone_colours[p.asked]})
+    return Filled(LABELS, aliases, {"choices": list_choices(LABELS), "zone": p.zone_colours[p.asked]})
 
 
 LAST_PEGS = 0.45  # of the board's width above the zones: so low a ball has the last rows of pegs before it
@@ -228,13 +236,13 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     grounds = {colour: _ground(frames[-1], colour) for colour in ZONE_COLOURS}
     colours = sorted({colour for pool in BALL_COLOURS.values() for colour in pool})
     balls = [round_ball(frames[-1], colour) for colour in colours]
-    homes = [_home(ball, grounds) or _above(ball, grounds) for ball in balls if ball is not None]
-    if len(homes) != BALLS or None in homes:
+    zones = [_zone_of(ball, grounds) or _zone_below(ball, grounds) for ball in balls if ball is not None]
+    if len(zones) != BALLS or None in zones:
         return None
-    return str(homes.count(slots["zone"]))
+    return str(zones.count(slots["zone"]))
 
 
-def _above(ball: Blob, grounds: Mapping[str, np.ndarray | None]) -> str | None:
+def _zone_below(ball: Blob, grounds: Mapping[str, np.ndarray | None]) -> str | None:
     """Return the colour of the zone that a ball is above; None if far above."""
     outlines = {colour: ground[:, 0].astype(float) for colour, ground in grounds.items() if ground is not None}
     if len(outlines) < 2:
@@ -260,10 +268,12 @@ def _ground(frame: np.ndarray, colour: str) -> np.ndarray | None:
     return cv2.convexHull(np.concatenate(regions))
 
 
-def _home(ball: Blob, grounds: Mapping[str, np.ndarray | None]) -> str | None:
+def _zone_of(ball: Blob, grounds: Mapping[str, np.ndarray | None]) -> str | None:
     """Return the colour of the zone that a ball's centre lies in."""
-    inside = (c for c, g in grounds.items() if g is not None and cv2.pointPolygonTest(g, (ball.x, ball.y), False) > 0)
-    return next(inside, None)
+    zones_around = (
+        c for c, g in grounds.items() if g is not None and cv2.pointPolygonTest(g, (ball.x, ball.y), False) > 0
+    )
+    return next(zones_around, None)
 
 
 FAMILY = scene_family(

@@ -15,7 +15,7 @@ import numpy as np
 
 from traps_pipeline.scenes.parts.course import Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import AHEAD, carried_on
+from traps_pipeline.scenes.parts.observers import AHEAD, extrapolate
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
 from traps_pipeline.scenes.parts.readings import Reading, top_m, yes_while
 from traps_pipeline.scenes.parts.vary import apart, between, facing, hidden, one_of, shuffled
@@ -30,19 +30,19 @@ PEG_DOWN = 0.62  # height of the peg below the pivot, as a share of the pendulum
 PEG_RADIUS_M = 0.012
 ROD_RADIUS_M = 0.008
 GIVES_PX = 2.0  # of a block that is struck
-PLAY, PLAIN = apart("red", "green", "blue", "cyan", "purple"), shuffled("wood", "grey")
+PLAY_COLOURS, PLAIN_COLOURS = apart("red", "green", "blue", "cyan", "purple"), shuffled("wood", "grey")
 
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths run from the occluder's edge, direction +1: to the right."""
+    """Parameters; lengths run from the occluder's edge; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
-    ball_colour: str = PLAY()
-    bob_colour: str = PLAY()
-    block_colour: str = PLAY()
-    lane_colour: str = PLAIN()
-    board_colour: str = PLAIN()
+    ball_colour: str = PLAY_COLOURS()
+    bob_colour: str = PLAY_COLOURS()
+    block_colour: str = PLAY_COLOURS()
+    lane_colour: str = PLAIN_COLOURS()
+    board_colour: str = PLAIN_COLOURS()
     peg_stops: bool = hidden(False, True)  # whether the peg sticks out just before the rod
     radius_m: float = between(0.046, 0.054)  # of the ball and of the bob
     speed_m_s: float = between(0.75, 0.95)
@@ -65,12 +65,12 @@ class Params:
 
     @property
     def block_at_m(self) -> float:
-        """Centre of the standing block."""
+        """Position of the standing block's centre."""
         return self.pivot_at_m + self.radius_m + self.reach_m + self.block_half_m
 
     @property
     def peg_at_m(self) -> float:
-        """Where the peg sticks out of the board."""
+        """Position of the peg in the board."""
         swing = PEG_DOWN * self.length_m * float(np.tan(np.radians(self.stop_deg)))
         return self.pivot_at_m + (swing + ROD_RADIUS_M + PEG_RADIUS_M if self.peg_stops else self.free_peg_m)
 
@@ -78,34 +78,38 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build a raised lane, floor and block before a board with pendulum and peg."""
     course = Course(physics, p.direction)
-    r, side, rim, high = p.radius_m, 1.6 * p.radius_m, 0.012, p.pivot_z_m + 0.05
-    deep, top = (-side, side), FLOOR_M + p.lane_m
+    r, half_width, rim, high = p.radius_m, 1.6 * p.radius_m, 0.012, p.pivot_z_m + 0.05
+    depth_span, top = (-half_width, half_width), FLOOR_M + p.lane_m
     end = p.block_at_m + p.block_height_m + 0.14  # the fallen block has room before it
     lip = p.pivot_at_m - 2 * r + 0.80 * r  # the ball touches it a little after it has touched the bob
 
-    course.block("lane_in", (-p.run_m, STEP_AT_M), deep, (0, top + STEP_M), p.lane_colour)
-    course.block("lane", (STEP_AT_M, lip + 0.008), deep, (0, top), p.lane_colour, Surface(3e-4))
-    course.block("lip", (lip, lip + 0.008), deep, (top, top + 0.25 * r), p.board_colour)
-    course.block("front_in", (-p.run_m, STEP_AT_M), (-side - rim, -side), (0, top + STEP_M + 0.3 * r), p.board_colour)
-    course.block("back_in", (-p.run_m, 0), (side, side + rim), (0, top + STEP_M + 0.3 * r), p.board_colour)
-    course.block("front", (STEP_AT_M, lip + 0.008), (-side - rim, -side), (0, top + 0.3 * r), p.board_colour)
-    course.block("floor_board", (lip + 0.008, end), (-side - rim, side), (0, FLOOR_M), p.lane_colour)
-    course.block("end", (end, end + 0.02), (-side - rim, side), (0, FLOOR_M + 0.06), p.board_colour)
-    course.block("board", (0, end + 0.02), (side, side + 0.015), (0, high), p.board_colour)
-    _add_pendulum(course, p, side)
+    course.block("lane_in", (-p.run_m, STEP_AT_M), depth_span, (0, top + STEP_M), p.lane_colour)
+    course.block("lane", (STEP_AT_M, lip + 0.008), depth_span, (0, top), p.lane_colour, Surface(3e-4))
+    course.block("lip", (lip, lip + 0.008), depth_span, (top, top + 0.25 * r), p.board_colour)
+    course.block(
+        "front_in", (-p.run_m, STEP_AT_M), (-half_width - rim, -half_width), (0, top + STEP_M + 0.3 * r), p.board_colour
+    )
+    course.block("back_in", (-p.run_m, 0), (half_width, half_width + rim), (0, top + STEP_M + 0.3 * r), p.board_colour)
+    course.block(
+        "front", (STEP_AT_M, lip + 0.008), (-half_width - rim, -half_width), (0, top + 0.3 * r), p.board_colour
+    )
+    course.block("floor_board", (lip + 0.008, end), (-half_width - rim, half_width), (0, FLOOR_M), p.lane_colour)
+    course.block("end", (end, end + 0.02), (-half_width - rim, half_width), (0, FLOOR_M + 0.06), p.board_colour)
+    course.block("board", (0, end + 0.02), (half_width, half_width + 0.015), (0, high), p.board_colour)
+    _add_pendulum(course, p, half_width)
     peg_z = p.pivot_z_m - PEG_DOWN * p.length_m
-    course.rod("peg", (p.peg_at_m, -0.04, peg_z), (p.peg_at_m, side, peg_z), PEG_RADIUS_M, "yellow")
-    half = (p.block_half_m, 0.6 * side, p.block_height_m / 2)
-    course.free_box("block", (p.block_at_m, 0, FLOOR_M + p.block_height_m / 2), half, p.block_colour, density=400)
+    course.rod("peg", (p.peg_at_m, -0.04, peg_z), (p.peg_at_m, half_width, peg_z), PEG_RADIUS_M, "yellow")
+    half_size = (p.block_half_m, 0.6 * half_width, p.block_height_m / 2)
+    course.free_box("block", (p.block_at_m, 0, FLOOR_M + p.block_height_m / 2), half_size, p.block_colour, density=400)
     course.ball("ball", (-p.run_m + 1.2 * r, 0, top + STEP_M + r), r, p.ball_colour, speed=p.speed_m_s)
-    course.mark("bob", (p.pivot_at_m, side), p.bob_colour)
+    course.mark("bob", (p.pivot_at_m, half_width), p.bob_colour)
     course.mark("block", "block")
     return course.scene(
         p,
         decisive=["block"],
         hidden=["peg"],
-        cover=course.box((0, end + 0.02), (-side - rim, side + 0.03), (0, high + 0.02), right=0.02),
-        in_view=[course.box((-p.run_m, end), deep, (0, high))],
+        cover=course.box((0, end + 0.02), (-half_width - rim, half_width + 0.03), (0, high + 0.02), right=0.02),
+        in_view=[course.box((-p.run_m, end), depth_span, (0, high))],
         things=[f"{p.ball_colour} ball", f"{p.block_colour} block", f"{p.bob_colour} pendulum bob", "pendulum"],
         also=["lane", "board", "peg", "rod"],
         colours=["black", "yellow"],
@@ -130,8 +134,8 @@ def outcome(motion: Motion, p: Params) -> Reading:
     """Read 'yes' once the block's top is low, 'no' once the pendulum swings back."""
     top = top_m(motion, "block", p.block_height_m, FLOOR_M)
     swing = -p.direction * motion.rot("pendulum")[:, 0, 2]
-    fallen = top < p.block_height_m / 2
-    return Reading(yes_while(fallen, int(np.argmax(swing)) + 1), float(abs(top[-1] - p.block_height_m / 2)))
+    has_fallen = top < p.block_height_m / 2
+    return Reading(yes_while(has_fallen, int(np.argmax(swing)) + 1), float(abs(top[-1] - p.block_height_m / 2)))
 
 
 def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
@@ -146,7 +150,7 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
 def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Predict a fall: the block gives way, or the bob is about to strike it."""
     first, last = largest(frames[0], slots["block"], 80), largest(frames[-1], slots["block"], 80)
-    bob = carried_on(track(frames, slots["bob"], 80), AHEAD)
+    bob = extrapolate(track(frames, slots["bob"], 80), AHEAD)
     if first is None or last is None or bob is None:
         return None
     gives_way = abs(last.x - first.x) + abs(last.box[2] - first.box[2]) > GIVES_PX

@@ -14,13 +14,22 @@ from typing import Any
 import cv2
 import numpy as np
 
-from traps_pipeline.scenes.parts.board import WALL_M, Board, looking_on, peg_rows, place, round_ball
+from traps_pipeline.scenes.parts.board import WALL_M, Board, camera_elevation, peg_rows, place, round_ball
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.questions import NUMBERS, Filled, Question, colour_from, either
 from traps_pipeline.scenes.parts.readings import Reading
 from traps_pipeline.scenes.parts.vary import Drawn, between, chance, drawn_by, one_of, together
 from traps_pipeline.scenes.parts.wording import choices_in
-from traps_pipeline.scenes.physics.kit import Inventory, Motion, Physics, Scene, View, distinct_colours, listed, uniform
+from traps_pipeline.scenes.physics.kit import (
+    Inventory,
+    Motion,
+    Physics,
+    Scene,
+    View,
+    distinct_colours,
+    list_choices,
+    uniform,
+)
 
 APRON_M = 0.175  # strip below the buckets that carries their numbers
 BUCKET_M = 0.16  # length of the walls between the buckets
@@ -61,7 +70,7 @@ BALLS = together(_balls)
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; per ball: colour, start and push; the first ball is asked for."""
+    """Parameters; a ball has colour, start and push; the question is on the first."""
 
     rows: int = ROWS()
     peg_gap_m: float = ROWS()  # from peg to peg in a row
@@ -79,7 +88,7 @@ class Params:
     pushes_m_s: tuple[float, ...] = BALLS()  # sideways speed
     rises_m: tuple[float, ...] = BALLS()  # how far up the board the throw carries
     azimuth_deg: float = between(86, 94)
-    elevation_deg: float = looking_on(-6, 6)
+    elevation_deg: float = camera_elevation(-6, 6)
 
     @property
     def pitch_m(self) -> float:
@@ -88,7 +97,7 @@ class Params:
 
     @property
     def rim_m(self) -> float:
-        """Where the buckets open, measured up the board."""
+        """Height of the buckets' openings, measured up the board."""
         return APRON_M + BUCKET_M
 
     @property
@@ -108,10 +117,10 @@ def build(p: Params, physics: Physics) -> Scene:
         bounce=(-20000.0, -12.0),
     )
     *rows, start = p.row_heights_m
-    top, whole = start + max(p.rises_m) + 2.5 * p.ball_radius_m, (-board.outer, board.outer)
+    top, full_width = start + max(p.rises_m) + 2.5 * p.ball_radius_m, (-board.outer, board.outer)
     frame = "black" if p.board_colour not in ("black", "purple", "blue") else "white"
-    board.block("plate", whole, (APRON_M, top), (-0.02, 0), p.board_colour)
-    board.block("apron", whole, (0, APRON_M), (-0.02, 0), "white")
+    board.block("plate", full_width, (APRON_M, top), (-0.02, 0), p.board_colour)
+    board.block("apron", full_width, (0, APRON_M), (-0.02, 0), "white")
     board.frame(APRON_M, top, frame)
     for i in range(1, p.buckets):
         board.divider(i, -board.side + i * p.pitch_m, (APRON_M, p.rim_m), WALL_M / 2, frame)
@@ -135,16 +144,16 @@ def build(p: Params, physics: Physics) -> Scene:
 
 def _add_digit(board: Board, digit: int, x: float) -> None:
     """Add a seven-segment digit on the apron, drawn only."""
-    half, pen = 0.024, 0.007  # half the digit's width, half a stroke
-    low, mid, high = 0.025, 0.07, 0.115
+    half_width, pen = 0.024, 0.007  # half the digit's width, half a stroke
+    low, middle, high = 0.025, 0.07, 0.115
     strokes = {
-        "a": (0, high, half + pen, pen),
-        "g": (0, mid, half + pen, pen),
-        "d": (0, low, half + pen, pen),
-        "f": (-half, (mid + high) / 2, pen, (high - mid) / 2),
-        "b": (half, (mid + high) / 2, pen, (high - mid) / 2),
-        "e": (-half, (low + mid) / 2, pen, (mid - low) / 2),
-        "c": (half, (low + mid) / 2, pen, (mid - low) / 2),
+        "a": (0, high, half_width + pen, pen),
+        "g": (0, middle, half_width + pen, pen),
+        "d": (0, low, half_width + pen, pen),
+        "f": (-half_width, (middle + high) / 2, pen, (high - middle) / 2),
+        "b": (half_width, (middle + high) / 2, pen, (high - middle) / 2),
+        "e": (-half_width, (low + middle) / 2, pen, (middle - low) / 2),
+        "c": (half_width, (low + middle) / 2, pen, (middle - low) / 2),
     }
     for segment in SEGMENTS[digit]:
         right, up, half_x, half_y = strokes[segment]
@@ -168,7 +177,7 @@ def _numbers(p: Params, rng: np.random.Generator) -> Filled:
     for n, word, ordinal in zip(labels, NUMBERS[1:], ORDINALS, strict=False):
         forms = (word, f"bucket {n}", f"bucket {word}", f"number {n}", f"{ordinal} bucket", f"bucket number {n}")
         aliases |= dict.fromkeys(forms, n)
-    return Filled(labels, aliases, {"choices": listed(labels), "ball": p.ball_colours[0]})
+    return Filled(labels, aliases, {"choices": list_choices(labels), "ball": p.ball_colours[0]})
 
 
 # In lengths of the apron's lower edge, which is as long as the board is wide (1.18 to 1.43 m): a ball that is so far
@@ -192,20 +201,20 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     height = float(along[1] * offset[0] - along[0] * offset[1]) / float(along @ along)
     if not (0 < share < 1 and 0 < height < LAST_PEGS):
         return None
-    buckets = len(choices_in(slots["choices"])) if "choices" in slots else _digits(last, edge)
+    buckets = len(choices_in(slots["choices"])) if "choices" in slots else _count_digits(last, edge)
     return str(int(share * buckets) + 1) if buckets else None
 
 
-def _digits(frame: np.ndarray, edge: tuple[np.ndarray, np.ndarray]) -> int:
+def _count_digits(frame: np.ndarray, edge: tuple[np.ndarray, np.ndarray]) -> int:
     """Count the digits on the apron, one a bucket, by the gaps between their ink."""
     left, right = edge
     along = right - left
     up = np.array([along[1], -along[0]])
     across, heights = np.linspace(0.02, 0.98, 600), np.linspace(*INK, 24)
     x, y = (left[i] + across * along[i] + heights[:, None] * up[i] for i in (0, 1))
-    inside = (x >= 0) & (x < frame.shape[1]) & (y >= 0) & (y < frame.shape[0])
+    is_inside = (x >= 0) & (x < frame.shape[1]) & (y >= 0) & (y < frame.shape[0])
     rows, columns = (np.clip(v.round().astype(int), 0, n - 1) for v, n in zip((y, x), frame.shape[:2], strict=True))
-    ink = ((frame[rows, columns].max(axis=2) < 110) & inside).any(axis=0).astype(np.uint8)
+    ink = ((frame[rows, columns].max(axis=2) < 110) & is_inside).any(axis=0).astype(np.uint8)
     ink = cv2.morphologyEx(ink[None], cv2.MORPH_CLOSE, np.ones((1, 9), np.uint8))[0]
     return int((np.diff(ink, prepend=0) == 1).sum())
 
@@ -213,10 +222,10 @@ def _digits(frame: np.ndarray, edge: tuple[np.ndarray, np.ndarray]) -> int:
 def _lower_edge(frame: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the lower left and right corner of the white apron."""
     outlines, _ = cv2.findContours((frame.min(axis=2) > 225).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    large = [outline[:, 0] for outline in outlines if cv2.contourArea(outline) > 1500]
-    if not large:
+    large_outlines = [outline[:, 0] for outline in outlines if cv2.contourArea(outline) > 1500]
+    if not large_outlines:
         return None
-    points = np.concatenate(large).astype(float)
+    points = np.concatenate(large_outlines).astype(float)
     return points[np.argmax(points[:, 1] - points[:, 0])], points[np.argmax(points[:, 1] + points[:, 0])]
 
 

@@ -22,16 +22,16 @@ from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 BOARD_M = 0.016  # thickness of the ramp
 WALL_M = 0.012
 BALLS = ("green", "yellow", "orange", "cyan", "purple")  # the bins are red and blue
-PLAIN = shuffled("wood", "grey", "black")
+PLAIN_COLOURS = shuffled("wood", "grey", "black")
 
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; y from the table's front edge to the back, x from its middle, right."""
+    """Parameters; y runs back from the table's front edge, x right from its middle."""
 
-    ramp_colour: str = PLAIN()
-    table_colour: str = PLAIN()
-    deflector_colour: str = PLAIN()
+    ramp_colour: str = PLAIN_COLOURS()
+    table_colour: str = PLAIN_COLOURS()
+    deflector_colour: str = PLAIN_COLOURS()
     deflects: str = hidden("left", "right")
     angle_deg: float = between(40, 50)  # between the deflector and the ball's way
     deflector_m: float = between(0.13, 0.15)  # half its length
@@ -52,11 +52,17 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build table with front and back wall, deflector, two bins, and a ramp behind."""
     course = Course(physics)
-    r, top, wide, rim, side = p.radius_m, p.table_m, p.half_width_m, p.table_m + 1.1 * p.radius_m, 1.5 * p.radius_m
+    r, top, half_width, rim, half_ramp = (
+        p.radius_m,
+        p.table_m,
+        p.half_width_m,
+        p.table_m + 1.1 * p.radius_m,
+        1.5 * p.radius_m,
+    )
 
-    course.block("table", (-wide, wide), (0, p.depth_m), (0, top), p.table_colour)
-    front = course.block("wall_front", (-wide, wide), (-WALL_M, 0), (0, rim), p.table_colour)
-    for name, x in (("left", (-wide, p.ramp_x_m - side)), ("right", (p.ramp_x_m + side, wide))):
+    course.block("table", (-half_width, half_width), (0, p.depth_m), (0, top), p.table_colour)
+    front = course.block("wall_front", (-half_width, half_width), (-WALL_M, 0), (0, rim), p.table_colour)
+    for name, x in (("left", (-half_width, p.ramp_x_m - half_ramp)), ("right", (p.ramp_x_m + half_ramp, half_width))):
         course.block(f"wall_{name}", x, (p.depth_m, p.depth_m + WALL_M), (0, rim), p.table_colour)
     turn = np.radians(90 + p.angle_deg if p.deflects == "left" else 90 - p.angle_deg) / 2
     centre = (p.ramp_x_m, p.deflector_m * float(np.cos(np.radians(p.angle_deg))) + 0.02, top + 0.9 * r)
@@ -69,24 +75,24 @@ def build(p: Params, physics: Physics) -> Scene:
 
     ramp = Ramp(p.slope_deg, top, p.depth_m, towards_camera=True, middle_m=p.ramp_x_m)
     middle = p.ramp_m / 2
-    ramp.board(course, "ramp", middle, -BOARD_M / 2, (middle, side, BOARD_M / 2), p.ramp_colour)
-    for name, x in (("left", -side), ("right", side)):
+    ramp.board(course, "ramp", middle, -BOARD_M / 2, (middle, half_ramp, BOARD_M / 2), p.ramp_colour)
+    for name, x in (("left", -half_ramp), ("right", half_ramp)):
         ramp.board(course, f"rail_{name}", middle, 0, (middle, 0.005, 0.4 * r), p.ramp_colour, aside=x)
-    ramp.support(course, "support", p.ramp_m - 0.05, BOARD_M, 0.8 * side, p.ramp_colour)
+    ramp.support(course, "support", p.ramp_m - 0.05, BOARD_M, 0.8 * half_ramp, p.ramp_colour)
     course.ball("ball", ramp.at(p.ramp_m - p.start_m, r), r, p.ball_colour)
 
-    high, out = top + 2 * r + 0.01, wide + p.bin_m + WALL_M
-    _, back, highest = ramp.at(p.ramp_m)
+    high, outer_x = top + 2 * r + 0.01, half_width + p.bin_m + WALL_M
+    _, back, ramp_top = ramp.at(p.ramp_m)
     for name in ("left", "right"):
         course.mark(f"{name} bin", f"bin_{name}")
     return course.scene(
         p,
         decisive=["ball"],
         hidden=["deflector"],
-        cover=course.box((-out, out), (-WALL_M - 0.01, p.depth_m), (0, high), right=0.02),
+        cover=course.box((-outer_x, outer_x), (-WALL_M - 0.01, p.depth_m), (0, high), right=0.02),
         in_view=[
-            course.box((-out, out), (-WALL_M, p.depth_m), (0, high)),
-            course.box((p.ramp_x_m - side, p.ramp_x_m + side), (back, back), (0, highest)),
+            course.box((-outer_x, outer_x), (-WALL_M, p.depth_m), (0, high)),
+            course.box((p.ramp_x_m - half_ramp, p.ramp_x_m + half_ramp), (back, back), (0, ramp_top)),
         ],
         things=[f"{p.ball_colour} ball", "red bin", "blue bin", "ramp", "table"],
         also=["board", "wall"],
@@ -96,21 +102,21 @@ def build(p: Params, physics: Physics) -> Scene:
 
 def _add_bin(course: Course, p: Params, name: str, sign: int, colour: str) -> None:
     """Add an open box beside the table (sign -1: on the left), lower than it."""
-    near, far = p.half_width_m, p.half_width_m + p.bin_m
-    middle, half, depth = sign * (near + far) / 2, p.bin_m / 2, p.depth_m / 2
-    course.slab(f"bin_{name}", (middle, depth, 0.006), (half, depth, 0.006), colour).friction = [0.8, 0.005, 0.006]
+    near_x, far_x = p.half_width_m, p.half_width_m + p.bin_m
+    middle, half_bin, depth = sign * (near_x + far_x) / 2, p.bin_m / 2, p.depth_m / 2
+    course.slab(f"bin_{name}", (middle, depth, 0.006), (half_bin, depth, 0.006), colour).friction = [0.8, 0.005, 0.006]
     for end, y, high in (("front", -WALL_M / 2, 0.04), ("back", p.depth_m + WALL_M / 2, p.table_m)):
-        course.slab(f"bin_{name}_{end}", (middle, y, high / 2), (half, WALL_M / 2, high / 2), colour)
+        course.slab(f"bin_{name}_{end}", (middle, y, high / 2), (half_bin, WALL_M / 2, high / 2), colour)
     high = p.table_m + p.radius_m
-    at = (sign * (far + WALL_M / 2), depth, high / 2)
+    at = (sign * (far_x + WALL_M / 2), depth, high / 2)
     course.slab(f"bin_{name}_end", at, (WALL_M / 2, depth + WALL_M, high / 2), colour)
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
     """Read the end of the table that the ball is past, and by how far its middle."""
     x = motion.pos("ball")[:, 0]
-    past = np.abs(x) - p.half_width_m
-    return Reading(side_while(past > 0, x, "right", "left"), float(past[-1]))
+    past_m = np.abs(x) - p.half_width_m
+    return Reading(side_while(past_m > 0, x, "right", "left"), float(past_m[-1]))
 
 
 FAMILY = scene_family(

@@ -20,7 +20,7 @@ from traps_pipeline.scenes.parts.ramp import Ramp
 from traps_pipeline.scenes.parts.readings import Reading, first_past
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, hidden, in_front
 from traps_pipeline.scenes.parts.vision import Blob, is_at_rest
-from traps_pipeline.scenes.physics.kit import AnswerableQuestion, Motion, Physics, Scene, listed, uniform
+from traps_pipeline.scenes.physics.kit import AnswerableQuestion, Motion, Physics, Scene, list_choices, uniform
 
 BOARD_M = 0.016  # thickness of a ramp
 WALL_M = 0.012
@@ -28,9 +28,9 @@ ROUGH_M = 0.16  # length of the rough board
 ARRIVING = 0.86  # share of its energy that a ball still has after the foot of the ramp, as measured
 MIN_LEAD_S = 0.35  # a closer finish could fall between two sampled frames
 BALLS = ("ball_0", "ball_1")
-SOON = 2.0  # frames until the first ball is in the tray
+FRAMES_AHEAD = 2.0  # frames until the first ball is in the tray
 BALL_COLOURS = "red", "green", "blue", "yellow", "orange", "cyan", "purple"
-PLAY = apart(*BALL_COLOURS)
+PLAY_COLOURS = apart(*BALL_COLOURS)
 
 
 def _tray_colour(rng: np.random.Generator, so_far: Drawn) -> str:
@@ -53,9 +53,9 @@ def _starts(rng: np.random.Generator, so_far: Drawn) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; pairs: left and right track, y from the tray's front to the back."""
+    """Parameters; pairs are left and right track; y runs back from the tray's front."""
 
-    colours: tuple[str, str] = PLAY(2)
+    colours: tuple[str, str] = PLAY_COLOURS(2)
     tray_colour: str = drawn_by(_tray_colour)
     ramp_m: float = between(0.60, 0.70)
     starts_m: tuple[float, float] = drawn_by(_starts)  # from the foot of the ramp up along it to where each ball starts
@@ -76,40 +76,48 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build two tracks towards the front, a ramp behind each, and one tray."""
     course = Course(physics)
-    r, side, track = p.radius_m, 1.5 * p.radius_m, (0, p.track_m)
-    rough = (p.tray_m + p.after_m, p.tray_m + p.after_m + ROUGH_M)
-    foot = rough[1] + p.lead_m
+    r, half_track, track = p.radius_m, 1.5 * p.radius_m, (0, p.track_m)
+    rough_span = (p.tray_m + p.after_m, p.tray_m + p.after_m + ROUGH_M)
+    foot = rough_span[1] + p.lead_m
     mat_colour = next(c for c in ("black", "wood", "grey") if c not in p.track_colours)
     half_up, tracks = p.ramp_m / 2, (-p.apart_m / 2, p.apart_m / 2)
     ramps = [Ramp(p.slope_deg, p.track_m, foot, towards_camera=True, middle_m=x) for x in tracks]
     for i, (x, ramp) in enumerate(zip(tracks, ramps, strict=True)):
-        across, colour = (x - side, x + side), p.track_colours[i]
-        course.block(f"track_out_{i}", across, (p.tray_m, rough[0]), track, colour)
-        mat, rolling = (mat_colour, _roughness(p, i, physics)) if i == p.rough_track else (colour, 2e-5)
-        course.block(f"board_{i}", across, rough, track, mat).friction = [4.0, 0.005, rolling]
-        course.block(f"track_in_{i}", across, (rough[1], foot + 0.01), track, colour)
+        across, colour = (x - half_track, x + half_track), p.track_colours[i]
+        course.block(f"track_out_{i}", across, (p.tray_m, rough_span[0]), track, colour)
+        mat, rolling_friction = (mat_colour, _roughness(p, i, physics)) if i == p.rough_track else (colour, 2e-5)
+        course.block(f"board_{i}", across, rough_span, track, mat).friction = [4.0, 0.005, rolling_friction]
+        course.block(f"track_in_{i}", across, (rough_span[1], foot + 0.01), track, colour)
         for k in (-1, 1):
-            rail = (x + k * side - 0.004, x + k * side + 0.004)
+            rail = (x + k * half_track - 0.004, x + k * half_track + 0.004)
             course.block(f"rail_{i}_{k}", rail, (p.tray_m, foot), (0, p.track_m + 0.01), colour)
-        ramp.board(course, f"ramp_{i}", half_up, -BOARD_M / 2, (half_up, side, BOARD_M / 2), colour)
+        ramp.board(course, f"ramp_{i}", half_up, -BOARD_M / 2, (half_up, half_track, BOARD_M / 2), colour)
         for k in (-1, 1):
-            ramp.board(course, f"ramp_rail_{i}_{k}", half_up, 0, (half_up, 0.005, 0.4 * r), colour, aside=k * side)
-        ramp.support(course, f"support_{i}", p.ramp_m - 0.05, BOARD_M, 0.8 * side, colour)
+            ramp.board(
+                course, f"ramp_rail_{i}_{k}", half_up, 0, (half_up, 0.005, 0.4 * r), colour, aside=k * half_track
+            )
+        ramp.support(course, f"support_{i}", p.ramp_m - 0.05, BOARD_M, 0.8 * half_track, colour)
         course.ball(BALLS[i], ramp.at(p.starts_m[i], r), r, p.colours[i])
 
-    half = p.apart_m / 2 + side + 0.02
-    outer, deep, rim = (-half - WALL_M, half + WALL_M), (0, p.tray_m), (0, p.track_m + 0.01)
-    course.block("tray_floor", (-half, half), deep, (0, WALL_M), p.tray_colour).friction = [0.8, 0.005, 0.006]
+    half_width = p.apart_m / 2 + half_track + 0.02
+    outer, tray_depth, rim = (-half_width - WALL_M, half_width + WALL_M), (0, p.tray_m), (0, p.track_m + 0.01)
+    course.block("tray_floor", (-half_width, half_width), tray_depth, (0, WALL_M), p.tray_colour).friction = [
+        0.8,
+        0.005,
+        0.006,
+    ]
     course.block("tray_front", outer, (-WALL_M, 0), (0, 1.1 * r), p.tray_colour)
-    course.block("tray_side_-1", (outer[0], -half), deep, rim, p.tray_colour)
-    course.block("tray_side_1", (half, outer[1]), deep, rim, p.tray_colour)
-    course.block("divider", (-0.006, 0.006), deep, (0, 0.9 * r), p.tray_colour)
+    course.block("tray_side_-1", (outer[0], -half_width), tray_depth, rim, p.tray_colour)
+    course.block("tray_side_1", (half_width, outer[1]), tray_depth, rim, p.tray_colour)
+    course.block("divider", (-0.006, 0.006), tray_depth, (0, 0.9 * r), p.tray_colour)
 
-    hidden_y = rough[1] + 1.8 * r + 0.03  # the ball that feels the rough board is behind the occluder with its shadow
+    hidden_y = (
+        rough_span[1] + 1.8 * r + 0.03
+    )  # the ball that feels the rough board is behind the occluder with its shadow
     high = p.track_m + 2 * r + 0.015
     _, back, top = ramps[0].at(p.ramp_m)
-    beside = half if p.azimuth_deg < 94 else -half  # where no ball rolls behind the flag
-    course.mark("tray", (beside, p.tray_m), p.tray_colour)
+    flag_x = half_width if p.azimuth_deg < 94 else -half_width  # where no ball rolls behind the flag
+    course.mark("tray", (flag_x, p.tray_m), p.tray_colour)
     return course.scene(
         p,
         decisive=BALLS,
@@ -130,8 +138,8 @@ def _roughness(p: Params, track: int, physics: Physics) -> float:
     """
     slope = float(np.radians(p.slope_deg))
     down = 10 / 7 * physics.gravity_m_s2 * (p.starts_m[track] - p.radius_m * np.tan(slope / 2)) * np.sin(slope)
-    entering = ARRIVING * down * (5 / 7 * np.cos(slope) + 2 / 7) ** 2
-    return float(brake(p.radius_m, entering - p.creep_m_s**2, ROUGH_M, physics))
+    entry_speed2 = ARRIVING * down * (5 / 7 * np.cos(slope) + 2 / 7) ** 2
+    return float(brake(p.radius_m, entry_speed2 - p.creep_m_s**2, ROUGH_M, physics))
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
@@ -145,9 +153,9 @@ def _higher_or_side(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
     choices = tuple(str(c) for c in rng.permutation(p.colours))
     if rng.integers(2):
         higher = p.colours[int(np.argmax(p.starts_m))]
-        return AnswerableQuestion(f"Which ball starts higher up on its ramp, {listed(choices)}?", choices, higher)
+        return AnswerableQuestion(f"Which ball starts higher up on its ramp, {list_choices(choices)}?", choices, higher)
     side = int(rng.integers(2))
-    question = f"Which ball rolls down the {('left', 'right')[side]} ramp, {listed(choices)}?"
+    question = f"Which ball rolls down the {('left', 'right')[side]} ramp, {list_choices(choices)}?"
     return AnswerableQuestion(question, choices, p.colours[side])
 
 
@@ -173,7 +181,7 @@ def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
         ys = [ball.y + ball.box[3] / 2 for ball in path if ball is not None]
         if len(ys) == len(path) == 3:
             step, gain = ys[2] - ys[1], ys[2] - 2 * ys[1] + ys[0]
-            lower[colour] = ys[2] + SOON * step + SOON * (SOON + 1) / 2 * gain
+            lower[colour] = ys[2] + FRAMES_AHEAD * step + FRAMES_AHEAD * (FRAMES_AHEAD + 1) / 2 * gain
     return max(lower, key=lambda colour: lower[colour]) if len(lower) == 2 else None
 
 

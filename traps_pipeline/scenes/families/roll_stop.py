@@ -26,21 +26,21 @@ TRACK_M = 0.04  # height of the track
 WALL_M = 0.014
 LINE_M = 0.035  # width of a painted line
 STILL_M = 0.003  # a ball that moves less than this any more is at rest
-PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
-PLAIN = shuffled("wood", "grey", "white")
+PLAY_COLOURS = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
+PLAIN_COLOURS = shuffled("wood", "grey", "white")
 PARTS = ("ball", "start", "line")
 
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths run from the track's beginning, direction +1: to the right."""
+    """Parameters; lengths run from the track's beginning; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
-    ball_colour: str = PLAY()
-    start_colour: str = PLAY()  # of the line outside the occluder
-    line_colour: str = PLAY()
-    track_colour: str = PLAIN()
-    wall_colour: str = PLAIN()
+    ball_colour: str = PLAY_COLOURS()
+    start_colour: str = PLAY_COLOURS()  # of the line outside the occluder
+    line_colour: str = PLAY_COLOURS()
+    track_colour: str = PLAIN_COLOURS()
+    wall_colour: str = PLAIN_COLOURS()
     radius_m: float = between(0.048, 0.058)
     rough: bool = hidden(False, True)
     speed_m_s: float = between(0.55, 0.80)
@@ -58,27 +58,27 @@ class Params:
 
     @property
     def line_m(self) -> float:
-        """Where the middle of the line is."""
+        """Position of the line's middle."""
         return self.run_m + self.lead_m + self.patch_m + self.line_at_m
 
 
 def build(p: Params, physics: Physics) -> Scene:
     """Build track with kerbs, patch, two lines and end wall."""
     course = Course(physics, p.direction)
-    r, side, end = p.radius_m, p.half_width_m, p.line_m + p.felt_m
-    deep, outer, track = (-side, side), (-side - WALL_M, side + WALL_M), (0, TRACK_M)
+    r, half_width, end = p.radius_m, p.half_width_m, p.line_m + p.felt_m
+    depth_span, outer, track = (-half_width, half_width), (-half_width - WALL_M, half_width + WALL_M), (0, TRACK_M)
     patch = (p.run_m + p.lead_m, p.run_m + p.lead_m + p.patch_m)
-    rolling = brake(r, p.speed_m_s**2, p.stop_share * p.patch_m, physics) if p.rough else 2e-5
+    rolling_friction = brake(r, p.speed_m_s**2, p.stop_share * p.patch_m, physics) if p.rough else 2e-5
 
-    course.block("track_in", (-0.02, patch[0]), deep, track, p.track_colour)
-    mat = course.block("patch", patch, deep, track, "black" if p.rough else p.track_colour)
-    mat.friction = [4.0, 0.005, rolling]
-    course.block("track_out", (patch[1], p.line_m), deep, track, p.track_colour)
-    course.block("felt", (p.line_m, end), deep, track, p.track_colour).friction = [0.8, 0.005, 0.006]
+    course.block("track_in", (-0.02, patch[0]), depth_span, track, p.track_colour)
+    mat = course.block("patch", patch, depth_span, track, "black" if p.rough else p.track_colour)
+    mat.friction = [4.0, 0.005, rolling_friction]
+    course.block("track_out", (patch[1], p.line_m), depth_span, track, p.track_colour)
+    course.block("felt", (p.line_m, end), depth_span, track, p.track_colour).friction = [0.8, 0.005, 0.006]
     for name, middle, colour in (("start_line", 0.6 * p.run_m, p.start_colour), ("line", p.line_m, p.line_colour)):
-        painted = (middle - LINE_M / 2, middle + LINE_M / 2)
-        course.block(name, painted, deep, (0, TRACK_M + 0.001), colour, solid=False)
-    course.sides("kerb", (-0.02, end), side, WALL_M, (0, TRACK_M + 0.012), p.wall_colour)
+        line_span = (middle - LINE_M / 2, middle + LINE_M / 2)
+        course.block(name, line_span, depth_span, (0, TRACK_M + 0.001), colour, solid=False)
+    course.sides("kerb", (-0.02, end), half_width, WALL_M, (0, TRACK_M + 0.012), p.wall_colour)
     course.block("end_wall", (end, end + WALL_M), outer, (0, TRACK_M + 2 * r), p.wall_colour)
     course.ball("ball", (0.05, 0, TRACK_M + r), r, p.ball_colour, speed=p.speed_m_s)
 
@@ -97,8 +97,8 @@ def build(p: Params, physics: Physics) -> Scene:
 
 def outcome(motion: Motion, p: Params) -> Reading:
     """Read whether the ball's middle is past the line; 'no' only once it rests."""
-    past = p.direction * motion.pos("ball")[:, 0] - p.line_m - LINE_M / 2
-    return Reading(yes_while(past > 0, still_from(past, within_m=STILL_M)), clear_m(past, LINE_M))
+    past_m = p.direction * motion.pos("ball")[:, 0] - p.line_m - LINE_M / 2
+    return Reading(yes_while(past_m > 0, still_from(past_m, within_m=STILL_M)), clear_m(past_m, LINE_M))
 
 
 def observe(frames: np.ndarray, slots: Mapping[str, str], ahead: float | None = None) -> str | None:

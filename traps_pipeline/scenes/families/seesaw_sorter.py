@@ -17,10 +17,10 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from traps_pipeline.scenes.parts.board import WALL_M, Board, looking_on, peg_rows, place, turned
+from traps_pipeline.scenes.parts.board import WALL_M, Board, camera_elevation, peg_rows, place, turn_quaternion
 from traps_pipeline.scenes.parts.course import Surface
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import AHEAD, carried_on
+from traps_pipeline.scenes.parts.observers import AHEAD, extrapolate
 from traps_pipeline.scenes.parts.questions import Filled, Question, choice_of, either
 from traps_pipeline.scenes.parts.readings import Reading, turns_deg
 from traps_pipeline.scenes.parts.vary import Drawn, between, chance, drawn_by, one_of, several_between, shuffled
@@ -33,7 +33,7 @@ from traps_pipeline.scenes.physics.kit import (
     Scene,
     View,
     add_box,
-    listed,
+    list_choices,
     rgba,
     uniform,
 )
@@ -103,7 +103,7 @@ def _bands(rng: np.random.Generator, so_far: Drawn) -> tuple[float, ...]:
         return ()
     low, high = (-so_far["half_m"], so_far["half_m"]) if so_far["bands"] == "along" else (0.35, 1.5)
     first, second = uniform(rng, low, (low + high) / 2 - 0.1), uniform(rng, (low + high) / 2, high - 0.1)
-    return tuple(round(at + wide, 3) for at in (first, second) for wide in (0, uniform(rng, 0.1, (high - low) / 3)))
+    return tuple(round(at + width, 3) for at in (first, second) for width in (0, uniform(rng, 0.1, (high - low) / 3)))
 
 
 def _crates(rng: np.random.Generator, so_far: Drawn) -> tuple[tuple[float, ...], ...]:
@@ -111,17 +111,17 @@ def _crates(rng: np.random.Generator, so_far: Drawn) -> tuple[tuple[float, ...],
     crates: list[tuple[float, ...]] = []
     for side in (-1, 1):
         if rng.random() < 0.6:
-            half, tall = uniform(rng, 0.06, 0.16), uniform(rng, 0.05, 0.25)
-            away = uniform(rng, 0.0, 1.0)
-            across = side * (so_far["half_m"] + 0.06 + half + uniform(rng, 0.0, 0.15))
-            crates.append((round(across, 4), away, half, tall))
+            half_width, height = uniform(rng, 0.06, 0.16), uniform(rng, 0.05, 0.25)
+            distance = uniform(rng, 0.0, 1.0)
+            across = side * (so_far["half_m"] + 0.06 + half_width + uniform(rng, 0.0, 0.15))
+            crates.append((round(across, 4), distance, half_width, height))
     so_far["crates"] = len(crates)
     return tuple(crates)
 
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths on the board, bins' and seesaw's sideways from the pivot."""
+    """Parameters; lengths on the board; bins and seesaw are measured from the pivot."""
 
     rows: int = ROWS()
     peg_gap_m: float = ROWS()  # from peg to peg in a row
@@ -150,26 +150,26 @@ class Params:
     crate_colours: tuple[str, ...] = shuffled(*CRATES)("crates")
     beside_m: float = between(-0.45, 0.45)  # so much more of the floor is in view to the right, or to the left
     azimuth_deg: float = between(82, 98)
-    elevation_deg: float = looking_on(-10, 6)
+    elevation_deg: float = camera_elevation(-10, 6)
 
     @property
     def width_m(self) -> float:
-        """Inside of the board."""
+        """Inner width of the board."""
         return 2 * self.bin_m + sum(self.trays_m)
 
     @property
     def middle_m(self) -> float:
-        """Where the pivot is across the board."""
+        """Position of the pivot across the board."""
         return (self.trays_m[0] - self.trays_m[1]) / 2
 
     @property
     def rim_m(self) -> float:
-        """Where the bins open, measured up the board."""
+        """Height of the bins' openings, measured up the board."""
         return SILL_M + BIN_M
 
     @property
     def pivot_m(self) -> float:
-        """Where the seesaw turns, measured up the board."""
+        """Height of the seesaw's pivot, measured up the board."""
         return self.rim_m + self.beam_m * math.sin(math.radians(self.swing_deg)) + self.drop_m
 
 
@@ -196,20 +196,20 @@ def build(p: Params, physics: Physics) -> Scene:
     for i, (x, high) in enumerate(((left, p.rim_m), (middle, p.pivot_m - 0.035), (right, p.rim_m))):
         board.divider(i, x, (SILL_M, high), WALL_M / 2, trim)
     _add_seesaw(board, p)
-    passed = _add_funnel(board, p, trim)
-    board.pegs(rows, p.row_shifts_m, p.peg_gap_m, p.peg_radius_m, trim, square=p.square_pegs, where=passed)
+    funnel_end = _add_funnel(board, p, trim)
+    board.pegs(rows, p.row_shifts_m, p.peg_gap_m, p.peg_radius_m, trim, square=p.square_pegs, where=funnel_end)
     ball = board.ball("ball", (p.start_m, start), p.ball_colour)
     ball.contype = ball.conaffinity = 3  # the seesaw's 2 as well as the board's 1
     _stand_crates(board, p)
     colours = sorted({"red", "blue", "grey", p.ball_colour, p.board_colour, p.beam_colour, trim, *p.crate_colours})
     nouns = ["ball", "board", "peg", "seesaw", "bin", "tray", "wall"]
-    out, (sill, head) = p.beside_m + math.copysign(board.outer, p.beside_m), board.ends(top)
-    beside = Box((out, sill.low[1], sill.low[2]), (out, sill.low[1], sill.low[2]))
+    outer_x, (sill, head) = p.beside_m + math.copysign(board.outer, p.beside_m), board.ends(top)
+    beside_box = Box((outer_x, sill.low[1], sill.low[2]), (outer_x, sill.low[1], sill.low[2]))
     return Scene(
         spec=board.spec,
         view=View(azimuth_deg=p.azimuth_deg, elevation_deg=p.elevation_deg),
         decisive=("ball",),
-        framed=(sill, head, beside),
+        framed=(sill, head, beside_box),
         rest=board.region((SILL_M, p.rim_m), board.deep),
         velocity={"ball": board.throw(p.push_m_s, p.rise_m)},
         inventory=Inventory(tuple(colours), (*nouns, *(["box", "crate"] if p.crates_m else []))),
@@ -219,18 +219,18 @@ def build(p: Params, physics: Physics) -> Scene:
 def _add_funnel(board: Board, p: Params, colour: str) -> Callable[[float, float], bool]:
     """Add two slanted bars; return whether a ball passes them by a peg at a place."""
     tip = p.pivot_m + TIP_M
-    feet = [p.bin_m - FUNNEL_IN_M + side * p.middle_m for side in (-1, 1)]
-    for name, side, foot in zip(("funnel_left", "funnel_right"), (-1, 1), feet, strict=True):
+    foot_positions = [p.bin_m - FUNNEL_IN_M + side * p.middle_m for side in (-1, 1)]
+    for name, side, foot in zip(("funnel_left", "funnel_right"), (-1, 1), foot_positions, strict=True):
         a, b = np.array([side * foot, tip]), np.array([side * board.side, tip + STEEP * (board.side - foot)])
         middle, along = (a + b) / 2, b - a
         bar = board.block(name, (-1e-3, 1e-3), (-1e-3, 1e-3), (0, board.deep), colour)
         bar.pos = [float(middle[0]), float(middle[1]), board.deep / 2]
         bar.size = [float(np.hypot(*along)) / 2, WALL_M / 2, board.deep / 2]
-        bar.quat = turned(math.atan2(along[1], along[0]), 3)
+        bar.quat = turn_quaternion(math.atan2(along[1], along[0]), 3)
         SLICK.on(bar)
 
     def has_room(across: float, up: float) -> bool:
-        foot = feet[0] if across < 0 else feet[1]
+        foot = foot_positions[0] if across < 0 else foot_positions[1]
         high = tip + STEEP * (board.side - foot) + p.ball_radius_m
         return up > high or foot + (up - tip) / STEEP - abs(across) - p.peg_radius_m > 2.9 * p.ball_radius_m
 
@@ -252,9 +252,11 @@ def _paint_bands(board: Board, p: Params, top: float) -> None:
 
 def _stand_crates(board: Board, p: Params) -> None:
     """Stand boxes without contact on the floor beside the board."""
-    for i, (colour, (across, away, half, tall)) in enumerate(zip(p.crate_colours, p.crates_m, strict=True)):
-        at = (across, away, tall)
-        add_box(board.spec.worldbody, f"crate_{i}", at, (half, half, tall), colour, contype=0, conaffinity=0)
+    for i, (colour, (across, distance, half_width, height)) in enumerate(zip(p.crate_colours, p.crates_m, strict=True)):
+        at = (across, distance, height)
+        add_box(
+            board.spec.worldbody, f"crate_{i}", at, (half_width, half_width, height), colour, contype=0, conaffinity=0
+        )
 
 
 def _add_seesaw(board: Board, p: Params) -> None:
@@ -266,8 +268,8 @@ def _add_seesaw(board: Board, p: Params) -> None:
     joint = body.add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 0, 1])
     joint.limited, joint.range = mujoco.mjtLimited.mjLIMITED_TRUE, [-p.swing_deg, p.swing_deg]
     joint.damping, joint.stiffness = [0.006, 0, 0], [0.03, 0, 0]
-    half = (p.beam_m, BEAM_M, half_deep - 0.004)
-    SLICK.on(add_box(body, "seesaw", (0, 0, 0), half, p.beam_colour, density=300.0, contype=2, conaffinity=2))
+    half_size = (p.beam_m, BEAM_M, half_deep - 0.004)
+    SLICK.on(add_box(body, "seesaw", (0, 0, 0), half_size, p.beam_colour, density=300.0, contype=2, conaffinity=2))
     pivot = body.add_geom(name="pivot", type=mujoco.mjtGeom.mjGEOM_CYLINDER, rgba=rgba(p.beam_colour))
     pivot.size, pivot.pos, pivot.contype, pivot.conaffinity = [0.018, half_deep, 0], [0, -BEAM_M, 0], 2, 2
 
@@ -278,8 +280,8 @@ def outcome(motion: Motion, p: Params) -> Reading:
     across = across - p.middle_m
     names = np.where(np.abs(across) > p.bin_m, "elsewhere", np.where(across < 0, "left", "right"))
     labels = [str(name) if u < p.rim_m - BARE_M else None for name, u in zip(names, up, strict=True)]
-    off = abs(float(across[-1]))  # from the middle wall, which only a ball in a bin could have missed
-    margin = min(abs(off - p.bin_m), off if off < p.bin_m else math.inf, p.rim_m - float(up[-1]))
+    offset_m = abs(float(across[-1]))  # from the middle wall, which only a ball in a bin could have missed
+    margin = min(abs(offset_m - p.bin_m), offset_m if offset_m < p.bin_m else math.inf, p.rim_m - float(up[-1]))
     return Reading(labels, margin, turns_deg=turns_deg(motion.rot("seesaw")))
 
 
@@ -290,7 +292,7 @@ def _places(p: Params, rng: np.random.Generator) -> Filled:
     aliases = {f.format(*side): side[0] for side in (("left", "red"), ("right", "blue")) for f in forms}
     forms = ("other", "tray", "grey", "grey tray", "side tray", "in a grey tray", "in the grey tray")
     aliases |= dict.fromkeys(forms, "elsewhere") | {text: label for label, text in CHOICES.items()}
-    return Filled(tuple(CHOICES), aliases, {"choices": listed([CHOICES[str(label)] for label in order])})
+    return Filled(tuple(CHOICES), aliases, {"choices": list_choices([CHOICES[str(label)] for label in order])})
 
 
 PAST_PEGS = 1.2  # bin widths above the bins: so low a ball has at most one row of pegs before it
@@ -302,33 +304,33 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     if red is None or blue is None or blue.x <= red.x or not any(slots["ball"] in pool for pool in BALLS.values()):
         return None
     path = [_ball(frame, frames[0], slots["ball"]) for frame in frames[-3:]]
-    places = {_lies(ball, red, blue) for ball in path}
+    places = {_bin_of(ball, red, blue) for ball in path}
     place_seen = places.pop() if len(places) == 1 else None
-    return _falls(path, red, blue) if place_seen is None else place_seen
+    return _predict_bin(path, red, blue) if place_seen is None else place_seen
 
 
-def _falls(path: Sequence[Blob | None], red: Blob, blue: Blob) -> str | None:
+def _predict_bin(path: Sequence[Blob | None], red: Blob, blue: Blob) -> str | None:
     """Return where a ball past the pegs goes by the seesaw's side; None before."""
-    now, soon = carried_on(path, 0.0), carried_on(path, AHEAD)
-    if now is None or soon is None:
+    now, later_blob = extrapolate(path, 0.0), extrapolate(path, AHEAD)
+    if now is None or later_blob is None:
         return None
     middle, along = np.array([red.x + blue.x, red.y + blue.y]) / 2, np.array([blue.x - red.x, blue.y - red.y])
     bin_px = float(np.linalg.norm(along))  # from the middle of one bin to that of the other: as wide as each is
     along = along / bin_px
-    above = (along[1] * (now.x - middle[0]) - along[0] * (now.y - middle[1])) / bin_px
-    if not 0 < above < PAST_PEGS:
+    height_in_bins = (along[1] * (now.x - middle[0]) - along[0] * (now.y - middle[1])) / bin_px
+    if not 0 < height_in_bins < PAST_PEGS:
         return None
-    out = (np.array([soon.x, soon.y]) - middle) @ along / bin_px
-    return "elsewhere" if abs(out) > 1 else "right" if out > 0 else "left"
+    offset_in_bins = (np.array([later_blob.x, later_blob.y]) - middle) @ along / bin_px
+    return "elsewhere" if abs(offset_in_bins) > 1 else "right" if offset_in_bins > 0 else "left"
 
 
 def _ball(frame: np.ndarray, first: np.ndarray, colour: str) -> Blob | None:
     """Return the largest region that got the ball's colour since the first frame."""
-    before = cv2.dilate(colour_mask(first, colour).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    return next(iter(blobs(colour_mask(frame, colour) & ~before, 40)), None)
+    mask_before = cv2.dilate(colour_mask(first, colour).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    return next(iter(blobs(colour_mask(frame, colour) & ~mask_before, 40)), None)
 
 
-def _lies(ball: Blob | None, red: Blob, blue: Blob) -> str | None:
+def _bin_of(ball: Blob | None, red: Blob, blue: Blob) -> str | None:
     """Return the place of a ball by its pixels."""
     if ball is None or ball.y < red.y + (ball.x - red.x) * (blue.y - red.y) / (blue.x - red.x):
         return None

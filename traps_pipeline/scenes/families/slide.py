@@ -28,7 +28,7 @@ TILT_RAD = 0.015  # of the rough board: its near edge is below the deck in eithe
 SUNK_M = 0.012
 STILL_M = 0.003  # a block that moves less than this any more is at rest
 COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
-PLAY = apart(*COLOURS)
+PLAY_COLOURS = apart(*COLOURS)
 
 
 def _incline_colour(rng: np.random.Generator, so_far: Drawn) -> str:
@@ -38,11 +38,11 @@ def _incline_colour(rng: np.random.Generator, so_far: Drawn) -> str:
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths run from the incline's foot, direction +1: to the right."""
+    """Parameters; lengths run from the incline's foot; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
-    block_colour: str = PLAY()
-    tray_colour: str = PLAY()
+    block_colour: str = PLAY_COLOURS()
+    tray_colour: str = PLAY_COLOURS()
     deck_colour: str = one_of("wood", "grey")
     incline_colour: str = drawn_by(_incline_colour)
     block_half_m: tuple[float, float, float] = drawn_by(  # along, across, up
@@ -67,49 +67,56 @@ class Params:
 
     @property
     def board_span(self) -> Span:
-        """Where the rough board is."""
+        """Start and end of the rough board."""
         return (self.mouth_m + self.lead_m, self.mouth_m + self.lead_m + self.board_m)
 
     @property
     def deck_end_m(self) -> float:
-        """Where the deck ends."""
+        """Position of the deck's end."""
         return self.board_span[1] + self.after_m
 
 
 def build(p: Params, physics: Physics) -> Scene:
     """Build deck, incline with its support and block, the board in the deck, and tray."""
     course = Course(physics, p.direction)
-    side, far, end = p.block_half_m[1] + 0.04, p.deck_end_m, p.deck_end_m + p.tray_m
-    deep, outer, tray = (-side, side), (-side - WALL_M, side + WALL_M), (p.deck_end_m, end)
+    half_width, deck_end, end = p.block_half_m[1] + 0.04, p.deck_end_m, p.deck_end_m + p.tray_m
+    depth_span, outer, tray = (
+        (-half_width, half_width),
+        (-half_width - WALL_M, half_width + WALL_M),
+        (p.deck_end_m, end),
+    )
 
-    deck = course.block("deck", (-OVERLAP_M, far), deep, (0, p.deck_m), p.deck_colour)
+    deck = course.block("deck", (-OVERLAP_M, deck_end), depth_span, (0, p.deck_m), p.deck_colour)
     ramp = Ramp(p.slope_deg, p.deck_m)
-    half = ((p.incline_m + OVERLAP_M / 2) / 2, side, INCLINE_M / 2)
+    half_size = ((p.incline_m + OVERLAP_M / 2) / 2, half_width, INCLINE_M / 2)
     middle = (p.incline_m - OVERLAP_M / 2) / 2
-    incline = ramp.board(course, "incline", middle, -INCLINE_M / 2, half, p.incline_colour)
+    incline = ramp.board(course, "incline", middle, -INCLINE_M / 2, half_size, p.incline_colour)
     for geom in (deck, incline):
         geom.friction, geom.priority = [p.deck_friction, 0.001, 0.0001], 1
-    ramp.support(course, "support", p.incline_m - 0.05, INCLINE_M, 0.8 * side, p.deck_colour)
+    ramp.support(course, "support", p.incline_m - 0.05, INCLINE_M, 0.8 * half_width, p.deck_colour)
     start = ramp.at(p.incline_m - p.start_m, p.block_half_m[2])
     block = course.free_box("block", start, p.block_half_m, p.block_colour, density=600)
     turn = ramp.slope_rad / 2
     block.quat = [float(np.cos(turn)), 0.0, p.direction * float(np.sin(turn)), 0.0]
-    _add_board(course, p, side)
-    course.block("tray_floor", tray, deep, (0, WALL_M), p.tray_colour)
-    course.block("tray_front", tray, (outer[0], -side), (0, 0.03), p.tray_colour)
-    course.block("tray_back", tray, (side, outer[1]), (0, 0.07), p.tray_colour)
+    _add_board(course, p, half_width)
+    course.block("tray_floor", tray, depth_span, (0, WALL_M), p.tray_colour)
+    course.block("tray_front", tray, (outer[0], -half_width), (0, 0.03), p.tray_colour)
+    course.block("tray_back", tray, (half_width, outer[1]), (0, 0.07), p.tray_colour)
     course.block("tray_end", (end, end + WALL_M), outer, (0, p.deck_m + 0.02), p.tray_colour)
 
     high, along = p.deck_m + 2 * max(p.block_half_m) + 0.01, (p.mouth_m, end + WALL_M)
     across = (outer[0] - 0.01, outer[1] + 0.5 * high)
-    highest = ramp.at(p.incline_m)
+    incline_top = ramp.at(p.incline_m)
     course.mark("tray", "tray_floor")
     return course.scene(
         p,
         decisive=["block"],
         hidden=["board"],
         cover=course.box(along, across, (0, high), right=course.ahead(SHADOW_RIGHT * high)),
-        in_view=[course.box(along, outer, (0, p.deck_m)), course.box((highest[0], 0), deep, (0, highest[2]))],
+        in_view=[
+            course.box(along, outer, (0, p.deck_m)),
+            course.box((incline_top[0], 0), depth_span, (0, incline_top[2])),
+        ],
         things=[f"{p.block_colour} block", f"{p.tray_colour} tray", "incline", "deck"],
         also=["end"],
         shown_by={"end": ["deck"]},
@@ -119,19 +126,19 @@ def build(p: Params, physics: Physics) -> Scene:
 def _add_board(course: Course, p: Params, side: float) -> None:
     """Add the rough board, tilted a little; it stands out of the deck or stays below."""
     begin, end = p.board_span
-    half, thick = (end - begin) / 2, 0.03
-    rise = half * TILT_RAD - 0.001  # of its middle over the deck when the near edge is just below the surface
-    middle = (begin + half, 0, p.deck_m + rise - thick / 2 - (0.0 if p.rough else SUNK_M))
-    board = course.slab("board", middle, (half, side - 0.002, thick / 2), "black", falls_rad=-TILT_RAD)
+    half_length, thickness = (end - begin) / 2, 0.03
+    rise = half_length * TILT_RAD - 0.001  # of its middle over the deck when the near edge is just below the surface
+    middle = (begin + half_length, 0, p.deck_m + rise - thickness / 2 - (0.0 if p.rough else SUNK_M))
+    board = course.slab("board", middle, (half_length, side - 0.002, thickness / 2), "black", falls_rad=-TILT_RAD)
     board.friction, board.priority = [p.rough_friction, 0.005, 0.0001], 2
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
     """Read whether the block is off the deck, past its end; 'no' only once it rests."""
     block = motion.pos("block")
-    past = p.direction * block[:, 0] - p.deck_end_m
-    is_off = (past > 0) & (block[:, 2] < p.deck_m)
-    return Reading(yes_while(is_off, still_from(block, within_m=STILL_M)), float(abs(past[-1])))
+    past_m = p.direction * block[:, 0] - p.deck_end_m
+    is_off = (past_m > 0) & (block[:, 2] < p.deck_m)
+    return Reading(yes_while(is_off, still_from(block, within_m=STILL_M)), float(abs(past_m[-1])))
 
 
 BLOCK = partial(compact_blob, area=4500, shape=(0.3, 3.5), fill=0.4)

@@ -30,19 +30,19 @@ BAR_M = 0.026  # radius of the bars
 PIECES = 6
 STILL_M = 0.015
 COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
-PLAY, PLAIN = apart(*COLOURS), shuffled("wood", "grey", "white")
+PLAY_COLOURS, PLAIN_COLOURS = apart(*COLOURS), shuffled("wood", "grey", "white")
 
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; passes: pairs of bars passed, wide, narrow: gaps in ball diameters."""
+    """Parameters; passes counts pairs of bars; wide and narrow are in ball diameters."""
 
-    ball_colour: str = PLAY()
-    upper_colour: str = PLAY()
-    lower_colour: str = PLAY()
-    tray_colour: str = PLAY()
-    cube_colour: str = PLAIN()
-    board_colour: str = PLAIN()
+    ball_colour: str = PLAY_COLOURS()
+    upper_colour: str = PLAY_COLOURS()
+    lower_colour: str = PLAY_COLOURS()
+    tray_colour: str = PLAY_COLOURS()
+    cube_colour: str = PLAIN_COLOURS()
+    board_colour: str = PLAIN_COLOURS()
     passes: int = hidden(0, 1, 2)
     radius_m: float = between(0.072, 0.080)
     young_pa: float = between(3500.0, 4500.0)
@@ -60,7 +60,7 @@ class Params:
     elevation_deg: float = between(-24, -16)
 
     def gap_m(self, pair: int) -> float:
-        """From bar to bar of the upper pair (0) or the lower one (1)."""
+        """Return the gap between the bars of the upper pair (0) or the lower one (1)."""
         return 2 * self.radius_m * (self.wide if pair < self.passes else self.narrow)
 
 
@@ -68,8 +68,10 @@ def build(p: Params, physics: Physics) -> Scene:
     """Build two pairs of bars on a board, the tray below, and a cube to one side."""
     course = Course(physics, surface=Surface(solref=SOFT))
     end, high = p.half_m, p.upper_m + 0.10
-    outer, deep = end + WALL_M, (-DEPTH_M, DEPTH_M)
-    course.tray("tray", (-end, end), deep, (0, FLOOR_M), p.tray_colour, wall=WALL_M, near=0.10, far=0.10, front=0.04)
+    outer, depth_span = end + WALL_M, (-DEPTH_M, DEPTH_M)
+    course.tray(
+        "tray", (-end, end), depth_span, (0, FLOOR_M), p.tray_colour, wall=WALL_M, near=0.10, far=0.10, front=0.04
+    )
     course.block("board", (-outer, outer), (DEPTH_M, DEPTH_M + WALL_M), (0, high), p.board_colour)
     bars = []
     for pair, (name, height, colour) in enumerate(
@@ -80,9 +82,11 @@ def build(p: Params, physics: Physics) -> Scene:
             bar = course.rod(f"{name}_{side}", (along, -0.9 * DEPTH_M, height), (along, DEPTH_M, height), BAR_M, colour)
             bar.friction, bar.priority = [0.05, 0.005, 0.0001], 2
             bars.append(bar.name)
-    half = p.cube_m / 2
-    beside = p.cube_side * (outer + 0.12 + half + (0.14 if p.cube_side > 0 else 0.0))
-    course.block("cube", (beside - half, beside + half), (-half, half), (0, p.cube_m), p.cube_colour)
+    half_cube = p.cube_m / 2
+    cube_at = p.cube_side * (outer + 0.12 + half_cube + (0.14 if p.cube_side > 0 else 0.0))
+    course.block(
+        "cube", (cube_at - half_cube, cube_at + half_cube), (-half_cube, half_cube), (0, p.cube_m), p.cube_colour
+    )
     soft_ball(
         course,
         "ball",
@@ -104,7 +108,7 @@ def build(p: Params, physics: Physics) -> Scene:
         cover=course.box((-outer, outer), (-DEPTH_M, DEPTH_M + 0.08), (0, high + 0.02), left=0.01, right=0.06),
         in_view=[
             course.box((-outer, outer), (-DEPTH_M, DEPTH_M + WALL_M), (0, high)),
-            course.box((beside - half, beside + half), (-half, half), (0, p.cube_m)),
+            course.box((cube_at - half_cube, cube_at + half_cube), (-half_cube, half_cube), (0, p.cube_m)),
         ],
         things=[f"{p.ball_colour} ball", f"{p.cube_colour} cube", f"{p.tray_colour} tray"],
         also=["bar", "board"],
@@ -115,8 +119,8 @@ def build(p: Params, physics: Physics) -> Scene:
 def outcome(motion: Motion, p: Params) -> Reading:
     """Read what is nearest below the resting ball: a pair of bars, or the tray."""
     height = motion.pos("ball")[:, 2]
-    lies = [p.upper_m + 0.9 * p.radius_m, p.lower_m + 0.9 * p.radius_m, FLOOR_M + p.radius_m]
-    halfway = [(lies[0] + lies[1]) / 2, (lies[1] + lies[2]) / 2]
+    rest_heights = [p.upper_m + 0.9 * p.radius_m, p.lower_m + 0.9 * p.radius_m, FLOOR_M + p.radius_m]
+    halfway = [(rest_heights[0] + rest_heights[1]) / 2, (rest_heights[1] + rest_heights[2]) / 2]
     colours = (p.upper_colour, p.lower_colour, p.tray_colour)
     label = colours[sum(height[-1] < line for line in halfway)]
     first = still_from(motion.vertices["ball"], within_m=STILL_M)
@@ -139,8 +143,8 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     heights = {colour: _height(frames[-1], colour) for colour in choices_in(slots["choices"])}
     if end is None or not is_at_rest(path, tolerance_px=4) or None in heights.values():
         return None
-    under = end.box[1] + end.box[3]
-    return min(heights, key=lambda colour: abs((heights[colour] or 0.0) - under))
+    underside_y = end.box[1] + end.box[3]
+    return min(heights, key=lambda colour: abs((heights[colour] or 0.0) - underside_y))
 
 
 FAMILY = scene_family(

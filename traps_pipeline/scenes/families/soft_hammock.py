@@ -30,21 +30,21 @@ CELLS = (8, 6)
 STILL_M = 0.02
 CLOTH_PX = 300  # of the cloth, for an observer
 FELT = Surface(0.004, sliding=0.6, solref=SOFT)
-PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
-PLAIN = shuffled("wood", "grey", "white")
+PLAY_COLOURS = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
+PLAIN_COLOURS = shuffled("wood", "grey", "white")
 
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; direction +1: cube on the right, cloth tied left if at one end."""
+    """Parameters; at direction +1 the cube is right, and a half-tied cloth hangs left."""
 
     direction: int = one_of(-1, 1)
-    ball_colour: str = PLAY()
-    cloth_colour: str = PLAY()
-    tray_colour: str = PLAY()
-    cube_colour: str = PLAY()
-    board_colour: str = PLAIN()
-    post_colour: str = PLAIN()
+    ball_colour: str = PLAY_COLOURS()
+    cloth_colour: str = PLAY_COLOURS()
+    tray_colour: str = PLAY_COLOURS()
+    cube_colour: str = PLAY_COLOURS()
+    board_colour: str = PLAIN_COLOURS()
+    post_colour: str = PLAIN_COLOURS()
     ends_tied: int = hidden(1, 2)
     radius_m: float = between(0.055, 0.065)
     span_m: float = between(0.44, 0.50)  # from post to post
@@ -62,23 +62,27 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build two pairs of posts with the cloth, the tray, a board behind, and a cube."""
     course = Course(physics, p.direction, FELT)
-    end, side, high = p.span_m / 2 + 0.06, p.deep_m / 2 + 0.03, p.post_m + 0.02
-    outer, back = end + WALL_M, side + WALL_M
-    course.tray("tray", (-end, end), (-side, side), (0, FLOOR_M), p.tray_colour, wall=WALL_M, near=0.10, far=0.10)
-    course.block("tray_front", (-outer, outer), (-back, -side), (0, 0.06), p.tray_colour)
-    course.block("board", (-outer, outer), (side, back), (0, high), p.board_colour)
+    end, half_width, high = p.span_m / 2 + 0.06, p.deep_m / 2 + 0.03, p.post_m + 0.02
+    outer, back = end + WALL_M, half_width + WALL_M
+    course.tray(
+        "tray", (-end, end), (-half_width, half_width), (0, FLOOR_M), p.tray_colour, wall=WALL_M, near=0.10, far=0.10
+    )
+    course.block("tray_front", (-outer, outer), (-back, -half_width), (0, 0.06), p.tray_colour)
+    course.block("board", (-outer, outer), (half_width, back), (0, high), p.board_colour)
     for end_name, along_sign in (("near", -1), ("far", 1)):
         for side_name, across_sign in (("front", -1), ("back", 1)):
             at = (along_sign * (p.span_m / 2 + POST_M), across_sign * p.deep_m / 2, high / 2)
             course.post(f"post_{end_name}_{side_name}", at, POST_M, high / 2, p.post_colour)
-    half, beside = p.cube_m / 2, outer + 0.12 + p.cube_m / 2 + course.ahead(0.22)
-    course.block("cube", (beside - half, beside + half), (-half, half), (0, p.cube_m), p.cube_colour)
+    half_cube, cube_at = p.cube_m / 2, outer + 0.12 + p.cube_m / 2 + course.ahead(0.22)
+    course.block(
+        "cube", (cube_at - half_cube, cube_at + half_cube), (-half_cube, half_cube), (0, p.cube_m), p.cube_colour
+    )
 
-    size, tied = (p.span_m, p.deep_m), (-1, 1) if p.ends_tied == 2 else (-1,)
-    hammock(course, "cloth", (0, 0, p.post_m), size, CELLS, p.cloth_colour, sag=p.sag_m, tied=tied)
+    size, tied_ends = (p.span_m, p.deep_m), (-1, 1) if p.ends_tied == 2 else (-1,)
+    hammock(course, "cloth", (0, 0, p.post_m), size, CELLS, p.cloth_colour, sag=p.sag_m, tied=tied_ends)
     course.ball("ball", (0, 0, p.release_m), p.radius_m, p.ball_colour, thrown=(p.drift_m_s, p.toss_m_s), density=350)
-    course.mark("cloth", (0.55 * end, side), p.cloth_colour)
-    course.mark("tray", (-0.55 * end, side), p.tray_colour)
+    course.mark("cloth", (0.55 * end, half_width), p.cloth_colour)
+    course.mark("tray", (-0.55 * end, half_width), p.tray_colour)
     return course.scene(
         p,
         decisive=["ball"],
@@ -86,7 +90,7 @@ def build(p: Params, physics: Physics) -> Scene:
         cover=course.box((-outer, outer), (-back, back + 0.06), (0, high + 0.02), left=0.01, right=SHADOW_RIGHT * high),
         in_view=[
             course.box((-outer, outer), (-back, back), (0, high)),
-            course.box((beside - half, beside + half), (-half, half), (0, p.cube_m)),
+            course.box((cube_at - half_cube, cube_at + half_cube), (-half_cube, half_cube), (0, p.cube_m)),
         ],
         things=[f"{p.ball_colour} ball", f"{p.cube_colour} cube", f"{p.cloth_colour} cloth", f"{p.tray_colour} tray"],
         also=["post", "board"],
@@ -96,10 +100,10 @@ def build(p: Params, physics: Physics) -> Scene:
 def outcome(motion: Motion, p: Params) -> Reading:
     """Read 'no' once the ball is below half the posts' height, 'yes' if it stays up."""
     ball = motion.pos("ball")
-    over = ball[:, 2] - p.post_m / 2
-    first = lasting_from(over < 0) if over[-1] < 0 else still_from(ball, within_m=STILL_M)
-    label = "no" if over[-1] < 0 else "yes"
-    return Reading([label if i >= first else None for i in range(len(over))], float(abs(over[-1])))
+    over_m = ball[:, 2] - p.post_m / 2
+    first = lasting_from(over_m < 0) if over_m[-1] < 0 else still_from(ball, within_m=STILL_M)
+    label = "no" if over_m[-1] < 0 else "yes"
+    return Reading([label if i >= first else None for i in range(len(over_m))], float(abs(over_m[-1])))
 
 
 def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
@@ -108,8 +112,8 @@ def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     rows, columns = np.nonzero(colour_mask(frames[-1], slots["cloth"]))
     if len(rows) < CLOTH_PX or not is_at_rest(path, tolerance_px=4):
         return None
-    wide, high = (float(np.ptp(np.percentile(along, (1, 99)))) for along in (columns, rows))
-    return "yes" if wide > 1.2 * high else "no"
+    width, height = (float(np.ptp(np.percentile(along, (1, 99)))) for along in (columns, rows))
+    return "yes" if width > 1.2 * height else "no"
 
 
 FAMILY = scene_family(

@@ -28,20 +28,20 @@ DEPTH_M = 0.10  # half of the tray's depth
 PEG_RADIUS_M = 0.022
 PEG_FROM_M = -0.07  # how far before the board the peg reaches
 STILL_M = 0.02
-PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
-PLAIN = shuffled("wood", "grey", "white")
+PLAY_COLOURS = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
+PLAIN_COLOURS = shuffled("wood", "grey", "white")
 
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; direction +1: cube on the right, as is a peg beside the middle."""
+    """Parameters; at direction +1 the cube is right, and so is an off-centre peg."""
 
     direction: int = one_of(-1, 1)
-    rope_colour: str = PLAY()
-    tray_colour: str = PLAY()
-    cube_colour: str = PLAY()
-    board_colour: str = PLAIN()
-    peg_colour: str = PLAIN()
+    rope_colour: str = PLAY_COLOURS()
+    tray_colour: str = PLAY_COLOURS()
+    cube_colour: str = PLAY_COLOURS()
+    board_colour: str = PLAIN_COLOURS()
+    peg_colour: str = PLAIN_COLOURS()
     peg_in_middle: bool = hidden(False, True)
     length_m: float = between(0.66, 0.76)
     radius_m: float = between(0.011, 0.0125)
@@ -59,16 +59,18 @@ def build(p: Params, physics: Physics) -> Scene:
     """Build a board with the peg in it, the tray before it, and a cube to one side."""
     course = Course(physics, p.direction)
     end, high = p.length_m / 2 + 0.08, p.peg_m + 0.06
-    outer, deep = end + WALL_M, (-DEPTH_M, DEPTH_M)
-    floor = ((-end, end), deep, (0, FLOOR_M))
+    outer, depth_span = end + WALL_M, (-DEPTH_M, DEPTH_M)
+    floor = ((-end, end), depth_span, (0, FLOOR_M))
     course.tray("tray", *floor, p.tray_colour, wall=WALL_M, near=0.08, far=0.08, front=0.05, floor=Surface(solref=SOFT))
     course.block("board", (-outer, outer), (DEPTH_M, DEPTH_M + WALL_M), (0, high), p.board_colour)
     along = 0.0 if p.peg_in_middle else p.off_m
     peg = course.rod("peg", (along, PEG_FROM_M, p.peg_m), (along, DEPTH_M, p.peg_m), PEG_RADIUS_M, p.peg_colour)
     peg.friction, peg.priority = [0.4, 0.005, 0.0001], 2
 
-    half, beside = p.cube_m / 2, outer + 0.12 + p.cube_m / 2
-    course.block("cube", (beside - half, beside + half), (-half, half), (0, p.cube_m), p.cube_colour)
+    half_cube, cube_at = p.cube_m / 2, outer + 0.12 + p.cube_m / 2
+    course.block(
+        "cube", (cube_at - half_cube, cube_at + half_cube), (-half_cube, half_cube), (0, p.cube_m), p.cube_colour
+    )
     rope(
         course,
         "rope",
@@ -87,7 +89,7 @@ def build(p: Params, physics: Physics) -> Scene:
         cover=course.box((-outer, outer), (-DEPTH_M, DEPTH_M + 0.06), (0, high + 0.02), left=0.01, right=0.04),
         in_view=[
             course.box((-outer, outer), (-DEPTH_M, DEPTH_M + WALL_M), (0, high)),
-            course.box((beside - half, beside + half), (-half, half), (0, p.cube_m)),
+            course.box((cube_at - half_cube, cube_at + half_cube), (-half_cube, half_cube), (0, p.cube_m)),
         ],
         things=[f"{p.rope_colour} rope", f"{p.cube_colour} cube", f"{p.tray_colour} tray"],
         also=["peg", "board"],

@@ -33,17 +33,17 @@ LANE = 0.76  # distance of the ball's path from the hub, in disc radii
 POINTER = 0.80  # length of the pointer, likewise
 PEG_AT_M, PEG_M, POINTER_HALF_M = 0.085, 0.008, 0.012
 RIM_M = 0.015
-PLAIN = shuffled("wood", "grey", "white")
+PLAIN_COLOURS = shuffled("wood", "grey", "white")
 
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; direction +1: to the right, sectors: as the pointer passes them."""
+    """Parameters; direction +1 is right; sectors are in the order the pointer passes."""
 
     direction: int = one_of(-1, 1)
     sectors: tuple[str, ...] = drawn_by(lambda rng, so_far: distinct_colours(rng, int(rng.integers(3, 5)), SECTORS))
-    table_colour: str = PLAIN()
-    rim_colour: str = PLAIN()
+    table_colour: str = PLAIN_COLOURS()
+    rim_colour: str = PLAIN_COLOURS()
     stop_sector: int = hidden_index("sectors")  # where the peg stands
     stop_at: float = between(0.40, 0.58)  # place of the stopped pointer within its sector: 0.5 is the middle
     disc_m: float = between(0.30, 0.34)
@@ -65,15 +65,15 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build spinner, pointer, peg and ball; the hub is at the origin."""
     course = Course(physics, p.direction)
-    r, lane, side = p.radius_m, -LANE * p.disc_m, p.disc_m + 0.025
-    start, end, rim = -side - p.run_m, side + 0.12, (0, TABLE_M + 0.035)
-    deep, outer, floor = (-side, side), (-side - RIM_M, side + RIM_M), (0, TABLE_M)
+    r, lane, half_width = p.radius_m, -LANE * p.disc_m, p.disc_m + 0.025
+    start, end, rim = -half_width - p.run_m, half_width + 0.12, (0, TABLE_M + 0.035)
+    depth_span, outer, floor = (-half_width, half_width), (-half_width - RIM_M, half_width + RIM_M), (0, TABLE_M)
 
     gripping = Surface(1e-4)
-    course.block("lane", (start - 0.07, -side), (lane - 1.5 * r, lane + 1.5 * r), floor, p.table_colour, gripping)
-    course.block("table", deep, deep, floor, p.table_colour, gripping)
-    course.block("tray", (side, end), deep, floor, p.table_colour, Surface(4e-3))
-    course.sides("rim", (-side, end), side, RIM_M, rim, p.rim_colour)
+    course.block("lane", (start - 0.07, -half_width), (lane - 1.5 * r, lane + 1.5 * r), floor, p.table_colour, gripping)
+    course.block("table", depth_span, depth_span, floor, p.table_colour, gripping)
+    course.block("tray", (half_width, end), depth_span, floor, p.table_colour, Surface(4e-3))
+    course.sides("rim", (-half_width, end), half_width, RIM_M, rim, p.rim_colour)
     course.block("rim_end", (end, end + RIM_M), outer, (0, TABLE_M + 0.06), p.rim_colour)
     for i, colour in enumerate(p.sectors):  # thin, and nothing touches them
         angles = np.linspace(FIRST_DEG + i * p.sector_deg, FIRST_DEG + (i + 1) * p.sector_deg, 13)
@@ -82,14 +82,14 @@ def build(p: Params, physics: Physics) -> Scene:
         course.hull(f"sector_{i}", [(x, y, z) for z in heights for x, y in corners], colour)
     _add_pointer(course, p)
     # The peg stands just past the angle at which it is to stop the pointer.
-    wide = np.degrees(np.arcsin((PEG_M + POINTER_HALF_M) / PEG_AT_M))
-    along, across = _place(PEG_AT_M, FIRST_DEG + (p.stop_sector + p.stop_at) * p.sector_deg + wide)
+    stop_angle = np.degrees(np.arcsin((PEG_M + POINTER_HALF_M) / PEG_AT_M))
+    along, across = _place(PEG_AT_M, FIRST_DEG + (p.stop_sector + p.stop_at) * p.sector_deg + stop_angle)
     peg = course.post("peg", (along, across, TABLE_M + 0.03), PEG_M, 0.03, "white")
     peg.solref, peg.priority = [0.02, 4], 1  # overdamped: the pointer does not bounce back
     at = (start, lane, TABLE_M + r)
     course.ball("ball", at, r, p.ball_colour, speed=p.speed_m_s, rolling=1e-4, sliding=0.1, density=2500)
 
-    span = (-side, end + RIM_M)
+    span = (-half_width, end + RIM_M)
     course.mark("pointer", (0.0, 0.0), POINTER_COLOUR)
     for i, colour in enumerate(p.sectors):
         course.mark(f"{colour} sector", _place(p.disc_m, FIRST_DEG + (i + 0.5) * p.sector_deg), colour)
@@ -97,7 +97,7 @@ def build(p: Params, physics: Physics) -> Scene:
         p,
         decisive=["pointer"],
         hidden=["peg"],
-        cover=course.box(span, (-side - 0.02, side + 0.03), (0, 0.10), right=0.03),
+        cover=course.box(span, (-half_width - 0.02, half_width + 0.03), (0, 0.10), right=0.03),
         in_view=[course.box(span, outer, (0, 0.09))],
         things=[f"{p.ball_colour} ball", "black pointer", "spinner", *(f"{c} sector" for c in p.sectors)],
         also=["table", "rim", "peg"],
@@ -114,11 +114,11 @@ def _place(radius: float, angle_deg: float) -> tuple[float, float]:
 
 def _add_pointer(course: Course, p: Params) -> None:
     """Add a bar that turns about the hub; it starts at the near side."""
-    half = POINTER * p.disc_m / 2
+    half_pointer = POINTER * p.disc_m / 2
     body = course.hinge("pointer", (0, 0, TABLE_M + 0.03), axis=(0, 0, p.direction), damping=2e-4)
     joint = body.first_joint()
     joint.frictionloss, joint.armature = 0.003, 0.002
-    bar = add_box(body, "pointer", (0, -half, 0), (POINTER_HALF_M, half, 0.016), POINTER_COLOUR)
+    bar = add_box(body, "pointer", (0, -half_pointer, 0), (POINTER_HALF_M, half_pointer, 0.016), POINTER_COLOUR)
     bar.density, bar.friction = 300, [0.1, 0.005, 0.0001]
     course.post("hub", (0, 0, 0), 0.026, 0.022, POINTER_COLOUR, body=body).density = 300
 
@@ -127,8 +127,8 @@ def outcome(motion: Motion, p: Params) -> Reading:
     """Read the pointer's sector, from when it turns no more."""
     tip = -motion.rot("pointer")[:, :2, 1]
     angles = np.degrees(np.arctan2(p.direction * tip[:, 0], -tip[:, 1])) % 360  # from the near side
-    turned = np.abs(np.radians(angles - angles[-1] + 180) % (2 * np.pi) - np.pi)
-    rest_frame = lasting_from(turned <= 0.02)
+    turn_left = np.abs(np.radians(angles - angles[-1] + 180) % (2 * np.pi) - np.pi)
+    rest_frame = lasting_from(turn_left <= 0.02)
     angle_in_sector = (angles[-1] - FIRST_DEG) % p.sector_deg
     margin = np.radians(min(angle_in_sector, p.sector_deg - angle_in_sector)) * POINTER * p.disc_m
     index = np.floor((angles - FIRST_DEG) / p.sector_deg).astype(int)

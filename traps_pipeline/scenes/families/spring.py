@@ -27,7 +27,7 @@ FEEL_M = 0.03  # the ball has met the plunger when it has been this near to it
 WALL_M = 0.014
 COILS = [f"coil_{i}" for i in range(4)]
 PARTS = ("ball", "deck", "line")
-PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
+PLAY_COLOURS = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
 
 
 def _plungers(rng: np.random.Generator, so_far: Drawn) -> tuple[float, float, str, str]:
@@ -43,13 +43,13 @@ PLUNGER = together(_plungers)
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths run from where the ball starts, direction +1: to the right."""
+    """Parameters; lengths run from where the ball starts; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
-    ball_colour: str = PLAY()
-    line_colour: str = PLAY()
-    deck_colour: str = PLAY()
-    head_colour: str = PLAY()
+    ball_colour: str = PLAY_COLOURS()
+    line_colour: str = PLAY_COLOURS()
+    deck_colour: str = PLAY_COLOURS()
+    head_colour: str = PLAY_COLOURS()
     damping_n_s_m: float = PLUNGER()  # of the plunger: the hidden element
     other_damping_n_s_m: float = PLUNGER()  # what the twin has
     lane_colour: str = PLUNGER()
@@ -67,38 +67,38 @@ class Params:
 
     @property
     def edge_m(self) -> float:
-        """Where the deck ends."""
+        """Position of the deck's end."""
         return self.run_m + 2 * self.radius_m + 0.06
 
     @property
     def head_m(self) -> float:
-        """Where the plunger's face is at rest."""
+        """Rest position of the plunger's face."""
         return self.edge_m + self.lane_m
 
 
 def build(p: Params, physics: Physics) -> Scene:
     """Build deck with tunnel, step, lower lane with a line across, and plunger."""
     course = Course(physics, p.direction, Surface(2e-5, solref=SOFT))
-    r, wide = p.radius_m, 1.9 * p.radius_m
+    r, half_width = p.radius_m, 1.9 * p.radius_m
     deck, end, line = LANE_M + p.step_m, p.head_m + 0.32, p.head_m - p.line_m
-    deep, outer = (-wide, wide), (-wide - WALL_M, wide + WALL_M)
+    depth_span, outer = (-half_width, half_width), (-half_width - WALL_M, half_width + WALL_M)
 
-    course.block("deck", (-r, p.edge_m), deep, (0, deck), p.deck_colour)
-    course.block("lane", (p.edge_m, end), deep, (0, LANE_M), p.lane_colour, Surface(p.felt, solref=SOFT))
+    course.block("deck", (-r, p.edge_m), depth_span, (0, deck), p.deck_colour)
+    course.block("lane", (p.edge_m, end), depth_span, (0, LANE_M), p.lane_colour, Surface(p.felt, solref=SOFT))
     tunnel, roof = (p.run_m - 2.6 * r, p.run_m + 2 * r), deck + 2.4 * r
-    course.block("tunnel_front", tunnel, (-wide, -wide + WALL_M), (deck, roof), p.tunnel_colour)
-    course.block("tunnel_back", tunnel, (wide - WALL_M, wide), (deck, roof), p.tunnel_colour)
-    course.block("tunnel_roof", tunnel, deep, (roof, roof + WALL_M), p.tunnel_colour)
+    course.block("tunnel_front", tunnel, (-half_width, -half_width + WALL_M), (deck, roof), p.tunnel_colour)
+    course.block("tunnel_back", tunnel, (half_width - WALL_M, half_width), (deck, roof), p.tunnel_colour)
+    course.block("tunnel_roof", tunnel, depth_span, (roof, roof + WALL_M), p.tunnel_colour)
     paint = (LANE_M, LANE_M + 0.001)
-    course.block("line", (line - 0.016, line + 0.016), deep, paint, p.line_colour, solid=False)
-    course.block("back", (-r, end), (wide, outer[1]), (0, deck + 0.4 * r), p.lane_colour)
-    course.block("front", (p.edge_m, end), (outer[0], -wide), (0, LANE_M + 0.3 * r), p.lane_colour)
-    course.block("housing", (end - 0.13, end), deep, (LANE_M, LANE_M + 2.3 * r), p.tunnel_colour)
+    course.block("line", (line - 0.016, line + 0.016), depth_span, paint, p.line_colour, solid=False)
+    course.block("back", (-r, end), (half_width, outer[1]), (0, deck + 0.4 * r), p.lane_colour)
+    course.block("front", (p.edge_m, end), (outer[0], -half_width), (0, LANE_M + 0.3 * r), p.lane_colour)
+    course.block("housing", (end - 0.13, end), depth_span, (LANE_M, LANE_M + 2.3 * r), p.tunnel_colour)
     _add_plunger(course, p)
     course.ball("ball", (0, 0, deck + r), r, p.ball_colour, speed=p.speed_m_s)
 
     high, shading = max(deck + 2.2 * r, LANE_M + 2.4 * r), deck + 2 * r
-    across = (outer[0], wide + SHADOW_BACK * shading)
+    across = (outer[0], half_width + SHADOW_BACK * shading)
     course.mark("line", "line")
     course.mark("spring", "housing")
     return course.scene(
@@ -117,17 +117,17 @@ def _add_plunger(course: Course, p: Params) -> None:
     """Add head and rod on a sprung slide joint, and the housing behind them."""
     import mujoco
 
-    r, way = p.radius_m, p.direction
-    body = course.spec.worldbody.add_body(name="plunger", pos=[way * p.head_m, 0, LANE_M + 1.1 * r])
-    joint = body.add_joint(name="plunger", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[way, 0, 0])
+    r, direction = p.radius_m, p.direction
+    body = course.spec.worldbody.add_body(name="plunger", pos=[direction * p.head_m, 0, LANE_M + 1.1 * r])
+    joint = body.add_joint(name="plunger", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[direction, 0, 0])
     joint.stiffness[0], joint.damping[0] = p.stiffness_n_m, p.damping_n_s_m
-    head = add_box(body, "head", (way * 0.012, 0, 0), (0.012, 1.5 * r, 0.95 * r), p.head_colour)
+    head = add_box(body, "head", (direction * 0.012, 0, 0), (0.012, 1.5 * r, 0.95 * r), p.head_colour)
     head.density, head.condim, head.priority = 200, 3, 1
     head.friction, head.solref = [0.05, 0.005, 0.0001], [0.006, 1]
     coils = [(name, 0.05 + 0.042 * i, 0.7 * r, 0.007) for i, name in enumerate(COILS)]
-    for name, along, radius, half in [("rod", 0.12, 0.012, 0.10), *coils]:
+    for name, along, radius, half_length in [("rod", 0.12, 0.012, 0.10), *coils]:
         part = body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_CYLINDER, rgba=rgba("grey"))
-        part.pos, part.size, part.density = [way * along, 0, 0], [radius, half, 0], 10
+        part.pos, part.size, part.density = [direction * along, 0, 0], [radius, half_length, 0], 10
         part.quat = [0.5**0.5, 0, 0.5**0.5, 0]
         part.contype = part.conaffinity = 0
 

@@ -27,17 +27,17 @@ BLOCKS = [f"block_{i}" for i in range(len(COLOURS))]  # from the bottom of the s
 STAND_COLOUR = "black"
 RADIUS_M = 0.05
 ROD_M = 0.17  # from the plate back to the pad that the ball strikes
-STACKED, PLAIN = shuffled(*COLOURS), shuffled("wood", "grey", "white")
+STACKED, PLAIN_COLOURS = shuffled(*COLOURS), shuffled("wood", "grey", "white")
 
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; direction +1: to the right, block_colours: from the stand upwards."""
+    """Parameters; direction +1 is right; block_colours run from the stand upwards."""
 
     direction: int = one_of(-1, 1)
-    ledge_colour: str = PLAIN()
-    wall_colour: str = PLAIN()
-    pusher_colour: str = PLAIN()
+    ledge_colour: str = PLAIN_COLOURS()
+    wall_colour: str = PLAIN_COLOURS()
+    pusher_colour: str = PLAIN_COLOURS()
     below: int = hidden(*range(len(COLOURS) + 1))  # blocks below the pusher's plate: sets the height of the stand
     block_colours: tuple[str, ...] = STACKED(len(COLOURS))
     block_height_m: float = between(0.054, 0.062)
@@ -71,35 +71,35 @@ class Params:
 
     @property
     def travel_m(self) -> float:
-        """How far the pusher can slide."""
+        """Distance that the pusher can slide."""
         return self.block_width_m + 0.05
 
 
 def build(p: Params, physics: Physics) -> Scene:
     """Build ledge, pusher, stand with the stack, and tray."""
     course = Course(physics, p.direction)
-    ledge, stand, half_w = p.ledge_m, p.stand_half_m, p.block_width_m / 2
-    plate, end = -half_w - 0.025, stand + p.tray_m
-    screened = plate - ROD_M - 2 * RADIUS_M - 0.07
-    start = screened - p.run_m + RADIUS_M
-    felt = plate - ROD_M - 2 * RADIUS_M - 0.02  # where it begins: the ball comes to rest on it, behind the occluder
+    ledge, half_stand, half_w = p.ledge_m, p.stand_half_m, p.block_width_m / 2
+    plate, end = -half_w - 0.025, half_stand + p.tray_m
+    occluder_at = plate - ROD_M - 2 * RADIUS_M - 0.07
+    start = occluder_at - p.run_m + RADIUS_M
+    felt_at = plate - ROD_M - 2 * RADIUS_M - 0.02  # where it begins: the ball comes to rest on it, behind the occluder
     deck, high = (ledge - 0.025, ledge), ledge + 0.6 * len(COLOURS) * p.block_height_m
 
-    course.block("ledge", (start - 0.06, felt), (-0.075, 0.075), deck, p.ledge_colour, Surface(1e-4))
-    course.block("felt", (felt, -stand - 0.004), (-0.075, 0.075), deck, p.ledge_colour, Surface(4e-3))
-    for i, x in enumerate((start - 0.03, screened - 0.03, -stand - 0.03)):
+    course.block("ledge", (start - 0.06, felt_at), (-0.075, 0.075), deck, p.ledge_colour, Surface(1e-4))
+    course.block("felt", (felt_at, -half_stand - 0.004), (-0.075, 0.075), deck, p.ledge_colour, Surface(4e-3))
+    for i, x in enumerate((start - 0.03, occluder_at - 0.03, -half_stand - 0.03)):
         course.block(f"leg_{i}", (x - 0.012, x + 0.012), (-0.06, 0.06), (0, deck[0]), p.ledge_colour)
-    course.block("stand", (-stand, stand), (-stand, stand), (0, p.stand_m), STAND_COLOUR)
-    course.block("wall_back", (screened + 0.01, end), (0.15, 0.165), (0, high), p.wall_colour)
-    course.block("wall_front", (stand + 0.02, end), (-0.165, -0.15), (0, 0.035), p.wall_colour)
+    course.block("stand", (-half_stand, half_stand), (-half_stand, half_stand), (0, p.stand_m), STAND_COLOUR)
+    course.block("wall_back", (occluder_at + 0.01, end), (0.15, 0.165), (0, high), p.wall_colour)
+    course.block("wall_front", (half_stand + 0.02, end), (-0.165, -0.15), (0, 0.035), p.wall_colour)
     course.block("wall_end", (end, end + 0.015), (-0.165, 0.165), (0, ledge), p.wall_colour)
     _add_pusher(course, p, plate)
-    half = (half_w, half_w, p.block_height_m / 2)
-    course.tower(BLOCKS, half, p.block_colours, density=300, sliding=0.3, solref=(0.006, 1), base=p.stand_m)
+    half_size = (half_w, half_w, p.block_height_m / 2)
+    course.tower(BLOCKS, half_size, p.block_colours, density=300, sliding=0.3, solref=(0.006, 1), base=p.stand_m)
     at = (start, 0, ledge + RADIUS_M)
     course.ball("ball", at, RADIUS_M, p.ball_colour, speed=p.speed_m_s, rolling=0.0002, density=7500)
 
-    along, top = (screened, end + 0.02), ledge + p.stack_m + 0.03
+    along, top = (occluder_at, end + 0.02), ledge + p.stack_m + 0.03
     course.mark("block", BLOCKS[-1])
     course.mark("stand", (0.0, 0.15), STAND_COLOUR)
     return course.scene(
@@ -119,20 +119,20 @@ def _add_pusher(course: Course, p: Params, plate: float) -> None:
     """Add a tall plate on a slide, with a rod back to the pad that the ball strikes."""
     import mujoco
 
-    way, half = p.direction, (p.stack_m + 0.005) / 2
-    body = course.spec.worldbody.add_body(name="pusher", pos=[way * plate, 0, p.ledge_m])
-    joint = body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[way, 0, 0])
+    direction, half_height = p.direction, (p.stack_m + 0.005) / 2
+    body = course.spec.worldbody.add_body(name="pusher", pos=[direction * plate, 0, p.ledge_m])
+    joint = body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[direction, 0, 0])
     joint.range, joint.limited = [0, p.travel_m], mujoco.mjtLimited.mjLIMITED_TRUE
     joint.damping, joint.frictionloss, joint.solref_limit = [1.0, 0, 0], 0.3, [0.02, 1.5]
     for name, centre, size in (
-        ("plate", (0, 0, 0.012 + half), (0.008, 0.06, half)),
-        ("rod", (-way * ROD_M / 2, 0, RADIUS_M), (ROD_M / 2 - 0.012, 0.008, 0.008)),
-        ("pad", (-way * ROD_M, 0, RADIUS_M), (0.008, 0.05, 0.035)),
+        ("plate", (0, 0, 0.012 + half_height), (0.008, 0.06, half_height)),
+        ("rod", (-direction * ROD_M / 2, 0, RADIUS_M), (ROD_M / 2 - 0.012, 0.008, 0.008)),
+        ("pad", (-direction * ROD_M, 0, RADIUS_M), (0.008, 0.05, 0.035)),
     ):
         add_box(body, name, centre, size, p.pusher_colour, density=300, friction=[0.1, 0.005, 0.0001])
 
 
-def _standing(motion: Motion, p: Params) -> np.ndarray:
+def _stands(motion: Motion, p: Params) -> np.ndarray:
     """Return whether each block is over the stand, shape (F, blocks)."""
     at = np.stack([motion.pos(block) for block in BLOCKS], axis=1)
     return (np.abs(at[..., 0]) < p.stand_half_m) & (at[..., 2] > p.stand_m)
@@ -142,17 +142,17 @@ def outcome(motion: Motion, p: Params) -> Reading:
     """Read the range of the number of standing blocks, once everything is still."""
     rest_frame = still_from(*(motion.pos(block) for block in BLOCKS), within_m=0.003)
     is_pushed = p.direction * (motion.pos("pusher") - motion.pos("pusher")[0])[:, 0] > 0.95 * p.travel_m
-    counts = _standing(motion, p).sum(axis=1)
+    counts = _stands(motion, p).sum(axis=1)
     labels = [range_of(RANGES, n) if i >= rest_frame and is_pushed[i] else None for i, n in enumerate(counts)]
     return Reading(labels, min(float(abs(abs(motion.pos(block)[-1, 0]) - p.stand_half_m)) for block in BLOCKS))
 
 
 def legible(motion: Motion, p: Params) -> list[tuple[tuple[str, ...], float]]:
     """Return the blocks to be seen: all standing ones, and enough of the fallen ones."""
-    standing = _standing(motion, p)[-1]
-    groups = [((BLOCKS[i],), 150.0) for i in np.flatnonzero(standing)]
-    fallen = tuple(BLOCKS[i] for i in np.flatnonzero(~standing))
-    return [*groups, (fallen, 200.0 * len(fallen))] if fallen else groups
+    is_standing = _stands(motion, p)[-1]
+    groups = [((BLOCKS[i],), 150.0) for i in np.flatnonzero(is_standing)]
+    fallen_blocks = tuple(BLOCKS[i] for i in np.flatnonzero(~is_standing))
+    return [*groups, (fallen_blocks, 200.0 * len(fallen_blocks))] if fallen_blocks else groups
 
 
 def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
@@ -170,10 +170,10 @@ def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
 
 
 def _count(frame: np.ndarray, stand_colour: str) -> int | None:
-    stand = largest(frame, stand_colour, 600)  # a flag of the stand is smaller
-    if stand is None:
+    stand_blob = largest(frame, stand_colour, 600)  # a flag of the stand is smaller
+    if stand_blob is None:
         return None
-    x, y, width, _ = stand.box
+    x, y, width, _ = stand_blob.box
     blobs_by_colour = [blobs(colour_mask(frame, colour), 60) for colour in COLOURS]
     return sum(any(x - 4 < b.x < x + width + 4 and b.y < y + 0.4 * width for b in parts) for parts in blobs_by_colour)
 

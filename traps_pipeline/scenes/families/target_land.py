@@ -32,18 +32,18 @@ GREYS = ("grey", "black", "white")
 SLANTS = 0.4  # columns a row: boards that hang straight down slant less in the picture
 TRAY_PX = 40  # a tray is wider in the picture
 COLOURS = "red", "green", "blue", "yellow", "orange", "cyan", "purple"
-PLAY, PLAIN = apart(*COLOURS), shuffled(*GREYS)
+PLAY_COLOURS, PLAIN_COLOURS = apart(*COLOURS), shuffled(*GREYS)
 
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters, left to right as the camera sees them; direction +1: to the right."""
+    """Parameters, left to right as the camera sees them; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
-    ball_colour: str = PLAY()
-    tray_colours: tuple[str, ...] = PLAY(3)
-    pedestal_colour: str = PLAIN()
-    back_colour: str = PLAIN()
+    ball_colour: str = PLAY_COLOURS()
+    tray_colours: tuple[str, ...] = PLAY_COLOURS(3)
+    pedestal_colour: str = PLAIN_COLOURS()
+    back_colour: str = PLAIN_COLOURS()
     radius_m: float = between(0.066, 0.074)
     pedestal_m: float = between(0.50, 0.66)  # height of the pedestal that the ball starts from
     speed_along_m_s: float = between(1.20, 1.38)
@@ -72,26 +72,30 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build pedestal, three trays with a high back, and two boards over them."""
     course = Course(physics, surface=Surface(0.006, sliding=0.5, solref=SOFT))
-    r, side, start = p.radius_m, 1.5 * p.tray_m, -p.direction * p.range_m
-    deep, outer, foot = (-DEPTH_M, DEPTH_M), (-side - WALL_M, side + WALL_M), (start - 0.08, start + 0.08)
+    r, half_width, start = p.radius_m, 1.5 * p.tray_m, -p.direction * p.range_m
+    depth_span, outer, foot = (
+        (-DEPTH_M, DEPTH_M),
+        (-half_width - WALL_M, half_width + WALL_M),
+        (start - 0.08, start + 0.08),
+    )
     course.block("pedestal", foot, (-0.08, 0.08), (0, p.pedestal_m), p.pedestal_colour)
     throw = (p.direction * p.speed_along_m_s, p.speed_up_m_s)
     course.ball("ball", (start, 0, p.start_m), r, p.ball_colour, thrown=throw, rolling=0.0002)
     for i, colour in enumerate(p.tray_colours):
-        ends = (i * p.tray_m - side, (i + 1) * p.tray_m - side)
-        course.block(f"tray_{i}", ends, deep, (0, FLOOR_M), colour)
+        ends = (i * p.tray_m - half_width, (i + 1) * p.tray_m - half_width)
+        course.block(f"tray_{i}", ends, depth_span, (0, FLOOR_M), colour)
         course.block(f"front_{i}", ends, (-DEPTH_M - WALL_M, -DEPTH_M), (0, FLOOR_M + 0.3 * r), colour)
         course.block(f"rear_{i}", ends, (DEPTH_M - WALL_M, DEPTH_M), (0, DIVIDER_M), colour)
     for i in (1, 2):
-        x = i * p.tray_m - side
-        course.block(f"divider_{i}", (x - WALL_M / 2, x + WALL_M / 2), deep, (0, DIVIDER_M), p.back_colour)
-    course.block("end_left", (outer[0], -side), deep, (0, END_M), p.back_colour)
-    course.block("end_right", (side, outer[1]), deep, (0, END_M), p.back_colour)
+        x = i * p.tray_m - half_width
+        course.block(f"divider_{i}", (x - WALL_M / 2, x + WALL_M / 2), depth_span, (0, DIVIDER_M), p.back_colour)
+    course.block("end_left", (outer[0], -half_width), depth_span, (0, END_M), p.back_colour)
+    course.block("end_right", (half_width, outer[1]), depth_span, (0, END_M), p.back_colour)
     course.block("back", outer, (DEPTH_M, DEPTH_M + WALL_M), (0, p.mouth_m), p.back_colour)
-    angle, half = p.slant * radians(p.slant_deg), (0.006, DEPTH_M - 0.03, p.board_m / 2)
+    angle, half_size = p.slant * radians(p.slant_deg), (0.006, DEPTH_M - 0.03, p.board_m / 2)
     for i, hinge in enumerate((-p.gap * r / 2, p.gap * r / 2)):
         centre = (hinge + p.board_m / 2 * sin(angle), 0.0, p.mouth_m - p.board_m / 2 * cos(angle))
-        board = course.slab(f"board_{i}", centre, half, "wood", falls_rad=-angle)
+        board = course.slab(f"board_{i}", centre, half_size, "wood", falls_rad=-angle)
         Surface(0.001, sliding=0.3, solref=SOFT).on(board)
     for i, colour in enumerate(p.tray_colours):
         course.mark(f"{colour} tray", f"tray_{i}")
@@ -114,10 +118,12 @@ def outcome(motion: Motion, p: Params) -> Reading:
     """Read the colour of the tray that the ball is over, while it is that low."""
     ball = motion.pos("ball")
     place = ball[:, 0] / p.tray_m + 1.5  # in tray widths from the left end
-    over, low = np.clip(np.floor(place), 0, 2).astype(int), ball[:, 2] < DIVIDER_M + 0.02
-    aside = min(abs(place[-1] - 1), abs(place[-1] - 2)) * p.tray_m
-    margin = min(aside, DIVIDER_M + p.radius_m - ball[-1, 2])
-    return Reading([p.tray_colours[i] if down else None for i, down in zip(over, low, strict=True)], float(margin))
+    tray_index, low = np.clip(np.floor(place), 0, 2).astype(int), ball[:, 2] < DIVIDER_M + 0.02
+    margin_m = min(abs(place[-1] - 1), abs(place[-1] - 2)) * p.tray_m
+    margin = min(margin_m, DIVIDER_M + p.radius_m - ball[-1, 2])
+    return Reading(
+        [p.tray_colours[i] if down else None for i, down in zip(tray_index, low, strict=True)], float(margin)
+    )
 
 
 def _colours(slots: Mapping[str, str]) -> Sequence[str]:
@@ -126,27 +132,27 @@ def _colours(slots: Mapping[str, str]) -> Sequence[str]:
 
 
 def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
-    """Return the tray colour that most of the picture around the resting ball has."""
+    """Return the tray colour that covers most of the picture around the resting ball."""
     path = [round_blob(frame, slots["ball"]) for frame in frames[-3:]]
     ball = path[-1]
     if ball is None or not is_at_rest(path):
         return None
     reach = 1.1 * max(ball.box[2:])
     rows, columns = np.ogrid[: frames.shape[1], : frames.shape[2]]
-    near = (columns - ball.x) ** 2 + (rows - ball.y) ** 2 < reach**2
-    around = {c: int((colour_mask(frames[-1], c) & near).sum()) for c in _colours(slots)}
-    best = max(around, key=lambda c: around[c])
-    return best if around[best] >= 60 else None
+    is_near = (columns - ball.x) ** 2 + (rows - ball.y) ** 2 < reach**2
+    pixels_of = {c: int((colour_mask(frames[-1], c) & is_near).sum()) for c in _colours(slots)}
+    best = max(pixels_of, key=lambda c: pixels_of[c])
+    return best if pixels_of[best] >= 60 else None
 
 
 def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     """Predict the tray that the chute's boards lead to; the middle if upright."""
     trays = {colour: largest(frames[-1], colour, 200) for colour in _colours(slots)}
     visible = {colour: blob for colour, blob in trays.items() if blob is not None and blob.box[2] > TRAY_PX}
-    in_order = sorted(visible, key=lambda colour: visible[colour].x)
-    if len(in_order) != 3:
+    tray_colours = sorted(visible, key=lambda colour: visible[colour].x)
+    if len(tray_colours) != 3:
         return None
-    left, right = visible[in_order[0]], visible[in_order[2]]
+    left, right = visible[tray_colours[0]], visible[tray_colours[2]]
     top = min(blob.y for blob in visible.values())
     slopes = []
     for board in blobs(colour_mask(frames[0], "wood"), 200):
@@ -157,7 +163,7 @@ def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     if not slopes:
         return None
     slope = float(np.mean(slopes))  # pixels to the right from row to row
-    return in_order[0 if slope < -SLANTS else 2 if slope > SLANTS else 1]
+    return tray_colours[0 if slope < -SLANTS else 2 if slope > SLANTS else 1]
 
 
 FAMILY = scene_family(

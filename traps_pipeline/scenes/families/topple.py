@@ -27,19 +27,22 @@ LIGHT, HEAVY = 200.0, 7000.0  # kg/m3
 MAT_M = 0.01  # thickness of the mat
 HALF_DEPTH_M = 0.17  # of the mat
 RIM_M = 0.012
-PLAY, PLAIN = apart("red", "green", "blue", "orange", "cyan", "purple"), shuffled("wood", "grey", "white")
+PLAY_COLOURS, PLAIN_COLOURS = (
+    apart("red", "green", "blue", "orange", "cyan", "purple"),
+    shuffled("wood", "grey", "white"),
+)
 
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; heights are shares of the pillar's, direction +1: to the right."""
+    """Parameters; heights are shares of the pillar's; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
-    pillar_colour: str = PLAY()
-    ball_colour: str = PLAY()
-    prop_colour: str = PLAY()
-    ledge_colour: str = PLAIN()
-    mat_colour: str = PLAIN()
+    pillar_colour: str = PLAY_COLOURS()
+    ball_colour: str = PLAY_COLOURS()
+    prop_colour: str = PLAY_COLOURS()
+    ledge_colour: str = PLAIN_COLOURS()
+    mat_colour: str = PLAIN_COLOURS()
     kind: str = one_of("prop", "pillar")  # of the hidden element
     firm: bool = hidden(False, True)  # whether it keeps the pillar upright
     pillar_m: float = between(0.32, 0.40)
@@ -57,32 +60,32 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build ledge, pillar, mat and prop; lengths run from the middle of the pillar."""
     course = Course(physics, p.direction)
-    r, half_w, deep = p.radius_m, p.width_m / 2, HALF_DEPTH_M
+    r, half_w, half_depth = p.radius_m, p.width_m / 2, HALF_DEPTH_M
     ledge = p.strike * p.pillar_m - r  # height of the ledge that the ball rolls on
     ledge_end, end = -half_w - 0.025, half_w + p.pillar_m + 0.09  # the pillar falls onto the mat between them
-    screened = ledge_end - 3 * r - 0.10
-    start = screened - p.run_m + r
+    occluder_at = ledge_end - 3 * r - 0.10
+    start = occluder_at - p.run_m + r
 
-    course.block("ledge", (start - 0.06, screened + 2 * r), (-0.09, 0.09), (0, ledge), p.ledge_colour, Surface(1e-4))
-    course.block("felt", (screened + 2 * r, ledge_end), (-0.09, 0.09), (0, ledge), p.ledge_colour, FELT)
-    course.block("mat", (ledge_end, end), (-deep, deep), (0, MAT_M), p.mat_colour)
-    course.block("rim_back", (ledge_end, end), (deep, deep + RIM_M), (0, 0.06), p.mat_colour)
-    course.block("rim_front", (half_w + 0.02, end), (-deep - RIM_M, -deep), (0, 0.03), p.mat_colour)
-    course.block("rim_end", (end, end + RIM_M), (-deep - RIM_M, deep + RIM_M), (0, 0.06), p.mat_colour)
+    course.block("ledge", (start - 0.06, occluder_at + 2 * r), (-0.09, 0.09), (0, ledge), p.ledge_colour, Surface(1e-4))
+    course.block("felt", (occluder_at + 2 * r, ledge_end), (-0.09, 0.09), (0, ledge), p.ledge_colour, FELT)
+    course.block("mat", (ledge_end, end), (-half_depth, half_depth), (0, MAT_M), p.mat_colour)
+    course.block("rim_back", (ledge_end, end), (half_depth, half_depth + RIM_M), (0, 0.06), p.mat_colour)
+    course.block("rim_front", (half_w + 0.02, end), (-half_depth - RIM_M, -half_depth), (0, 0.03), p.mat_colour)
+    course.block("rim_end", (end, end + RIM_M), (-half_depth - RIM_M, half_depth + RIM_M), (0, 0.06), p.mat_colour)
     has_prop = p.kind == "prop"
     if has_prop:
-        near, y = half_w + 0.004, 0.0 if p.firm else deep - 0.03
+        prop_x, y = half_w + 0.004, 0.0 if p.firm else half_depth - 0.03
         height = p.prop_height * p.pillar_m
-        course.block("prop", (near, near + 0.07), (y - 0.03, y + 0.03), (MAT_M, height), p.prop_colour)
-    at, half = (0, 0, MAT_M + p.pillar_m / 2), (half_w, p.depth_m / 2, p.pillar_m / 2)
+        course.block("prop", (prop_x, prop_x + 0.07), (y - 0.03, y + 0.03), (MAT_M, height), p.prop_colour)
+    at, half_size = (0, 0, MAT_M + p.pillar_m / 2), (half_w, p.depth_m / 2, p.pillar_m / 2)
     density = HEAVY if p.firm and p.kind == "pillar" else LIGHT
-    pillar = course.free_box("pillar", at, half, p.pillar_colour, density=density, solref=(0.006, 1))
+    pillar = course.free_box("pillar", at, half_size, p.pillar_colour, density=density, solref=(0.006, 1))
     pillar.first_geom().friction = [0.8, 0.01, 0.0005]
     at = (start, 0, ledge + r)
     course.ball("ball", at, r, p.ball_colour, speed=p.speed_m_s, rolling=1e-4, sliding=0.1, density=1500)
 
-    along, top = (screened, end + 0.02), p.pillar_m + 0.03
-    across = (-deep - 0.02, max(deep + 0.05, 0.05 + SHADOW_BACK * p.pillar_m))
+    along, top = (occluder_at, end + 0.02), p.pillar_m + 0.03
+    across = (-half_depth - 0.02, max(half_depth + 0.05, 0.05 + SHADOW_BACK * p.pillar_m))
     props = [f"{p.prop_colour} block"] if has_prop else []
     course.mark("pillar", "pillar")
     scene = course.scene(
@@ -90,7 +93,7 @@ def build(p: Params, physics: Physics) -> Scene:
         decisive=["pillar"],
         hidden=[p.kind],
         cover=course.box(along, across, (0, top), right=course.ahead(0.04)),
-        in_view=[course.box(along, (-deep - RIM_M, deep + RIM_M), (0, p.pillar_m))],
+        in_view=[course.box(along, (-half_depth - RIM_M, half_depth + RIM_M), (0, p.pillar_m))],
         things=[f"{p.ball_colour} ball", f"{p.pillar_colour} pillar", "ledge", "mat", *props],
         also=["block", "rim"],
     )

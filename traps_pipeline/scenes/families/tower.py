@@ -26,22 +26,22 @@ FELT = Surface(2e-3)  # behind the occluder: no ball comes back from there
 HALF_DEPTH_M = 0.11
 STILL_M = 0.003
 COLOURS = "red", "green", "blue", "yellow", "orange", "cyan", "purple"
-PLAY, PLAIN = apart(*COLOURS), shuffled("wood", "grey", "white")
+PLAY_COLOURS, PLAIN_COLOURS = apart(*COLOURS), shuffled("wood", "grey", "white")
 
-GIVES = 0.25  # of its width: a block that is so far from its place falls
+FALL_SHARE = 0.25  # of its width: a block that is so far from its place falls
 
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; direction +1: to the right. Only the top block's colour is unique."""
+    """Parameters; direction +1 is right. Only the top block's colour is unique."""
 
     direction: int = one_of(-1, 1)
     blocks: int = one_of(3, 4, longer=(5,))
-    top_colour: str = PLAY()
-    ball_colour: str = PLAY()
-    block_colours: tuple[str, ...] = PLAY(2)
-    ledge_colour: str = PLAIN()
-    tray_colour: str = PLAIN()
+    top_colour: str = PLAY_COLOURS()
+    ball_colour: str = PLAY_COLOURS()
+    block_colours: tuple[str, ...] = PLAY_COLOURS(2)
+    ledge_colour: str = PLAIN_COLOURS()
+    tray_colour: str = PLAIN_COLOURS()
     kind: str = one_of("stop", "strip")  # of the hidden element
     barred: bool = hidden(False, True)  # whether it keeps the ball from the tower
     block_height_m: float = drawn_by(
@@ -65,28 +65,28 @@ class Params:
 
     @property
     def names(self) -> list[str]:
-        """Bodies of the tower, from the ground up."""
+        """Names of the tower's bodies, from the ground up."""
         return [f"block_{i}" for i in range(self.blocks)]
 
 
 def build(p: Params, physics: Physics) -> Scene:
     """Build ledge, stop or strip, tower and tray."""
     course = Course(physics, p.direction)
-    r, half_w, deep = p.radius_m, p.block_width_m / 2, (-HALF_DEPTH_M, HALF_DEPTH_M)
+    r, half_w, depth_span = p.radius_m, p.block_width_m / 2, (-HALF_DEPTH_M, HALF_DEPTH_M)
     ledge = p.strike * p.block_height_m - r  # height of the ledge that the ball rolls on
     ledge_end, end = -half_w - 0.02, half_w + p.tray_m
     strip = (ledge_end - 2 * r - 0.03 - STRIP_M, ledge_end - 2 * r - 0.03)
-    screened = strip[0] - 2 * r - 0.05
-    start = screened - p.run_m + r
+    occluder_at = strip[0] - 2 * r - 0.05
+    start = occluder_at - p.run_m + r
 
-    is_strip, rough = p.kind == "strip", Surface(0.03)
+    is_strip, rough_surface = p.kind == "strip", Surface(0.03)
     for name, along, surface, colour in (
-        ("ledge_in", (start - 0.06, screened + 2 * r), Surface(1e-4), p.ledge_colour),
-        ("felt", (screened + 2 * r, strip[0]), FELT, p.ledge_colour),
-        ("strip", strip, rough if p.barred and is_strip else FELT, "black" if is_strip else p.ledge_colour),
+        ("ledge_in", (start - 0.06, occluder_at + 2 * r), Surface(1e-4), p.ledge_colour),
+        ("felt", (occluder_at + 2 * r, strip[0]), FELT, p.ledge_colour),
+        ("strip", strip, rough_surface if p.barred and is_strip else FELT, "black" if is_strip else p.ledge_colour),
         ("ledge_out", (strip[1], ledge_end), FELT, p.ledge_colour),
     ):
-        course.block(name, along, deep, (0, ledge), colour, surface)
+        course.block(name, along, depth_span, (0, ledge), colour, surface)
     if p.kind == "stop":
         y = 0.0 if p.barred else HALF_DEPTH_M - 0.018
         course.block("stop", (strip[1] - 0.05, strip[1]), (y - 0.018, y + 0.018), (ledge, ledge + 1.6 * r), "black")
@@ -94,12 +94,12 @@ def build(p: Params, physics: Physics) -> Scene:
     course.block("wall_front", (half_w + 0.02, end), (-0.165, -0.15), (0, 0.03), p.tray_colour)
     course.block("wall_end", (end, end + 0.015), (-0.165, 0.165), (0, 0.16), p.tray_colour)
     colours = [p.block_colours[i % len(p.block_colours)] for i in range(p.blocks - 1)] + [p.top_colour]
-    half = (half_w, half_w, p.block_height_m / 2)
-    course.tower(p.names, half, colours, density=300, sliding=0.35, solref=(0.006, 1))
+    half_size = (half_w, half_w, p.block_height_m / 2)
+    course.tower(p.names, half_size, colours, density=300, sliding=0.35, solref=(0.006, 1))
     at = (start, 0, ledge + r)
     course.ball("ball", at, r, p.ball_colour, speed=p.speed_m_s, rolling=1e-4, sliding=0.3, density=2500)
 
-    view_box = course.box((screened, end + 0.02), (-0.165, 0.165), (0, p.tower_m))
+    view_box = course.box((occluder_at, end + 0.02), (-0.165, 0.165), (0, p.tower_m))
     right = max(view_box.high[0], SHADOW_RIGHT * p.tower_m + half_w) + course.ahead(0.07) - view_box.high[0]
     across = (-0.17, half_w + SHADOW_BACK * p.tower_m)
     course.mark("block", p.names[-1])
@@ -107,7 +107,7 @@ def build(p: Params, physics: Physics) -> Scene:
         p,
         decisive=[p.names[-1]],
         hidden=[p.kind],
-        cover=course.box((screened, end + 0.02), across, (0, p.tower_m + 0.02), right=right),
+        cover=course.box((occluder_at, end + 0.02), across, (0, p.tower_m + 0.02), right=right),
         in_view=[view_box],
         things=[
             f"{p.ball_colour} ball",
@@ -147,7 +147,7 @@ def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
     first, last = largest(frames[0], slots["top"], 60), largest(frames[-1], slots["top"], 60)
     if first is None or last is None:
         return None
-    return "yes" if abs(last.x - first.x) + abs(last.y - first.y) > GIVES * first.box[2] else "no"
+    return "yes" if abs(last.x - first.x) + abs(last.y - first.y) > FALL_SHARE * first.box[2] else "no"
 
 
 def look(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:

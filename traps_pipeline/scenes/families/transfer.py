@@ -23,20 +23,20 @@ STEP_M = 0.022  # the ramp ends this high over the deck
 WALL_M = 0.014
 SIDE_M = 0.085  # half the deck's width
 STILL_M = 0.002  # a block that moves less than this any more is at rest
-PLAY = apart("red", "green", "blue", "yellow", "cyan", "purple")
-PLAIN = shuffled("wood", "grey", "white")
+PLAY_COLOURS = apart("red", "green", "blue", "yellow", "cyan", "purple")
+PLAIN_COLOURS = shuffled("wood", "grey", "white")
 
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths run from the ramp's upper end, direction +1: to the right."""
+    """Parameters; lengths run from the ramp's upper end; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
-    ball_colour: str = PLAY()
-    block_colour: str = PLAY()
-    zone_colour: str = PLAY()
-    deck_colour: str = PLAIN()
-    ramp_colour: str = PLAIN()
+    ball_colour: str = PLAY_COLOURS()
+    block_colour: str = PLAY_COLOURS()
+    zone_colour: str = PLAY_COLOURS()
+    deck_colour: str = PLAIN_COLOURS()
+    ramp_colour: str = PLAIN_COLOURS()
     radius_m: float = between(0.046, 0.056)
     shape: str = one_of("box", "cylinder")  # of the block
     start_m: float = between(0.06, 0.14)
@@ -54,12 +54,12 @@ class Params:
 
     @property
     def block_at_m(self) -> float:
-        """Where the middle of the block stands at first."""
+        """Initial position of the block's middle."""
         return self.ramp_m + self.ahead_m + self.block_m / 2
 
     @property
     def zone_at_m(self) -> float:
-        """Where the zone begins."""
+        """Position at which the zone begins."""
         return self.block_at_m + self.block_m / 2 + self.gap_m
 
 
@@ -67,15 +67,15 @@ def build(p: Params, physics: Physics) -> Scene:
     """Build ramp, step, deck with low rims, and zone before an end wall."""
     course = Course(physics, p.direction)
     r, end, board_at = p.radius_m, p.zone_at_m + p.zone_m, p.block_at_m - p.block_m / 2 - 0.03
-    deep, outer, deck = (-SIDE_M, SIDE_M), (-SIDE_M - WALL_M, SIDE_M + WALL_M), (0, DECK_M)
+    depth_span, outer, deck = (-SIDE_M, SIDE_M), (-SIDE_M - WALL_M, SIDE_M + WALL_M), (0, DECK_M)
     board = Surface(4e-4, sliding=p.rough_friction if p.rough else p.slick_friction, priority=2)
 
     ramp = SteppedRamp(p.ramp_m, p.slope_deg, DECK_M + STEP_M)
     ramp.add(course, SIDE_M, p.ramp_colour)
     course.ball("ball", ramp.at(p.start_m, r), r, p.ball_colour, rolling=0.0002, density=800)
-    course.block("deck", (p.ramp_m, board_at), deep, deck, p.deck_colour)
-    course.block("board", (board_at, p.zone_at_m), deep, deck, p.deck_colour, board)
-    course.block("zone", (p.zone_at_m, end), deep, deck, p.zone_colour, Surface(4e-4, sliding=0.25, priority=2))
+    course.block("deck", (p.ramp_m, board_at), depth_span, deck, p.deck_colour)
+    course.block("board", (board_at, p.zone_at_m), depth_span, deck, p.deck_colour, board)
+    course.block("zone", (p.zone_at_m, end), depth_span, deck, p.zone_colour, Surface(4e-4, sliding=0.25, priority=2))
     course.sides("rim", (p.ramp_m, end), SIDE_M, WALL_M, (0, DECK_M + 0.016), p.ramp_colour)
     wall = course.block("end_wall", (end, end + WALL_M), outer, (0, DECK_M + 0.05), p.ramp_colour)
     wall.priority = 3  # dead: the block stays where it strikes the wall
@@ -100,14 +100,16 @@ def _add_target(course: Course, p: Params) -> None:
     """Add the free block, a cube or an upright cylinder."""
     import mujoco
 
-    half = p.block_m / 2
-    at = (p.block_at_m, 0, DECK_M + half)
-    lively = (-20000.0, -25.0)
-    body = course.free_box("block", at, (half, half, half), p.block_colour, density=700, sliding=0.1, solref=lively)
+    half_block = p.block_m / 2
+    at = (p.block_at_m, 0, DECK_M + half_block)
+    solref = (-20000.0, -25.0)
+    body = course.free_box(
+        "block", at, (half_block, half_block, half_block), p.block_colour, density=700, sliding=0.1, solref=solref
+    )
     geom = body.first_geom()
     geom.priority = 1
     if p.shape == "cylinder":
-        geom.type, geom.size = mujoco.mjtGeom.mjGEOM_CYLINDER, [half, half, 0]
+        geom.type, geom.size = mujoco.mjtGeom.mjGEOM_CYLINDER, [half_block, half_block, 0]
 
 
 def outcome(motion: Motion, p: Params) -> Reading:

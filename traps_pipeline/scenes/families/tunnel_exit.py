@@ -30,18 +30,18 @@ SLIPPERY = Surface(1e-5, sliding=0.03, spinning=0.001)  # a ball slides along it
 FELT = Surface(0.004)
 COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
 PARTS = ("ball", "tunnel")
-PLAY, PLAIN = apart(*COLOURS), shuffled("wood", "grey", "white", "black")
+PLAY_COLOURS, PLAIN_COLOURS = apart(*COLOURS), shuffled("wood", "grey", "white", "black")
 
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; the ball rolls to the camera, turn +1: deflected to the right."""
+    """Parameters; the ball rolls to the camera; turn +1 deflects it to the right."""
 
-    ball_colour: str = PLAY()
-    tunnel_colour: str = PLAY()
-    left_colour: str = PLAIN()
-    right_colour: str = PLAIN()
-    ramp_colour: str = PLAIN()
+    ball_colour: str = PLAY_COLOURS()
+    tunnel_colour: str = PLAY_COLOURS()
+    left_colour: str = PLAIN_COLOURS()
+    right_colour: str = PLAIN_COLOURS()
+    ramp_colour: str = PLAIN_COLOURS()
     turn: int = hidden(-1, 1)
     turn_deg: float = between(40, 50)  # angle between the deflector and the ball's way
     radius_m: float = between(0.046, 0.054)
@@ -59,22 +59,22 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build the fork, its front at the origin, and the ramp down to it from the back."""
     course = Course(physics)
-    r, wide, depth = p.radius_m, p.half_width_m, p.depth_m
+    r, half_width, depth = p.radius_m, p.half_width_m, p.depth_m
     roof, bore, end = FLOOR_M + 2.8 * r, 1.3 * r, p.half_width_m + p.tray_m
-    fork, before, behind = (-wide, wide), (-WALL_M, 0), (depth, depth + WALL_M)
+    fork, front_span, back_span = (-half_width, half_width), (-WALL_M, 0), (depth, depth + WALL_M)
 
     course.block("fork_floor", fork, (0, depth), (0, FLOOR_M), p.tunnel_colour)
     course.block("fork_roof", fork, (-WALL_M, depth + WALL_M), (roof, roof + WALL_M), p.tunnel_colour)
-    course.block("fork_front", fork, before, (0, roof), p.tunnel_colour, SLIPPERY)
-    for name, side, colour in (("left", -1, p.left_colour), ("right", 1, p.right_colour)):
-        way_out, tray, high = course.towards(side), (wide, end), (0, TRAY_M + 1.2 * r)
-        way_out.block(f"fork_back_{name}", (bore, wide), behind, (0, roof), p.tunnel_colour)
+    course.block("fork_front", fork, front_span, (0, roof), p.tunnel_colour, SLIPPERY)
+    for name, outer_wall, colour in (("left", -1, p.left_colour), ("right", 1, p.right_colour)):
+        way_out, tray, high = course.towards(outer_wall), (half_width, end), (0, TRAY_M + 1.2 * r)
+        way_out.block(f"fork_back_{name}", (bore, half_width), back_span, (0, roof), p.tunnel_colour)
         way_out.block(f"tray_{name}", tray, (-WALL_M, depth), (0, TRAY_M), colour, FELT)
         way_out.block(f"tray_end_{name}", (end, end + WALL_M), (-WALL_M, depth), high, colour)
         way_out.block(f"tray_front_{name}", tray, (-2 * WALL_M, -WALL_M), (0, TRAY_M + 0.5 * r), colour)
-        way_out.block(f"tray_back_{name}", tray, behind, high, colour)
-    half = (2.3 * r, 0.006, (roof - 0.004 - FLOOR_M) / 2)
-    deflector = SLIPPERY.on(course.slab("deflector", (0, 0.45 * depth, (FLOOR_M + roof) / 2), half, "black"))
+        way_out.block(f"tray_back_{name}", tray, back_span, high, colour)
+    half_size = (2.3 * r, 0.006, (roof - 0.004 - FLOOR_M) / 2)
+    deflector = SLIPPERY.on(course.slab("deflector", (0, 0.45 * depth, (FLOOR_M + roof) / 2), half_size, "black"))
     yaw = p.turn * float(np.radians(p.turn_deg)) + np.pi / 2
     deflector.quat = [float(np.cos(yaw / 2)), 0.0, 0.0, float(np.sin(yaw / 2))]
     ramp = Ramp(p.slope_deg, FLOOR_M, foot_m=depth, towards_camera=True)
@@ -82,10 +82,10 @@ def build(p: Params, physics: Physics) -> Scene:
     start = ramp.at(p.covered_m + p.open_m - p.start_m, r)
     course.ball("ball", start, r, p.ball_colour, rolling=1e-4)
 
-    side, across = end + WALL_M, (-2 * WALL_M - 0.01, depth + 2 * WALL_M)
-    cover = course.box((-side - 0.01, side), across, (0, roof + WALL_M), right=SHADOW_RIGHT * 0.15)
-    for name, side, colour in (("left", -1, p.left_colour), ("right", 1, p.right_colour)):
-        course.mark(f"{name} exit", (side * wide, depth), colour)
+    outer_wall, across = end + WALL_M, (-2 * WALL_M - 0.01, depth + 2 * WALL_M)
+    cover = course.box((-outer_wall - 0.01, outer_wall), across, (0, roof + WALL_M), right=SHADOW_RIGHT * 0.15)
+    for name, outer_wall, colour in (("left", -1, p.left_colour), ("right", 1, p.right_colour)):
+        course.mark(f"{name} exit", (outer_wall * half_width, depth), colour)
     return course.scene(
         p,
         decisive=["ball"],
@@ -106,8 +106,16 @@ def _add_ramp(course: Course, p: Params, ramp: Ramp, bore: float) -> None:
     length, outer, top = p.covered_m + p.open_m, bore + WALL_M, 2.7 * p.radius_m
 
     def board(name: str, across: Span, up: Span, over: Span, colour: str, side: int = 1) -> None:
-        along, aside, out = ((span[1] - span[0]) / 2 for span in (up, across, over))
-        ramp.board(course, name, sum(up) / 2, sum(over) / 2, (along, aside, out), colour, aside=side * sum(across) / 2)
+        half_up, half_across, half_over = ((span[1] - span[0]) / 2 for span in (up, across, over))
+        ramp.board(
+            course,
+            name,
+            sum(up) / 2,
+            sum(over) / 2,
+            (half_up, half_across, half_over),
+            colour,
+            aside=side * sum(across) / 2,
+        )
 
     board("ramp", (-outer, outer), (0, length), (-0.02, 0), p.ramp_colour)
     board("stem_roof", (-outer, outer), (0, p.covered_m), (top, top + WALL_M), p.tunnel_colour)
@@ -121,8 +129,8 @@ def _add_ramp(course: Course, p: Params, ramp: Ramp, bore: float) -> None:
 def outcome(motion: Motion, p: Params) -> Reading:
     """Read the side on which the ball is wholly out of the tunnel."""
     across = motion.pos("ball")[:, 0]
-    outside = np.abs(across) - p.radius_m - p.half_width_m
-    return Reading(side_while(outside > 0, across, over="right", under="left"), float(outside[-1]))
+    outside_m = np.abs(across) - p.radius_m - p.half_width_m
+    return Reading(side_while(outside_m > 0, across, over="right", under="left"), float(outside_m[-1]))
 
 
 def observe(frames: np.ndarray, slots: Mapping[str, str], ahead: float | None = None) -> str | None:

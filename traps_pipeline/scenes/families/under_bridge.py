@@ -23,18 +23,18 @@ ROAD_M = 0.02
 SLAB_M = 0.03
 RAILING_M = 0.05
 BALL_COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
-PLAY, PLAIN = apart(*BALL_COLOURS), shuffled("wood", "grey", "white", "black")
+PLAY_COLOURS, PLAIN_COLOURS = apart(*BALL_COLOURS), shuffled("wood", "grey", "white", "black")
 
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; lengths run from the bridge's near edge, direction +1: to the right."""
+    """Parameters; lengths run from the bridge's near edge; direction +1 is right."""
 
-    ball_colour: str = PLAY()
-    bridge_colour: str = PLAY()
-    road_colour: str = PLAIN()
-    ramp_colour: str = PLAIN()
-    kerb_colour: str = PLAIN()
+    ball_colour: str = PLAY_COLOURS()
+    bridge_colour: str = PLAY_COLOURS()
+    road_colour: str = PLAIN_COLOURS()
+    ramp_colour: str = PLAIN_COLOURS()
+    kerb_colour: str = PLAIN_COLOURS()
     direction: int = one_of(-1, 1)
     blocked: bool = hidden(False, True)  # whether the kerb lies across the road
     radius_m: float = between(0.048, 0.056)
@@ -55,20 +55,24 @@ class Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Build a ramp, a road with an end wall, and a bridge on four legs across it."""
     course = Course(physics, p.direction)
-    r, end, side = p.radius_m, p.bridge_m + p.beyond_m, 1.6 * p.radius_m
-    deep, road = (-side, side), (0, ROAD_M)
+    r, end, half_width = p.radius_m, p.bridge_m + p.beyond_m, 1.6 * p.radius_m
+    depth_span, road = (-half_width, half_width), (0, ROAD_M)
     stop = 0.62 * p.bridge_m + r  # where the kerb's face is: the ball rests in the middle of the bridge
     bed = (stop - 3.5 * r, stop)  # rough: a ball that bounces off the kerb stays there
 
-    course.block("road_in", (-p.flat_m, bed[0]), deep, road, p.road_colour, Surface(1e-4))
-    course.block("road_bed", bed, deep, road, p.road_colour, Surface(0.003))
-    course.block("road_out", (bed[1], end), deep, road, p.road_colour, Surface(0.004))
-    course.block("end_wall", (end, end + 0.015), deep, (0, ROAD_M + 1.4 * r), p.road_colour)
-    start = _add_ramp(course, p, side)
+    course.block("road_in", (-p.flat_m, bed[0]), depth_span, road, p.road_colour, Surface(1e-4))
+    course.block("road_bed", bed, depth_span, road, p.road_colour, Surface(0.003))
+    course.block("road_out", (bed[1], end), depth_span, road, p.road_colour, Surface(0.004))
+    course.block("end_wall", (end, end + 0.015), depth_span, (0, ROAD_M + 1.4 * r), p.road_colour)
+    start = _add_ramp(course, p, half_width)
     _add_bridge(course, p)
-    along, across, up = (stop, stop + 0.04), deep, (ROAD_M, ROAD_M + 0.9 * r)
+    along, across, up = (stop, stop + 0.04), depth_span, (ROAD_M, ROAD_M + 0.9 * r)
     if not p.blocked:
-        along, across, up = (stop + 0.02 - side, stop + 0.02 + side), (side, side + 0.04), (0, 0.9 * r)
+        along, across, up = (
+            (stop + 0.02 - half_width, stop + 0.02 + half_width),
+            (half_width, half_width + 0.04),
+            (0, 0.9 * r),
+        )
     course.block("kerb", along, across, up, p.kerb_colour, Surface(0.001, sliding=0.2))
     course.ball("ball", start, r, p.ball_colour, rolling=1e-4)
 
@@ -78,9 +82,9 @@ def build(p: Params, physics: Physics) -> Scene:
         p,
         decisive=["ball"],
         hidden=["kerb"],
-        cover=course.cover((p.mouth_m, end + 0.015), (front, side + 0.04), high),
+        cover=course.cover((p.mouth_m, end + 0.015), (front, half_width + 0.04), high),
         in_view=[
-            course.box((-(p.flat_m + p.ramp_m), end), deep, (0, high)),
+            course.box((-(p.flat_m + p.ramp_m), end), depth_span, (0, high)),
             course.box((0, p.bridge_m), (front, -front), (0, top)),
         ],
         things=[
@@ -97,26 +101,26 @@ def build(p: Params, physics: Physics) -> Scene:
 
 def _add_ramp(course: Course, p: Params, side: float) -> Vec3:
     """Add the ramp down to the road; return where the ball starts on it."""
-    slope, thick = float(np.radians(p.slope_deg)), 0.012
+    slope, thickness = float(np.radians(p.slope_deg)), 0.012
     length = p.ramp_m / np.cos(slope)
     foot = np.array([-p.flat_m, ROAD_M])
     up, normal = np.array([-np.cos(slope), np.sin(slope)]), np.array([np.sin(slope), np.cos(slope)])
-    middle = foot + up * length / 2 - normal * thick
-    course.slab("ramp", (middle[0], 0, middle[1]), (length / 2, side, thick), p.ramp_colour, falls_rad=slope)
-    top = foot + up * (length - 0.03) - normal * thick
-    half = (top[1] - 0.008) / 2
-    course.slab("ramp_post", (top[0], 0, half), (0.02, side * 0.8, half), p.ramp_colour)
+    middle = foot + up * length / 2 - normal * thickness
+    course.slab("ramp", (middle[0], 0, middle[1]), (length / 2, side, thickness), p.ramp_colour, falls_rad=slope)
+    top = foot + up * (length - 0.03) - normal * thickness
+    half_height = (top[1] - 0.008) / 2
+    course.slab("ramp_post", (top[0], 0, half_height), (0.02, side * 0.8, half_height), p.ramp_colour)
     ball = foot + up * (length - 1.2 * p.radius_m) + normal * p.radius_m
     return float(ball[0]), 0.0, float(ball[1])
 
 
 def _add_bridge(course: Course, p: Params) -> None:
     """Add a humped deck of planks on four legs, with a railing on either edge."""
-    side, post, pitch, colour = p.span_m / 2, 0.014, p.span_m / p.planks, p.bridge_colour
+    half_span, post, pitch, colour = p.span_m / 2, 0.014, p.span_m / p.planks, p.bridge_colour
     edges = ((0, 2 * post), (p.bridge_m - 2 * post, p.bridge_m))
     for k in range(p.planks):
-        y = -side + (k + 0.5) * pitch
-        z = p.height_m + p.hump_m * (1 - (y / side) ** 2)
+        y = -half_span + (k + 0.5) * pitch
+        z = p.height_m + p.hump_m * (1 - (y / half_span) ** 2)
         rail = z + SLAB_M + RAILING_M
         course.block(f"plank_{k}", (0, p.bridge_m), (y - 0.47 * pitch, y + 0.47 * pitch), (z, z + SLAB_M), colour)
         for i, along in enumerate(edges):

@@ -28,17 +28,17 @@ STRIP_M = 0.20  # length of the strip before the mat
 GRIPPING = Surface(1e-4)  # of the visible run-up
 SLIPPERY = Surface(2e-3, sliding=0.05)
 ROUGH = Surface(2e-3, sliding=1.0)
-PLAY = apart("red", "green", "blue", "orange", "cyan", "purple")
+PLAY_COLOURS = apart("red", "green", "blue", "orange", "cyan", "purple")
 
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters; direction +1: to the right."""
+    """Parameters; direction +1 is right."""
 
     direction: int = one_of(-1, 1)
-    wedge_colour: str = PLAY()
-    ball_colour: str = PLAY()
-    mat_colour: str = PLAY()
+    wedge_colour: str = PLAY_COLOURS()
+    ball_colour: str = PLAY_COLOURS()
+    mat_colour: str = PLAY_COLOURS()
     wedge_length_m: float = between(0.13, 0.16)
     kind: str = one_of("strip", "stop")  # of the hidden element
     barred: bool = hidden(False, True)  # whether it keeps the wedge from the mat
@@ -54,36 +54,36 @@ class Params:
 
     @property
     def mat_at_m(self) -> float:
-        """Where the mat begins, from the middle of the wedge at the start."""
+        """Position at which the mat begins, from the wedge's middle at the start."""
         return self.wedge_length_m / 2 + 0.03 + STRIP_M + 0.03
 
 
 def build(p: Params, physics: Physics) -> Scene:
     """Build track, strip or stop, mat and wedge; lengths run from the wedge's middle."""
     course = Course(physics, p.direction)
-    r, half, end = p.radius_m, p.wedge_length_m / 2, p.mat_at_m + p.mat_m
-    strip = (half + 0.03, half + 0.03 + STRIP_M)
-    screened = -half - 2 * r - 0.08
-    start = screened - p.run_m + r
-    deep, is_strip = (-HALF_TRACK_M, HALF_TRACK_M), p.kind == "strip"
+    r, half_wedge, end = p.radius_m, p.wedge_length_m / 2, p.mat_at_m + p.mat_m
+    strip = (half_wedge + 0.03, half_wedge + 0.03 + STRIP_M)
+    occluder_at = -half_wedge - 2 * r - 0.08
+    start = occluder_at - p.run_m + r
+    depth_span, is_strip = (-HALF_TRACK_M, HALF_TRACK_M), p.kind == "strip"
 
     for name, along, surface, colour in (
-        ("run_up", (start - 0.06, screened + 2 * r), GRIPPING, p.track_colour),
-        ("track", (screened + 2 * r, strip[0]), SLIPPERY, p.track_colour),
+        ("run_up", (start - 0.06, occluder_at + 2 * r), GRIPPING, p.track_colour),
+        ("track", (occluder_at + 2 * r, strip[0]), SLIPPERY, p.track_colour),
         ("strip", strip, ROUGH if p.barred and is_strip else SLIPPERY, "black" if is_strip else p.track_colour),
         ("track_end", (strip[1], p.mat_at_m), SLIPPERY, p.track_colour),
         ("mat", (p.mat_at_m, end), SLIPPERY, p.mat_colour),
     ):
-        course.block(name, along, deep, (0, TRACK_M), colour, surface)
+        course.block(name, along, depth_span, (0, TRACK_M), colour, surface)
     if p.kind == "stop":
         y, z = (0.0, TRACK_M) if p.barred else (HALF_TRACK_M + 0.05, 0.0)
         course.block("stop", (strip[1] - 0.03, strip[1]), (y - 0.04, y + 0.04), (z, z + 0.07), "black")
-    course.block("wall_end", (end, end + 0.015), deep, (0, TRACK_M + 0.05), p.track_colour)
+    course.block("wall_end", (end, end + 0.015), depth_span, (0, TRACK_M + 0.05), p.track_colour)
     _add_wedge(course, p)
     at = (start, 0, TRACK_M + r)
     course.ball("ball", at, r, p.ball_colour, speed=p.speed_m_s, rolling=1e-4, sliding=0.1, density=2500)
 
-    span, top, back = (screened, end + 0.015), TRACK_M + p.wedge_height_m + 0.02, HALF_TRACK_M + 0.11
+    span, top, back = (occluder_at, end + 0.015), TRACK_M + p.wedge_height_m + 0.02, HALF_TRACK_M + 0.11
     course.mark("wedge", "base", p.wedge_colour)
     course.mark("mat", "mat")
     return course.scene(
@@ -106,23 +106,23 @@ def build(p: Params, physics: Physics) -> Scene:
 
 def _add_wedge(course: Course, p: Params) -> None:
     """Add a wedge, high end to the ball; a base and a back plate inside it collide."""
-    half, wide, high = p.wedge_length_m / 2, p.wedge_width_m / 2, p.wedge_height_m
-    profile = ((-half, 0.0), (half, 0.0), (half, 0.025), (-half, high))
+    half_length, width, height = p.wedge_length_m / 2, p.wedge_width_m / 2, p.wedge_height_m
+    profile = ((-half_length, 0.0), (half_length, 0.0), (half_length, 0.025), (-half_length, height))
     body = course.spec.worldbody.add_body(name="wedge", pos=[0, 0, TRACK_M])
     body.add_freejoint()
-    course.hull("wedge", [(x, y, z) for y in (-wide, wide) for x, z in profile], p.wedge_colour, body=body).mass = 0.0
-    base = (half - 0.001, wide - 0.001, 0.012)
+    course.hull("wedge", [(x, y, z) for y in (-width, width) for x, z in profile], p.wedge_colour, body=body).mass = 0.0
+    base = (half_length - 0.001, width - 0.001, 0.012)
     add_box(body, "base", (0, 0, 0.0121), base, p.wedge_colour, density=900)
-    plate_at, plate = (-p.direction * (half - 0.011), 0, high * 0.42), (0.01, wide - 0.001, high * 0.42)
+    plate_at, plate = (-p.direction * (half_length - 0.011), 0, height * 0.42), (0.01, width - 0.001, height * 0.42)
     add_box(body, "back", plate_at, plate, p.wedge_colour, density=900)
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
     """Read whether the wedge's middle is on the mat; 'no' only once both bodies rest."""
     wedge = motion.pos("wedge")
-    past = p.direction * wedge[:, 0] - p.mat_at_m
+    past_m = p.direction * wedge[:, 0] - p.mat_at_m
     rest_frame = still_from(wedge, motion.pos("ball"), within_m=0.002)
-    return Reading(yes_while(past > 0, rest_frame), float(abs(past[-1]) - p.wedge_length_m / 2))
+    return Reading(yes_while(past_m > 0, rest_frame), float(abs(past_m[-1]) - p.wedge_length_m / 2))
 
 
 def observe(frames: np.ndarray, slots: Mapping[str, str], ahead: float | None = None) -> str | None:

@@ -1,4 +1,4 @@
-"""Parts of scene families, one module for each section of a family's file.
+"""Share parts of scene families: a module for each section of a family's file.
 
 `vary`: what varies, a parameter and its range in one line. `course`: a world with a way through it; `ramp`, `dominoes`
 and `board`: what stands on some courses. `readings`: labels and margin of a run. `questions`: what is asked, and what

@@ -1,4 +1,4 @@
-"""A tilted board under glass on which balls run down past pegs.
+"""Build a tilted board under glass on which balls run down past pegs.
 
 Places are (across, up, out) in metres: from the middle of the board to the right, up its slope from its lower edge, and
 out of it towards the glass. Everything is added in the order of the calls, which is the order of the compiled model.
@@ -40,7 +40,7 @@ def peg_rows(least: int, most: int) -> Group:
     return together(draw)
 
 
-def looking_on(low: float, high: float) -> Any:
+def camera_elevation(low: float, high: float) -> Any:
     """Return the elevation of a camera off the normal of a board with a `tilt_deg`."""
     return drawn_by(lambda rng, so_far: uniform(rng, low, high) + so_far["tilt_deg"] - 90)
 
@@ -54,7 +54,7 @@ def slope(tilt_deg: float) -> tuple[np.ndarray, np.ndarray]:
     return np.array([0, math.cos(tilt), math.sin(tilt)]), np.array([0, -math.sin(tilt), math.cos(tilt)])
 
 
-def turned(angle_rad: float, axis: int) -> list[float]:
+def turn_quaternion(angle_rad: float, axis: int) -> list[float]:
     """Return the quaternion of a turn about the x axis (1), y axis (2) or z axis (3)."""
     return [math.cos(angle_rad / 2), *(math.sin(angle_rad / 2) * (i == axis) for i in (1, 2, 3))]
 
@@ -91,14 +91,14 @@ class Board:
         key.castshadow = False  # long shadows of pegs would clutter the board
         key.diffuse = list(light)
         self.body = self.spec.worldbody.add_body(
-            name="board", pos=[0, 0, LIFT_M], quat=turned(math.radians(tilt_deg), 1)
+            name="board", pos=[0, 0, LIFT_M], quat=turn_quaternion(math.radians(tilt_deg), 1)
         )
 
     def block(self, name: str, across: Span, up: Span, out: Span, colour: str, *, solid: bool = True) -> mujoco.MjsGeom:
         """Return a box of the board from its three spans; without solid, paint only."""
         spans = (across, up, out)
-        centre, half = [sum(s) / 2 for s in spans], [(s[1] - s[0]) / 2 for s in spans]
-        geom = add_box(self.body, name, centre, half, colour)
+        centre, half_size = [sum(s) / 2 for s in spans], [(s[1] - s[0]) / 2 for s in spans]
+        geom = add_box(self.body, name, centre, half_size, colour)
         if self._friction is not None:
             geom.friction = list(self._friction)
         if not solid:
@@ -111,12 +111,12 @@ class Board:
 
     def frame(self, bottom: float, top: float, colour: str, *, sill: bool = True) -> None:
         """Add sill, head and sides from `bottom` to `top`, and the glass, never drawn."""
-        side, outer, out = self.side, self.outer, (0, self.deep)
+        side, outer, depth_span = self.side, self.outer, (0, self.deep)
         if sill:
-            self.block("sill", (-outer, outer), (bottom - 2 * WALL_M, bottom), out, colour)
-        self.block("head", (-outer, outer), (top, top + 2 * WALL_M), out, colour)
-        self.block("left", (-outer, -side), (bottom, top), out, colour)
-        self.block("right", (side, outer), (bottom, top), out, colour)
+            self.block("sill", (-outer, outer), (bottom - 2 * WALL_M, bottom), depth_span, colour)
+        self.block("head", (-outer, outer), (top, top + 2 * WALL_M), depth_span, colour)
+        self.block("left", (-outer, -side), (bottom, top), depth_span, colour)
+        self.block("right", (side, outer), (bottom, top), depth_span, colour)
         glass = self.block("glass", (-outer, outer), (bottom, top), (self.deep, self.deep + 0.02), "white")
         glass.rgba, glass.friction, glass.priority = [1, 1, 1, 0], [0, 0, 0], 1
 
@@ -124,17 +124,17 @@ class Board:
         """Add a lively post up to the glass: round, or square with a corner up."""
         import mujoco
 
-        half = self.deep / 2
+        half_depth = self.deep / 2
         post = self.body.add_geom(
             name=name,
             type=mujoco.mjtGeom.mjGEOM_BOX if square else mujoco.mjtGeom.mjGEOM_CYLINDER,
-            pos=[*at, half],
-            size=[radius, radius if square else half, half],
+            pos=[*at, half_depth],
+            size=[radius, radius if square else half_depth, half_depth],
             rgba=rgba(colour),
         )
         post.solref, post.priority, post.condim, post.friction = list(self._bounce), 1, 6, [0.3, 0.002, 0.0001]
         if square:
-            post.quat = turned(math.pi / 4, 3)
+            post.quat = turn_quaternion(math.pi / 4, 3)
 
     def divider(self, i: int, x: float, up: Span, half_m: float, colour: str) -> None:
         """Add a wall `wall_<i>` between buckets, and a post on it: a flat end holds balls."""
@@ -154,8 +154,8 @@ class Board:
     ) -> None:
         """Add rows of pegs, without those that leave a ball just room to jam at a side.
 
-        heights: up the board; shifts: sideways; one a row. gap: from peg to peg. where: whether a peg may stand at a
-        place (across, up).
+        heights: up the board; shifts: sideways; one a row. gap: distance of neighbouring pegs. where: whether a peg may
+        stand at a place (across, up).
         """
         reach = self.side - radius
         for row, (height, shift) in enumerate(zip(heights, shifts, strict=True)):
@@ -183,9 +183,9 @@ class Board:
 
     def region(self, up: Span, out: float) -> Box:
         """Return the box around a strip of the board from side to side, `out` thick (m)."""
-        corners = np.array([self.up * height + self.normal * away for height in up for away in (0.0, out)])
-        (_, near, low), (_, far, high) = corners.min(axis=0).tolist(), corners.max(axis=0).tolist()
-        return Box((-self.outer, near, low + LIFT_M), (self.outer, far, high + LIFT_M))
+        corners = np.array([self.up * height + self.normal * distance for height in up for distance in (0.0, out)])
+        (_, near_y, low), (_, far_y, high) = corners.min(axis=0).tolist(), corners.max(axis=0).tolist()
+        return Box((-self.outer, near_y, low + LIFT_M), (self.outer, far_y, high + LIFT_M))
 
     def ends(self, top: float) -> tuple[Box, ...]:
         """Return the board's lower and the frame's upper edge, which must be in frame."""
@@ -203,6 +203,6 @@ def place(motion: Motion, body: str, tilt_deg: float) -> tuple[np.ndarray, np.nd
 
 
 def round_ball(frame: np.ndarray, colour: str) -> Blob | None:
-    """Return the largest round thing of a ball's size that has a colour."""
+    """Return the largest round region of a colour and of a ball's size."""
     candidates = blobs(colour_mask(frame, colour), min_area=90)
     return next((b for b in candidates if b.area < 900 and b.fill > 0.6 and 0.7 < b.box[2] / b.box[3] < 1.4), None)

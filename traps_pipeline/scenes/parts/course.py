@@ -1,4 +1,4 @@
-"""A world with one way through it, and what stands along the way.
+"""Build a world with one path through it, and the things along that path.
 
 Places are (along, across, up) in metres: along the way, away from the camera, above the floor. `direction` is +1 for a
 way to the right, -1 for one to the left: a course mirrors all that is placed on it, so that a family is written once.
@@ -48,7 +48,7 @@ MAST = (0.20, 0.20, 0.21, 1.0)  # neither black nor grey to an observer
 
 @dataclass(frozen=True)
 class Surface:
-    """How a surface meets what touches it.
+    """Contact properties of a surface.
 
     rolling: friction (m) that brings a rolling ball to rest. sliding: Coulomb friction, no unit. spinning: friction
     (m) against turning on the spot. solref: MuJoCo's contact, (-stiffness, -damping) or (time constant in s, damping
@@ -62,7 +62,7 @@ class Surface:
     priority: int = 1
 
     def on(self, geom: mujoco.MjsGeom) -> mujoco.MjsGeom:
-        """Give a geom this surface; returns the geom."""
+        """Give a geom this surface; return the geom."""
         geom.condim = 6  # with less, MuJoCo leaves rolling friction out
         geom.priority = self.priority
         geom.friction = [self.sliding, self.spinning, self.rolling]
@@ -87,7 +87,7 @@ def brake(radius_m: float, loss: float, length_m: float, physics: Physics) -> fl
 
 
 class Course:
-    """A world under construction. surface: of blocks without one, None: MuJoCo's own."""
+    """A world under construction. surface: default of blocks; None is MuJoCo's own."""
 
     def __init__(self, physics: Physics, direction: int = 1, surface: Surface | None = None) -> None:
         self.spec = new_spec(physics)
@@ -117,8 +117,8 @@ class Course:
     ) -> mujoco.MjsGeom:
         """Return a static box from its three spans; without solid, paint only."""
         middle = (self.direction * sum(along) / 2, sum(across) / 2, sum(up) / 2)
-        half = ((along[1] - along[0]) / 2, (across[1] - across[0]) / 2, (up[1] - up[0]) / 2)
-        geom = add_box(self.spec.worldbody, name, middle, half, colour)
+        half_size = ((along[1] - along[0]) / 2, (across[1] - across[0]) / 2, (up[1] - up[0]) / 2)
+        geom = add_box(self.spec.worldbody, name, middle, half_size, colour)
         surface = surface or self.surface
         if surface is not None:
             surface.on(geom)
@@ -145,8 +145,8 @@ class Course:
         (xa, za), (xb, zb) = sorted(((self.direction * u, z) for u, z in (a, b)))
         angle, half_thick = -float(np.arctan2(zb - za, xb - xa)), 0.008
         centre = ((xa + xb) / 2 - half_thick * np.sin(angle), 0.0, (za + zb) / 2 - half_thick * np.cos(angle))
-        half = (float(np.hypot(xb - xa, zb - za)) / 2, half_width, half_thick)
-        return add_box(self.spec.worldbody, name, centre, half, colour, euler_y=angle)
+        half_size = (float(np.hypot(xb - xa, zb - za)) / 2, half_width, half_thick)
+        return add_box(self.spec.worldbody, name, centre, half_size, colour, euler_y=angle)
 
     def slab(self, name: str, centre: Vec3, half: Vec3, colour: str, *, falls_rad: float = 0.0) -> mujoco.MjsGeom:
         """Return a static box from its centre and half sizes, tilted along the way."""
@@ -359,19 +359,19 @@ class Course:
         ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
         across = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
         points = np.concatenate([box.corners() for box in (*in_view, cover)])
-        upright = np.array([0.0, 0.0, np.cos(down)]) + ahead * np.sin(down)
-        scale = max(np.ptp(_along(points, across)), np.ptp(_along(points, upright)) * 4 / 3)
-        wide, high = FLAG * scale, FLAG_SHAPE * FLAG * scale / float(np.cos(down))
+        up_vector = np.array([0.0, 0.0, np.cos(down)]) + ahead * np.sin(down)
+        scale = max(np.ptp(_project(points, across)), np.ptp(_project(points, up_vector)) * 4 / 3)
+        width, height = FLAG * scale, FLAG_SHAPE * FLAG * scale / float(np.cos(down))
         corners, flags, boxes = cover.corners(), [], []
-        for phrase, (foot, colour) in sorted(self._marks.items(), key=lambda mark: float(_along(mark[1][0], across))):
+        for phrase, (foot, colour) in sorted(self._marks.items(), key=lambda mark: float(_project(mark[1][0], across))):
             place = np.array(foot)
-            over = float((corners[:, 2] + _along(corners - place, ahead) * np.tan(down)).max())
-            over += FLAG_CLEAR_M + high / 2
-            at = float(_along(place, across))
-            over += high * 1.2 * max((n + 1 for n, flag_at in flags if abs(at - flag_at) < 1.15 * wide), default=0)
-            flags.append((int(any(abs(at - flag_at) < 1.15 * wide for _, flag_at in flags)), at))
-            centre = place + across * wide / 2 + np.array([0, 0, over - place[2]])
-            boxes.append(self._add_flag(phrase, place, centre, (wide, high), p.azimuth_deg, colour))
+            top_z = float((corners[:, 2] + _project(corners - place, ahead) * np.tan(down)).max())
+            top_z += FLAG_CLEAR_M + height / 2
+            at = float(_project(place, across))
+            top_z += height * 1.2 * max((n + 1 for n, flag_at in flags if abs(at - flag_at) < 1.15 * width), default=0)
+            flags.append((int(any(abs(at - flag_at) < 1.15 * width for _, flag_at in flags)), at))
+            centre = place + across * width / 2 + np.array([0, 0, top_z - place[2]])
+            boxes.append(self._add_flag(phrase, place, centre, (width, height), p.azimuth_deg, colour))
         return boxes
 
     def _add_flag(
@@ -386,12 +386,12 @@ class Course:
         """Add a mast and its flag, without mass or contact; return the flag's box."""
         import mujoco
 
-        top, half = float(centre[2] + size[1] / 2), np.radians(azimuth_deg - 90) / 2
+        top, half_turn = float(centre[2] + size[1] / 2), np.radians(azimuth_deg - 90) / 2
         mast = self.spec.worldbody.add_geom(name=f"mast {phrase}", type=mujoco.mjtGeom.mjGEOM_CYLINDER)
         mast.pos, mast.size = [foot[0], foot[1], (foot[2] + top) / 2], [0.05 * size[0], (top - foot[2]) / 2, 0]
         flag = self.spec.worldbody.add_geom(name=flag_of(phrase), type=mujoco.mjtGeom.mjGEOM_BOX)
         flag.pos, flag.size = centre.tolist(), [size[0] / 2, 0.02 * size[0], size[1] / 2]
-        flag.quat = [float(np.cos(half)), 0.0, 0.0, float(np.sin(half))]
+        flag.quat = [float(np.cos(half_turn)), 0.0, 0.0, float(np.sin(half_turn))]
         for geom, paint in ((mast, MAST), (flag, colour)):
             geom.rgba, geom.contype, geom.conaffinity, geom.mass = list(paint), 0, 0, 0
         (x, y, z), reach, half_high = (float(value) for value in centre), size[0] / 2, size[1] / 2
@@ -409,7 +409,7 @@ class Course:
         return length if self.direction > 0 else 0.0
 
     def cover(self, along: Span, across: Span, high: float) -> Box:
-        """Return what the occluder must hide of things up to `high`, with their shadows."""
+        """Return the box that hides things up to `high` m, with their shadows."""
         right = SHADOW_RIGHT * high if self.direction > 0 else 0.01
         return self.box(along, (across[0], across[1] + SHADOW_BACK * high), (0, high), left=0.01, right=right)
 
@@ -456,11 +456,11 @@ class Course:
 
 def part_colours(p: Any) -> dict[str, str]:
     """Return part -> colour, from the fields `<part>_colour` of the parameters."""
-    names = [each.name for each in fields(p) if each.name.endswith("_colour")]
+    names = [member.name for member in fields(p) if member.name.endswith("_colour")]
     return {name.removesuffix("_colour"): getattr(p, name) for name in names}
 
 
-def _along(points: Any, axis: np.ndarray) -> np.ndarray:
+def _project(points: Any, axis: np.ndarray) -> np.ndarray:
     """Return how far points (..., 3) lie along an axis (3,), summed in one order.
 
     The last bit of a matrix product differs between CPUs, and these numbers go into the model.

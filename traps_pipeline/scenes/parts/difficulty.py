@@ -1,6 +1,6 @@
 """Make scenes harder to follow: distractors, faster events, longer rows.
 
-The settings belong to a draw (`traps benchmark sample`). What they come to in one scene is stored with its parameters,
+The settings belong to a draw (`traps benchmark sample`). Their values for one scene is stored with its parameters,
 as `difficulty`, and its speed with its physics; a record without either is as scenes were before there were settings.
 """
 
@@ -31,11 +31,11 @@ if TYPE_CHECKING:
 Shape = Literal["ball", "puck"]
 Colour = Literal["red", "green", "blue", "yellow", "orange", "cyan", "purple"]
 DISTRACTOR = "distractor_"  # begins the name of a distractor's body and geom
-MOST_DISTRACTORS = 3
+MAX_DISTRACTORS = 3
 SPEEDS = (1.0, 1.5, 2.0)  # each a whole number of simulation steps from frame to frame
 # The greatest speed of each family that takes one: most draws still show half a second of motion before the occluder
 # and settle after 0.8 s or more. In other families the certificates `referents` or `cut` would be lost.
-FASTEST: Mapping[str, float] = {
+MAX_SPEEDS: Mapping[str, float] = {
     **dict.fromkeys(("balance", "behind_wall", "bounce", "chain", "domino_branch", "head_on", "hidden_collision"), 2.0),
     **dict.fromkeys(("hidden_drop", "launch", "lever_gate", "roll_stop", "spinner", "under_bridge"), 2.0),
     **dict.fromkeys(("pendulum", "slide", "stack", "topple", "tower", "transfer", "wedge_push"), 1.5),
@@ -43,7 +43,7 @@ FASTEST: Mapping[str, float] = {
 RADIUS = 0.026, 0.030  # of a distractor, as a share of the scene's width
 LANE = 2.4  # radii from lane to lane: each distractor has one of its own, so that they pass each other
 PUCK_HALF = 0.45  # of its radius
-LEAST_DOWN_DEG = 8.0
+MIN_DOWN_DEG = 8.0
 WAY = (0.5, 0.9)  # share of the scene's width that a distractor crosses
 BALL_COLOURS: dict[str, Colour] = {colour: colour for colour in get_args(Colour)}  # by their word
 
@@ -52,7 +52,7 @@ BALL_COLOURS: dict[str, Colour] = {colour: colour for colour in get_args(Colour)
 class Difficulty:
     """Settings of a draw.
 
-    distractors: how many. speed: how many times as fast everything happens. longer: rows, lanes and counts from the
+    distractors: their number. speed: factor on the speed of all events. longer: rows, lanes and counts from the
     longer ranges of their family.
     """
 
@@ -61,24 +61,24 @@ class Difficulty:
     longer: bool = False
 
     def settings(self) -> dict[str, Any]:
-        """Return the settings that are not the usual ones."""
-        return {name: value for name, value in asdict(self).items() if value != getattr(USUAL, name)}
+        """Return the settings that differ from the defaults."""
+        return {name: value for name, value in asdict(self).items() if value != getattr(DEFAULT_DIFFICULTY, name)}
 
 
-USUAL = Difficulty()
+DEFAULT_DIFFICULTY = Difficulty()
 
 
-def untakeable(family: Family, difficulty: Difficulty) -> list[str]:
-    """Return which of the settings a family cannot be drawn with.
+def unsupported_settings(family: Family, difficulty: Difficulty) -> list[str]:
+    """Return the settings that a family does not support.
 
     Distractors move, and the board that closes a chaotic control must hide all that moves.
     """
-    takes = {
+    is_supported = {
         "distractors": family.taxonomy == "occlusion" and family.category not in EXTENSION_CATEGORIES,
-        "speed": difficulty.speed <= FASTEST.get(family.name, 1.0),
+        "speed": difficulty.speed <= MAX_SPEEDS.get(family.name, 1.0),
         "longer": vary.can_be_longer(family.params),
     }
-    return [name for name in difficulty.settings() if not takes[name]]
+    return [name for name in difficulty.settings() if not is_supported[name]]
 
 
 _PLAUSIBLE = ConfigDict(extra="forbid", allow_inf_nan=False)
@@ -102,10 +102,10 @@ class Distractor:
 
 @dataclass(frozen=True)
 class SceneDifficulty:
-    """What the settings of a draw come to in one scene."""
+    """The values that a draw's settings take in one scene."""
 
     __pydantic_config__ = _PLAUSIBLE
-    distractors: Annotated[tuple[Distractor, ...], Field(max_length=MOST_DISTRACTORS)] = ()
+    distractors: Annotated[tuple[Distractor, ...], Field(max_length=MAX_DISTRACTORS)] = ()
     longer: StrictBool = False
 
     @staticmethod
@@ -136,28 +136,30 @@ def draw_distractors(
     whole clip.
     """
     low, high, front = float(points[:, 0].min()), float(points[:, 0].max()), float(points[:, 1].min())
-    hides = 2 / np.tan(np.radians(max(-scene.view.elevation_deg, LEAST_DOWN_DEG)))  # so many radii behind a ball
-    most = RADIUS[1] * (high - low)
+    hidden_depth = 2 / np.tan(np.radians(max(-scene.view.elevation_deg, MIN_DOWN_DEG)))  # so many radii behind a ball
+    max_radius = RADIUS[1] * (high - low)
     texts = (wording.question, wording.answerable_question.question)
     words = {*re.findall(r"\w+", " ".join((*texts, *wording.answerable_question.labels, *wording.labels)).lower())}
-    asked = re.findall(r"\w+", wording.question)
-    coloured = dict.fromkeys((*asked, *scene.inventory.colours))
-    named: list[Colour] = [BALL_COLOURS[word] for word in coloured if word in BALL_COLOURS]
-    taken = words | {*scene.inventory.colours}
+    question_words = re.findall(r"\w+", wording.question)
+    colour_words = dict.fromkeys((*question_words, *scene.inventory.colours))
+    named_colours: list[Colour] = [BALL_COLOURS[word] for word in colour_words if word in BALL_COLOURS]
+    taken_colours = words | {*scene.inventory.colours}
     things = list[Distractor]()
     for number, lane in enumerate(rng.permutation(count)):
-        like = named[(number // 2) % len(named)]
-        near = [] if number % 2 == 0 else _like_and_free(like, taken | {thing.colour for thing in things})
-        shape: Shape = "ball" if near else "puck"
+        like = named_colours[(number // 2) % len(named_colours)]
+        similar_colours = (
+            [] if number % 2 == 0 else _like_and_free(like, taken_colours | {thing.colour for thing in things})
+        )
+        shape: Shape = "ball" if similar_colours else "puck"
         ahead = getattr(p, "direction", 0) if shape == "ball" else 0
-        radius, towards = rng.uniform(*RADIUS) * (high - low), ahead or int(rng.choice([-1, 1]))
-        way, begins = rng.uniform(*WAY), 0.0 if ahead else rng.uniform(0.0, 1.0)
+        radius, direction = rng.uniform(*RADIUS) * (high - low), ahead or int(rng.choice([-1, 1]))
+        path_share, start_share = rng.uniform(*WAY), 0.0 if ahead else rng.uniform(0.0, 1.0)
         room = high - low - 2 * radius
-        start = begins * (1 - way) * room
-        x = low + radius + start if towards > 0 else high - radius - start
-        y = front - most * (1 + hides + LANE * int(lane))
-        colour = near[int(rng.integers(len(near)))] if near else like
-        speed = towards * way * room / duration_s
+        start = start_share * (1 - path_share) * room
+        x = low + radius + start if direction > 0 else high - radius - start
+        y = front - max_radius * (1 + hidden_depth + LANE * int(lane))
+        colour = similar_colours[int(rng.integers(len(similar_colours)))] if similar_colours else like
+        speed = direction * path_share * room / duration_s
         things.append(Distractor(shape, colour, (round(x, 4), round(y, 4)), round(radius, 4), round(speed, 4)))
     return tuple(things)
 
@@ -165,8 +167,8 @@ def draw_distractors(
 def _like_and_free(colour: str, taken: Collection[str]) -> list[Colour]:
     """Return free colours that are easily taken for a colour, else all free ones."""
     free: list[Colour] = [other for word, other in BALL_COLOURS.items() if word not in taken]
-    alike: list[Colour] = [other for other in free if {colour, other} in LOOK_ALIKE]
-    return alike or free
+    similar_colours: list[Colour] = [other for other in free if {colour, other} in LOOK_ALIKE]
+    return similar_colours or free
 
 
 # --- building ---------------------------------------------------------------------------------------------------------
@@ -193,11 +195,11 @@ def _add(spec: mujoco.MjSpec, name: str, thing: Distractor) -> None:
     import mujoco
 
     ball = thing.shape == "ball"
-    half = thing.radius_m if ball else PUCK_HALF * thing.radius_m
-    body = spec.worldbody.add_body(name=name, pos=[*thing.place_m, half])
+    half_height = thing.radius_m if ball else PUCK_HALF * thing.radius_m
+    body = spec.worldbody.add_body(name=name, pos=[*thing.place_m, half_height])
     body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[1, 0, 0])
     geom = body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_SPHERE if ball else mujoco.mjtGeom.mjGEOM_CYLINDER)
-    geom.size, geom.rgba = [thing.radius_m, 0 if ball else half, 0], rgba(thing.colour)
+    geom.size, geom.rgba = [thing.radius_m, 0 if ball else half_height, 0], rgba(thing.colour)
     geom.contype = geom.conaffinity = 0
 
 

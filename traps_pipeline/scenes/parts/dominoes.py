@@ -1,4 +1,4 @@
-"""Two rows of dominoes with a hand-off: the second never pushes back on the first.
+"""Build two rows of dominoes; the second never pushes back on the first.
 
 A rolling ball sets off the first row, which is in view. Its last domino only kicks a second ball, which is behind the
 occluder from the start and which two posts stop after it has struck the second row. Lengths are in domino heights
@@ -34,7 +34,7 @@ class Size:
 
 @dataclass(frozen=True)
 class Domino:
-    """A domino of the second row. place: in spacings, aside: lies flat behind the row."""
+    """A domino of the second row. place: in spacings; aside: it lies flat behind."""
 
     name: str
     place: int
@@ -53,10 +53,10 @@ def add_rows(
     plank_colour: str,
     speed_m_s: float,
 ) -> Span:
-    """Add plank, balls, both rows and posts; return where the covered part is (m).
+    """Add plank, balls, both rows and posts; return the covered part's span (m).
 
     first: the colours of the first row, whose bodies are `domino_0` and so on. places: how many spacings the second row
-    is long. speed_m_s: of the ball that sets all off.
+    is long. speed_m_s: speed of the first ball.
     """
     h = size.height_m
     last = (len(first) - 1) * size.spacing
@@ -86,20 +86,20 @@ def add_domino(course: Course, size: Size, domino: Domino, row_at: float) -> Non
     h = size.height_m
     x = (row_at + domino.place * size.spacing) * h
     at = (x, h * (size.width + 0.10), size.thickness * h / 2) if domino.aside else (x, 0.0, (PLANK + 0.5) * h)
-    half = (size.thickness * h / 2, size.width * h / 2, h / 2)
-    body = course.free_box(domino.name, at, half, domino.colour, density=500, sliding=0.2, solref=(0.006, 1))
+    half_size = (size.thickness * h / 2, size.width * h / 2, h / 2)
+    body = course.free_box(domino.name, at, half_size, domino.colour, density=500, sliding=0.2, solref=(0.006, 1))
     if domino.aside:
         body.quat = [0.5**0.5, 0, 0.5**0.5, 0]
 
 
 def cover(course: Course, size: Size, along: Span, back: float) -> Box:
-    """Return what the occluder must hide, `back` heights deep, with all shadows."""
+    """Return the box that the occluder must hide, `back` heights deep, with shadows."""
     h = size.height_m
     across = (-h * (size.width / 2 + 0.10), h * back)
     return course.box(along, across, (0, (PLANK + 1.04) * h), right=course.ahead(SHADOW_RIGHT * h))
 
 
 def in_view(course: Course, size: Size, along: Span, back: float) -> Box:
-    """Return what the camera must see of the covered part."""
+    """Return the box of the covered part that the camera must have in frame."""
     h = size.height_m
     return course.box(along, (-h * (size.width / 2 + 0.10), h * back), (0, (PLANK + 1.0) * h))

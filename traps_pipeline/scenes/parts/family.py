@@ -1,4 +1,4 @@
-"""A family put together from its parts, as the registry takes it."""
+"""Assemble a family from its parts, for the registry."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 
 from traps_pipeline.scenes.parts import vary
 from traps_pipeline.scenes.parts.difficulty import SceneDifficulty, add_distractors
-from traps_pipeline.scenes.parts.look import OF_OCCLUSION, Look, apply_look, look_of
+from traps_pipeline.scenes.parts.look import OCCLUSION_PARTS, Look, apply_look, look_of
 from traps_pipeline.scenes.parts.observers import Observer
 from traps_pipeline.scenes.parts.questions import Aside, Question
 from traps_pipeline.scenes.parts.vision import after_occluder, before_occluder, is_still, without_flags
 from traps_pipeline.scenes.physics.kit import Family, Motion, Physics, Reading, Scene
 from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH
 
-USUAL_PHYSICS = Physics()
+DEFAULT_PHYSICS = Physics()
 
 
 def scene_family(
@@ -32,7 +32,7 @@ def scene_family(
     observe: Observer,
     foresee: Observer | None = None,
     look: Observer | None = None,
-    physics: Physics = USUAL_PHYSICS,
+    physics: Physics = DEFAULT_PHYSICS,
     min_margin_m: float = 0.005,
     sub_scenario: str | None = None,
     legible: Callable[[Motion, Any], Sequence[tuple[tuple[str, ...], float]]] | None = None,
@@ -59,12 +59,18 @@ def scene_family(
         if frames.shape[1:3] != (HEIGHT, WIDTH):  # what an observer takes for large is so at this size
             frames = np.stack([cv2.resize(frame, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA) for frame in frames])
         visible = before_occluder(frames)  # what an occluder covers at the end was seen before it came
-        unflagged = visible if twins is None else without_flags(visible)
+        frames_without_flags = visible if twins is None else without_flags(visible)
         if foresee is not None and len(visible) < len(frames):
-            rests = is_still(visible) or is_still(visible[:-1])  # the shadow of an occluder may come before it does
-            return _first(unflagged, slots, (observe, foresee) if rests else (foresee, observe))
-        answer = observe(unflagged, slots)
-        if answer is None and look is not None and len(end := after_occluder(unflagged)) < len(unflagged):
+            is_at_rest = is_still(visible) or is_still(
+                visible[:-1]
+            )  # the shadow of an occluder may come before it does
+            return _first_answer(frames_without_flags, slots, (observe, foresee) if is_at_rest else (foresee, observe))
+        answer = observe(frames_without_flags, slots)
+        if (
+            answer is None
+            and look is not None
+            and len(end := after_occluder(frames_without_flags)) < len(frames_without_flags)
+        ):
             return look(end, slots)
         return answer
 
@@ -87,11 +93,11 @@ def scene_family(
         min_margin_m=min_margin_m,
         twins=twins,
         perturbation=perturbation,
-        looks=(() if twins is None else OF_OCCLUSION) if looks is None else looks,
+        looks=(() if twins is None else OCCLUSION_PARTS) if looks is None else looks,
         check=vary.check,
     )
 
 
-def _first(frames: np.ndarray, slots: Mapping[str, str], observers: Sequence[Observer]) -> str | None:
+def _first_answer(frames: np.ndarray, slots: Mapping[str, str], observers: Sequence[Observer]) -> str | None:
     """Return the answer of the first observer that has one."""
     return next((answer for observe in observers if (answer := observe(frames, slots)) is not None), None)

@@ -1,4 +1,4 @@
-"""Floors of two muted colours in a pattern, which nothing that moves depends on."""
+"""Draw floors with a pattern of two muted colours; no motion depends on them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TONES: Mapping[str, tuple[float, float, float]] = {
     "slate": (0.33, 0.36, 0.39),
     "coal": (0.21, 0.21, 0.20),
 }
-PALE = ("chalk", "sand", "clay", "stone", "moss")  # on which what is black, and the masts of flags, show
+PALE_TONES = ("chalk", "sand", "clay", "stone", "moss")  # on which what is black, and the masts of flags, show
 PATTERNS = ("checks", "stripes", "planks")
 PLAIN_SHARE = 0.08  # of floors that have no pattern: two of a family would look alike
 TEXELS = 256  # of a side of the texture, which shows one repeat of the pattern
@@ -33,10 +33,10 @@ def floors(tones: Sequence[str] = tuple(TONES)) -> Group:
 
     def draw(rng: np.random.Generator, so_far: Drawn) -> tuple[str, tuple[str, ...], float, float, tuple[float, ...]]:
         pattern = PATTERNS[int(rng.integers(len(PATTERNS)))] if rng.random() > PLAIN_SHARE else "plain"
-        chosen = tuple(str(tone) for tone in rng.permutation(list(tones))[:2])
+        tone_pair = tuple(str(tone) for tone in rng.permutation(list(tones))[:2])
         repeat = round(float(rng.uniform(0.5, 1.5)), 2)
         turn = round(float(rng.uniform(-45, 45)), 1)
-        return pattern, chosen, repeat, turn, tuple(round(float(x), 2) for x in rng.uniform(0, repeat, 2))
+        return pattern, tone_pair, repeat, turn, tuple(round(float(x), 2) for x in rng.uniform(0, repeat, 2))
 
     return together(draw)
 
@@ -56,8 +56,8 @@ def lay_floor(spec: mujoco.MjSpec, p: Any) -> None:
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "floor"
     material.texuniform, material.texrepeat = True, [1 / p.floor_repeat_m] * 2
     floor = spec.geom("floor")
-    half = np.radians(p.floor_turn_deg) / 2
-    floor.quat, floor.pos = [np.cos(half), 0, 0, np.sin(half)], [*p.floor_shift_m, 0]
+    half_turn = np.radians(p.floor_turn_deg) / 2
+    floor.quat, floor.pos = [np.cos(half_turn), 0, 0, np.sin(half_turn)], [*p.floor_shift_m, 0]
 
 
 def _shares(pattern: str) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Looks of a scene: floor, light, occluder, bystanders, camera, frame size.
+"""Vary a scene's look: floor, light, occluder, bystanders, camera, frame size.
 
 A look is a value that is drawn with a scenario and stored with its parameters, as `look`; a record without one looks as
 scenes did before there were looks. It touches nothing that moves, so the trajectory is the same; camera, occluder and
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.scenes.parts.floor import PALE, TEXELS, TONES, floors, lay_floor
+from traps_pipeline.scenes.parts.floor import PALE_TONES, TEXELS, TONES, floors, lay_floor
 from traps_pipeline.scenes.physics.kit import COLOURS, Scene, uniform
 from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH
 from traps_pipeline.scenes.picture.render import SUPERSAMPLE
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 # What may vary, as `traps benchmark sample --look` names it.
 PARTS = ("floor", "pale-floor", "light", "panel", "bystanders", "camera", "material", "size")
-OF_OCCLUSION = ("bystanders", "camera", "light", "material", "pale-floor", "panel")  # of a family that says nothing
+OCCLUSION_PARTS = ("bystanders", "camera", "light", "material", "pale-floor", "panel")  # of a family that says nothing
 # Colours of the occluder (sRGB): dark, dull, and none that a question names or that is taken for one in another light.
 OCCLUDERS: Mapping[str, tuple[float, float, float]] = {
     "navy": COLOURS["navy"],
@@ -37,7 +37,7 @@ OCCLUDERS: Mapping[str, tuple[float, float, float]] = {
 MATERIALS = ("plain", "slats", "tiles")
 LINE_TONE, LINES_PER_M, LINE_SHARE = 1.6, 8.0, 0.08
 SIZES = {"360p": 1, "720p": 2}  # of a frame: how many times as fine as 480x360
-_FLOORS = {"pale-floor": floors(PALE), "floor": floors()}  # the first that is named counts
+_FLOORS = {"pale-floor": floors(PALE_TONES), "floor": floors()}  # the first that is named counts
 _FLOOR_FIELDS = ("floor_pattern", "floor_tones", "floor_repeat_m", "floor_turn_deg", "floor_shift_m")
 BYSTANDERS = (0, 0, 2, 3)  # how many stand there: none in half of the scenes
 BEHIND_M = (0.25, 0.9)  # so far behind all that is shown a bystander stands: it hides nothing and shades nothing
@@ -45,12 +45,12 @@ BEHIND_M = (0.25, 0.9)  # so far behind all that is shown a bystander stands: it
 
 @dataclass(frozen=True)
 class Look:
-    """Look of a scene. None or an empty field leaves things as without a look.
+    """The look of a scene; a field that is None or empty changes nothing.
 
-    floor_*: `parts.floor`. light_turn_deg: of the key light about the vertical; light: what its brightness is
-    multiplied by, RGB. panel: a name of `OCCLUDERS`. bystanders: (across, behind, half width, half height) in metres,
-    from the middle of the back edge of what is shown, and a tone each. orbit_deg: camera, around and up. material: of
-    the occluder, of `MATERIALS`. size: of a frame, of `SIZES`.
+    floor_*: see `parts.floor`. light_turn_deg: turn of the key light about the vertical; light: factors of its
+    brightness, RGB. panel: a name of `OCCLUDERS`. bystanders: (across, behind, half width, half height) in metres,
+    from the middle of the back edge of what is shown, and a tone each. orbit_deg: turn of the camera, around and up.
+    material: the occluder's, a name of `MATERIALS`. size: the frame's, a name of `SIZES`.
     """
 
     floor_pattern: str | None = None
@@ -79,9 +79,9 @@ class Look:
                 raise ValueError(f"look: no tone {name!r}; there are {', '.join(TONES)}")
         if look.panel not in (None, *OCCLUDERS):
             raise ValueError(f"look: no panel {look.panel!r}; there are {', '.join(OCCLUDERS)}")
-        for name, allowed in (("material", MATERIALS), ("size", SIZES)):
-            if getattr(look, name) not in allowed:
-                raise ValueError(f"look: no {name} {getattr(look, name)!r}; there are {', '.join(allowed)}")
+        for name, allowed_values in (("material", MATERIALS), ("size", SIZES)):
+            if getattr(look, name) not in allowed_values:
+                raise ValueError(f"look: no {name} {getattr(look, name)!r}; there are {', '.join(allowed_values)}")
         return look
 
 
@@ -99,9 +99,9 @@ def draw_look(rng: np.random.Generator, parts: Collection[str]) -> Look | None:
     if floor is not None:
         fields_drawn |= dict(zip(_FLOOR_FIELDS, floor.draw(rng, {}, len(_FLOOR_FIELDS)), strict=True))
     if "light" in parts:
-        bright, warm = uniform(rng, 0.8, 1.1), uniform(rng, -0.06, 0.06)
+        brightness, warmth = uniform(rng, 0.8, 1.1), uniform(rng, -0.06, 0.06)
         fields_drawn["light_turn_deg"] = uniform(rng, -15, 15)
-        fields_drawn["light"] = tuple(round(bright * (1 + tint), 3) for tint in (warm, 0.0, -warm))
+        fields_drawn["light"] = tuple(round(brightness * (1 + tint), 3) for tint in (warmth, 0.0, -warmth))
     if "panel" in parts:
         fields_drawn["panel"] = str(rng.choice(list(OCCLUDERS)))
     if "bystanders" in parts:
@@ -129,7 +129,7 @@ def look_of(params: Any) -> Look | None:
 
 
 def fineness(params: Any) -> int:
-    """Return how many times as fine as 480x360 the frames of a scene are."""
+    """Return the factor by which a scene's frames are finer than 480x360."""
     look = look_of(params)
     return 1 if look is None else SIZES[look.size]
 
@@ -137,8 +137,8 @@ def fineness(params: Any) -> int:
 def frame_size(record: Mapping[str, Any]) -> tuple[int, int]:
     """Return width and height (px) of the clips of a record, from its parameters."""
     look = record.get("look")
-    fine = 1 if look is None else SIZES[Look.from_record(look).size]
-    return WIDTH * fine, HEIGHT * fine
+    scale = 1 if look is None else SIZES[Look.from_record(look).size]
+    return WIDTH * scale, HEIGHT * scale
 
 
 def paint_occluders(spec: mujoco.MjSpec, occluders: Sequence[mujoco.MjsGeom], params: Any) -> None:
@@ -163,9 +163,11 @@ def paint_occluders(spec: mujoco.MjSpec, occluders: Sequence[mujoco.MjsGeom], pa
     material.texuniform, material.texrepeat = True, [LINES_PER_M] * 2
     for geom in occluders:
         geom.material, geom.rgba = "occluder", [1, 1, 1, 1]
-        wide, thick, tall = (float(half) for half in geom.size)  # a texture lies in a box's own x and y: stand it up
+        width, thickness, height = (
+            float(half_size) for half_size in geom.size
+        )  # a texture lies in a box's own x and y: stand it up
         cos, _, _, sin = (float(part) for part in geom.quat)
-        geom.size, geom.quat = [wide, tall, thick], [part / np.sqrt(2) for part in (cos, cos, sin, sin)]
+        geom.size, geom.quat = [width, height, thickness], [part / np.sqrt(2) for part in (cos, cos, sin, sin)]
 
 
 def apply_look(scene: Scene, look: Look | None) -> Scene:
@@ -179,10 +181,13 @@ def apply_look(scene: Scene, look: Look | None) -> Scene:
     if SIZES[look.size] > 1:  # a renderer reads from the model how fine it draws
         scale = SUPERSAMPLE * SIZES[look.size]
         scene.spec.visual.global_.offwidth, scene.spec.visual.global_.offheight = WIDTH * scale, HEIGHT * scale
-    around, up = look.orbit_deg
+    azimuth_turn, elevation_turn = look.orbit_deg
     view = scene.view
     return replace(
-        scene, view=replace(view, azimuth_deg=view.azimuth_deg + around, elevation_deg=view.elevation_deg + up)
+        scene,
+        view=replace(
+            view, azimuth_deg=view.azimuth_deg + azimuth_turn, elevation_deg=view.elevation_deg + elevation_turn
+        ),
     )
 
 
@@ -201,9 +206,12 @@ def _add_bystanders(scene: Scene, look: Look) -> None:
     corners = np.concatenate([box.corners() for box in (*scene.framed, *([scene.cover] if scene.cover else []))])
     middle, back = float(corners[:, 0].mean()), float(corners[:, 1].max())
     for i, (place, tone) in enumerate(zip(look.bystanders, look.bystander_tones, strict=True)):
-        across, behind, half, tall = place
+        across, distance_behind, half_width, half_height = place
         box = scene.spec.worldbody.add_geom(name=f"bystander_{i}", type=mujoco.mjtGeom.mjGEOM_BOX)
-        box.pos, box.size = [middle + across, back + behind + half, tall], [half, half, tall]
+        box.pos, box.size = (
+            [middle + across, back + distance_behind + half_width, half_height],
+            [half_width, half_width, half_height],
+        )
         box.rgba, box.contype, box.conaffinity = [*TONES[tone], 1], 0, 0
 
 

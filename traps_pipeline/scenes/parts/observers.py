@@ -1,4 +1,4 @@
-"""Observers, which answer a question by its slots from frames, or abstain.
+"""Build observers, which answer a question from frames and its slots, or abstain.
 
 An `Observer(frames, slots)` gets the sampled frames (N, 360, 480, 3) RGB and what the question names, read back from
 its templates: part -> colour, and 'choices' where it offers some. It gives a label, or None if the decisive thing is
@@ -33,8 +33,8 @@ Finder = Callable[[np.ndarray, str], Blob | None]
 AHEAD = 1.5  # frames after which what is about to happen has happened
 BEGUN_PX = 3.0  # what is so far from its first place has left it
 FLIGHT = 3.0  # for so many frames a thing may fly on
-STRUCK = 0.2  # of a thing's area: so much changes where something moves at it
-LOST = 2  # for so many frames a moving thing may be out of sight
+STRUCK_SHARE = 0.2  # of a thing's area: so much changes where something moves at it
+MAX_FRAMES_LOST = 2  # for so many frames a moving thing may be out of sight
 
 
 # --- one thing in one frame -------------------------------------------------------------------------------------------
@@ -50,7 +50,7 @@ def compact_blob(
 ) -> Blob | None:
     """Return the largest region of a colour that may be a ball: filled, about round.
 
-    area: at most so many pixels. shape: width over height, between. fill: least share of its bounding box.
+    area: maximum in pixels. shape: range of width over height. fill: minimum share of its bounding box.
     """
     for blob in blobs(colour_mask(frame, colour), 60):
         if blob.area < area and shape[0] < blob.box[2] / blob.box[3] < shape[1] and blob.fill > fill:
@@ -65,8 +65,10 @@ def offered(slots: Mapping[str, str], otherwise: Sequence[str]) -> Sequence[str]
 
 def colours_of_balls(frames: np.ndarray, slots: Mapping[str, str], pool: Sequence[str]) -> Sequence[str]:
     """Return the offered colours, or else those of the pool that a ball has at first."""
-    at_first = [colour for colour in pool if sum(compact_blob(frame, colour) is not None for frame in frames[:3]) >= 2]
-    return offered(slots, at_first)
+    ball_colours = [
+        colour for colour in pool if sum(compact_blob(frame, colour) is not None for frame in frames[:3]) >= 2
+    ]
+    return offered(slots, ball_colours)
 
 
 def round_blob(frame: np.ndarray, colour: str, *, fill: float = 0.9, longer: float = 1.9) -> Blob | None:
@@ -81,48 +83,48 @@ def round_blob(frame: np.ndarray, colour: str, *, fill: float = 0.9, longer: flo
 
 
 def is_upper_half_in_place(frames: np.ndarray, colour: str, first: Blob) -> bool:
-    """Return whether a thing's upper half is in the last frame where it was at first."""
+    """Return whether a thing's upper half keeps its initial place in the last frame."""
     x, y, width, height = first.box
     part = np.s_[y : y + height // 2, x : x + width]
-    before, after = (colour_mask(frame, colour)[part] for frame in (frames[0], frames[-1]))
-    return bool((before & after).sum() > 0.7 * before.sum())
+    mask_before, mask_after = (colour_mask(frame, colour)[part] for frame in (frames[0], frames[-1]))
+    return bool((mask_before & mask_after).sum() > 0.7 * mask_before.sum())
 
 
 # --- where a thing comes to be ---------------------------------------------------------------------------------------
 
 
 def end_of(path: Sequence[Blob | None], ahead: float | None = None, tolerance_px: float = 1.5) -> Blob | None:
-    """Return the thing at rest, or, with `ahead`, so many frames later; else None."""
+    """Return the thing at rest, or extrapolated by `ahead` frames; else None."""
     if ahead is not None:
-        return carried_on(path, ahead)
+        return extrapolate(path, ahead)
     return path[-1] if is_at_rest(path, tolerance_px=tolerance_px) else None
 
 
-def carried_on(path: Sequence[Blob | None], ahead: float) -> Blob | None:
-    """Return the thing so many frames on, at its last speed; None if lost for long."""
+def extrapolate(path: Sequence[Blob | None], ahead: float) -> Blob | None:
+    """Extrapolate a thing some frames ahead at its last speed; None if long lost."""
     sightings = [(index, blob) for index, blob in enumerate(path) if blob is not None]
-    if not sightings or len(path) - 1 - sightings[-1][0] > LOST:
+    if not sightings or len(path) - 1 - sightings[-1][0] > MAX_FRAMES_LOST:
         return None
     index, last = sightings[-1]
-    if len(sightings) == 1 or index - sightings[-2][0] > LOST + 1:
+    if len(sightings) == 1 or index - sightings[-2][0] > MAX_FRAMES_LOST + 1:
         return last
-    before, frames = sightings[-2], ahead + len(path) - 1 - index
-    steps = frames / (index - before[0])
-    dx, dy = steps * (last.x - before[1].x), steps * (last.y - before[1].y)
+    previous_sighting, frames = sightings[-2], ahead + len(path) - 1 - index
+    steps = frames / (index - previous_sighting[0])
+    dx, dy = steps * (last.x - previous_sighting[1].x), steps * (last.y - previous_sighting[1].y)
     x, y, width, height = last.box
     return replace(last, x=last.x + dx, y=last.y + dy, box=(round(x + dx), round(y + dy), width, height))
 
 
 def is_struck(frames: np.ndarray, thing: Blob, reach: float) -> bool:
     """Return whether much moved at a thing, or `reach` lengths off, in the last step."""
-    return bool(motion_mask(frames)[around(thing, reach)].sum() > STRUCK * thing.area)
+    return bool(motion_mask(frames)[surrounding_slices(thing, reach)].sum() > STRUCK_SHARE * thing.area)
 
 
-def around(thing: Blob, reach: float) -> tuple[slice, slice]:
+def surrounding_slices(thing: Blob, reach: float) -> tuple[slice, slice]:
     """Return the slices of a frame around a thing, with a margin in its longer sides."""
     x, y, width, height = thing.box
-    beside = round(reach * max(width, height))
-    return slice(max(0, y - beside), y + height + beside), slice(max(0, x - beside), x + width + beside)
+    margin = round(reach * max(width, height))
+    return slice(max(0, y - margin), y + height + margin), slice(max(0, x - margin), x + width + margin)
 
 
 # --- observers --------------------------------------------------------------------------------------------------------
@@ -210,8 +212,8 @@ def reaches(thing: str, goal: str, foot: float | None = None, ahead: float | Non
         first, last = path[0], end_of(path, ahead)
         if first is None or last is None or box is None or is_occluder(last) or is_occluder(box):
             return None
-        way = np.array([box.x, box.y]) - place(first)
-        return "yes" if (place(last) - place(first)) @ way / (way @ way) > 0.6 else "no"
+        direction = np.array([box.x, box.y]) - place(first)
+        return "yes" if (place(last) - place(first)) @ direction / (direction @ direction) > 0.6 else "no"
 
     return observe
 
@@ -248,16 +250,20 @@ def will_clear(thing: str, mark: str) -> Observer:
 
     def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
         path, wall = track(frames, slots[thing], 60), largest(frames[-1], slots[mark], 60)
-        start, now, soon = next((blob for blob in path if blob), None), carried_on(path, 0.0), carried_on(path, 1.0)
-        if wall is None or start is None or now is None or soon is None:
+        start, now, later_blob = (
+            next((blob for blob in path if blob), None),
+            extrapolate(path, 0.0),
+            extrapolate(path, 1.0),
+        )
+        if wall is None or start is None or now is None or later_blob is None:
             return None
         side = 1.0 if wall.x > start.x else -1.0
-        lead, speed = side * (now.x - wall.x), side * (soon.x - now.x)
-        if lead > 0:
+        lead_px, speed = side * (now.x - wall.x), side * (later_blob.x - now.x)
+        if lead_px > 0:
             return "yes"
-        if speed <= 0 or lead + FLIGHT * speed < 0:
+        if speed <= 0 or lead_px + FLIGHT * speed < 0:
             return "no"  # it comes back, or does not get there
-        height = now.y - lead / speed * (soon.y - now.y)
+        height = now.y - lead_px / speed * (later_blob.y - now.y)
         return "yes" if height < wall.box[1] else "no"
 
     return foresee

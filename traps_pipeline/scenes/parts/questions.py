@@ -1,4 +1,4 @@
-"""Questions of a scene as values: templates, labels and other forms of these.
+"""Represent a scene's questions as values: templates, labels and their aliases.
 
 A template names parts in braces: '{ball}' is the value of the field `ball_colour`, and `fills` adds others. A family
 has one `Question` and some answerable asides, of which each scenario has one; even the void answers those.
@@ -15,7 +15,7 @@ import numpy as np
 
 from traps_pipeline.scenes.parts.course import part_colours
 from traps_pipeline.scenes.parts.wording import match_slots
-from traps_pipeline.scenes.physics.kit import AnswerableQuestion, AnswerType, Wording, listed
+from traps_pipeline.scenes.physics.kit import AnswerableQuestion, AnswerType, Wording, list_choices
 
 Forms = Sequence[str]  # ways to say a label; '{}' stands for it
 Aside = Callable[[Any, np.random.Generator], AnswerableQuestion]
@@ -40,16 +40,16 @@ class Question:
 
     def word(self, p: Any, rng: np.random.Generator, asides: Sequence[Aside]) -> Wording:
         """Word the question and one of the asides; a sole aside costs no draw."""
-        filled = self.fill(p, rng)
-        text = str(rng.choice(self.templates)).format_map({**part_colours(p), **filled.fills})
-        return Wording(text, filled.labels, filled.aliases, _one_of(asides, rng)(p, rng))
+        question = self.fill(p, rng)
+        text = str(rng.choice(self.templates)).format_map({**part_colours(p), **question.fills})
+        return Wording(text, question.labels, question.aliases, _choose(asides, rng)(p, rng))
 
     def slots_in(self, question: str) -> dict[str, str] | None:
         """Return what fills this question's placeholders; None if it is another one."""
         return match_slots(self.templates, question)
 
 
-def _one_of(asides: Sequence[Aside], rng: np.random.Generator) -> Aside:
+def _choose(asides: Sequence[Aside], rng: np.random.Generator) -> Aside:
     return asides[0] if len(asides) == 1 else asides[int(rng.integers(len(asides)))]
 
 
@@ -75,8 +75,8 @@ def left_or_right(*templates: str, forms: Forms, colours: Callable[[Any], tuple[
     """
 
     def fill(p: Any, rng: np.random.Generator) -> Filled:
-        of_sides = ("", "") if colours is None else colours(p)
-        sides = tuple(zip(("left", "right"), of_sides, strict=True))
+        side_colours = ("", "") if colours is None else colours(p)
+        sides = tuple(zip(("left", "right"), side_colours, strict=True))
         return Filled(("left", "right"), {form.format(*side): side[0] for side in sides for form in forms}, {})
 
     return Question("direction", templates, fill)
@@ -96,7 +96,7 @@ def which_colour(
     def fill(p: Any, rng: np.random.Generator) -> Filled:
         choices = tuple(str(c) for c in rng.permutation(colours(p)))
         aliases = {form.format(c): c for c in choices for form in forms}
-        return Filled(choices, aliases | dict(also), {"choices": listed(choices)})
+        return Filled(choices, aliases | dict(also), {"choices": list_choices(choices)})
 
     return Question("colour", templates, fill)
 
@@ -122,7 +122,7 @@ def how_many(
             numbers = [form for n in range(low, high + 1) for form in (str(n), NUMBERS[n])]
             aliases |= dict.fromkeys([f"{low} to {high}", f"{low} or {high}", *numbers], f"{low}-{high}")
         labels = tuple(f"{low}-{high}" for low, high in ranges(p))
-        return Filled(labels, aliases, {"choices": listed(labels), **fills(p, rng)})
+        return Filled(labels, aliases, {"choices": list_choices(labels), **fills(p, rng)})
 
     return Question("count_range", templates, fill)
 
@@ -154,7 +154,9 @@ def choice_of(question: str, choices: Callable[[Any], Sequence[str]], answer: Ca
 
     def ask(p: Any, rng: np.random.Generator) -> AnswerableQuestion:
         order = tuple(str(c) for c in rng.permutation(choices(p)))
-        return AnswerableQuestion(question.format_map({**part_colours(p), "choices": listed(order)}), order, answer(p))
+        return AnswerableQuestion(
+            question.format_map({**part_colours(p), "choices": list_choices(order)}), order, answer(p)
+        )
 
     return ask
 
@@ -169,9 +171,9 @@ def colour_from(part: str, question: str, pool: Sequence[str], unlike: Sequence[
 
     def ask(p: Any, rng: np.random.Generator) -> AnswerableQuestion:
         colours = part_colours(p)
-        excluded = [colours[name] for name in unlike]
-        others = [str(c) for c in rng.permutation([c for c in pool if c not in excluded])[:2]]
-        return choice_of(question, lambda p: [colours[part], *others], lambda p: colours[part])(p, rng)
+        excluded_colours = [colours[name] for name in unlike]
+        other_colours = [str(c) for c in rng.permutation([c for c in pool if c not in excluded_colours])[:2]]
+        return choice_of(question, lambda p: [colours[part], *other_colours], lambda p: colours[part])(p, rng)
 
     return ask
 

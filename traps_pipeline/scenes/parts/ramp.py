@@ -1,4 +1,4 @@
-"""Ramps along the way or towards the camera, and places on them."""
+"""Build ramps along the path or towards the camera, and locate points on them."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 class Ramp:
     """A slope, from its foot: `up` it, `over` its surface, `aside` of its middle (m).
 
-    foot_m: where the foot is; along the way that is 0 for most, towards the camera it is how far away in y. height_m:
-    of the surface at the foot. towards_camera: the ramp falls towards the camera and its middle is at `middle_m` in x;
-    else it falls along the way.
+    foot_m: position of the foot, along the path or, towards the camera, in y. height_m: height of the
+    surface at the foot. towards_camera: the ramp falls towards the camera and its middle is at `middle_m` in x; else it
+    falls along the path.
     """
 
     slope_deg: float
@@ -35,10 +35,10 @@ class Ramp:
         return float(np.radians(self.slope_deg))
 
     def at(self, up: float, over: float = 0.0, aside: float = 0.0) -> Vec3:
-        """Return a place by the slope, as a course takes it."""
+        """Return a point on the slope in the course's coordinates."""
         sin, cos = float(np.sin(self.slope_rad)), float(np.cos(self.slope_rad))
-        away, high = self.foot_m + up * cos - over * sin, self.height_m + up * sin + over * cos
-        return (self.middle_m + aside, away, high) if self.towards_camera else (-away, aside, high)
+        distance, height = self.foot_m + up * cos - over * sin, self.height_m + up * sin + over * cos
+        return (self.middle_m + aside, distance, height) if self.towards_camera else (-distance, aside, height)
 
     def board(
         self,
@@ -62,15 +62,15 @@ class Ramp:
     def support(self, course: Course, name: str, up: float, under: float, half_width: float, colour: str) -> None:
         """Add a post from the ground to a depth under the surface."""
         x, y, z = self.at(up, -under)
-        half = (half_width, 0.02, z / 2) if self.towards_camera else (0.02, half_width, z / 2)
-        course.slab(name, (x, y, z / 2), half, colour)
+        half_size = (half_width, 0.02, z / 2) if self.towards_camera else (0.02, half_width, z / 2)
+        course.slab(name, (x, y, z / 2), half_size, colour)
 
 
 @dataclass(frozen=True)
 class SteppedRamp:
     """A ramp that ends in a step above the deck: nothing comes back up.
 
-    length_m: along the ground. height_m: of its lower end.
+    length_m: length along the ground. height_m: height of its lower end.
     """
 
     length_m: float
@@ -78,7 +78,7 @@ class SteppedRamp:
     height_m: float
 
     def at(self, along: float, over: float = 0.0) -> Vec3:
-        """Return the place so far along the way and out of the surface there."""
+        """Return the point at a distance along the path and above the surface."""
         slope = np.radians(self.slope_deg)
         high = self.height_m + (self.length_m - along) * np.tan(slope)
         return (float(along + over * np.sin(slope)), 0.0, float(high + over * np.cos(slope)))
@@ -86,8 +86,8 @@ class SteppedRamp:
     def add(self, course: Course, half_width: float, colour: str) -> mujoco.MjsGeom:
         """Add the board `ramp` and the `prop` under its upper end; return the board."""
         slope, half_thick = np.radians(self.slope_deg), 0.012
-        half = (self.length_m / 2 / float(np.cos(slope)), half_width, half_thick)
-        ramp = course.slab("ramp", self.at(self.length_m / 2, -half_thick), half, colour, falls_rad=float(slope))
+        half_size = (self.length_m / 2 / float(np.cos(slope)), half_width, half_thick)
+        ramp = course.slab("ramp", self.at(self.length_m / 2, -half_thick), half_size, colour, falls_rad=float(slope))
         top = self.at(0.05)[2] / 2 - 0.012
         course.slab("prop", (0.05, 0, top), (0.012, half_width, top), colour)
         return ramp

@@ -1,4 +1,4 @@
-"""Readings of a simulation: each frame's outcome label and the end state's margin.
+"""Read simulations: each frame's outcome label, and the end state's margin.
 
 A family's `outcome(motion, p)` gives a `kit.Reading`, mostly from one of the functions here. Arrays over the frames are
 (F,), lengths in metres.
@@ -20,8 +20,8 @@ Labels = list[str | None]
 
 def lasting_from(holds: np.ndarray) -> int:
     """Return the first frame from which `holds` (F,) stays true; F if none."""
-    broken = np.flatnonzero(~holds)
-    return int(broken[-1]) + 1 if broken.size else 0
+    false_frames = np.flatnonzero(~holds)
+    return int(false_frames[-1]) + 1 if false_frames.size else 0
 
 
 def still_from(*paths: np.ndarray, within_m: float) -> int:
@@ -29,9 +29,11 @@ def still_from(*paths: np.ndarray, within_m: float) -> int:
 
     A path is (F,), a place along a line, or (F, ..., 3), places in space.
     """
-    moves = [np.abs(path - path[-1]) if path.ndim == 1 else np.linalg.norm(path - path[-1], axis=-1) for path in paths]
-    restless = [(move > within_m).reshape(len(move), -1).any(axis=1) for move in moves]
-    return lasting_from(~np.any(restless, axis=0))
+    distances = [
+        np.abs(path - path[-1]) if path.ndim == 1 else np.linalg.norm(path - path[-1], axis=-1) for path in paths
+    ]
+    is_moving = [(move > within_m).reshape(len(move), -1).any(axis=1) for move in distances]
+    return lasting_from(~np.any(is_moving, axis=0))
 
 
 def clear_m(past: np.ndarray, before_m: float = 0.0) -> float:
@@ -88,16 +90,16 @@ def read_passage(rear_past: np.ndarray, radius_m: float) -> Reading:
 def first_past(motion: Motion, ahead: np.ndarray, names: Sequence[str], min_lead_s: float) -> Reading:
     """Read which name is first past the line: `ahead` (F, N) m above 0.
 
-    No reading at all if somebody never gets past or the lead is below `min_lead_s`. The margin is how far the second
-    still is from the line when the first is past it.
+    There is no reading if a competitor never gets past or the lead is below `min_lead_s`. The margin is how far the
+    second still is from the line when the first is past it.
     """
-    past = ahead > 0
-    margin = float(-np.sort(ahead[int(past.any(axis=1).argmax())])[-2])
-    arrivals = motion.times[past.argmax(axis=0)]
-    first, second = np.sort(arrivals)[:2]
-    if not past[-1].all() or second - first < min_lead_s:
+    is_past = ahead > 0
+    margin = float(-np.sort(ahead[int(is_past.any(axis=1).argmax())])[-2])
+    arrival_times = motion.times[is_past.argmax(axis=0)]
+    first, second = np.sort(arrival_times)[:2]
+    if not is_past[-1].all() or second - first < min_lead_s:
         return Reading(undecided(motion), margin)
-    winner, frames = names[int(arrivals.argmin())], np.sort(past.argmax(axis=0))
+    winner, frames = names[int(arrival_times.argmin())], np.sort(is_past.argmax(axis=0))
     labels = [winner if t >= first else None for t in motion.times]
     return Reading(labels, margin, (int(frames[0]), int(frames[1])))
 

@@ -1,4 +1,4 @@
-"""Soft bodies on a course: a rope, a cloth and a ball that give way.
+"""Add soft bodies to a course: a rope, a cloth and a ball.
 
 Each is one of MuJoCo's flexes, by whose name it is called in the roles of a scene; its family reads it by
 `motion.vertices`. Places are those of `parts.course`. A scene with one is integrated with MuJoCo's `discrete`
@@ -35,7 +35,7 @@ def rope(
 ) -> mujoco.MjsFlex:
     """Return a rope that lies straight along the way at first and does not stretch.
 
-    thrown: speeds along and up (m/s). links: of which it is made, each longer than the rope is thick. sliding:
+    thrown: speeds along and up (m/s). links: their number, each longer than the rope is thick. sliding:
     friction, no unit. drag: viscosity of the air (Pa s).
     """
     count, spacing = (links + 1, 1, 1), (length / links,) * 3
@@ -74,8 +74,8 @@ def hammock(
     for body in _vertices(course, name):
         along, across = (2 * (float(body.pos[i]) - middle[i] * (course.direction, 1)[i]) / size[i] for i in (0, 1))
         body.pos[2] -= sag * (1 - along**2) * (1 - 0.4 * across**2)
-        at_corner = abs(along) > 1 - 1e-6 and abs(across) > 1 - 1e-6
-        if at_corner and round(along) * course.direction in tied:
+        is_corner = abs(along) > 1 - 1e-6 and abs(across) > 1 - 1e-6
+        if is_corner and round(along) * course.direction in tied:
             knot = course.spec.add_equality(type=mujoco.mjtEq.mjEQ_CONNECT, objtype=mujoco.mjtObj.mjOBJ_BODY)
             knot.name1, knot.name2 = body.name, "world"
     return flex

@@ -1,14 +1,14 @@
-"""Fields of a family's `Params`, each with the range that it is drawn from.
+"""Declare fields of a family's `Params`, each with the range it is drawn from.
 
     @dataclass(frozen=True)
     class Params:
         direction: int = one_of(-1, 1)
-        ball_colour: str = PLAY()
-        wall_colour: str = PLAY()
+        ball_colour: str = PLAY_COLOURS()
+        wall_colour: str = PLAY_COLOURS()
         rough: bool = hidden(False, True)
         speed_m_s: float = between(0.50, 0.66)
 
-    PLAY = apart("red", "green", "blue")  # before the class: colours that differ from each other
+    PLAY_COLOURS = apart("red", "green", "blue")  # before the class: colours that differ from each other
 
 `draw_params(Params, rng)` draws the fields in their order; a field may depend on those before it only. So a hidden
 element that depends on nothing is as likely whatever is seen. `twins(p)` changes the hidden element.
@@ -24,7 +24,7 @@ from typing import Any, TypeVar, get_type_hints
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from traps_pipeline.scenes.physics.kit import READ, distinct_colours, uniform
+from traps_pipeline.scenes.physics.kit import READER_KEY, distinct_colours, uniform
 
 Drawn = dict[str, Any]  # name -> value: what is drawn so far
 Draw = Callable[[np.random.Generator, Drawn], Any]
@@ -50,19 +50,22 @@ def drawn_by(draw: Draw, **metadata: Any) -> Any:
 
 
 def between(low: float, high: float) -> Any:
-    """Return a float between two bounds, rounded to 0.0001."""
+    """Return a field: a float between two bounds, rounded to 0.0001."""
     return drawn_by(lambda rng, so_far: uniform(rng, low, high), range=(low, high))
 
 
 def several_between(count: Count, low: float, high: float) -> Any:
-    """Return a tuple of floats between two bounds. count: a number or a drawn field."""
+    """Return a field: a tuple of floats between two bounds.
+
+    count: their number, or the drawn field that holds it.
+    """
     return drawn_by(
         lambda rng, so_far: tuple(uniform(rng, low, high) for _ in range(_number(count, so_far))), range=(low, high)
     )
 
 
 def one_of(*values: Any, longer: tuple[Any, ...] = ()) -> Any:
-    """Return one of these values, each as often: colours, -1 and 1, counts.
+    """Return a field with one of these values, each equally likely.
 
     longer: the values instead, where a draw asks for longer rows.
     """
@@ -75,12 +78,12 @@ def one_of(*values: Any, longer: tuple[Any, ...] = ()) -> Any:
 
 
 def chance(share: float) -> Any:
-    """Return a boolean field that is true in this share of the draws."""
+    """Return a boolean field that is true with this probability."""
     return drawn_by(lambda rng, so_far: bool(rng.random() < share))
 
 
 def facing(low: float, high: float) -> Any:
-    """Return the azimuth of a camera, off the front towards where things come from.
+    """Return a field: a camera's azimuth, turned towards where things come from.
 
     Needs a field `direction` above it.
     """
@@ -88,7 +91,7 @@ def facing(low: float, high: float) -> Any:
 
 
 def in_front(low: float, high: float) -> Any:
-    """Return the azimuth (degrees) of a camera, off the front whatever the direction."""
+    """Return a field: a camera's azimuth (degrees) off the front, for any direction."""
     return drawn_by(lambda rng, so_far: 90 + uniform(rng, low, high))
 
 
@@ -97,7 +100,7 @@ def in_front(low: float, high: float) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Fields that are drawn together, in place of the first. A call gives one field.
+    """Fields that are drawn together, where the first stands. A call gives one field.
 
     draw(rng, so_far, count): as many values as the group's fields take, in the order of the fields.
     """
@@ -141,12 +144,12 @@ def together(draw: Callable[[np.random.Generator, Drawn], Sequence[Any]]) -> Gro
 
 
 def hidden(*values: Any) -> Any:
-    """Return the hidden element: one of these values, whatever else is drawn."""
+    """Return the field of the hidden element: one of these values, drawn by itself."""
     return _hidden(lambda so_far: values)
 
 
 def hidden_index(of: str) -> Any:
-    """Return the hidden element as an index of the tuple in the field `of`."""
+    """Return the field of the hidden element: an index of the tuple in field `of`."""
     return _hidden(lambda so_far: range(len(so_far[of])))
 
 
@@ -160,7 +163,7 @@ def _hidden(values: Callable[[Mapping[str, Any]], Sequence[Any]]) -> Any:
 
 def hidden_field(params: type) -> str | None:
     """Return the hidden element's name, None if none. Raises TypeError if several."""
-    names = [each.name for each in fields(params) if _HIDDEN in each.metadata]
+    names = [member.name for member in fields(params) if _HIDDEN in member.metadata]
     if len(names) > 1:
         raise TypeError(f"{params.__module__}: several hidden elements {names}; a scene has one")
     return names[0] if names else None
@@ -171,16 +174,18 @@ def twins(p: Any) -> list[Any]:
     name = hidden_field(type(p))
     if name is None:
         raise TypeError(f"{type(p).__module__}: no field of Params is `hidden(...)`, so there are no twins")
-    values = {each.name: each for each in fields(p)}[name].metadata[_HIDDEN](vars(p))
+    values = {member.name: member for member in fields(p)}[name].metadata[_HIDDEN](vars(p))
     return [replace(p, **{name: value}) for value in values if value != getattr(p, name)]
 
 
 def with_field(params: type, name: str, kind: Any) -> type:
     """Return the class with a last field, None by default, that is not drawn."""
-    read = field(default=None, metadata={READ: lambda value: None if value is None else kind.from_record(value)})
-    extended = make_dataclass(params.__name__, [(name, kind | None, read)], bases=(params,), frozen=True)
-    extended.__module__, extended.__doc__ = params.__module__, params.__doc__
-    return extended
+    new_field = field(
+        default=None, metadata={READER_KEY: lambda value: None if value is None else kind.from_record(value)}
+    )
+    new_class = make_dataclass(params.__name__, [(name, kind | None, new_field)], bases=(params,), frozen=True)
+    new_class.__module__, new_class.__doc__ = params.__module__, params.__doc__
+    return new_class
 
 
 # --- values from a file -----------------------------------------------------------------------------------------------
@@ -192,16 +197,16 @@ def check(p: Any) -> None:
     A number may lie outside of its range by the width of the range, as a correction may need.
     """
     types = _types(type(p))
-    for each in fields(p):
-        value = getattr(p, each.name)
+    for member in fields(p):
+        value = getattr(p, member.name)
         try:
-            types[each.name].validate_python(value, strict=True)
+            types[member.name].validate_python(value, strict=True)
         except ValidationError as error:
-            raise ValueError(f"parameter {each.name} is {_short_repr(value)}: {error.errors()[0]['msg']}") from None
-        for member in _members(value):
-            if isinstance(member, float) and not np.isfinite(member):
-                raise ValueError(f"parameter {each.name} is {_short_repr(value)}; it must be finite")
-            _check_member(p, each, member)
+            raise ValueError(f"parameter {member.name} is {_short_repr(value)}: {error.errors()[0]['msg']}") from None
+        for element in _members(value):
+            if isinstance(element, float) and not np.isfinite(element):
+                raise ValueError(f"parameter {member.name} is {_short_repr(value)}; it must be finite")
+            _check_member(p, member, element)
 
 
 @cache
@@ -214,8 +219,8 @@ def _check_member(p: Any, each: Field[Any], value: Any) -> None:
         low, high = bounds
         if not low - (high - low) <= value <= high + (high - low):
             raise ValueError(f"parameter {each.name} is {_short_repr(value)}; it is drawn from {low} to {high}")
-    hides = each.metadata.get(_HIDDEN)
-    values = tuple(hides(vars(p))) if hides else each.metadata.get(_VALUES)
+    hidden_values = each.metadata.get(_HIDDEN)
+    values = tuple(hidden_values(vars(p))) if hidden_values else each.metadata.get(_VALUES)
     difficulty = getattr(p, "difficulty", None)
     if difficulty is not None and difficulty.longer and isinstance(each.metadata.get(_LONGER), tuple):
         values = each.metadata[_LONGER] or values
@@ -243,7 +248,7 @@ def is_longer(so_far: Mapping[str, Any]) -> bool:
 
 def can_be_longer(params: type) -> bool:
     """Return whether some field has longer ranges."""
-    return any(each.metadata.get(_LONGER) for each in fields(params))
+    return any(member.metadata.get(_LONGER) for member in fields(params))
 
 
 def draw_params(params: type[Params], rng: np.random.Generator, longer: bool = False) -> Params:
@@ -253,28 +258,30 @@ def draw_params(params: type[Params], rng: np.random.Generator, longer: bool = F
     """
     so_far: Drawn = {_LONGER: True} if longer else {}
     members = fields(params)  # type: ignore[arg-type]
-    for each in members:
-        if each.name in so_far or each.default is not MISSING:
+    for member in members:
+        if member.name in so_far or member.default is not MISSING:
             continue
-        draw = each.metadata.get(_HOW)
+        draw = member.metadata.get(_HOW)
         if draw is None:
-            raise TypeError(f"{params.__module__}: Params.{each.name} has no range; write it as `= between(low, high)`")
+            raise TypeError(
+                f"{params.__module__}: Params.{member.name} has no range; write it as `= between(low, high)`"
+            )
         if isinstance(draw, Group):
-            so_far |= _of_group(draw, members, rng, so_far)
+            so_far |= _group_values(draw, members, rng, so_far)
         else:
-            so_far[each.name] = draw(rng, so_far)
-    return params(**{each.name: so_far[each.name] for each in members if each.name in so_far})
+            so_far[member.name] = draw(rng, so_far)
+    return params(**{member.name: so_far[member.name] for member in members if member.name in so_far})
 
 
-def _of_group(group: Group, members: Sequence[Field[Any]], rng: np.random.Generator, so_far: Drawn) -> Drawn:
+def _group_values(group: Group, members: Sequence[Field[Any]], rng: np.random.Generator, so_far: Drawn) -> Drawn:
     """Return the values of all fields of a group."""
-    counts = {each.name: each.metadata[_COUNT] for each in members if each.metadata.get(_HOW) is group}
+    counts = {member.name: member.metadata[_COUNT] for member in members if member.metadata.get(_HOW) is group}
     numbers = {name: 1 if count is None else _number(count, so_far) for name, count in counts.items()}
     values = list(group.draw(rng, so_far, sum(numbers.values())))
     field_values: Drawn = {}
     for name, number in numbers.items():
-        chosen, values = values[:number], values[number:]
-        field_values[name] = chosen[0] if counts[name] is None else tuple(chosen)
+        member_values, values = values[:number], values[number:]
+        field_values[name] = member_values[0] if counts[name] is None else tuple(member_values)
     return field_values
 
 

@@ -1,4 +1,4 @@
-"""Classical vision for observers: where a colour is in a frame, how it moves.
+"""Locate and track colours in frames, for observers (classical vision).
 
 Frames are RGB uint8, shape (360, 480, 3); pixel coordinates are x to the right, y down. Colours are named as in
 `kit.COLOURS`. A colour that is none of them (most occluders') belongs to no mask.
@@ -21,7 +21,10 @@ COMING_PX = 600  # of an occluder on its way, that are new in a frame
 COMES_FRAMES = 4  # of five a second, in which it may be seen on its way
 EDGE = 60  # least contrast of an edge
 MOVED_PX = 24  # what moves changes more pixels from frame to frame
-CHANGED, ALIKE = 16, 12  # levels of 255: by more than these a pixel changes, by no more two are of one colour
+CHANGED_LEVELS, SAME_COLOUR_LEVELS = (
+    16,
+    12,
+)  # levels of 255: by more than these a pixel changes, by no more two are of one colour
 # Hue (degrees), least saturation and value (0-1) of the saturated colours. Shade lowers the value, not the hue.
 _HUES: Mapping[str, tuple[float, float, float, float]] = {
     "red": (346, 8, 0.62, 0.22),
@@ -50,13 +53,13 @@ class Blob:
 
 
 def colour_mask(frame: np.ndarray, colour: str) -> np.ndarray:
-    """Return where a frame has a colour, bool (H, W), tolerant of shade."""
+    """Return the mask of a colour in a frame, bool (H, W), tolerant of shade."""
     hsv = cv2.cvtColor(frame.astype(np.float32) / 255, cv2.COLOR_RGB2HSV)
     hue, saturation, value = hsv[..., 0], hsv[..., 1], hsv[..., 2]
     if colour in _HUES:
         low, high, least_saturation, least_value = _HUES[colour]
-        inside = (hue >= low) & (hue <= high) if low < high else (hue >= low) | (hue <= high)
-        return inside & (saturation >= least_saturation) & (value >= least_value)
+        is_in_hue = (hue >= low) & (hue <= high) if low < high else (hue >= low) | (hue <= high)
+        return is_in_hue & (saturation >= least_saturation) & (value >= least_value)
     match colour:
         case "wood":
             return (hue >= 18) & (hue <= 42) & (saturation >= 0.40) & (saturation < 0.72) & (value >= 0.2)
@@ -97,9 +100,9 @@ def largest_board(frame: np.ndarray, min_area: int = 12) -> Blob | None:
     pixels, mask = frame.astype(np.float32) / 255, np.zeros(frame.shape[:2], bool)
     for rgb in OCCLUDERS.values():
         colour = np.array(rgb, np.float32)
-        bright = pixels @ colour / (colour @ colour)
-        off = np.linalg.norm(pixels - bright[..., None] * colour, axis=2) / np.linalg.norm(colour)
-        mask |= (bright > 0.5) & (bright < 1.1) & (off < 0.06 * bright)
+        brightness = pixels @ colour / (colour @ colour)
+        colour_error = np.linalg.norm(pixels - brightness[..., None] * colour, axis=2) / np.linalg.norm(colour)
+        mask |= (brightness > 0.5) & (brightness < 1.1) & (colour_error < 0.06 * brightness)
     lines = np.ones((9, 9), np.uint8)  # are no wider
     return next(iter(blobs(cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, lines), min_area)), None)
 
@@ -107,7 +110,7 @@ def largest_board(frame: np.ndarray, min_area: int = 12) -> Blob | None:
 def slanting_edges(
     frame: np.ndarray, part: tuple[slice, slice], slants: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return where edges of a part fall to the left, and to the right, bool masks.
+    """Return two masks: a part's edges that fall to the left, and to the right.
 
     slants: least and greatest slope, in rows a column.
     """
@@ -131,40 +134,50 @@ def before_occluder(frames: np.ndarray) -> np.ndarray:
     come; where an occluder goes, the scene goes on.
     """
     for at in range(1, len(frames)):
-        is_new = _levels(frames[at], frames[at - 1]) > CHANGED
+        is_new = _levels(frames[at], frames[at - 1]) > CHANGED_LEVELS
         if is_new.sum() < STEP_PX:
             continue
         count, names = cv2.connectedComponents(is_new.astype(np.uint8), connectivity=4)
         sizes = np.bincount(names.ravel(), minlength=count)
         sizes[0] = 0
         region = names == sizes.argmax()
-        around = cv2.dilate(region.astype(np.uint8), np.ones((17, 17), np.uint8)).astype(bool) & ~region
-        before, colour = (np.median(frame[region], axis=0).astype(np.uint8) for frame in (frames[at - 1], frames[at]))
-        even, beside = ((_levels(frames[at][part], colour) <= ALIKE).mean() for part in (region, around))
-        was_even = (_levels(frames[at - 1][region], before) <= ALIKE).mean()
-        stands_out = beside < 0.4 or (beside < 0.75 and was_even < even)  # some of what is around it may be as dark
-        if sizes.max() >= STEP_PX and even > 0.5 and stands_out and _is_standing_later(frames, at, colour):
-            return frames[: _first_on_its_way(frames, at, colour)]
+        ring = cv2.dilate(region.astype(np.uint8), np.ones((17, 17), np.uint8)).astype(bool) & ~region
+        previous_colour, colour = (
+            np.median(frame[region], axis=0).astype(np.uint8) for frame in (frames[at - 1], frames[at])
+        )
+        region_share, ring_share = (
+            (_levels(frames[at][part], colour) <= SAME_COLOUR_LEVELS).mean() for part in (region, ring)
+        )
+        was_even = (_levels(frames[at - 1][region], previous_colour) <= SAME_COLOUR_LEVELS).mean()
+        stands_out = ring_share < 0.4 or (
+            ring_share < 0.75 and was_even < region_share
+        )  # some of what is around it may be as dark
+        if sizes.max() >= STEP_PX and region_share > 0.5 and stands_out and _is_standing_later(frames, at, colour):
+            return frames[: _first_moving_frame(frames, at, colour)]
     return frames
 
 
 def _is_standing_later(frames: np.ndarray, comes: int, colour: np.ndarray) -> bool:
     """Return whether a region that turned to a colour has it soon and at the end."""
-    early, soon = max(0, comes - 1 - COMES_FRAMES), min(comes + COMES_FRAMES, len(frames) - 1)
-    before, was, soon_after, at_end = (_levels(frames[at], colour) <= ALIKE for at in (comes - 1, early, soon, -1))
-    new_region = at_end & ~before & ~was
-    filled = cv2.morphologyEx(
+    earlier_frame, later_frame = max(0, comes - 1 - COMES_FRAMES), min(comes + COMES_FRAMES, len(frames) - 1)
+    level_before, level_early, soon_after, level_at_end = (
+        _levels(frames[at], colour) <= SAME_COLOUR_LEVELS for at in (comes - 1, earlier_frame, later_frame, -1)
+    )
+    new_region = level_at_end & ~level_before & ~level_early
+    filled_mask = cv2.morphologyEx(
         new_region.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8)
     )  # lines between slats
-    return bool(filled.sum() >= OCCLUDER_PX and (soon_after & new_region).sum() > 0.9 * new_region.sum())
+    return bool(filled_mask.sum() >= OCCLUDER_PX and (soon_after & new_region).sum() > 0.9 * new_region.sum())
 
 
-def _first_on_its_way(frames: np.ndarray, comes: int, colour: np.ndarray) -> int:
+def _first_moving_frame(frames: np.ndarray, comes: int, colour: np.ndarray) -> int:
     """Return the first frame in which an occluder that comes is seen on its way."""
     first = comes
     while first > max(1, comes - COMES_FRAMES):
-        current, before = (_levels(frame, colour) <= ALIKE for frame in (frames[first - 1], frames[first - 2]))
-        if (current & ~before).sum() < COMING_PX:
+        current, previous_level = (
+            _levels(frame, colour) <= SAME_COLOUR_LEVELS for frame in (frames[first - 1], frames[first - 2])
+        )
+        if (current & ~previous_level).sum() < COMING_PX:
             break
         first -= 1
     return first
@@ -176,8 +189,8 @@ def after_occluder(frames: np.ndarray) -> np.ndarray:
 
 
 def motion_mask(frames: np.ndarray) -> np.ndarray:
-    """Return where the last frame differs from the one before, bool (H, W)."""
-    return _levels(frames[-1], frames[-2]) > CHANGED if len(frames) > 1 else np.zeros(frames.shape[1:3], bool)
+    """Return the mask of pixels that changed in the last frame, bool (H, W)."""
+    return _levels(frames[-1], frames[-2]) > CHANGED_LEVELS if len(frames) > 1 else np.zeros(frames.shape[1:3], bool)
 
 
 def is_still(frames: np.ndarray) -> bool:
@@ -198,23 +211,25 @@ def without_flags(frames: np.ndarray) -> np.ndarray:
     black flag the mast is told apart only below.
     """
     background = np.median(frames, axis=0).astype(np.uint8)
-    painted = frames.copy()
+    painted_frames = frames.copy()
     for left, top, width in _mast_tops(background):
         for seed in ((left + width + 3, top + 5), (left + width + 3, top - 4)):
             patch = _flag_patch(background, seed)
             if patch is None or patch[0] > left + width + 3:
                 continue
-            x, y, wide, high = patch
-            box = np.s_[y : y + high, x : x + wide]
+            x, y, flag_width, height = patch
+            box = np.s_[y : y + height, x : x + flag_width]
             changes = np.abs(np.stack([frames[0][box], frames[-1][box]]).astype(int) - background[box])
             rest_share = (changes[1] > 40).any(axis=-1).mean()  # a thing that lies before the patch is smaller than it
-            if min(abs(y - top), abs(y + high - top)) > 6 or changes.mean() > 12 or rest_share > 0.03:
+            if min(abs(y - top), abs(y + height - top)) > 6 or changes.mean() > 12 or rest_share > 0.03:
                 continue  # neither flies at the end of the mast, or it moves
-            above = max(0, min(top, y) - 4)
-            beside = painted[:, above, max(0, left - 4)]
-            painted[:, above + 2 : y + high + 3, left - 1 : x + wide + 3] = beside[:, None, None]
+            row_above = max(0, min(top, y) - 4)
+            colour_beside = painted_frames[:, row_above, max(0, left - 4)]
+            painted_frames[:, row_above + 2 : y + height + 3, left - 1 : x + flag_width + 3] = colour_beside[
+                :, None, None
+            ]
             break
-    return painted
+    return painted_frames
 
 
 def _flag_patch(background: np.ndarray, seed: tuple[int, int]) -> tuple[int, int, int, int] | None:
@@ -224,19 +239,25 @@ def _flag_patch(background: np.ndarray, seed: tuple[int, int]) -> tuple[int, int
         return None
     region = np.zeros((height + 2, width + 2), np.uint8)
     flags = 4 | cv2.FLOODFILL_MASK_ONLY | cv2.FLOODFILL_FIXED_RANGE | (1 << 8)
-    _, _, _, (x, y, wide, high) = cv2.floodFill(background.copy(), region, seed, (0, 0, 0), (22,) * 3, (22,) * 3, flags)
-    filled = region[1:-1, 1:-1][y : y + high, x : x + wide].mean()
-    fits = 8 <= wide <= FLAG_PX[0] and 6 <= high <= FLAG_PX[1] and filled > 0.6
-    return (x, y, wide, high) if fits else None
+    _, _, _, (x, y, patch_width, patch_height) = cv2.floodFill(
+        background.copy(), region, seed, (0, 0, 0), (22,) * 3, (22,) * 3, flags
+    )
+    filled_share = region[1:-1, 1:-1][y : y + patch_height, x : x + patch_width].mean()
+    is_flag = 8 <= patch_width <= FLAG_PX[0] and 6 <= patch_height <= FLAG_PX[1] and filled_share > 0.6
+    return (x, y, patch_width, patch_height) if is_flag else None
 
 
 def _mast_tops(background: np.ndarray) -> list[tuple[int, int, int]]:
     """Return upper ends (left, top, width) of thin, dark, upright lines."""
     light = background.max(axis=2)
-    beside = cv2.morphologyEx(light, cv2.MORPH_CLOSE, np.ones((1, 7), np.uint8))
-    thin = ((light < 125) & (np.ptp(background, axis=2) < 30) & (cv2.subtract(beside, light) > 30)).astype(np.uint8)
-    tall = cv2.morphologyEx(cv2.dilate(thin, np.ones((1, 3), np.uint8)), cv2.MORPH_OPEN, np.ones((6, 1), np.uint8))
-    count, names = cv2.connectedComponents(tall, connectivity=8)
+    closed_light = cv2.morphologyEx(light, cv2.MORPH_CLOSE, np.ones((1, 7), np.uint8))
+    thin_mask = ((light < 125) & (np.ptp(background, axis=2) < 30) & (cv2.subtract(closed_light, light) > 30)).astype(
+        np.uint8
+    )
+    tall_mask = cv2.morphologyEx(
+        cv2.dilate(thin_mask, np.ones((1, 3), np.uint8)), cv2.MORPH_OPEN, np.ones((6, 1), np.uint8)
+    )
+    count, names = cv2.connectedComponents(tall_mask, connectivity=8)
     masts = []
     for name in range(1, count):
         y, x = np.nonzero(names == name)

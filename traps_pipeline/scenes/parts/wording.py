@@ -1,4 +1,4 @@
-"""Words of a scenario: templates that can be read back, and ill-posed questions.
+"""Word scenarios: templates that can be parsed back, and ill-posed questions.
 
 An ill-posed question is drawn from shared templates over the scene's inventory, and checked by vocabulary alone, so
 that a question which a reviewer wrote is checked in the same way (docs/spec.md 2.4).
@@ -32,7 +32,7 @@ def _pattern(template: str) -> re.Pattern[str]:
 
 
 def match_slots(templates: Sequence[str], question: str) -> dict[str, str] | None:
-    """Return what a question has in a template's placeholders; None if none fits."""
+    """Return a question's values of a template's placeholders; None if none matches."""
     for template in templates:
         match = _pattern(template).fullmatch(question)
         if match:
@@ -169,7 +169,7 @@ _COLOUR_WORDS = frozenset(COLOURS) - {"wood"} | frozenset(ABSENT_COLOURS)
 
 
 def false_premises(question: str, inventory: Inventory, *, near: bool = False) -> list[str]:
-    """Return what a question presumes and the inventory refutes.
+    """Return a question's presumptions that the inventory refutes.
 
     near: include colours like those in view, which a viewer may take for another false premise, though they refute
     nothing.
@@ -212,8 +212,8 @@ def is_far(colour: str, present: Sequence[str]) -> bool:
 def colour_distance(colour: str, neighbour: str) -> float:
     """Return the least CIELAB (D65) distance of two colours, in shade and light too."""
     srgb_of = {**COLOURS, **_ELSEWHERE}
-    lit = (tuple(min(1.0, light * part) for part in srgb_of[neighbour]) for light in LIGHTS)
-    return min(float(np.linalg.norm(_lab(srgb_of[colour]) - _lab(shade))) for shade in lit)
+    lit_colours = (tuple(min(1.0, light * part) for part in srgb_of[neighbour]) for light in LIGHTS)
+    return min(float(np.linalg.norm(_lab(srgb_of[colour]) - _lab(shade))) for shade in lit_colours)
 
 
 def _lab(srgb: Sequence[float]) -> np.ndarray:
@@ -253,16 +253,16 @@ def _beyond_video(inventory: Inventory) -> Iterator[str]:
 
 
 def _false_premises(inventory: Inventory, rng: np.random.Generator) -> Iterator[str]:
-    absent = [thing for thing in ABSENT_OBJECTS if thing not in inventory.objects]
+    absent_objects = [thing for thing in ABSENT_OBJECTS if thing not in inventory.objects]
     colours = [colour for colour in ABSENT_COLOURS if is_far(colour, inventory.colours)]
-    present = [colour for colour in inventory.colours if colour in _COLOUR_WORDS]
+    colour_words = [colour for colour in inventory.colours if colour in _COLOUR_WORDS]
     for template in _FALSE_PREMISES:
         if "{colour}" in template and not colours:
             continue
         for _ in range(6):
             yield template.format(
-                absent=rng.choice(absent),
+                absent=rng.choice(absent_objects),
                 colour=rng.choice(colours) if colours else "",
-                present=rng.choice(present),
+                present=rng.choice(colour_words),
                 object=rng.choice(inventory.objects),
             )

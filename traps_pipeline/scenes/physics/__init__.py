@@ -1,1 +1,1 @@
-"""MuJoCo models: shared builders, soft bodies, and simulation to a trajectory."""
+"""Build MuJoCo models, with soft bodies, and simulate them to trajectories."""

@@ -1,4 +1,4 @@
-"""Soft bodies (MuJoCo's flexes) of a compiled model.
+"""Query the soft bodies (MuJoCo's flexes) of a compiled model.
 
 A soft body is named in the roles of a scene as any other body is. It has no pose: it is where its vertices are, which
 follow from the poses of the bodies that carry it, and it is drawn as a whole.

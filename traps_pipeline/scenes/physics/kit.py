@@ -1,4 +1,4 @@
-"""Values that a scene family is made of, and builders that all families share.
+"""Define the values that make a scene family, and builders that families share.
 
 A family file defines one `FAMILY`, put together by `parts.family`. Its functions are pure: `draw` and `word` take the
 generator they draw from, `build` and `outcome` draw nothing, so that a stored spec always gives the same scene.
@@ -38,7 +38,7 @@ COLOURS: Mapping[str, tuple[float, float, float]] = {
     "navy": (0.07, 0.11, 0.28),
 }
 
-READ = "read"  # key of a parameter's metadata: how its stored value is read, where that is not as it stands
+READER_KEY = "read"  # key of a parameter's metadata: how its stored value is read, where that is not as it stands
 OCCLUDER_GROUP = 4  # geoms of the occluder: drawn in the void only, collide with nothing
 COMING_GROUP = 2  # the board that comes before a scene, until it stands
 FLOOR_GROUP = 3  # planes, while they are drawn
@@ -92,7 +92,7 @@ class Box:
 
 @dataclass(frozen=True)
 class View:
-    """Where the camera looks from. Distance and aim are fitted (`camera.fit_camera`).
+    """The camera's direction. Distance and aim are fitted (`camera.fit_camera`).
 
     Azimuth 90 looks along +y (from the front), elevation is negative when looking down: MuJoCo's free camera.
     """
@@ -104,7 +104,7 @@ class View:
 
 @dataclass(frozen=True)
 class Inventory:
-    """What a viewer can name; ill-posed questions are made from it (`wording.py`).
+    """The things a viewer can name; ill-posed questions use it (`wording.py`).
 
     colours: every colour in view. objects: every noun, singular ('ball', 'ramp'). things: phrases that single one out
     ('red ball', 'wooden ramp'), which occlusion scenes are asked about; at least three of them.
@@ -174,8 +174,8 @@ class Motion:
         """Return points of a body, its middle and three beside it, or vertices, (F, N, 3)."""
         if body in self.vertices:
             return self.vertices[body]
-        beside = np.pad(self.rot(body).swapaxes(1, 2), ((0, 0), (1, 0), (0, 0)))
-        return self.pos(body)[:, None] + beside_m * beside
+        offsets = np.pad(self.rot(body).swapaxes(1, 2), ((0, 0), (1, 0), (0, 0)))
+        return self.pos(body)[:, None] + beside_m * offsets
 
 
 @dataclass(frozen=True)
@@ -219,12 +219,12 @@ class Family:
     params: a frozen dataclass of plain values with units in the names.
     draw(rng, longer=False): parameters of one scenario.
     build(params, physics): the scene. Draws nothing.
-    outcome(motion, params): what a run comes to.
+    outcome(motion, params): the run's outcome.
     word(params, rng): the question and its companions.
     questions: the templates that `word` fills; no other family has the same.
-    observe(frames, question): the answer of one who sees only the 5 FPS frames (N, 360, 480, 3) RGB and the question;
+    observe(frames, question): the answer by the 5 FPS frames (N, 360, 480, 3) RGB and the question alone;
         None if the decisive thing is not to be seen.
-    legible(motion, params): groups of geoms that must be seen at the end and the least pixels of each group; by default
+    legible(motion, params): groups of geoms that must be seen at the end and the minimum pixels of each; by default
         each decisive body's geoms and 150.
     twins(params): the same scene with only the hidden element changed, so that the outcome may differ (occlusion).
     """
@@ -252,23 +252,23 @@ class Family:
     def params_from(self, values: Mapping[str, Any]) -> Any:
         """Return parameters from a stored mapping. Raises ValueError naming a wrong one."""
         field_of = {f.name: f for f in fields(self.params)}
-        required = {name for name, f in field_of.items() if f.default is MISSING}
-        unknown, missing = sorted(set(values) - set(field_of)), sorted(required - set(values))
+        required_names = {name for name, f in field_of.items() if f.default is MISSING}
+        unknown, missing = sorted(set(values) - set(field_of)), sorted(required_names - set(values))
         if unknown or missing:
             raise ValueError(
                 f"family {self.name}: unknown parameters {unknown}, missing parameters {missing}; "
                 f"known: {sorted(field_of)}"
             )
-        read = {name: field_of[name].metadata.get(READ, _as_tuple) for name in values}
-        params = self.params(**{name: read[name](value) for name, value in values.items()})
+        reader_of = {name: field_of[name].metadata.get(READER_KEY, _as_tuple) for name in values}
+        params = self.params(**{name: reader_of[name](value) for name, value in values.items()})
         self.check(params)
         return params
 
 
 def params_to_dict(params: Any) -> dict[str, Any]:
     """Return a family's parameters as a plain mapping, without a missing look."""
-    absent = {each.name for each in fields(params) if each.default is None and getattr(params, each.name) is None}
-    return {name: value for name, value in asdict(params).items() if name not in absent}
+    unset = {m.name for m in fields(params) if m.default is None and getattr(params, m.name) is None}
+    return {name: value for name, value in asdict(params).items() if name not in unset}
 
 
 def _as_tuple(value: Any) -> Any:
@@ -388,12 +388,12 @@ LOOK_ALIKE = (
 def distinct_colours(rng: np.random.Generator, count: int, pool: Sequence[str]) -> tuple[str, ...]:
     """Return `count` colours of the pool, no two of which look alike."""
     for _ in range(1000):
-        chosen = tuple(str(c) for c in rng.permutation(list(pool))[:count])
-        if len(chosen) == count and not any(pair <= set(chosen) for pair in LOOK_ALIKE):
-            return chosen
+        colours = tuple(str(c) for c in rng.permutation(list(pool))[:count])
+        if len(colours) == count and not any(pair <= set(colours) for pair in LOOK_ALIKE):
+            return colours
     raise ValueError(f"no {count} distinct colours among {list(pool)}; enlarge the pool")
 
 
-def listed(choices: Sequence[str]) -> str:
+def list_choices(choices: Sequence[str]) -> str:
     """Return the choices as they are read out: 'red, blue or green'."""
     return ", ".join(choices[:-1]) + " or " + choices[-1]

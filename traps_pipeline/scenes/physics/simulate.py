@@ -1,4 +1,4 @@
-"""Simulation of a built scene to a trajectory, and replay of it to poses."""
+"""Simulate a built scene to a trajectory, and replay it to poses."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 
 
 def initial_velocity(model: mujoco.MjModel, velocity: Mapping[str, Sequence[float]]) -> np.ndarray:
-    """Return qvel at the start, (nv,): a number a freedom, three a soft body."""
-    qvel, soft = np.zeros(model.nv), flexes(model)
+    """Return the initial qvel, (nv,), from velocities by body (3 numbers if soft)."""
+    qvel, soft_bodies = np.zeros(model.nv), flexes(model)
     for body, values in velocity.items():
-        if body in soft:
-            for address in model.body_dofadr[carriers(model, soft[body])]:
+        if body in soft_bodies:
+            for address in model.body_dofadr[carriers(model, soft_bodies[body])]:
                 qvel[address : address + 3] = values[:3]
             continue
         address = model.body(body).dofadr[0]
@@ -37,9 +37,9 @@ def simulate(model: mujoco.MjModel, scene: Scene, physics: Physics) -> np.ndarra
     for i in range(physics.n_frames):
         frames[i] = data.qpos
         mujoco.mj_step(model, data, physics.substeps)
-    bad = int(data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number)
-    if bad or not np.isfinite(frames).all():
-        raise FloatingPointError(f"simulation diverged ({bad} bad accelerations)")
+    n_warnings = int(data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number)
+    if n_warnings or not np.isfinite(frames).all():
+        raise FloatingPointError(f"simulation diverged ({n_warnings} bad accelerations)")
     return frames
 
 
@@ -47,17 +47,17 @@ def replay(model: mujoco.MjModel, qpos: np.ndarray, physics: Physics) -> Motion:
     """Return the poses of a trajectory's bodies, without dynamics."""
     import mujoco
 
-    data, soft = mujoco.MjData(model), flexes(model)
+    data, soft_bodies = mujoco.MjData(model), flexes(model)
     names = [model.body(i).name for i in range(1, model.nbody)]
     positions = np.empty((len(qpos), model.nbody, 3))
     rotations = np.empty((len(qpos), model.nbody, 9))
-    soft_vertices = {name: np.empty((len(qpos), int(model.flex_vertnum[i]), 3)) for name, i in soft.items()}
+    soft_vertices = {name: np.empty((len(qpos), int(model.flex_vertnum[i]), 3)) for name, i in soft_bodies.items()}
     for i, row in enumerate(qpos):
         data.qpos[:] = row
         mujoco.mj_kinematics(model, data)
         positions[i], rotations[i] = data.xpos, data.xmat
         for name, places in soft_vertices.items():
-            places[i] = vertices(model, data, soft[name])
+            places[i] = vertices(model, data, soft_bodies[name])
     return Motion(
         times=np.arange(len(qpos)) / physics.fps,
         positions={name: positions[:, i + 1] for i, name in enumerate(names)},
@@ -67,22 +67,22 @@ def replay(model: mujoco.MjModel, qpos: np.ndarray, physics: Physics) -> Motion:
 
 
 def swept_points(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
-    """Return corners of boxes of all that moves, over a trajectory, (N, 3), by eights."""
+    """Return box corners of all that moves, over a trajectory: (N, 3), in eights."""
     import mujoco
 
     data = mujoco.MjData(model)
-    moving = np.flatnonzero(model.body_dofnum[model.geom_bodyid] > 0)
+    moving_geoms = np.flatnonzero(model.body_dofnum[model.geom_bodyid] > 0)
     signs = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, 8).T
-    centre, half = model.geom_aabb[moving, :3], model.geom_aabb[moving, 3:]
-    local = centre[:, None] + signs[None] * half[:, None]
-    points, soft = [], flexes(model).values()
+    centre, half_size = model.geom_aabb[moving_geoms, :3], model.geom_aabb[moving_geoms, 3:]
+    local = centre[:, None] + signs[None] * half_size[:, None]
+    points, soft_bodies = [], flexes(model).values()
     for row in qpos:
         data.qpos[:] = row
         mujoco.mj_kinematics(model, data)
-        rotation = data.geom_xmat[moving].reshape(-1, 3, 3)
-        points.append(np.einsum("gij,gkj->gki", rotation, local) + data.geom_xpos[moving][:, None])
-        for flex in soft:
+        rotation = data.geom_xmat[moving_geoms].reshape(-1, 3, 3)
+        points.append(np.einsum("gij,gkj->gki", rotation, local) + data.geom_xpos[moving_geoms][:, None])
+        for flex in soft_bodies:
             at, reach = vertices(model, data, flex)[elements(model, flex)], float(model.flex_radius[flex])
-            middle, wide = (at.max(axis=1) + at.min(axis=1)) / 2, np.ptp(at, axis=1) / 2 + reach
-            points.append(middle[:, None] + signs[None] * wide[:, None])
+            middle, half_extent = (at.max(axis=1) + at.min(axis=1)) / 2, np.ptp(at, axis=1) / 2 + reach
+            points.append(middle[:, None] + signs[None] * half_extent[:, None])
     return np.concatenate(points).reshape(-1, 3)

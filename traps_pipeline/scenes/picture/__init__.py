@@ -1,1 +1,1 @@
-"""Camera, rendering, encoding, and the pixel checks of a simulated world."""
+"""Frame, render and encode simulated worlds, and check their pixels."""

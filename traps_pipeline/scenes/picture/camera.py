@@ -1,4 +1,4 @@
-"""Camera and occluder, both fitted, neither placed by hand."""
+"""Fit camera and occluder to a scene; neither is placed by hand."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class Occluder:
 
 @dataclass(frozen=True)
 class Closing:
-    """How a control ends: from this frame on an occluder stands before its outcome."""
+    """A control's end: from this frame on an occluder stands before the outcome."""
 
     frame: int
     occluder: Occluder
@@ -133,10 +133,10 @@ def fit_occluder(camera: Camera, cover: Box) -> Occluder:
     corners = cover.corners()
     front = float((corners @ ahead).min()) - OCCLUDER_GAP - 2 * OCCLUDER_HALF_THICKNESS
     reach = (corners - eye) @ ahead
-    on_plane = eye + (corners - eye) * ((front - eye @ ahead) / reach)[:, None]
-    side = on_plane @ across
+    plane_points = eye + (corners - eye) * ((front - eye @ ahead) / reach)[:, None]
+    side = plane_points @ across
     low, high = float(side.min()) - OCCLUDER_MARGIN, float(side.max()) + OCCLUDER_MARGIN
-    top = float(on_plane[:, 2].max()) + OCCLUDER_MARGIN
+    top = float(plane_points[:, 2].max()) + OCCLUDER_MARGIN
     centre = across * (low + high) / 2 + ahead * (front + OCCLUDER_HALF_THICKNESS) + np.array([0, 0, top / 2])
     return Occluder(
         centre=_vec(centre),
@@ -146,7 +146,7 @@ def fit_occluder(camera: Camera, cover: Box) -> Occluder:
 
 
 def fit_shot(view: View, points: np.ndarray, cover: Box | None) -> tuple[Camera, Occluder | None]:
-    """Return a camera, and an occluder placed by it that it has in frame."""
+    """Fit a camera, and an occluder in its frame; return both."""
     camera, occluder = fit_camera(view, points), None
     if cover is None:
         return camera, None

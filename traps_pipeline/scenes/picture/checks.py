@@ -1,4 +1,4 @@
-"""Pixel evidence: of a geom, past an occluder, between two worlds."""
+"""Measure pixels: of a geom, past an occluder, between two worlds."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ SAMPLED_FPS = 5  # models are shown this rate (docs/spec.md 3.1)
 
 
 def last_sampled(n_frames: int, fps: int, count: int = 3) -> list[int]:
-    """Return indices of the last frames that a 5 FPS sample has."""
+    """Return indices of the last frames of a 5 FPS sample."""
     return list(range(0, n_frames, fps // SAMPLED_FPS))[-count:]
 
 
 def least_visible(renderer: Renderer, qpos: np.ndarray, groups: Sequence[tuple[tuple[str, ...], float]]) -> list[float]:
-    """Return the least pixels of each group of geoms in any of some control frames."""
+    """Return each geom group's minimum of visible pixels over some control frames."""
     geoms = sorted({name for names, _ in groups for name in names})
     counts = renderer.visible_pixels(qpos, geoms)
     return [float(counts[:, [geoms.index(n) for n in names]].sum(axis=1).min()) for names, _ in groups]
@@ -35,8 +35,8 @@ class PastOccluder:
 
     def hidden_from(self) -> int:
         """Return the first frame from which no decisive pixel is seen; F if none."""
-        showing = np.flatnonzero(self.decisive)
-        return int(showing[-1]) + 1 if showing.size else 0
+        visible_frames = np.flatnonzero(self.decisive)
+        return int(visible_frames[-1]) + 1 if visible_frames.size else 0
 
     def leaked(self, first: int) -> float:
         """Return decisive pixels from a frame on, and all of the hidden element."""
@@ -44,19 +44,19 @@ class PastOccluder:
 
 
 def past_occluder(renderer: Renderer, qpos: np.ndarray, decisive: Sequence[str], hidden: Sequence[str]) -> PastOccluder:
-    """Return what is seen past the occluder of some geoms, by segmentation."""
+    """Return the visible pixels of some geoms past the occluder, by segmentation."""
     counts = renderer.visible_pixels(qpos, [*decisive, *hidden], occluder=True)
     return PastOccluder(counts[:, : len(decisive)].sum(axis=1), counts[:, len(decisive) :].sum(axis=1))
 
 
 def seen_moving(pixels: np.ndarray, places: np.ndarray, *, least_px: float, step_px: float) -> int:
-    """Count the steps in which a body is visible in both frames and moves so far.
+    """Count the steps of at least `step_px` whose body is visible in both frames.
 
     pixels (F,), places (F, 2) in pixels.
     """
-    moves = np.abs(np.diff(places, axis=0)).max(axis=1) >= step_px
+    is_moving = np.abs(np.diff(places, axis=0)).max(axis=1) >= step_px
     visible = pixels >= least_px
-    return int((moves & visible[1:] & visible[:-1]).sum())
+    return int((is_moving & visible[1:] & visible[:-1]).sum())
 
 
 def swept_behind(camera: Camera, swept: Sequence[np.ndarray], occluder: Occluder) -> float:
@@ -66,12 +66,12 @@ def swept_behind(camera: Camera, swept: Sequence[np.ndarray], occluder: Occluder
     """
     import cv2
 
-    moving, board = (np.zeros((HEIGHT, WIDTH), np.uint8) for _ in range(2))
-    for mask, solids in ((moving, swept), (board, [occluder.corners()])):
+    motion_mask, board = (np.zeros((HEIGHT, WIDTH), np.uint8) for _ in range(2))
+    for mask, solids in ((motion_mask, swept), (board, [occluder.corners()])):
         for corners in solids:
             outline = cv2.convexHull(camera.project(corners).round().astype(np.int32))
             cv2.fillConvexPoly(mask, outline, 1)
-    return float((moving & board).sum() / max(1, moving.sum()))
+    return float((motion_mask & board).sum() / max(1, motion_mask.sum()))
 
 
 def void_frames(renderer: Renderer, qpos: np.ndarray, without: Sequence[str] = ()) -> Iterator[np.ndarray]:
@@ -84,30 +84,30 @@ def closing_frames(
 ) -> Iterator[np.ndarray]:
     """Yield a trajectory (F, nq) with its closing board, and the void's if `occluder`.
 
-    board: of each row, where the board is; once it stands it is drawn in place of the void's own.
+    board: offset of the board in each row; once it stands it is drawn in place of the void's own.
     """
     for row, offset in zip(qpos, board, strict=True):
-        stands = offset == LANDED
-        yield from renderer.frames([row], occluder=occluder or stands, board=None if stands else offset)
+        is_standing = offset == LANDED
+        yield from renderer.frames([row], occluder=occluder or is_standing, board=None if is_standing else offset)
 
 
 def ablation_pixels(
     renderer: Renderer, qpos: np.ndarray, geoms: Sequence[str], void: Iterable[np.ndarray] | None = None
 ) -> int:
-    """Return how many void pixels change when geoms are taken away; 0: no trace shows.
+    """Return the number of void pixels that change without some geoms (0: no trace).
 
     void: the frames with them, if they are drawn already.
     """
-    complete = void_frames(renderer, qpos) if void is None else void
-    return differing_pixels(complete, void_frames(renderer, qpos, without=geoms))[0]
+    complete_frames = void_frames(renderer, qpos) if void is None else void
+    return differing_pixels(complete_frames, void_frames(renderer, qpos, without=geoms))[0]
 
 
 def differing_pixels(frames: Iterable[np.ndarray], counterparts: Iterable[np.ndarray]) -> tuple[int, int]:
     """Return how many pixels of two videos differ, and the largest difference (0-255)."""
-    pixels, largest = 0, 0
+    pixels, largest_difference = 0, 0
     for a, b in zip(frames, counterparts, strict=True):
         if not np.array_equal(a, b):
             difference = np.abs(a.astype(np.int16) - b)
             pixels += int(difference.any(axis=2).sum())
-            largest = max(largest, int(difference.max()))
-    return pixels, largest
+            largest_difference = max(largest_difference, int(difference.max()))
+    return pixels, largest_difference

@@ -1,4 +1,4 @@
-"""The board that closes a control: it falls into the picture and stands.
+"""Animate the board that closes a control: it falls into the picture and stands.
 
 A camera that looks down on the scene sees it slide in from the side instead. It comes just in front of where a void's
 own board stands, in control and void alike: neither that a board comes nor when tells the sides of an occlusion pair
@@ -13,7 +13,7 @@ import numpy as np
 
 from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH, Camera, Closing, Occluder
 
-FASTER_M_S2 = 9.81  # as things fall; a board that slides in gains speed like one
+ACCELERATION_M_S2 = 9.81  # as things fall; a board that slides in gains speed like one
 STEEP_DEG = 45.0  # a camera that looks down by more
 IN_FRONT_M = 0.002  # of the board that may stand already
 STEP_M = 0.02  # to which the way is found
@@ -25,17 +25,17 @@ Coming = list[Offset | None]  # of each frame: how far from its place (m) the bo
 
 
 def coming_board(closing: Closing | None, camera: Camera, n_frames: int, fps: float) -> Coming:
-    """Return where the board is in every frame of a clip that it closes."""
+    """Return the board's offset (m) in every frame of the clip, None before it comes."""
     if closing is None:
         return [None] * n_frames
-    way = _way(closing.occluder, camera)
-    distance = _out_of_picture_m(closing.occluder, camera, way)
-    speed = math.sqrt(2 * FASTER_M_S2 * distance)  # m/s, as it lands
+    direction = _direction(closing.occluder, camera)
+    distance = _out_of_picture_m(closing.occluder, camera, direction)
+    speed = math.sqrt(2 * ACCELERATION_M_S2 * distance)  # m/s, as it lands
 
     def offset(left_s: float) -> Offset | None:
-        if left_s >= speed / FASTER_M_S2:
+        if left_s >= speed / ACCELERATION_M_S2:
             return None
-        x, y, z = (speed * left_s - FASTER_M_S2 * left_s**2 / 2) * way
+        x, y, z = (speed * left_s - ACCELERATION_M_S2 * left_s**2 / 2) * direction
         return (float(x), float(y), float(z))
 
     return [LANDED if i >= closing.frame else offset((closing.frame - i) / fps) for i in range(n_frames)]
@@ -47,7 +47,7 @@ def before_board(occluder: Occluder) -> np.ndarray:
     return -(2 * occluder.half[1] + IN_FRONT_M) * np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
 
 
-def _way(occluder: Occluder, camera: Camera) -> np.ndarray:
+def _direction(occluder: Occluder, camera: Camera) -> np.ndarray:
     """Return the unit vector to where a board comes from: up, or its side."""
     if camera.elevation_deg >= -STEEP_DEG:
         return np.array([0.0, 0.0, 1.0])

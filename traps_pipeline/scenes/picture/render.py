@@ -1,4 +1,4 @@
-"""Frames of a trajectory, drawn by MuJoCo at twice the size and averaged 2x2.
+"""Render a trajectory's frames with MuJoCo at twice the size, averaged 2x2.
 
 One off-screen GL context lives as long as the process; each `Renderer` owns one `MjrContext` for its model.
 """
@@ -91,8 +91,8 @@ def _make_floors_finite(model: mujoco.MjModel, camera: Camera) -> None:
 class Renderer:
     """Context manager that draws a model from a camera: uint8 RGB, (360, 480, 3).
 
-    Frames are (720, 960, 3) of a model whose look is as fine as that. supersample: by how much the drawing is larger; 1
-    takes a quarter of the time, where edges need not be smooth.
+    Frames are (720, 960, 3) of a model whose look is as fine as that. supersample: factor by which the drawing is
+    larger; 1 takes a quarter of the time, where edges need not be smooth.
     """
 
     def __init__(self, model: mujoco.MjModel, camera: Camera, *, supersample: int = SUPERSAMPLE) -> None:
@@ -154,8 +154,8 @@ class Renderer:
         for row in qpos:
             self._put_board(board)
             raw = self._draw(row, occluder=occluder, without=without)
-            small = cv2.resize(raw, (WIDTH * self._fine, HEIGHT * self._fine), interpolation=cv2.INTER_AREA)
-            yield cv2.flip(cv2.cvtColor(small, cv2.COLOR_RGBA2RGB), 0)
+            frame = cv2.resize(raw, (WIDTH * self._fine, HEIGHT * self._fine), interpolation=cv2.INTER_AREA)
+            yield cv2.flip(cv2.cvtColor(frame, cv2.COLOR_RGBA2RGB), 0)
 
     def visible_pixels(
         self, qpos: Sequence[np.ndarray] | np.ndarray, geoms: Sequence[str], *, occluder: bool = False
@@ -164,8 +164,8 @@ class Renderer:
         import mujoco
 
         kinds = (int(mujoco.mjtObj.mjOBJ_GEOM), int(mujoco.mjtObj.mjOBJ_FLEX))
-        things = [(kinds[self._is_soft(name)], self._number(name)) for name in geoms]
-        counts = np.zeros((len(qpos), len(things)))
+        keys = [(kinds[self._is_soft(name)], self._number(name)) for name in geoms]
+        counts = np.zeros((len(qpos), len(keys)))
         flags = self._scene.flags
         flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = True
         try:
@@ -175,8 +175,8 @@ class Renderer:
                 pixels = np.bincount((rgba.view("<u4") & 0xFFFFFF).ravel())  # a segment's id is its colour
                 shapes = self._scene.geoms[: self._scene.ngeom]
                 shape_of = {g.segid + 1: (g.objtype, g.objid) for g in shapes if g.objtype in kinds}
-                pixels_of = {thing: pixels[id_] for id_, thing in shape_of.items() if id_ < len(pixels)}
-                counts[i] = [pixels_of.get(thing, 0) / self._scale**2 for thing in things]
+                pixels_of = {key: pixels[id_] for id_, key in shape_of.items() if id_ < len(pixels)}
+                counts[i] = [pixels_of.get(key, 0) / self._scale**2 for key in keys]
         finally:
             flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = False
         return counts
@@ -205,19 +205,21 @@ class Renderer:
         option.geomgroup[:] = 1
         option.geomgroup[OCCLUDER_GROUP], option.geomgroup[COMING_GROUP] = int(occluder), int(self._comes)
         option.geomgroup[FLOOR_GROUP] = option.geomgroup[REMOVED_GROUP] = option.flexgroup[REMOVED_GROUP] = 0
-        everything, unmoved = mujoco.mjtCatBit.mjCAT_ALL, mujoco.MjvPerturb()
+        all_categories, no_perturbation = mujoco.mjtCatBit.mjCAT_ALL, mujoco.MjvPerturb()
         groups, soft_groups = self._model.geom_group.copy(), self._model.flex_group.copy()
         self._model.geom_group[self._model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE] = FLOOR_GROUP
         for name in without:
             target = self._model.flex_group if self._is_soft(name) else self._model.geom_group
             target[self._number(name)] = REMOVED_GROUP
         try:
-            mujoco.mjv_updateScene(self._model, self._data, option, unmoved, self._camera, everything, self._scene)
+            mujoco.mjv_updateScene(
+                self._model, self._data, option, no_perturbation, self._camera, all_categories, self._scene
+            )
             # The floor last: what stands before it is not painted over. The same picture, up to a fifth sooner.
             for target in (option.geomgroup, option.flexgroup, option.sitegroup, option.tendongroup, option.skingroup):
                 target[:] = 0
             option.geomgroup[FLOOR_GROUP] = 1
-            mujoco.mjv_addGeoms(self._model, self._data, option, unmoved, everything, self._scene)
+            mujoco.mjv_addGeoms(self._model, self._data, option, no_perturbation, all_categories, self._scene)
             self._add_haze()
         finally:
             self._model.geom_group[:], self._model.flex_group[:] = groups, soft_groups
@@ -236,8 +238,10 @@ class Renderer:
 
         for plane in np.flatnonzero(self._model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)[:1]:
             place, turn = self._data.geom_xpos[plane], self._data.geom_xmat[plane]
-            unseen = self._scene.geoms[self._scene.ngeom]
-            mujoco.mjv_initGeom(unseen, mujoco.mjtGeom.mjGEOM_PLANE, np.zeros(3), place, turn, np.ones(4, np.float32))
+            haze_geom = self._scene.geoms[self._scene.ngeom]
+            mujoco.mjv_initGeom(
+                haze_geom, mujoco.mjtGeom.mjGEOM_PLANE, np.zeros(3), place, turn, np.ones(4, np.float32)
+            )
             self._scene.ngeom += 1
 
     def _is_soft(self, name: str) -> bool:
@@ -253,12 +257,12 @@ class Renderer:
         In a model with other things than geoms the whole pose stands for them.
         """
         model, data = self._model, self._data
-        removed = [self._number(name) for name in without if not self._is_soft(name)]
+        removed_ids = [self._number(name) for name in without if not self._is_soft(name)]
         groups = model.geom_group
-        shown = (groups != REMOVED_GROUP) & ((groups != OCCLUDER_GROUP) | occluder)
-        shown &= (groups != COMING_GROUP) | self._comes
-        shown[removed] = False
-        places = (data.geom_xpos[shown], data.geom_xmat[shown], data.light_xpos, data.light_xdir)
+        is_shown = (groups != REMOVED_GROUP) & ((groups != OCCLUDER_GROUP) | occluder)
+        is_shown &= (groups != COMING_GROUP) | self._comes
+        is_shown[removed_ids] = False
+        places = (data.geom_xpos[is_shown], data.geom_xmat[is_shown], data.light_xpos, data.light_xdir)
         pose = data.qpos if model.nflex or model.nsite or model.ntendon or model.nskin else np.empty(0)
         return (*(values.tobytes() for values in places), pose.tobytes())
 

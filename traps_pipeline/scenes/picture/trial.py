@@ -1,4 +1,4 @@
-"""Trial of this machine: draw a frame and encode a clip."""
+"""Test whether this machine can draw a frame and encode a clip."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _OPENGL = re.compile(r"MUJOCO_|PYOPENGL_|MESA_|GALLIUM_|LIBGL_|LP_NATIVE|EGL_|__
 
 
 def draw_frame() -> str:
-    """Draw a red ball; return what drew it. Raises TrapsError with the remedy."""
+    """Draw a red ball; return the renderer's name. Raises TrapsError with the remedy."""
     import numpy as np
 
     try:
@@ -38,7 +38,7 @@ def draw_frame() -> str:
 
 
 def opengl_variables() -> dict[str, str]:
-    """Return the environment's variables that choose what draws, and how."""
+    """Return the environment variables that select and configure the renderer."""
     variables = {name: value for name, value in sorted(os.environ.items()) if _OPENGL.match(name)}
     # OpenCV adds a folder of its own to the loader's when it is imported: nobody chose that.
     folders = [folder for folder in variables.pop("LD_LIBRARY_PATH", "").split(":") if folder and "/cv2/" not in folder]

@@ -1,7 +1,7 @@
-"""Walls that are not drawn, and the drawn edges by which a viewer knows of them.
+"""Find walls that are not drawn, and the drawn edges that reveal them.
 
-A thing that turns round where nothing is to be seen breaks the physics that a viewer can reckon with. So a wall that
-is not drawn (a pane that would tint what is behind it) must have edges that are. A pane before the scene that lies
+A thing that turns back where nothing is visible contradicts the physics that a viewer expects. So a wall that is not
+drawn (a pane that would tint what is behind it) must have edges that are. A pane before the scene that lies
 parallel to the picture needs none: it stops only what would come towards the eye.
 """
 
@@ -31,20 +31,20 @@ def outlines(model: mujoco.MjModel, camera: Camera, qpos: np.ndarray) -> Mapping
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_kinematics(model, data)
-    solid = (model.geom_contype | model.geom_conaffinity) != 0
+    is_solid = (model.geom_contype | model.geom_conaffinity) != 0
     static = model.body_weldid[model.geom_bodyid] == 0
     visible = model.geom_rgba[:, 3] > 0
-    edges = np.flatnonzero(static & visible & ~solid)
+    edges = np.flatnonzero(static & visible & ~is_solid)
     names: dict[str, tuple[str, ...]] = {}
-    for wall in np.flatnonzero(solid & ~visible):
+    for wall in np.flatnonzero(is_solid & ~visible):
         if _is_facing_eye(model, data, camera, int(wall)):
             continue
-        near = [
+        nearby_edges = [
             int(edge)
             for edge in edges
             if mujoco.mj_geomDistance(model, data, int(wall), int(edge), 2 * TOUCHES_M, np.zeros(6)) < TOUCHES_M
         ]
-        names[model.geom(int(wall)).name] = tuple(model.geom(edge).name for edge in near)
+        names[model.geom(int(wall)).name] = tuple(model.geom(edge).name for edge in nearby_edges)
     return names
 
 

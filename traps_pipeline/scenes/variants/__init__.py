@@ -1,1 +1,1 @@
-"""Variants of a scenario, its further clips and questions: arms and variations."""
+"""Make variants of a scenario, with other clips and questions: arms, variations."""

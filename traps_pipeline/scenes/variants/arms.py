@@ -1,4 +1,4 @@
-"""Arms: further clips and questions that take one shortcut away (docs/arms.md).
+"""Define arms: clips and questions that take one shortcut away (docs/arms.md).
 
 A shortcut tells control from void without looking at what happens: an occluder in the first frame, a short clip, the
 words of a question. In an arm the shortcut points the wrong way, and a certificate says that it may: what must be
@@ -42,7 +42,7 @@ OCCLUDER_PX = 2000.0  # of a decoy in the first frame: 1 % of the picture
 EARLIEST_COVER_S = 0.5  # the late occluder comes no earlier
 AGREE_SHARE = 0.95  # of the futures of a predictable cut
 FUTURES = 64  # of the last frame that it shows
-LEADS = (5, 3, 2, 1)  # frames before commitment at which it may cut, the earliest first
+LEAD_FRAMES = (5, 3, 2, 1)  # frames before commitment at which it may cut, the earliest first
 BEHIND_M = 0.05  # a decoy stands so far behind all that is shown
 
 
@@ -91,7 +91,7 @@ class Scenario:
 
 @dataclass(frozen=True)
 class Take:
-    """What an arm shows, and the numbers behind its certificate."""
+    """The frames that an arm shows, and the numbers behind its certificate."""
 
     frames: list[np.ndarray]
     evidence: Mapping[str, Any]
@@ -113,7 +113,7 @@ class Question:
 
 @dataclass(frozen=True)
 class Arm:
-    """An arm of some scenarios; `protocol.datasets` says of which, and what it asks.
+    """An arm of some scenarios; `protocol.datasets` says of which, and its questions.
 
     takes_away: the shortcut that it turns against its user. promises: its certificate in words.
 
@@ -142,17 +142,17 @@ def _decoys(scenario: Scenario, points: np.ndarray) -> Iterator[Occluder]:
     azimuth = np.radians(control.camera.azimuth_deg)
     ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     across = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
-    centre, half = np.array(occluder.centre), occluder.half[0]
+    centre, half_width = np.array(occluder.centre), occluder.half[0]
     low, high = float((points @ across).min()), float((points @ across).max())
-    behind = float((points @ ahead).max()) - float(centre @ ahead) + BEHIND_M + OCCLUDER_HALF_THICKNESS
+    depth_behind = float((points @ ahead).max()) - float(centre @ ahead) + BEHIND_M + OCCLUDER_HALF_THICKNESS
     at = float(centre @ across)
-    for aside in (0.0, high - at, low - at):
-        yield _moved(occluder, ahead * behind + across * aside)
-    for aside in (high + half + BEHIND_M - at, low - half - BEHIND_M - at):
-        yield _moved(occluder, across * aside)
+    for offset in (0.0, high - at, low - at):
+        yield _move(occluder, ahead * depth_behind + across * offset)
+    for offset in (high + half_width + BEHIND_M - at, low - half_width - BEHIND_M - at):
+        yield _move(occluder, across * offset)
 
 
-def _moved(occluder: Occluder, by: np.ndarray) -> Occluder:
+def _move(occluder: Occluder, by: np.ndarray) -> Occluder:
     x, y, z = (round(float(value), 6) for value in np.array(occluder.centre) + by)
     return replace(occluder, centre=(x, y, z))
 
@@ -167,19 +167,20 @@ def _decoy(scenario: Scenario) -> Take:
         model, scene = compile_scene(control.family, control.params, control.physics, occluder)
         geoms = [*decisive_geoms(model, scene.decisive), *scene.hidden]
         groups = legible_groups(control.family, model, scene, control.motion, control.params)
-        sampled = control.qpos[scenario.sampled]
+        sampled_qpos = control.qpos[scenario.sampled]
         with Renderer(model, camera) as renderer:
-            shown = float(renderer.visible_pixels(sampled[:1], ["occluder"], occluder=True)[0, 0])
-            without, beside = (renderer.visible_pixels(sampled, geoms, occluder=drawn) for drawn in (False, True))
-            hidden = float(np.abs(without - beside).sum())
-            least = checks.least_visible(renderer, sampled[-3:], groups)
-            small = [f"{px:.0f} of {want:.0f} pixels" for px, (_, want) in zip(least, groups, strict=True) if px < want]
-            if shown < OCCLUDER_PX or hidden or small:
-                reason = (
-                    f"the decoy shows {shown:.0f} pixels, hides {hidden:.0f}, leaves {small or 'enough'} to be seen"
-                )
+            occluder_px = float(renderer.visible_pixels(sampled_qpos[:1], ["occluder"], occluder=True)[0, 0])
+            pixels = [renderer.visible_pixels(sampled_qpos, geoms, occluder=is_drawn) for is_drawn in (False, True)]
+            hidden = float(np.abs(pixels[0] - pixels[1]).sum())
+            min_pixels = checks.least_visible(renderer, sampled_qpos[-3:], groups)
+            needs = [needed for _, needed in groups]
+            too_small = [f"{px:.0f} of {n:.0f} pixels" for px, n in zip(min_pixels, needs, strict=True) if px < n]
+            if occluder_px < OCCLUDER_PX or hidden or too_small:
+                visible = too_small or "enough"
+                reason = f"the decoy shows {occluder_px:.0f} pixels, hides {hidden:.0f}, leaves {visible} to be seen"
                 continue
-            evidence = {"panel_px": shown, "hides_px": hidden, "least_visible_px": min(least), "panel": vars(occluder)}
+            evidence = {"panel_px": occluder_px, "hides_px": hidden, "least_visible_px": min(min_pixels)}
+            evidence |= {"panel": vars(occluder)}
             return Take(list(renderer.frames(control.qpos, occluder=True)), evidence)
     raise Rejected(f"{spec.scenario_id}: no place for an occluder that hides nothing ({reason})")
 
@@ -202,15 +203,15 @@ def _late_occluder(scenario: Scenario) -> Take:
     at = scenario.control.outcome.commit_frame - 1
     if at < EARLIEST_COVER_S * scenario.fps:
         raise Rejected(f"the outcome is settled at {(at + 1) / scenario.fps:.1f} s: nothing can be seen before it")
-    before = slice(0, at, scenario.fps // checks.SAMPLED_FPS)
-    pairs = zip(scenario.control_frames[before], scenario.twin_frames[before], strict=True)
-    differing = max(int((a != b).any(axis=2).sum()) for a, b in pairs)
-    if differing < SEEN_PX:
+    frames_before = slice(0, at, scenario.fps // checks.SAMPLED_FPS)
+    pairs = zip(scenario.control_frames[frames_before], scenario.twin_frames[frames_before], strict=True)
+    n_differing = max(int((a != b).any(axis=2).sum()) for a, b in pairs)
+    if n_differing < SEEN_PX:
         raise Rejected(
-            f"before the occluder comes the two worlds differ in {differing} pixels, {SEEN_PX:.0f} are wanted"
+            f"before the occluder comes the two worlds differ in {n_differing} pixels, {SEEN_PX:.0f} are wanted"
         )
     frames = [*scenario.control_frames[:at], *scenario.void_frames[at:]]
-    return Take(frames, {"covered_from_s": at / scenario.fps, "differing_px": differing})
+    return Take(frames, {"covered_from_s": at / scenario.fps, "differing_px": n_differing})
 
 
 # --- length -----------------------------------------------------------------------------------------------------------
@@ -235,15 +236,15 @@ def _predictable_cut(scenario: Scenario) -> Take:
     control, commit = scenario.control, scenario.control.outcome.commit_frame
     if not control.same_physics:
         raise Rejected("simulating here does not give the frozen trajectory, so that its futures are not known")
-    for frame in (commit - lead for lead in LEADS if commit - lead > EARLIEST_CUT_S * scenario.fps):
-        agree = _agreeing(scenario, frame - 1)
+    for frame in (commit - lead for lead in LEAD_FRAMES if commit - lead > EARLIEST_CUT_S * scenario.fps):
+        agree = _count_agreeing(scenario, frame - 1)
         if agree is not None:
             evidence = {"cut_s": frame / scenario.fps, "settled_s": commit / scenario.fps, "agree": agree}
             return Take(scenario.control_frames[:frame], evidence | {"futures": FUTURES})
     raise Rejected("no cut before the outcome is settled leaves it nearly certain")
 
 
-def _agreeing(scenario: Scenario, frame: int) -> int | None:
+def _count_agreeing(scenario: Scenario, frame: int) -> int | None:
     """Return how many perturbed futures of a frame end in the answer; None if too few."""
     import mujoco
 
@@ -257,7 +258,7 @@ def _agreeing(scenario: Scenario, frame: int) -> int | None:
     state = np.empty(mujoco.mj_stateSize(model, kind))
     mujoco.mj_getState(model, data, state, kind)
     rng = np.random.default_rng([spec.seed, frame, FUTURES])
-    trajectory, disagree = np.array(control.qpos, float), 0
+    trajectory, n_disagreeing = np.array(control.qpos, float), 0
     for _ in range(FUTURES):
         mujoco.mj_setState(model, data, state, kind)
         mujoco.mj_integratePos(model, data.qpos, rng.normal(scale=control.family.perturbation, size=model.nv), 1.0)
@@ -265,10 +266,10 @@ def _agreeing(scenario: Scenario, frame: int) -> int | None:
             mujoco.mj_step(model, data, substeps)
             row[:] = data.qpos
         labels = control.family.outcome(replay(model, trajectory, control.physics), control.params).labels
-        disagree += labels[-1] != spec.ground_truth
-        if disagree > (1 - AGREE_SHARE) * FUTURES:
+        n_disagreeing += labels[-1] != spec.ground_truth
+        if n_disagreeing > (1 - AGREE_SHARE) * FUTURES:
             return None
-    return FUTURES - disagree
+    return FUTURES - n_disagreeing
 
 
 # --- the other world, other words -------------------------------------------------------------------------------------
@@ -300,8 +301,8 @@ def crossed(partner: SceneSpec | None) -> Arm:
     def film(scenario: Scenario) -> Take:
         ask(scenario.spec)
         assert partner is not None, "asked for above"
-        if why := false_premise(_presumed(partner), scenario.control.inventory):
-            return Take([], {"refuted_by": why})
+        if premise := false_premise(_presumed(partner), scenario.control.inventory):
+            return Take([], {"refuted_by": premise})
         raise Rejected(f"the scene does not refute {partner.question!r}")
 
     return Arm(
@@ -328,11 +329,11 @@ def partners(specs: Iterable[SceneSpec]) -> dict[str, str]:
     The scenes of partners refute each other's question. So each question is asked in vain as often as it is answered.
     Scenarios with the fewest candidates choose first, which leaves few without a partner.
     """
-    by_id = {spec.scenario_id: spec for spec in sorted(specs, key=lambda spec: spec.scenario_id)}
-    inventories = {id_: World.of_record(spec, np.empty((0, 0))).inventory for id_, spec in by_id.items()}
-    presumed = {id_: _presumed(spec) for id_, spec in by_id.items()}
-    refuted = {(a, b) for a in by_id for b in by_id if false_premise(presumed[b], inventories[a]) is not None}
-    free = {a: {b for b in by_id if (a, b) in refuted and (b, a) in refuted} for a in by_id}
+    spec_of = {spec.scenario_id: spec for spec in sorted(specs, key=lambda spec: spec.scenario_id)}
+    inventories = {id_: World.of_record(spec, np.empty((0, 0))).inventory for id_, spec in spec_of.items()}
+    presumed = {id_: _presumed(spec) for id_, spec in spec_of.items()}
+    refuted = {(a, b) for a in spec_of for b in spec_of if false_premise(presumed[b], inventories[a]) is not None}
+    free = {a: {b for b in spec_of if (a, b) in refuted and (b, a) in refuted} for a in spec_of}
     partner_of: dict[str, str] = {}
     while candidates := [a for a in free if free[a]]:
         a = min(candidates, key=lambda name: len(free[name]))
@@ -382,7 +383,7 @@ ARMS: Mapping[str, Arm] = {
         Arm(
             "predictable_cut",
             "a cut means: abstain",
-            f"the control is cut up to {LEADS[0]} frames before its outcome is settled, where at least "
+            f"the control is cut up to {LEAD_FRAMES[0]} frames before its outcome is settled, where at least "
             f"{AGREE_SHARE:.0%} of {FUTURES} futures of the last frame, perturbed as for `open`, end in the answer",
             must_answer,
             _predictable_cut,

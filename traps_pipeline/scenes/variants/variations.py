@@ -1,4 +1,4 @@
-"""Variations of how a scenario is asked and shown, one thing changed in each.
+"""Define variations: a scenario asked or shown with one thing changed.
 
 docs/hypotheses.md says what each is for. What varies the question or the way it is put shows the pair's own clips; what
 varies the occluder is drawn and certified here. An occluder that lets the outcome through makes no void, and is not
@@ -18,7 +18,7 @@ from traps_pipeline.protocol.datasets import FRAMINGS, OCCLUDER_DOSES, OCCLUDER_
 from traps_pipeline.scenes.certification.certificates import legible_groups
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.parts.wording import choices_in, match_slots
-from traps_pipeline.scenes.physics.kit import listed
+from traps_pipeline.scenes.physics.kit import list_choices
 from traps_pipeline.scenes.picture import checks
 from traps_pipeline.scenes.picture.render import Renderer
 from traps_pipeline.scenes.variants.arms import SEEN_PX, Arm, Question, Scenario, Take, must_answer
@@ -29,8 +29,8 @@ from traps_pipeline.video.policies import shown_at_end
 
 # --- thresholds -------------------------------------------------------------------------------------------------------
 
-NOTICED = 8  # levels of 255 by which a channel must differ for a pixel to count as seen through an occluder
-WIDER = 1.4  # by which the large occluder is wider: a higher one would hide the flags of what the question names
+SEEN_LEVELS = 8  # levels of 255 by which a channel must differ for a pixel to count as seen through an occluder
+WIDTH_FACTOR = 1.4  # by which the large occluder is wider: a higher one would hide the flags of what the question names
 GREY, MAGENTA = (0.55, 0.55, 0.57), (1.0, 0.0, 1.0)  # a colour near the floor's; one that nothing in any scene has
 END_S = 0.5  # of the control's end, in which frames shown later must show the outcome
 PALETTE = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")  # colours that may be offered as answers
@@ -46,7 +46,7 @@ def with_labels(spec: SceneSpec, count: int) -> tuple[str, tuple[str, ...]]:
     answers are no colours, or the choices are part of the sentence.
     """
     if spec.answer_type != "colour":
-        raise Rejected(f"the answers {listed(spec.labels)} are no colours, so that no others can be offered")
+        raise Rejected(f"the answers {list_choices(spec.labels)} are no colours, so that no others can be offered")
     slots = match_slots(get_family(spec.family).questions, spec.question)
     if slots is None or set(choices_in(slots.get("choices", ""))) != set(spec.labels):
         raise Rejected(f"the choices of {spec.question!r} are part of its sentence")
@@ -55,7 +55,7 @@ def with_labels(spec: SceneSpec, count: int) -> tuple[str, tuple[str, ...]]:
     labels = _mixed(spec, [*dict.fromkeys(pool)][:count])
     if len(labels) < count:
         raise Rejected(f"there are {len(labels)} answers to choose from, {count} are wanted")
-    return spec.question.replace(slots["choices"], listed(labels)), tuple(labels)
+    return spec.question.replace(slots["choices"], list_choices(labels)), tuple(labels)
 
 
 def _mixed(spec: SceneSpec, labels: Sequence[str]) -> list[str]:
@@ -103,7 +103,7 @@ def _offered(scenario: Scenario) -> Take:
 
 @dataclass(frozen=True)
 class Look:
-    """Look of an occluder. colour: RGB or None, alpha: 1 is opaque, wide: factor."""
+    """An occluder's look. colour: RGB or None; alpha: 1 is opaque; wide: a factor."""
 
     colour: tuple[float, float, float] | None = None
     alpha: float = 1.0
@@ -126,20 +126,24 @@ def _renderer(world: World, look: Look) -> Renderer:
 def _void_with(scenario: Scenario, look: Look) -> Take:
     """Return the void with another occluder, alike in both worlds. Raises Rejected."""
     control, twin = scenario.control, scenario.twin
-    moving = moving_geoms(control.model)
+    moving_names = moving_geoms(control.model)
     with _renderer(control, look) as renderer:
         frames = list(checks.void_frames(renderer, control.qpos))
         shown_px = float(renderer.visible_pixels(control.qpos[:1], ["occluder"], occluder=True)[0, 0])
-        cause = float(renderer.visible_pixels(control.qpos[scenario.sampled], moving, occluder=True).sum(axis=1).max())
+        cause = float(
+            renderer.visible_pixels(control.qpos[scenario.sampled], moving_names, occluder=True).sum(axis=1).max()
+        )
     with _renderer(twin, look) as renderer:
-        differing, levels = checks.differing_pixels(frames, checks.void_frames(renderer, twin.qpos))
-    if differing:
-        raise Rejected(f"behind this occluder the two worlds differ in {differing} pixels, by {levels} levels at most")
+        n_differing, levels = checks.differing_pixels(frames, checks.void_frames(renderer, twin.qpos))
+    if n_differing:
+        raise Rejected(
+            f"behind this occluder the two worlds differ in {n_differing} pixels, by {levels} levels at most"
+        )
     if cause < SEEN_PX:
         raise Rejected(
             f"past this occluder at most {cause:.0f} pixels of what moves are seen, {SEEN_PX:.0f} are wanted"
         )
-    evidence = {"panel_px": shown_px, "cause_px": cause, "twin_px": differing}
+    evidence = {"panel_px": shown_px, "cause_px": cause, "twin_px": n_differing}
     looks = {"wide": look.wide, "contrast": _contrast(frames[0], scenario.control_frames[0])}
     return Take(frames, evidence | looks)
 
@@ -149,8 +153,8 @@ def _contrast(void: np.ndarray, control: np.ndarray) -> float:
     import cv2
 
     lab = [cv2.cvtColor((frame / 255).astype(np.float32), cv2.COLOR_RGB2LAB) for frame in (void, control)]
-    far = np.linalg.norm(lab[0] - lab[1], axis=2)
-    return round(float(far[far > 0].mean()), 1) if (far > 0).any() else 0.0
+    colour_distances = np.linalg.norm(lab[0] - lab[1], axis=2)
+    return round(float(colour_distances[colour_distances > 0].mean()), 1) if (colour_distances > 0).any() else 0.0
 
 
 def _coloured(colour: tuple[float, float, float]) -> Callable[[Scenario], Take]:
@@ -158,7 +162,7 @@ def _coloured(colour: tuple[float, float, float]) -> Callable[[Scenario], Take]:
 
 
 def _large(scenario: Scenario) -> Take:
-    return _void_with(scenario, Look(wide=WIDER))
+    return _void_with(scenario, Look(wide=WIDTH_FACTOR))
 
 
 def _sheer(alpha: float) -> Callable[[Scenario], Take]:
@@ -170,12 +174,15 @@ def _sheer(alpha: float) -> Callable[[Scenario], Take]:
         with _renderer(scenario.twin, look) as renderer:
             twin_frames = list(checks.void_frames(renderer, scenario.twin.qpos))
         gaps = [np.abs(frames[k].astype(np.int16) - twin_frames[k]).max(axis=2) for k in last]
-        noticed, levels = max(int((gap >= NOTICED).sum()) for gap in gaps), max(int(gap.max()) for gap in gaps)
-        evidence = {"alpha": alpha, "seen_through_px": noticed, "levels": levels}
-        if noticed < SEEN_PX:
+        n_noticed, levels = (
+            max(int((gap >= SEEN_LEVELS).sum()) for gap in gaps),
+            max(int(gap.max()) for gap in gaps),
+        )
+        evidence = {"alpha": alpha, "seen_through_px": n_noticed, "levels": levels}
+        if n_noticed < SEEN_PX:
             raise Rejected(
-                f"through an occluder of alpha {alpha:g} the two worlds differ by {NOTICED} levels or more in "
-                f"{noticed} pixels of a late frame ({levels} levels at most), {SEEN_PX:.0f} are wanted"
+                f"through an occluder of alpha {alpha:g} the two worlds differ by {SEEN_LEVELS} levels or more in "
+                f"{n_noticed} pixels of a late frame ({levels} levels at most), {SEEN_PX:.0f} are wanted"
             )
         return Take(frames, evidence)
 
@@ -188,17 +195,21 @@ def _sheer(alpha: float) -> Callable[[Scenario], Take]:
 def _later(scenario: Scenario) -> Take:
     """Return no clip, if the frames after those shown at the end show the outcome too."""
     control = scenario.control
-    at_end = shown_at_end(len(control.qpos), scenario.fps, END_S, control.open_frames - 1)
-    late = [frame + 1 for frame in at_end]
-    if late[0] < control.outcome.commit_frame:
-        raise Rejected(f"the outcome is settled at frame {control.outcome.commit_frame}, frame {late[0]} is shown")
+    end_frames = shown_at_end(len(control.qpos), scenario.fps, END_S, control.open_frames - 1)
+    late_frames = [frame + 1 for frame in end_frames]
+    if late_frames[0] < control.outcome.commit_frame:
+        raise Rejected(
+            f"the outcome is settled at frame {control.outcome.commit_frame}, frame {late_frames[0]} is shown"
+        )
     groups = legible_groups(control.family, control.model, control.scene, control.motion, control.params)
     with control.renderer() as renderer:
-        least = checks.least_visible(renderer, control.qpos[late], groups)
-    small = [f"{px:.0f} of {want:.0f} pixels" for px, (_, want) in zip(least, groups, strict=True) if px < want]
-    if small:
-        raise Rejected(f"the frames that are shown later show {', '.join(small)} of the outcome")
-    return Take([], {"late_frames": late, "least_visible_px": min(least)})
+        min_pixels = checks.least_visible(renderer, control.qpos[late_frames], groups)
+    too_small = [
+        f"{px:.0f} of {needed:.0f} pixels" for px, (_, needed) in zip(min_pixels, groups, strict=True) if px < needed
+    ]
+    if too_small:
+        raise Rejected(f"the frames that are shown later show {', '.join(too_small)} of the outcome")
+    return Take([], {"late_frames": late_frames, "least_visible_px": min(min_pixels)})
 
 
 # --- all of them ------------------------------------------------------------------------------------------------------
@@ -208,8 +219,8 @@ _SAME_VOID = (
     f"{SEEN_PX:.0f} pixels of what moves are seen past the occluder in some sampled frame"
 )
 _SEEN_THROUGH = (
-    f"not a void: in one of the last three sampled frames the two worlds differ by {NOTICED} of 255 levels or more in "
-    f"at least {SEEN_PX:.0f} pixels"
+    f"not a void: in one of the last three sampled frames the two worlds differ by {SEEN_LEVELS} of 255 levels or more "
+    f"in at least {SEEN_PX:.0f} pixels"
 )
 _COUNTS = {"labels_two": 2, "labels_three": 3, "labels_six": 6}
 _COLOURED = {"occluder_grey": GREY, "occluder_magenta": MAGENTA}
@@ -217,7 +228,7 @@ _ALPHAS = {name: int(name.removeprefix("occluder_alpha_")) / 100 for name in OCC
 _CHANGES: Mapping[str, str] = {
     "occluder_grey": "the occluder is grey, near the floor's colour",
     "occluder_magenta": "the occluder is magenta, which nothing in any scene is",
-    "occluder_large": f"the occluder is {WIDER:g} times as wide",
+    "occluder_large": f"the occluder is {WIDTH_FACTOR:g} times as wide",
     "schema_answer": 'the prompt asks for the object `{"final_answer"}`',
     "schema_reason": 'it asks for `{"reason", "final_answer"}`: the request of the regime `json`',
     "schema_abstain": 'it asks for `{"reason", "abstain", "final_answer"}`',

@@ -1,1 +1,1 @@
-"""Scenarios as data and as simulated worlds: outcome, length, and clips."""
+"""Represent scenarios as records and as simulated worlds, and render their clips."""

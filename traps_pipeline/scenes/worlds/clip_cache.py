@@ -1,4 +1,4 @@
-"""Cache of rendered clips by content, shared by this machine's studies.
+"""Cache rendered clips by content, shared by this machine's studies.
 
 An entry is a clip with its note, under a digest of all that decides its bytes. Entries are copied, so that a study
 never changes with the cache; the least recently used one goes first.
@@ -29,7 +29,7 @@ DEFAULT_GB = 4.0
 class ClipCache:
     """Rendered clips in a folder of at most `most_bytes` bytes.
 
-    Threads and processes may share it. A study is made without whatever cannot be read or written here.
+    Threads and processes may share it. A study goes on without an entry that cannot be read or written.
     """
 
     folder: Path
@@ -91,12 +91,12 @@ class ClipCache:
     def trim(self) -> None:
         """Remove least recently used entries until nine tenths of the bound are left."""
         entries = self._entries()
-        size = sum(each for _, each, _ in entries)
+        size = sum(n_bytes for _, n_bytes, _ in entries)
         if size <= self.most_bytes:
             return
-        for _, each, entry in sorted(entries):
+        for _, n_bytes, entry in sorted(entries):
             _remove(entry)
-            size -= each
+            size -= n_bytes
             if size <= 0.9 * self.most_bytes:
                 break
 

@@ -16,7 +16,7 @@ from traps_pipeline.video.encode import DamagedClip, encode, frames_digest
 
 @dataclass(frozen=True)
 class Clip:
-    """An encoded clip. leaked_pixels: of what a void must hide, None without occluder."""
+    """An encoded clip. leaked_pixels: visible pixels of hidden things; None without occluder."""
 
     file_sha256: str
     frames_sha256: str
@@ -52,7 +52,7 @@ def read_clip(path: Path) -> Clip | None:
 
 
 def read_note(path: Path) -> Clip | None:
-    """Return what a clip's note says, None if there is none. Raises DamagedClip."""
+    """Return the content of a clip's note, None if there is none. Raises DamagedClip."""
     if not note_of(path).is_file():
         return None
     try:

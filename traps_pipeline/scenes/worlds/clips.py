@@ -1,4 +1,4 @@
-"""Clips of a scenario, replayed from its frozen trajectory without simulation.
+"""Render a scenario's clips from its frozen trajectory, without simulation.
 
 Occluder: the void is the same replay with the occluder drawn. Truncation: the void is a prefix of the control. A
 board comes before a control that closes, and before its void if an occluder makes it; the twin's clip never has one.
@@ -69,8 +69,8 @@ def _render_scene(job: Job, family: Family, physics: Physics, missing: Sequence[
         Occluder.from_record(spec.void["panel"]) if spec.void_kind == "occluder" else None,
         closing_of(spec),
     )
-    behind = occluder if closing is None else closing.occluder
-    model, scene = compile_scene(family, family.params_from(spec.params), physics, behind)
+    occluder_or_none = occluder if closing is None else closing.occluder
+    model, scene = compile_scene(family, family.params_from(spec.params), physics, occluder_or_none)
     camera = Camera.from_record(spec.camera)
     n_frames, open_frames = 0, len(job.qpos) if closing is None else closing.frame
     board = coming_board(closing, camera, len(job.qpos), physics.fps)
@@ -85,11 +85,11 @@ def _render_scene(job: Job, family: Family, physics: Physics, missing: Sequence[
             decisive = decisive_geoms(model, scene.decisive)
             closed_frames = control[open_frames:]  # behind the same occluder: these are not drawn again
             open_to = len(job.qpos) - len(closed_frames)
-            before = checks.closing_frames(renderer, job.qpos[:open_to], board[:open_to], occluder=True)
-            void = [*before, *closed_frames]
-            still = [frame for frame, offset in enumerate(board) if offset in (None, LANDED)]
-            leaked = _leaked_pixels(renderer, scene, decisive, job, void, still)
-            n_frames += save_clip(job.void, void, physics.fps, leaked)
+            opening_frames = checks.closing_frames(renderer, job.qpos[:open_to], board[:open_to], occluder=True)
+            void = [*opening_frames, *closed_frames]
+            still_frames = [frame for frame, offset in enumerate(board) if offset in (None, LANDED)]
+            leaked_pixels = _leaked_pixels(renderer, scene, decisive, job, void, still_frames)
+            n_frames += save_clip(job.void, void, physics.fps, leaked_pixels)
         elif job.void in missing:
             save_clip(job.void, control[: spec.void["cut_frame"]], physics.fps)
         if job.twin in missing and spec.twin.params is None:
@@ -116,6 +116,10 @@ def _leaked_pixels(
         -(-first // step)
     )
     hiding_frames = [frame for frame in still if frame >= first]
-    sampled = [hiding_frames[i] for i in np.unique(np.linspace(0, len(hiding_frames) - 1, ABLATION_FRAMES).astype(int))]
-    complete = [void[frame] for frame in sampled]
-    return past_occluder_px + checks.ablation_pixels(renderer, job.qpos[sampled], [*decisive, *scene.hidden], complete)
+    sampled_indices = [
+        hiding_frames[i] for i in np.unique(np.linspace(0, len(hiding_frames) - 1, ABLATION_FRAMES).astype(int))
+    ]
+    complete_frames = [void[frame] for frame in sampled_indices]
+    return past_occluder_px + checks.ablation_pixels(
+        renderer, job.qpos[sampled_indices], [*decisive, *scene.hidden], complete_frames
+    )

@@ -1,4 +1,4 @@
-"""Outcomes: a compiled scene, what its run comes to, and the geoms that decide it."""
+"""Compile scenes, read their outcomes, and name the geoms that decide these."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Rejected(ValueError):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a run comes to, before it is certified.
+    """The outcome of a run, before it is certified.
 
     label: None if it is undecided at the end. commit_frame: first frame from which the label holds to the end (the
     number of frames if it is undecided). margin_m: distance (m) of the end from the nearest other outcome. in_order,
@@ -71,11 +71,11 @@ def compile_scene(
     scene = family.build(params, physics)
     if occluder is not None:
         occluders = []
-        for name, group, beside in (("occluder", OCCLUDER_GROUP, 0), ("coming_occluder", COMING_GROUP, 1)):
-            centre = np.array(occluder.centre) + beside * before_board(occluder)
+        for name, group, offset in (("occluder", OCCLUDER_GROUP, 0), ("coming_occluder", COMING_GROUP, 1)):
+            centre = np.array(occluder.centre) + offset * before_board(occluder)
             geom = add_box(scene.spec.worldbody, name, centre.tolist(), occluder.half, "navy")
-            half = np.radians(occluder.yaw_deg) / 2
-            geom.quat = [float(np.cos(half)), 0.0, 0.0, float(np.sin(half))]
+            half_turn = np.radians(occluder.yaw_deg) / 2
+            geom.quat = [float(np.cos(half_turn)), 0.0, 0.0, float(np.sin(half_turn))]
             geom.contype = geom.conaffinity = 0
             geom.group = group
             occluders.append(geom)
@@ -93,13 +93,13 @@ def simulated(model: mujoco.MjModel, scene: Scene, physics: Physics) -> np.ndarr
 
 def moving_geoms(model: mujoco.MjModel) -> tuple[str, ...]:
     """Return the names of the geoms of bodies that move, and of soft bodies."""
-    moving = np.flatnonzero(model.body_weldid[model.geom_bodyid] > 0)
-    return (*(model.geom(int(i)).name for i in moving if model.geom(int(i)).name), *flexes(model))
+    geom_ids = np.flatnonzero(model.body_weldid[model.geom_bodyid] > 0)
+    return (*(model.geom(int(i)).name for i in geom_ids if model.geom(int(i)).name), *flexes(model))
 
 
 def decisive_geoms(model: mujoco.MjModel, bodies: Sequence[str]) -> tuple[str, ...]:
     """Return the names of the geoms of some bodies, and of those that are soft."""
-    soft = flexes(model)
-    ids = {model.body(name).id for name in bodies if name not in soft}
+    soft_bodies = flexes(model)
+    ids = {model.body(name).id for name in bodies if name not in soft_bodies}
     geoms = (model.geom(i).name for i in range(model.ngeom) if int(model.geom_bodyid[i]) in ids)
-    return (*geoms, *(name for name in soft if name in bodies))
+    return (*geoms, *(name for name in soft_bodies if name in bodies))

@@ -1,4 +1,4 @@
-"""Pace: how long a clip is, and when it closes.
+"""Decide how long a clip is, and when it closes.
 
 An outcome settles neither at a clip's beginning nor at its very end. A scene is simulated for as long as its family
 says. Where the outcome settles early the clip ends earlier, void and control alike, so that its length tells nothing of
@@ -40,7 +40,7 @@ def settles_share(commit_frame: int, n_frames: int) -> float:
 
 
 def out_of_pace(share: float) -> str | None:
-    """Return what is wrong with an outcome that settles after a share of a clip."""
+    """Return why an outcome settles too early or late in a clip, in words."""
     if share < EARLIEST_SHARE:
         return f"the outcome settles after {share:.0%} of the clip, {EARLIEST_SHARE:.0%} is wanted"
     if share > LATEST_SHARE:
@@ -56,7 +56,7 @@ def is_exchangeable(family: Family) -> bool:
     return family.category not in EXTENSION_CATEGORIES
 
 
-def _counted(worlds: Sequence[World]) -> Sequence[World]:
+def _counting_worlds(worlds: Sequence[World]) -> Sequence[World]:
     return worlds if is_exchangeable(worlds[0].family) else worlds[:1]
 
 
@@ -66,16 +66,16 @@ def lengths(worlds: Sequence[World], seed: int) -> list[int]:
     Those are all that there are, or, where the outcome of one world is early, an even number drawn by seed, and then
     the most.
     """
-    worlds = _counted(worlds)
+    worlds = _counting_worlds(worlds)
     n_frames, fps = len(worlds[0].qpos), worlds[0].physics.fps
     first, last = (of(world.outcome.commit_frame for world in worlds) for of in (min, max))
     if None in [world.outcome.label for world in worlds] or settles_share(first, n_frames) >= EARLIEST_SHARE:
         return [n_frames]
-    most = _even(first / EARLIEST_SHARE)
-    least = min(most, _even(max(last / DRAWN_SHARE, last + FRAMES_AFTER * fps / 10)))
+    max_frames = _even(first / EARLIEST_SHARE)
+    min_frames = min(max_frames, _even(max(last / DRAWN_SHARE, last + FRAMES_AFTER * fps / 10)))
     rng = np.random.default_rng([seed, *worlds[0].family.name.encode(), *b"pace"])
-    length = least + 2 * int(rng.integers((most - least) // 2 + 1))
-    return list(dict.fromkeys((length, most)))
+    length = min_frames + 2 * int(rng.integers((max_frames - min_frames) // 2 + 1))
+    return list(dict.fromkeys((length, max_frames)))
 
 
 def moments(worlds: Sequence[World], seed: int) -> Iterator[int]:
@@ -84,7 +84,7 @@ def moments(worlds: Sequence[World], seed: int) -> Iterator[int]:
     All outcomes have been in view and at rest for long enough; after those, or where there is no time for that, comes
     the last possible frame.
     """
-    worlds = _counted(worlds)
+    worlds = _counting_worlds(worlds)
     fps, commit = worlds[0].physics.fps, max(world.outcome.commit_frame for world in worlds)
     last = last_of_all(len(worlds[0].qpos), fps)
     if last - commit < round(IN_VIEW_S * fps):
@@ -111,11 +111,11 @@ def shortened(world: World, n_frames: int) -> World:
     """Return the world's first frames, as a clip of its own."""
     if n_frames == len(world.qpos):
         return world
-    simulated = None if world.simulated is None else world.simulated[:n_frames]
+    simulated_qpos = None if world.simulated is None else world.simulated[:n_frames]
     physics = with_length(world.physics, n_frames)
-    return replace(world, physics=physics, qpos=world.qpos[:n_frames], simulated=simulated)
+    return replace(world, physics=physics, qpos=world.qpos[:n_frames], simulated=simulated_qpos)
 
 
 def with_length(physics: Physics, n_frames: int) -> Physics:
-    """Return the settings of a clip of so many frames."""
+    """Return the settings of a clip with this number of frames."""
     return replace(physics, duration_s=round(n_frames / physics.fps, 6))

@@ -1,4 +1,4 @@
-"""Camera and occluder of a pair, fitted to both worlds, whichever is the control."""
+"""Fit a pair's camera and occluder to both worlds, whichever is the control."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def shot_of(worlds: Sequence[World]) -> tuple[Camera, Occluder | None]:
     It covers what any world must hide; None if some world has nothing to cover.
     """
     points = np.concatenate([shown_points(world.model, world.scene, world.qpos) for world in worlds])
-    covers = [world.scene.cover for world in worlds if world.scene.cover is not None]
-    cover = box_around([box.corners() for box in covers]) if len(covers) == len(worlds) else None
+    cover_boxes = [world.scene.cover for world in worlds if world.scene.cover is not None]
+    cover = box_around([box.corners() for box in cover_boxes]) if len(cover_boxes) == len(worlds) else None
     return fit_shot(worlds[0].scene.view, points, cover)
 
 

@@ -1,4 +1,4 @@
-"""Scenarios as data: resolved records of `scene_specs/`, and their trajectories."""
+"""Define the records of `scene_specs/`, and read and write their trajectories."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from traps_pipeline.base.digests import digest
-from traps_pipeline.base.files import replacing
+from traps_pipeline.base.files import replace_file
 
 if TYPE_CHECKING:
     from traps_pipeline.scenes.physics.kit import Physics
@@ -148,15 +148,15 @@ class SceneSpec(BaseModel):
             raise ValueError(f"ground_truth {self.ground_truth!r} is not one of the labels {self.labels}")
         if len(set(self.labels)) != len(self.labels):
             raise ValueError(f"labels {self.labels} repeat")
-        strays = sorted(set(self.aliases.values()) - set(self.labels))
-        if strays:
-            raise ValueError(f"aliases point to unknown labels {strays}; labels are {self.labels}")
+        unknown_labels = sorted(set(self.aliases.values()) - set(self.labels))
+        if unknown_labels:
+            raise ValueError(f"aliases point to unknown labels {unknown_labels}; labels are {self.labels}")
         if self.answerable_question.answer not in self.answerable_question.labels:
             raise ValueError(
                 f"answerable_question: answer {self.answerable_question.answer!r} is not one of its labels"
             )
-        of_cut = self.void_kind == "truncation"
-        if (self.twin.params is None) != of_cut or (self.twin.rollout is not None) != of_cut:
+        is_cut = self.void_kind == "truncation"
+        if (self.twin.params is None) != is_cut or (self.twin.rollout is not None) != is_cut:
             raise ValueError("twin: an occluder's has `params` and no `rollout`, a truncation's has a `rollout` alone")
         return self
 
@@ -182,7 +182,7 @@ class SceneSpec(BaseModel):
 
     @property
     def scene_hash(self) -> str:
-        """Digest of what the clips show; a corrected question leaves it alone."""
+        """Digest of the clips' content; a corrected question does not change it."""
         parts = ("family", "params", "physics", "camera", "void_kind", "void", "control", "trajectory_sha256", "twin")
         record = self.model_dump(mode="json", include=set(parts))
         return digest(record)
@@ -194,7 +194,7 @@ class SceneSpec(BaseModel):
 
 
 def physics_record(physics: Physics) -> dict[str, Any]:
-    """Return `kit.Physics` as a record has it: without a speed that is the usual one."""
+    """Return `kit.Physics` as records store it, without a default speed."""
     return {name: value for name, value in asdict(physics).items() if name != "speed" or value != 1.0}
 
 
@@ -219,9 +219,9 @@ def trajectory_digest(qpos: np.ndarray) -> str:
 def save_trajectory(folder: Path, scenario_id: str, qpos: np.ndarray, twin: np.ndarray) -> None:
     """Write `<folder>/<scenario_id>.npz`: trajectories of a scenario and its twin."""
     arrays = {"qpos": qpos, "twin": twin}
-    plain = {name: np.ascontiguousarray(values, dtype="<f4") for name, values in arrays.items()}
-    with replacing(folder / f"{scenario_id}.npz") as part, part.open("wb") as stream:
-        np.savez_compressed(stream, allow_pickle=False, **plain)
+    plain_arrays = {name: np.ascontiguousarray(values, dtype="<f4") for name, values in arrays.items()}
+    with replace_file(folder / f"{scenario_id}.npz") as part, part.open("wb") as stream:
+        np.savez_compressed(stream, allow_pickle=False, **plain_arrays)
 
 
 def load_trajectory(path: Path, sha256: str, world: Literal["qpos", "twin"] = "qpos") -> np.ndarray:

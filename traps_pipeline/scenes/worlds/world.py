@@ -1,4 +1,4 @@
-"""A simulated world in its pair's shot, with cached values for certificates."""
+"""Represent a simulated world in its pair's shot, with cached values."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class World:
 
     @property
     def inventory(self) -> Inventory:
-        """What a viewer can name; needs no trajectory and no compiled model."""
+        """The things a viewer can name; needs no trajectory and no compiled model."""
         return self.family.build(self.params, self.physics).inventory
 
     @cached_property
@@ -109,16 +109,16 @@ class World:
 
     @cached_property
     def outcome(self) -> Outcome:
-        """What the trajectory comes to."""
+        """The outcome of the trajectory."""
         return read_outcome(self.family, self.motion, self.params)
 
     @property
     def outcome_read(self) -> Outcome:
-        """What the frames before the closing come to, by themselves."""
+        """The outcome that the frames before the closing show by themselves."""
         open_frames, motion = slice(0, self.open_frames), self.motion
         parts = (
-            {k: v[open_frames] for k, v in each.items()}
-            for each in (motion.positions, motion.rotations, motion.vertices)
+            {k: v[open_frames] for k, v in poses.items()}
+            for poses in (motion.positions, motion.rotations, motion.vertices)
         )
         return read_outcome(self.family, Motion(motion.times[open_frames], *parts), self.params)
 
@@ -145,7 +145,7 @@ class World:
 
     @property
     def concealed_geoms(self) -> tuple[str, ...]:
-        """Geoms that the void must not show: of decisive bodies and the hidden element."""
+        """Geoms of decisive bodies and the hidden element, which the void must not show."""
         return (*decisive_geoms(self.model, self.scene.decisive), *self.scene.hidden)
 
     @property
@@ -198,10 +198,10 @@ class World:
         """Return how many pixels of some frames change when geoms are taken away."""
         missing = [frame for frame in frames if (frame, geoms) not in self._ablated]
         if missing:
-            complete = self.behind_occluder(missing)
+            complete_frames = self.behind_occluder(missing)
             with self.closed_renderer() as renderer:
-                without = void_frames(renderer, self.qpos[missing], without=geoms)
-                for frame, ablated, unablated in zip(missing, complete, without, strict=True):
+                ablated_frames = void_frames(renderer, self.qpos[missing], without=geoms)
+                for frame, ablated, unablated in zip(missing, complete_frames, ablated_frames, strict=True):
                     self._ablated[frame, geoms] = differing_pixels([ablated], [unablated])[0]
         return sum(self._ablated[frame, geoms] for frame in frames)
 
@@ -211,7 +211,7 @@ class World:
 
     @cached_property
     def past_occluder(self) -> PastOccluder:
-        """What is seen past the occluder."""
+        """The pixels that are visible past the occluder."""
         decisive = decisive_geoms(self.model, self.scene.decisive)
         return PastOccluder(self.pixels_of(decisive), self.pixels_of(self.scene.hidden))
 
@@ -226,7 +226,7 @@ class World:
 
 
 def closing_of(spec: SceneSpec) -> Closing | None:
-    """Return how the control of a record closes."""
+    """Return the closing of a record's control."""
     if spec.control is None:
         return None
     occluder = (spec.void if spec.void_kind == "occluder" else spec.control)["panel"]

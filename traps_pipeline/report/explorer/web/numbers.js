@@ -25,7 +25,7 @@ function count(value) {
   return Math.abs(value) < 10000 ? String(value) : String(value).replace(/\B(?=(\d{3})+$)/g, ",");
 }
 
-// A count with its noun, as `counted` of traps_pipeline/base/wording.py writes it.
+// A count with its noun, as `count_noun` of traps_pipeline/base/wording.py writes it.
 function counted(number, singular, plural = `${singular}s`) {
   return `${count(number)} ${number === 1 ? singular : plural}`;
 }
