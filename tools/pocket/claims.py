@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.mechanism.effects import on_both_sides
+from traps_pipeline.mechanism.effects import two_sided_effects
 from traps_pipeline.mechanism.probes import auroc
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import GUIDED, STANDARD
@@ -140,7 +140,7 @@ def _same_direction(results: Results) -> float | None:
 def _followed(results: Results) -> float | None:
     """Return by how many more controls abstain along a dataset's own direction if it comes from guided states and not
     from standard ones, at one dose for both. An answer that says nothing is no abstention."""
-    rows = on_both_sides(results.effects)
+    rows = two_sided_effects(results.effects)
     rows = rows.loc[(rows["source"] == rows["target"]) & (rows["side"] == "control")]
     rows = rows.loc[rows["alpha"] == rows["alpha"].max()]
     share = (rows["abstained"] / (rows["n"] + rows["n_missing"])).groupby(rows["directions"].astype(str)).mean()

@@ -342,13 +342,8 @@ def _footer_of(path: Path) -> tuple[State, list[str]]:
     stamp = _stamp(path.stat())
     if (cached := _FOOTERS.get(path)) is None or cached[0] != stamp:
         content = _verified_bytes(path)
-        if _COLUMNS in content:
-            names = _json_behind(content, _COLUMNS)
-        else:  # written before the names stood there
-            import pyarrow.parquet as pq
-
-            names = pq.ParquetFile(_sound_bytes(path)).schema_arrow.names
-        cached = _FOOTERS[path] = stamp, State(**_json_behind(content, _STATE, len(_STATE))), names
+        names, state = _json_behind(content, _COLUMNS), State(**_json_behind(content, _STATE, len(_STATE)))
+        cached = _FOOTERS[path] = stamp, state, names
     return cached[1], cached[2]
 
 
