@@ -20,7 +20,7 @@ END_S = 60  # more than nine times what it takes
 COMMAND = '''
 import os, signal, subprocess, sys, time
 from traps_pipeline.base.process_tree import split, stop_descendants, wait_for
-from traps_pipeline.cli import _stopped_alike
+from traps_pipeline.cli import _stop_on_signals
 
 SLEEPS = """
 import signal, sys, time
@@ -32,7 +32,7 @@ STARTS = """
 import subprocess, sys
 subprocess.Popen([sys.executable, "-c", *sys.argv[1:]], start_new_session=True).wait()
 """
-with _stopped_alike():
+with _stop_on_signals():
     if (code := split(3)) is not None:
         sys.exit(code % 256)
     child = subprocess.Popen([sys.executable, "-c", STARTS, SLEEPS, sys.argv[1], str(os.getpid())])
