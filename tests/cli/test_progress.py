@@ -99,6 +99,16 @@ def test_a_partition_that_became_stale_after_its_stage_began_counts_as_one_to_ma
     assert out.getvalue().splitlines() == ["votes: 2 of 2 made, 6 asked, 0:04"]
 
 
+def test_no_time_is_said_to_be_left_before_a_stage_has_a_pace(clock: Clock) -> None:
+    report = make_progress("auto", io.StringIO())
+    report.stage("votes", 4)
+    report.partition("votes", "a", Tally(asked=3))
+    clock.now = 4.0  # its judges' libraries are loaded, and little else
+    assert report.line() == "votes: 1 of 4, 0:04 so far"
+    clock.now = 10.0
+    assert report.line() == "votes: 1 of 4, 0:30 left"
+
+
 def test_lines_of_json_have_the_same_figures(clock: Clock) -> None:
     out = io.StringIO()
     report = make_progress("json", out)

@@ -19,6 +19,7 @@ from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.wording import count_noun
 
 HEARTBEAT_S = 30.0  # between two lines about the same stage
+PACE_S = 5.0  # before that a stage's pace is mostly what it loads first, and its first calls in flight
 
 
 @dataclass
@@ -94,14 +95,12 @@ class StageProgress:
 
     @property
     def left_s(self) -> float | None:
-        """Seconds until the stage ends at its pace so far; None before anything is known."""
+        """Seconds until the stage ends at its pace so far; None in its first seconds."""
         total = self.total()
         begun_calls = max(self.done + self.share, self.cells * total.done / total.wanted if total.wanted else 0.0)
-        return (
-            self.seconds / begun_calls * max(self.partitions - begun_calls, 0.0)
-            if begun_calls and self.partitions
-            else None
-        )
+        if not begun_calls or not self.partitions or self.seconds < PACE_S:
+            return None
+        return self.seconds / begun_calls * max(self.partitions - begun_calls, 0.0)
 
     def total(self) -> Traffic:
         """Return the sum of all calls."""
