@@ -94,6 +94,7 @@ def test_every_promise_of_the_page_has_its_test() -> None:
         assert "|" in told or "mark.promise" in source, (file, name)  # of those with a page, any tier
 
 
+@pytest.mark.promise
 def test_what_all_tests_import_loads_no_library_that_takes_seconds() -> None:
     code = "import tests.conftest, sys; print(sorted({'dagster', 'aiohttp', 'pandas', 'torch'} & set(sys.modules)))"
     finished = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)

@@ -30,6 +30,7 @@ def test_a_worker_gives_way_after_so_many_jobs_also_where_it_is_kept(monkeypatch
     assert pids == [pids[0]] * 3 + [pids[3]] * 3 + [pids[6]] and len(set(pids)) == 3
 
 
+@pytest.mark.promise
 def test_after_a_worker_died_the_next_call_has_others_and_after_an_early_stop_the_same() -> None:
     with keep_workers():
         with pytest.raises(BrokenProcessPool):
@@ -48,6 +49,7 @@ def test_ctrl_c_says_what_it_waits_for(capsys: pytest.CaptureFixture[str]) -> No
     assert "stopping: waiting for the scenes in progress" in capsys.readouterr().err
 
 
+@pytest.mark.promise
 def test_ctrl_c_while_a_worker_is_started_leaves_no_process_waiting() -> None:
     """The executor never learns of such a worker, and Python waits at its end for every child."""
     script = """

@@ -48,6 +48,7 @@ def test_a_decision_that_does_not_fit_is_not_written(tmp_path: Path) -> None:
     assert (tmp_path / FILE).read_text() == ""
 
 
+@pytest.mark.promise
 @pytest.mark.parametrize(
     "steps",
     [

@@ -115,6 +115,7 @@ def test_a_run_that_waits_for_a_host_goes_on_waiting_and_one_that_waits_for_noth
         assert state(instance, waiting) == "STARTING"
 
 
+@pytest.mark.promise
 def test_a_command_says_why_a_run_could_not_be_started() -> None:
     with dg.DagsterInstance.ephemeral() as instance:
         run = instance.create_run_for_job(study)

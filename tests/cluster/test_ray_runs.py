@@ -264,6 +264,7 @@ def _nothing() -> None:
     _nothing_op()
 
 
+@pytest.mark.promise
 @pytest.mark.parametrize("on_interrupt", ["leave", "cancel"])
 def test_an_interrupted_command_leaves_its_runs_or_ends_them_and_the_next_one_counts_what_was_left(
     workspace: Workspace, monkeypatch: pytest.MonkeyPatch, on_interrupt: Any

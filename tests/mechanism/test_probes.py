@@ -207,6 +207,7 @@ def test_a_planted_signal_is_found_at_its_layer_and_nowhere_else(rows: pd.DataFr
     assert chosen["layer"].tolist() == [PLANTED] * 12
 
 
+@pytest.mark.promise
 def test_shuffled_rows_lie_around_half_at_every_layer(rows: pd.DataFrame) -> None:
     shuffled = rows[rows["analysis"] == "shuffled"]
     assert len(shuffled) == 4 * LAYERS and (shuffled["spread"] > 0).all()

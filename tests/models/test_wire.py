@@ -29,6 +29,7 @@ from traps_pipeline.models.request import Outcome, TransientError
 from traps_pipeline.models.wire import get
 from traps_pipeline.storage.study import Study
 
+pytestmark = pytest.mark.promise  # the client library alone takes seconds to import
 PROXIES = ("http_proxy", "https_proxy", "all_proxy", "no_proxy")
 MODEL = "m"
 LONG_S = 300.0

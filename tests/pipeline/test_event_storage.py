@@ -34,6 +34,7 @@ def test_dagsters_own_storage_reads_every_event(home: Path) -> None:
     assert theirs.get_latest_materialization_events([answer.key])[answer.key] is not None
 
 
+@pytest.mark.promise
 def test_each_commit_touches_the_file_that_a_page_watches(home: Path) -> None:
     touched = list[int]()
 
@@ -48,6 +49,7 @@ def test_each_commit_touches_the_file_that_a_page_watches(home: Path) -> None:
     assert touched == sorted(set(touched))
 
 
+@pytest.mark.promise
 def test_only_the_first_event_looks_up_which_tables_and_columns_there_are(home: Path) -> None:
     asked = list[str]()
 
@@ -84,6 +86,7 @@ def test_threads_that_write_at_once_lose_nothing(home: Path) -> None:
             assert len(instance.fetch_materializations(key, limit=100).records) == 20
 
 
+@pytest.mark.promise
 def test_the_settings_of_a_checkout_need_no_study_and_send_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -133,6 +133,7 @@ def test_a_model_whose_every_call_failed_is_a_row_of_dashes_and_breaks_no_page(b
         assert table_latex(table).isascii(), table.name
 
 
+@pytest.mark.promise
 @pytest.mark.parametrize("name", ["pecs_landscape", "abs_rec", "visual_textual", "reasoning_arrows"])
 def test_a_model_whose_every_call_failed_breaks_no_figure(broken, name):
     figure = next(report for report in FIGURE_REPORTS if report.name == name).make(broken)
@@ -290,6 +291,7 @@ def test_the_report_page_depends_on_all_that_its_tables_and_figures_read():
     assert (reads & graph.declared.keys()) | {"published", "verdicts"} <= graph.parents("report_page", None).keys()
 
 
+@pytest.mark.promise
 @pytest.mark.parametrize("report", [report for report in FIGURE_REPORTS if report.frames], ids=lambda r: r.name)
 def test_a_figure_reads_the_frames_that_decide_whether_it_is_drawn_again(report, partial):
     frames = {name for name, value in vars(Results).items() if isinstance(value, cached_property)}

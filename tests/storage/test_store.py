@@ -43,19 +43,13 @@ def hosts(request: pytest.FixtureRequest, tmp_path: Path) -> Hosts:
     if request.param == "shared":
         address, study = request.getfixturevalue("postgres").address(), f"study-{secrets.token_hex(4)}"
         return Hosts(lambda name: FolderStore(tmp_path / "study", database(address, study).lease))
-    return Hosts(_hosts_of_bucket(request, tmp_path))
+    return request.getfixturevalue("bucket_hosts")
 
 
 @pytest.fixture
-def bucket_hosts(request: pytest.FixtureRequest, tmp_path: Path) -> Hosts:
-    return Hosts(_hosts_of_bucket(request, tmp_path))
-
-
-def _hosts_of_bucket(request: pytest.FixtureRequest, tmp_path: Path) -> Callable[[str], Store]:
-    request.getfixturevalue("s3")
-    postgres: Postgres = request.getfixturevalue("postgres")
+def bucket_hosts(s3: S3, postgres: Postgres, tmp_path: Path) -> Hosts:
     study = f"study-{secrets.token_hex(4)}"
-    return lambda name: opened(str(tmp_path), postgres.address(), study, name)
+    return Hosts(lambda name: opened(str(tmp_path), postgres.address(), study, name))
 
 
 def put(store: Store, name: str, content: bytes) -> Path:

@@ -108,6 +108,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> TableStore:
     return store
 
 
+@pytest.mark.promise
 @pytest.mark.parametrize("reader", READERS)
 def test_every_table_opens_with_one_line(store: TableStore, reader: str) -> None:
     for table in TABLES.values():

@@ -116,6 +116,7 @@ def test_a_folder_that_dagsters_history_cannot_lie_in_is_refused_before_anything
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.promise
 @pytest.mark.parametrize("name", ["a#b", "a%b", "a b"])
 def test_a_folder_with_other_signs_keeps_a_history(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TRAPS_WORKSPACE", str(tmp_path / name))

@@ -11,6 +11,7 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.extras import sentence_of
@@ -138,8 +139,9 @@ def _raise_interrupt(*_: object) -> None:
     signal.raise_signal(signal.SIGINT)
 
 
+@cache
 def build_parser() -> Parser:
-    """Return the parser of the command line."""
+    """Return the parser of the command line, which is built once and changed by nothing."""
     parser = Parser(
         prog="traps",
         description="TRAPSBench: do vision-language models know when not to answer?",
