@@ -11,10 +11,14 @@ import hmac
 import ipaddress
 import secrets
 from base64 import urlsafe_b64encode
-from collections.abc import Awaitable, Callable, Iterable, Mapping, MutableMapping, Sequence
-from http.cookies import CookieError, SimpleCookie
-from typing import Any
-from urllib.parse import parse_qsl, quote, urlencode, urlsplit
+from collections.abc import Mapping, Sequence
+from urllib.parse import quote, urlencode, urlsplit
+
+from starlette.datastructures import MutableHeaders
+from starlette.requests import HTTPConnection
+from starlette.responses import PlainTextResponse, RedirectResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.websockets import WebSocketClose
 
 from traps_pipeline.base.errors import TrapsError
 
@@ -22,23 +26,15 @@ MIN_TOKEN = 16  # characters
 TOKEN_OWNER = "traps.who"  # key of a request's scope: the owner of its token
 LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 _SAFE_METHODS = ("GET", "HEAD")
-_OWN_SITE = (b"same-origin", b"none")
 # Added to every answer: it is not shown in a frame, its address (which may hold the token) goes to no other site.
-_HEADERS = (
-    (b"x-frame-options", b"DENY"),
-    (b"content-security-policy", b"frame-ancestors 'none'"),
-    (b"x-content-type-options", b"nosniff"),
-    (b"referrer-policy", b"no-referrer"),
-    (b"cross-origin-opener-policy", b"same-origin"),
-    (b"cross-origin-resource-policy", b"same-origin"),
-    (b"cache-control", b"no-store"),
-)
-
-Message = MutableMapping[str, Any]
-Scope = MutableMapping[str, Any]
-Receive = Callable[[], Awaitable[Message]]
-Send = Callable[[Message], Awaitable[None]]
-App = Callable[[Scope, Receive, Send], Awaitable[None]]
+_HEADERS = {
+    "x-frame-options": "DENY",
+    "content-security-policy": "frame-ancestors 'none'",
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+}
 
 
 def is_loopback(host: str) -> bool:
@@ -88,14 +84,14 @@ def personal_tokens(token: str, people: Sequence[str]) -> dict[str, str]:
 class Guard:
     """An ASGI app that guards another one.
 
-    token: the only token, or several tokens with the person of each; the app finds the person in the scope under WHO.
-    command: the command that printed the address, for the message to visitors without a token. behind: the address of
-    an HTTPS proxy in front, if there is one.
+    token: the only token, or several tokens with the person of each; the app finds the person in the scope under
+    TOKEN_OWNER. command: the command that printed the address, for the message to visitors without a token. behind: the
+    address of an HTTPS proxy in front, if there is one.
     """
 
     def __init__(
         self,
-        app: App,
+        app: ASGIApp,
         token: str | Mapping[str, str],
         host: str,
         port: int,
@@ -115,51 +111,45 @@ class Guard:
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
-        if scope["type"] not in ("http", "websocket"):
-            return
-        headers = {name.lower(): value for name, value in scope["headers"]}
-        refusal = self._refusal(scope, headers)
-        if refusal is None and scope["type"] == "http" and self._has_token(scope):
-            await self._enter(scope, send)
-        elif refusal is None and (person := self._header_owner(headers)) is not None:
-            scope[TOKEN_OWNER] = person
-        elif refusal is None:
-            refusal = 403, f"open the address that `{self._command}` printed: the token in it lets this browser in"
-        if refusal is not None:
-            await _refuse(scope, receive, send, *refusal)
-        elif not (scope["type"] == "http" and self._has_token(scope)):
+        request = HTTPConnection(scope)
+        refusal, owner = self._refusal(request), self._header_owner(request)
+        if refusal is None and self._has_token(request):
+            await self._entry(request)(scope, receive, _with_headers(send))
+        elif refusal is None and owner is not None:
+            scope[TOKEN_OWNER] = owner
             await self._app(scope, receive, _with_headers(send))
+        else:
+            no_token = f"open the address that `{self._command}` printed: the token in it lets this browser in"
+            await _refuse(*(refusal or (403, no_token)), scope, receive, send)
 
-    def _refusal(self, scope: Scope, headers: Mapping[bytes, bytes]) -> tuple[int, str] | None:
-        host = headers.get(b"host", b"").decode("latin-1").lower()
-        if sum(name.lower() == b"host" for name, _ in scope["headers"]) != 1 or (
-            self._names is not None and host not in self._names
-        ):
+    def _refusal(self, request: HTTPConnection) -> tuple[int, str] | None:
+        websocket = request.scope["type"] == "websocket"
+        hosts = [host.lower() for host in request.headers.getlist("host")]
+        if len(hosts) != 1 or (self._names is not None and hosts[0] not in self._names):
             return 421, f"this is not the name of this server: open the address that `{self._command}` printed"
-        origin, websocket = headers.get(b"origin"), scope["type"] == "websocket"
-        if origin is not None or websocket:
-            origin_url = urlsplit((origin or b"").decode("latin-1").lower())
-            if origin_url.scheme not in ("http", "https") or origin_url.netloc != host:
+        origin = request.headers.get("origin", "" if websocket else None)
+        if origin is not None:
+            url = urlsplit(origin.lower())
+            if url.scheme not in ("http", "https") or url.netloc != hosts[0]:
                 return 403, "a page of another site asked for this"
-        reads = not websocket and scope["method"] in _SAFE_METHODS
-        if headers.get(b"sec-fetch-site", b"none") not in _OWN_SITE and not (reads and self._has_token(scope)):
+        own_site = request.headers.get("sec-fetch-site", "none") in ("same-origin", "none")
+        if not own_site and not self._has_token(request):
             return 403, "a page of another site asked for this"
         if websocket:
             return None
-        path = scope["path"].rstrip("/")
-        if reads:
-            if path.endswith("/graphql") and scope.get("query_string"):
+        if request.scope["method"] in _SAFE_METHODS:
+            if request.scope["path"].rstrip("/").endswith("/graphql") and request.scope.get("query_string"):
                 return 405, "GraphQL is asked by POST"
             return None
-        if scope["method"] != "POST":
+        if request.scope["method"] != "POST":
             return 405, "POST changes something here, GET reads, and nothing else does anything"
-        kind = headers.get(b"content-type", b"").split(b";")[0].strip().lower()
-        return None if kind == b"application/json" else (415, "a POST holds JSON here")
+        kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+        return None if kind == "application/json" else (415, "a POST holds JSON here")
 
-    def _has_token(self, scope: Scope) -> bool:
-        if scope["method"] not in _SAFE_METHODS:
-            return False
-        return self._owner(_token_of_address(scope)) is not None
+    def _has_token(self, request: HTTPConnection) -> bool:
+        """Return whether a request that changes nothing has a token in its address."""
+        reads = request.scope["type"] == "http" and request.scope["method"] in _SAFE_METHODS
+        return reads and self._owner(request.query_params.get("token")) is not None
 
     def _owner(self, token_given: str | None) -> str | None:
         """Return the token's owner, if any, in constant time."""
@@ -169,58 +159,33 @@ class Guard:
                 owner = person
         return owner
 
-    def _header_owner(self, headers: Mapping[bytes, bytes]) -> str | None:
-        """Return the owner of a request's cookie or bearer token, if any.
+    def _header_owner(self, request: HTTPConnection) -> str | None:
+        """Return the owner of a request's bearer token (`Authorization: Bearer TOKEN`) or cookie, if any."""
+        scheme, _, token = request.headers.get("authorization", "").partition(" ")
+        return self._owner(token.strip() if scheme.lower() == "bearer" else request.cookies.get(self._cookie))
 
-        The header is `Authorization: Bearer TOKEN`.
-        """
-        scheme, _, token = headers.get(b"authorization", b"").decode("latin-1").partition(" ")
-        if scheme.lower() == "bearer":
-            return self._owner(token.strip())
-        try:
-            cookies = SimpleCookie(headers.get(b"cookie", b"").decode("latin-1"))
-        except CookieError:
-            return None
-        return self._owner(cookies[self._cookie].value) if self._cookie in cookies else None
-
-    async def _enter(self, scope: Scope, send: Send) -> None:
-        """Set the token as a cookie and redirect, so that no address shows the token."""
-        parameters = [pair for pair in parse_qsl(scope["query_string"].decode("latin-1")) if pair[0] != "token"]
-        place = "/" + quote(scope["path"].lstrip("/\\")) + (f"?{urlencode(parameters)}" if parameters else "")
-        cookie = f"{self._cookie}={_token_of_address(scope)}; HttpOnly; SameSite=Strict; Path=/{self._secure}"
-        headers = [(b"location", place.encode()), (b"set-cookie", cookie.encode("latin-1"))]
-        await _answer(send, 303, b"", headers)
+    def _entry(self, request: HTTPConnection) -> RedirectResponse:
+        """Return what sets the token as a cookie and redirects, so that no address shows the token."""
+        parameters = [pair for pair in request.query_params.multi_items() if pair[0] != "token"]
+        place = "/" + quote(request.scope["path"].lstrip("/\\")) + (f"?{urlencode(parameters)}" if parameters else "")
+        token = request.query_params["token"]
+        cookie = f"{self._cookie}={token}; HttpOnly; SameSite=Strict; Path=/{self._secure}"
+        return RedirectResponse(place, 303, {"set-cookie": cookie})
 
 
-def _token_of_address(scope: Scope) -> str | None:
-    """Return the token in the address of a request."""
-    return dict(parse_qsl(scope.get("query_string", b"").decode("latin-1"))).get("token")
-
-
-async def _refuse(scope: Scope, receive: Receive, send: Send, status: int, why: str) -> None:
+async def _refuse(status: int, why: str, scope: Scope, receive: Receive, send: Send) -> None:
     if scope["type"] == "websocket":
-        await receive()
-        await send({"type": "websocket.close", "code": 1008, "reason": why[:120]})
-        return
-    await _answer(send, status, f"{why}\n".encode(), [(b"content-type", b"text/plain; charset=utf-8")])
-
-
-async def _answer(send: Send, status: int, body: bytes, headers: Iterable[tuple[bytes, bytes]]) -> None:
-    length = (b"content-length", str(len(body)).encode())
-    await send({"type": "http.response.start", "status": status, "headers": [*headers, length, *_HEADERS]})
-    await send({"type": "http.response.body", "body": body})
+        await WebSocketClose(1008, why[:120])(scope, receive, send)
+    else:
+        await PlainTextResponse(f"{why}\n", status)(scope, receive, _with_headers(send))
 
 
 def _with_headers(send: Send) -> Send:
     async def sending(message: Message) -> None:
         if message["type"] == "http.response.start":
-            token_of = {name for name, _ in _HEADERS if name != b"cache-control"}
-            headers = [(name, value) for name, value in message.get("headers", ()) if name.lower() not in token_of]
-            has_cache_control = any(name.lower() == b"cache-control" for name, _ in headers)
-            message["headers"] = [
-                *headers,
-                *(header for header in _HEADERS if not has_cache_control or header[0] != b"cache-control"),
-            ]
+            headers = MutableHeaders(scope=message)
+            headers.update(_HEADERS)
+            headers.setdefault("cache-control", "no-store")
         await send(message)
 
     return sending
