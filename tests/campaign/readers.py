@@ -56,11 +56,7 @@ def _ledger(folder: Path) -> Any:
 
 
 def _accounts(folder: Path) -> Any:
-    budget = AccountBudget("openai", folder, "s")
-    try:
-        return budget.spent_usd
-    finally:
-        budget.close()
+    return AccountBudget("openai", folder, "s").spent_usd
 
 
 def _corrected(folder: Path) -> Any:

@@ -63,37 +63,23 @@ def test_a_call_in_flight_at_a_kill_stays_spent(folder: Path) -> None:
     assert process.stdout.readline() == "hanging\n"
     process.send_signal(signal.SIGKILL)
     process.communicate()
-    with (folder / "spent.jsonl").open("ab") as stream:
-        stream.write(b'{"study": "torn", "usd"')  # by a process that died before its call was sent
     budget = AccountBudget("openai", folder, "next")
     assert budget.spent_usd == pytest.approx({"killed": 0.10})
     assert budget.reserve(9.90)
     assert not budget.reserve(0.01)
 
 
-def test_a_damaged_line_stops_paid_calls_and_a_lost_file_is_filled_again(folder: Path) -> None:
+def test_a_damaged_file_stops_paid_calls_and_a_lost_one_is_filled_again(folder: Path) -> None:
     budget = AccountBudget("openai", folder, "a")
     assert budget.reserve(1.0)
-    path = folder / "spent.jsonl"
+    path = folder / "spent.json"
     path.write_bytes(path.read_bytes().replace(b"1.0", b"0.1"))
-    with pytest.raises(TrapsError, match=r"spent\.jsonl: a line is not what was written.*remove the file"):
-        AccountBudget("openai", folder, "b")
+    for spend in (lambda: budget.reserve(0.1), lambda: AccountBudget("openai", folder, "b")):
+        with pytest.raises(TrapsError, match=r"spent\.json: is not what was written.*remove the file"):
+            spend()
     path.unlink()
     budget.begin(known_usd=1.0)
     assert AccountBudget("openai", folder, "b").spent_usd == {"a": 1.0}
-
-
-def test_long_files_are_summed_up_under_the_feet_of_a_running_process(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    running = AccountBudget("openai", folder, "running")
-    assert running.reserve(1.0)
-    assert running.reserve(0.5)
-    monkeypatch.setattr("traps_pipeline.models.account_budget._COMPACTED", 100)
-    AccountBudget("openai", folder, "other").close()
-    assert len((folder / "spent.jsonl").read_bytes().splitlines()) == 1
-    running.correct(-0.25)
-    assert AccountBudget("openai", folder, "third").spent_usd == {"running": 1.25}
 
 
 def study(root: Path, folder: Path) -> Workspace:

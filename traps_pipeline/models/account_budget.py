@@ -1,16 +1,14 @@
 """Cap an account's spending over all studies on one machine or shared disk.
 
 A study's own budget knows only its own ledger, so two studies with one key could spend twice. Each may therefore name a
-folder for an account. The folder's `budget.yaml` gives the cap; `spent.jsonl` has one line per change, which every
-process appends under a lock that it holds for that moment only: concurrent runs share what is left.
+folder for an account. The folder's `budget.yaml` gives the cap; `spent.json` holds what each study has spent or
+reserved, which every process replaces under a lock that it holds for that moment only.
 """
 
 from __future__ import annotations
 
 import fcntl
 import json
-import os
-from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,12 +16,11 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, Field
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.files import is_in_place, remedy, write_bytes
+from traps_pipeline.base.files import remedy, write_bytes
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml
-from traps_pipeline.storage.lines import NOT_WHOLE, append_whole, is_whole, line_with_checksum
+from traps_pipeline.storage.lines import NOT_WHOLE, is_whole, line_with_checksum
 
-CAP, SPENT = "budget.yaml", "spent.jsonl"
-_COMPACTED = 2**20  # bytes of lines above which a run compacts them at its start
+CAP, SPENT, LOCK = "budget.yaml", "spent.json", "spent.lock"
 
 
 class Cap(BaseModel):
@@ -36,9 +33,8 @@ class Cap(BaseModel):
 class AccountBudget:
     """The remaining budget of an account over all studies.
 
-    A line reserves a call's worst case before it is sent, and another adds the difference when its cost is known. A
-    killed process leaves the worst case of its calls in flight reserved for good. study: the name in this study's
-    lines.
+    A call's worst case is reserved before it is sent, and replaced when its cost is known. A killed process leaves the
+    worst case of its calls in flight reserved for good. study: the name under which this study's dollars are kept.
     """
 
     def __init__(self, account: str, folder: Path, study: str) -> None:
@@ -50,46 +46,39 @@ class AccountBudget:
                 f"account {account}) into it, or remove {account} from account_budgets in study.yaml"
             )
         self.cap_usd = parse_yaml_model(Cap, read_yaml(path), path).usd
-        self._spent: defaultdict[str, float] = defaultdict(float)
-        self._descriptor, self._read = -1, 0
-        with self._lock():
-            if self._read > _COMPACTED:
-                content = b"".join(line_with_checksum({"study": name, "usd": usd}) for name, usd in self._spent.items())
-                write_bytes(self._path, content, durable=True)  # other processes notice the new file and read it
-
-    @property
-    def _path(self) -> Path:
-        return self.folder / SPENT
+        _ = self.spent_usd
 
     @property
     def spent_usd(self) -> Mapping[str, float]:
-        """Dollars spent or reserved, by study."""
+        """Dollars spent or reserved, by study. Raises TrapsError."""
         with self._lock():
-            return dict(self._spent)
+            return self._read()
 
     def begin(self, known_usd: float) -> None:
         """Record this study's earlier spending that the account's folder lacks.
 
         The study spent it before it named the folder, or the file was lost. known_usd: dollars by the study's own
-        ledgers and journal.
+        ledger.
         """
         with self._lock():
-            if (missing := known_usd - self._spent[self.study]) > 1e-6:
-                self._append(missing)
+            spent = self._read()
+            if (missing := known_usd - spent.get(self.study, 0.0)) > 1e-6:
+                self._add(spent, missing)
 
     def reserve(self, dollars: float) -> bool:
         """Reserve a call's worst case if the cap leaves room; return whether it does."""
         with self._lock():
-            if sum(self._spent.values()) + dollars > self.cap_usd + 1e-9:
+            spent = self._read()
+            if sum(spent.values()) + dollars > self.cap_usd + 1e-9:
                 return False
-            self._append(dollars)
+            self._add(spent, dollars)
             return True
 
     def correct(self, dollars: float) -> None:
         """Replace a call's worst case by its cost: add the difference, usually negative."""
         if dollars:
             with self._lock():
-                self._append(dollars)
+                self._add(self._read(), dollars)
 
     def explain(self, worst_usd: float) -> str:
         """Return why there is no room for a call."""
@@ -100,59 +89,31 @@ class AccountBudget:
             f"next call may cost ${worst_usd:.4f}. Raise `usd` in {self.folder / CAP} and run the same command to go on"
         )
 
-    def close(self) -> None:
-        """Close the file without removing it."""
-        if self._descriptor >= 0:
-            os.close(self._descriptor)
-            self._descriptor = -1
-
     @contextmanager
     def _lock(self) -> Iterator[None]:
-        """Hold the file's lock for a moment, after reading all lines of other processes."""
+        """Hold the account's lock for a moment."""
         try:
-            while True:
-                if self._descriptor < 0:
-                    self._descriptor, self._read = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644), 0
-                    self._spent.clear()
-                fcntl.flock(self._descriptor, fcntl.LOCK_EX)
-                if is_in_place(self._descriptor, self._path):
-                    break
-                self.close()  # another process has compacted the lines into a new file
-            try:
-                self._catch_up()
+            with (self.folder / LOCK).open("w") as stream:
+                fcntl.flock(stream, fcntl.LOCK_EX)
                 yield
-            finally:
-                fcntl.flock(self._descriptor, fcntl.LOCK_UN)
         except OSError as error:
             raise TrapsError(
-                f"{self._path}: cannot be read or written ({error.strerror}); {remedy(error)} and run the same command "
-                "again: nothing is sent through an account whose budget cannot be kept"
+                f"{error.filename or self.folder}: cannot be read or written ({error.strerror}); {remedy(error)} and "
+                "run the same command again: nothing is sent through an account whose budget cannot be kept"
             ) from error
 
-    def _catch_up(self) -> None:
-        size = os.fstat(self._descriptor).st_size
-        if size < self._read:
-            self._read = 0
-            self._spent.clear()
-        content = os.pread(self._descriptor, size - self._read, self._read)
-        if torn_length := len(content) - (
-            content.rfind(b"\n") + 1
-        ):  # torn line of a dead process: its call was never sent
-            size, content = size - torn_length, content[:-torn_length]
-            os.ftruncate(self._descriptor, size)
-        for line in content.splitlines(keepends=True):
-            if not is_whole(line):
-                raise TrapsError(
-                    f"{self._path}: a line is {NOT_WHOLE}, so that nobody can tell what was spent; compare the "
-                    "provider's bill, then remove the file: every study that names it adds its own spending again when "
-                    "it next runs"
-                )
-            change = json.loads(line)
-            self._spent[change["study"]] += change["usd"]
-        self._read = size
+    def _read(self) -> dict[str, float]:
+        path = self.folder / SPENT
+        if not path.exists():
+            return {}
+        content = path.read_bytes()
+        if not is_whole(content):
+            raise TrapsError(
+                f"{path}: is {NOT_WHOLE}, so that nobody can tell what was spent; compare the provider's bill, then "
+                "remove the file: every study that names it adds its own spending again when it next runs"
+            )
+        return json.loads(content)["usd"]
 
-    def _append(self, dollars: float) -> None:
-        line = line_with_checksum({"study": self.study, "usd": dollars})
-        append_whole(self._descriptor, line)
-        self._spent[self.study] += dollars
-        self._read += len(line)
+    def _add(self, spent: Mapping[str, float], dollars: float) -> None:
+        changed = {**spent, self.study: spent.get(self.study, 0.0) + dollars}
+        write_bytes(self.folder / SPENT, line_with_checksum({"usd": changed}))

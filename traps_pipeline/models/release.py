@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import getpass
 import os
-from contextlib import closing
 from datetime import UTC, datetime
 
 from traps_pipeline.ledger.money import Money, Releasable
@@ -32,8 +31,7 @@ def release(workspace: Workspace, participant: str, usd: float | None, why: str)
         account = account_budgets(workspace, money.spent()).get(participant)
         dollars = money.release(participant, usd, why, _person(), datetime.now(UTC).isoformat())
         if account is not None:
-            with closing(account):
-                account.correct(-dollars)
+            account.correct(-dollars)
         return dollars
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 from traps_pipeline.base.errors import TrapsError
@@ -23,13 +23,9 @@ def open_budget(workspace: Workspace, participants: Iterable[Entry]) -> Iterator
     if not any(entry.prices for entry in participants):
         yield Budget(*caps)
         return
-    with ExitStack() as stack:
-        stack.enter_context(workspace.ledger.writing())
+    with workspace.ledger.writing():
         money = Money(workspace.ledger)
-        accounts = account_budgets(workspace, money.spent())
-        for account in accounts.values():
-            stack.callback(account.close)
-        yield Budget(*caps, money, accounts)
+        yield Budget(*caps, money, account_budgets(workspace, money.spent()))
 
 
 @contextmanager
