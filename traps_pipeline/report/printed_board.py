@@ -25,7 +25,21 @@ def printed_board(workspace: Workspace) -> str:
         tables = [TextTable(**table) for table in json.loads(workspace.store.here(path).read_bytes())]
     else:  # somebody has cleared the folder
         tables = board_tables(workspace)
-    return "\n".join(table.text() for table in tables) or NO_BOARD
+    text = "\n".join(table.text() for table in tables) or NO_BOARD
+    earlier = _asked_earlier(workspace)
+    return f"{text}\nof earlier runs: {earlier}, which no experiment in study.yaml asks any more\n" if earlier else text
+
+
+def _asked_earlier(workspace: Workspace) -> str:
+    """Return models, or models and regimes, with verdicts that no experiment of the study asks for."""
+    from traps_pipeline.judging.judging_rows import VERDICTS
+
+    asked = [(model, each.regimes) for each in workspace.study.experiments.values() for model in each.models]
+    models = {model for model, _ in asked}
+    entries = {(model, regime) for model, regimes in asked for regime in regimes}
+    judged = {(cell["model"], cell["regime"]) for cell in workspace.tables.partitions(VERDICTS)}
+    left = {f"{model} ({regime})" if model in models else model for model, regime in judged - entries}
+    return ", ".join(sorted(left))
 
 
 def board_tables(workspace: Workspace) -> list[TextTable]:
