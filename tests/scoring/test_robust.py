@@ -122,7 +122,15 @@ def test_a_kind_weighs_as_the_pairs_from_thirty_scenarios_on(rows: Rows) -> None
     # Acc = (1 + 0) / 2, FalseAbs = (0 + 1) / 2, AbsRec = 1: 1/2 x (1 - 1/2) = 1/4.
     row = only(robust(study(rows, [RIGHT] * 40, {"decoy": [SHY] * 30}), 20))
     assert row.robust == pytest.approx(1 / 4)
-    assert (row.arms, row.n_runs, row.n_items, row.n_missing) == (["decoy"], 1, 4 * 80 + 30, 0)
+    assert (row.arms, row.n_runs, row.n_items, row.n_missing) == (["decoy"], 1, 2 * 80 + 30, 0)
+
+
+def test_what_words_alone_give_away_enters_no_figure_but_pecs(rows: Rows) -> None:
+    # Abstaining on each ill-posed question and on nothing else: PECS 1/2, as half of the datasets have J 1 and Acc 1.
+    datasets = {name: [RIGHT if name.endswith("ill_posed") else BOLD] * 30 for name in DATASETS}
+    by_words = [cells(rows, name, of) for name, of in (datasets | {"crossed": [BOLD] * 30}).items()]
+    row = only(robust(pd.concat(by_words, ignore_index=True), 20))
+    assert (row.robust, row.n_items) == (0.0, 3 * 60)
 
 
 def test_a_kind_of_few_scenarios_weighs_less(rows: Rows) -> None:
@@ -184,8 +192,7 @@ def test_a_scenarios_items_in_pairs_and_arm_are_drawn_together(rows: Rows) -> No
     # Decoys are answered rightly where the occlusion controls are not, and the reverse: their mean never varies, so the
     # interval is narrower than with decoys that agree with the pairs.
     even, odd = ([(k % 2 == rest, False, True) for k in range(60)] for rest in (0, 1))
-    parts = {"occlusion": even, "occlusion_ill_posed": even, "chaotic": [RIGHT] * 60, "chaotic_ill_posed": [RIGHT] * 60}
-    pairs = [cells(rows, name, of) for name, of in parts.items()]
+    pairs = [cells(rows, name, even if name == "occlusion" else [RIGHT] * 60) for name in DATASETS]
     against, alike = (only(robust(pd.concat([*pairs, cells(rows, "decoy", of)]), 300)) for of in (odd, even))
     width = {name: row.robust_ci_high - row.robust_ci_low for name, row in (("against", against), ("alike", alike))}
     assert against.robust == alike.robust == pytest.approx(5 / 8)

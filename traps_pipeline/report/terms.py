@@ -21,8 +21,8 @@ ARM_TITLES |= {name: f"Variation: {name.replace('_', ' ')}" for name in VARIATIO
 ROBUST_TERMS = {
     "Conjunction %": "share of scenarios with control, twin, void and both crossed questions right; 0 for every rule "
     "that abstains for the clip alone or for the question alone",
-    "Robust": "PECS over kinds: the pairs and each arm that takes a shortcut away. Entries over different arms are not "
-    "compared",
+    "Robust": "PECS over kinds: the well-posed pairs and each arm that takes a shortcut away. Entries over different "
+    "arms are not compared",
     "Inferred %": "share of the items of late_occluder and predictable_cut answered correctly: their outcome is not "
     "shown",
 }

@@ -1,8 +1,8 @@
 """Compute PECS of abstention that follows from clip and question together.
 
 See docs/scoring.md, "Beyond PECS". The conjunction requires every decision about a scenario to be right. The robust
-figure is PECS over kinds: sets of items that are all answerable, or all void, for one reason. Arms whose outcome must
-be inferred enter neither.
+figure is PECS over kinds: sets of items that are all answerable, or all void, for one reason that can be seen. Arms
+whose outcome must be inferred enter neither, nor do the ill-posed datasets, whose questions words alone give away.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def robust(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED)
     for key, group in items.groupby(["model", "regime"], sort=True):
         runs, arms = _runs_and_arms(group)
         if runs:
-            is_in_entry = group["run"].isin(runs) & group["dataset"].isin([*DATASETS, *arms])
+            is_in_entry = group["run"].isin(runs) & group["dataset"].isin([*VISUAL, *arms])
             entries[key] = arms, group.loc[is_in_entry]
     if not entries:
         return pd.DataFrame(columns=pd.Index(ROBUST.names))
@@ -93,7 +93,7 @@ def _row(items: pd.DataFrame, named: str, arms: Sequence[str], resampling: Resam
     """Return the columns of an entry's ROBUST row except model, regime and arms."""
     runs = dict(list(items.groupby("run", sort=True)))
     sums = run_sums(items, resampling, named)
-    kinds = (*DATASETS, *(arm for arm in arms if arm in ROBUST_ARMS))
+    kinds = (*VISUAL, *(arm for arm in arms if arm in ROBUST_ARMS))
     conjunctions = [_conjunction(rows, resampling, f"{named}|conjunction") for rows in runs.values()]
     figures = {
         "robust": [
@@ -129,11 +129,11 @@ def _row(items: pd.DataFrame, named: str, arms: Sequence[str], resampling: Resam
 def robust_ends(cells: Mapping[str, np.ndarray], scenarios: Mapping[str, int]) -> np.ndarray:
     """Return a run's ends of the robust score, (2, draws); NaN without robust arms.
 
-    cells: the ends of RESAMPLED_FIGURES, (2, RESAMPLED_FIGURES, draws), of the four datasets and the robust arms.
+    cells: the ends of RESAMPLED_FIGURES, (2, RESAMPLED_FIGURES, draws), of VISUAL and the robust arms.
     scenarios: the number of scenarios in each of them.
     """
     arms = {arm: min(1.0, scenarios[arm] / FULL_KIND) for arm in cells if arm in ROBUST_ARMS}
-    pairs = np.mean([cells[dataset] for dataset in DATASETS], axis=0)
+    pairs = np.mean([cells[dataset] for dataset in VISUAL], axis=0)
 
     def mean_over_kinds(figure: str, weights: Mapping[str, float]) -> np.ndarray:
         position = RESAMPLED_FIGURES.index(figure)

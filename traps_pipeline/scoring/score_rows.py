@@ -189,13 +189,13 @@ LEADERBOARD = Table("leaderboard", LeaderboardRow, partition_by=(), key=("model"
 @dataclass(frozen=True, kw_only=True)
 @with_neighbours
 class RobustRow:
-    """A model under a regime, on four datasets and arms (clip and question together)."""
+    """A model under a regime, on well-posed pairs and arms (clip and question together)."""
 
     model: shared.Model
     regime: shared.Regime
     arms: Annotated[list[str], "arms (of datasets.ARMS) in the figures; entries with other arms are not compared"]
     n_runs: Annotated[int, "runs averaged: those that have all four datasets and these arms"]
-    n_items: Annotated[int, "items per run, of the four datasets and the arms"]
+    n_items: Annotated[int, "items per run, of occlusion, chaotic and the arms"]
     n_missing: Annotated[int, "items without an answer or a majority, over runs"]
     conjunction: Annotated[
         float | None,
