@@ -17,6 +17,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from hashlib import sha256
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,8 @@ ABOUT = {"outcome": "answer", "cost_usd": USD, "components": {"participant": "m"
 
 
 def rows(count: int) -> Iterator[dict[str, Any]]:
-    return ({"key": f"{number:064x}", **ABOUT} for number in range(count))
+    """Yield rows whose keys are digests, as those of calls."""
+    return ({"key": sha256(b"%d" % number).hexdigest(), **ABOUT} for number in range(count))
 
 
 @contextmanager
@@ -50,6 +52,11 @@ def _cpu_s() -> float:
     return used.ru_utime + used.ru_stime
 
 
+def store(database: Database, evaluation: str, count: int) -> None:
+    """Write rows as an import does."""
+    asyncio.run(Ledger(database, "answers").store({evaluation: [(row, {}) for row in rows(count)]}, print))
+
+
 async def ask(database: Database, evaluation: str, count: int, connections: int, *, paid: bool) -> None:
     """Write rows as calls that are answered at once do. paid: each is reserved before, under a cap it never meets."""
     pending, money = rows(count), Money(database)
@@ -57,9 +64,8 @@ async def ask(database: Database, evaluation: str, count: int, connections: int,
 
         async def connection() -> None:
             for row in pending:
-                reserved = money.reserve("m", WORST_USD, {None: 1e9}) if paid else None
-                reservations = [str(await asyncio.wrap_future(reserved))] if reserved else []
-                await writer.write(row, None, reservations)
+                paid_by = [str(await money.reserve("m", WORST_USD, {None: 1e9}))] if paid else []
+                await writer.write(row, None, paid_by)
 
         await asyncio.gather(*(connection() for _ in range(connections)))
 
@@ -73,6 +79,8 @@ def compare(database: Database, count: int) -> None:
                 what = f"{count:,} rows, {connections} connections" + (", reserved" if paid else "")
                 with measured(what):
                     asyncio.run(ask(database, f"m{connections}{paid}", count, connections, paid=paid))
+    with measured(f"{count:,} rows, imported at once"):
+        store(database, "imported", count)
     with measured(f"read {count:,} rows"):
         assert len(ledger.read("m200False").rows) == count
     wanted = [row["key"] for row in islice(rows(count), 0, None, 200)]
@@ -84,7 +92,7 @@ def begin(database: Database, count: int) -> None:
     """What a study of so many rows reads before its first call, and what it takes to recover one evaluation."""
     cell = min(100_000, count)
     for number in range(count // cell):
-        asyncio.run(ask(database, f"m{number}", cell, 200, paid=False))
+        store(database, f"m{number}", cell)
     with database.writing(), measured(f"totals and spending of {count:,} rows"):
         Ledger(database, "answers").totals()
         Money(database).spent()

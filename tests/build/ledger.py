@@ -12,6 +12,7 @@ from typing import Any
 from traps_pipeline.ledger.database import Database
 from traps_pipeline.ledger.ledger import Ledger
 from traps_pipeline.ledger.money import Money
+from traps_pipeline.ledger.rows import Totals
 from traps_pipeline.ledger.sqlite import SqliteDatabase
 from traps_pipeline.models.budget import Budget
 
@@ -38,7 +39,8 @@ def write(ledger: Ledger, *rows: Mapping[str, object], evaluation: str = "m") ->
 def spend(database: Database, spent_usd: Mapping[str, float]) -> None:
     """Count dollars as spent."""
     with database.writing():
-        database.submit(lambda batch: [batch.spend(*its) for its in spent_usd.items()]).result()
+        totals = {("answers", participant): Totals(dollars=usd) for participant, usd in spent_usd.items()}
+        database.submit(lambda batch: batch.totals.update(totals)).result()
 
 
 def budget(

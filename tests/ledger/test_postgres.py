@@ -99,7 +99,7 @@ def test_a_transaction_whose_end_is_not_heard_is_not_applied_twice(postgres: Pos
 
     def run(work: Any, patience_s: float | None = None) -> Any:
         """The transaction is committed, its end is lost, and it is done again."""
-        if not broken and work.__name__ == "work":
+        if not broken and work.__name__ == "numbered":
             broken.append("once")
             real(work)
         return real(work)

@@ -37,7 +37,7 @@ def blocked(tmp_path: Path) -> Workspace:
 def in_flight(workspace: Workspace, participant: str) -> None:
     """Let a process die while a call of $1 of a participant is in flight."""
     with workspace.ledger.writing():
-        Money(workspace.ledger).reserve(participant, 1.0, {}).result()
+        asyncio.run(Money(workspace.ledger).reserve(participant, 1.0, {}))
 
 
 def room_for(workspace: Workspace, dollars: float) -> bool:

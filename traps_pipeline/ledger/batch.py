@@ -5,106 +5,140 @@ from __future__ import annotations
 import os
 import socket
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import sqlalchemy as sa
+from sqlalchemy import exc
 
 from traps_pipeline.ledger.rows import AVERAGED_COLUMNS, Totals
-from traps_pipeline.ledger.schema import EVALUATIONS, RESERVATIONS, ROWS, SPENT, TOTALS
+from traps_pipeline.ledger.schema import EVALUATIONS, RELEASES, RESERVATIONS, ROWS, TOTALS
 
 CENT = 1e-9  # below this, dollars are rounding
 
 
+@dataclass(frozen=True)
+class CapExhausted:
+    """The reason why a call was not reserved.
+
+    slot: the participant whose cap is exhausted, None for the study's; taken_usd: spent and reserved under that cap;
+    others: sessions of other processes that hold reservations.
+    """
+
+    slot: str | None
+    taken_usd: float
+    others: frozenset[str]
+
+
 @dataclass
+class Request:
+    """A call's worst case, to be reserved under the caps of participants and of the study (None).
+
+    exhausted: set by the commit, if a cap leaves no room.
+    """
+
+    id: str
+    participant: str
+    usd: float
+    caps: Mapping[str | None, float]
+    exhausted: CapExhausted | None = None
+
+
 class Batch:
-    """A transaction of the commit thread: collects changes, writes them at its end."""
+    """A transaction of the commit thread: collects changes, which `flush` writes."""
 
-    connection: sa.Connection
-    study: int
-    session: str
-    rows: list[dict[str, Any]] = field(default_factory=list)
-    totals: dict[tuple[str, str], Totals] = field(default_factory=dict)
-    more_usd: dict[str, float] = field(default_factory=dict)
-    reservations: list[dict[str, Any]] = field(default_factory=list)
-    covered: dict[str, None] = field(default_factory=dict)  # reservations whose calls' rows are stored
-    _open: dict[str, float] = field(default_factory=dict)  # dollars by reservation, once `reserved` is read
-    _writers: dict[int, bool] = field(default_factory=dict)
+    def __init__(self, connection: sa.Connection, study: int, session: str) -> None:
+        self.connection, self.study, self.session = connection, study, session
+        self.rows: list[dict[str, Any]] = []
+        self.totals = defaultdict[tuple[str, str], Totals](Totals)
+        self._writers: dict[int, bool] = {}
+        # By reservation: requests, new amounts of existing ones, and those to remove.
+        self._requests: dict[str, Request] = {}
+        self._settled: dict[str, float] = {}
+        self._gone: dict[str, None] = {}
 
-    @cached_property
-    def spent(self) -> dict[str, float]:
-        """Dollars spent for good, by participant; kept up to date by `spend`."""
-        query = sa.select(SPENT.c.participant, SPENT.c.usd).where(SPENT.c.study == self.study)
-        usd_by_participant: dict[str, float] = {row.participant: row.usd for row in self.connection.execute(query)}
-        for participant, usd in self.more_usd.items():
-            usd_by_participant[participant] = usd_by_participant.get(participant, 0.0) + usd
-        return usd_by_participant
+    def reserve(self, request: Request) -> None:
+        """Reserve dollars once everything else of the transaction is written."""
+        self._requests[request.id] = request
 
-    @cached_property
-    def reserved(self) -> dict[str, float]:
-        """Reserved dollars by participant; callers that change reservations update it."""
-        query = sa.select(RESERVATIONS.c.id, RESERVATIONS.c.participant, RESERVATIONS.c.usd)
-        reserved = dict[str, float]()
-        for reservation, participant, usd in self.connection.execute(query.where(RESERVATIONS.c.study == self.study)):
-            if reservation not in self.covered:
-                self._open[reservation] = usd
-                reserved[participant] = reserved.get(participant, 0.0) + usd
-        return reserved
-
-    def spend(self, participant: str, usd: float) -> None:
-        """Add dollars to a participant's spending; a negative amount is a refund."""
-        self.more_usd[participant] = self.more_usd.get(participant, 0.0) + usd
-        if "spent" in self.__dict__:
-            self.spent[participant] = self.spent.get(participant, 0.0) + usd
-
-    def reserve(self, reservation: str, participant: str, usd: float) -> None:
-        """Add a reservation."""
-        values = {"id": reservation, "study": self.study, "session": self.session}
-        self.reservations.append({**values, "participant": participant, "usd": usd})
-        self.reserved[participant] = self.reserved.get(participant, 0.0) + usd
-
-    def settle(self, reservation: str, participant: str, was_usd: float, usd: float) -> None:
+    def settle(self, reservation: str, usd: float) -> None:
         """Replace a reservation's amount; an amount of 0 removes the reservation."""
-        is_reservation = RESERVATIONS.c.id == reservation
         if usd > CENT:
-            self.connection.execute(sa.update(RESERVATIONS).where(is_reservation).values(usd=usd))
-        else:
-            self.connection.execute(sa.delete(RESERVATIONS).where(is_reservation))
-        if "reserved" in self.__dict__:
-            self._open[reservation] = max(usd, 0.0)
-            self.reserved[participant] = self.reserved.get(participant, 0.0) + max(usd, 0.0) - was_usd
+            self._settled[reservation] = usd
+        elif self._requests.pop(reservation, None) is None:
+            self._gone[reservation] = None
 
-    def cover(self, participant: str, reservations: Sequence[str]) -> None:
+    def remove(self, reservations: Iterable[str]) -> None:
         """Remove the reservations of a call whose row now records its cost."""
-        self.covered |= dict.fromkeys(reservations)
-        if "reserved" in self.__dict__:
-            was_usd = sum(self._open.pop(reservation, 0.0) for reservation in reservations)
-            self.reserved[participant] = self.reserved.get(participant, 0.0) - was_usd
+        self._gone |= dict.fromkeys(reservations)
 
     def is_writer(self, evaluation: int) -> bool:
         """Return whether this session still holds an evaluation's lock and may add rows."""
         if evaluation not in self._writers:
-            query = sa.select(EVALUATIONS.c.writer).where(EVALUATIONS.c.id == evaluation)
-            self._writers[evaluation] = self.connection.execute(query).scalar() == self.session
+            its = self._execute(_WRITER, {"of_id": evaluation}).fetchone()
+            self._writers[evaluation] = its is not None and its[0] == self.session
         return self._writers[evaluation]
+
+    def taken_usd(self) -> dict[str, float]:
+        """Return dollars by participant: costs of rows less released ones, and reservations."""
+        return dict(self._execute(_TAKEN, {"of_study": self.study}).fetchall())
+
+    def other_sessions(self) -> frozenset[str]:
+        """Return the sessions of other processes that hold reservations."""
+        query = sa.select(RESERVATIONS.c.session).where(RESERVATIONS.c.study == self.study).distinct()
+        return frozenset(self.connection.execute(query).scalars()) - {self.session}
 
     def flush(self) -> None:
         """Write the collected changes."""
-        if self.rows:
-            self.connection.execute(sa.insert(ROWS), self.rows)
-        if self.reservations:
-            self.connection.execute(sa.insert(RESERVATIONS), self.reservations)
-        if self.covered:
-            removals = [{"gone": reservation} for reservation in self.covered]
-            self.connection.execute(sa.delete(RESERVATIONS).where(RESERVATIONS.c.id == sa.bindparam("gone")), removals)
+        self._execute(_ADD_ROW, *self.rows)
+        self._execute(_REMOVE, *({"of_study": self.study, "of_id": reservation} for reservation in self._gone))
+        settled = ({"of_study": self.study, "of_id": each, "new_usd": usd} for each, usd in self._settled.items())
+        self._execute(_SETTLE, *settled)
         for (kind, participant), totals in self.totals.items():
             self._add_totals(kind, participant, totals)
-        for participant, usd in self.more_usd.items():
-            key = {"of_study": self.study, "of_participant": participant}
-            if not self.connection.execute(_ADD_SPENT, {**key, "more_usd": usd}).rowcount:
-                self.connection.execute(sa.insert(SPENT).values(study=self.study, participant=participant, usd=usd))
+        if self._requests:
+            self._execute(_RESERVE, *self._granted())
+        for collected in (self.rows, self.totals, self._requests, self._settled, self._gone):
+            collected.clear()
+
+    def _execute(self, statement: sa.Executable, *values: dict[str, Any]) -> Any:
+        """Execute a statement for each of `values` by the driver, and return its cursor.
+
+        SQLAlchemy's own way takes more time than SQLite itself.
+        """
+        cursor, driver = self.connection.connection.cursor(), self.connection.dialect.loaded_dbapi
+        if values:
+            sql, parameters = _compiled(statement, self.connection.dialect, tuple(values[0]))
+            rows = [parameters(row) for row in values]
+            try:
+                cursor.execute(sql, rows[0]) if len(rows) == 1 else cursor.executemany(sql, rows)
+            except driver.Error as error:
+                raise exc.DBAPIError.instance(sql, None, error, driver.Error) from error
+        return cursor
+
+    def _granted(self) -> list[dict[str, Any]]:
+        """Return the reservations for which there is room, in the order of the requests."""
+        taken, granted = self.taken_usd(), list[dict[str, Any]]()
+        total = sum(taken.values())
+        for request in self._requests.values():
+            participant, usd = request.participant, request.usd
+            under_caps = {None: total, participant: taken.get(participant, 0.0)}
+            request.exhausted = next(
+                (
+                    CapExhausted(slot, taken_usd, self.other_sessions())
+                    for slot, taken_usd in under_caps.items()
+                    if slot in request.caps and request.caps[slot] - taken_usd < usd - CENT
+                ),
+                None,
+            )
+            if request.exhausted is None:
+                taken[participant], total = under_caps[participant] + usd, total + usd
+                values = {"study": self.study, "id": request.id, "session": self.session}
+                granted.append({**values, "participant": participant, "usd": usd})
+        return granted
 
     def _add_totals(self, kind: str, participant: str, its: Totals) -> None:
         values: dict[str, float] = {"dollars": its.dollars, "failed": its.failed, "unknown": its.unknown}
@@ -112,25 +146,42 @@ class Batch:
             values[f"{column}_sum"], values[f"{column}_n"] = its.means.get(column, (0.0, 0))
         key = {"of_study": self.study, "of_kind": kind, "of_participant": participant}
         increments = {f"more_{name}": value for name, value in values.items()}
-        if not self.connection.execute(_ADD_TOTALS, {**key, **increments, "its_dearest": its.dearest}).rowcount:
+        if not self._execute(_ADD_TOTALS, {**key, **increments, "its_dearest": its.dearest}).rowcount:
             new = {"study": self.study, "kind": kind, "participant": participant, "dearest": its.dearest}
             self.connection.execute(sa.insert(TOTALS).values(**new, **values))
 
 
-def _add_statement(table: sa.Table, *columns: str) -> sa.Update:
-    """Return a cached UPDATE that adds `more_COLUMN` where the key is `of_COLUMN`."""
-    key = [column == sa.bindparam(f"of_{column.name}") for column in table.primary_key]
-    sums = {name: table.c[name] + sa.bindparam(f"more_{name}") for name in columns}
-    return sa.update(table).where(*key).values(sums)
+@lru_cache
+def _compiled(statement: Any, dialect: sa.Dialect, names: tuple[str, ...]) -> tuple[str, Callable[[Any], Any]]:
+    """Return a statement for the driver, and what makes its parameters of a dict with these names."""
+    compiled = statement.compile(dialect=dialect, column_keys=names)
+    order = compiled.positiontup
+    return str(compiled), dict if order is None else lambda row: [row[name] for name in order]
 
 
-_ADD_SPENT = _add_statement(SPENT, "usd")
+def _is(*columns: sa.Column[Any]) -> sa.ColumnElement[bool]:
+    """Return a condition that each column has the value of the parameter `of_COLUMN`."""
+    return sa.and_(*(column == sa.bindparam(f"of_{column.name}") for column in columns))
+
+
+_ADD_ROW, _RESERVE = sa.insert(ROWS).inline(), sa.insert(RESERVATIONS).inline()
+_REMOVE = sa.delete(RESERVATIONS).where(_is(*RESERVATIONS.primary_key))
+_SETTLE = sa.update(RESERVATIONS).where(_is(*RESERVATIONS.primary_key)).values(usd=sa.bindparam("new_usd"))
+_WRITER = sa.select(EVALUATIONS.c.writer).where(_is(EVALUATIONS.c.id))
+_AMOUNTS = sa.union_all(
+    sa.select(TOTALS.c.participant, TOTALS.c.dollars.label("usd")).where(_is(TOTALS.c.study)),
+    sa.select(RELEASES.c.participant, -RELEASES.c.failed).where(_is(RELEASES.c.study)),
+    sa.select(RESERVATIONS.c.participant, RESERVATIONS.c.usd).where(_is(RESERVATIONS.c.study)),
+).subquery()
+_TAKEN = sa.select(_AMOUNTS.c.participant, sa.func.sum(_AMOUNTS.c.usd)).group_by(_AMOUNTS.c.participant)
 _DEAREST = sa.bindparam("its_dearest", type_=sa.Double)
-_ADD_TOTALS = _add_statement(
-    TOTALS,
-    *("dollars", "failed", "unknown"),
-    *(f"{column}_{what}" for column in AVERAGED_COLUMNS for what in ("sum", "n")),
-).values(dearest=sa.case((TOTALS.c.dearest < _DEAREST, _DEAREST), else_=TOTALS.c.dearest))
+_SUMS = ("dollars", "failed", "unknown", *(f"{column}_{what}" for column in AVERAGED_COLUMNS for what in ("sum", "n")))
+_ADD_TOTALS = (
+    sa.update(TOTALS)
+    .where(_is(*TOTALS.primary_key))
+    .values({name: TOTALS.c[name] + sa.bindparam(f"more_{name}") for name in _SUMS})
+    .values(dearest=sa.case((TOTALS.c.dearest < _DEAREST, _DEAREST), else_=TOTALS.c.dearest))
+)
 
 
 def holder() -> str:

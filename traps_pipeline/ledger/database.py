@@ -62,7 +62,7 @@ class Database(ABC):
         self.session = ""  # while this process writes: a unique id
         self.study = 0  # the study's number, once there is one
         self._queue: SimpleQueue[tuple[Change, AnyFuture] | None] = SimpleQueue()
-        self._users, self._guard, self._batch = 0, threading.Lock(), 0
+        self._users, self._guard = 0, threading.Lock()
         self._thread: threading.Thread | None = None
         self._session_lock: Lock | None = None
         self.sharers: dict[str, int] = {}  # by account in use: the number of processes that use it now
@@ -89,6 +89,10 @@ class Database(ABC):
 
         Raises TrapsError.
         """
+
+    def run_once(self, work: Callable[[sa.Connection], T]) -> T:
+        """Run `work` as `run` does, but not again if only its commit's answer was lost."""
+        return self.run(work)
 
     @abstractmethod
     def try_lock(self, name: str) -> Lock | None:
@@ -212,8 +216,8 @@ class Database(ABC):
             self._study(connection)
             or connection.execute(sa.insert(STUDIES).values(name=self.study_name).returning(STUDIES.c.id)).scalar_one()
         )
-        if connection.execute(sa.select(SESSIONS.c.batch).where(SESSIONS.c.id == self.session)).scalar() is None:
-            connection.execute(sa.insert(SESSIONS).values(id=self.session, study=self.study, batch=self._batch))
+        if connection.execute(sa.select(SESSIONS.c.id).where(SESSIONS.c.id == self.session)).first() is None:
+            connection.execute(sa.insert(SESSIONS).values(id=self.session, study=self.study))
 
     def _study(self, connection: sa.Connection) -> int | None:
         return connection.execute(sa.select(STUDIES.c.id).where(STUDIES.c.name == self.study_name)).scalar()
@@ -232,7 +236,7 @@ class Database(ABC):
             self.run(lambda connection: connection.execute(sa.delete(SESSIONS).where(SESSIONS.c.id == self.session)))
         finally:
             self._session_lock.release()
-            self.session, self._session_lock, self._batch = "", None, 0
+            self.session, self._session_lock = "", None
             self.end()
 
     def _work(self) -> None:
@@ -265,15 +269,9 @@ class Database(ABC):
 
     def _commit(self, changes: list[tuple[Change, AnyFuture]]) -> None:
         """Apply changes in one transaction; skip any that raises TrapsError."""
-        number = self._batch + 1
 
         def work(connection: sa.Connection) -> list[Any]:
-            connection.execute(sa.select(STUDIES.c.id).where(STUDIES.c.id == self.study).with_for_update())
-            is_own = (SESSIONS.c.id == self.session) & (SESSIONS.c.batch == number - 1)
-            if not connection.execute(sa.update(SESSIONS).where(is_own).values(batch=number)).rowcount and results:
-                return results  # committed before the connection broke
-            results.clear()
-            batch = Batch(connection, self.study, self.session)
+            results, batch = list[Any](), Batch(connection, self.study, self.session)
             for change, _ in changes:
                 try:
                     results.append(change(batch))
@@ -282,10 +280,8 @@ class Database(ABC):
             batch.flush()
             return results
 
-        results = list[Any]()
         try:
-            self.run(work)
-            self._batch = number
+            results = self.run_once(work)
         except Exception as error:  # noqa: BLE001 - handed to those who wait for these changes
             results = [error] * len(changes)
         by_loop = defaultdict[asyncio.AbstractEventLoop | None, list[tuple[AnyFuture, Any]]](list)

@@ -11,7 +11,6 @@ import json
 from collections.abc import AsyncIterator, Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 from functools import partial
-from itertools import islice
 from typing import Any
 
 import sqlalchemy as sa
@@ -36,7 +35,7 @@ from traps_pipeline.ledger.schema import EVALUATIONS, ROWS, STUDIES, TOTALS
 
 LOCK_POLL_S = 0.1
 SYNC_S = 0.5  # how often rows are synced to disk
-_KEYS = 500  # keys per query: SQLite takes 32,766 values
+_KEYS = 500  # for more keys than these, reading the whole evaluation takes less time than searching it
 _FETCHED = 1000  # rows per fetch
 
 Waiting = Callable[[str], None]  # called once with the holder of the lock
@@ -147,10 +146,11 @@ class Ledger:
         query = sa.select(ROWS).where(ROWS.c.evaluation == ids.scalar_subquery()).order_by(ROWS.c.id)
         if wanted is None:
             yield from self._select(query)
-            return
-        keys = iter(wanted)
-        while some := [*islice(keys, _KEYS)]:
-            yield from self._select(query.where(ROWS.c.key.in_(some)))
+        elif len(wanted) <= _KEYS:
+            yield from self._select(query.where(ROWS.c.key.in_([*wanted])))
+        else:
+            keys = frozenset(wanted)
+            yield from (row for row in self._select(query) if row.key in keys)
 
     def _add(self, rows: EvaluationRows, entry: sa.Row[Any]) -> None:
         """Add a row and a note about impossible values, or only a note if it is damaged."""
@@ -176,9 +176,7 @@ class Ledger:
         with self.database.writing():
             lock = await self._lock(evaluation, waiting, give_up)
             try:
-                number = await asyncio.wrap_future(
-                    self.database.submit(partial(claim, kind=self.kind, name=evaluation))
-                )
+                number = await self.database.apply(partial(claim, kind=self.kind, name=evaluation))
                 yield Writer(self.database, self.kind, number, lock)
             finally:
                 lock.release()
@@ -190,22 +188,21 @@ class Ledger:
         """
         async with AsyncExitStack() as stack:
             writers = {name: await stack.enter_async_context(self.writing(name, waiting)) for name in sorted(rows)}
-            new = {
-                name: [entry for entry in rows[name] if entry[0]["key"] not in known]
-                for name in writers
-                if (known := self.read(name, {row["key"] for row, _ in rows[name]}).settled) is not None
-            }
-            contents = [(writers[name], _Content.of(*entry)) for name in new for entry in new[name]]
+            new = list[tuple[Writer, Mapping[str, Any], dict[str, Any]]]()
+            for name, writer in writers.items():
+                known = self.read(name, {row["key"] for row, _ in rows[name]}).settled
+                entries = (entry for entry in rows[name] if entry[0]["key"] not in known)
+                new += [(writer, row, writer.encode(row, beside)) for row, beside in entries]
 
             def change(batch: Batch) -> None:
                 for writer in writers.values():  # before the first row: all of them or none
                     writer.check(batch)
-                for writer, content in contents:
-                    writer.add(batch, content, ())
+                for writer, row, values in new:
+                    writer.add(batch, row, values)
 
-            await asyncio.wrap_future(self.database.submit(change))
+            await self.database.apply(change)
             await asyncio.to_thread(self.database.sync)
-        return sum(settles(row) for entries in new.values() for row, _ in entries)
+        return sum(settles(row) for _, row, _ in new)
 
     async def _lock(self, evaluation: str, waiting: Waiting, give_up: GiveUp) -> Lock:
         is_told = False
@@ -224,24 +221,6 @@ class Ledger:
     def _holder(self, evaluation: str) -> str:
         query = sa.select(EVALUATIONS.c.holder).where(self._is_own_kind(EVALUATIONS), EVALUATIONS.c.name == evaluation)
         return next((row.holder for row in self._select(query) if row.holder), "another process")
-
-
-class _Content:
-    """A row in its stored form, encoded by the caller and not by the commit thread."""
-
-    def __init__(self, row: Mapping[str, Any], content: bytes, asides: Mapping[str, bytes]) -> None:
-        self.row, self.content, self.asides = row, content, asides
-
-    @classmethod
-    def of(cls, row: Mapping[str, Any], beside: Mapping[str, str] | None) -> _Content:
-        """Encode a row. Raises ValueError if JSON cannot hold it."""
-        asides = {name: text.encode("utf-8", "replace") for name, text in (beside or {}).items()}
-        return cls(row, encode_row(row), asides)
-
-    def values(self, evaluation: int) -> dict[str, Any]:
-        asides = {name: self.asides.get(name) for name in SIDE_TEXTS}
-        digest = digest_of(self.row["key"], self.content, asides["reasoning"], asides["raw"])
-        return {"evaluation": evaluation, "key": self.row["key"], "content": self.content, "digest": digest, **asides}
 
 
 class Writer:
@@ -266,21 +245,23 @@ class Writer:
         beside: texts by name in SIDE_TEXTS. paid_by: reservations that the row's cost replaces. Raises TrapsError if
         nothing was stored, and ValueError for a row that JSON cannot hold.
         """
-        content = _Content.of(row, beside)
-        await self._database.apply(lambda batch: self.add(batch, content, paid_by))
+        values = self.encode(row, beside or {})
+        await self._database.apply(lambda batch: self.add(batch, row, values, paid_by))
         self._is_synced = False
 
-    def add(self, batch: Batch, content: _Content, paid_by: Sequence[str]) -> None:
-        """Add a row to a transaction. Raises TrapsError if another process took over."""
+    def encode(self, row: Mapping[str, Any], beside: Mapping[str, str]) -> dict[str, Any]:
+        """Return a row of the table, without its id. Raises ValueError if JSON cannot hold the row."""
+        content = encode_row(row)
+        texts = {name: beside[name].encode("utf-8", "replace") if name in beside else None for name in SIDE_TEXTS}
+        digest = digest_of(row["key"], content, **texts)
+        return {"evaluation": self._evaluation, "key": row["key"], "content": content, "digest": digest, **texts}
+
+    def add(self, batch: Batch, row: Mapping[str, Any], values: dict[str, Any], paid_by: Sequence[str] = ()) -> None:
+        """Add a row to a transaction, encoded before. Raises TrapsError if another process took over."""
         self.check(batch)
-        batch.rows.append(content.values(self._evaluation))
-        participant = participant_of(content.row)
-        its = batch.totals.setdefault((self._kind, participant), Totals())
-        before = its.dollars
-        its.add(content.row)
-        if its.dollars > before:
-            batch.spend(participant, its.dollars - before)
-        batch.cover(participant, paid_by)
+        batch.rows.append(values)
+        batch.totals[self._kind, participant_of(row)].add(row)
+        batch.remove(paid_by)
 
     def check(self, batch: Batch) -> None:
         """Raise TrapsError if another process now writes this evaluation."""

@@ -7,30 +7,17 @@ reservation of a dead process stays, and counts as spent, until a person release
 from __future__ import annotations
 
 import secrets
+from asyncio import CancelledError
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
-from concurrent.futures import Future
 from dataclasses import dataclass
 
 import sqlalchemy as sa
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.ledger.batch import CENT, Batch
+from traps_pipeline.ledger.batch import CENT, Batch, CapExhausted, Request
 from traps_pipeline.ledger.database import Database
 from traps_pipeline.ledger.schema import RELEASES, RESERVATIONS, TOTALS
-
-
-@dataclass(frozen=True)
-class CapExhausted:
-    """The reason why a call was not reserved.
-
-    slot: the participant whose cap is exhausted, None for the study's; taken_usd: spent and reserved under that cap;
-    others: sessions of other processes that hold reservations.
-    """
-
-    slot: str | None
-    taken_usd: float
-    others: frozenset[str]
 
 
 @dataclass(frozen=True)
@@ -47,41 +34,30 @@ class Money:
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def reserve(self, participant: str, usd: float, caps: Mapping[str | None, float]) -> Future[str | CapExhausted]:
+    async def reserve(self, participant: str, usd: float, caps: Mapping[str | None, float]) -> str | CapExhausted:
         """Reserve dollars and return the reservation's id, or why a cap leaves no room.
 
-        caps: of each participant that has one, and of the study (None).
+        caps: of each participant that has one, and of the study (None). If the caller is cancelled nothing stays
+        reserved.
         """
-        reservation = secrets.token_hex(8)
-        slots = [slot for slot in (None, participant) if slot in caps]
+        request = Request(secrets.token_hex(8), participant, usd, caps)
+        try:
+            await self._database.apply(lambda batch: batch.reserve(request))
+        except CancelledError:
+            self._database.submit(lambda batch: batch.settle(request.id, 0.0))
+            raise
+        return request.exhausted or request.id
 
-        def change(batch: Batch) -> str | CapExhausted:
-            for slot in slots:
-                committed = sum(sum(_slot_dollars(amounts, slot)) for amounts in (batch.spent, batch.reserved))
-                if caps[slot] - committed < usd - CENT:
-                    return CapExhausted(slot, committed, _other_sessions(batch))
-            batch.reserve(reservation, participant, usd)
-            return reservation
-
-        return self._database.submit(change)
-
-    def forget(self, pending: Future[str | CapExhausted], participant: str, usd: float) -> None:
-        """Remove an abandoned reservation, if it was made."""
-        if not pending.cancelled() and pending.exception() is None and isinstance(pending.result(), str):
-            self.settle(str(pending.result()), participant, usd, 0.0)
-
-    def settle(self, reservation: str, participant: str, was_usd: float, usd: float) -> Future[None]:
+    async def settle(self, reservation: str, usd: float) -> None:
         """Replace a reservation's worst case by the call's cost, until its row is stored."""
-        return self._database.submit(lambda batch: batch.settle(reservation, participant, was_usd, usd))
+        await self._database.apply(lambda batch: batch.settle(reservation, usd))
 
     def spent(self) -> dict[str, float]:
         """Return dollars by participant: costs of rows, and reservations in flight."""
 
         def change(batch: Batch) -> dict[str, float]:
-            return {
-                name: batch.spent.get(name, 0.0) + batch.reserved.get(name, 0.0)
-                for name in {*batch.spent, *batch.reserved}
-            }
+            batch.flush()
+            return batch.taken_usd()
 
         return self._database.submit(change).result()
 
@@ -113,9 +89,9 @@ class Money:
             in_flight_usd = min(dollars, room.in_flight)
             failed = min(dollars, max_usd) - in_flight_usd
             self._reduce(batch, participant, in_flight_usd)
-            batch.spend(participant, -failed)
             values = {"study": batch.study, "participant": participant, "in_flight": in_flight_usd, "failed": failed}
             batch.connection.execute(sa.insert(RELEASES).values(**values, why=why, by=by, at=at))
+            batch.flush()
             return in_flight_usd + failed
 
         return self._database.submit(change).result()
@@ -130,7 +106,7 @@ class Money:
         ).result()
 
     def _dead_sessions(self, batch: Batch) -> set[str]:
-        return {session for session in _other_sessions(batch) if self._database.is_dead(session)}
+        return {session for session in batch.other_sessions() if self._database.is_dead(session)}
 
     def _releasable(self, batch: Batch) -> dict[str, Releasable]:
         dead_sessions = self._dead_sessions(batch)
@@ -159,13 +135,4 @@ class Money:
         for row in batch.connection.execute(query.order_by(RESERVATIONS.c.id)).all():
             remaining_usd = max(0.0, row.usd - usd)
             usd -= row.usd - remaining_usd
-            batch.settle(row.id, participant, row.usd, remaining_usd)
-
-
-def _slot_dollars(dollars: Mapping[str, float], slot: str | None) -> list[float]:
-    return [*dollars.values()] if slot is None else [dollars.get(slot, 0.0)]
-
-
-def _other_sessions(batch: Batch) -> frozenset[str]:
-    query = sa.select(RESERVATIONS.c.session).where(RESERVATIONS.c.study == batch.study).distinct()
-    return frozenset({*batch.connection.execute(query).scalars()} - {batch.session})
+            batch.settle(row.id, remaining_usd)

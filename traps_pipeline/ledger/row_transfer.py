@@ -14,7 +14,7 @@ from traps_pipeline.base.wording import count_noun
 from traps_pipeline.ledger.batch import Batch
 from traps_pipeline.ledger.database import Database
 from traps_pipeline.ledger.ledger import Ledger
-from traps_pipeline.ledger.schema import EVALUATIONS, RELEASES, RESERVATIONS, ROWS, SPENT, STUDIES, TOTALS
+from traps_pipeline.ledger.schema import EVALUATIONS, RELEASES, RESERVATIONS, ROWS, STUDIES, TOTALS
 from traps_pipeline.ledger.sqlite import SqliteDatabase
 
 KINDS = ("answers", "votes")
@@ -82,7 +82,7 @@ def _copy(source: Database, batch: Batch, place: str, mark: str) -> int:
         )
     # Remove leftovers of a killed copy, and evaluations without a row.
     batch.connection.execute(sa.delete(ROWS).where(ROWS.c.evaluation.in_(evaluations)))
-    for table in (TOTALS, SPENT, RELEASES, RESERVATIONS):
+    for table in (TOTALS, RELEASES, RESERVATIONS):
         batch.connection.execute(sa.delete(table).where(table.c.study == batch.study))
     batch.connection.execute(sa.delete(EVALUATIONS).where(EVALUATIONS.c.study == batch.study))
     count = 0
@@ -98,7 +98,7 @@ def _copy(source: Database, batch: Batch, place: str, mark: str) -> int:
             for rows in _row_chunks(connection, query, "id"):
                 batch.connection.execute(sa.insert(ROWS), [row | {"evaluation": number} for row in rows])
                 count += len(rows)
-        for table, omitted_columns in ((TOTALS, ()), (SPENT, ()), (RELEASES, ("id",)), (RESERVATIONS, ())):
+        for table, omitted_columns in ((TOTALS, ()), (RELEASES, ("id",)), (RESERVATIONS, ())):
             for rows in _row_chunks(connection, sa.select(table).where(table.c.study == study), *omitted_columns):
                 batch.connection.execute(sa.insert(table), [row | {"study": batch.study} for row in rows])
     return count

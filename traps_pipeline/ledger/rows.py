@@ -18,6 +18,7 @@ SIDE_TEXTS = ("reasoning", "raw")  # texts kept beside rows, so that reading ans
 NOT_WHOLE = "not what was written"
 Stored = tuple[Mapping[str, Any], Mapping[str, str]]  # a row, and its side texts by name in SIDE_TEXTS
 
+_ENCODER = json.JSONEncoder(ensure_ascii=False, allow_nan=False)
 MAX_TOKENS = 10**9
 MAX_USD = 10_000.0  # limit for one call with all its attempts
 
@@ -84,13 +85,13 @@ def settles(row: Mapping[str, Any]) -> bool:
 def participant_of(row: Mapping[str, Any]) -> str:
     """Return the model or judge of a row's call, or `unknown`."""
     components = row.get("components")
-    participant = components.get("participant") if isinstance(components, Mapping) else None
+    participant = components.get("participant") if isinstance(components, dict) else None
     return participant if isinstance(participant, str) else "unknown"
 
 
 def encode_row(row: Mapping[str, Any]) -> bytes:
     """Return a row as JSON. Raises ValueError for NaN, which JSON lacks."""
-    return json.dumps(row, ensure_ascii=False, allow_nan=False).encode()
+    return _ENCODER.encode(row).encode()
 
 
 def digest_of(key: str, content: bytes, reasoning: bytes | None, raw: bytes | None) -> bytes:

@@ -11,7 +11,6 @@ import json
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.ledger.money import CapExhausted, Money
@@ -113,19 +112,14 @@ class Budget:
             return None
         assert self._money is not None, "a participant with a price is asked with the study's money"
         while True:
-            pending = self._money.reserve(participant, worst_usd, self._caps)
-            try:
-                result = await asyncio.wrap_future(pending)
-            except asyncio.CancelledError:
-                pending.add_done_callback(partial(self._money.forget, participant=participant, usd=worst_usd))
-                raise
+            result = await self._money.reserve(participant, worst_usd, self._caps)
             if isinstance(result, str):
                 reservation = Reservation(result, participant, worst_usd)
                 account = self._accounts.get(participant)
                 if account is None or account.reserve(worst_usd):
                     self._in_flight[reservation.id] = reservation
                     return reservation
-                await self._replace(reservation, 0.0)
+                await self._money.settle(reservation.id, 0.0)
                 if not self._has_calls_through(account):
                     raise BudgetReached(account.explain(worst_usd))
             elif not await self._has_room_later(result):
@@ -145,16 +139,12 @@ class Budget:
             account.correct(cost - reservation.usd)
         try:
             if cost != reservation.usd:
-                await self._replace(reservation, cost)
+                assert self._money is not None, "what is settled was reserved"
+                await self._money.settle(reservation.id, cost)
         finally:
             async with self._changed:
                 self._in_flight.pop(reservation.id, None)
                 self._changed.notify_all()
-
-    async def _replace(self, reservation: Reservation, cost_usd: float) -> None:
-        assert self._money is not None, "what is replaced was reserved"
-        usd = self._money.settle(reservation.id, reservation.participant, reservation.usd, cost_usd)
-        await asyncio.wrap_future(usd)
 
     async def _has_room_later(self, full: CapExhausted) -> bool:
         """Return whether calls in flight, of any process, may yet cost less than reserved."""
