@@ -141,6 +141,19 @@ def test_a_call_that_cost_nothing_leaves_nothing(ledger: Ledger) -> None:
     assert asyncio.run(run()) == 0.0
 
 
+def test_a_cancelled_reservation_leaves_nothing(ledger: Ledger) -> None:
+    async def run() -> float:
+        with budget_in(ledger, 1.0) as budget:
+            reserving = asyncio.create_task(budget.reserve("m", 0.4))
+            await asyncio.sleep(0)
+            reserving.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await reserving
+            return budget.spent_usd
+
+    assert asyncio.run(run()) == 0.0
+
+
 def test_a_cost_above_the_worst_case_is_spent_and_asked_for_no_more(ledger: Ledger) -> None:
     async def run() -> float:
         with budget_in(ledger, 1.0) as budget:

@@ -6,7 +6,7 @@ import os
 import socket
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -65,21 +65,16 @@ class Batch:
         self._requests[request.id] = request
 
     def settle(self, reservation: str, usd: float) -> None:
-        """Replace a reservation's amount; an amount of 0 removes the reservation."""
+        """Replace a reservation's amount; 0 removes it, as a row that records the call's cost does."""
         if usd > CENT:
             self._settled[reservation] = usd
         elif self._requests.pop(reservation, None) is None:
             self._gone[reservation] = None
 
-    def remove(self, reservations: Iterable[str]) -> None:
-        """Remove the reservations of a call whose row now records its cost."""
-        self._gone |= dict.fromkeys(reservations)
-
     def is_writer(self, evaluation: int) -> bool:
         """Return whether this session still holds an evaluation's lock and may add rows."""
         if evaluation not in self._writers:
-            its = self._execute(_WRITER, {"of_id": evaluation}).fetchone()
-            self._writers[evaluation] = its is not None and its[0] == self.session
+            self._writers[evaluation] = self._execute(_WRITER, {"of_id": evaluation}).fetchone() == (self.session,)
         return self._writers[evaluation]
 
     def taken_usd(self) -> dict[str, float]:
@@ -111,33 +106,28 @@ class Batch:
         """
         cursor, driver = self.connection.connection.cursor(), self.connection.dialect.loaded_dbapi
         if values:
-            sql, parameters = _compiled(statement, self.connection.dialect, tuple(values[0]))
-            rows = [parameters(row) for row in values]
+            sql = _compiled(statement, self.connection.dialect, tuple(values[0]))
             try:
-                cursor.execute(sql, rows[0]) if len(rows) == 1 else cursor.executemany(sql, rows)
+                cursor.execute(sql, values[0]) if len(values) == 1 else cursor.executemany(sql, values)
             except driver.Error as error:
                 raise exc.DBAPIError.instance(sql, None, error, driver.Error) from error
         return cursor
 
     def _granted(self) -> list[dict[str, Any]]:
         """Return the reservations for which there is room, in the order of the requests."""
-        taken, granted = self.taken_usd(), list[dict[str, Any]]()
-        total = sum(taken.values())
+        by_participant, granted = self.taken_usd(), list[dict[str, Any]]()
+        taken = defaultdict[str | None, float](float, by_participant | {None: sum(by_participant.values())})
         for request in self._requests.values():
-            participant, usd = request.participant, request.usd
-            under_caps = {None: total, participant: taken.get(participant, 0.0)}
-            request.exhausted = next(
-                (
-                    CapExhausted(slot, taken_usd, self.other_sessions())
-                    for slot, taken_usd in under_caps.items()
-                    if slot in request.caps and request.caps[slot] - taken_usd < usd - CENT
-                ),
-                None,
-            )
-            if request.exhausted is None:
-                taken[participant], total = under_caps[participant] + usd, total + usd
+            slots, request.exhausted = (None, request.participant), None
+            for slot in slots:
+                if slot in request.caps and request.caps[slot] - taken[slot] < request.usd - CENT:
+                    request.exhausted = CapExhausted(slot, taken[slot], self.other_sessions())
+                    break
+            else:
+                for slot in slots:
+                    taken[slot] += request.usd
                 values = {"study": self.study, "id": request.id, "session": self.session}
-                granted.append({**values, "participant": participant, "usd": usd})
+                granted.append({**values, "participant": request.participant, "usd": request.usd})
         return granted
 
     def _add_totals(self, kind: str, participant: str, its: Totals) -> None:
@@ -152,11 +142,8 @@ class Batch:
 
 
 @lru_cache
-def _compiled(statement: Any, dialect: sa.Dialect, names: tuple[str, ...]) -> tuple[str, Callable[[Any], Any]]:
-    """Return a statement for the driver, and what makes its parameters of a dict with these names."""
-    compiled = statement.compile(dialect=dialect, column_keys=names)
-    order = compiled.positiontup
-    return str(compiled), dict if order is None else lambda row: [row[name] for name in order]
+def _compiled(statement: Any, dialect: sa.Dialect, names: tuple[str, ...]) -> str:
+    return str(statement.compile(dialect=dialect, column_keys=names))
 
 
 def _is(*columns: sa.Column[Any]) -> sa.ColumnElement[bool]:

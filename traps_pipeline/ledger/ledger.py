@@ -261,7 +261,8 @@ class Writer:
         self.check(batch)
         batch.rows.append(values)
         batch.totals[self._kind, participant_of(row)].add(row)
-        batch.remove(paid_by)
+        for reservation in paid_by:
+            batch.settle(reservation, 0.0)
 
     def check(self, batch: Batch) -> None:
         """Raise TrapsError if another process now writes this evaluation."""

@@ -35,7 +35,8 @@ class SqliteDatabase(Database):
     def __init__(self, folder: Path, study: str = "study", file: str = FILE) -> None:
         super().__init__(study, str(folder / file))
         self.folder, self.path = folder, folder / file
-        self._engine = sa.create_engine("sqlite://", creator=self._open, poolclass=sa.NullPool)
+        # paramstyle: `Batch` hands dicts to either driver.
+        self._engine = sa.create_engine("sqlite://", creator=self._open, poolclass=sa.NullPool, paramstyle="named")
         event.listen(self._engine, "begin", _begin)
 
     def exists(self) -> bool:
