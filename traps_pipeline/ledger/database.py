@@ -245,14 +245,11 @@ class Database(ABC):
         while True:
             changes, is_last = list[tuple[Change, AnyFuture]](), False
             try:
-                first = self._queue.get(timeout=BEAT_S)
-                while first is not None:
-                    if isinstance(first[1], asyncio.Future) or first[1].set_running_or_notify_cancel():
-                        changes.append(first)
+                while (queued := self._queue.get(block=not changes, timeout=BEAT_S)) is not None:
+                    changes.append(queued)
                     if len(changes) == MAX_CHANGES:
                         break
-                    first = self._queue.get_nowait()
-                is_last = first is None
+                is_last = queued is None
             except Empty:
                 pass
             if self.sharers and time.monotonic() - shared_at > SHARE_S:
