@@ -212,7 +212,7 @@ def test_a_clip_slower_than_asked_is_not_sped_up(tmp_path: Path, store: MediaSto
 def test_a_clip_whose_frame_rate_no_video_can_have_is_named(
     tmp_path: Path, store: MediaStore, clip: tuple[Path, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(media, "decode", lambda _: (np.stack(frames(4)), np.arange(4) / 2.5))
+    monkeypatch.setattr(media, "decode", lambda *_: (np.stack(frames(4)), np.arange(4) / 2.5))
     with raises(TrapsError, "storage.media._rate", "control.mp4", "2.5"):
         store.prepare(*clip, VIDEO)
     assert store.prepare(*clip, IMAGES).n_frames == 4

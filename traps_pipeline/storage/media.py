@@ -14,17 +14,17 @@ import json
 import os
 import struct
 import zipfile
-from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
-from threading import Lock
 from typing import Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from traps_pipeline.base.bounded_cache import BoundedCache
 from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import remedy, write_bytes
@@ -129,11 +129,21 @@ def pick(times: np.ndarray, spec: MediaSpec) -> np.ndarray:
 
 
 def sample(clip: Path, spec: MediaSpec) -> Frames:
-    """Return a clip's frames as a model sees them; may raise DamagedClip."""
-    frames, times = decode(clip)
-    indices = pick(times, spec)
+    """Return a clip's frames as a model sees them; may raise DamagedClip.
+
+    They are cached until the file changes, and shared by their callers, who must not change them.
+    """
+    try:
+        file = clip.stat()
+    except OSError as error:
+        raise DamagedClip(f"{clip}: cannot be read ({error.strerror}); materialize videos again") from error
+    return _SAMPLED.get((clip, file.st_mtime_ns, file.st_size, spec), lambda: _sample(clip, spec))
+
+
+def _sample(clip: Path, spec: MediaSpec) -> Frames:
+    frames, times = decode(clip, partial(pick, spec=spec))
     clip_fps = round((len(times) - 1) / float(times[-1] - times[0]), 3) if len(times) > 1 else None
-    return Frames(resize(frames[indices], spec.size, spec.fit), times[indices], clip_fps)
+    return Frames(resize(frames, spec.size, spec.fit), times[pick(times, spec)], clip_fps)
 
 
 def resize(frames: np.ndarray, size: tuple[int, int] | None, fit: Literal["stretch", "crop"] = "stretch") -> np.ndarray:
@@ -358,35 +368,15 @@ def _lock_folder(folder: Path) -> Iterator[None]:
 # --- as text ----------------------------------------------------------------------------------------------------------
 
 
-class UriCache:
-    """A thread-safe LRU cache of data URIs by digest, bounded by their total length."""
-
-    def __init__(self, most_bytes: int) -> None:
-        self.most_bytes, self.held_bytes = most_bytes, 0
-        self._lock = Lock()
-        self._kept: OrderedDict[tuple[Profile, str], tuple[str, ...]] = OrderedDict()
-
-    def get(self, media: Media) -> tuple[str, ...]:
-        """Return the data URIs of `payload`, in order, or raise its errors."""
-        key = (media.profile, media.sha256)
-        with self._lock:
-            uri = self._kept.get(key)
-            if uri is None:
-                uri = self._kept[key] = tuple(_data_uri(media.profile, part) for part in payload(media))
-                self.held_bytes += sum(map(len, uri))
-            self._kept.move_to_end(key)
-            while self.held_bytes > self.most_bytes:
-                self.held_bytes -= sum(map(len, self._kept.popitem(last=False)[1]))
-        return uri
-
-
 def _data_uri(profile: Profile, data: bytes) -> str:
     return f"data:{_MIME[profile]};base64,{base64.b64encode(data).decode('ascii')}"
 
 
-_URIS = UriCache(CACHE_BYTES)
-
-
 def data_uris(media: Media) -> tuple[str, ...]:
     """Return `payload` as data URIs, cached for this process; may raise its errors."""
-    return _URIS.get(media)
+    make = lambda: tuple(_data_uri(media.profile, part) for part in payload(media))  # noqa: E731
+    return _URIS.get((media.profile, media.sha256), make)
+
+
+_URIS = BoundedCache[tuple[Profile, str], tuple[str, ...]](CACHE_BYTES, lambda uris: sum(map(len, uris)))
+_SAMPLED = BoundedCache[tuple[Path, int, int, MediaSpec], Frames](CACHE_BYTES, lambda frames: frames.frames.nbytes)

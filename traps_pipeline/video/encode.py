@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -64,24 +65,31 @@ def encode(frames: Sequence[np.ndarray], path: Path, fps: int) -> None:
             raise OSError(error.errno, error.strerror) from error
 
 
-def decode(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return frames (F, H, W, 3) uint8 RGB and times (F,) s. Raises DamagedClip."""
+def decode(path: Path, pick: Callable[[np.ndarray], np.ndarray] | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return frames (N, H, W, 3) uint8 RGB and the times (F,) s of all frames.
+
+    pick: maps these times to the indices of the frames to return; all by default. Raises DamagedClip.
+    """
     import av
     from av.error import FFmpegError
+    from av.video.reformatter import VideoReformatter
 
     try:
         with av.open(str(path)) as container:
             n_declared = container.streams.video[0].frames
-            pairs = [(f.to_ndarray(format="rgb24"), float(f.time or 0.0)) for f in container.decode(video=0)]
+            frames = [*container.decode(video=0)]
     except (FFmpegError, OSError, IndexError) as error:  # IndexError: no video stream
         raise DamagedClip(
             f"{path}: cannot be decoded ({error}); delete the file and materialize videos again"
         ) from error
-    if not pairs or len(pairs) != n_declared:
+    if not frames or len(frames) != n_declared:
         raise DamagedClip(
-            f"{path}: holds {len(pairs)} of {n_declared} frames; delete the file and materialize videos again"
+            f"{path}: holds {len(frames)} of {n_declared} frames; delete the file and materialize videos again"
         )
-    return np.stack([p[0] for p in pairs]), np.array([p[1] for p in pairs])
+    times = np.array([float(frame.time or 0.0) for frame in frames])
+    to_rgb = partial(VideoReformatter().reformat, format="rgb24")  # one for all frames: making it takes as long as one
+    chosen = range(len(frames)) if pick is None else pick(times)
+    return np.stack([to_rgb(frames[index]).to_ndarray() for index in chosen]), times
 
 
 def count_frames(path: Path) -> int:
@@ -117,5 +125,4 @@ def decode_sampled(path: Path, policy: FramePolicy = SAMPLED) -> np.ndarray:
 
     By default 5 a second and at most 25 (docs/spec.md 3.1). Raises DamagedClip.
     """
-    frames, times = decode(path)
-    return frames[policy.pick(times)]
+    return decode(path, policy.pick)[0]

@@ -28,8 +28,8 @@ def test_a_clip_is_known_by_its_pixels_and_the_oldest_are_forgotten() -> None:
         of.forward_states(one)
         assert (of.forward_states(two).raw == own).all()
         assert memory.passes == 2
-        memory.most_bytes = 1  # room for one clip alone
+        memory.features.most_bytes = 1  # room for one clip alone
         of.forward_states(ask(of, frames=4))
         of.forward_states(one)
-    assert memory.passes == 4 and len(memory._kept) == 1
+    assert memory.passes == 4 and len(memory.features) == 1
     assert not torch.equal(one.inputs["pixel_values_videos"], two.inputs["pixel_values_videos"])

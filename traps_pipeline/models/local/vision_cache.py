@@ -10,11 +10,13 @@ from __future__ import annotations
 import functools
 import hashlib
 import inspect
-from collections import OrderedDict
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
+
+from traps_pipeline.base.bounded_cache import BoundedCache
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -34,15 +36,13 @@ class _Features:
         return sum(part.numel() * part.element_size() for part in (self.tokens, *self.deepstack))
 
 
-@dataclass(eq=False)
 class ClipMemory:
     """Features of the latest clips; `passes` counts those that the tower encoded."""
 
-    most_bytes: int = MAX_BYTES
-    passes: int = 0
-    _kept: OrderedDict[str, _Features] = field(default_factory=OrderedDict)
-    _size: int = 0
-    _form: Any = None  # the library's class of outputs, and whether its tokens come as a tuple
+    def __init__(self) -> None:
+        self.passes = 0
+        self.features = BoundedCache[str, _Features](MAX_BYTES, lambda features: features.size)
+        self._form: Any = None  # the library's class of outputs, and whether its tokens come as a tuple
 
     @contextmanager
     def remembering(self, network: Any) -> Iterator[None]:
@@ -61,11 +61,12 @@ class ClipMemory:
             clips = _clips_of(arguments)
             if clips is None:
                 return original(*given, **named)
-            keys = [_key(clip) for clip in clips]
-            rows = {key: self._kept[key] for key in keys if key in self._kept}
+            keys = _keys(clips)
+            rows: dict[str, _Features] = {}
             for key, clip in zip(keys, clips, strict=True):
                 if key not in rows:
-                    rows[key] = self._pass(original, key, {**arguments, **clip, **keyword_arguments})
+                    pass_arguments = {**arguments, **clip, **keyword_arguments}
+                    rows[key] = self.features.get(key, partial(self._pass, original, pass_arguments))
             return self._join_features([rows[key] for key in keys])
 
         owner.get_video_features = features
@@ -74,15 +75,13 @@ class ClipMemory:
         finally:
             del owner.get_video_features  # restore the class's own method
 
-    def _pass(self, original: Any, key: str, arguments: dict[str, Any]) -> _Features:
+    def _pass(self, original: Any, arguments: dict[str, Any]) -> _Features:
         output = original(**arguments)
         self._form = type(output), isinstance(output.pooler_output, tuple | list)
         self.passes += 1
         tokens = output.pooler_output[0] if self._form[1] else output.pooler_output
         layers = getattr(output, "deepstack_features", None) or ()
-        features = _Features(tokens.clone(), tuple(layer[0].clone() for layer in layers))
-        self._keep(key, features)
-        return features
+        return _Features(tokens.clone(), tuple(layer[0].clone() for layer in layers))
 
     def _join_features(self, rows: list[_Features]) -> Any:
         """Return these clips' features in the form of the library's output."""
@@ -96,13 +95,6 @@ class ClipMemory:
                 tuple(layer) for layer in zip(*(row.deepstack for row in rows), strict=True)
             ]
         return make(**fields)
-
-    def _keep(self, key: str, features: _Features) -> None:
-        self._kept[key] = features
-        self._size += features.size
-        while self._size > self.most_bytes and len(self._kept) > 1:
-            _, oldest = self._kept.popitem(last=False)
-            self._size -= oldest.size
 
 
 def _clips_of(arguments: dict[str, Any]) -> list[dict[str, Tensor]] | None:
@@ -121,6 +113,17 @@ def _clips_of(arguments: dict[str, Any]) -> list[dict[str, Tensor]] | None:
     if pixels.dim() == 5:  # LLaVA-NeXT-Video: a row a clip
         return [{"pixel_values_videos": row[None]} for row in pixels]
     return None
+
+
+def _keys(clips: list[dict[str, Tensor]]) -> list[str]:
+    """Return each clip's digest; one that equals the clip before it is not read again."""
+    import torch
+
+    keys: list[str] = []
+    for number, clip in enumerate(clips):
+        is_repeated = number > 0 and all(torch.equal(part, clips[number - 1][name]) for name, part in clip.items())
+        keys.append(keys[-1] if is_repeated else _key(clip))
+    return keys
 
 
 def _key(clip: dict[str, Tensor]) -> str:
