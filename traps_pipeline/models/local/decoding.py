@@ -10,6 +10,7 @@ from traps_pipeline.models.first_token import MAX_ALTERNATIVES
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.prompt_batches import Prompt, collate
 from traps_pipeline.models.local.sampling import Sampling, SeededNucleus
+from traps_pipeline.models.local.shared_prompts import sharing_prompts
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -19,6 +20,7 @@ class DecodingModel(Protocol):
     """The parts of a `LocalModel` that decoding needs."""
 
     network: Any
+    blocks: Any
 
     def placed(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return inputs on the model's device."""
@@ -27,6 +29,11 @@ class DecodingModel(Protocol):
 
 class Steers(Protocol):
     """Anything that changes hidden states in a pass, as `mechanism.hook.Steering`."""
+
+    @property
+    def layer(self) -> int:
+        """The block whose output it changes."""
+        ...
 
     def rows(self, chosen: Sequence[int]) -> Steers:
         """Return the steering of some of the prompts."""
@@ -60,7 +67,12 @@ def decode(
     inputs: dict[str, Any] = model.placed(collate(prompts, pad))
     first = _FirstToken()
     processors = [first, SeededNucleus(sampling)] if sampling else [first]
-    with torch.inference_mode(), steering_context(steering, model):
+    same_up_to = 0 if steering is None else steering.layer
+    with (
+        torch.inference_mode(),
+        sharing_prompts(model, prompts, same_up_to, pad),
+        steering_context(steering, model),
+    ):
         sequences = model.network.generate(
             **inputs,
             max_new_tokens=max_new_tokens,
