@@ -35,7 +35,7 @@ def test_the_passes_of_the_papers_study_are_counted() -> None:
     scenarios = {"occlusion": 202, "chaotic": 500}
     passes = {work.kind: work.passes for work in mechanism_passes(settings, DATASETS, scenarios)}
     assert passes["states"] == 2 * (4 * 202 + 4 * 500) + 202 + 2 * 500
-    assert passes["sentences"] == (3 + 1) * 2 * (4 * 202 + 4 * 500)  # three abstentions and the own answer, two regimes
+    assert passes["sentences"] == 2 * (4 * 202 + 4 * 500)  # one pass an item under each of two regimes
     assert passes["states of random weights"] == 4 * 202 + 4 * 500 + 202 + 2 * 500
     # Two directions of 100 pairs: 2 records and a gradient (3); 1 + 4 records; 4 sources x (24 + 1) rows of half a pass
     assert passes["patching"] == 2 * 100 * (5 + 5 + 50)

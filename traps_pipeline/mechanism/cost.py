@@ -80,8 +80,8 @@ def mechanism_passes(settings: MechanismSettings, datasets: Sequence[str], scena
     extra_prompts += 2 * scenarios.get("chaotic", 0) * ("chaotic" in datasets)  # sides with the other's times
     extra_prompts += sum(len(sides_of(arm)) * sum(scenarios.values()) for arm in datasets if arm in PROBED_ARMS)
     work = [Work("states", len(settings.prompts) * n_pair_items + extra_prompts)]
-    if settings.sentences:  # and the model's own answer, under each regime
-        work.append(Work("sentences", (len(settings.sentences) + 1) * len(settings.prompts) * n_pair_items))
+    if settings.sentences:  # under each regime; the sentences themselves are few tokens behind one pass
+        work.append(Work("sentences", len(settings.prompts) * n_pair_items))
     if settings.gate.untrained:
         work.append(Work("states of random weights", n_pair_items + extra_prompts))
     if settings.patching is not None:

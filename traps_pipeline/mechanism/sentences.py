@@ -2,11 +2,12 @@
 
 The output margin covers only the first answer token, and shows nothing for a model that begins every answer with "The".
 Here every sentence of a set, and the model's own answer, follows the benchmark's prompt (teacher forcing), and the
-log-probabilities of its tokens are averaged, so that long and short sentences are comparable. One pass per sentence.
+log-probabilities of its tokens are averaged, so that long and short sentences are comparable. The prompt is read once.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base import progress
@@ -52,10 +53,10 @@ def sentence_rows(workspace: Workspace, entry: ModelEntry, extraction: Extractio
             text = texts.get(item_columns["item_id"])
             answer_ids = answer_tokens(model, text)[:OWN_TOKENS] if isinstance(text, str) and text else []
             with model.caching_clips():
-                log_probability_of = {
-                    name: mean_log_probability(model, prompt, tokens) for name, tokens in sentences.items()
-                }
-                answer = mean_log_probability(model, prompt, answer_ids) if answer_ids else None
+                values = mean_log_probabilities(
+                    model, prompt, [*sentences.values(), *([answer_ids] if answer_ids else [])]
+                )
+            log_probability_of = dict(zip(sentences, values, strict=False))
             best = max(log_probability_of, key=lambda name: log_probability_of[name])
             rows.append(
                 SentenceRow(
@@ -63,7 +64,7 @@ def sentence_rows(workspace: Workspace, entry: ModelEntry, extraction: Extractio
                     **{name: item_columns[name] for name in ("item_id", "dataset", "scenario_id", "side")},
                     sentence=best,
                     abstention=log_probability_of[best],
-                    own=answer,
+                    own=values[-1] if answer_ids else None,
                     own_tokens=len(answer_ids),
                 )
             )
@@ -80,12 +81,21 @@ def answer_tokens(model: LocalModel, text: str) -> list[int]:
     return model.processor.tokenizer(text, add_special_tokens=False).input_ids
 
 
-def mean_log_probability(model: LocalModel, prompt: Prompt, tokens: list[int]) -> float:
-    """Return tokens' mean log-probability after a prompt (nats per token); one pass."""
+def mean_log_probabilities(model: LocalModel, prompt: Prompt, answers: Sequence[Sequence[int]]) -> list[float]:
+    """Return the mean log-probability of each answer's tokens behind a prompt, in nats.
+
+    The prompt is read once; then all answers in one pass, which reads its keys and values. Shorter answers are filled
+    up on the right, where no token of theirs looks.
+    """
     import torch
 
-    full_prompt = prompt.followed_by(tokens)
+    width = max(len(tokens) for tokens in answers)
+    rows = torch.tensor([[*tokens, *[0] * (width - len(tokens))] for tokens in answers], device=model.inputs_device)
     with torch.inference_mode():
-        states = model.forward(full_prompt).last_hidden_state[0, -len(tokens) - 1 : -1]
-        chances = head_logits(model, states).log_softmax(-1)
-        return float(chances[torch.arange(len(tokens)), torch.tensor(tokens)].mean())
+        output = model.network.base_model(**model.placed(prompt.inputs), use_cache=True)
+        output.past_key_values.batch_repeat_interleave(len(answers))
+        behind = model.network.base_model(input_ids=rows, past_key_values=output.past_key_values)
+        ends = output.last_hidden_state[:, -1:].expand(len(answers), -1, -1)
+        states = torch.cat([ends, behind.last_hidden_state[:, :-1].to(ends.device)], dim=1)
+        chances = head_logits(model, states).log_softmax(-1).gather(-1, rows[..., None].to(ends.device))[..., 0]
+        return [float(row[: len(tokens)].mean()) for row, tokens in zip(chances, answers, strict=True)]
