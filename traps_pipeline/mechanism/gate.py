@@ -12,7 +12,7 @@ of the target's family in any dataset).
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pandas as pd
@@ -29,16 +29,22 @@ SOURCES = (*(f"one:{name}" for name in DATASETS), OTHER_DATASETS, OTHER_FAMILIES
 NO_THRESHOLD = float("inf")  # threshold above every score
 
 
+# A probe, its thresholds, and the shares of calibrating controls above each.
+FittedGate = tuple[Scorer, dict[str, float], dict[str, float]]
+
+
 @dataclass(frozen=True, eq=False)
 class Items:
     """Items that a gate is fitted on and applied to.
 
     table: rows with dataset, scenario_id, family, prompt (equal for items with the same prompt) and void (bool).
-    features: (n, d), rows in the same order.
+    features: (n, d), rows in the same order. fitted: the gates fitted on some of these rows, which several targets
+    share.
     """
 
     table: pd.DataFrame
     features: np.ndarray
+    fitted: dict[object, FittedGate] = field(default_factory=dict)
 
     def rows(self, chosen: np.ndarray) -> Items:
         """Return the items that a boolean mask selects."""
@@ -108,19 +114,20 @@ def decide(items: Items, source: str, target: str, *, folds: int, seed: int, fal
     expected = {name: np.zeros(len(target_rows)) for name in THRESHOLDS}
     for fold in _held_out_groups(groups[target_rows], source, folds, seed):
         is_in_fold = np.isin(groups[target_rows], fold)
-        train = items.rows(is_source & ~np.isin(groups, fold))
-        if len(set(train.void)) < 2:
+        is_training = is_source & ~np.isin(groups, fold)
+        if len(set(items.void[is_training])) < 2:
             continue
-        probe, cuts, shares = fit_gate(train, folds, seed, false_abs)
+        key = (is_training.tobytes(), folds, seed, false_abs)
+        if key not in items.fitted:
+            items.fitted[key] = fit_gate(items.rows(is_training), folds, seed, false_abs)
+        probe, cuts, shares = items.fitted[key]
         score[is_in_fold] = probe.scores(items.features[target_rows[is_in_fold]])
         for name in THRESHOLDS:
             cut[name][is_in_fold], expected[name][is_in_fold] = cuts[name], shares[name]
     return Decisions(target_rows, score, cut, expected)
 
 
-def fit_gate(
-    train: Items, folds: int, seed: int, false_abs: float
-) -> tuple[Scorer, dict[str, float], dict[str, float]]:
+def fit_gate(train: Items, folds: int, seed: int, false_abs: float) -> FittedGate:
     """Return probe, thresholds, and shares of calibrating controls above each.
 
     train: both sides, in two scenarios or more.

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.base import progress
+from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.mechanism.baselines import MARGIN, NoMargin, output_margins, probed_items, raw_features
@@ -67,6 +68,10 @@ class Gates:
     sources: Sequence[str]
 
 
+Gated = dict[tuple[str, str], tuple[Decisions, int]]  # source and target -> decisions, and layer of the states
+_GATED: dict[str, dict[str, Gated]] = {}  # by digest of what decides them: those that this process has made
+
+
 def gate_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> list[GateRow]:
     """Return GATE rows of an extraction, for each regime evaluated in run 1.
 
@@ -75,8 +80,9 @@ def gate_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> 
     resamples, seed = workspace.mechanism.probes.resamples, workspace.mechanism.seed
     return [
         row
-        for regime, outcomes, gates, source, decisions in _each_regime(workspace, entry, states, SOURCES)
-        for row in _rows(states, (gates, regime, source), decisions, outcomes, resamples, seed)
+        for regime, outcomes, features, gated in _each_regime(workspace, entry, states)
+        for source in dict.fromkeys(source for source, _ in gated)
+        for row in _rows(states, (features, regime, source), _of_source(gated, source), outcomes, resamples, seed)
     ]
 
 
@@ -84,18 +90,22 @@ def curve_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) ->
     """Return RISK_COVERAGE rows, as `gate_rows`, for gates from other datasets."""
     return [
         row
-        for regime, outcomes, gates, _, decisions in _each_regime(workspace, entry, states, (OTHER_DATASETS,))
-        for row in _curves(states, gates, regime, decisions, outcomes)
+        for regime, outcomes, features, gated in _each_regime(workspace, entry, states)
+        for row in _curves(states, features, regime, _of_source(gated, OTHER_DATASETS), outcomes)
     ]
 
 
 DecisionsByTarget = Mapping[str, tuple[Decisions, int]]  # target -> decisions and layer
 
 
+def _of_source(gated: Gated, source: str) -> DecisionsByTarget:
+    return {target: decisions for (name, target), decisions in gated.items() if name == source}
+
+
 def _each_regime(
-    workspace: Workspace, entry: ModelEntry, states: StoredStates, sources: Sequence[str]
-) -> Iterator[tuple[str, Mapping[str, Outcomes], str, str, DecisionsByTarget]]:
-    """Yield regime, its outcomes, features, source and decisions of every gate."""
+    workspace: Workspace, entry: ModelEntry, states: StoredStates
+) -> Iterator[tuple[str, Mapping[str, Outcomes], str, Gated]]:
+    """Yield regime, its outcomes, features and the decisions of all gates on them."""
     outcomes = {
         regime: regime_outcomes
         for regime in PROMPTING
@@ -106,22 +116,33 @@ def _each_regime(
             f"gate {states.extraction.key}: {entry.id} has no verdicts under {' or '.join(PROMPTING)} in run 1; the "
             "experiment must ask the model under one of these regimes"
         )
-    table = gate_table(states)
+    for features, gated in _all_decisions(workspace, entry, states).items():
+        for regime in outcomes:
+            yield regime, outcomes[regime], features, gated
+
+
+def _all_decisions(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> dict[str, Gated]:
+    """Return the decisions of every kind of features, which `gate_rows` and `curve_rows` share."""
+    settings = workspace.mechanism
     layers = chosen_layers(workspace, states, dict.fromkeys(states.items["dataset"]))
-    kinds = [*_kinds(workspace, entry, states, layers, sources)]
-    for number, gates in enumerate(kinds):
-        progress.current().tick("gate", f"features of {states.extraction.key}", number + 1, len(kinds))
-        decisions = _decisions(workspace, table, gates, layers)
-        for regime, source in product(outcomes, gates.sources):
-            own_decisions = {target: decision for (name, target), decision in decisions.items() if name == source}
-            yield regime, outcomes[regime], gates.name, source, own_decisions
+    probe_settings = settings.probes.model_dump(mode="json")
+    key = digest([states.digest, layers, probe_settings, settings.gate.model_dump(mode="json"), settings.seed])
+    if key not in _GATED:
+        table, kinds = gate_table(states), [*_kinds(workspace, entry, states, layers)]
+        gated_by_features: dict[str, Gated] = {}
+        for number, gates in enumerate(kinds):
+            progress.current().tick("gate", f"features of {states.extraction.key}", number + 1, len(kinds))
+            gated_by_features[gates.name] = _decisions(workspace, table, gates, layers)
+        _GATED[key] = gated_by_features
+    return _GATED[key]
 
 
 def gate_table(states: StoredStates) -> pd.DataFrame:
     """Return all items as `gate.Items.table`, in the order of `states.items`."""
     items = states.items
     id_columns = pd.DataFrame(items[["dataset", "scenario_id", "item_id"]])
-    return id_columns.assign(family=families(items), prompt=items["states_key"], void=items["side"] == "void")
+    table = id_columns.assign(family=families(items), prompt=items["states_key"])
+    return table.astype(object).assign(void=items["side"] == "void")  # Arrow's strings are slow to select from
 
 
 def chosen_layers(workspace: Workspace, states: StoredStates, targets: Iterable[str]) -> dict[str, int]:
@@ -131,13 +152,11 @@ def chosen_layers(workspace: Workspace, states: StoredStates, targets: Iterable[
     return {target: layer_choice(curves, target).layer for target in targets}
 
 
-def _kinds(
-    workspace: Workspace, entry: ModelEntry, states: StoredStates, layers: Mapping[str, int], sources: Sequence[str]
-) -> Iterator[Gates]:
+def _kinds(workspace: Workspace, entry: ModelEntry, states: StoredStates, layers: Mapping[str, int]) -> Iterator[Gates]:
     """Yield states by every source, and control features by sources of many datasets."""
     names = [*dict.fromkeys(states.items["dataset"])]
     states_by_layer = {layer: read_states(states, names, layer) for layer in sorted({*layers.values()})}
-    yield Gates(STATES, states_by_layer, sources)
+    yield Gates(STATES, states_by_layer, SOURCES)
     controls = (OTHER_DATASETS,)
     assert entry.media is not None, "local entries have media"
     items = {name: probed_items(workspace, states, name) for name in names}
@@ -159,20 +178,20 @@ def read_states(states: StoredStates, names: Sequence[str], layer: int) -> dict[
     return {name: states.read(name, layer) for name in names}
 
 
-def _decisions(
-    workspace: Workspace, table: pd.DataFrame, gates: Gates, layers: Mapping[str, int]
-) -> dict[tuple[str, str], tuple[Decisions, int]]:
+def _decisions(workspace: Workspace, table: pd.DataFrame, gates: Gates, layers: Mapping[str, int]) -> Gated:
     """Return decisions and states' layer (-1 for other features), by source, target."""
     settings, seed = workspace.mechanism, workspace.mechanism.seed
     settings_of_gate = {"folds": settings.probes.folds, "seed": seed, "false_abs": settings.gate.false_abs}
-    decisions: dict[tuple[str, str], tuple[Decisions, int]] = {}
+    decisions: Gated = {}
+    items_of = {
+        layer: gate_items(table, features, gates.name == SHUFFLED, seed) for layer, features in gates.by_layer.items()
+    }
     datasets = [name for name in DATASETS if name in set(table["dataset"])]
     for source, target in product(gates.sources, dict.fromkeys(table["dataset"])):
         if not sources_of_gate(source, str(target), datasets):
             continue  # a study without all datasets has fewer gates
         layer = layers[str(target)] if layers[str(target)] in gates.by_layer else -1
-        items = gate_items(table, gates.by_layer[layer], gates.name == SHUFFLED, seed)
-        decision = decide(items, source, str(target), **settings_of_gate)
+        decision = decide(items_of[layer], source, str(target), **settings_of_gate)
         if np.isfinite(decision.score).any():
             decisions[source, str(target)] = decision, layer
     return decisions
