@@ -170,7 +170,7 @@ def patched_changes(
 ) -> np.ndarray:
     """Measure the change of the target's outcome by each patch, (patches,).
 
-    Passes begin at the lowest patched block of their rows; the vision tower is not run again. Every pass has one row
+    Patches at one block share passes that begin there; the vision tower is not run again. Every pass has one row
     without a patch, and changes are relative to that row: a patch that replaces states by equal ones changes nothing,
     bit for bit, whatever the batch size does to rounding. Raises TrapsError if the two prompts have different numbers
     of tokens, or different visual positions.
@@ -179,13 +179,15 @@ def patched_changes(
 
     _require_one_form(target, source)
     changes, rows = np.empty(len(patches)), max(1, min(ROWS, TOKENS // target.length))
-    order = sorted(range(len(patches)), key=lambda i: _first_layer(model, patches[i]))
-    for numbers in (order[k : k + rows] for k in range(0, len(order), rows)):
-        batch = [patches[i] for i in numbers]
-        weights = _masks(batch, target.length, model.inputs_device)
-        with torch.inference_mode():
-            margins = _margins(model, target, source, weights, _first_layer(model, batch[0]), 1 + len(batch), tokens)
-        changes[numbers] = (margins[1:] - margins[0]).double().numpy()
+    numbers_by_start: dict[int, list[int]] = {}
+    for number, patch in enumerate(patches):
+        numbers_by_start.setdefault(_first_layer(model, patch), []).append(number)
+    for start, same_start in numbers_by_start.items():
+        for numbers in (same_start[k : k + rows] for k in range(0, len(same_start), rows)):
+            weights = _masks([patches[i] for i in numbers], target.length, model.inputs_device)
+            with torch.inference_mode():
+                margins = _margins(model, target, source, weights, start, 1 + len(numbers), tokens)
+            changes[numbers] = (margins[1:] - margins[0]).double().numpy()
     return changes
 
 

@@ -222,34 +222,26 @@ def wanted_steered(
     plan = strengths(cell.dataset, settings.models[entry.id], settings, directions)
     max_tokens = settings.steering.max_new_tokens
     return [
-        SteeredQuestion(steered_request(workspace, entry, item, cell, strength, max_tokens), item, strength)
+        SteeredQuestion(steered_request(unsteered, str(item["side"]), strength), item, strength)
         for item in rows
+        for unsteered in [unsteered_request(workspace, entry, item, cell, max_tokens)]
         for strength, sides in plan
         if item["side"] in sides
         and (strength.source == UNSTEERED or item["scenario_id"] not in directions[strength.source].scenarios)
     ]
 
 
-def steered_request(
-    workspace: Workspace,
-    entry: ModelEntry,
-    item: Mapping[str, Any],
-    cell: SteeringCell,
-    strength: Strength,
-    max_new_tokens: int,
+def unsteered_request(
+    workspace: Workspace, entry: ModelEntry, item: Mapping[str, Any], cell: SteeringCell, max_new_tokens: int
 ) -> Request:
-    """Return a steered call: full benchmark prompt, greedy, precision of extraction."""
+    """Return the call at alpha 0: full benchmark prompt, greedy, precision of extraction."""
     assert entry.media is not None, "local entries have media"
     clip = workspace.resolve(item["clip"])
     media = workspace.media.prepare(clip, item["media_digest"], entry.media)
-    steering = None
-    if strength.alpha:
-        signed_alpha = strength.signed_alpha(item["side"])
-        steering = {"direction": strength.digest, "layer": strength.layer, "alpha": signed_alpha}
     return Request(
         participant=entry.id,
         endpoint=entry.backend,
-        params=loaded_params(entry) | {"do_sample": False, "max_new_tokens": max_new_tokens, "steering": steering},
+        params=loaded_params(entry) | {"do_sample": False, "max_new_tokens": max_new_tokens, "steering": None},
         system=system_prompt(cell.evaluation.regime),
         user=item["question"],
         about={"item_id": ledger_item_id(item), "model": entry.id, "regime": cell.evaluation.regime},
@@ -257,6 +249,14 @@ def steered_request(
         sent=media,
         media_digest=media.sha256,
     )
+
+
+def steered_request(unsteered: Request, side: str, strength: Strength) -> Request:
+    """Return the call at a strength, whose key holds what is added to the states."""
+    if not strength.alpha:
+        return unsteered
+    added = {"direction": strength.digest, "layer": strength.layer, "alpha": strength.signed_alpha(side)}
+    return replace(unsteered, params={**unsteered.params, "steering": added})
 
 
 def ledger_item_id(item: Mapping[str, Any]) -> str:

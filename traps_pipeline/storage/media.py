@@ -131,8 +131,11 @@ def pick(times: np.ndarray, spec: MediaSpec) -> np.ndarray:
 def sample(clip: Path, spec: MediaSpec) -> Frames:
     """Return a clip's frames as a model sees them; may raise DamagedClip.
 
-    They are cached until the file changes, and shared by their callers, who must not change them.
+    Those of profile frames are cached until the file changes, and shared by callers, who must not change them; the
+    files of other profiles are prepared once.
     """
+    if spec.profile != "frames":
+        return _sample(clip, spec)
     try:
         file = clip.stat()
     except OSError as error:
