@@ -19,15 +19,14 @@ from traps_pipeline.models.local.sidepaths import has_other_paths
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from traps_pipeline.models.local.decoding import DecodingModel
-
 
 @contextmanager
-def sharing_prompts(model: DecodingModel, prompts: Sequence[Prompt], last: int, pad_token: int) -> Iterator[None]:
+def sharing_prompts(model: Any, prompts: Sequence[Prompt], last: int, pad_token: int) -> Iterator[None]:
     """Skip blocks 1 to `last` in the first pass over these prompts inside the context.
 
-    last: the last block whose input is the same for equal prompts. Models whose later blocks read more of earlier ones
-    than the residual stream, or that keep only a window of their keys, run all blocks.
+    model: a `decoding.DecodingModel`. last: the last block whose input is the same for equal prompts. Models whose
+    later blocks read more of earlier ones than the residual stream, or that keep only a window of their keys, run all
+    blocks.
     """
     import torch
 
