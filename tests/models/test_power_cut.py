@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import os
 import shutil
 import time
@@ -26,12 +27,12 @@ def study(tmp_path: Path) -> Path:
 @pytest.fixture
 def on_disk(study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> OnDisk:
     """The items whose answers the ledger has in a copy made as its log was last synced."""
-    fsync, copies = os.fsync, list[Path]()
+    fsync, copies, numbers = os.fsync, list[Path](), itertools.count()  # two threads may sync at once
 
     def syncing(descriptor: int) -> None:
         fsync(descriptor)
         if Path(f"/proc/self/fd/{descriptor}").readlink().name.endswith("-wal"):
-            copy = tmp_path / f"disk-{len(copies)}"
+            copy = tmp_path / f"disk-{next(numbers)}"
             shutil.copytree(study, copy, ignore=shutil.ignore_patterns("*-shm"))
             copies.append(copy)
 
