@@ -92,7 +92,7 @@ def _cues(clips: pd.DataFrame, root: Path) -> dict[str, _Cue]:
 
 def _hits(items: pd.DataFrame, features: np.ndarray, classify: Classifier) -> np.ndarray:
     """Return the share of correctly predicted sides of each pair (0, 0.5 or 1)."""
-    void, fold = (items["side"] == "void").to_numpy(), _folds(items["scenario_id"])
+    void, fold = (items["side"] == "void").to_numpy(), _folds(items["scenario_id"].to_numpy(str))
     is_right = np.empty(len(items), bool)
     for k in range(FOLDS):
         held_out = fold == k
@@ -101,9 +101,9 @@ def _hits(items: pd.DataFrame, features: np.ndarray, classify: Classifier) -> np
     return np.bincount(pair, weights=is_right) / np.bincount(pair)
 
 
-def _folds(scenarios: pd.Series) -> np.ndarray:
+def _folds(scenarios: np.ndarray) -> np.ndarray:
     """Return each item's fold: the scenarios of most items first, each into the smallest fold."""
-    _, scenario, sizes = np.unique(scenarios.to_numpy(str), return_inverse=True, return_counts=True)
+    _, scenario, sizes = np.unique(scenarios, return_inverse=True, return_counts=True)
     fold_of, fold_sizes = np.empty(len(sizes), int), np.zeros(FOLDS, int)
     for k in np.argsort(sizes, kind="stable")[::-1]:
         fold_of[k] = np.argmin(fold_sizes)
