@@ -78,6 +78,7 @@ def test_only_the_planted_cue_tells_control_from_void(
     assert (rows.loc[sorted(silent), "accuracy"] == 0.5).all(), rows
 
 
+@pytest.mark.slow  # imports scikit-learn
 def test_words_are_classified_as_by_scikit_learn() -> None:
     from sklearn.feature_extraction.text import TfidfVectorizer
     from sklearn.linear_model import LogisticRegression

@@ -122,7 +122,7 @@ def _thumbnail(clip: Path) -> np.ndarray:
 def by_words(texts: np.ndarray, void: np.ndarray, others: np.ndarray) -> np.ndarray:
     """Classify texts by logistic regression (C = 10) on the TF-IDF of their words and pairs of words.
 
-    In NumPy, since importing scikit-learn takes longer than all else that follows a corrected question.
+    It is written in NumPy because importing scikit-learn takes over a second after each corrected question.
     """
     terms = [_terms(text) for text in texts]
     column = {term: k for k, term in enumerate(sorted({*chain(*terms)}))}
