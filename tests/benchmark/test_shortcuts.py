@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from traps_pipeline.base.digests import file_digest
-from traps_pipeline.benchmark.shortcuts import shortcuts
+from traps_pipeline.benchmark.shortcuts import by_words, shortcuts
 from traps_pipeline.report.figures.grids import shortcut_figure
 from traps_pipeline.video.encode import encode
 
@@ -76,6 +76,22 @@ def test_only_the_planted_cue_tells_control_from_void(
     assert (rows["n_pairs"] == SCENARIOS).all()
     assert (rows.loc[sorted(telling), "accuracy"] >= 0.8).all(), rows
     assert (rows.loc[sorted(silent), "accuracy"] == 0.5).all(), rows
+
+
+@pytest.mark.slow  # imports scikit-learn
+def test_words_are_classified_as_by_scikit_learn() -> None:
+    from sklearn.feature_extraction.text import TfidfVectorizer
+    from sklearn.linear_model import LogisticRegression
+    from sklearn.pipeline import make_pipeline
+
+    rng = np.random.default_rng(0)
+    words = ["which", "what", "colour", "ball", "block", "falls", "first", "is", "heavier", "Blue", "red", "a"]
+    texts = np.array([" ".join(rng.choice(words, rng.integers(1, 12))) for _ in range(90)], object)
+    void = rng.random(90) < np.where([text.count("is") > 0 for text in texts], 0.8, 0.3)
+    model = make_pipeline(TfidfVectorizer(ngram_range=(1, 2)), LogisticRegression(C=10, max_iter=1000, tol=1e-10))
+    expected = model.fit(texts[:60], void[:60]).predict(texts[60:])
+    assert 5 < expected.sum() < 25
+    assert by_words(texts[:60], void[:60], texts[60:]).tolist() == expected.tolist()
 
 
 @pytest.mark.slow

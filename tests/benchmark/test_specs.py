@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.corrections import Correction, Scenario, fold
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.benchmark.specs import resolve_scenario
+from traps_pipeline.benchmark.specs import ResolvedScenario, resolve_scenario, unsettled_outcomes
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 
@@ -74,3 +75,18 @@ def test_an_answer_that_the_simulation_contradicts_is_refused(workspace: Workspa
     change = {"scenario_id": "domino_chain-0001", "params": {"azimuth_deg": azimuth}, "answer": wrong}
     with pytest.raises(TrapsError, match=r"review\.jsonl:1: .* the correction says"):
         resolve_scenario(workspace, corrected(change))
+
+
+@pytest.mark.slow  # compiles a scene
+def test_a_corrected_question_replays_no_scene_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    spec = load_released()["plinko-0003"]
+    trajectory, absent = RELEASED / "trajectories" / "plinko-0003.npz", tmp_path / "absent.npz"
+    other_evidence = spec.model_copy(update={"evidence": {**spec.evidence, "commit_s": 0.0}})
+    assert len(unsettled_outcomes([ResolvedScenario(other_evidence, trajectory)])) == 1
+    with pytest.raises(ValueError, match="no such trajectory"):
+        unsettled_outcomes([ResolvedScenario(spec, absent)])
+    assert unsettled_outcomes([ResolvedScenario(spec, trajectory)]) == []
+    asked = spec.model_copy(update={"ill_posed_question": "How heavy is the blue square?"})
+    assert unsettled_outcomes([ResolvedScenario(asked, absent)]) == []
+    assert len(unsettled_outcomes([ResolvedScenario(other_evidence, trajectory)])) == 1

@@ -100,7 +100,7 @@ def test_dagster_shows_exactly_the_touched_partitions_stale_stage_by_stage(study
     assert stale_in_dagster(study) == []
     study.correct("hidden_race-0003", question="Which of the balls leaves the tunnel before the other ones?")
     status = study.traps("status").out
-    assert "hidden: corrections/hidden changed" in status
+    assert "hidden: corrections changed" in status
     assert stale_in_dagster(study) == ["scene_specs/hidden"]
     materialize(study, "scene_specs", "hidden")
     assert stale_in_dagster(study) == ["items/occlusion", "items/occlusion_ill_posed", "videos/hidden"]

@@ -18,8 +18,9 @@ _GAP = 2  # blanks between the columns of a table
 
 # Controls, and what Unicode calls default ignorable, with all marks of direction; as HIDDEN in the explorer's dom.js.
 _HIDDEN = re.compile(
-    "(?!\\r\\n)[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u034f\u061c\u115f\u1160\u17b4\u17b5\u180b-\u180f\u200b-\u200f\u2028-\u202e"
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u034f\u061c\u115f\u1160\u17b4\u17b5\u180b-\u180f\u200b-\u200f\u2028-\u202e"
     "\u2060-\u206f\u3164\ufe00-\ufe0f\ufeff\uffa0\ufff0-\ufffb\U0001bca0-\U0001bca3\U0001d173-\U0001d17a\U000e0000-\U000e0fff]"
+    "(?<!\\r(?=\\n))"
 )
 _JOINER, _EMOJI_STYLE = "\u200d", "\ufe0f"
 

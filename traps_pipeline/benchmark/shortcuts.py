@@ -6,10 +6,12 @@ They are reported beside the observer and are no gate: a cut clip *is* shorter.
 
 from __future__ import annotations
 
-from collections.abc import Callable, MutableMapping
+import re
+from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from importlib.metadata import version
+from itertools import chain, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -17,12 +19,14 @@ import pandas as pd
 from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.protocol.datasets import DATASETS
 
-if TYPE_CHECKING:
-    from sklearn.pipeline import Pipeline
-
 FOLDS = 5
+NEWTON_STEPS = 100  # at most; ten are usual
 THUMBNAIL = (32, 24)  # pixels of a first frame that the classifier sees, width and height
 COLUMNS = ("dataset", "cue", "n_pairs", "accuracy", "half_width")
+
+
+# (features of items to fit, (n, ..), which are void, (n,); features of others, (m, ..)) -> whether those are void, (m,)
+Classifier = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
 class _Cue(NamedTuple):
@@ -30,7 +34,7 @@ class _Cue(NamedTuple):
 
     values: Callable[[pd.DataFrame], pd.Series]
     features: Callable[[pd.DataFrame], np.ndarray]
-    model: Callable[[], Pipeline]
+    classify: Classifier
 
 
 def shortcuts(
@@ -52,7 +56,7 @@ def shortcuts(
         id_rows: list[Any] = data[["scenario_id", "pair_id", "side"]].to_numpy().tolist()
         for name, cue in cues.items():
             key = digest([*code, dataset, name, id_rows, cue.values(data).tolist()])
-            results[key] = (cache or {}).get(key) or _accuracy(_hits(data, cue.features(data), cue.model()))
+            results[key] = (cache or {}).get(key) or _accuracy(_hits(data, cue.features(data), cue.classify))
             rows.append((dataset, name, data["pair_id"].nunique(), *results[key]))
     if cache is not None:
         cache.clear()
@@ -70,7 +74,7 @@ def _cues(clips: pd.DataFrame, root: Path) -> dict[str, _Cue]:
 
     def by_clip(column: str) -> _Cue:
         values = of_clip(column)
-        return _Cue(values, lambda items: values(items).to_numpy(float)[:, None], _tree)
+        return _Cue(values, lambda items: values(items).to_numpy(float)[:, None], _by_number)
 
     def first_frames(items: pd.DataFrame) -> np.ndarray:
         thumbnails = {path: _thumbnail(root / path) for path in items["clip"].unique()}
@@ -78,22 +82,33 @@ def _cues(clips: pd.DataFrame, root: Path) -> dict[str, _Cue]:
 
     return {
         "question": _Cue(
-            lambda items: pd.Series(items["question"]), lambda items: items["question"].to_numpy(), _reader
+            lambda items: pd.Series(items["question"]), lambda items: items["question"].to_numpy(), by_words
         ),
         "clip length": by_clip("duration_s"),
-        "first frame": _Cue(of_clip("file_sha256"), first_frames, _viewer),
+        "first frame": _Cue(of_clip("file_sha256"), first_frames, _by_picture),
         "file size": by_clip("size_bytes"),
     }
 
 
-def _hits(items: pd.DataFrame, features: np.ndarray, model: Pipeline) -> np.ndarray:
+def _hits(items: pd.DataFrame, features: np.ndarray, classify: Classifier) -> np.ndarray:
     """Return the share of correctly predicted sides of each pair (0, 0.5 or 1)."""
-    from sklearn.model_selection import GroupKFold, cross_val_predict
-
-    void = (items["side"] == "void").to_numpy()
-    predictions = cross_val_predict(model, features, void, groups=items["scenario_id"], cv=GroupKFold(FOLDS))
+    void, fold = (items["side"] == "void").to_numpy(), _folds(items["scenario_id"].to_numpy(str))
+    is_right = np.empty(len(items), bool)
+    for k in range(FOLDS):
+        held_out = fold == k
+        is_right[held_out] = classify(features[~held_out], void[~held_out], features[held_out]) == void[held_out]
     _, pair = np.unique(items["pair_id"].to_numpy(str), return_inverse=True)
-    return np.bincount(pair, weights=predictions == void) / np.bincount(pair)
+    return np.bincount(pair, weights=is_right) / np.bincount(pair)
+
+
+def _folds(scenarios: np.ndarray) -> np.ndarray:
+    """Return each item's fold: the scenarios of most items first, each into the smallest fold."""
+    _, scenario, sizes = np.unique(scenarios, return_inverse=True, return_counts=True)
+    fold_of, fold_sizes = np.empty(len(sizes), int), np.zeros(FOLDS, int)
+    for k in np.argsort(sizes, kind="stable")[::-1]:
+        fold_of[k] = np.argmin(fold_sizes)
+        fold_sizes[fold_of[k]] += sizes[k]
+    return fold_of[scenario]
 
 
 def _thumbnail(clip: Path) -> np.ndarray:
@@ -104,24 +119,70 @@ def _thumbnail(clip: Path) -> np.ndarray:
     return cv2.resize(decode_first(clip), THUMBNAIL, interpolation=cv2.INTER_AREA).ravel() / 255
 
 
-def _reader() -> Pipeline:
-    from sklearn.feature_extraction.text import TfidfVectorizer
-    from sklearn.linear_model import LogisticRegression
-    from sklearn.pipeline import make_pipeline
+def by_words(texts: np.ndarray, void: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Classify texts by logistic regression (C = 10) on the TF-IDF of their words and pairs of words.
 
-    return make_pipeline(TfidfVectorizer(ngram_range=(1, 2)), LogisticRegression(C=10, max_iter=1000))
+    It is written in NumPy because importing scikit-learn takes over a second after each corrected question.
+    """
+    terms = [_terms(text) for text in texts]
+    column = {term: k for k, term in enumerate(sorted({*chain(*terms)}))}
+    counts, other_counts = _counts(terms, column), _counts([_terms(text) for text in others], column)
+    idf = np.log((1 + len(texts)) / (1 + (counts > 0).sum(axis=0))) + 1
+    rows, other_rows = (_normalised(part * idf) * np.sqrt(10) for part in (counts, other_counts))
+    weights, intercept = _logistic_regression(rows, void)
+    return other_rows @ weights + intercept > 0
 
 
-def _viewer() -> Pipeline:
+def _terms(text: str) -> list[str]:
+    words = re.findall(r"\w\w+", text.lower())
+    return words + [" ".join(pair) for pair in pairwise(words)]
+
+
+def _counts(terms: Sequence[Sequence[str]], column: Mapping[str, int]) -> np.ndarray:
+    counts = np.zeros((len(terms), len(column)))
+    for row, text_terms in enumerate(terms):
+        np.add.at(counts[row], [column[term] for term in text_terms if term in column], 1)
+    return counts
+
+
+def _normalised(rows: np.ndarray) -> np.ndarray:
+    length = np.linalg.norm(rows, axis=1, keepdims=True)
+    return rows / np.where(length, length, 1)
+
+
+def _logistic_regression(rows: np.ndarray, label: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return weights (d,) and intercept by Newton's method on the Gram matrix; C is 1."""
+    gram, point = rows @ rows.T, np.zeros(len(rows) + 1)  # dual variables and intercept
+
+    def objective(point: np.ndarray) -> float:
+        product = gram @ point[:-1]
+        return point[:-1] @ product / 2 + np.logaddexp(0, np.where(label, -1, 1) * (product + point[-1])).sum()
+
+    for _ in range(NEWTON_STEPS):
+        chance = 1 / (1 + np.exp(-(gram @ point[:-1] + point[-1])))
+        residual = np.append(label - chance - point[:-1], -point[:-1].sum())
+        if np.abs(residual).max() < 1e-9:
+            break
+        weight = (chance * (1 - chance))[:, None]
+        matrix = np.block([[np.eye(len(rows)) + weight * gram, weight], [np.ones(len(rows)), np.zeros(1)]])
+        step = np.linalg.solve(matrix, residual)
+        while objective(point + step) > objective(point) + 1e-12 and np.abs(step).max() > 1e-12:
+            step /= 2
+        point = point + step
+    return rows.T @ point[:-1], float(point[-1])
+
+
+def _by_picture(pictures: np.ndarray, void: np.ndarray, others: np.ndarray) -> np.ndarray:
     from sklearn.linear_model import LogisticRegression
     from sklearn.pipeline import make_pipeline
     from sklearn.preprocessing import StandardScaler
 
-    return make_pipeline(StandardScaler(), LogisticRegression(C=0.01, max_iter=1000))
+    model = make_pipeline(StandardScaler(), LogisticRegression(C=0.01, max_iter=1000))
+    return model.fit(pictures, void).predict(others)
 
 
-def _tree() -> Pipeline:
-    from sklearn.pipeline import make_pipeline
+def _by_number(numbers: np.ndarray, void: np.ndarray, others: np.ndarray) -> np.ndarray:
     from sklearn.tree import DecisionTreeClassifier
 
-    return make_pipeline(DecisionTreeClassifier(max_depth=4, min_samples_leaf=2, random_state=0))
+    model = DecisionTreeClassifier(max_depth=4, min_samples_leaf=2, random_state=0)
+    return model.fit(numbers, void).predict(others)

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
+from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from traps_pipeline.base import progress
-from traps_pipeline.base.digests import digest
+from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
-from traps_pipeline.base.paths import CORRECTIONS, RELEASED, ROOT
+from traps_pipeline.base.paths import CORRECTIONS, PACKAGE, RELEASED, ROOT, user_cache
 from traps_pipeline.benchmark.corrections import WORDS, Scenario, apply_words, load_scenarios, subset
 from traps_pipeline.benchmark.records import parse_record, released_lines
 from traps_pipeline.benchmark.versions import version_of
@@ -266,14 +269,18 @@ def trajectory_of(workspace: Workspace, row: Mapping[str, Any], world: Literal["
 
 
 def unsettled_outcomes(resolved: Sequence[ResolvedScenario]) -> list[str]:
-    """Return problems of outcomes, recomputed from the frozen trajectories."""
-    from traps_pipeline.scenes.certification.certificates import OUTCOME, pair_of
+    """Return problems of outcomes, recomputed from the frozen trajectories.
 
-    problems = []
+    A file in the user's cache folder names the records that were found settled here by the same code, so that a
+    corrected question replays no scene: importing and compiling MuJoCo's models takes half a second.
+    """
+    problems, known, settled = [], _settled_records(), set[str]()
     for item in resolved:
-        spec = item.spec
-        if spec.evidence.get("answer_from") == "correction":
+        spec, key = item.spec, _replayed(item.spec)
+        if spec.evidence.get("answer_from") == "correction" or key in known:
             continue  # the reviewer's answer overrides the simulator's
+        from traps_pipeline.scenes.certification.certificates import OUTCOME, pair_of
+
         qpos = load_trajectory(item.trajectory, spec.trajectory_sha256)
         pair = pair_of(spec, qpos, qpos[:0])
         evidence = OUTCOME.measured(pair)
@@ -281,4 +288,30 @@ def unsettled_outcomes(resolved: Sequence[ResolvedScenario]) -> list[str]:
         failure = OUTCOME.failure(evidence, pair.claim) or OUTCOME.contradiction(evidence, spec.evidence, exact=False)
         if failure is not None:
             problems.append(f"{spec.scenario_id}: {failure}")
+        else:
+            settled.add(key)
+    if settled:
+        with suppress(OSError, RuntimeError):  # RuntimeError: a user without a home folder
+            write_text(_settled_path(), json.dumps({_replaying_code(): sorted(known | settled)}))
     return problems
+
+
+def _replayed(spec: SceneSpec) -> str:
+    """Return the digest of all that decides a replayed outcome and its evidence."""
+    return digest(spec.model_dump(mode="json", exclude={"question", "ill_posed_question", "answerable_question"}))
+
+
+@cache
+def _replaying_code() -> str:
+    files = sorted((PACKAGE / "scenes").rglob("*.py"))
+    return digest([metadata.version("mujoco"), *map(file_digest, files)])
+
+
+def _settled_path() -> Path:
+    return user_cache() / "settled.json"
+
+
+def _settled_records() -> set[str]:
+    with suppress(OSError, RuntimeError, ValueError, AttributeError):  # a damaged file counts as none
+        return {*json.loads(_settled_path().read_text(encoding="utf-8")).get(_replaying_code(), [])}
+    return set()

@@ -50,7 +50,7 @@ from traps_pipeline.models.registry import NETWORK, Entry, get_model
 from traps_pipeline.models.request import JUDGED, WITH_TEXT, Backend, Request
 from traps_pipeline.models.thinking import Marks, split_thinking, strip_tokens
 from traps_pipeline.protocol.cells import Cell
-from traps_pipeline.storage.parquet import StageOutput, join_outputs
+from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
@@ -256,7 +256,7 @@ def collect_votes(workspace: Workspace, cells: Sequence[Cell]) -> Iterator[tuple
     for part, output in ask_judges(workspace, "votes", panel, all_parts, calls, lambda settled: settled.output(row_of)):
         outputs.setdefault(part.whole, []).append(output)
         if len(outputs[part.whole]) == len(parts[part.whole]):
-            yield part.whole, join_outputs(outputs.pop(part.whole))
+            yield part.whole, _join_outputs(outputs.pop(part.whole))
 
 
 def _parts(workspace: Workspace, cell: Cell) -> list[AnswerSlice]:
@@ -352,3 +352,13 @@ def _vote_row(panel: str, cell: Cell, ballot: Ballot, row: Row) -> VoteRow:
         judge_correct=vote.judge_correct,
         extracted_value=vote.extracted_value,
     )
+
+
+def _join_outputs(parts: Sequence[StageOutput]) -> StageOutput:
+    """Join the outputs of a partition's parts: concatenate rows, add up the numbers."""
+    first, *other_parts = parts
+    for later_part in other_parts:
+        first.tally.add(later_part.tally)
+    rows = [row for part in parts for row in part.content]
+    figures = {name: round(sum(part.shown[name] for part in parts), 6) for name in first.shown}
+    return StageOutput(rows, first.tally, figures, first.beside)

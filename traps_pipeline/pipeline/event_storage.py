@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import sqlalchemy as db
+from dagster import __version__
 from dagster._core.storage.event_log import AssetKeyTable, SqliteEventLogStorage
 from dagster._core.storage.sqlite_storage import (
     DagsterSqliteStorage,
@@ -74,7 +75,6 @@ class _EventStorage(SqliteEventLogStorage):
     def __init__(self, base_dir: str) -> None:
         self._engines: dict[str, db.Engine] = {}
         self._engines_lock = threading.Lock()  # threads of a web server ask at once
-        self._blank = b""  # a run's file without events
         self._there: set[str] = set()  # tables, and columns of assets: what is there stays
         super().__init__(base_dir)
 
@@ -96,14 +96,15 @@ class _EventStorage(SqliteEventLogStorage):
     def _begin(self, shard: str) -> None:
         """Make a run's file, a copy of the first: Dagster would read all its migrations."""
         path = Path(self.path_for_shard(shard))
+        empty = path.with_name(f"empty-{__version__}")  # a run's file without events
         is_new = shard != _INDEX and not path.exists()
-        if is_new and self._blank:
-            write_bytes(path, self._blank)
+        if is_new and empty.exists():
+            write_bytes(path, empty.read_bytes())
             return
         self._initdb(self._engine(shard))
         if is_new:
             with contextlib.closing(sqlite3.connect(path)) as connection:
-                self._blank = connection.serialize()
+                write_bytes(empty, connection.serialize())
 
     def _engine(self, shard: str) -> db.Engine:
         with self._engines_lock:

@@ -114,7 +114,7 @@ def _archive(inputs: Mapping[str, Digests], contents: Mapping[str, bytes]) -> by
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in {NOTES: json.dumps(inputs).encode(), **contents}.items():
-            archive.writestr(zipfile.ZipInfo(name, _DATE), content, zipfile.ZIP_DEFLATED)
+            archive.writestr(zipfile.ZipInfo(name, _DATE), content, zipfile.ZIP_DEFLATED, compresslevel=1)
     return stream.getvalue()
 
 

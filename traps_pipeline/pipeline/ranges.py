@@ -14,7 +14,6 @@ import numpy as np
 from traps_pipeline.pipeline.partitioning import Partitioning
 
 Range = tuple[str | None, str | None]  # first and last key
-_Corners = tuple[int, int, int, int]  # first and last row, first and last column
 WORTH_S = 120.0  # minimum work per run, since each takes 12 to 20 s to start
 
 

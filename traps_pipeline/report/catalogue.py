@@ -225,7 +225,7 @@ FIGURE_REPORTS: tuple[FigureReport, ...] = (
     FigureReport("doubt_conversion", "Doubt and conversion", "abstention.doubt",
         ("leaderboard", "confabulation_prevalence"), frames=("rates", "confabulation")),
     FigureReport("sub_scenarios", "AbsRec by sub-scenario", "grids.sub_scenarios", ("metrics", "items"),
-        frames=("sub_scenarios", "sub_cells")),
+        frames=("visual_sub_scenarios", "visual_sub_cells")),
     FigureReport("graded", "Graded cuts", "graded_figure.graded", ("graded",), published=False),
     FigureReport("confabulation", "Prevalence of confabulation", "grids.confabulation", ("confabulation_prevalence",)),
     FigureReport("states_and_output", "States against output, item by item", "expression_figures.states_and_output",

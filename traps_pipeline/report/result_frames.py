@@ -28,6 +28,7 @@ from traps_pipeline.people.human_label_rows import HUMAN_AGREEMENT
 from traps_pipeline.people.human_score_rows import CORRECTED, HUMAN_ROW, PANEL_ERRORS
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import PROBE_PROMPT
+from traps_pipeline.scoring.analyses import TAXONOMIES
 from traps_pipeline.scoring.score_rows import (
     CONFABULATION_PREVALENCE,
     CONTRASTS,
@@ -59,6 +60,7 @@ SUB_COLUMNS = (
     *("guided_false_abs", "guided_pecs", "abs_rec_uplift", "false_abs_uplift", "abs_rec_ill_posed"),
     *("textual_over_visual", "answer_type", "epoch"),
 )
+TEXTUAL_COLUMNS = ("ill_posed_n_models", "abs_rec_ill_posed", "textual_over_visual", "n_missing")
 
 
 def own(what: str) -> cached_property[pd.DataFrame]:
@@ -95,6 +97,11 @@ class Results:
     rates = own("RATE_COLUMNS: visual and textual AbsRec under standard, one row per model and taxonomy (or pooled).")
     sub_scenarios = own("SUB_COLUMNS: means over models, one row per sub-scenario.")
     sub_cells = own("One row per (model, dataset, regime) and sub-scenario (column scope).")
+    # Both without what ill-posed questions decide: a correction of one need not draw the heatmaps again.
+    visual_sub_scenarios = cached_property(lambda results: results.sub_scenarios.drop(columns=[*TEXTUAL_COLUMNS]))
+    visual_sub_cells = cached_property(
+        lambda results: results.sub_cells.loc[results.sub_cells["dataset"].isin(TAXONOMIES)]
+    )
     labels = own("Mean Acc over models by the control's answer: dataset, sub_scenario, label, acc, n_pairs, n_models.")
     agreement = table_frame(AGREEMENT)
     bias = table_frame(JUDGE_BIAS)

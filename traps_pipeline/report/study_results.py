@@ -8,9 +8,7 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.base.wording import count_noun
-from traps_pipeline.mechanism.effects import in_gaps
 from traps_pipeline.mechanism.mechanism_rows import COSINES, STEERING_EFFECTS
-from traps_pipeline.mechanism.shares import paper_protocol_rows
 from traps_pipeline.models.judges import panel_id
 from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 from traps_pipeline.report.leaderboard_page import judged_by
@@ -119,6 +117,9 @@ def _cosines(results: StudyResults) -> pd.DataFrame:
 
 def _effects(results: StudyResults) -> pd.DataFrame:
     """Return the paper's protocol rows, with dose in class gaps and degenerate share."""
+    from traps_pipeline.mechanism.effects import in_gaps
+    from traps_pipeline.mechanism.shares import paper_protocol_rows  # imports what steers, which few studies need
+
     all_effects = results.rows(STEERING_EFFECTS)
     rows = in_gaps(paper_protocol_rows(all_effects), all_effects)
     answers = rows["n"].astype(float) + rows["n_missing"].astype(float)

@@ -18,7 +18,7 @@ from traps_pipeline.models.registry import load_models
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, STANDARD
 from traps_pipeline.scoring.epochs import require_one_epoch
-from traps_pipeline.scoring.metrics import joined_epochs, joined_in_groups, mean
+from traps_pipeline.scoring.metrics import joined_epochs, joined_in_groups
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -61,10 +61,12 @@ def scoped_cells(metrics: pd.DataFrame, scope: str) -> pd.DataFrame:
     scope: `category`, `sub_scenario` or `label` (the control's answer in a sub-scenario). Columns as in `study_cells`,
     and `scope`, which names the part.
     """
+    from traps_pipeline.scoring.standings import group_figure
+
     parts = metrics["scope"].str.partition(":")
     rows = metrics.assign(scope=parts[2]).loc[parts[0] == scope]
     groups = rows.groupby([*_ENTRY, "scope"], sort=True)
-    cells = groups[SHARES].agg(mean)
+    cells = group_figure(groups, SHARES)
     cells["n_pairs"], cells["n_missing"] = groups["n_pairs"].max(), groups["n_missing"].sum()
     cells["n_runs"], cells["epoch"] = groups["run"].nunique(), joined_in_groups(groups, "epoch", joined_epochs)
     return cells.reset_index()

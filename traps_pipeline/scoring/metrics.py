@@ -90,11 +90,6 @@ def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]
     return sums.assign(**_figures(sums), **_bounds(sums), **_wilson(sums)).reset_index().loc[:, METRICS.names]
 
 
-def mean(values: pd.Series) -> float:
-    """Return the mean, or null if a value is null: no mean silently uses fewer values."""
-    return float(np.mean(values.to_numpy(float)))
-
-
 def joined_in_groups(groups: Any, column: str, joined: Callable[[Iterable[str]], str]) -> pd.Series:
     """Return a column's joined values by group, as `agg(joined)`, at once for groups with the same values."""
     import pandas as pd

@@ -35,6 +35,9 @@ _SMALL_BYTES = 2**20  # handing a smaller file to threads takes twice as long as
 _ROWS_AT_ONCE = 1000  # rows converted to Python values at a time
 _VERIFIED: dict[Path, str] = {}  # files whose digest this process has verified, with their stamp
 _FOOTERS: dict[Path, tuple[str, State, list[str]]] = {}  # footers by file, with its stamp
+# Small tables by file and columns, with the file's stamp: a dozen stages of one run read the same hundreds of files.
+_TABLES: dict[tuple[Path, tuple[str, ...]], tuple[str, pa.Table]] = {}
+_KEPT_TABLES, _KEPT_BYTES = 1024, 2**16  # at most: 64 MB together
 
 
 @dataclass(frozen=True)
@@ -65,16 +68,6 @@ class StageOutput:
     def frame(self) -> pd.DataFrame:
         """The rows of a table that is built as a frame."""
         return cast("pd.DataFrame", self.content)
-
-
-def join_outputs(parts: Sequence[StageOutput]) -> StageOutput:
-    """Join the outputs of a partition's parts: concatenate rows, add up the numbers."""
-    first, *other_parts = parts
-    for later_part in other_parts:
-        first.tally.add(later_part.tally)
-    rows = [row for part in parts for row in part.content]
-    figures = {name: round(sum(part.shown[name] for part in parts), 6) for name in first.shown}
-    return StageOutput(rows, first.tally, figures, first.beside)
 
 
 class TableStore:
@@ -246,11 +239,18 @@ class TableStore:
         import pyarrow.parquet as pq
 
         try:
-            names = _schema_of(table, columns)
-            content = _sound_bytes(self._store.here(path))
+            names, file = _schema_of(table, columns), self._store.here(path)
+            key, stamp = (file, tuple(names.names)), _stamp(file.stat())
+            if (kept := _TABLES.get(key)) is not None and kept[0] == stamp:
+                return kept[1]
+            content = _sound_bytes(file)
             data = pq.ParquetFile(content).read(columns=names.names, use_threads=content.size() > _SMALL_BYTES)
             if not data.schema.equals(names):
                 raise pa.ArrowInvalid("its columns are not those of this version")
+            if data.nbytes <= _KEPT_BYTES:
+                if len(_TABLES) >= _KEPT_TABLES:
+                    _TABLES.clear()
+                _TABLES[key] = stamp, data
             return data
         except FileNotFoundError:
             raise TrapsError(f"{path}: not there yet; materialize {table.name} for this partition first") from None

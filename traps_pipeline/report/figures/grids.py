@@ -45,7 +45,7 @@ def sub_scenarios(results: Results) -> Figure:
     Columns are the models that take video, or all others if none of those was asked, 12 at most. The paper prints only
     means over models, so for its numbers the columns are the figures that it prints. Blue is good, orange is bad.
     """
-    rows = results.sub_scenarios
+    rows = results.visual_sub_scenarios
     rows = rows.loc[rows["abs_rec"].notna()]
     if not len(rows):
         raise NotRun(results.why("sub_scenarios"))
@@ -77,8 +77,7 @@ class Panel:
 
 def _model_panels(results: Results, rows: pd.DataFrame) -> list[Panel]:
     """Return the panels of standard and of guided, one column per model."""
-    cells = results.sub_cells
-    cells = cells.loc[cells["dataset"].isin(analyses.TAXONOMIES)]
+    cells = results.visual_sub_cells
     models_here = [model for model in load_models() if model in set(cells["model"])]
     video = [m for m in analyses.models_of(media="video", group="main") if m in models_here]
     models = (video or models_here)[:MAX_MODELS]

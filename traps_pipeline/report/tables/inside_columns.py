@@ -28,7 +28,6 @@ SHORTCUTS = ("question words", "first frame", "all frames", "length", "time stam
 KEYS = ["model", "source", "target"]
 PROBE_KEY = ["model", "prompt", "analysis", "source", "target"]
 NO_RAW = "none above .5"
-BASELINE_COLUMNS = ("raw", "raw_value", "margin", "noise", "noise_spread")
 BASELINE_NOTES = (
     "best raw input: the one of question words, first frame, all frames, length and time stamps with the highest "
     "AUROC, by the same protocol; output margin: log-odds that the first answer token begins an abstention; noise: "
