@@ -11,11 +11,11 @@ import os
 import sqlite3
 import threading
 from collections.abc import Iterator
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, cast
 
 import sqlalchemy as db
-from dagster import __version__
 from dagster._core.storage.event_log import AssetKeyTable, SqliteEventLogStorage
 from dagster._core.storage.sqlite_storage import (
     DagsterSqliteStorage,
@@ -96,7 +96,7 @@ class _EventStorage(SqliteEventLogStorage):
     def _begin(self, shard: str) -> None:
         """Make a run's file, a copy of the first: Dagster would read all its migrations."""
         path = Path(self.path_for_shard(shard))
-        empty = path.with_name(f"empty-{__version__}")  # a run's file without events
+        empty = path.with_name(f"empty-{version('dagster')}")  # a run's file without events
         is_new = shard != _INDEX and not path.exists()
         if is_new and empty.exists():
             write_bytes(path, empty.read_bytes())
