@@ -27,8 +27,8 @@ from traps_pipeline.base.databases import reason_and_remedy
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.extras import require
 from traps_pipeline.base.keys import check_key
-from traps_pipeline.ledger.database import Database, Lock, taken_over
-from traps_pipeline.ledger.schema import EVALUATIONS, SESSIONS, STUDIES
+from traps_pipeline.ledger.database import Lock, NumberedDatabase, taken_over
+from traps_pipeline.ledger.schema import EVALUATIONS, SESSIONS
 from traps_pipeline.storage.store import Lease
 
 T = TypeVar("T")
@@ -43,20 +43,13 @@ SKEW_S = 60  # Dagster compares times of several hosts to tell a run that never 
 _awake_s = partial(time.clock_gettime, time.CLOCK_BOOTTIME)  # runs on while the process is stopped or the host sleeps
 _ALIVE = {"keepalives_idle": 5, "keepalives_interval": 5, "keepalives_count": 3}
 KEEPALIVE: dict[str, Any] = {**_ALIVE, "tcp_user_timeout": 15_000}
-_LOCK_STUDY = sa.select(STUDIES.c.id).where(STUDIES.c.id == sa.bindparam("of_study")).with_for_update()
-_NUMBER = sa.bindparam("number", type_=sa.BigInteger)
-_COUNT = (
-    sa.update(SESSIONS)
-    .where(SESSIONS.c.id == sa.bindparam("of_session"), SESSIONS.c.batch == _NUMBER - 1)
-    .values(batch=_NUMBER)
-)
 _END_FORMER = (
     "select pg_terminate_backend(pid) from pg_stat_activity "
     "where application_name = :application and pid <> pg_backend_pid()"
 )
 
 
-class PostgresDatabase(Database):
+class PostgresDatabase(NumberedDatabase):
     """A ledger shared by hosts; the environment variable `variable` has its address."""
 
     def __init__(self, address: str, variable: str, study: str, idle_s: float = IDLE_S) -> None:
@@ -80,7 +73,6 @@ class PostgresDatabase(Database):
         )
         idle = dict.fromkeys(("idle_session_timeout", "idle_in_transaction_session_timeout"), int(1000 * idle_s))
         self._settings = {**idle, **{f"tcp_{name}": seconds for name, seconds in _ALIVE.items()}}
-        self._batch = 0  # the number of this session's last transaction
         self._held: dict[int, bool] = {}  # by lock number: whether this process still holds it
         self._seen_s = float("-inf")  # when the locks were last checked
         self.run(self._compare_clocks, patience_s=0.0)
@@ -144,22 +136,6 @@ class PostgresDatabase(Database):
         """See `Database.prepare`."""
         self.lock_schema(connection)
         super().prepare(connection)
-        self._batch = 0
-
-    def run_once(self, work: Callable[[sa.Connection], T]) -> T:
-        """See `Database.run_once`; transactions of a study are numbered, and one at a time."""
-        results, number = list[T](), self._batch + 1
-
-        def numbered(connection: sa.Connection) -> T:
-            connection.execute(_LOCK_STUDY, {"of_study": self.study})
-            is_first = connection.execute(_COUNT, {"of_session": self.session, "number": number}).rowcount
-            if is_first or not results:
-                results[:] = [work(connection)]
-            return results[0]
-
-        result = self.run(numbered)
-        self._batch = number
-        return result
 
     def now_s(self, connection: sa.Connection) -> float:
         """See `Database.now_s`."""

@@ -318,3 +318,38 @@ def sentence(error: Exception, place: str) -> TrapsError:
         f"{place}: cannot be read or written ({reason}); {remedy} and run the same command again: everything answered "
         "before is kept, only what was in flight is asked again"
     )
+
+
+_LOCK_STUDY = sa.select(STUDIES.c.id).where(STUDIES.c.id == sa.bindparam("of_study")).with_for_update()
+_NUMBER = sa.bindparam("number", type_=sa.BigInteger)
+_COUNT = (
+    sa.update(SESSIONS)
+    .where(SESSIONS.c.id == sa.bindparam("of_session"), SESSIONS.c.batch == _NUMBER - 1)
+    .values(batch=_NUMBER)
+)
+
+
+class NumberedDatabase(Database):
+    """A database over a network, where the answer to a commit may be lost: transactions are numbered."""
+
+    _batch = 0  # the number of this session's last transaction
+
+    def prepare(self, connection: sa.Connection) -> None:
+        """See `Database.prepare`."""
+        super().prepare(connection)
+        self._batch = 0
+
+    def run_once(self, work: Callable[[sa.Connection], T]) -> T:
+        """See `Database.run_once`; one transaction of a study runs at a time."""
+        results, number = list[T](), self._batch + 1
+
+        def numbered(connection: sa.Connection) -> T:
+            connection.execute(_LOCK_STUDY, {"of_study": self.study})
+            is_first = connection.execute(_COUNT, {"of_session": self.session, "number": number}).rowcount
+            if is_first or not results:
+                results[:] = [work(connection)]
+            return results[0]
+
+        result = self.run(numbered)
+        self._batch = number
+        return result
