@@ -18,7 +18,7 @@ from traps_pipeline.scenes.worlds.spec import SceneSpec
 
 
 def version_of(released: Iterable[Any], current: Iterable[Any]) -> str:
-    """Return the release's version; with a digest (0.2.0+3f2a9c01) if content differs."""
+    """Return the release's version; with a digest (0.3.0+3f2a9c01) if content differs."""
     release = load_release().version
     digests = sorted(digest(part) for part in current)
     return release if digests == sorted(digest(part) for part in released) else f"{release}+{digest(digests)[:8]}"
