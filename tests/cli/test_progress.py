@@ -52,6 +52,17 @@ def test_a_line_has_pace_latency_failures_money_and_time_left(clock: Clock) -> N
     assert report.line() == line
 
 
+def test_the_time_left_of_a_large_cell_is_that_of_the_slices_to_come(clock: Clock) -> None:
+    report = Progress()
+    report.stage("votes", 1)
+    for _ in range(3):  # of five
+        report.asking("votes", {"judge": (10, 0)}, share=1 / 5)
+        for _ in range(10):
+            clock.now += 1.0
+            report.called("judge", False, latency_s=1.0, dollars=0.0)
+    assert report.line() == "votes: 0 of 1, 1.0/s at 1.0 s, 0:20 left"
+
+
 def test_a_listener_hears_of_a_stage_every_half_minute_and_at_its_end(clock: Clock) -> None:
     report, lines = Progress(), list[str]()
     with report.heard_by(lines.append):

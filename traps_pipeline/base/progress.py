@@ -81,7 +81,7 @@ class StageProgress:
     partitions: int
     done: int = 0
     empty: int = 0
-    cells: int = 0
+    cells: float = 0.0
     detail: str = ""
     share: float = 0.0
     tally: Tally = field(default_factory=Tally)
@@ -162,11 +162,11 @@ class Progress:
             now.detail, now.share = f"{unit}: {done:,} of {total:,}", done / max(total, 1)
         self.changed()
 
-    def asking(self, stage: str, calls: Mapping[str, tuple[int, int]]) -> None:
-        """Count a cell's new and recorded calls, by model or judge, before sending any."""
+    def asking(self, stage: str, calls: Mapping[str, tuple[int, int]], share: float = 1.0) -> None:
+        """Count new and recorded calls of a share of a cell, by model or judge, before sending any."""
         if self.current_stage is None:
             self.current_stage = StageProgress(stage, 0)
-        self.current_stage.cells += 1
+        self.current_stage.cells += share
         self.current_stage.detail, self.current_stage.share = "", 0.0
         for participant, (missing, recorded_calls) in calls.items():
             traffic = self.current_stage.calls.setdefault(participant, Traffic())

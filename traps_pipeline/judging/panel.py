@@ -229,9 +229,15 @@ class Ballot(Call):
 
 @dataclass(frozen=True)
 class AnswerSlice(Cell):
-    """A slice of a cell's answers; slices of a large cell bound memory."""
+    """One of `of` slices of a cell's answers; slices of a large cell bound memory."""
 
     start: int
+    of: int
+
+    @property
+    def share(self) -> float:
+        """The share of the partition's items that it holds."""
+        return 1 / self.of
 
     @property
     def whole(self) -> Cell:
@@ -262,7 +268,7 @@ def collect_votes(workspace: Workspace, cells: Sequence[Cell]) -> Iterator[tuple
 def _parts(workspace: Workspace, cell: Cell) -> list[AnswerSlice]:
     state = workspace.tables.state(RESPONSES, cell.partition)
     starts = range(0, state.rows if state else 0, PART) or range(1)  # a cell without answers has one empty part
-    return [AnswerSlice(cell.dataset, cell.evaluation, start) for start in starts]
+    return [AnswerSlice(cell.dataset, cell.evaluation, start, len(starts)) for start in starts]
 
 
 def ask_judges(

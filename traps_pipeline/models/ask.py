@@ -237,7 +237,8 @@ async def _settle_cell(
     missing = [request for key, request in requests.items() if key not in rows]
     new = Counter(request.participant for request in missing)
     counts = Counter(request.participant for request in requests.values())
-    report.asking(work.stage, {name: (new[name], count - new[name]) for name, count in counts.items()})
+    calls_by_name = {name: (new[name], count - new[name]) for name, count in counts.items()}
+    report.asking(work.stage, calls_by_name, cell.share)
     asker = _Asking(work, its.writer, missing, stop)
     await asker.run()
     rows |= asker.rows

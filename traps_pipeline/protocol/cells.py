@@ -56,6 +56,11 @@ class Cell:
         e = self.evaluation
         return {"dataset": self.dataset, "model": e.model, "regime": e.regime, "run": e.run}
 
+    @property
+    def share(self) -> float:
+        """The share of the partition's items that it holds."""
+        return 1.0
+
     @staticmethod
     def parse(key: str) -> Cell:
         """Parse a cell's key. Raises ValueError that says what is wrong."""
