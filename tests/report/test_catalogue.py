@@ -10,6 +10,7 @@ from functools import cache, cached_property
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.text import Text
 
 from tests.build.boards import board_of, board_row
 from tests.build.cells import row
@@ -22,6 +23,7 @@ from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report import publish
 from traps_pipeline.report.catalogue import FIGURE_REPORTS, JUDGED_STAGES, TABLE_REPORTS
 from traps_pipeline.report.figures.abstention import doubt_points
+from traps_pipeline.report.figures.steering_figures import dose_response
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.study_results import StudyResults
@@ -256,11 +258,17 @@ def overhang(figure):
     return max(-drawn.x0, -drawn.y0, drawn.x1 - width, drawn.y1 - height)
 
 
+def overlapping_titles(figure):
+    """Pairs of panels whose titles run into each other."""
+    texts = [(text, ax.get_title(loc="left")) for ax in figure.axes for text in ax.findobj(Text)]
+    titles = [text for text, title in texts if title and text.get_text() == title]
+    boxes = [(title.get_text(), title.get_window_extent()) for title in titles]
+    return [(a, b) for k, (a, box) in enumerate(boxes) for b, other in boxes[:k] if box.overlaps(other)]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("report", FIGURE_REPORTS, ids=lambda report: report.name)
 def test_no_text_of_a_figure_is_clipped_or_under_six_points(report, partial, empty):
-    from matplotlib.text import Text
-
     for results in (PAPER, partial, empty):
         try:
             figure = report.make(results)
@@ -268,7 +276,19 @@ def test_no_text_of_a_figure_is_clipped_or_under_six_points(report, partial, emp
             assert str(why)
             continue
         assert overhang(figure) < 0.01
+        assert not overlapping_titles(figure)
         assert min(text.get_fontsize() for text in figure.findobj(Text) if text.get_text()) >= 6
+
+
+@pytest.mark.slow
+def test_titles_of_panels_with_their_numbers_of_answers_do_not_overlap():
+    class Counted(PublishedResults):
+        effects = cached_property(lambda _: PAPER.effects.assign(n=np.resize([44, 44, 100], len(PAPER.effects))))
+
+    figure = dose_response(Counted())
+    freeze_layout(figure)
+    assert all("n 44 to 100" in ax.get_title(loc="left") for ax in figure.axes)
+    assert not overlapping_titles(figure)
 
 
 def test_the_doubt_figure_refuses_to_mix_epochs():

@@ -165,14 +165,15 @@ def dose_response(results: Results) -> Figure:
     across = 2 if len(panels) > 1 else 1
     lines = -(-len(panels) // across)
     with figure_style():
-        figure = new_figure(PAGE_IN, 0.75 + 1.75 * lines)
+        figure = new_figure(PAGE_IN, 0.75 + 1.85 * lines)
         axes = figure.subplots(lines, 2 * across, sharey=True, squeeze=False)
         pairs = axes.reshape(-1, 2)
         for pair, ((model, path_set), part) in zip(pairs, panels.items(), strict=False):
             for ax, side, sign in zip(pair, ("control", "void"), ("+α on controls", "−α on voids"), strict=True):
                 _mean_band(ax, _panel_shares(results.shares, part, path_set, side))
                 _doses(ax, part, side, KEY_PATHS if path_set == "transfer" else STEERING_PATHS)
-                ax.set_title(f"{plain(model)[:20]}\n{sign}, {SETS[path_set]}{_count_answers(part, side)}", size=6.5)
+                title = [plain(model)[:20], f"{sign}, {SETS[path_set]}", *_count_answers(part, side)]
+                ax.set_title("\n".join(title), size=6.5)
                 ax.set_xlabel("α")
         for ax in pairs[len(panels) :].flat:
             ax.set_axis_off()
@@ -184,10 +185,10 @@ def dose_response(results: Results) -> Figure:
     return figure
 
 
-def _count_answers(part: pd.DataFrame, side: str) -> str:
-    """Return the number of answers behind a marker."""
+def _count_answers(part: pd.DataFrame, side: str) -> list[str]:
+    """Return a line with the number of answers behind a marker, if it is known."""
     counts = part[f"{side}_n"].dropna().astype(int) if f"{side}_n" in part else []
-    return f", n {range_text(min(counts), max(counts))}" if len(counts) else ""
+    return [f"n {range_text(min(counts), max(counts))}"] if len(counts) else []
 
 
 def _panel_shares(shares: pd.DataFrame, part: pd.DataFrame, path_set: str, side: str) -> pd.DataFrame:
