@@ -105,7 +105,7 @@ def test_lost_states_are_stale_and_made_again_as_they_were(own: Workspace, lost:
     before, was_gone = StoredStates.of(own, STANDARD).read("chaotic", 3), are_gone()
     if lost == "a torn index":
         (folder / "ids.parquet").write_bytes(b"torn")
-        with pytest.raises(TrapsError, match="run again, and it is made anew"):
+        with pytest.raises(TrapsError, match="materialize it again"):
             StoredStates.of(own, STANDARD).read("chaotic", 3)
     else:
         (folder / lost).unlink()
