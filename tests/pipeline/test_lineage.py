@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +15,16 @@ from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.pipeline.automation import report_unseen, sensors
 from traps_pipeline.pipeline.graph import the_graph
 from traps_pipeline.pipeline.history import History
-from traps_pipeline.pipeline.lineage import Lineage, Status
+from traps_pipeline.pipeline.lineage import OTHER_COLUMNS, Lineage, Status
 from traps_pipeline.pipeline.partition_checks import CURRENT, evaluations
 from traps_pipeline.pipeline.schemes import CELL as CELLS
-from traps_pipeline.pipeline.study_status import StageStatus
+from traps_pipeline.pipeline.study_status import StageStatus, stage_statuses
 from traps_pipeline.pipeline.translation import partitions_of
 from traps_pipeline.scoring.score_rows import METRICS
+from traps_pipeline.storage import columns as shared
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.study import Asked, Study
+from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
 CELL = {"dataset": "chaotic", "model": "prior", "regime": "json", "run": 1}
@@ -44,6 +47,13 @@ def score(workspace: Workspace, code: str) -> None:
 
 def status(workspace: Workspace) -> Status:
     return Lineage(workspace).status("metrics", "chaotic")
+
+
+@dataclass(frozen=True, kw_only=True)
+class OlderRow:
+    """A row of metrics as an older version had it."""
+
+    dataset: shared.Dataset
 
 
 @pytest.fixture
@@ -72,6 +82,13 @@ def test_a_cell_that_joins_makes_metrics_stale(study: Workspace) -> None:
 def test_a_table_that_is_gone_makes_metrics_stale(study: Workspace) -> None:
     study.tables.path(VERDICTS, CELL).unlink()
     assert status(study) == Status("stale", (f"{NAME} is gone",))
+
+
+def test_a_table_of_a_version_with_other_columns_is_to_be_made_again_and_not_told_as_lost(study: Workspace) -> None:
+    study.tables.write(Table("metrics", OlderRow, ("dataset",), ("dataset",)), {"dataset": "chaotic"}, [], {})
+    assert status(study) == Status("missing", (OTHER_COLUMNS,))
+    (told,) = (one for one in stage_statuses(study, Lineage(study), None) if one.stage == "metrics")
+    assert told.by_reason() == {OTHER_COLUMNS: ["chaotic"]}
 
 
 def test_what_would_read_a_damaged_table_names_it_and_the_remedy_before(study: Workspace) -> None:
@@ -152,4 +169,4 @@ def test_another_formula_makes_metrics_stale(study: Workspace) -> None:
 
 def test_partitions_that_lost_their_own_parent_are_one_line_of_the_status():
     stale = {key: (f"responses/{key} is gone", "judges changed") for key in ("occlusion|a__json__run1", "chaotic|b")}
-    assert StageStatus("votes", 0, stale, []).by_reason() == {"responses is gone; judges changed": [*stale]}
+    assert StageStatus("votes", 0, stale, {}).by_reason() == {"responses is gone; judges changed": [*stale]}

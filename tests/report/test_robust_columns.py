@@ -11,8 +11,9 @@ import pytest
 from tests.build.boards import board_of, board_row
 from tests.build.cells import row
 from traps_pipeline.protocol.datasets import ARMS, DATASETS
-from traps_pipeline.report.leaderboard_page import leaderboard_markdown, leaderboard_text, leaderboards
+from traps_pipeline.report.leaderboard_page import LEGEND, leaderboard_markdown, leaderboard_text, leaderboards
 from traps_pipeline.report.page import report_html
+from traps_pipeline.report.terms import TITLES
 from traps_pipeline.scoring.score_rows import ROBUST
 
 BOARD = board_of(*(board_row(model, dataset=d) for model in ("asked", "alone") for d in ("overall", *DATASETS)))
@@ -66,3 +67,10 @@ def _columns(robust: pd.DataFrame) -> list[tuple[Any, list[str]]]:
     """The columns of the overall table with their cells."""
     table = leaderboards(BOARD, robust)[0]
     return [(column, [cells[k] for cells in table.cells]) for k, column in enumerate(table.columns)]
+
+
+def test_every_column_of_the_ranking_is_in_the_legend() -> None:
+    headings = [column.heading.removesuffix(" %") for column in leaderboards(BOARD, robust_of())[0].columns]
+    explained = {*LEGEND, *(heading.removesuffix(" %") for heading in LEGEND)}
+    own_words = {"Model", "Regime", "Runs", *(f"PECS {TITLES[dataset]}" for dataset in DATASETS)}
+    assert {*headings} - explained == own_words

@@ -9,7 +9,7 @@ import pytest
 from tests.build.errors import raises
 from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.scoring.metrics import BOUNDS, CELL_FIGURES, cell_metrics, wrong_figures
-from traps_pipeline.scoring.score_rows import METRICS
+from traps_pipeline.scoring.score_rows import LEADERBOARD, METRICS
 from traps_pipeline.storage.parquet import TableStore
 
 
@@ -19,6 +19,10 @@ def one(metrics: pd.DataFrame, **equal: object) -> pd.Series:
         metrics = metrics[metrics[name] == value]
     assert len(metrics) == 1
     return metrics.iloc[0]
+
+
+def test_every_figure_of_a_cell_is_a_column_of_its_table_and_of_the_leaderboard():
+    assert {*CELL_FIGURES} <= {*METRICS.names} & {*LEADERBOARD.names}
 
 
 def test_figures_follow_their_definitions(rows):

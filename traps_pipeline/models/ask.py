@@ -348,7 +348,8 @@ def _raise_together(stage: str, problems: Sequence[Exception]) -> None:
     if len(problems) == 1:
         raise problems[0]
     if problems:
-        raise ExceptionGroup(f"{stage}: {len(problems)} models failed", problems)
+        causes = "; ".join(sorted({f"{type(problem).__name__}: {problem}" for problem in problems}))
+        raise ExceptionGroup(f"{stage}: {causes}", problems)
 
 
 class _drain_on_interrupt:  # noqa: N801 - reads as a verb where it is used

@@ -102,6 +102,9 @@ def _stages(costs: bool) -> list[Stage]:
     return [stage for stage in the_graph().stages if costs or not stage.cost]
 
 
+_GONE = "its file is gone; materialize it again: nothing that the ledger holds is asked"
+
+
 def report_unseen(instance: dg.DagsterInstance, workspace: Workspace, lineage: Lineage, reported: set[str]) -> None:
     """Fail the check `current` for altered, lost or (unpartitioned) stale assets.
 
@@ -116,7 +119,7 @@ def report_unseen(instance: dg.DagsterInstance, workspace: Workspace, lineage: L
                 [*status.outdated] if stage.scheme is None else [*filter(None, [lineage.damage(stage.name, key)])]
             )
             if status.kind == "missing" and key in recorded_versions:
-                problems = ["its file is gone; materialize it again: nothing that the ledger holds is asked"]
+                problems = [*status.outdated] or [_GONE]
             text = f"{name_of((stage.name, key))}: {'; '.join(problems)}"
             if problems and text not in reported:
                 reported.add(text)

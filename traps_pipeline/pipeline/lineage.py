@@ -32,6 +32,9 @@ def failed_calls(count: int) -> str:
     )
 
 
+OTHER_COLUMNS = "made by a version with other columns"
+
+
 @dataclass(frozen=True)
 class Status:
     """A partition's status, its changed inputs, and its number of failed calls."""
@@ -78,7 +81,9 @@ class Lineage:
             return Status("stale", (damage,))
         state = self.state(name, key)
         if state is None:
-            return Status("missing")
+            table, tables = stage.table, self._workspace.tables
+            is_there = table is not None and self._workspace.store.has(tables.path(table, stage.columns(key)))
+            return Status("missing", (OTHER_COLUMNS,) if is_there else ())
         reasons = [*_differences(state.inputs, self.inputs(name, key)), *stage.lost(self._workspace, key)]
         if state.code != stage.code:
             reasons.append(f"its code has version {stage.code} now, it was made by version {state.code}")

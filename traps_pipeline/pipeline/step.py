@@ -220,6 +220,6 @@ def to_make(
     only partitions that exist and whose inputs have changed.
     """
     status = lineage.status(name, key)
-    if existing or status.kind == "missing":
-        return bool(status.outdated) if existing else True
-    return status.kind == "stale" or recorded.get(key) != lineage.version(name, key)
+    if existing:
+        return status.kind == "stale" and bool(status.outdated)
+    return status.kind != "fresh" or recorded.get(key) != lineage.version(name, key)
