@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import os
 import random
+import re
 import shutil
 import statistics
 import sys
@@ -297,8 +298,7 @@ def measure(site: Path, pairs: list[tuple[str, str]], say: Callable[[str, float,
         say("memory after 30 pairs", memory_mb(), 600, "MB")
         began = time.perf_counter()
         page.goto(index + "#/answers?q=momentum")
-        while not page.evaluate("/ mention /.test(document.querySelector('.status')?.textContent || '')"):
-            page.wait_for_timeout(50)
+        page.get_by_role("status").filter(has_text=re.compile("^“momentum”: ")).wait_for(timeout=600_000)
         say("search in all texts", 1000 * (time.perf_counter() - began), float("inf"), "ms")
         say("memory after the search", memory_mb(), 600, "MB")
         for hash_, what in (
