@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from tests.build.commitments import committed
-from tests.conftest import Checkout
+from tests.conftest import ROOT, Checkout
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.release.commitment import (
@@ -42,12 +42,13 @@ def problems(folder: Path) -> list[str]:
     return broken_seals(*files, revealed_specs(folder / "private"))
 
 
-def test_the_seed_draws_the_committed_records_again(committed: Path, demo: Checkout) -> None:
+def test_the_seed_draws_the_committed_records_again(committed: Path, tmp_path: Path) -> None:
+    checkout = Checkout(ROOT, tmp_path / "none")  # no study is needed
     given = committed / "commitment.json", committed / "reveal.json", "--specs", committed / "private"
-    finished = demo.traps("benchmark", "prove", *given, "--workers", "1")
+    finished = checkout.traps("benchmark", "prove", *given, "--workers", "1")
     assert finished.code == 0, finished.out + finished.err
     assert finished.out.splitlines()[-1].endswith("are the committed ones, and the revealed seed draws them")
-    outcome = json.loads(demo.traps("benchmark", "prove", *given, "--without-drawing", "--json").ok().out)
+    outcome = json.loads(checkout.traps("benchmark", "prove", *given, "--without-drawing", "--json").ok().out)
     assert outcome["problems"] == [] and len(outcome["proven"]) == 1
 
 
@@ -76,10 +77,11 @@ def test_records_that_were_left_out_or_added_are_named(copy: Path) -> None:
 
 @pytest.mark.parametrize("change", [{"seed": 2027}, {"nonce": "0" * 64}])
 def test_another_seed_or_number_is_refused_before_anything_is_drawn(
-    copy: Path, demo: Checkout, change: dict[str, Any]
+    copy: Path, tmp_path: Path, change: dict[str, Any]
 ) -> None:
     reveal = edit(copy / "reveal.json", **change)
-    finished = demo.traps("benchmark", "prove", copy / "commitment.json", reveal, "--specs", copy / "private")
+    checkout = Checkout(ROOT, tmp_path / "none")
+    finished = checkout.traps("benchmark", "prove", copy / "commitment.json", reveal, "--specs", copy / "private")
     assert finished.code == 1 and "drawing" not in finished.out
     assert "the revealed seed, number or composition is not the one that was committed" in finished.out
 
