@@ -57,15 +57,19 @@ def tally_of(metadata: Mapping[str, dg.MetadataValue]) -> Tally:
     return Tally(**{name: cast(int, metadata[word].value) for name, word in WORDS.items() if word in metadata})
 
 
-def partition_metadata(workspace: Workspace, stage: Stage, output: StageOutput) -> dict[str, Any]:
-    """Return the metadata that Dagster shows of a partition or of files for people."""
+def partition_metadata(workspace: Workspace, stage: Stage, key: str | None, output: StageOutput) -> dict[str, Any]:
+    """Return the metadata that Dagster shows of a partition or of files for people.
+
+    Paths are relative to the study, so that they hold in a copy of it.
+    """
     counts = tally_metadata(stage, output.tally)
     if stage.table is None:
         files = cast(Mapping[str, bytes], output.content)
         pages = {path: StudyFile(workspace.relative(workspace.reports / path)) for path in files if "/" not in path}
         return {"files": len(files), **pages, **output.shown, **counts}
     count = "dagster/row_count" if stage.scheme is None else "dagster/partition_row_count"
-    return {count: len(output.content), **preview(stage.table, output), **output.shown, **counts}
+    file = workspace.relative(workspace.tables.path(stage.table, stage.columns(key)))
+    return {count: len(output.content), "file": file, **preview(stage.table, output), **output.shown, **counts}
 
 
 def preview(table: Table, output: StageOutput) -> dict[str, dg.TableMetadataValue]:

@@ -57,7 +57,7 @@ def run_step(stage: Stage, context: dg.AssetExecutionContext, workspace: Workspa
         version = step.write(key, output)
         failures = step.checks.test(key, output)
         progress.current().partition(stage.name, key or "", output.tally, is_empty=not len(output.content))
-        metadata = partition_metadata(workspace, stage, output)
+        metadata = partition_metadata(workspace, stage, key, output)
         if stage.scheme is None:
             yield from step.checks.of_made(key, failures)
             metadata = visible_metadata(metadata)
