@@ -125,13 +125,32 @@ def test_damage_and_a_loss_are_reported_again_after_a_restart_of_the_daemon(stud
         for last in (False, False, True):  # a new process has reported nothing yet
             if last:
                 path.unlink()
-            report_unseen(instance, study, Lineage(study), set())
+            report_unseen(instance, study, Lineage(study), {})
         key = dg.AssetCheckKey(dg.AssetKey("verdicts"), CURRENT)
         stored = instance.event_log_storage.get_asset_check_execution_history(key, limit=9)
     newest, *_ = found = [each.event.dagster_event.asset_check_evaluation_data for each in stored]  # pyright: ignore
     assert [each.partition for each in found] == [None, None, cell]
     assert all(each.metadata["partition"].value == cell for each in found)
     assert "its file is gone" in newest.metadata["not current"].value
+
+
+@pytest.mark.slow
+def test_a_loss_is_told_each_time_that_it_happens_and_taken_back_once_it_is_repaired(
+    study: Workspace, tmp_path: Path
+) -> None:
+    graph, path, reported = the_graph(), study.tables.path(METRICS, {"dataset": "chaotic"}), dict[str, str]()
+    with dg.DagsterInstance.local_temp(str(tmp_path)) as instance:
+        instance.report_runless_asset_event(History(instance, graph).event(graph["metrics"], "chaotic", "1", {}, {}))
+        for _ in range(2):
+            path.unlink()
+            for _ in range(2):
+                report_unseen(instance, study, Lineage(study), reported)
+            score(study, graph["metrics"].code)
+            report_unseen(instance, study, Lineage(study), reported)
+        key = dg.AssetCheckKey(dg.AssetKey("metrics"), CURRENT)
+        stored = instance.event_log_storage.get_asset_check_execution_history(key, limit=9)
+    passed = [each.event.dagster_event.asset_check_evaluation_data.passed for each in stored]  # pyright: ignore
+    assert (passed, reported) == ([True, False, True, False], {})
 
 
 def test_a_check_is_of_the_newest_event_of_its_partition(study: Workspace, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ request runs of what exists and is outdated. They read the state of the tables, 
 correction made while they were off.
 """
 
+import json
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
@@ -105,10 +106,12 @@ def _stages(costs: bool) -> list[Stage]:
 _GONE = "its file is gone; materialize it again: nothing that the ledger holds is asked"
 
 
-def report_unseen(instance: dg.DagsterInstance, workspace: Workspace, lineage: Lineage, reported: set[str]) -> None:
-    """Fail the check `current` for altered, lost or (unpartitioned) stale assets.
+def report_unseen(
+    instance: dg.DagsterInstance, workspace: Workspace, lineage: Lineage, reported: dict[str, str]
+) -> None:
+    """Fail the check `current` for altered, lost or (unpartitioned) stale assets, and pass it once they are well.
 
-    reported: the failures that this process has reported before.
+    reported: the failures that were reported and last, by partition.
     """
     partitions, history = StudyPartitions(workspace), History(instance, the_graph())
     for stage in the_graph().stages:
@@ -120,26 +123,28 @@ def report_unseen(instance: dg.DagsterInstance, workspace: Workspace, lineage: L
             )
             if status.kind == "missing" and key in recorded_versions:
                 problems = [*status.outdated] or [_GONE]
-            text = f"{name_of((stage.name, key))}: {'; '.join(problems)}"
-            if problems and text not in reported:
-                reported.add(text)
-                _report(instance, stage.name, key, "; ".join(problems))
+            name, wrong = name_of((stage.name, key)), "; ".join(problems)
+            if wrong != reported.get(name, ""):
+                reported[name] = wrong
+                _report(instance, stage.name, key, wrong)
+            if not wrong:
+                reported.pop(name, None)
 
 
 def _report(instance: dg.DagsterInstance, stage: str, key: str | None, wrong: str) -> None:
-    """Fail the check `current` of a partition outside of any run."""
-    failed = partial(
+    """Evaluate the check `current` of a partition outside of any run: it passes if nothing is wrong."""
+    evaluation = partial(
         dg.AssetCheckEvaluation,
         asset_key=asset_key(stage),
         check_name=CURRENT,
-        passed=False,
-        metadata={"not current": wrong, "partition": key or "all"},
+        passed=not wrong,
+        metadata={**({"not current": wrong} if wrong else {}), "partition": key or "all"},
         target_materialization_data=History(instance, the_graph()).check_target(stage, key),
     )
     try:
-        instance.report_runless_asset_event(failed(partition=key))
+        instance.report_runless_asset_event(evaluation(partition=key))
     except IntegrityError:  # Dagster stores one evaluation without a run for each partition; the next is of the asset
-        instance.report_runless_asset_event(failed(partition=None))
+        instance.report_runless_asset_event(evaluation(partition=None))
 
 
 def _requests(
@@ -168,8 +173,6 @@ def _requests(
 
 
 def _sensor(name: str, doc: str, *, costs: bool) -> dg.SensorDefinition:
-    reported_failures: set[str] = set()
-
     @dg.sensor(
         name=name,
         asset_selection=dg.AssetSelection.assets(*(asset_key(stage.name) for stage in _stages(costs))),
@@ -184,11 +187,14 @@ def _sensor(name: str, doc: str, *, costs: bool) -> dg.SensorDefinition:
             return dg.SkipReason("there is no study; make one with `traps init`, then press Reload definitions")
         lineage = Lineage(study_workspace)
         History(context.instance, the_graph()).observe(lineage)
-        report_unseen(context.instance, study_workspace, lineage, reported_failures)
         if context.instance.get_runs_count(dg.RunsFilter(statuses=UNFINISHED)):
-            return dg.SkipReason("runs are under way")
+            return dg.SkipReason("runs are under way")  # they may be mending what would be reported
+        reported: dict[str, str] = json.loads(context.cursor or "{}")
+        report_unseen(context.instance, study_workspace, lineage, reported)
+        context.update_cursor(json.dumps(reported))
+        told = f"; the check `{CURRENT}` fails for {', '.join([*reported][:3])}" if reported else ""
         requests = _requests(context.instance, study_workspace, lineage, costs=costs)
-        return requests or dg.SkipReason("nothing that is there is outdated")
+        return requests or dg.SkipReason(f"nothing that is there is outdated{told}")
 
     return follow
 
