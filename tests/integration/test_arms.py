@@ -55,14 +55,17 @@ def test_arms_and_variations_are_asked_and_rendered_once(
     armed: tuple[Checkout, Path, dict[str, int]], tables: TableStore
 ) -> None:
     study, path, counts = armed
-    # Pairs: 2 scenarios x 2 datasets x 2 sides. Arms: decoy 1, twin_control 2, crossed 2 x 2.
+    # Pairs: 2 scenarios x 2 datasets x 2 sides. Arms: decoy 1, twin_control 2, crossed 1 x 2: a race has no partner.
     # Variations: 2 x 2 of the race, whose answers are colours, panel 1, schema and frames 2 x 2 each. A graded cut.
-    assert counts["answers"] == 3 * (8 + (1 + 2 + 4) + (4 + 1 + 4 + 4) + 1)
+    assert counts["answers"] == 3 * (8 + (1 + 2 + 2) + (4 + 1 + 4 + 4) + 1)
     arms = tables.read_all(ARMS)
     # Decoy and grey, and the graded cut; the others show the pair's own clips.
     assert counts["frames"] == 50 + 50 + arms.set_index("arm").loc["graded", "n_frames"]
-    (refused,) = arms.dropna(subset=["refused"])["scenario_id"].unique()
-    assert refused == "plinko-0001"  # the numbers of its buckets are no colours
+    refused = arms.dropna(subset=["refused"])
+    assert {*zip(refused["arm"], refused["scenario_id"], strict=True)} == {
+        ("crossed", "hidden_race-0001"),  # its choices are colours, which its question names
+        *((arm, "plinko-0001") for arm in ("labels_two", "labels_six")),  # the numbers of its buckets are no colours
+    }
     assert study.traps("run", path, *UNTIL).counts() == {"answers": 0, "votes": 0, "frames": 0}
 
 
@@ -81,7 +84,9 @@ def test_arms_take_the_shortcuts_gain_away(tables: TableStore) -> None:
     board = tables.read_all(LEADERBOARD).query("dataset == 'overall'").set_index("model")
     assert robust.loc["oracle", ["conjunction", "robust"]].tolist() == [1.0, 1.0] and board.loc["oracle", "pecs"] == 1.0
     assert board.loc["any-rule", "pecs"] == 1.0  # it understands nothing of a void
-    assert robust.loc["any-rule", "conjunction"] == 0 and robust.loc["any-rule", "robust"] < 0.8
+    # Right in the pairs (weight 1) and twin_control (2 scenarios of 30), wrong in decoy and crossed (1 of 30 each).
+    robust_of_rule = 32 / 34 * (30 / 31 - 2 / 34)
+    assert robust.loc["any-rule", ["conjunction", "robust"]].tolist() == pytest.approx([0, robust_of_rule])
     text = leaderboard_text(tables.read(LEADERBOARD, {}), tables.read_all(ROBUST))
     assert "all over 3 of 7 arms" in text and "nan" not in text and "no conjunction" not in text
 

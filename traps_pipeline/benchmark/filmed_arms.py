@@ -15,12 +15,13 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
-from traps_pipeline.base.paths import PACKAGE
 from traps_pipeline.benchmark.corrections import corrected_scenarios
 from traps_pipeline.benchmark.sharing import RenderWork, Row, existing_clips, share
 from traps_pipeline.benchmark.specs import clips_version, released_in_study, spec_of, spec_rows, trajectory_of
 from traps_pipeline.protocol.datasets import ARMS as ARM_NAMES
 from traps_pipeline.protocol.datasets import CROSSED, GRADED, extra_datasets_of, sides_of, taxonomy_of_category
+from traps_pipeline.scenes.variants import arms as shortcut_arms
+from traps_pipeline.scenes.variants import graded_cuts, variations
 from traps_pipeline.scenes.variants.arms import ARMS as SHORTCUT_ARMS
 from traps_pipeline.scenes.variants.arms import Arm, Question, Scenario, crossed, partners
 from traps_pipeline.scenes.variants.graded_cuts import GRADED_CUT
@@ -149,8 +150,8 @@ def _files(clip: Path) -> tuple[Path, ...]:
 @cache
 def _code(arm: str) -> str:
     """Return the code version of an arm or variation; a change renders it again."""
-    name = GRADED if arm == GRADED else "arms" if arm in ARM_NAMES else "variations"
-    return file_digest(PACKAGE / "scenes" / "variants" / f"{name}.py")
+    declared_in = graded_cuts if arm == GRADED else shortcut_arms if arm in ARM_NAMES else variations
+    return file_digest(Path(declared_in.__file__))
 
 
 def arm_of(spec: SceneSpec, arm: str) -> Arm:
