@@ -40,7 +40,9 @@ def test_a_finished_study_moves_into_a_store_where_nothing_is_asked_or_made_agai
     assert not Workspace.is_there(ADDRESS) and Workspace.open(study.workspace).answers.evaluations()
 
     moved = study.traps("study", "move", "--store", ADDRESS)
-    assert moved.code == 0 and f"the study lies at {ADDRESS} now" in moved.out, moved.out + moved.err
+    assert moved.code == 0 and f"rows to {ADDRESS}; next: export TRAPS_WORKSPACE={ADDRESS}" in moved.out, (
+        moved.out + moved.err
+    )
     shutil.rmtree(tmp_path / "scratch")  # another host has none of it
     monkeypatch.setenv("TRAPS_WORKSPACE", ADDRESS)
     command = [sys.executable, "-m", "traps_pipeline.cli", "run", EXPERIMENT, "--until", "leaderboard"]

@@ -109,24 +109,27 @@ def test_states_made_on_another_device_say_so_item_by_item(
 
 
 SLOW = """
-import sys, time
+import os, sys, time
 from pathlib import Path
 from tests.build.states import work
 from tests.local_models import model
 from traps_pipeline.mechanism.hidden_states import extract
-of = model("qwen3-vl")
-print(extract(of, work(of, 40, opened=lambda i: time.sleep(0.05)), Path(sys.argv[1]), shard_size=2))
+of, folder, deadline = model("qwen3-vl"), Path(sys.argv[1]), time.monotonic() + 900
+folder.with_name(f"ready-{os.getpid()}").touch()
+while len([*folder.parent.glob("ready-*")]) < int(sys.argv[2]) and time.monotonic() < deadline:
+    time.sleep(0.01)
+print(extract(of, work(of, 40, opened=lambda i: time.sleep(0.05)), folder, shard_size=2))
 """
 
 
-def slowly(folder: Path) -> subprocess.Popen[str]:
-    """A process that extracts forty items, in two seconds or more."""
-    root = Path(__file__).resolve().parents[2]
-    return subprocess.Popen([sys.executable, "-c", SLOW, folder], cwd=root, stdout=subprocess.PIPE, text=True)
+def slowly(folder: Path, processes: int = 1) -> subprocess.Popen[str]:
+    """A process that extracts forty items, in two seconds or more, once so many processes are ready."""
+    command = [sys.executable, "-c", SLOW, folder, str(processes)]
+    return subprocess.Popen(command, cwd=Path(__file__).resolve().parents[2], stdout=subprocess.PIPE, text=True)
 
 
 def test_processes_at_one_folder_share_the_items_and_each_is_made_once(tmp_path: Path) -> None:
-    both = [slowly(tmp_path) for _ in range(2)]
+    both = [slowly(tmp_path, 2) for _ in range(2)]
     made = [int(process.communicate()[0]) for process in both]
     assert sum(made) == 40 and min(made) > 0
     of, (ids, states) = model("qwen3-vl"), read_layer(tmp_path, 2)
