@@ -11,9 +11,10 @@ import dagster as dg
 import pytest
 
 from tests.conftest import ROOT, Checkout
-from traps_pipeline.pipeline.graph import JOB_GROUPS
+from traps_pipeline.definitions import defs
+from traps_pipeline.pipeline.graph import JOB_GROUPS, the_graph
 from traps_pipeline.pipeline.run import dagster_history
-from traps_pipeline.pipeline.runs import PARENT_TAG, ROOT_TAG
+from traps_pipeline.pipeline.runs import PARENT_TAG, ROOT_TAG, LocalRuns
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
@@ -58,3 +59,13 @@ def test_a_job_that_is_stopped_leaves_no_failed_run_behind(empty: Checkout, monk
     process.communicate()
     [started] = [run for run in runs_of(empty, monkeypatch) if PARENT_TAG in run.tags]
     assert started.status == dg.DagsterRunStatus.CANCELED
+
+
+def test_below_a_job_that_is_being_terminated_no_run_begins(tmp_path: Path) -> None:
+    everything = defs.resolve_implicit_global_asset_job_def()
+    with dg.DagsterInstance.local_temp(str(tmp_path)) as instance:
+        parent = instance.add_run(dg.DagsterRun(job_name="everything", status=dg.DagsterRunStatus.CANCELING))
+        runs = LocalRuns(instance, everything, parent=parent)
+        with pytest.raises(KeyboardInterrupt):
+            next(iter(runs.make([the_graph()["items"]], [("chaotic", "chaotic")], {})))
+        assert [run.run_id for run in instance.get_runs()] == [parent.run_id]

@@ -60,7 +60,7 @@ class LocalRuns(Runs):
         parent: dg.DagsterRun | None = None,
         log: Callable[[str], None] = lambda line: None,
     ) -> None:
-        self._instance, self._job, self._log = instance, job, log
+        self._instance, self._job, self._parent, self._log = instance, job, parent, log
         ids = {PARENT_TAG: parent.run_id, ROOT_TAG: parent.root_run_id or parent.run_id} if parent else {}
         self._tags = {PID_TAG: str(os.getpid()), HOST_TAG: this_host(), **ids}
         self.finished: list[dict[str, str]] = []
@@ -72,6 +72,7 @@ class LocalRuns(Runs):
     def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterator[RunOutcome]:
         """See `Runs`."""
         for number, keys in enumerate(ranges, start=1):
+            self._stop_with_parent()
             run_id, names = str(uuid.uuid4()), ", ".join(stage.name for stage in stages)
             words = "" if keys[0] is None else keys[0] if keys[0] == keys[1] else f"{keys[0]} to {keys[1]}"
             self._log(f"run {run_id} ({number} of {len(ranges)}): {names} {words}")
@@ -80,6 +81,13 @@ class LocalRuns(Runs):
             self._log(f"run {run_id}: {result}")
             self.finished.append({"run": run_id, "assets": names, "partitions": words, "result": result})
             yield outcome
+        self._stop_with_parent()
+
+    def _stop_with_parent(self) -> None:
+        """Raise KeyboardInterrupt if the parent was terminated, also where a library has swallowed the signal."""
+        parent = self._instance.get_run_by_id(self._parent.run_id) if self._parent else None
+        if parent and parent.status in (dg.DagsterRunStatus.CANCELING, dg.DagsterRunStatus.CANCELED):
+            raise KeyboardInterrupt
 
     def _execute(self, stages: Sequence[Stage], keys: Range, tags: Mapping[str, str], run_id: str) -> RunOutcome:
         key = keys[0] if keys[0] == keys[1] else None
