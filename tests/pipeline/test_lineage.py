@@ -188,4 +188,4 @@ def test_another_formula_makes_metrics_stale(study: Workspace) -> None:
 
 def test_partitions_that_lost_their_own_parent_are_one_line_of_the_status():
     stale = {key: (f"responses/{key} is gone", "judges changed") for key in ("occlusion|a__json__run1", "chaotic|b")}
-    assert StageStatus("votes", 0, stale, {}).by_reason() == {"responses is gone; judges changed": [*stale]}
+    assert StageStatus("votes", 0, stale, []).by_reason() == {"responses is gone; judges changed": [*stale]}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from traps_pipeline.pipeline.lineage import Lineage
@@ -12,7 +12,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 @dataclass(frozen=True)
 class StageStatus:
-    """A stage's partitions: fresh (their number), stale and missing (with reasons).
+    """A stage's partitions: fresh (their number), stale (with reasons), missing.
 
     A stage without partitions has one, of its own name.
     """
@@ -20,7 +20,7 @@ class StageStatus:
     stage: str
     fresh: int
     stale: Mapping[str, tuple[str, ...]]
-    missing: Mapping[str, tuple[str, ...]]
+    missing: Sequence[str]
 
     def by_reason(self) -> Mapping[str, list[str]]:
         """Return the partitions that are not fresh, by their reasons.
@@ -28,10 +28,10 @@ class StageStatus:
         A reason leaves out the partition's own key, so that many partitions share it.
         """
         groups = dict[str, list[str]]()
-        for key, reasons in [*self.stale.items(), *self.missing.items()]:
+        for key, reasons in self.stale.items():
             general_reasons = [reason.replace(f"/{key} ", " ") for reason in reasons]
-            groups.setdefault("; ".join(general_reasons) or "not made yet", []).append(key)
-        return groups
+            groups.setdefault("; ".join(general_reasons), []).append(key)
+        return groups | ({"not made yet": [*self.missing]} if self.missing else {})
 
 
 def stage_statuses(workspace: Workspace, lineage: Lineage, experiment: str | None) -> Iterator[StageStatus]:
@@ -39,8 +39,9 @@ def stage_statuses(workspace: Workspace, lineage: Lineage, experiment: str | Non
     partitions = StudyPartitions(workspace, experiment)
     for stage in lineage.graph.stages:
         statuses = {key or stage.name: lineage.status(stage.name, key) for key in stage.wanted(partitions)}
-        stale_reasons = {key: status.reasons for key, status in statuses.items() if status.kind == "stale"}
-        missing = {key: status.reasons for key, status in statuses.items() if status.kind == "missing"}
+        # A table of other columns is no lost one: it is told with its reason.
+        stale_reasons = {key: status.reasons for key, status in statuses.items() if status.reasons}
+        missing = [key for key, status in statuses.items() if status.kind == "missing" and not status.reasons]
         yield StageStatus(stage.name, len(statuses) - len(stale_reasons) - len(missing), stale_reasons, missing)
 
 
