@@ -45,6 +45,7 @@ class Finished:
     code: int
     out: str
     err: str
+    raised: str = ""  # the function whose error ended a command in this process, as `base.files.replace_file`
 
     def ok(self) -> Finished:
         """Itself; fails with what the command said where it did not end with 0."""

@@ -17,22 +17,35 @@ from types import ModuleType
 
 import pytest
 
+from tests.build.errors import raised_in
+
 PACKAGE = "traps_pipeline"
 # The graph is declared for the study that the environment names when it is imported: these rooms stand on it.
 OF_ONE_STUDY = ("cli", "cluster", "definitions", "exchange", "pipeline", "release", "servers")
 
 
-def traps(arguments: Sequence[str], folder: Path, environment: Mapping[str, str]) -> tuple[int, str, str]:
-    """Run a `traps` command in a folder with exactly this environment; return its exit code, stdout and stderr."""
-    out, err = _Stream(), _Stream()
-    with _surroundings(folder, environment), redirect_stdout(out), redirect_stderr(err):
-        from traps_pipeline.cli import main
+def traps(arguments: Sequence[str], folder: Path, environment: Mapping[str, str]) -> tuple[int, str, str, str]:
+    """Run a `traps` command in a folder with exactly this environment.
 
+    Returns its exit code, stdout, stderr, and the function whose error ended it, as `tests.build.errors.raised_in` says.
+    """
+    out, err, raised = _Stream(), _Stream(), ""
+    with _surroundings(folder, environment), redirect_stdout(out), redirect_stderr(err):
+        from traps_pipeline import cli
+
+        def print_failure(*sentence: str, as_json: bool = False) -> None:
+            nonlocal raised
+            raised = raised_in(error) if (error := sys.exception()) else ""
+            printed(*sentence, as_json=as_json)
+
+        printed, cli.print_failure = cli.print_failure, print_failure
         try:
-            code = main(arguments)
+            code = cli.main(arguments)
         except SystemExit as end:  # argparse: bad usage, or --help
             code = end.code if isinstance(end.code, int) else int(end.code is not None)
-    return code, out.text(), err.text()
+        finally:
+            cli.print_failure = printed
+    return code, out.text(), err.text(), raised
 
 
 @contextmanager
