@@ -56,15 +56,14 @@ explorer-check: ## types and style of the pages' scripts; needs npm and its inde
 lock: ## the locks from pyproject.toml, with uv
 	$(PYTHON) tools/lock.py $(LOCK_OPTIONS)
 
-wheel: setup-core ## dist/*.whl: the same bytes whoever builds it from the same files
+wheel: setup-core ## dist/*.whl: the same bytes whoever builds it from the same commit
 	$(BIN)/python -m hatchling build -t wheel
 
 sbom: setup ## dist/sbom.json: what the lock installs, as CycloneDX
 	$(BIN)/python tools/sbom.py dist/sbom.json
 
-# The version stands in pyproject.toml alone, so that an archive without git builds the same wheel; a tag repeats it.
-release-check: setup-core ## whether TAG=v0.2.0 is this version, and no placeholder of this repository is left
-	@version=v$$($(BIN)/python -m hatchling version); test "$$version" = "$(TAG)" || { echo "the tag is $(TAG), the version in pyproject.toml $$version: change one of them"; exit 1; }
+release-check: setup-core ## whether this checkout is that of TAG=v0.3.0, and no placeholder of this repository is left
+	@version=v$$($(BIN)/python -m hatchling version); test "$$version" = "$(TAG)" || { echo "this checkout is $$version and not $(TAG): check the tag out, with no changed file"; exit 1; }
 	@! grep -nE 'OWNER|host\.invalid|SECURITY-ADDRESS' pyproject.toml SECURITY.md .github/CODEOWNERS || { echo "put your own in the place of these placeholders"; exit 1; }
 
 # Libraries and harnesses that others use, each in an environment of its own: tests/release is tried with them.

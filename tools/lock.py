@@ -26,7 +26,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 LOCK, CORE, PYLOCK = (ROOT / name for name in ("requirements.lock", "requirements-core.lock", "pylock.toml"))
 WHEELS = "wheels"
-BUILD = "hatchling\n"  # installs the checkout itself
+BUILD = "hatchling\nhatch-vcs\n"  # installs the checkout itself
 TORCH_NEEDS = "filelock\nfsspec\nnetworkx\nsetuptools>=77\nsympy\n"
 UNLOCKED = ("sign", "cluster")  # the latter has a lock of its own
 WITHOUT_TORCH = 'torch; sys_platform == "never"\n'

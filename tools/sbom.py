@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import sys
 import tomllib
-from importlib.metadata import PackageMetadata, PackageNotFoundError, metadata
+from importlib.metadata import PackageMetadata, PackageNotFoundError, metadata, version
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +68,7 @@ def main() -> None:
     """Write the bill to the file that the first argument names."""
     (out,) = map(Path, sys.argv[1:])
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    project["version"] = version(project["name"])  # of the tag that was installed
     document = bill((ROOT / "pylock.toml").read_text(encoding="utf-8"), project)
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
