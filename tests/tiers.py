@@ -118,8 +118,33 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         taken = {id(item) for item in chosen}
         config.hook.pytest_deselected(items=[item for item in items if id(item) not in taken])
         items[:] = chosen
-    known = durations("test") | durations("campaign")
-    items.sort(key=lambda item: -known.get(file_of(item), 0.0) if tier_of(item) != "check" else 0.0)
+    costs: dict[str, float] = defaultdict(float)
+    for item in items:
+        costs[file_of(item)] = max(costs[file_of(item)], durations(tier_of(item)).get(file_of(item), 0.0))
+    items.sort(key=lambda item: tier_of(item) == "check")
+    items[:] = in_slices(items, costs, int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")))
+
+
+def in_slices(items: list[pytest.Item], costs: Mapping[str, float], workers: int) -> list[pytest.Item]:
+    """Order tests for `--dist worksteal`, which first deals equal slices: each begins with what takes long.
+
+    costs: CPU seconds by file. Tests of a file stay together where its slice has room.
+    """
+    files: dict[str, list[pytest.Item]] = defaultdict(list)
+    for item in items:
+        files[file_of(item)].append(item)
+    slices, loads, rooms = [list[pytest.Item]() for _ in range(workers)], [0.0] * workers, list[int]()
+    for k in range(workers):
+        rooms.append((len(items) - sum(rooms)) // (workers - k))
+    for name in sorted(files, key=lambda name: -costs[name]):
+        chosen = -1
+        for item in files[name]:
+            if chosen < 0 or len(slices[chosen]) == rooms[chosen]:
+                free = [k for k in range(workers) if len(slices[k]) < rooms[k]]
+                chosen = min(free, key=lambda k: loads[k])
+            slices[chosen].append(item)
+            loads[chosen] += costs[name] / len(files[name])
+    return [item for part in slices for item in part]
 
 
 # --- what a test costs ------------------------------------------------------------------------------------------------
