@@ -7,6 +7,8 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -47,6 +49,23 @@ def test_shards_hold_each_file_once_and_cost_the_same() -> None:
     assert sorted(name for part in parts for name in part) == sorted(COSTS)
     assert tiers.shards(COSTS, 1) == [["a", "b", "c", "d", "e"]]
     assert tiers.shards({"a": 1.0}, 2) == [["a"], []]
+
+
+def test_a_file_that_takes_longer_than_a_shard_is_dealt_by_its_tests(monkeypatch: pytest.MonkeyPatch) -> None:
+    costs = {"a": 60.0, "b": 20.0, "c": 10.0, "d": 10.0}  # 50 a shard
+    monkeypatch.setattr(tiers, "durations", {"campaign": costs}.__getitem__)
+    names = ("a::1", "a::2", "a::3", "b::1", "b::2", "c::1", "d::1")
+    tests: list[Any] = [SimpleNamespace(nodeid=name, fixturenames=["demo"] * (name[0] in "cd")) for name in names]
+    first, second = ({test.nodeid for test in tiers.of_shard(tests, shard)} for shard in ("1/2", "2/2"))
+    assert first == {"a::1", "a::3", "c::1", "d::1"} and second == {"a::2", "b::1", "b::2"}
+
+
+def test_each_worker_begins_with_what_takes_long() -> None:
+    tests: list[Any] = [SimpleNamespace(nodeid=name) for name in ("c::1", "c::2", "c::3", "b::1", "a::1", "a::2")]
+    ordered = tiers.in_slices(tests, {"a": 50.0, "b": 30.0, "c": 0.0}, 2)
+    assert [test.nodeid for test in ordered[:3]] == ["a::1", "a::2", "c::3"]
+    assert [test.nodeid for test in ordered[3:]] == ["b::1", "c::1", "c::2"]
+    assert tiers.in_slices(tests, dict.fromkeys("abc", 0.0), 1) == tests
 
 
 @pytest.mark.parametrize("shard", ["0/3", "4/3", "2", "2/0", "a/b"])

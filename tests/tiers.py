@@ -11,8 +11,8 @@ import json
 import os
 import re
 import time
-from collections import defaultdict
-from collections.abc import Generator, Iterable, Mapping
+from collections import Counter, defaultdict
+from collections.abc import Generator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -72,27 +72,29 @@ def file_of(item: pytest.Item) -> str:
     return item.nodeid.partition("::")[0]
 
 
-def _units(items: Iterable[pytest.Item]) -> dict[str, str]:
-    """Return what is dealt as one by file: files that need the demo stay together, since it takes minutes to make."""
-    units: dict[str, str] = {}
-    for item in items:
-        if "demo" in getattr(item, "fixturenames", ()):
-            units[file_of(item)] = "demo"
-        units.setdefault(file_of(item), file_of(item))
-    return units
-
-
 def of_shard(items: list[pytest.Item], shard: str) -> list[pytest.Item]:
-    """Return the tests of shard `K/N`. Raises UsageError for another form."""
+    """Return the tests of shard `K/N`. Raises UsageError for another form.
+
+    Files that need the demo stay together, since it takes minutes to make; one that takes longer than a shard is dealt
+    test by test.
+    """
     match = re.fullmatch(r"(\d+)/(\d+)", shard)
     if match is None or not 1 <= int(match[1]) <= int(match[2]):
         raise pytest.UsageError(f"--shard {shard}: give K/N with K from 1 to N, such as 2/6")
-    units, known = _units(items), durations("campaign")
-    costs: dict[str, float] = defaultdict(float)
-    for file, unit in units.items():
-        costs[unit] += known.get(file, UNKNOWN_S)
-    chosen = {*shards(costs, int(match[2]))[int(match[1]) - 1]}
-    return [item for item in items if units[file_of(item)] in chosen]
+    tests, known = Counter(map(file_of, items)), durations("campaign")
+    costs = {file: known.get(file, UNKNOWN_S) for file in tests}
+    limit = sum(costs.values()) / int(match[2])
+    demo = {file_of(item) for item in items if "demo" in getattr(item, "fixturenames", ())}
+
+    def unit(item: pytest.Item) -> str:
+        file = file_of(item)
+        return "demo" if file in demo else item.nodeid if costs[file] > limit else file
+
+    loads: dict[str, float] = defaultdict(float)
+    for item in items:
+        loads[unit(item)] += costs[file_of(item)] / tests[file_of(item)]
+    chosen = {*shards(loads, int(match[2]))[int(match[1]) - 1]}
+    return [item for item in items if unit(item) in chosen]
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
@@ -118,8 +120,33 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         taken = {id(item) for item in chosen}
         config.hook.pytest_deselected(items=[item for item in items if id(item) not in taken])
         items[:] = chosen
-    known = durations("test") | durations("campaign")
-    items.sort(key=lambda item: -known.get(file_of(item), 0.0) if tier_of(item) != "check" else 0.0)
+    costs: dict[str, float] = defaultdict(float)
+    for item in items:
+        costs[file_of(item)] = max(costs[file_of(item)], durations(tier_of(item)).get(file_of(item), 0.0))
+    items.sort(key=lambda item: tier_of(item) == "check")
+    items[:] = in_slices(items, costs, int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")))
+
+
+def in_slices(items: list[pytest.Item], costs: Mapping[str, float], workers: int) -> list[pytest.Item]:
+    """Order tests for `--dist worksteal`, which first deals equal slices: each begins with what takes long.
+
+    costs: CPU seconds by file. Tests of a file stay together where its slice has room.
+    """
+    files: dict[str, list[pytest.Item]] = defaultdict(list)
+    for item in items:
+        files[file_of(item)].append(item)
+    slices, loads, rooms = [list[pytest.Item]() for _ in range(workers)], [0.0] * workers, list[int]()
+    for k in range(workers):
+        rooms.append((len(items) - sum(rooms)) // (workers - k))
+    for name in sorted(files, key=lambda name: -costs[name]):
+        chosen = -1
+        for item in files[name]:
+            if chosen < 0 or len(slices[chosen]) == rooms[chosen]:
+                free = [k for k in range(workers) if len(slices[k]) < rooms[k]]
+                chosen = min(free, key=lambda k: loads[k])
+            slices[chosen].append(item)
+            loads[chosen] += costs[name] / len(files[name])
+    return [item for part in slices for item in part]
 
 
 # --- what a test costs ------------------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.conftest import EXPERIMENT, Checkout, copied
+from tests.conftest import CLIP_CACHE, EXPERIMENT, SMALL, Checkout, make_checkout
 from tests.pages import a_browser, patient
 from tests.providers.servers import closed_port
 from traps_pipeline.models.answer_rows import RESPONSES
@@ -118,18 +118,15 @@ def written(study: Checkout, name: str) -> dict[Path, int]:
 
 
 @pytest.fixture
-def fresh(small: Checkout, tmp_path: Path) -> Checkout:
-    """A study of four scenarios with an empty history; the clips of another serve it. Two fifths of one model's calls
-    fail, whichever they are: that depends on the bytes of the clips."""
-    study = copied(small, tmp_path)
+def fresh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Checkout:
+    """A study of four scenarios with an empty history. Two fifths of one model's calls fail, whichever they are: that
+    depends on the bytes of the clips, which may be those of this machine's cache."""
+    monkeypatch.setenv("TRAPS_CLIP_CACHE", CLIP_CACHE)
+    study = Checkout(make_checkout(tmp_path / "checkout"), tmp_path / "study")
+    shutil.copytree(SMALL.parent, study.root / "tests" / "experiments")
     registry = study.root / "assets" / "models.yaml"
     registry.write_text(registry.read_text().replace("failing: 0.05", "failing: 0.4"))
-    clips = study.workspace / "clips"
-    shutil.move(clips, tmp_path / "clips")
-    shutil.rmtree(study.workspace)
     study.traps("init", "tests/experiments/four.yaml").ok()
-    shutil.rmtree(clips)
-    shutil.move(tmp_path / "clips", clips)
     return study
 
 
