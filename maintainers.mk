@@ -62,9 +62,12 @@ wheel: setup-core ## dist/*.whl: the same bytes whoever builds it from the same 
 sbom: setup ## dist/sbom.json: what the lock installs, as CycloneDX
 	$(BIN)/python tools/sbom.py dist/sbom.json
 
-release-check: setup-core ## whether this checkout is that of TAG=v0.3.0, and no placeholder of this repository is left
-	@version=v$$($(BIN)/python -m hatchling version); test "$$version" = "$(TAG)" || { echo "this checkout is $$version and not $(TAG): check the tag out, with no changed file"; exit 1; }
-	@! grep -nE 'OWNER|host\.invalid|SECURITY-ADDRESS' pyproject.toml SECURITY.md .github/CODEOWNERS || { echo "put your own in the place of these placeholders"; exit 1; }
+release-check: setup-core ## whether this checkout is TAG=v0.3.0, is in the changelog, and has no placeholder left
+	@wrong() { echo "$$1"; failed=1; }; failed=; version=v$$($(BIN)/python -m hatchling version); \
+	test "$$version" = "$(TAG)" || wrong "this checkout is $$version and not $(TAG): check the tag out, with no changed file"; \
+	grep -q '^## $(TAG:v%=%) ' CHANGELOG.md || wrong "CHANGELOG.md has no section $(TAG:v%=%)"; \
+	! grep -nE 'OWNER|host\.invalid|SECURITY-ADDRESS' pyproject.toml SECURITY.md .github/CODEOWNERS || wrong "put your own in the place of these placeholders"; \
+	test -z "$$failed"
 
 # Libraries and harnesses that others use, each in an environment of its own: tests/release is tried with them.
 ENVIRONMENTS := $(patsubst tests/release/%.txt,.workspaces/environments/%/.installed,$(wildcard tests/release/*.txt))

@@ -57,15 +57,17 @@ def test_checks_run_on_every_python_that_the_package_admits_and_every_shard_at_n
 
 
 def test_a_tag_that_is_another_version_and_a_placeholder_that_is_left_stop_a_release() -> None:
-    def check(tag: str) -> str:
+    def check(tag: str) -> list[str]:
         command = ["make", "-o", "setup-core", f"BIN={Path(sys.executable).parent}", "release-check", f"TAG={tag}"]
         finished = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-        return "passes" if finished.returncode == 0 else finished.stdout
+        return [] if finished.returncode == 0 else finished.stdout.splitlines()
 
     command = [sys.executable, "-m", "hatchling", "version"]
     version = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
-    assert "v0.0.1" in check("v0.0.1") and f"v{version}" in check("v0.0.1")
-    assert "CODEOWNERS" in check(f"v{version}")  # this checkout still has placeholders
+    another = check("v0.0.1")
+    assert f"v{version}" in another[0] and "v0.0.1" in another[0] and "CHANGELOG.md" in another[1]
+    assert "CODEOWNERS" in "".join(another)  # this checkout still has placeholders
+    assert another[0] not in check(f"v{version}") and "CODEOWNERS" in "".join(check(f"v{version}"))
 
 
 def test_the_lock_meets_the_project_and_one_that_does_not_is_named(tmp_path: Path) -> None:

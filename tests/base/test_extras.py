@@ -80,13 +80,6 @@ def test_the_bill_of_materials_names_every_pin_and_is_written_twice_to_the_same_
     assert hashes == {pin: found & hashes[pin] for pin, found in pins(ROOT / "requirements.lock").items()}
 
 
-def test_the_version_has_a_section_in_the_changelog_and_the_wheel_that_pages_name_is_of_it() -> None:
-    sections = re.findall(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
-    assert PROJECT["version"] in sections
-    named_wheels = re.findall(r"traps_pipeline-([\d.]+)-py3", (ROOT / "docs" / "install.md").read_text())
-    assert named_wheels and {*named_wheels} == {PROJECT["version"]}
-
-
 @pytest.mark.parametrize(
     ("name", "blocked", "said"),
     [
