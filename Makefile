@@ -40,7 +40,7 @@ check: setup ## lint, types and fast tests: two minutes on two cores
 fast-tests: setup
 	$(PYTEST) -n 0 $(FAST)
 
-test: setup browser ## check, and one real path for each promise of the documentation: 8 to 15 minutes
+test: setup browser ## check, and one real path for each promise of the documentation: 8 minutes
 	$(MAKE) --no-print-directory -j2 --output-sync=line lint promises
 
 # What is compiled is copied to the checkouts of the tests, whose commands would each compile it again. One worker more
