@@ -27,7 +27,7 @@ OF_ONE_STUDY = ("cli", "cluster", "definitions", "exchange", "pipeline", "releas
 def traps(arguments: Sequence[str], folder: Path, environment: Mapping[str, str]) -> tuple[int, str, str, str]:
     """Run a `traps` command in a folder with exactly this environment.
 
-    Returns its exit code, stdout, stderr, and the function whose error ended it, as `tests.build.errors.raised_in` says.
+    Returns its exit code, stdout, stderr, and the function whose error ended it (`tests.build.errors.raised_in`).
     """
     out, err, raised = _Stream(), _Stream(), ""
     with _surroundings(folder, environment), redirect_stdout(out), redirect_stderr(err):

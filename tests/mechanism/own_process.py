@@ -50,9 +50,7 @@ def steer(workspace: Workspace, entry: ModelEntry, patch: pytest.MonkeyPatch) ->
         return made
 
     patch.setattr(SteeredBackend, "generate", counting)
-    ((_, cell),) = collect_steered(
-        workspace, entry, [CELL], {"standard": stages.saved_directions(workspace, STANDARD)}
-    )
+    ((_, cell),) = collect_steered(workspace, entry, [CELL], {"standard": stages.saved_directions(workspace, STANDARD)})
     return {"made": len(generated), "content": {row.request_key: row.text for row in cell.rows(STEERING)}}
 
 

@@ -105,7 +105,7 @@ def test_lost_states_are_stale_and_made_again_as_they_were(own: Workspace, lost:
     before, sound = StoredStates.of(own, STANDARD).read("chaotic", 3), reasons()
     if lost == "a torn index":
         (folder / "ids.parquet").write_bytes(b"torn")
-        with raises(TrapsError, "mechanism.hidden_states._ids", str(folder / "ids.parquet")):
+        with raises(TrapsError, "storage.parquet._verified_bytes", str(folder / "ids.parquet")):
             StoredStates.of(own, STANDARD).read("chaotic", 3)
     else:
         (folder / lost).unlink()
