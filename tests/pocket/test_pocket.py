@@ -221,4 +221,4 @@ def test_the_card_command_needs_the_figures_of_every_model(
     monkeypatch.setitem(SHIPPED, GAP, tmp_path)
     assert main(["card"], build_parser()) == 1
     said = capsys.readouterr().err
-    assert str(tmp_path / MECHANISM) in said and "`python -m tools.pocket card`" in said
+    assert str(tmp_path / MECHANISM) in said and "`python -m tools.pocket card" in said
