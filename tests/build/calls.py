@@ -13,23 +13,11 @@ from traps_pipeline.models.registry import Account, Entry, Limits, Prices
 from traps_pipeline.models.request import Request
 
 PARAMS = {"temperature": 0.8, "top_p": 0.95, "max_tokens": 8000}
-
-
 PRICES = Prices(input=1.0, output=10.0, as_of=datetime.date(2026, 11, 1))
-
-
 ANSWER = "The answer is: left."
-
-
 USAGE = {"prompt_tokens": 20, "completion_tokens": 21, "total_tokens": 41}
-
-
 MESSAGE = {"role": "assistant", "content": ANSWER}
-
-
 CHOICE = {"index": 0, "message": MESSAGE, "finish_reason": "stop"}
-
-
 BODY = {"id": "x", "object": "chat.completion", "created": 1, "model": "m", "choices": [CHOICE], "usage": USAGE}
 
 

@@ -10,17 +10,18 @@ import pytest
 from pydantic import ValidationError
 
 PACKAGE = "traps_pipeline."
+OURS = (PACKAGE, "tools.")
 
 
 def raised_in(error: BaseException) -> str:
-    """Return the innermost function of the package in a traceback, as `base.files.replace_file`.
+    """Return the innermost function of the package in a traceback, as `base.files.replace_file`, or of `tools`.
 
     Otherwise the model of pydantic that refused, or nothing.
     """
     function, frames = "", error.__traceback__
     while isinstance(frames, TracebackType):
         module = frames.tb_frame.f_globals.get("__name__", "")
-        if module.startswith(PACKAGE):
+        if module.startswith(OURS):
             function = f"{module.removeprefix(PACKAGE)}.{frames.tb_frame.f_code.co_qualname}"
         frames = frames.tb_next
     return error.title if not function and isinstance(error, ValidationError) else function

@@ -17,8 +17,6 @@ from traps_pipeline.storage.benchmark_tables import ITEMS, current_rows
 from traps_pipeline.storage.workspace import Workspace
 
 Rows = Callable[..., pd.DataFrame]
-
-
 JUDGES = ("rule-1", "rule-2", "rule-3")
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.build.errors import raises
 from tests.local_models import FAMILIES, Family, model
 from tests.models.local import check_table
 from traps_pipeline.base.errors import TrapsError
@@ -61,23 +62,23 @@ def paths_beside_the_stream_forgotten(patch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("family", "check", "broken", "said"),
+    ("family", "check", "broken"),
     [
-        ("qwen3-vl", "states", one_block_late, "hooked states differ from the library's own at layers"),
-        ("qwen3-vl", "alpha 0", a_hook_that_stays, "steering with alpha 0 leaves a hook"),
-        ("qwen3-vl", "alpha", a_hook_that_stays, "a steered state at layer 2 is not the plain one and alpha times v"),
-        ("qwen3-vl", "clips", rounded_features, "a remembered clip gives other states"),
-        ("gemma-4", "patching", paths_beside_the_stream_forgotten, "patching all positions misses the source's"),
+        ("qwen3-vl", "states", one_block_late),
+        ("qwen3-vl", "alpha 0", a_hook_that_stays),
+        ("qwen3-vl", "alpha", a_hook_that_stays),
+        ("qwen3-vl", "clips", rounded_features),
+        ("gemma-4", "patching", paths_beside_the_stream_forgotten),
     ],
 )
 def test_a_check_loses_where_the_adapter_is_broken(
-    family: Family, check: str, broken: Callable[[pytest.MonkeyPatch], None], said: str, monkeypatch: pytest.MonkeyPatch
+    family: Family, check: str, broken: Callable[[pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     subject = Subject(model(family), *brightening_clip())
     subject.model.clips = clips.ClipMemory()
     with monkeypatch.context() as patch:
         broken(patch)
-        with pytest.raises(TrapsError, match=said):
+        with raises(TrapsError, "mechanism.adapter_checks._require"):
             BY_NAME[check].found(subject)
     subject.model.clips = clips.ClipMemory()
     BY_NAME[check].found(subject)
@@ -86,6 +87,7 @@ def test_a_check_loses_where_the_adapter_is_broken(
 def test_in_sixteen_bits_what_rounding_changes_is_not_looked_at() -> None:
     subject = Subject(model("qwen3-vl", dtype="bfloat16"), *brightening_clip())
     found = {check.name: check.found(subject) for check in CHECKS}
-    assert found["states"] == "5 states, bit for bit"
-    assert found["batches"] == "not looked at: in bfloat16 rounding differs with the shape of a pass"
+    assert found["states"].startswith(f"{subject.model.n_layers + 1} ")
+    left_out = {name for name, said in found.items() if "bfloat16" in said}
+    assert left_out == {check.name for check in CHECKS if check.exact}
     assert np.isfinite(subject.model.forward_states(subject.prompts[0]).raw).all()

@@ -13,6 +13,7 @@ from sklearn.linear_model import LogisticRegression
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
+from tests.build.errors import raises
 from tests.build.mechanism import STANDARD, entry, patch
 from tests.build.mechanism import study as extracted
 from tests.mechanism.study import PAIRS, write_verdicts
@@ -62,7 +63,7 @@ def test_states_stand_beside_their_items_and_verdicts(study: Workspace) -> None:
     judged = states.where("dataset == 'chaotic' and void").items.set_index("scenario_id")["abstained_standard"]
     assert judged.astype(bool).to_dict() == {f"plinko-{n}": n < 2 for n in range(PAIRS)}
     assert states.where(states.void).items["side"].unique().tolist() == ["void"]
-    with pytest.raises(TrapsError, match="no hidden states of decoy"):
+    with raises(TrapsError, "inside.load", "decoy"):
         inside.load(study.root, "tiny", layer=2, datasets=["decoy"])
 
 
@@ -73,35 +74,24 @@ def test_a_direction_of_the_api_steers_as_the_stages_do(study: Workspace, entry:
     theirs = model.generate([prompt], 4, None, Steering(push.vector, 2, (3.0,)))[0]
     with push.apply(model.network, 3.0):
         ours = model.generate([prompt], 4)[0]
-    plain = (
-        model.network.get_decoder()
-        .layers[1]
-        .register_forward_hook(
-            lambda module, args, output: (
-                output + 3.0 * torch.from_numpy(push.vector)
-            )  # a block of this class returns a tensor
-        )
-    )
+    along, block = torch.from_numpy(push.vector), model.network.get_decoder().layers[1]
+    plain = block.register_forward_hook(lambda module, args, output: output + 3.0 * along)  # of this class a tensor
     own = model.network.generate(**prompt.inputs, max_new_tokens=4, do_sample=False)[0, prompt.n_tokens :].tolist()
     plain.remove()
     assert ours.tokens == theirs.tokens and [*ours.tokens] == own[: len(ours.tokens)]
     before = model.forward_states(prompt).raw
-    along = torch.from_numpy(push.vector)
-    with push.apply(
-        model, 1.0, change=lambda states, unit, amount: states - amount * (states @ unit)[..., None] * unit
-    ):
+    with push.apply(model, 1.0, change=lambda states, unit, dose: states - dose * (states @ unit)[..., None] * unit):
         without = model.forward_states(prompt).raw
     assert abs(without[2] @ push.vector) < 1e-4 < abs(before[2] @ push.vector)
-    attention = model.network.get_decoder().layers[1].self_attn
-    plain = attention.register_forward_hook(lambda module, args, output: (output[0] + 5.0 * along, *output[1:]))
+    plain = block.self_attn.register_forward_hook(lambda module, args, output: (output[0] + 5.0 * along, *output[1:]))
     expected = model.forward_states(prompt).raw
     plain.remove()
     with push.apply(model, 5.0, site="attention"):
         assert (model.forward_states(prompt).raw == expected).all() and (expected[2] != before[2]).any()
     assert (model.forward_states(prompt).raw == before).all()  # every hook is gone
-    with pytest.raises(TrapsError, match="and not both"), push.apply(model, 1.0, gaps=1.0):
+    with raises(TrapsError, "inside.Direction.apply", "amount", "gaps"), push.apply(model, 1.0, gaps=1.0):
         pass
-    with pytest.raises(TrapsError, match="no block 9"), inside.Direction(push.vector, 9).apply(model, 1.0):
+    with raises(TrapsError, "inside._block", "9"), inside.Direction(push.vector, 9).apply(model, 1.0):
         pass
 
 
@@ -177,5 +167,5 @@ def test_the_protocol_takes_any_probe_and_any_features_of_items(study: Workspace
     some = states.where("dataset in ['chaotic', 'chaotic_ill_posed']")
     figures = inside.protocol(study, "tiny", layer=2, features=some)
     assert set(figures["source"]) == set(figures["target"]) == {"chaotic", "chaotic_ill_posed"}
-    with pytest.raises(TrapsError, match="lacks 2 items of chaotic"):
+    with raises(TrapsError, "inside.protocol.<locals>.read", "`features`", "2", "chaotic"):
         inside.protocol(study, "tiny", layer=2, features=inside.LoadedStates(some.X[2:], some.items.iloc[2:]))

@@ -29,7 +29,7 @@ from traps_pipeline.mechanism.lens import lens_rows
 from traps_pipeline.mechanism.margin import is_abstention_start
 from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS, PROBES
 from traps_pipeline.mechanism.probing import ProbeRun
-from traps_pipeline.mechanism.sentences import sentence_rows
+from traps_pipeline.mechanism.sentences import mean_log_probabilities, sentence_rows
 from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.mechanism.transfer_paths import LOOK_ALIKES
 from traps_pipeline.mechanism.untrained import untrained_states
@@ -257,7 +257,10 @@ def test_the_lens_is_the_models_norm_and_head_on_each_layer_and_ends_at_the_outp
     assert rows.loc[("chaotic", 2), "voids"] == pytest.approx(odds[void].mean(), abs=1e-3)
 
 
-def test_sentences_are_as_likely_as_the_librarys_own_logits_say(study: Workspace, entry: ModelEntry) -> None:
+def test_an_item_has_the_likelihood_of_its_answer_and_of_the_likeliest_abstention(
+    study: Workspace, entry: ModelEntry
+) -> None:
+    """`test_sentences.py` holds likelihoods against the library's own."""
     item = study.tables.read(PROBE_ITEMS, {"dataset": "chaotic"}).iloc[0]
     partition = Cell("chaotic", Evaluation("tiny", "standard", 1)).partition
     texts = {item["item_id"]: "It ends left.", "chaotic:plinko-1:void": None}
@@ -271,20 +274,12 @@ def test_sentences_are_as_likely_as_the_librarys_own_logits_say(study: Workspace
     assert entry.media is not None
     shown = sample(study.resolve(item["clip"]), entry.media)
     prompt = model.prompt(system_prompt("standard"), item["question"], shown.frames, shown.times_s)
-    likely: dict[str, float] = {}
-    for text in (*study.mechanism.sentences, "It ends left."):
-        tokens = torch.tensor([model.processor.tokenizer(text, add_special_tokens=False).input_ids])
-        inputs = dict(prompt.inputs) | {"input_ids": torch.cat([prompt.inputs["input_ids"], tokens], 1)}
-        for name in {*prompt.sequences} - {"input_ids"}:
-            more = torch.full_like(tokens, 1 if name == "attention_mask" else 0, dtype=inputs[name].dtype)
-            inputs[name] = torch.cat([inputs[name], more], 1)
-        with torch.no_grad():
-            logits = model.network(**inputs).logits[0, -tokens.shape[1] - 1 : -1].log_softmax(-1)
-        likely[text] = float(logits.gather(1, tokens.T).mean())
-    assert row.own == pytest.approx(likely.pop("It ends left."), abs=1e-5) and row.own_tokens == 13
-    assert row.abstention == pytest.approx(likely[row.sentence], abs=1e-5) and likely[row.sentence] == max(
-        likely.values()
-    )
+    said = [*study.mechanism.sentences, "It ends left."]
+    tokens = [model.processor.tokenizer(text, add_special_tokens=False).input_ids for text in said]
+    *abstentions, own = mean_log_probabilities(model, prompt, tokens)
+    assert row.own == pytest.approx(own, abs=1e-5) and row.own_tokens == 13
+    assert row.abstention == pytest.approx(max(abstentions), abs=1e-5)
+    assert row.sentence == said[int(np.argmax(abstentions))]
     assert rows["chaotic:plinko-1:void"].own is None and len(rows) == 2 * PAIRS
     with raises(TrapsError, "mechanism.sentences.sentence_rows", "guided"):
         sentence_rows(study, entry, Extraction("tiny", "guided"))

@@ -20,7 +20,7 @@ def test_every_cell_of_the_notebook_was_run_as_it_stands_and_keeps_what_it_print
 
 
 def test_the_page_of_the_site_has_texts_code_output_and_pictures_in_order() -> None:
-    page = notebook_page()
-    assert page.startswith("# Look inside from a notebook\n")
+    page, (head, *_) = notebook_page(), json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
+    assert page.startswith("# ") and page.startswith("".join(head["source"]))
     first, printed, drawn = (page.index(part) for part in ("```python\n", "```text\n", "](data:image/png;base64,"))
     assert first < printed < drawn and page.count("```") % 2 == 0

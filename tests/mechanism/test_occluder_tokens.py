@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.build.errors import raises
+from tests.build.mechanism import STANDARD
 from tests.mechanism.study import PAIRS, make_study, register, tiny_entry
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism import stages
@@ -14,13 +16,12 @@ from traps_pipeline.mechanism.hidden_states import read_layer
 from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS, HiddenStatesRow
 from traps_pipeline.mechanism.probe_items import other_clip, probe_items
 from traps_pipeline.mechanism.probing_versions import extraction_version, states_folder
-from traps_pipeline.protocol.cells import Extraction, StatesCell
+from traps_pipeline.protocol.cells import StatesCell
 from traps_pipeline.protocol.datasets import ANSWERABLE
 from traps_pipeline.storage.benchmark_tables import VIDEOS, VideoRow
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
-STANDARD = Extraction("tiny", "standard")
 
 
 @pytest.fixture
@@ -58,17 +59,15 @@ def test_the_states_of_an_ill_posed_pair_are_those_where_the_occluder_would_be(s
     changed = pooled(study, "changed")
     own, ill_posed = (states(changed, name) for name in ("occlusion", "occlusion_ill_posed"))
     for n in range(PAIRS):  # the same clip, question and other clip: the same states
-        assert (
-            own[f"occlusion:hidden-{n}:control"].states_key
-            == ill_posed[f"occlusion_ill_posed:hidden-{n}:control"].states_key
-        )
+        mine, theirs = own[f"occlusion:hidden-{n}:control"], ill_posed[f"occlusion_ill_posed:hidden-{n}:control"]
+        assert mine.states_key == theirs.states_key
     read: dict[str, np.ndarray] = {}
     for of in (changed, pooled(study, "visual")):
         made = states(of, "occlusion")
         read[of.mechanism.pooling] = read_layer(states_folder(of, StatesCell("occlusion", STANDARD)), 2)[1]
         assert {row.pooling for row in made.values()} == {of.mechanism.pooling}
     assert (read["changed"] == read["visual"]).all() and np.isfinite(read["changed"]).all()
-    with pytest.raises(TrapsError, match="has no unchanged; choose another pooling"):
+    with raises(TrapsError, "mechanism.hidden_states._pooled_tokens", "occlusion:hidden-", "unchanged"):
         states(pooled(study, "unchanged"), "occlusion")
 
 

@@ -3,9 +3,6 @@ changed, where the nulls of a pair come from, and what a killed run leaves."""
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.conftest import ROOT
 from tests.local_models import SYSTEM, ask, clip, model
+from tests.mechanism.own_process import printed, start
 from tests.mechanism.study import PAIRS, SETTINGS, make_study, register, tiny_entry
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.mechanism import patching_stage
@@ -286,25 +283,18 @@ def test_a_null_is_the_next_scenario_that_fits_or_the_own_frames_with_the_other_
 
 
 def test_a_killed_run_goes_on_behind_its_last_pair_and_gives_the_same_rows(entry: ModelEntry, tmp_path: Path) -> None:
-    described = tmp_path / "entry.json"
-    described.write_text(entry.model_dump_json(), "utf-8")
     workspaces = [make_study(tmp_path / name) for name in ("killed", "alone")]
     for workspace in workspaces:
         for dataset in patching_stage.WELL_POSED:
             workspace.tables.write(PROBE_ITEMS, {"dataset": dataset}, probe_items(workspace, dataset), {})
 
-    def start(workspace: Workspace) -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "tests.mechanism.patch_cell", str(workspace.root), str(described)]
-        return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
-
-    killed, written = start(workspaces[0]), workspaces[0].root / "patching"
+    killed, written = start("patch", workspaces[0].root, entry), workspaces[0].root / "patching"
     while len([*written.rglob("*-patches-*.json")]) < 2:  # behind the estimates of a dataset, amid its patches
         assert killed.poll() is None
         time.sleep(0.02)
     killed.kill()
     killed.communicate()
-    (resumed, _), (alone, _) = (start(workspace).communicate() for workspace in workspaces)
-    again, whole = (json.loads(output.splitlines()[-1]) for output in (resumed, alone))
-    assert again["rows"] == whole["rows"] and whole["passes"] > 0
-    per_pair = whole["passes"] / (2 * PAIRS)  # half of the pairs were estimated, and two of them patched
-    assert again["passes"] <= whole["passes"] - per_pair
+    again, whole = (printed(start("patch", workspace.root, entry)) for workspace in workspaces)
+    assert again["content"] == whole["content"] and whole["made"] > 0
+    per_pair = whole["made"] / (2 * PAIRS)  # half of the pairs were estimated, and two of them patched
+    assert again["made"] <= whole["made"] - per_pair

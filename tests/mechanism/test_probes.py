@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -246,7 +247,7 @@ def test_cf_of_shared_controls_is_held_out_by_scenario_too_or_says_that_too_few_
     many, two = of(12), of(2)
     assert many["confabulated"]["value"].min() > 0.9 > 0.8 > many["confabulated_held_out"]["value"].max()
     assert two["confabulated_held_out"]["value"].isna().all()
-    assert "2 confabulated voids are too few for 5 folds" in two["confabulated_held_out"]["note"].iloc[0]
+    assert re.findall(r"\d+", two["confabulated_held_out"]["note"].iloc[0]) == ["2", "5"]  # voids, folds
 
 
 @pytest.mark.slow

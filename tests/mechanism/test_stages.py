@@ -6,7 +6,6 @@ import asyncio
 import json
 import shutil
 import subprocess
-import sys
 import time
 from collections.abc import Iterable
 from pathlib import Path
@@ -14,10 +13,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from pydantic import ValidationError
 
+from tests.build.errors import raises
 from tests.build.mechanism import STANDARD, entry, extract_all, own, patch, study
-from tests.conftest import ROOT
-from tests.mechanism.steer_cell import CELL
+from tests.mechanism.own_process import CELL, printed, start
 from tests.mechanism.study import PAIRS, register, tiny_entry, write_items, write_verdicts
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.panel import tasks_for
@@ -99,39 +99,40 @@ def test_states_stand_in_the_order_of_their_table(study: Workspace) -> None:
 def test_lost_states_are_stale_and_made_again_as_they_were(own: Workspace, lost: str) -> None:
     cell, folder = StatesCell("chaotic", STANDARD), own.root / "states" / "tiny" / "standard" / "chaotic"
 
-    def are_gone() -> bool:
-        return "its states are gone" in Lineage(own).status("hidden_states", cell.key).reasons
+    def reasons() -> set[str]:
+        return {*Lineage(own).status("hidden_states", cell.key).reasons}
 
-    before, was_gone = StoredStates.of(own, STANDARD).read("chaotic", 3), are_gone()
+    before, sound = StoredStates.of(own, STANDARD).read("chaotic", 3), reasons()
     if lost == "a torn index":
         (folder / "ids.parquet").write_bytes(b"torn")
-        with pytest.raises(TrapsError, match="materialize it again"):
+        with raises(TrapsError, "storage.parquet._verified_bytes", str(folder / "ids.parquet")):
             StoredStates.of(own, STANDARD).read("chaotic", 3)
     else:
         (folder / lost).unlink()
-    assert not was_gone and are_gone()
+    assert len(reasons() - sound) == 1
     _, made = stages.extract_states(own, cell)
-    assert not are_gone() and (made == 0 or lost != "a torn index")
+    assert reasons() == sound and (made == 0 or lost != "a torn index")
     assert (StoredStates.of(own, STANDARD).read("chaotic", 3) == before).all()
 
 
 @pytest.mark.parametrize("ending", [".safetensors", ".json"])
 def test_lost_or_damaged_directions_are_made_again_as_they_were(own: Workspace, ending: str) -> None:
-    def gone() -> bool:
-        return "its directions are gone" in Lineage(own).status("directions", STANDARD.key).reasons
+    def reasons() -> set[str]:
+        return {*Lineage(own).status("directions", STANDARD.key).reasons}
 
-    before = own.tables.read(DIRECTIONS, STANDARD.partition)
+    before, sound = own.tables.read(DIRECTIONS, STANDARD.partition), reasons()
     file = own.root / "directions" / "tiny" / "standard" / f"chaotic{ending}"
     file.write_bytes(file.read_bytes()[:-9])
-    with pytest.raises(TrapsError, match="delete it, then `traps run` makes it again"):
+    named = str(file.with_suffix(".safetensors")), "`traps run`"
+    with raises(TrapsError, "mechanism.directions.load_directions", *named) as damaged:
         stages.saved_directions(own, STANDARD)
-    assert not gone()
+    assert reasons() == sound and damaged.value.__cause__ is not None
     file.unlink()
-    with pytest.raises(TrapsError, match="`traps run` makes both from the states"):
+    with raises(TrapsError, "mechanism.directions.load_directions", *named) as missing:
         stages.saved_directions(own, STANDARD)
-    assert gone()
+    assert len(reasons() - sound) == 1 and missing.value.__cause__ is None
     again = pd.DataFrame(stages.direction_rows(own, STANDARD))
-    assert set(again["direction_digest"]) == set(before["direction_digest"]) and not gone()
+    assert set(again["direction_digest"]) == set(before["direction_digest"]) and reasons() == sound
 
 
 def test_directions_are_what_the_states_say(study: Workspace) -> None:
@@ -165,8 +166,9 @@ def test_probes_take_confabulated_items_from_the_verdicts_and_are_fitted_once(
     assert set(cf.query("target == 'occlusion' and source == 'chaotic'")["n_voids"]) == {3}
     notes = cf[cf["value"].isna()].set_index(["source", "target"])["note"]
     assert len(notes) == 10
-    assert "confabulated on none of the 4 judged void items" in notes["chaotic", "chaotic_ill_posed"]
-    assert "there are no verdicts occlusion_ill_posed|tiny__standard__run1" in notes["chaotic", "occlusion_ill_posed"]
+    none, unasked = notes["chaotic", "chaotic_ill_posed"], notes["chaotic", "occlusion_ill_posed"]
+    assert all(name in none for name in ("tiny", str(PAIRS), "chaotic_ill_posed", "standard"))
+    assert "occlusion_ill_posed|tiny__standard__run1" in unasked and "|" not in none
     own.tables.write(PROBES, STANDARD.partition, rows, {})
     monkeypatch.setattr(probing.ProbeRun, "rows", lambda *_: pytest.fail("fitted again"))
     again = pd.DataFrame(stages.probe_rows(own, STANDARD))
@@ -199,11 +201,11 @@ def test_probes_of_another_prompt_are_fitted_where_they_are_asked_for(own: Works
 
 
 def test_a_model_that_is_not_local_or_not_asked_for_is_told(study: Workspace, entry: ModelEntry) -> None:
-    with pytest.raises(TrapsError, match="oracle: is asked through backend reference, and only local models"):
+    with raises(TrapsError, "mechanism.stages.examined_model", "oracle", "reference"):
         stages.examined_model(study, "oracle")
-    with pytest.raises(TrapsError, match=r"mechanism\.models does not name qwen3-vl-8b"):
+    with raises(TrapsError, "mechanism.stages.examined_model", "mechanism.models", "qwen3-vl-8b"):
         stages.examined_model(study, "qwen3-vl-8b")
-    with pytest.raises(TrapsError, match="asks nothing inside models; run an experiment with a `mechanism:` section"):
+    with raises(TrapsError, "storage.workspace.Workspace.mechanism", str(study.root / "study.yaml"), "`mechanism:`"):
         _ = study.allow(mechanism=None).mechanism
     study.save_study()
 
@@ -211,7 +213,7 @@ def test_a_model_that_is_not_local_or_not_asked_for_is_told(study: Workspace, en
 def test_a_layer_that_the_model_has_not_is_told_before_anything_is_extracted(own: Workspace) -> None:
     layers = {"tiny": {"steering": 9, "centroid": 1}}
     wrong = own.allow(mechanism=MechanismSettings.model_validate({"models": layers}))
-    with pytest.raises(TrapsError, match=r"tiny\.steering: layer 9 is out of range, tiny has blocks 1 to 4"):
+    with raises(TrapsError, "mechanism.stages._check_layers", "mechanism.models.tiny.steering", "9", "4"):
         stages.extract_states(wrong, StatesCell("chaotic", Extraction("tiny", "guided")))
     assert not (own.root / "states" / "tiny" / "guided").exists()
 
@@ -260,13 +262,7 @@ def test_who_may_not_write_a_cell_makes_its_answers_and_a_killed_process_gives_i
     """While this process holds the ledger, one helper is killed behind its first chunk and another one makes the rest;
     when it may write it generates nothing twice, and its texts are those of one process alone."""
     few = entry.model_copy(update={"limits": entry.limits.model_copy(update={"concurrency": 8})})
-    described, made = tmp_path / "entry.json", own.ledger_folder / "made" / "tiny"
-    described.write_text(few.model_dump_json(), "utf-8")
-    alone = shutil.copytree(own.root, tmp_path / "alone", symlinks=True)
-
-    def start(root: Path) -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "tests.mechanism.steer_cell", str(root), str(described)]
-        return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    alone, made = shutil.copytree(own.root, tmp_path / "alone", symlinks=True), own.ledger_folder / "made" / "tiny"
 
     def wait_for(files: int, process: subprocess.Popen[str]) -> int:
         while len(done := list(made.glob("*.json"))) < files:
@@ -276,21 +272,18 @@ def test_who_may_not_write_a_cell_makes_its_answers_and_a_killed_process_gives_i
 
     async def helped() -> tuple[int, subprocess.Popen[str]]:
         async with own.answers.writing(CELL.evaluation.key, print):
-            first = start(own.root)
+            first = start("steer", own.root, few)
             wait_for(1, first)
             first.kill()
             first.wait()
-            known = wait_for(1, second := start(own.root))
+            known = wait_for(1, second := start("steer", own.root, few))
             assert wait_for(7, second) == 55  # 55 answers in chunks of 8
             return known, second
 
     known, process = asyncio.run(helped())
-    output, _ = process.communicate()
-    said, alone_said = json.loads(output.splitlines()[-1]), None
-    assert process.returncode == 0 and known >= 6 and said["generated"] == 55 - known
-    process = start(alone)
-    alone_said = json.loads(process.communicate()[0].splitlines()[-1])
-    assert alone_said["generated"] == 55 and said["texts"] == alone_said["texts"]
+    said, whole = printed(process), printed(start("steer", alone, few))
+    assert process.returncode == 0 and known >= 6 and said["made"] == 55 - known
+    assert whole["made"] == 55 and said["content"] == whole["content"]
     assert not made.exists() and len(own.answers.read(CELL.evaluation.key).rows) == 55
 
 
@@ -385,9 +378,9 @@ def test_a_study_may_show_other_frames_where_it_looks_inside_than_where_it_asks(
 def test_steering_refuses_layers_and_sources_that_are_not_there(study: Workspace) -> None:
     directions, settings = stages.saved_directions(study, STANDARD), study.mechanism
     wrong = settings.models["tiny"].model_copy(update={"steering": 5})
-    with pytest.raises(TrapsError, match="layer 5 is out of range, blocks 1 to 4 can be steered"):
+    with raises(TrapsError, "mechanism.steering._in_range", "mechanism.models", "5", "4"):
         strengths("chaotic", wrong, settings, directions)
-    with pytest.raises(TrapsError, match="no direction leads to chaotic; materialize hidden_states and directions"):
+    with raises(TrapsError, "mechanism.steering.strengths", "chaotic", "hidden_states"):
         strengths("chaotic", settings.models["tiny"], settings, {})
     only = {"chaotic": directions["chaotic"]}  # a study of one dataset steers the paths that it has
     assert {s.source for s, _ in strengths("chaotic", settings.models["tiny"], settings, only)} == {"chaotic", "none"}
@@ -395,19 +388,14 @@ def test_steering_refuses_layers_and_sources_that_are_not_there(study: Workspace
 
 def test_settings_that_cannot_be_are_refused() -> None:
     layers = {"tiny": {"steering": 2, "centroid": 1}}
-    for wrong, message in (
-        ({"models": {}}, "at least 1"),
-        ({"models": layers, "probes": {"shuffles": 5}}, "greater than or equal to 20"),
-        (
-            {"models": layers, "prompts": ["standard"], "steering": {"direction_regimes": ["guided"]}},
-            "are not among the prompts",
-        ),
-        (
-            {"models": layers, "prompts": ["standard"], "steering": None, "probes": {"prompts": ["guided"]}},
-            "probes.prompts: .'guided'. are not among the prompts",
-        ),
-        ({"models": layers, "steering": {"alphas": [5, 2]}}, "must ascend"),
-        ({"models": {"a__b": layers["tiny"]}}, "must match"),
+    of_prompts = {"models": layers, "prompts": ["standard"]}
+    for wrong, *named in (
+        ({"models": {}}, "models", "too_short"),
+        ({"models": layers, "probes": {"shuffles": 5}}, "probes.shuffles", "greater_than_equal"),
+        (of_prompts | {"steering": {"direction_regimes": ["guided"]}}, "steering.direction_regimes", "['guided']"),
+        (of_prompts | {"steering": None, "probes": {"prompts": ["guided"]}}, "probes.prompts", "['guided']"),
+        ({"models": layers, "steering": {"alphas": [5, 2]}}, "steering.alphas", "(5.0, 2.0)"),
+        ({"models": {"a__b": layers["tiny"]}}, "models", "'a__b'", "value_error"),
     ):
-        with pytest.raises(ValueError, match=message):
+        with raises(ValidationError, "MechanismSettings", *named):
             MechanismSettings.model_validate(wrong)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import re
+import json
 
 import pytest
 
@@ -15,18 +15,16 @@ from traps_pipeline.storage.workspace import Workspace
 pytestmark = pytest.mark.slow
 
 
-def counted(finished: Finished) -> tuple[int, ...]:
+def counted(finished: Finished) -> list[int]:
     """Items extracted, steered answers asked, votes on them."""
-    assert finished.code == 0, finished.out + finished.err
-    found = re.search(r"inside models: (\d+) items? .*? (\d+) steered .*? (\d+) votes? on them", finished.out)
-    assert found, finished.out
-    return tuple(map(int, found.groups()))
+    tallies = json.loads(finished.ok().out)["run"]["tallies"]
+    return [tallies.get(stage, {"asked": 0})["asked"] for stage in ("hidden_states", "steering", "steering_votes")]
 
 
 @pytest.mark.promise
 def test_traps_run_looks_into_a_model_once(own_study: Checkout) -> None:
     experiment = with_mechanism(own_study)
-    extracted, answers, votes = counted(own_study.traps("run", experiment))
+    extracted, answers, votes = counted(own_study.traps("run", experiment, "--json"))
     tables = Workspace.open(own_study.workspace).tables
     judged, effects = tables.read_all(STEERING_VOTES), tables.read(STEERING_EFFECTS, {})
     assert extracted > 0 and answers > 0 and votes > 3 * answers  # controls are judged for correctness too
@@ -40,4 +38,4 @@ def test_traps_run_looks_into_a_model_once(own_study: Checkout) -> None:
     assert set(patched.loc[patched["effect"].notna()].groupby(["dataset", "into", "source"]).size()) == {6}
     assert ((patched["n"] + patched["n_left_out"]) > 0).all()
     assert tables.read_all(PROBES)["note"].notna().any()  # tiny was not asked under standard: no Cf->Cf, and why
-    assert counted(own_study.traps("run", experiment)) == (0, 0, 0)
+    assert counted(own_study.traps("run", experiment, "--json")) == [0, 0, 0]

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from tests.build.errors import raises
 from tools.pocket.batches import Scenes
-from tools.pocket.data import Question, SceneRecord, draw_shard, render, shard_jobs
+from tools.pocket.data import Question, SceneRecord, draw_shard, read_shards, render, shard_jobs
 from tools.pocket.recipe import Hedge, Jitter, Recipe, load_recipe
 from tools.pocket.words import PROMPTS
 from traps_pipeline.base.errors import TrapsError
@@ -29,10 +30,7 @@ def recipe(**settings: object) -> Recipe:
 def drawn(made: Recipe, folder: Path) -> dict[str, list[SceneRecord]]:
     for job in shard_jobs(made, "train", folder):
         draw_shard(job)
-    return {
-        job.family: [SceneRecord.read(line) for line in job.lines.read_text().splitlines()]
-        for job in shard_jobs(made, "train", folder)
-    }
+    return {job.family: records for job, records in read_shards(made, "train", folder)}
 
 
 Planted = tuple[Recipe, Path, dict[str, list[SceneRecord]]]
@@ -153,7 +151,7 @@ def test_recipes_that_differ_in_shares_alone_have_the_same_scenes(planted: Plant
     render(made, "train", folder)
     render(other, "train", folder)  # nothing is missing, and the folder is not refused
     assert drawn(other, folder / "again") == records
-    with pytest.raises(TrapsError, match="another recipe"):
+    with raises(TrapsError, "tools.pocket.data._check_recipe", str(folder)):
         render(made.model_copy(update={"decoys": 0.4}), "train", folder)
 
 
@@ -161,5 +159,5 @@ def test_every_prompt_needs_one_share() -> None:
     values = recipe(abstain_shares=SHARES).model_dump() | {"hedge": None}
     assert Recipe.model_validate(values).hedge is None
     for wrong in ({"abstain_shares": {"standard": 0.1}}, {"hedge": HEDGE.model_dump()}):
-        with pytest.raises(ValidationError, match=r"each of standard, .* must be in one of them"):
+        with raises(ValidationError, "Recipe", "abstain_shares", "hedge", *PROMPTS):
             Recipe.model_validate(values | wrong)

@@ -16,6 +16,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from tests.build.errors import raises
 from tests.local_models import (
     FAMILIES,
     NF4_SKIP,
@@ -158,7 +159,8 @@ def test_a_batch_that_does_not_fit_is_halved_and_answers_stay_the_same(monkeypat
     assert tokens(of.generate(prompts, 6)) == expected
     assert Counter(sizes) == {3: 1, 1: 3, 2: 1}
     most = 0
-    with pytest.raises(TrapsError, match="too little memory on cpu for one prompt"):
+    named = "cpu", str(prompts[0].n_tokens)
+    with raises(TrapsError, "models.local.model.LocalModel._generate_fitting", *named):
         of.generate(prompts[:1], 6)
 
 
@@ -218,14 +220,9 @@ def test_what_answers_whole_can_be_looked_into_in_four_bits_but_for_some_modules
     assert answering.quantisation == "none"
     assert loaded_params(of)["nf4_skip"] == NF4_SKIP  # so it is in keys of steered answers and versions of states
     assert "nf4_skip" not in loaded_params(with_skip()) and loaded_params(with_skip())["quantisation"] == "nf4"
-    with pytest.raises(TrapsError, match=r"under nf4_skip beside .* \(in params or in mechanism\)"):
+    too_narrow = "model.visual.blocks.0.attn.qkv", "nf4_skip", "params", "mechanism"
+    with raises(TrapsError, "models.local.adapter._require_packable", *too_narrow):
         load_local_model(with_skip(), inside=True)
-
-
-def test_modules_too_narrow_for_four_bits_on_a_cpu_are_named() -> None:
-    pytest.importorskip("bitsandbytes")
-    with pytest.raises(TrapsError, match=r"model\.visual\.blocks\.0\.attn\.qkv first.*nf4_skip"):
-        model("qwen3-vl", quantisation="nf4")
 
 
 # --- checkpoints ------------------------------------------------------------------------------------------------------
@@ -244,10 +241,12 @@ def altered(tmp_path: Path, family: Family = "qwen3-vl") -> Path:
 
 def test_weights_that_are_not_here_say_how_to_get_them(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
-    with pytest.raises(TrapsError, match=r"hf download nobody/nothing --revision abc.*`checkpoint:`"):
+    download = "`hf download nobody/nothing --revision abc`"
+    with raises(TrapsError, "models.local.checkpoint.find_checkpoint", download, "`checkpoint:`"):
         load_local_model(entry("qwen3-vl", "nobody/nothing", revision="abc"))
-    with pytest.raises(TrapsError, match=r"config\.json is missing.*save_pretrained"):
-        load_local_model(entry("qwen3-vl", tmp_path / "nowhere"))
+    gone = tmp_path / "nowhere" / "config.json"
+    with raises(TrapsError, "models.local.checkpoint._require_whole", str(gone), "save_pretrained"):
+        load_local_model(entry("qwen3-vl", gone.parent))
 
 
 def test_a_shard_that_is_missing_is_named(tmp_path: Path) -> None:
@@ -255,7 +254,7 @@ def test_a_shard_that_is_missing_is_named(tmp_path: Path) -> None:
     (folder / "model.safetensors").unlink()
     index = {"weight_map": {"a": "model-1-of-2.safetensors", "b": "model-2-of-2.safetensors"}}
     (folder / "model.safetensors.index.json").write_text(json.dumps(index))
-    with pytest.raises(TrapsError, match=r"model-1-of-2\.safetensors is missing \(2 files are\)"):
+    with raises(TrapsError, "models.local.checkpoint._require_whole", str(folder / "model-1-of-2.safetensors")):
         load_local_model(entry("qwen3-vl", folder))
 
 
@@ -264,21 +263,21 @@ def test_a_weight_that_is_missing_is_never_left_random(tmp_path: Path) -> None:
     tensors = load_file(folder / "model.safetensors")
     del tensors["model.language_model.layers.1.mlp.up_proj.weight"]
     save_file(tensors, folder / "model.safetensors", metadata={"format": "pt"})
-    with pytest.raises(TrapsError, match=r"its files lack 1 weight, .*layers\.1\.mlp\.up_proj\.weight first"):
+    with raises(TrapsError, "models.local.adapter._load", str(folder), "layers.1.mlp.up_proj.weight"):
         load_local_model(entry("qwen3-vl", folder))
 
 
 def test_a_checkpoint_of_another_kind_is_refused(tmp_path: Path) -> None:
     folder = altered(tmp_path)
     (folder / "config.json").write_text(json.dumps({"model_type": "bert", "architectures": ["BertModel"]}))
-    with pytest.raises(TrapsError, match="cannot load it as an image-text-to-text model"):
+    with raises(TrapsError, "models.local.adapter._load", str(folder), load_transformers().__version__):
         load_local_model(entry("qwen3-vl", folder))
 
 
 def test_too_little_memory_says_how_much_is_needed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     folder = build_tiny("llava-next-video", tmp_path / "big", seed=5)
     monkeypatch.setattr("traps_pipeline.models.local.checkpoint.free_bytes", lambda device: 1000.0)
-    with pytest.raises(TrapsError, match=r"take about 0\.0 GB as float32, and 0\.0 GB are free on cpu"):
+    with raises(TrapsError, "models.local.checkpoint.require_memory", str(folder), "0.0 GB", "float32", "cpu"):
         load_local_model(entry("llava-next-video", folder))
 
 
@@ -310,7 +309,7 @@ def test_a_model_that_is_spread_over_devices_gives_the_states_and_answers_of_one
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_a_device_that_is_not_here_is_never_replaced() -> None:
-    with pytest.raises(TrapsError, match=r"device cuda: torch .* finds none"):
+    with raises(TrapsError, "models.local.adapter.require_device", "cuda", f"torch {torch.__version__}"):
         load_local_model(entry("qwen3-vl").model_copy(update={"device": "cuda"}))
 
 
@@ -319,7 +318,7 @@ def test_a_chat_template_that_loses_the_system_prompt_is_refused(tmp_path: Path)
     template = (folder / "chat_template.jinja").read_text()
     (folder / "chat_template.jinja").write_text(template.replace("in messages", "in messages[1:]"))
     of = load_local_model(entry("qwen3-vl", folder))
-    with pytest.raises(TrapsError, match="does not keep system prompt, clip and question"):
+    with raises(TrapsError, "models.local.model.LocalModel._render", str(folder), "`params.template`"):
         ask(of)
 
 
@@ -372,21 +371,24 @@ def test_another_model_of_the_library_is_one_entry_and_no_code(tmp_path: Path) -
 def test_code_in_a_checkpoint_never_runs_and_nobody_is_asked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: str
 ) -> None:
-    folder, canary, asked = tmp_path / "checkpoint", tmp_path / "canary", list[str]()
-    shutil.copytree(checkpoint(FAMILIES[0]), folder)
-    evil = f"from pathlib import Path\nPath({str(canary)!r}).touch()\nclass Evil:\n    pass\n"
-    (folder / "evil.py").write_text(evil)
+    """One file names classes of code that lies elsewhere; or all do, and their code lies beside them."""
+    folder, canary, asked = altered(tmp_path), tmp_path / "canary", list[str]()
+    code, named = (tmp_path / "elsewhere", ["auto_map", file])
+    if file == "all":
+        code, named = folder, ["custom_generate/generate.py"]
+    (code / "custom_generate").mkdir(parents=True)
+    for module in ("evil.py", "custom_generate/generate.py"):
+        (code / module).write_text(f"from pathlib import Path\nPath({str(canary)!r}).touch()\nclass Evil:\n    pass\n")
+    evil = "evil.Evil" if code == folder else f"{code}--evil.Evil"
     auto = ("AutoConfig", "AutoTokenizer", "AutoProcessor", "AutoVideoProcessor", "AutoImageProcessor")
-    classes: dict[str, Any] = dict.fromkeys((*auto, "AutoModelForImageTextToText", "AutoModel"), "evil.Evil")
-    classes["AutoTokenizer"] = ["evil.Evil", "evil.Evil"]
+    classes: dict[str, Any] = dict.fromkeys((*auto, "AutoModelForImageTextToText", "AutoModel"), evil)
+    classes["AutoTokenizer"] = [evil, evil]
     for path in folder.glob("*config.json") if file == "all" else [folder / file]:
         said = json.loads(path.read_text()) if path.exists() else {}
         said |= {"auto_map": classes, "model_type": "evil", "architectures": ["Evil"]}
         said |= {"tokenizer_class": "Evil", "processor_class": "Evil", "video_processor_type": "Evil"}
         path.write_text(json.dumps(said))
-    (folder / "custom_generate").mkdir()
-    (folder / "custom_generate" / "generate.py").write_text(evil)
     monkeypatch.setattr("builtins.input", lambda question="": asked.append(question) or "y")
-    with pytest.raises(TrapsError, match=r"checkpoint .*: it brings code of its own \(.*\).*never runs"):
-        load_local_model(entry(FAMILIES[0], folder))
+    with raises(TrapsError, "models.local.checkpoint.require_no_code", str(folder), *named):
+        load_local_model(entry("qwen3-vl", folder))
     assert asked == [] and not canary.exists()

@@ -18,10 +18,12 @@ from typing import Any
 import pytest
 import torch
 
-from tests.local_models import QUESTIONS, SIX_FRAMES, SYSTEM, checkpoint, clip, entry, model
+from tests.build.errors import raises
+from tests.local_models import FAMILIES, QUESTIONS, SIX_FRAMES, SYSTEM, checkpoint, clip, entry, model
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cli import main
+from traps_pipeline.mechanism.adapter_checks import CHECKS
 from traps_pipeline.mechanism.probing_versions import loaded_params
 from traps_pipeline.models import registry
 from traps_pipeline.models.backends import make_backend
@@ -168,9 +170,9 @@ def test_another_registry_is_named_by_a_variable(tmp_path: Path) -> None:
 
 
 def test_missing_weights_are_told_before_anything_is_asked(tmp_path: Path) -> None:
-    with pytest.raises(TrapsError, match="hf download nobody/nothing"):
+    with raises(TrapsError, "models.local.checkpoint.find_checkpoint", "`hf download nobody/nothing`"):
         make_backend(entry("qwen3-vl", "nobody/nothing"))
-    with pytest.raises(TrapsError, match=r"config\.json is missing"):
+    with raises(TrapsError, "models.local.checkpoint._require_whole", str(tmp_path / "gone" / "config.json")):
         request(entry("qwen3-vl", tmp_path / "gone"), MediaStore(tmp_path), QUESTIONS[0])
 
 
@@ -224,23 +226,23 @@ def local(params: str = PARAMS, device: str = ", device: cpu", more: str = "") -
 
 
 @pytest.mark.parametrize(
-    ("text", "complaint"),
+    ("text", "named"),
     [
-        (local(device=""), "device: backend local needs it"),
-        (local(device=", device: gpu"), r"device: String should match"),
-        (local(PARAMS.replace(", quantisation: none", "")), "params: quantisation: Field"),
-        (local(f"{PARAMS}, top_k: 5"), "params: top_k: "),
-        (local(f"{PARAMS}, temperature: 0.8"), "params: do_sample: false is greedy"),
-        (local(PARAMS.replace("false", "true")), "params: do_sample: true needs"),
-        (local(f"{PARAMS}, nf4_skip: [lm_head]"), "params: nf4_skip goes with"),
-        ("backend: reference, device: cpu, params: {strategy: oracle}", "device, mechanism, size: only backend local"),
-        (local(more=", mechanism: {nf4_skip: [lm_head]}"), "mechanism: nf4_skip goes with"),
+        (local(device=""), ["device: ", "cpu, cuda"]),
+        (local(device=", device: gpu"), ["device: String should match"]),
+        (local(PARAMS.replace(", quantisation: none", "")), ["params: quantisation: Field"]),
+        (local(f"{PARAMS}, top_k: 5"), ["params: top_k: "]),
+        (local(f"{PARAMS}, temperature: 0.8"), ["params: ", "do_sample: false", "temperature"]),
+        (local(PARAMS.replace("false", "true")), ["params: ", "do_sample: true", "temperature", "top_p"]),
+        (local(f"{PARAMS}, nf4_skip: [lm_head]"), ["params: ", "nf4_skip", "quantisation: nf4"]),
+        ("backend: reference, device: cpu, params: {strategy: oracle}", ["device, mechanism, size: ", "local"]),
+        (local(more=", mechanism: {nf4_skip: [lm_head]}"), ["mechanism: ", "nf4_skip", "quantisation: nf4"]),
     ],
 )
-def test_a_wrong_entry_is_named_with_its_field(tmp_path: Path, text: str, complaint: str) -> None:
+def test_a_wrong_entry_is_named_with_its_field(tmp_path: Path, text: str, named: list[str]) -> None:
     path = tmp_path / "models.yaml"
     path.write_text(f"models:\n  - {{id: m, {text}}}\n")
-    with pytest.raises(TrapsError, match=rf"model 1 \(m\): .*{complaint}"):
+    with raises(TrapsError, "base.yamlfile.parse_yaml_model", str(path), "model 1 (m): ", *named):
         load_models(path)
 
 
@@ -271,15 +273,14 @@ def test_the_papers_three_local_models_are_asked_as_the_paper_has_it() -> None:
 
 
 def test_the_doctor_tries_every_family_and_says_what_is_not_here(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["doctor", "--local"]) == 0
-    said = capsys.readouterr().out
+    assert main(["doctor", "--local", "--json"]) == 0
+    found = {finding["what"]: finding["detail"] for finding in json.loads(capsys.readouterr().out)}
+    checks = {f"{family}, {check.name}" for family in FAMILIES for check in CHECKS}
+    assert found.keys() == {"devices", "nf4", "checkpoints", *FAMILIES, *checks}
     for family, name in (("qwen3-vl", "Qwen3VL"), ("gemma-4", "Gemma4"), ("llava-next-video", "LlavaNextVideo")):
-        assert f"ok   {family}: {name}ForConditionalGeneration saved and reloaded, a clip answered" in said
-        states = 7 if family == "gemma-4" else 5
-        assert f"ok   {family}, states: {states} states, bit for bit" in said
-        assert f"ok   {family}, batches: equal" in said
-    for part in ("devices: torch", "nf4: ", "checkpoints: qwen3-vl-8b is"):
-        assert f"ok   {part}" in said
+        states = "7 " if family == "gemma-4" else "5 "
+        assert found[family].startswith(name) and found[f"{family}, states"].startswith(states)
+    assert found["devices"].startswith(f"torch {torch.__version__}") and "qwen3-vl-8b" in found["checkpoints"]
 
 
 def test_models_of_one_device_share_a_worker_and_each_device_has_its_own() -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.build.errors import raises
 from tests.local_models import FAMILIES, QUESTIONS, SYSTEM, Family, ask, model
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.hidden_states import Item, item_states
@@ -76,7 +77,7 @@ def test_states_are_means_over_the_part_that_the_pooling_names(family: Family) -
         found = item_states(of, item(prompt), prompt, part).raw[2]  # pyright: ignore[reportArgumentType]
         assert found == pytest.approx(own[torch.from_numpy(parts[part])].mean(dim=0).numpy(), abs=1e-5)
     if family == "llava-next-video":
-        with pytest.raises(TrapsError, match="has no stamps; choose another pooling"):
+        with raises(TrapsError, "mechanism.hidden_states._pooled_tokens", "a:b:control", "stamps"):
             item_states(of, item(prompt), prompt, "stamps")
 
 
@@ -128,14 +129,14 @@ def test_states_at_occluder_tokens_are_means_over_the_visual_tokens_that_the_occ
 def test_states_at_occluder_tokens_are_refused_where_nothing_differs_or_nothing_can_be_compared() -> None:
     of = model("qwen3-vl")
     one, other = with_occluder(of)
-    with pytest.raises(TrapsError, match=r"a:b:void: its prompt for .* has no changed; choose another pooling"):
+    with raises(TrapsError, "mechanism.hidden_states._pooled_tokens", "a:b:void", of.checkpoint.name, "changed"):
         item_states(of, changed_item(one, one), one, "changed")
     same = item_states(of, changed_item(one, one), one, "unchanged").raw
     assert (same == item_states(of, item(one), one, "visual").raw).all()
     for wrong in (item(one), changed_item(one, ask(of, QUESTIONS[1]))):
-        with pytest.raises(TrapsError, match="cannot be compared with those of the pair's other clip"):
+        with raises(TrapsError, "mechanism.hidden_states._pair_masks", wrong.item_id):
             item_states(of, wrong, one, "changed")
     llava = model("llava-next-video")
     one, other = with_occluder(llava)
-    with pytest.raises(TrapsError, match="pixels that do not come token by token"):
+    with raises(TrapsError, "mechanism.hidden_states._pair_masks", "a:b:void"):
         item_states(llava, changed_item(one, other), one, "changed")
