@@ -185,10 +185,10 @@ def test_an_object_of_an_odd_shape_is_named_in_one_sentence(content: bytes, name
 
 
 def test_what_is_no_object_is_told_apart() -> None:
-    page, stream, cut = "\n<!doctype html><h1>Sign in</h1>", 'data: {"choices": []}\n\ndata: [DONE]\n', '{"choices": [{"ind'
-    assert len({shape_of(text) for text in ("", page, stream, cut)}) == 4
-    assert "`base_url`" in shape_of(page) and "/v1" in shape_of(page)
-    for content, shape in {"": shape_of(""), page: shape_of(page), "[" * 100_000: shape_of(cut), "[1]": " list "}.items():
+    page, stream, cut = "\n<!doctype html><h1>Sign in</h1>", 'data: {"choices": []}\n\n', '{"choices": [{"ind'
+    shapes = {text: shape_of(text) for text in ("", page, stream, cut)}
+    assert len({*shapes.values()}) == 4 and "`base_url`" in shapes[page] and "/v1" in shapes[page]
+    for content, shape in (shapes | {"[" * 100_000: shapes[cut], "[1]": " list "}).items():
         with raises(OddShapeError, "models.dialects.parse_body", shape):
             parse_body(content.encode())
 
