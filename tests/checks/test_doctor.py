@@ -74,7 +74,7 @@ def test_a_damaged_note_file_and_history_are_named_and_what_killed_runs_left_is_
         return main(["doctor", "--verify", "--workspace", str(workspace.root)]), capsys.readouterr().out
 
     code, told = verified()
-    assert code == 0 and "1 file of killed runs removed" in told, told
+    assert code == 0 and "unfinished: 1 " in told, told
     assert (old.exists(), young.exists()) == (False, True)
     states = workspace.root / "states" / "m" / "standard" / "occlusion" / "shard-00000.parquet"
     write_sealed(states, pa.table({"item_id": ["a" * 300]}), {})

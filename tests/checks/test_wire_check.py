@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -10,9 +11,10 @@ from typing import Any
 
 import pytest
 
+from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.checks import wire_check
-from traps_pipeline.checks.loopback import render
+from traps_pipeline.checks.loopback import PLACEHOLDER_KEY, render
 from traps_pipeline.checks.wire_body import ClipPart, WireBody, read_body
 from traps_pipeline.checks.wire_check import check_named, examine, requests_of
 from traps_pipeline.cli import main
@@ -69,17 +71,17 @@ def test_an_entry_sends_what_it_declares(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "shown"),
     [
-        ("qwen3-vl-8b", "16 frames of 480 x 360 at 0 0.3 0.7 ... 4.9 s"),
-        ("gemma-4-e4b", "10 frames of 480 x 360 at 0 0.5 1 ... 4.5 s"),
-        ("llava-next-video-7b", "10 frames of 336 x 336 at 0 0.5 1 ... 4.5 s"),
-        ("gemini-2.5-pro", "/v1beta/models/gemini-2.5-pro:generateContent  video 25 frames"),
-        ("qwen3-vl-instruct", "/compatible-mode/v1/chat/completions  video 25 frames"),
-        ("gpt-5-nr", "/v1/responses  images 25 frames"),
+        ("qwen3-vl-8b", ["local  16 ", "480 x 360", "0 0.3 0.7 ... 4.9 s"]),
+        ("gemma-4-e4b", ["local  10 ", "480 x 360", "0 0.5 1 ... 4.5 s"]),
+        ("llava-next-video-7b", ["local  10 ", "336 x 336", "0 0.5 1 ... 4.5 s"]),
+        ("gemini-2.5-pro", ["/v1beta/models/gemini-2.5-pro:generateContent  video 25 "]),
+        ("qwen3-vl-instruct", ["/compatible-mode/v1/chat/completions  video 25 "]),
+        ("gpt-5-nr", ["/v1/responses  images 25 "]),
     ],
 )
-def test_the_frames_are_those_of_the_protocol(name: str, shown: str) -> None:
+def test_the_frames_are_those_of_the_protocol(name: str, shown: list[str]) -> None:
     (checked,) = check_named([name])
-    assert shown in checked.line
+    assert all(part in checked.line for part in shown), checked.line
 
 
 @pytest.mark.parametrize(
@@ -106,12 +108,19 @@ def test_the_clip_in_the_body_is_the_one_that_was_prepared() -> None:
 # --- what must not pass -----------------------------------------------------------------------------------------------
 
 
+def place_and_figures(problem: str) -> tuple[str, list[str]]:
+    """What a problem begins with, and the numbers that it names."""
+    place, _, rest = problem.partition(": ")
+    return place, re.findall(r"\d+(?:\.\d+)?", rest)
+
+
 def test_gemini_drops_a_video_url_without_a_word(monkeypatch: pytest.MonkeyPatch) -> None:
     def as_video_url(media: Media, _: str) -> list[dict[str, Any]]:
         return [{"type": "video_url", "video_url": {"url": data_uris(media)[0]}, "fps": 5}]
 
     monkeypatch.setattr(api, "media_parts", as_video_url)
-    assert examine(get_model("gemini-2.5-pro")).problems == ["media: 0 of 1 videos arrive"]
+    (problem,) = examine(get_model("gemini-2.5-pro")).problems
+    assert place_and_figures(problem) == ("media", ["0", "1"])
 
 
 @pytest.mark.parametrize("name", ["gemini-3.1-flash-lite", "qwen3-vl-think"])
@@ -125,66 +134,67 @@ def test_another_rate_than_the_clips_is_found(name: str, monkeypatch: pytest.Mon
         return [part | {"fps": 1}]
 
     monkeypatch.setattr(api, "media_parts", at_one_fps)
-    assert examine(get_model(name)).problems == ["media.fps: 5 is declared, 1 arrives"]
+    (problem,) = examine(get_model(name)).problems
+    assert place_and_figures(problem) == ("media.fps", ["5", "1"])
 
 
 def test_anything_beside_clip_and_question_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     honest = api.media_parts
     hint = {"type": "text", "text": "These are 25 frames."}
     monkeypatch.setattr(api, "media_parts", lambda media, route: [*honest(media, route), hint])
-    assert examine(get_model("gpt-5-nr")).problems == ["something other than clip and question arrives"]
+    assert len(examine(get_model("gpt-5-nr")).problems) == 1
 
 
 @pytest.mark.parametrize(
-    ("entry", "complaint"),
+    ("entry", "names"),
     [
         pytest.param(
             altered("gemini-2.5-pro", media=MediaSpec(profile="video", fps=1)),
-            "media: {5} frames of a 5 s clip are sent, the protocol has 25",
+            ["media: {5} ", " 25 "],
             id="one frame a second",
         ),
         pytest.param(
             altered("gpt-5-high", {"temperature": 0.8}),
-            "gpt-5 doesn't support temperature=0.8 while reasoning is active",
+            ["gpt-5 doesn't support temperature=0.8 while reasoning is active"],  # in the words of the library
             id="a parameter that the model refuses is not dropped silently",
         ),
         pytest.param(
             altered("gemini-3.1-pro", {"temperature": None}),
-            "generationConfig.temperature: 1.0 is sent and not declared",
+            ["generationConfig.temperature: 1.0 "],
             id="a default of the library",
         ),
         pytest.param(
-            altered("qwen3-vl-think", {"note": "placeholder-of-a-key"}),
-            "the API key is in the body or the address",
-            id="a key in the body",
-        ),
-        pytest.param(
             altered("qwen3-vl-think", {"response_format": answer_object(FIELDS["json"])}),
-            "standard: structured output is for regimes that ask for an object",
+            ["standard: ", "json_schema"],
             id="a schema in every regime",
         ),
     ],
 )
-def test_an_altered_entry_is_told_what_is_wrong(entry: ModelEntry, complaint: str) -> None:
+def test_an_altered_entry_is_told_what_is_wrong(entry: ModelEntry, names: list[str]) -> None:
     problems = examine(entry).problems
-    assert any(complaint in problem for problem in problems), problems
+    assert any(all(name in problem for name in names) for problem in problems), problems
+
+
+def test_a_key_in_the_body_is_found() -> None:
+    assert examine(altered("qwen3-vl-think", {"note": "a word"})).problems == []
+    assert len(examine(altered("qwen3-vl-think", {"note": PLACEHOLDER_KEY})).problems) == 1
 
 
 @pytest.mark.parametrize(
-    ("line", "complaint"),
+    ("line", "names"),
     [
-        ("waivers: {temperature: refused}", r"params\.top_p is not sent, the protocol has 0\.95: .* under waivers"),
-        ("params: {temperature: 0.2}, waivers: {top_p: refused, max_tokens: long}", r"params\.temperature is 0\.2"),
-        ("params: {temperature: 0.8}, waivers: {temperature: x, top_p: x}", r"waivers\.temperature: is sent as"),
+        ("waivers: {temperature: refused}", ["params.top_p ", " 0.95", "waivers"]),
+        ("params: {temperature: 0.2}, waivers: {top_p: refused, max_tokens: long}", ["params.temperature ", " 0.2"]),
+        ("params: {temperature: 0.8}, waivers: {temperature: x, top_p: x}", ["waivers.temperature: "]),
     ],
 )
-def test_a_missing_waiver_names_entry_and_field(tmp_path: Path, line: str, complaint: str) -> None:
+def test_a_missing_waiver_names_entry_and_field(tmp_path: Path, line: str, names: list[str]) -> None:
     path = tmp_path / "models.yaml"
     media = "media: {profile: images, fps: 5}"
     path.write_text(
         f"models:\n  - {{id: mine, backend: api, account: openai, provider_id: openai/gpt-5, {media}, {line}}}\n"
     )
-    with pytest.raises(TrapsError, match=rf"models\.yaml: model 1 \(mine\): .*{complaint}"):
+    with raises(TrapsError, "base.yamlfile.parse_yaml_model", "models.yaml: ", " 1 (mine): ", *names):
         load_models(path)
 
 
@@ -221,7 +231,6 @@ def test_the_command_needs_neither_keys_nor_a_network() -> None:
     assert done.returncode == 0, done.stdout + done.stderr
     checked = ["gemini-2.5-pro", "qwen3-vl-think", "gpt-5-nr", "judge-claude-opus-4.6"]
     assert [line.split()[0] for line in lines[:-1]] == checked
-    assert lines[-1] == "every entry is sent as declared"
     assert done.stderr == ""
 
 
@@ -231,11 +240,10 @@ def test_the_command_fails_where_an_entry_does(
     broken = altered("gpt-5-nr", {"temperature": 0.8})
     monkeypatch.setattr(wire_check, "participants", lambda: {"gpt-5-nr": broken})
     assert main(["models", "check"]) == 1
-    printed = capsys.readouterr().out.splitlines()
-    assert printed[0] == f"{'gpt-5-nr':<24} nothing caught"
-    assert printed[1].startswith("    0 requests were sent")
-    assert printed[-1] == "1 entry sent otherwise than declared"
-    assert main(["models", "check", "gpt-6"]) == 1
+    entry, problem, *_, summary = capsys.readouterr().out.splitlines()
+    assert entry.startswith("gpt-5-nr ") and problem.startswith("    0 ") and summary.startswith("1 ")
+    with raises(TrapsError, "checks.wire_check.check_named", "gpt-6"):
+        next(check_named(["gpt-6"]))
 
 
 def test_a_panel_is_checked_by_its_name(capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,6 +8,7 @@ import base64
 import datetime
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +20,12 @@ from tests.providers.server import Provider
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.checks import loopback
 from traps_pipeline.checks.live_check import requests_of
+from traps_pipeline.checks.wire_body import Api
 from traps_pipeline.exchange import provider_batch
 from traps_pipeline.exchange.provider_batch import export_batches, failures, is_batch, outcomes_of, read_batch
 from traps_pipeline.models import api
 from traps_pipeline.models.registry import PROTOCOL, Account, Entry, ModelEntry, Prices
-from traps_pipeline.models.request import Request
+from traps_pipeline.models.request import Outcome, Request
 
 PRICES = Prices(input=1, output=10, as_of=datetime.date(2026, 11, 1))
 Entries = Callable[[str], Entry]
@@ -87,28 +89,6 @@ def test_media_by_reference_are_the_media_that_are_inline(kind: str, entry_at: E
     assert referring.stat().st_size < inline.stat().st_size / 2 and "base64" not in referring.read_text()
 
 
-@pytest.mark.slow
-def test_errors_and_expiries_are_typed_and_a_partial_batch_leaves_the_rest_missing(
-    entry_at: Entries, tmp_path: Path
-) -> None:
-    entry = entry_at("openai")
-    wanted = by_key(entry)
-    first, second, _ = wanted
-    results = tmp_path / "results.jsonl"
-    refused = {"status_code": 400, "body": {"error": {"message": "no", "type": "invalid_request_error"}}}
-    lines = [
-        {"custom_id": first, "response": refused, "error": None},
-        {"custom_id": second, "response": None, "error": {"code": "batch_expired", "message": "too late"}},
-    ]
-    results.write_text("".join(json.dumps(line) + "\n" for line in lines))
-    found = [*outcomes_of({"m": entry}, wanted, read_batch(results, wanted))]
-    assert [(request.key, outcome.kind, outcome.error) for request, outcome in found] == [
-        (first, "error", "http_400"),
-        (second, "error", "batch_expired"),
-    ]
-    assert failures([outcome for _, outcome in found]) == "1 batch_expired, 1 http_400"
-
-
 @pytest.mark.parametrize(
     "line", [{"custom_id": "other", "response": {"status_code": 200, "body": {}}}, {"custom_id": "k"}, {"response": {}}]
 )
@@ -138,6 +118,8 @@ def message_line(kind: str, **more: Any) -> dict[str, Any]:
     ("route", "line", "error"),
     [
         ("openai", chat_line(500, {"error": BODY}), "server_error"),
+        ("openai", chat_line(400, {"error": BODY}), "http_400"),
+        ("openai", chat_line(None, error={"code": "batch_expired", "message": "x"}), "batch_expired"),
         ("openai", chat_line(400, error={"error": BODY}), "http_400"),  # vLLM, and an earlier one
         ("openai", chat_line(400, error={"object": "error"} | BODY), "http_400"),
         ("gemini", {"key": "k", "error": {"code": 503, "status": "UNAVAILABLE", "message": "x"}}, "batch_503"),
@@ -146,31 +128,32 @@ def message_line(kind: str, **more: Any) -> dict[str, Any]:
         ("anthropic", message_line("errored", error={"type": "error"}), "batch_errored"),
     ],
 )
-def test_failures_of_every_form_are_outcomes_of_their_kind(
+def test_failures_of_every_form_are_outcomes_of_their_kind_and_a_partial_batch_leaves_the_rest_missing(
     route: str, line: dict[str, Any], error: str, entry_at: Entries, tmp_path: Path
 ) -> None:
     (tmp_path / "results.jsonl").write_text(json.dumps(line) + "\n")
     entry = entry_at(route)
-    wanted = {"k": Request("m", f"{route}/m", dict(entry.params), "Look.", "What?", {})}
+    request = Request("m", f"{route}/m", dict(entry.params), "Look.", "What?", {})
+    wanted = {"k": request, "missing": replace(request, user="Where?")}
     assert is_batch(tmp_path / "results.jsonl")
-    ((_, outcome),) = outcomes_of({"m": entry}, wanted, read_batch(tmp_path / "results.jsonl", wanted))
-    assert (outcome.kind, outcome.error) == ("error", error)
+    ((found, outcome),) = outcomes_of({"m": entry}, wanted, read_batch(tmp_path / "results.jsonl", wanted))
+    assert (found, outcome.kind, outcome.error) == (request, "error", error)
+
+
+def test_failures_are_counted_by_their_kind() -> None:
+    outcomes = [Outcome("error", error=error) for error in ("http_400", "batch_expired", "http_400")]
+    assert failures([*outcomes, Outcome("answer", "left")]) == "1 batch_expired, 2 http_400"
 
 
 def test_files_are_split_by_number_and_by_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(provider_batch, "LIMITS", {"chat": (3, 10_000), "anthropic": (2, 10_000)})
-    part = provider_batch._Part(tmp_path, "m")
-    for k in range(7):
-        part.add("chat", {"custom_id": str(k), "body": {}})
-    assert [len(file.read_text().splitlines()) for file in part.written()] == [3, 3, 1]
-    monkeypatch.setattr(provider_batch, "LIMITS", {"chat": (100, 250)})
-    part = provider_batch._Part(tmp_path, "n")
-    for k in range(4):
-        part.add("chat", {"custom_id": str(k), "body": "x" * 100})
-    assert [len(file.read_text().splitlines()) for file in part.written()] == [1, 1, 1, 1]
-    monkeypatch.setattr(provider_batch, "LIMITS", {"anthropic": (2, 10_000)})
-    part = provider_batch._Part(tmp_path, "o")
-    for k in range(3):
-        part.add("anthropic", {"custom_id": str(k), "params": {}})
-    first, second = (json.loads(file.read_text())["requests"] for file in part.written())
+    def written(name: str, form: Api, limits: tuple[int, int], lines: int, **content: Any) -> list[str]:
+        monkeypatch.setattr(provider_batch, "LIMITS", {form: limits})
+        part = provider_batch._Part(tmp_path, name)
+        for k in range(lines):
+            part.add(form, {"custom_id": str(k)} | content)
+        return [file.read_text() for file in part.written()]
+
+    assert [len(text.splitlines()) for text in written("m", "chat", (3, 10_000), 7, body={})] == [3, 3, 1]
+    assert [len(text.splitlines()) for text in written("n", "chat", (100, 250), 4, body="x" * 100)] == [1, 1, 1, 1]
+    first, second = (json.loads(text)["requests"] for text in written("o", "anthropic", (2, 10_000), 3, params={}))
     assert [one["custom_id"] for one in (*first, *second)] == ["0", "1", "2"]

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.build.errors import raises
 from tests.build.ledger import paid, write
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.account_budget import AccountBudget
@@ -75,7 +76,7 @@ def test_a_damaged_file_stops_paid_calls_and_a_lost_one_is_filled_again(folder: 
     path = folder / "spent.json"
     path.write_bytes(path.read_bytes().replace(b"1.0", b"0.1"))
     for spend in (lambda: budget.reserve(0.1), lambda: AccountBudget("openai", folder, "b")):
-        with pytest.raises(TrapsError, match=r"spent\.json: is not what was written.*remove the file"):
+        with raises(TrapsError, "models.account_budget.AccountBudget._read", str(path)):
             spend()
     path.unlink()
     budget.begin(known_usd=1.0)
@@ -96,7 +97,8 @@ def test_a_second_study_stops_where_the_first_has_spent_the_accounts_money(tmp_p
         asyncio.run(pay(one, 6))
         with open_budget(study(tmp_path / "two", folder), [entry]) as two:  # at the same time
             asyncio.run(pay(two, 5))
-            with pytest.raises(BudgetReached, match=r"account openai is reached: 2 studies have spent \$9\.00 of \$10"):
+            names = "openai", "$9.00", "$10.00", str(folder / "budget.yaml")
+            with raises(BudgetReached, "models.budget.Budget.reserve", *names):
                 asyncio.run(pay(two, 2))
             asyncio.run(two.reserve("gemini-2.5-pro", 2))  # another account
 
@@ -113,11 +115,10 @@ def test_money_spent_before_a_study_named_the_account_counts(tmp_path: Path, fol
 def test_an_account_without_a_file_or_a_name_is_refused(tmp_path: Path) -> None:
     entry = get_model("gpt-5-mini")
     nobody = Workspace.create(tmp_path / "a", Study(budget_usd=5, account_budgets={"opnai": "x"}))
-    with pytest.raises(TrapsError, match="account_budgets names opnai, no account"), open_budget(nobody, [entry]):
+    names = "study.yaml", "account_budgets", "opnai"
+    with raises(TrapsError, "models.spending._check_names", *names), open_budget(nobody, [entry]):
         pass
     missing = study(tmp_path / "b", tmp_path / "nowhere")
-    with (
-        pytest.raises(TrapsError, match=r"nowhere/budget\.yaml: no such file; write `usd: 100`"),
-        open_budget(missing, [entry]),
-    ):
+    names = str(tmp_path / "nowhere" / "budget.yaml"), "`usd: 100`", "study.yaml"
+    with raises(TrapsError, "models.account_budget.AccountBudget.__init__", *names), open_budget(missing, [entry]):
         pass

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from tests.build.errors import raises
-from traps_pipeline.models.dialects import OddShapeError, Reply, parse_body, read_reply
+from traps_pipeline.models.dialects import OddShapeError, Reply, parse_body, read_reply, shape_of
 
 LEFT = "The ball rolls to the left."
 ROUTES = {
@@ -170,24 +170,27 @@ def test_a_response_is_read_as_one_where_the_route_says_chat() -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "shape"),
+    ("content", "names"),
     [
-        (b"", "an empty body"),
-        (b"\n<!doctype html><h1>Sign in</h1>", "a page of HTML"),
-        (b'data: {"choices": []}\n\ndata: [DONE]\n', "a stream of events"),
-        (b'{"choices": [{"ind', "a text that breaks off or is no JSON"),
-        (b"[" * 100_000, "a text that breaks off or is no JSON"),
-        (b"[1]", "a JSON list and no object"),
-        (b"{}", "OpenAI's chat API: it has no list `choices` (it holds nothing)"),
-        (b'{"model": "m", "message": {"content": "left"}, "done": true}', "(it holds model, message, done)"),
-        (json.dumps(chat(content={"text": "left"})).encode(), "neither a text nor a list of parts but dict"),
-        (json.dumps(chat(content=["left"])).encode(), "a part of its content is no object but str"),
+        (b"{}", ["OpenAI's chat API", "`choices`"]),
+        (b'{"model": "m", "message": {"content": "left"}, "done": true}', ["`choices`", "model, message, done"]),
+        (json.dumps(chat(content={"text": "left"})).encode(), [" dict "]),
+        (json.dumps(chat(content=["left"])).encode(), [" str "]),
     ],
 )
-def test_an_odd_shape_is_named_in_one_sentence(content: bytes, shape: str) -> None:
-    with pytest.raises(OddShapeError) as raised:
+def test_an_object_of_an_odd_shape_is_named_in_one_sentence(content: bytes, names: list[str]) -> None:
+    with raises(OddShapeError, "models.dialects.read_reply", *names) as raised:
         read_reply(parse_body(content), "openai/m")
-    assert shape in str(raised.value) and "\n" not in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_what_is_no_object_is_told_apart() -> None:
+    page, stream, cut = "\n<!doctype html><h1>Sign in</h1>", 'data: {"choices": []}\n\n', '{"choices": [{"ind'
+    shapes = {text: shape_of(text) for text in ("", page, stream, cut)}
+    assert len({*shapes.values()}) == 4 and "`base_url`" in shapes[page] and "/v1" in shapes[page]
+    for content, shape in (shapes | {"[" * 100_000: shapes[cut], "[1]": " list "}).items():
+        with raises(OddShapeError, "models.dialects.parse_body", shape):
+            parse_body(content.encode())
 
 
 def test_bytes_that_are_no_text_lose_no_answer() -> None:

@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 
 from tests.build.calls import entry_of
+from tests.build.errors import raises
 from tests.build.ledger import write
+from tests.conftest import ROOT, Checkout
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cli import main
 from traps_pipeline.ledger.money import Money, Releasable
 from traps_pipeline.models.account_budget import AccountBudget
 from traps_pipeline.models.budget import BudgetReached
@@ -70,9 +71,9 @@ def test_what_was_in_flight_or_failed_is_released_with_its_reason_and_the_study_
 
 @pytest.mark.parametrize("usd", [4.1, 0.0, -1.0, float("nan"), float("inf")])
 def test_no_more_is_released_than_is_booked_for_calls_that_may_never_have_left(blocked: Workspace, usd: float) -> None:
-    with pytest.raises(TrapsError, match=r"m: \$.* cannot be released: \$1.0000 are booked for calls in flight"):
+    with raises(TrapsError, "ledger.money.Money.release", "m: $", "$1.0000", "$3.0000", "--usd"):
         release(blocked, "m", usd, "why")
-    with pytest.raises(TrapsError, match=r"nobody: \$0.0000 cannot be released"):
+    with raises(TrapsError, "ledger.money.Money.release", "nobody: $0.0000"):
         release(blocked, "nobody", None, "why")
     assert not room_for(blocked, 0.5)
 
@@ -86,13 +87,10 @@ def test_an_account_that_several_studies_share_gets_the_money_back_too(blocked: 
     assert AccountBudget("openai", tmp_path / "openai", "x").spent_usd == {blocked.study.name: 0.0}
 
 
-def test_the_command_lists_and_releases_and_wants_a_reason(
-    blocked: Workspace, capsys: pytest.CaptureFixture[str]
-) -> None:
-    command = ["study", "release-money", "--workspace", str(blocked.root)]
-    assert main(command) == 0
-    assert capsys.readouterr().out.splitlines()[1].split() == ["m", "1.0000", "3.0000"]
-    assert main([*command, "--participant", "m", "--all-in-flight"]) == 1
-    assert "the reason with --why" in capsys.readouterr().err
-    assert main([*command, "--participant", "m", "--all-in-flight", "--why", "killed"]) == 0
-    assert "$1.0000 of m are released" in capsys.readouterr().out
+def test_the_command_lists_and_releases_and_wants_a_reason(blocked: Workspace) -> None:
+    study, command = Checkout(ROOT, blocked.root), ("study", "release-money")
+    assert study.traps(*command).ok().out.splitlines()[1].split() == ["m", "1.0000", "3.0000"]
+    refused = study.traps(*command, "--participant", "m", "--all-in-flight")
+    assert (refused.code, refused.raised) == (1, "cli.ledger_commands.release") and "--why" in refused.err
+    assert "$1.0000" in study.traps(*command, "--participant", "m", "--all-in-flight", "--why", "killed").ok().out
+    assert releasable(blocked) == {"m": Releasable(in_flight=0.0, failed=3.0)}

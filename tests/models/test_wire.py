@@ -59,13 +59,13 @@ def call(base_url: str, timeout_s: float = LONG_S, **limits: int) -> tuple[Outco
     return asyncio.run(asking(base_url, budget, timeout_s, **limits)), budget.spent_usd
 
 
-def unsent(capsys: pytest.CaptureFixture[str], base_url: str, timeout_s: float = LONG_S) -> str:
-    """What is said of a call that never left; it cost nothing, and its row says no cost."""
+def unsent(capsys: pytest.CaptureFixture[str], base_url: str, *names: str, timeout_s: float = LONG_S) -> str:
+    """A call that never left cost nothing, its row says no cost, and what is said of it holds these names."""
     with progress.use_progress(progress.Progress()):
         outcome, booked_usd = call(base_url, timeout_s)
     assert (outcome, booked_usd) == (Outcome("error", error="unreachable"), 0.0)
     said = capsys.readouterr().err
-    assert SECRET not in said
+    assert SECRET not in said and all(name in said for name in names), said
     return said
 
 
@@ -78,9 +78,9 @@ def test_a_refused_connection_a_name_that_is_none_and_a_scheme_that_is_none_cost
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     port = closed_port()
-    assert f"nothing was sent to 127.0.0.1:{port}: Connection refused" in unsent(capsys, f"http://127.0.0.1:{port}/v1")
-    assert "nothing was sent to no-such-host.invalid:80: " in unsent(capsys, "http://no-such-host.invalid/v1")
-    assert "htp:// is no scheme of HTTP; write http://" in unsent(capsys, f"htp://127.0.0.1:{port}/v1")
+    unsent(capsys, f"http://127.0.0.1:{port}/v1", f"127.0.0.1:{port}", "Connection refused")
+    unsent(capsys, "http://no-such-host.invalid/v1", "no-such-host.invalid:80")
+    unsent(capsys, f"htp://127.0.0.1:{port}/v1", "htp://", "http://", "https://")
 
 
 @pytest.mark.parametrize("variable", ["http_proxy", "ALL_PROXY"])
@@ -89,9 +89,8 @@ def test_a_dead_proxy_costs_nothing_and_is_named_by_its_variable_without_its_pas
 ) -> None:
     proxy = f"127.0.0.1:{closed_port()}"
     environment.setenv(variable, f"http://me:passw0rd@{proxy}")
-    said = unsent(capsys, "http://provider.invalid/v1")
-    assert f"to provider.invalid:80 through the proxy http://{proxy} of {variable}: Connection refused" in said
-    assert "passw0rd" not in said
+    names = "provider.invalid:80", f"http://{proxy}", variable, "Connection refused"
+    assert "passw0rd" not in unsent(capsys, "http://provider.invalid/v1", *names)
 
 
 def test_what_reached_only_a_proxy_that_makes_no_tunnel_costs_nothing(
@@ -99,8 +98,7 @@ def test_what_reached_only_a_proxy_that_makes_no_tunnel_costs_nothing(
 ) -> None:
     with answering(407) as proxy:
         environment.setenv("HTTPS_PROXY", f"http://127.0.0.1:{proxy.port}")
-        said = unsent(capsys, "https://provider.invalid/v1")
-    assert "of HTTPS_PROXY: the proxy answered" in said and "407" in said
+        unsent(capsys, "https://provider.invalid/v1", "HTTPS_PROXY", " 407 ")
     assert {*proxy.requests} == {"CONNECT provider.invalid:443"}
 
 
@@ -116,9 +114,7 @@ def test_a_socks_proxy_costs_nothing_and_is_named(
     environment: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     environment.setenv("ALL_PROXY", "socks5://127.0.0.1:9")
-    assert "ALL_PROXY names the proxy socks5://127.0.0.1:9, and calls go" in unsent(
-        capsys, "http://provider.invalid/v1"
-    )
+    unsent(capsys, "http://provider.invalid/v1", "ALL_PROXY", "socks5://127.0.0.1:9", "NO_PROXY")
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost"])
@@ -141,10 +137,9 @@ def test_a_certificate_that_nobody_trusts_and_one_that_is_gone_cost_nothing(
     tls, _ = self_signed(tmp_path)
     with answering(200, body().encode(), tls=tls) as provider:
         address = f"https://localhost:{provider.port}/v1"
-        said = unsent(capsys, address)
-        assert "its certificate is not trusted (self-signed certificate): have SSL_CERT_FILE name" in said
+        unsent(capsys, address, "(self-signed certificate)", "SSL_CERT_FILE")
         environment.setenv("SSL_CERT_FILE", "/nonexistent.pem")
-        assert "SSL_CERT_FILE names the file /nonexistent.pem, which is not there" in unsent(capsys, address)
+        unsent(capsys, address, "SSL_CERT_FILE", "/nonexistent.pem")
     assert provider.requests == []
 
 
@@ -157,8 +152,8 @@ def test_a_certificate_that_a_variable_names_is_trusted(environment: pytest.Monk
 
 def test_https_to_a_plain_port_costs_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     with answering(200, body().encode()) as provider:
-        said = unsent(capsys, f"https://127.0.0.1:{provider.port}/v1")
-    assert "TLS failed" in said and "write http://" in said and provider.requests == []
+        unsent(capsys, f"https://127.0.0.1:{provider.port}/v1", "http://")
+    assert provider.requests == []
 
 
 @pytest.mark.parametrize("key", [SECRET + "\nX-Evil: 1", SECRET + "é"])
@@ -301,15 +296,16 @@ def test_a_compressed_answer_is_read_with_all_its_members(encoding: str, content
     assert outcome and (outcome.kind, outcome.text) == ("answer", "The answer is: left.")
 
 
-@pytest.mark.parametrize("content", [gzip.compress(ONE + TWO)[:-8], gzip.compress(ONE + TWO + b" " * 2**24)])
+@pytest.mark.parametrize(
+    ("content", "is_bomb"), [(gzip.compress(ONE + TWO)[:-8], False), (gzip.compress(ONE + TWO + b" " * 2**24), True)]
+)
 def test_a_compressed_answer_that_breaks_off_or_is_a_bomb_is_no_answer(
-    content: bytes, capsys: pytest.CaptureFixture[str]
+    content: bytes, is_bomb: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with answering(200, content, {"content-encoding": "gzip"}) as server, progress.use_progress(progress.Progress()):
         outcome, booked_usd = call(f"http://127.0.0.1:{server.port}/v1")
     assert outcome and (outcome.kind, outcome.text) == ("error", None) and booked_usd > 0.0
-    said = capsys.readouterr().err
-    assert "the compressed answer breaks off" in said or "is larger than 16777216 bytes" in said
+    assert ("16777216" in capsys.readouterr().err) == is_bomb
 
 
 @contextmanager

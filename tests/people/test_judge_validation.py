@@ -12,13 +12,21 @@ import pytest
 from sklearn.metrics import accuracy_score, cohen_kappa_score, precision_recall_fscore_support
 from statsmodels.stats.inter_rater import cohens_kappa
 
+from tests.build.errors import raises
 from tests.build.labels import GOOD, HEAD, MODEL, labelled_study, written
+from tests.conftest import ROOT, Checkout
 from tests.judging.conftest import answered_study
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cli import main
 from traps_pipeline.judging.judging_rows import CONFABULATION, JUDGE_VALIDATION
 from traps_pipeline.models.answer_rows import RESPONSES
-from traps_pipeline.people.judge_validation import HumanLabels, compare, is_degenerate, read_labels
+from traps_pipeline.people.judge_validation import (
+    HumanLabels,
+    annotation_sheet,
+    compare,
+    is_degenerate,
+    read_labels,
+    validate,
+)
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.ratings import AXES
 from traps_pipeline.storage.benchmark_tables import ITEMS
@@ -107,51 +115,48 @@ def test_labels_are_read_whatever_their_words_their_order_and_the_other_columns(
 
 
 @pytest.mark.parametrize(
-    ("lines", "complaint"),
+    ("lines", "by", "names"),
     [
-        (["annotator,sample_id", "ann,s1"], "labels.csv:1: column hallucinated_premise, invalid_inference"),
-        ([HEAD, *GOOD[:3], "bob,s2,1,0,2,1"], "labels.csv:5: epistemic_surrender is '2'; write 1 or 0"),
-        ([HEAD, *GOOD[:3], "bob,s2,1,0,1"], "labels.csv:5: doubt_in_reasoning is ''"),
-        ([HEAD, *GOOD[:3], "bob,s9,1,0,1,1"], "labels.csv:5: sample_id 's9' is not a failure"),
-        ([HEAD, *GOOD[:3], ",s2,1,0,1,1"], "labels.csv:5: annotator is empty"),
-        ([HEAD, *GOOD, "bob,s2,0,0,0,0"], "labels.csv:6: bob has already labelled s2 on line 5"),
-        ([HEAD, *GOOD[:3]], "labels.csv:3: only ann has labelled s2; both annotators must"),
-        ([HEAD, *GOOD[:2]], "has 1 annotator (ann); it needs exactly two"),
-        ([HEAD, *GOOD, "cy,s1,1,1,1,1"], "has 3 annotators (ann, bob, cy)"),
-        ([HEAD], "has 0 annotators (none)"),
+        (["annotator,sample_id", "ann,s1"], "_lines", ["labels.csv:1: ", "hallucinated_premise, invalid_inference"]),
+        ([HEAD, *GOOD[:3], "bob,s2,1,0,2,1"], "_refuse", ["labels.csv:5: epistemic_surrender ", "'2'"]),
+        ([HEAD, *GOOD[:3], "bob,s2,1,0,1"], "_refuse", ["labels.csv:5: doubt_in_reasoning ", "''"]),
+        ([HEAD, *GOOD[:3], "bob,s9,1,0,1,1"], "_refuse", ["labels.csv:5: sample_id 's9'"]),
+        ([HEAD, *GOOD[:3], ",s2,1,0,1,1"], "_refuse", ["labels.csv:5: annotator "]),
+        ([HEAD, *GOOD, "bob,s2,0,0,0,0"], "_refuse", ["labels.csv:6: bob ", " s2 ", " 5"]),
+        ([HEAD, *GOOD[:3]], "_refuse", ["labels.csv:3: ", " ann ", " s2"]),
+        ([HEAD, *GOOD[:2]], "_pair_labels", ["labels.csv: ", " 1 ", "(ann)"]),
+        ([HEAD, *GOOD, "cy,s1,1,1,1,1"], "_pair_labels", ["labels.csv: ", " 3 ", "(ann, bob, cy)"]),
+        ([HEAD], "_pair_labels", ["labels.csv: ", " 0 "]),
     ],
 )
-def test_a_wrong_label_file_is_answered_with_line_and_column(tmp_path: Path, lines: list[str], complaint: str) -> None:
-    with pytest.raises(TrapsError) as raised:
-        read_labels(written(tmp_path, *lines), ["s1", "s2"])
-    assert complaint in str(raised.value)
-
-
-def test_a_sheet_is_written_filled_in_and_compared_by_the_commands(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_a_wrong_label_file_is_answered_with_line_and_column(
+    tmp_path: Path, lines: list[str], by: str, names: list[str]
 ) -> None:
+    with raises(TrapsError, f"people.judge_validation.{by}", *names) as raised:
+        read_labels(written(tmp_path, *lines), ["s1", "s2"])
+    assert "\n" not in str(raised.value)
+
+
+def test_a_sheet_is_written_filled_in_and_compared_by_the_commands(tmp_path: Path) -> None:
     texts = ["It goes left.", "=HYPERLINK(1)", 'He said "left",\nthen stopped.', "Hm.<think>Left."]
     workspace = labelled_study(tmp_path / "study", texts)
-    sheet, filled = tmp_path / "sheet.csv", tmp_path / "filled.csv"
-    at = ("--workspace", str(workspace.root))
-    assert main(["people", "sheet", str(sheet), *at]) == 0
-    assert "4 failures in" in capsys.readouterr().out
+    sheet, filled, study = tmp_path / "sheet.csv", tmp_path / "filled.csv", Checkout(ROOT, workspace.root)
+    assert str(sheet) in study.traps("people", "sheet", sheet).ok().out
     rows = list(csv.DictReader(sheet.open(newline="")))
+    assert len(rows) == 4
     assert MODEL not in sheet.read_text() and "chaotic" not in sheet.read_text()
     assert {row["response"] for row in rows} == {"It goes left.", "'=HYPERLINK(1)", texts[2], "Left."}
     assert {row["reasoning_trace"] for row in rows} == {""}  # the judge saw none
-    assert main(["people", "sheet", str(sheet), *at]) == 1  # it may hold labels by now
-    assert "exists already" in capsys.readouterr().err
-
+    refused = study.traps("people", "sheet", sheet)  # it may hold labels by now
+    assert (refused.code, refused.raised) == (1, "people.judge_validation.write_sheet") and str(sheet) in refused.err
     with filled.open("w", newline="") as stream:
         writer = csv.DictWriter(stream, list(rows[0]))
         writer.writeheader()
         for who in ("ann", "bob"):
             said = dict.fromkeys(AXES, "no") | {"hallucinated_premise": "yes", "annotator": who}
             writer.writerows([row | said for row in rows])
-    assert main(["people", "validate", str(filled), *at]) == 0
-    out = capsys.readouterr().out
-    assert "judge against ann (A) and bob (B), 4 failures" in out
+    out = study.traps("people", "validate", filled).ok().out
+    assert "ann (A)" in out and "bob (B)" in out
     (line,) = (line for line in out.splitlines() if line.startswith("hallucinated_premise"))
     assert line.split() == ["hallucinated_premise", "8", *["1.000"] * 7, "degenerate"]
     kept = workspace.tables.read(JUDGE_VALIDATION, {}).set_index("axis")
@@ -159,27 +164,20 @@ def test_a_sheet_is_written_filled_in_and_compared_by_the_commands(
 
 
 @pytest.mark.parametrize("gone", ["the answer", "the item"])
-def test_labels_of_an_earlier_answer_are_not_put_before_people(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], gone: str
-) -> None:
+def test_labels_of_an_earlier_answer_are_not_put_before_people(tmp_path: Path, gone: str) -> None:
     workspace = labelled_study(tmp_path / "study", ["It goes left."])
     cell = Cell("chaotic", Evaluation(MODEL, "standard", 1))
     table, partition = (RESPONSES, cell.partition) if gone == "the answer" else (ITEMS, {"dataset": "chaotic"})
     rows = workspace.tables.read(table, partition)
     workspace.tables.write(table, partition, rows.assign(text="Right.") if gone == "the answer" else rows[:0], {})
-    sheet = tmp_path / "sheet.csv"
-    assert main(["people", "sheet", str(sheet), "--workspace", str(workspace.root)]) == 1
-    assert "are of earlier answers (of chaotic:s-0000:void, for one); materialize" in capsys.readouterr().err
-    assert not sheet.exists()
+    with raises(TrapsError, "people.judge_validation._sheet_row", "chaotic:s-0000:void"):
+        annotation_sheet(workspace)
 
 
-def test_without_a_labelled_failure_there_is_nothing_to_compare(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    workspace = answered_study(tmp_path / "study", {})
-    at = ("--workspace", str(workspace.root))
-    assert main(["people", "validate", str(written(tmp_path, HEAD, *GOOD)), *at]) == 1
-    assert "materialize confabulation" in capsys.readouterr().err
+def test_without_a_labelled_failure_there_is_nothing_to_compare(tmp_path: Path) -> None:
+    workspace, labels = answered_study(tmp_path / "study", {}), written(tmp_path, HEAD, *GOOD)
+    with raises(TrapsError, "storage.parquet.TableStore._load", "confabulation"):
+        validate(workspace, labels)
     workspace.tables.write(CONFABULATION, {}, [], {})
-    assert main(["people", "validate", str(written(tmp_path, HEAD, *GOOD)), *at]) == 1
-    assert "no labelled failure to compare with" in capsys.readouterr().err
+    with raises(TrapsError, "people.judge_validation.validate", str(workspace.root)):
+        validate(workspace, labels)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import base64
-import binascii
 import hashlib
 import json
 import math
@@ -25,7 +24,7 @@ import urllib.request
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -38,8 +37,7 @@ Turn = tuple[str, list[Json]]  # role and parts
 ROOT = Path(__file__).resolve().parents[2]
 REASONING_TOKENS = 16
 _MEDIA_TOKENS = 258  # what Gemini counts for a frame
-_LONG = 256  # strings from here on are looked at for base64: shorter ones are no clip
-_MEDIA_KEYS = ("data", "file_data")  # hold base64 however short it is
+_LONG = 256  # characters of what may be a clip in a body
 _PARENT_LOOK_S = 0.5
 HANG_S = 300.0  # when even the server gives up
 
@@ -121,13 +119,6 @@ class Config:
             raise ValueError(f"no such fault: {', '.join(sorted(map(str, unknown)))}")
         if any(share < 0 for share in self.faults.values()) or sum(self.faults.values()) > 1 + 1e-9:
             raise ValueError(f"shares of faults must lie in [0, 1] and add up to at most 1: {dict(self.faults)}")
-
-    def changed(self, changes: Mapping[str, Any]) -> Config:
-        """A copy. Raises ValueError naming what is unknown."""
-        unknown = {*changes} - {each.name for each in fields(self)}
-        if unknown:
-            raise ValueError(f"no such setting: {', '.join(sorted(unknown))}")
-        return replace(self, **changes)
 
     def fault(self, model: str, body: bytes, seen: int) -> str | None:
         """What happens to the attempt number `seen` (from 0) of the body with this digest."""
@@ -518,28 +509,14 @@ def _places(value: Any) -> Iterator[tuple[Any, Any]]:
 # --- what is kept -----------------------------------------------------------------------------------------------------
 
 
-def without_media(value: Any, key: str = "") -> Any:
-    """A body in which digest and size of the decoded bytes stand for base64."""
+def without_media(value: Any) -> Any:
+    """A body in which the size of a clip, as of any long text of one word, stands for it."""
     if isinstance(value, dict):
-        return {name: without_media(each, name) for name, each in value.items()}
+        return {name: without_media(each) for name, each in value.items()}
     if isinstance(value, list):
         return [without_media(each) for each in value]
-    if not isinstance(value, str):
-        return value
-    return _media(value, key) or value
-
-
-def _media(text: str, key: str) -> Json | None:
-    is_uri = text.startswith("data:")
-    if not is_uri and len(text) < _LONG and key not in _MEDIA_KEYS:
-        return None
-    head, _, coded = text.partition(",") if is_uri else ("", "", text)
-    try:
-        content = base64.b64decode(coded, validate=True)
-    except (binascii.Error, ValueError):
-        return None
-    kept: Json = {"sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content)}
-    return kept | ({"mime": head.removeprefix("data:").removesuffix(";base64")} if is_uri else {})
+    is_media = isinstance(value, str) and len(value) > _LONG and " " not in value
+    return f"{len(value)} characters" if is_media else value
 
 
 @dataclass
@@ -549,7 +526,6 @@ class Tallies:
     requests: int = 0
     billed_usd: float = 0.0
     by_status: Counter[str] = field(default_factory=Counter)
-    by_fault: Counter[str] = field(default_factory=Counter)
     answered_by_fault: Counter[str] = field(default_factory=Counter)
     attempts: Counter[bytes] = field(default_factory=Counter)  # by digest of path and body
     records: list[Json] = field(default_factory=list)
@@ -567,7 +543,6 @@ class Tallies:
             "billed_usd": self.billed_usd,
             "answered_in_full": self.answered_by_fault.total(),
             "by_status": dict(self.by_status),
-            "by_fault": dict(self.by_fault),
             "answered_by_fault": dict(self.answered_by_fault),
         }
 
@@ -683,7 +658,6 @@ class Server:
             record["body"] = without_media(body)
         digest = hashlib.sha256(request.path.encode() + b"\n" + content).digest()[:8]
         record["fault"] = fault = self._config.fault(question.model, digest, tallies.seen(digest))
-        tallies.by_fault[fault or "none"] += 1
         return reply_to(question, fault, self._config)
 
     async def _control(self, request: web.BaseRequest) -> Reply:
@@ -702,7 +676,7 @@ class Server:
 
     def _configure(self, content: bytes) -> Reply:
         try:
-            self._config = self._config.changed(json.loads(content))
+            self._config = replace(self._config, **json.loads(content))
         except (ValueError, TypeError) as error:
             return json_reply({"error": str(error)}, 400)
         return json_reply(asdict(self._config))
@@ -730,11 +704,11 @@ async def _end_with(parent: int) -> None:
         await asyncio.sleep(_PARENT_LOOK_S)
 
 
-async def _serve(server: Server, port: int, parent: int) -> None:
+async def _serve(server: Server, parent: int) -> None:
     handler = web.Server(server.handle, handler_cancellation=True, access_log=None)  # a closed client ends its wait
     runner = web.ServerRunner(handler, shutdown_timeout=0.1)
     await runner.setup()
-    site = web.TCPSite(runner, "127.0.0.1", port, backlog=4096)
+    site = web.TCPSite(runner, "127.0.0.1", 0, backlog=4096)
     await site.start()
     print(f"listening on http://127.0.0.1:{runner.addresses[0][1]}", flush=True)
     await _end_with(parent)
@@ -744,14 +718,13 @@ async def _serve(server: Server, port: int, parent: int) -> None:
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--port", type=int, default=0, help="0: any free one")
     parser.add_argument("--config", type=json.loads, default={}, help="JSON, see Config")
     parser.add_argument("--no-bodies", action="store_true", help="keep counts only, for load")
     parser.add_argument("--parent", type=int, default=os.getppid(), help="the process whose end ends this one")
     arguments = parser.parse_args()
-    server = Server(Config().changed(arguments.config), not arguments.no_bodies)
+    server = Server(Config(**arguments.config), not arguments.no_bodies)
     with suppress(KeyboardInterrupt):
-        asyncio.run(_serve(server, arguments.port, arguments.parent))
+        asyncio.run(_serve(server, arguments.parent))
 
 
 # --- for tests --------------------------------------------------------------------------------------------------------
@@ -767,9 +740,9 @@ class Provider:
     process: subprocess.Popen[str]
 
     @classmethod
-    def start(cls, config: Mapping[str, Any] | None = None, keeps_records: bool = True, port: int = 0) -> Self:
+    def start(cls, config: Mapping[str, Any] | None = None, keeps_records: bool = True) -> Self:
         """Start a server. Returns when it listens."""
-        command = [sys.executable, "-m", "tests.providers.server", "--port", str(port), "--parent", str(os.getpid())]
+        command = [sys.executable, "-m", "tests.providers.server", "--parent", str(os.getpid())]
         command += ["--config", json.dumps(dict(config or {}))] + ([] if keeps_records else ["--no-bodies"])
         process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, start_new_session=True)
         assert process.stdout

@@ -6,13 +6,11 @@ import csv
 import json
 from pathlib import Path
 
-import pytest
-
 from tests.build.errors import raises
 from tests.build.labels import MODEL, labelled_study
+from tests.conftest import ROOT, Checkout
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.webguard import personal_tokens, public_name
-from traps_pipeline.cli import main
 from traps_pipeline.judging.judging_rows import JUDGE_VALIDATION
 from traps_pipeline.protocol.ratings import AXES
 from traps_pipeline.servers.annotate import Annotation, SubmittedLabel
@@ -23,14 +21,11 @@ from traps_pipeline.storage.workspace import Workspace
 TEXTS = ["It goes left.", 'He said "left",\nthen stopped.', "Right, <b>surely</b>."]
 
 
-def test_labels_of_confabulation_go_from_the_pages_to_the_comparison(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_labels_of_confabulation_go_from_the_pages_to_the_comparison(tmp_path: Path) -> None:
     workspace = labelled_study(tmp_path / "study", TEXTS)
-    annotation, file = Annotation(workspace), tmp_path / "labels.csv"
-    at = ("--workspace", str(workspace.root))
-    assert main(["people", "labels", str(file), *at]) == 1
-    assert "no failure is labelled by everybody yet" in capsys.readouterr().err
+    annotation, file, study = Annotation(workspace), tmp_path / "labels.csv", Checkout(ROOT, workspace.root)
+    refused = study.traps("people", "labels", file)
+    assert (refused.code, refused.raised) == (1, "people.labels.confabulation_rows")
     seen = set()
     for who in ("ann", "bob"):
         while unit := annotation.next_unit(who, "confabulation"):
@@ -44,10 +39,9 @@ def test_labels_of_confabulation_go_from_the_pages_to_the_comparison(
     assert annotation.progress("bob", "confabulation") == (3, 3)
     assert "You have labelled all 3" in annotation.unit_page("bob", "confabulation")
     assert "There is nothing to label here" in annotation.unit_page("bob", "answerability")  # its clips are not there
-    assert main(["people", "labels", str(file), *at]) == 0
-    assert "6 labels of ann, bob" in capsys.readouterr().out
+    assert "ann, bob" in study.traps("people", "labels", file).ok().out
     assert {row["invalid_inference"] for row in csv.DictReader(file.open())} == {"0"}
-    assert main(["people", "validate", str(file), *at]) == 0
+    study.traps("people", "validate", file).ok()
     assert workspace.tables.read(JUDGE_VALIDATION, {})["accuracy"].tolist() == [1.0] * 5
 
 
