@@ -152,14 +152,12 @@ def test_no_key_is_printed_and_a_refused_one_is_named_by_its_variable(tried: tup
     assert _leaks(finished.out) == []
     assert _leaks(finished.err) == []
     for printed, command in ((finished.out, "models check"), (finished.err, "run")):
-        said, ends = (re.split(r"^== (.*)\n", printed, flags=re.MULTILINE)[first::2] for first in (0, 1))
-        assert len(ends) == len(REFUSED | TAKEN) * len(COMMANDS)
+        parts = re.split(r"^== (.*)\n", printed, flags=re.MULTILINE)
+        told = dict(zip(parts[1::2], parts[::2], strict=False))  # by how it ended, what was printed before
+        assert len(told) == len(REFUSED | TAKEN) * len(COMMANDS)
         for name in REFUSED:
-            told = next(told for told, end in zip(said, ends, strict=False) if end.startswith(f"{name} == {command}"))
-            assert KEY in told, name
-    for name in REFUSED:
-        live, run = (next(end for end in ends if end.startswith(f"{name} == {word}")) for word in ("models check", "run"))
-        assert live.endswith("== 1") and run.endswith("== 1")
+            end = next(end for end in told if end.startswith(f"{name} == {command} "))
+            assert end.endswith("== 1") and KEY in told[end], end
 
 
 def test_no_key_is_in_any_file_of_the_study(tried: tuple[Checkout, Finished]) -> None:
