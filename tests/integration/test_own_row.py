@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -54,8 +55,8 @@ def test_a_model_that_says_dots_is_broken_and_not_modest_and_a_changed_panel_mak
 
     path = experiment(unasked, provider.url, "one")
     assert unasked.traps("init", path, "--panel", "one").code == 0
-    status = unasked.traps("status", path).out.splitlines()
-    stale = {line.split()[0] for line in status if len(line.split()) == 4 and line.split()[2] not in ("0", "stale")}
+    stages = json.loads(unasked.traps("status", path, "--json").out)["stages"]
+    stale = {row["stage"] for row in stages if row["stale"]}
     assert {"votes", "verdicts", "metrics", "leaderboard"} <= stale and not {"responses", "items", "videos"} & stale
     again = unasked.traps("run", path, "--until", "leaderboard").ok()
     assert again.counts() == {"answers": 0, "votes": 0, "frames": 0}  # judge-a has voted before
