@@ -108,7 +108,7 @@ def test_a_run_that_waits_for_a_host_goes_on_waiting_and_one_that_waits_for_noth
         assert fail_lost_runs(instance, lost_s=3600) == [ended.run_id]  # the others may be submitted yet
         assert {*fail_lost_runs(instance, lost_s=0)} == {unknown.run_id, never_queued.run_id}
         assert [state(instance, run) for run in (waiting, left)] == ["STARTING", "CANCELED"]
-        assert all(name in told(instance, unknown) for name in (unknown.run_id[:8], "404"))  # of Ray: it has no such job
+        assert all(name in told(instance, unknown) for name in (unknown.run_id[:8], "404"))  # Ray has no such job
         cluster.signal("head", signal.SIGKILL)
         with pytest.raises(OSError, match=r"Max retries|Connection"):
             fail_lost_runs(instance, lost_s=0)

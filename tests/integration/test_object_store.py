@@ -114,7 +114,7 @@ def test_errors_name_the_host_the_study_and_the_remedy(
     monkeypatch.setenv(DATABASE, postgres.address())
     refused = one.traps("init", EXPERIMENT, "--workspace", "s3://no-such-bucket/study")
     assert refused.code == 1 and "s3://no-such-bucket/study" in refused.err and "AWS_ACCESS_KEY_ID" in refused.err
-    made = one.traps("init", EXPERIMENT, "--workspace", "s3://lab/refusals").ok()
+    one.traps("init", EXPERIMENT, "--workspace", "s3://lab/refusals").ok()
     for command in (("study", "move", "--store", "s3://lab/other"), ("people", "annotate", "--who", "jd")):
         refused = one.traps(*command, "--workspace", "s3://lab/refusals")
         assert refused.code == 1 and "s3://lab/refusals: " in refused.err, refused.err
