@@ -32,7 +32,7 @@ def test_a_number_that_is_none_is_bad_usage(arguments: list[str], capsys: pytest
 @pytest.mark.parametrize("said", ["nan", "inf", "-1", "1e3", "1_000", "", "yes", "gpt-5=nan", "=", "\u0661"])
 def test_a_budget_that_is_no_number_is_named(said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", "demo", "--workspace", str(tmp_path / "w"), f"--budget-usd={said}"]) == 1
-    assert f"--budget-usd {said}: give dollars" in capsys.readouterr().err
+    assert f"--budget-usd {said}: " in capsys.readouterr().err
 
 
 @pytest.mark.slow

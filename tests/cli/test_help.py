@@ -21,8 +21,8 @@ def test_the_examples_of_help_texts_can_be_given_as_they_stand() -> None:
         (example,) = (line for line in text.splitlines() if line.startswith("example: traps "))
         parsed = build_parser().parse_args(shlex.split(example.removeprefix("example: traps ")))
         assert parsed.parser.prog == f"traps {path}"
-        assert "exit codes: 0 done, 1 something failed, 2 bad usage, " in text
-        assert ("4 a budget is reached" in text) == (path == "study run")
+        codes = re.findall(r"\b\d+\b", text.partition(example)[2])
+        assert codes == ["0", "1", "2", *["4"] * (path == "study run"), "130"]
 
 
 def test_no_line_of_a_help_text_is_wider_than_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -43,7 +43,8 @@ def test_no_command_shows_where_to_start_and_a_group_its_commands(capsys: pytest
     assert main([]) == 0
     assert "traps run demo" in capsys.readouterr().out
     assert main(["people"]) == 0
-    assert "label clips and answers blindly" in " ".join(capsys.readouterr().out.split())
+    told = capsys.readouterr().out
+    assert not [path for path in build_parser().commands if path.startswith("people ") and path.split()[1] not in told]
     assert main(["--version"]) == 0
     assert capsys.readouterr().out.startswith("traps 0.")
 
@@ -51,13 +52,13 @@ def test_no_command_shows_where_to_start_and_a_group_its_commands(capsys: pytest
 @pytest.mark.parametrize(
     ("words", "hint"),
     [
-        (["sttaus"], "did you mean `traps status`?"),
-        (["certify"], "did you mean `traps benchmark certify`?"),
-        (["reslts"], "did you mean `traps results`?"),
-        (["study", "expot-votes"], "did you mean `traps study export-votes`?"),
-        (["zzz"], "unknown command 'zzz'; `traps --help` lists them"),
-        (["run", "demo", "--budgt-usd", "3"], "did you mean --budget-usd?"),
-        (["run", "demo", "--progress", "jsn"], "did you mean json?"),
+        (["sttaus"], "`traps status`"),
+        (["certify"], "`traps benchmark certify`"),
+        (["reslts"], "`traps results`"),
+        (["study", "expot-votes"], "`traps study export-votes`"),
+        (["zzz"], "`traps --help`"),
+        (["run", "demo", "--budgt-usd", "3"], "--budget-usd?"),
+        (["run", "demo", "--progress", "jsn"], "json?"),
     ],
 )
 def test_a_misspelt_word_is_bad_usage_with_the_nearest_one(

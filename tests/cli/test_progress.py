@@ -142,7 +142,7 @@ def test_lines_of_json_have_the_same_figures(clock: Clock) -> None:
 def test_a_failure_among_lines_of_json_is_one_of_them(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", "no-such-experiment", "--progress", "json"]) == 1
     (failure,) = map(json.loads, capsys.readouterr().err.splitlines())
-    assert failure["event"] == "failure" and failure["text"].startswith("no experiment 'no-such-experiment'")
+    assert failure["event"] == "failure" and "'no-such-experiment'" in failure["text"]
 
 
 @pytest.mark.parametrize(("columns", "rows"), [(80, 24), (160, 50)])

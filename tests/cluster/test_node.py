@@ -54,9 +54,9 @@ def test_a_run_of_other_code_fails_with_the_nodes_sentence_and_one_of_the_same_c
         failed = instance.get_run_by_id(run.run_id)
         assert failed is not None and failed.status == dg.DagsterRunStatus.FAILURE and REFUSED_TAG in failed.tags
         messages = [entry.dagster_event.message for entry in instance.all_logs(run.run_id) if entry.dagster_event]
-    assert refused.returncode == 1 and "has other code than the host that submitted this run" in refused.stderr
-    assert any(message and "numpy" in message and "1.0 there" in message for message in messages)
+    (said,) = (message for message in messages if message and "numpy" in message)
+    assert refused.returncode == 1 and said in refused.stderr and " 1.0 " in said
     begun = node(run.run_id, **here, **{CODE: code_here()})
     assert begun.returncode == 0 and dg.__version__ in begun.stdout
     lost = node(run.run_id, **{VARIABLE: str(tmp_path / "elsewhere"), CODE: code_here()})
-    assert lost.returncode == 1 and lost.stderr.startswith(f"{tmp_path / 'elsewhere'}/study.yaml: no such workspace")
+    assert lost.returncode == 1 and lost.stderr.startswith(f"{tmp_path / 'elsewhere'}/study.yaml: ")

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from tests.build.errors import raises
 from tests.postgres import Postgres
 from tests.remedies.remedied import command
 from traps_pipeline.base.errors import TrapsError
@@ -43,7 +44,7 @@ def test_a_study_that_is_made_with_a_database_is_shared_by_all_hosts_of_its_fold
 
 def test_a_study_whose_ledger_lies_elsewhere_is_not_shared_by_a_word(folder: Path) -> None:
     command("init", "demo", "--workspace", folder)
-    with pytest.raises(TrapsError, match=r"study\.yaml: its ledger lies in its folder; make a new one with --database"):
+    with raises(TrapsError, "cli.init_commands.create", f"{folder}/study.yaml", "--database LAB_DATABASE"):
         command("init", "demo", "--workspace", folder, "--database", "LAB_DATABASE")
     assert Workspace.open(folder).study.database is None
 
@@ -52,6 +53,6 @@ def test_a_database_that_cannot_be_used_leaves_no_study(
     folder: Path, postgres: Postgres, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("LAB_DATABASE", postgres.address(password="wrong"))
-    with pytest.raises(TrapsError, match=r"LAB_DATABASE: the database at .* password"):
+    with raises(TrapsError, "cluster.postgres.PostgresDatabase", "LAB_DATABASE: ", "password authentication failed"):
         command("init", "demo", "--workspace", folder, "--database", "LAB_DATABASE")
     assert not Workspace.is_there(folder)

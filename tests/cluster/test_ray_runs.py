@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shlex
+import socket
 import threading
 import time
 from collections.abc import Sequence
@@ -16,6 +17,7 @@ import dagster as dg
 import pytest
 from dagster._daemon.monitoring.run_monitoring import RESUME_RUN_LOG_MESSAGE
 
+from tests.build.errors import raises
 from tests.postgres import Postgres
 from traps_pipeline.base.cores import cores
 from traps_pipeline.base.errors import TrapsError
@@ -99,11 +101,10 @@ def test_a_host_with_other_code_refuses_a_run_and_names_both() -> None:
     theirs = json.loads(code_here())
     theirs |= {"files of assets": "0123", "numpy": "1.0", "numba": "9"}
     del theirs["mujoco"]  # which it does not have: what only one of them has is not compared
-    with pytest.raises(
-        TrapsError, match=rf"^the host .* has other code .* of the study lab: files of assets \w+ here and 0123 there, "
-        rf"numpy {version('numpy')} here and 1\.0 there\. Install",
-    ):  # fmt: skip
+    names = (socket.gethostname(), "lab", "files of assets", "0123", f"numpy {version('numpy')}", " 1.0 ")
+    with raises(TrapsError, "cluster.node.require_same_code", *names) as refused:
         require_same_code(json.dumps(theirs), "lab")
+    assert not [name for name in ("numba", "mujoco") if name in str(refused.value)]
 
 
 def test_dagsters_settings_hold_no_address_of_the_database(remote: Workspace) -> None:
@@ -189,9 +190,8 @@ def test_a_command_that_watches_runs_outlives_a_database_that_is_stopped_and_sta
             server.start()
             instance.report_run_failed(run, "it was ended")
             thread.join(300)
-    assert [problem for ran in ended for problem in ran.problems] == [
-        f"run {run.run_id[:8]} of the study lab ended as failure (it was ended); see its log in `traps ui`"
-    ]
+    (problem,) = (problem for ran in ended for problem in ran.problems)
+    assert all(name in problem for name in (run.run_id[:8], "lab", "(it was ended)", "`traps ui`"))
 
 
 @pytest.mark.slow
@@ -215,7 +215,7 @@ def test_a_run_that_breaks_off_is_made_once_more_and_then_told(
         monkeypatch.setattr(watching, "_submit", create)
         told = [problem for ran in watching.make([], [(None, None)], {}) for problem in ran.problems]
     assert len(submitted) == 2
-    assert (told == []) == (times == 1) and all("ended as failure (its host is gone)" in one for one in told)
+    assert len(told) == times - 1 and all("(its host is gone)" in one for one in told)
 
 
 @pytest.mark.parametrize("error", [TrapsError("the budget is reached"), ConnectionError("the server is gone")])
@@ -298,4 +298,4 @@ def test_an_interrupted_command_leaves_its_runs_or_ends_them_and_the_next_one_co
         assert watched == [again.run_id]
     datasets = [*DATASET.keys]
     between = abs(datasets.index("occlusion") - datasets.index("chaotic")) + 1
-    assert shown.stages == [("runs that were left", 2 * between)]
+    assert [partitions for _, partitions in shown.stages] == [2 * between]

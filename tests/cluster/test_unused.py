@@ -161,12 +161,13 @@ def test_the_command_shows_and_removes_what_is_old_enough(
         "checks.doctor.examine_unused",
         again=lambda: command("doctor", "--unused", "--workspace", address),
     )
-    assert "would be removed by `traps doctor --unused remove`" in capsys.readouterr().out
+    assert "`traps doctor --unused remove`" in capsys.readouterr().out
     command("doctor", "--unused", "remove", "--workspace", address)
     assert "0 objects" in capsys.readouterr().out  # it is younger than the grace period
     monkeypatch.setattr(objects, "GRACE_DAYS", 0.0)
     command("doctor", "--unused", "show", "--workspace", address)
-    assert "1 object (0.0 MB), the oldest of" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "1 object" in shown and object_name(digest(LOST)) in shown
     command("doctor", "--unused", "remove", "--workspace", address)
     assert object_name(digest(LOST)) in capsys.readouterr().out
     assert store.bucket.get(object_name(digest(LOST))) is None

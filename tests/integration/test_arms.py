@@ -4,6 +4,7 @@ and no part of the pairs' figures."""
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -88,7 +89,8 @@ def test_arms_take_the_shortcuts_gain_away(tables: TableStore) -> None:
     robust_of_rule = 32 / 34 * (30 / 31 - 2 / 34)
     assert robust.loc["any-rule", ["conjunction", "robust"]].tolist() == pytest.approx([0, robust_of_rule])
     text = leaderboard_text(tables.read(LEADERBOARD, {}), tables.read_all(ROBUST))
-    assert "all over 3 of 7 arms" in text and "nan" not in text and "no conjunction" not in text
+    assert re.search(r"\b3\b.* 7 .*: decoy, twin_control, crossed", text) and "nan" not in text
+    assert robust["refused"].isna().all()
 
 
 def test_variations_are_doses_of_their_hypotheses(tables: TableStore) -> None:

@@ -82,8 +82,8 @@ def through_files(study: Checkout, path: Path, what: str, url: str, folder: Path
         text = file.read_text()
         asked = json.loads(text)["requests"] if file.suffix == ".json" else map(json.loads, text.splitlines())
         results.write_text("".join(json.dumps(answered(url, line)) + "\n" for line in asked))
-        imported = study.traps("study", f"import-{what}", path, results)
-        assert imported.code == 0 and "already known: 0" in imported.out, imported.err
+        imported = json.loads(study.traps("study", f"import-{what}", path, results, "--json").ok().out)
+        assert imported["new"] and not imported["known"]
 
 
 def table(study: Checkout, which: Table[Any]) -> pd.DataFrame:

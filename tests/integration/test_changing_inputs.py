@@ -36,4 +36,5 @@ def test_an_input_that_changes_while_a_stage_is_at_work_leaves_the_stage_stale(
         finished = study.traps("run", EXPERIMENT, "--until", "metrics")
     assert finished.code == 0, finished.out + finished.err
     status = Lineage(workspace).status("metrics", "chaotic")
-    assert (status.kind, status.reasons) == ("stale", (f"verdicts/{CELL.key} changed",))
+    (reason,) = status.reasons
+    assert status.kind == "stale" and f"verdicts/{CELL.key}" in reason

@@ -26,7 +26,7 @@ from traps_pipeline.models.answer_rows import RESPONSES
 from traps_pipeline.report.explorer.site import write_site
 from traps_pipeline.report.leaderboard_page import leaderboards
 from traps_pipeline.report.published_results import PublishedResults
-from traps_pipeline.report.writing import fraction, percent
+from traps_pipeline.report.writing import NOT_RUN, fraction, percent
 from traps_pipeline.scoring.score_rows import CONTRASTS, LEADERBOARD, METRICS, REGIME_TESTS
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.study import Study
@@ -163,11 +163,11 @@ def test_the_paper_stands_beside_the_study_and_what_was_not_run_says_so(site: Si
         assert len(lines) == 6 + len(published)
         for key, paper in published.iterrows():
             for heading, (name, printed) in FIGURES.items():
-                assert lines[key][heading] == "not run"
+                assert lines[key][heading] == NOT_RUN
                 if name != "j":
                     assert lines[key][f"Paper: {heading}"] == printed(paper[name])
         assert lines["oracle", "json"]["Paper: PECS"] == "–"
-        assert "This study did not ask it" in visited.go("#/model/gpt-5-pro").inner_text("main")
+        assert "gpt-5-pro" in visited.go("#/model/gpt-5-pro").inner_text("main:has(.notice) h1")
 
 
 def test_counts_of_pairs_agree_with_the_table_of_metrics(site: Site, browser: Browser) -> None:
@@ -286,7 +286,8 @@ def test_filters_and_search_find_exactly_what_the_tables_hold(site: Site, browse
         assert page.locator(".answer", has=page.locator("mark")).count() == min(wanted, 25)
         page.get_by_role("searchbox").fill("left nowhere")
         page.keyboard.press("Enter")
-        page.get_by_text("No answer holds all these words").wait_for()
+        page.locator("main .notice").wait_for()
+        assert page.locator(".status").inner_text().startswith("“left nowhere”: 0 of ")
 
 
 def test_the_keyboard_reaches_a_pair_and_moves_through_its_neighbours(site: Site, browser: Browser) -> None:
@@ -356,14 +357,14 @@ def test_a_view_is_taken_along_as_a_table_or_as_an_address(site: Site, browser: 
 def test_what_an_address_names_wrongly_is_said(site: Site, browser: Browser) -> None:
     with visit(browser, site.address) as visited:
         pair = "#/pair/occlusion/hidden_race-0001"
-        for view, said in {
-            f"{pair}?model=nobody": "This study did not ask nobody.",
-            "#/compare?left=nobody&right=nobody2": "This study did not ask nobody and nobody2.",
-            "#/pair/occlusion": "The address names no scenario",
-            "#/pair/occlusion/none": "This study does not hold it.",
-            "#/answers?model=nobody": "Widen the filters above",
-        }.items():
-            assert said in visited.go(view).inner_text("main"), view
+        for view, place, named in (
+            (f"{pair}?model=nobody", "main [role=alert]", r"\bnobody\b"),
+            ("#/compare?left=nobody&right=nobody2", "main [role=alert]", r"\bnobody\b.*\bnobody2\b"),
+            ("#/pair/occlusion", "main .notice", "Scenes"),
+            ("#/pair/occlusion/none", "main:has(.notice) h1", r"\bnone\b.*occlusion"),
+            ("#/answers?model=nobody", "main:has(.notice) .status", "^0 of 288"),
+        ):
+            assert re.search(named, visited.go(view).inner_text(place)), view
 
 
 def test_scenes_play_and_cases_lead_to_both_answers(site: Site, browser: Browser) -> None:
@@ -386,7 +387,7 @@ def test_text_of_a_model_is_text_wherever_it_is_shown(browser: Browser, tmp_path
     with visit(browser, (tmp_path / "site" / "index.html").as_uri()) as visited:
         page = visited.go("#/pair/chaotic/plinko-0001?model=oracle")
         assert page.locator(".panel div.text").first.inner_text() == AS_SHOWN
-        assert "no text: refused" in page.locator(".side").last.inner_text()
+        assert "refused" in page.locator(".side").last.locator(".notice").inner_text()
         assert page.locator("main script, main img, main iframe").count() == 0
         for view in ("#/answers", "#/answers?q=desrever"):
             page = visited.go(view)
@@ -405,16 +406,18 @@ def test_what_was_not_run_or_cannot_be_read_says_so(browser: Browser, tmp_path: 
     write_site(workspace, tmp_path / "site")
     address = (tmp_path / "site" / "index.html").as_uri()
     with visit(browser, address) as visited:
-        assert "not run: this study has no leaderboard yet" in visited.go("#/").inner_text("main")
-        assert "not run: no answers fit" in visited.go("#/matrix").inner_text("main")
-        assert "not run: this study has no answers yet" in visited.go("#/compare").inner_text("main")
-        assert "0 of 0 answers" in visited.go("#/answers").inner_text("main")
-        assert "The clips were left out" in visited.go("#/pair/chaotic/plinko-0001").inner_text("main")
-        assert "did not ask it" in visited.go("#/model/nobody").inner_text("main")
-        assert "no page “nowhere”" in visited.go("#/nowhere").inner_text("main")
+        for view, place, named in (
+            ("", "td.absent", NOT_RUN),
+            ("matrix", "td.absent", NOT_RUN),
+            ("compare", ".notice", NOT_RUN),
+            ("answers", ".status", "0 of 0 answers"),
+            ("pair/chaotic/plinko-0001", ".clip-absent", "`traps site`"),
+            ("model/nobody", "main:has(.notice) h1", "nobody"),
+            ("nowhere", ".notice", "nowhere"),
+        ):
+            assert named in visited.go(f"#/{view}").inner_text(place), view
     (tmp_path / "site" / "data" / "items.js").unlink()
     page = patient(browser.new_page())
     page.goto(address + "#/matrix")
-    page.wait_for_selector("[role=alert]")
-    assert "items.js cannot be read: copy the whole folder" in page.inner_text("main")
+    assert "items.js" in page.inner_text("main [role=alert]")
     page.close()

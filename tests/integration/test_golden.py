@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-from tests.conftest import EXPERIMENT, Checkout
+from tests.conftest import EXPERIMENT, Checkout, Finished
 from tests.tables import TABLES
 from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.scoring.score_rows import LEADERBOARD, METRICS
@@ -19,7 +19,8 @@ VOTES = ANSWERS // 2 * 9  # three judges on a control's two tasks and on a void'
 
 
 def test_one_command_goes_from_records_to_the_leaderboard_and_the_report(small: Checkout, small_output: str) -> None:
-    assert f"{ANSWERS} answers asked (0 from the ledger)\n{VOTES:,} votes asked (0 from the ledger)\n" in small_output
+    counts = Finished(0, small_output, "").counts()
+    assert (counts["answers"], counts["votes"]) == (ANSWERS, VOTES)
     reports = small.workspace / "reports"
     for kind, page in (("report", reports / "report.html"), ("explorer", reports / "index.html")):
         assert f"{kind} {page}" in small_output.splitlines()
@@ -47,13 +48,14 @@ def test_every_table_that_was_made_knows_its_benchmark_version(small: Checkout) 
 def test_a_second_run_does_nothing_and_status_and_plan_agree(study: Checkout) -> None:
     again = study.traps("run", EXPERIMENT).ok()
     assert again.counts() == {"answers": 0, "votes": 0, "frames": 0}
-    assert "tables and figures" not in again.err  # no partition was materialized
+    assert again.err == ""  # no partition was materialized
+    stages = {row["stage"]: row for row in json.loads(study.traps("status", EXPERIMENT, "--json").out)["stages"]}
+    assert not [row for row in stages.values() if row["stale"] or row["missing"]]
     place, fresh = study.traps("status", EXPERIMENT).out.splitlines()
     assert place == f"workspace {study.workspace}"
-    assert re.fullmatch(r"everything is fresh: \d+ partitions of \d+ stages", fresh)
-    stages = {row["stage"]: row for row in json.loads(study.traps("status", EXPERIMENT, "--json").out)["stages"]}
+    partitions = sum(row["fresh"] for row in stages.values())
+    assert re.findall(r"\d+", fresh) == [str(partitions), str(len(stages))]
     expected = {"scene_specs": 4, "items": 4, "responses": 24, "verdicts": 24, "leaderboard": 1}
-    for stage, partitions in expected.items():
-        assert stages[stage] == {"stage": stage, "fresh": partitions, "stale": {}, "missing": []}
+    assert {stage: stages[stage]["fresh"] for stage in expected} == expected
     plan = study.traps("plan", EXPERIMENT).out
     assert re.search(rf"^all +{ANSWERS} +{ANSWERS} +0 +{VOTES:,} +{VOTES:,} +0$", plan, re.MULTILINE), plan

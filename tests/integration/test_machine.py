@@ -31,22 +31,22 @@ def test_opengl_that_does_not_draw_ends_a_run_before_its_first_table_unless_the_
     monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
     monkeypatch.setenv("MUJOCO_GL", "nonsense")
     refused = study.traps("run", experiment)
-    assert refused.code == 1
+    assert (refused.code, refused.raised) == (1, "scenes.picture.trial.check_rendering")
     (sentence,) = refused.err.splitlines()
-    assert sentence.startswith("traps: this machine cannot render clips with MUJOCO_GL=nonsense (")
+    assert "MUJOCO_GL=nonsense" in sentence
     assert not any((study.workspace / "tables").iterdir())
 
     stages = ("--select", "scene_specs,videos", "--partition", "dominoes")
     refused = study.dagster("asset", "materialize", "-m", "traps_pipeline.definitions", *stages)
     assert refused.code == 1
-    assert "this machine cannot render clips with MUJOCO_GL=nonsense (" in refused.err
+    assert "MUJOCO_GL=nonsense" in refused.err
     assert not any((study.workspace / "tables").iterdir())
 
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
     monkeypatch.setenv("PYOPENGL_PLATFORM", "egl")
     refused = study.traps("run", experiment)
-    assert refused.code == 1
-    assert "cannot render clips with MUJOCO_GL=osmesa, PYOPENGL_PLATFORM=egl (" in refused.err
+    assert (refused.code, refused.raised) == (1, "scenes.picture.trial.check_rendering")
+    assert "MUJOCO_GL=osmesa, PYOPENGL_PLATFORM=egl" in refused.err
     monkeypatch.delenv("PYOPENGL_PLATFORM")
     monkeypatch.delenv("MUJOCO_GL")
     assert study.traps("run", experiment, "--until", "videos").code == 0
@@ -69,17 +69,16 @@ def test_a_run_for_which_nothing_matches_says_so_and_fails(tmp_path: Path) -> No
         assert study.traps("init", tmp_path / f"{name}.yaml", "--workspace", tmp_path / place).code == 0
     for name, place in (("no-such-run", "study"), ("no-such-arm", "other")):
         ran = study.traps("run", tmp_path / f"{name}.yaml", "--workspace", tmp_path / place)
-        assert ran.code == 1
-        assert ran.err.startswith(f"traps: experiment {name} asks nothing: ")
+        assert (ran.code, ran.raised) == (1, "pipeline.selection.require_work") and name in ran.err
 
     materialize = ("asset", "materialize", "-m", "traps_pipeline.definitions", "--select", "responses")
     wanted, unwanted = "occlusion|oracle__standard__run1", "chaotic|oracle__standard__run1"
     alone = study.dagster(*materialize, "--partition", unwanted)
     assert alone.code == 1
-    assert f"study.yaml asks for {unwanted}" in alone.err
+    assert any("study.yaml" in line and unwanted in line for line in alone.err.splitlines())
     backwards = study.dagster(*materialize, "--partition-range", f"{unwanted}...{wanted}")
     assert backwards.code == 1
-    assert f"no partition lies between {unwanted} and {wanted}" in backwards.err
+    assert any(unwanted in line and wanted in line for line in backwards.err.splitlines())
 
 
 def test_proxies_and_certificates_are_looked_at_where_something_is_asked(
@@ -91,10 +90,11 @@ def test_proxies_and_certificates_are_looked_at_where_something_is_asked(
     monkeypatch.setenv("SSL_CERT_FILE", "/nowhere/ca.pem")
     study = Checkout(ROOT, tmp_path / "study")
     refused = study.traps("run", experiment, "--no-preflight")
-    assert refused.code == 1
-    assert refused.err == "traps: SSL_CERT_FILE names the file /nowhere/ca.pem, which is not there: mend or unset it\n"
+    assert (refused.code, refused.raised) == (1, "base.network.check_network")
+    (sentence,) = refused.err.splitlines()
+    assert "SSL_CERT_FILE" in sentence and "/nowhere/ca.pem" in sentence
     assert not any((study.workspace / "tables").iterdir())
     live = study.traps("models", "check", "--live", experiment)
     assert live.code == 1
-    assert "SSL_CERT_FILE names the file" in live.out
+    assert "SSL_CERT_FILE" in live.out
     assert "Traceback" not in live.err

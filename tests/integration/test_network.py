@@ -79,8 +79,7 @@ def test_the_cap_holds_and_the_next_run_goes_on(unasked: Checkout, provider: Pro
     model = entry("image-model", "images").replace("limits: {", "limits: {concurrency: 200, ")
     path = experiment(unasked, provider, [model])
     first = ask(unasked, path, "--budget-usd", "0.4")  # all answers cost about $0.70
-    assert first.code == 4, first.err
-    assert "the budget of the study is reached" in first.err
+    assert first.code == 4 and "$0.40" in first.err and "--budget-usd" in first.err, first.err
     spent = sum(row["cost_usd"] for row in settled(unasked))
     assert 0 < spent <= 0.4
     assert provider.stats()["answered_in_full"] == len(settled(unasked))
@@ -108,14 +107,14 @@ def test_money_of_calls_that_a_kill_cut_off_is_released_and_the_study_goes_on(
     process.communicate()
     provider.configure(latency_s=0.0)
     blocked = ask(unasked, path)
-    assert (blocked.code, "the budget of the study is reached" in blocked.err) == (4, True), blocked.err
+    assert blocked.code == 4 and "$0.40" in blocked.err, blocked.err
     assert settled(unasked) == []
     listed = unasked.traps("study", "release-money")
     assert listed.code == 0 and "image-model" in listed.out
     release = ("study", "release-money", "--participant", "image-model", "--all-in-flight")
     assert unasked.traps(*release).code == 1  # a reason is wanted
     assert unasked.traps(*release, "--why", "the provider's bill has none of them").code == 0
-    assert "nothing may be released" in unasked.traps("study", "release-money").out
+    assert json.loads(unasked.traps("study", "release-money", "--json").ok().out) == {}
     assert ask(unasked, path).code == 4  # goes on, up to the same cap
     assert 0 < sum(row["cost_usd"] for row in settled(unasked)) <= 0.4
 
@@ -124,16 +123,17 @@ def test_paid_stages_want_a_budget_and_a_price_whoever_starts_them(unasked: Chec
     path = experiment(unasked, provider, [entry("image-model", "images"), entry("no-price", "images", "runs: 1")])
     refused = ask(unasked, path)
     assert refused.code == 1
-    assert "image-model costs money and the study has no budget" in refused.err
-    assert "the price of no-price is unknown" in refused.err
+    told = refused.err.splitlines()
+    assert any("image-model" in line and "`traps plan`" in line for line in told), refused.err
+    assert any("no-price" in line and "--allow-unknown-prices" in line for line in told), refused.err
     partition = "occlusion|image-model__standard__run1"
     materialize = ("asset", "materialize", "-m", "traps_pipeline.definitions", "--select", "responses", "--partition")
     clicked = unasked.dagster(*materialize, partition)
     assert clicked.code != 0
-    assert "has no budget" in clicked.out + clicked.err
+    assert "`traps plan`" in clicked.out + clicked.err
     assert provider.stats()["requests"] == 0
-    planned = unasked.traps("plan", path)
-    assert "price unknown, not in the sum: no-price" in planned.out
+    planned = unasked.traps("plan", path).out.splitlines()
+    assert [line.rpartition(" ")[2] for line in planned if "no-price" in line and "image-model" not in line]
 
 
 def test_a_model_that_only_fails_is_stopped_and_the_others_go_on(unasked: Checkout, provider: Provider) -> None:
@@ -141,14 +141,14 @@ def test_a_model_that_only_fails_is_stopped_and_the_others_go_on(unasked: Checko
     path = experiment(unasked, provider, [entry("image-model", "images"), entry("locked-out", "images")])
     finished = ask(unasked, path, "--budget-usd", "10")
     assert finished.code == 1
-    assert "locked-out is stopped: 20 refusals in a row (http_401)" in finished.err
     assert SECRET not in finished.out + finished.err
     answered = [row for row in responses(unasked) if row["outcome"] != "error"]
     assert len(answered) == 2 * ITEMS
     assert {row["model"] for row in answered} == {"image-model"}
     # 20 in a row, those in flight then, and no more; in no later batch either.
     assert provider.stats()["by_status"]["401"] < 20 + 24
-    assert finished.err.count("locked-out is stopped") == 1
+    (stopped,) = (line for line in finished.err.splitlines() if "locked-out" in line and "(http_401)" in line)
+    assert " 20 " in stopped
 
 
 def test_only_what_decides_an_answer_is_asked_again(own_study: Checkout, provider: Provider) -> None:
@@ -206,7 +206,7 @@ def test_a_stop_sends_nothing_more_and_keeps_what_comes_back(unasked: Checkout, 
         process.send_signal(stop)
         said = b""
         assert process.stderr is not None
-        while b": stopping: " not in said:  # on a busy machine it may take a while until it knows of the signal
+        while stop.name.encode() not in said:  # on a busy machine it may take a while until it knows of the signal
             part = os.read(process.stderr.fileno(), 65536)
             assert part, said  # it ended without a word
             said += part
@@ -214,7 +214,7 @@ def test_a_stop_sends_nothing_more_and_keeps_what_comes_back(unasked: Checkout, 
         requests = provider.stats()["requests"]
         _, err = process.communicate(timeout=540)
         assert (process.returncode, "Traceback" in err) == (130, False), err
-        assert f"{stop.name}: stopping: waiting 30 s at most" in said.decode() + err
+        assert " 30 s " in said.decode() + err  # as long it waits
         assert provider.stats()["requests"] == requests
         assert provider.stats()["answered_in_full"] == len(settled(unasked))  # nothing that came back is lost
         assert unasked.in_flight_usd() == 0
@@ -237,16 +237,14 @@ def test_a_cluster_answers_in_the_models_stead(unasked: Checkout, provider: Prov
 
     given.write_text("\n".join(json.dumps(answer) for answer in [*answers[:20], {"key": "0" * 64, "text": "x"}]))
     refused = unasked.traps("study", "import-answers", path, given)
-    assert refused.code == 1
-    assert "answers.jsonl:21: key 0000000000000000 is not wanted" in refused.err
-    assert "nothing was imported" in refused.err
+    assert (refused.code, refused.raised) == (1, "exchange.answer_exchange.checked_answers")
+    assert "answers.jsonl:21: " in refused.err and "0" * 16 in refused.err
     assert settled(unasked) == []
 
-    given.write_text("\n".join(json.dumps(answer) for answer in answers[:20]))
-    assert "20 answers imported; already known: 0" in unasked.traps("study", "import-answers", path, given).out
-    given.write_text("\n".join(json.dumps(answer) for answer in answers))
-    imported = json.loads(unasked.traps("study", "import-answers", path, given, "--json").ok().out)
-    assert imported == {"new": 4, "known": 20, "failed": "", "dropped": 0}
+    for some, counts in ((answers[:20], {"new": 20, "known": 0}), (answers, {"new": 4, "known": 20})):
+        given.write_text("\n".join(json.dumps(answer) for answer in some))
+        imported = json.loads(unasked.traps("study", "import-answers", path, given, "--json").ok().out)
+        assert imported == counts | {"failed": "", "dropped": 0}
     finished = ask(unasked, path).ok()
     assert finished.counts()["answers"] == 0
     assert provider.stats()["requests"] == 0

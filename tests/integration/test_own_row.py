@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -43,7 +44,8 @@ def test_a_model_that_says_dots_is_broken_and_not_modest_and_a_changed_panel_mak
     provider.configure(scripts={"dots": {"fall": "....."}})  # to every question about dominoes
     finished = unasked.score(experiment(unasked, provider.url, "three"))
     # The study's other experiments are not run; a panel other than the study's is a contradiction.
-    assert finished.code == 1 and "panel is 'rules', experiment own has 'three'" in finished.err
+    assert (finished.code, finished.raised) == (1, "pipeline.experiment.Experiment.judged")
+    assert "'rules'" in finished.err and "'three'" in finished.err
     path = experiment(unasked, provider.url, "three")
     finished = unasked.traps("run", path, "--panel", "three", "--until", "leaderboard").ok()
     rows = board(unasked)
@@ -53,8 +55,8 @@ def test_a_model_that_says_dots_is_broken_and_not_modest_and_a_changed_panel_mak
 
     path = experiment(unasked, provider.url, "one")
     assert unasked.traps("init", path, "--panel", "one").code == 0
-    status = unasked.traps("status", path).out.splitlines()
-    stale = {line.split()[0] for line in status if len(line.split()) == 4 and line.split()[2] not in ("0", "stale")}
+    stages = json.loads(unasked.traps("status", path, "--json").out)["stages"]
+    stale = {row["stage"] for row in stages if row["stale"]}
     assert {"votes", "verdicts", "metrics", "leaderboard"} <= stale and not {"responses", "items", "videos"} & stale
     again = unasked.traps("run", path, "--until", "leaderboard").ok()
     assert again.counts() == {"answers": 0, "votes": 0, "frames": 0}  # judge-a has voted before
@@ -72,25 +74,26 @@ def test_whatever_is_wrong_with_a_model_is_named_before_anything_is_rendered_or_
         blind=["blind"],
         scripts={"no-schema": {"": "red and then blue"}, "thinks": {"": f"<think>red, blue</think>{said}"}},
     )
-    complaints = {
-        "dead": f"nothing answers at {dead}",
-        "wrong-name": "knows no model 'wrong-name'",
-        "wrong-key": f"the key in {KEY} is not accepted",
-        "blind": "it does not see the clip",
-        "no-schema": "it ignores the schema",
-        "thinks": "it thinks between marks in its answer",
+    named = {
+        "dead": dead,
+        "wrong-name": "'wrong-name'",
+        "wrong-key": KEY,
+        "blind": " blue",  # a colour of the clip
+        "no-schema": "`json_schema: false`",
+        "thinks": "`thinking: ",
     }
     path = tmp_path / "broken.yaml"
-    address = {name: dead if name == "dead" else f"{provider.url}/v1" for name in complaints}
+    address = {name: dead if name == "dead" else f"{provider.url}/v1" for name in named}
     models = "".join(
         f'  - {{id: {name}, base_url: "{url}", key: {KEY}, media: images}}\n' for name, url in address.items()
     )
     path.write_text(f"name: broken\nmodels:\n{models}panel: rules\nscenarios: [domino_chain-0001]\n")
     study = Checkout(ROOT, tmp_path / "study")
     finished = study.traps("run", path, "--judged-by-rules")
-    assert finished.code == 1
-    for name, complaint in complaints.items():
-        assert any(f"{name}: " in line and complaint in line for line in finished.err.splitlines()), name
-    assert "nothing was rendered and nothing was judged" in finished.err
+    assert (finished.code, finished.raised) == (1, "checks.live_check.require_sound")
+    *told, advice = (line for line in finished.err.splitlines() if not line.startswith("! "))
+    for (name, what), line in zip(named.items(), told, strict=True):
+        assert f"{name}: " in line and what in line, finished.err
+    assert "--no-preflight" in advice
     assert not list((study.workspace / "clips").rglob("*.mp4")) and not study.ledger_rows("answers")
     assert {row["components"]["about"]["check"] for row in study.ledger_rows("votes")} == {"clip", "no clip", "schema"}

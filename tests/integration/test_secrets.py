@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import threading
 from base64 import b64encode
 from collections.abc import Iterator
@@ -66,7 +67,8 @@ for name, key in keys.items():
         except Exception:
             sys.excepthook(*sys.exc_info())
             code = 1
-        print(f"== {name} == {command} == {code}", flush=True)
+        for stream in (sys.stdout, sys.stderr):
+            print(f"== {name} == {command} == {code}", file=stream, flush=True)
 """
 
 
@@ -149,14 +151,13 @@ def test_no_key_is_printed_and_a_refused_one_is_named_by_its_variable(tried: tup
     assert finished.code == 0, finished.err[-3000:]
     assert _leaks(finished.out) == []
     assert _leaks(finished.err) == []
-    ends = [line for line in finished.out.splitlines() if line.startswith("== ")]
-    assert len(ends) == len(REFUSED | TAKEN) * len(COMMANDS)
-    for name in REFUSED:
-        live, run = (next(e for e in ends if f"== {name} == {word}" in e) for word in ("models check", "run"))
-        assert live.endswith("== 1")
-        assert run.endswith("== 1")
-    assert f"{KEY} ends with a line break" in finished.out
-    assert f"{KEY} is wrapped in quotes" in finished.err
+    for printed, command in ((finished.out, "models check"), (finished.err, "run")):
+        parts = re.split(r"^== (.*)\n", printed, flags=re.MULTILINE)
+        told = dict(zip(parts[1::2], parts[::2], strict=False))  # by how it ended, what was printed before
+        assert len(told) == len(REFUSED | TAKEN) * len(COMMANDS)
+        for name in REFUSED:
+            end = next(end for end in told if end.startswith(f"{name} == {command} "))
+            assert end.endswith("== 1") and KEY in told[end], end
 
 
 def test_no_key_is_in_any_file_of_the_study(tried: tuple[Checkout, Finished]) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.build.errors import raises
 from tests.objectstore import S3
 from tests.postgres import Postgres
 from tests.remedies.remedied import remedied
@@ -76,9 +77,7 @@ def test_a_store_of_google_or_azure_without_its_key_is_refused_with_the_variable
     for name, value in exported.items():
         monkeypatch.setenv(name, value)
     assert place_of(f"{address}/") == address
-    with pytest.raises(
-        TrapsError, match=rf"^{address}: cannot be used from the host .* in the environment \({variable}"
-    ):
+    with raises(TrapsError, "cluster.bucket.Bucket._used", f"{address}: ", f"({variable}"):
         Bucket(address).get("a")
 
 
@@ -103,7 +102,7 @@ def test_a_budget_of_an_account_in_a_folder_that_all_hosts_see_is_spent_from(add
 def test_runs_want_the_extra_the_address_and_the_head(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in PACKAGES:
         pytest.importorskip(name, reason="the extra `cluster` is not installed")
-    workspace = Workspace.create(address, Study())
+    workspace, by = Workspace.create(address, Study()), "cluster.ray_runs.require_cluster"
     monkeypatch.setenv("TRAPS_WORKSPACE", address)
 
     def required() -> None:
@@ -113,12 +112,10 @@ def test_runs_want_the_extra_the_address_and_the_head(address: str, monkeypatch:
 
     with monkeypatch.context() as bare:
         bare.setitem(sys.modules, "ray", None)  # to Python's imports it is not there
-        with pytest.raises(TrapsError, match="need ray here and there: install"):
+        with raises(TrapsError, by, " ray ", "requirements-cluster.lock"):
             required()
-    with pytest.raises(TrapsError, match=r"TRAPS_RAY is not set: export TRAPS_RAY=http://HEAD:8265"):
+    with raises(TrapsError, by, "export TRAPS_RAY=http://HEAD:8265"):
         required()
     monkeypatch.setenv(RAY, "http://127.0.0.1:1")
-    with pytest.raises(
-        TrapsError, match=r"runs of the study .*: nobody takes runs from its queue; run `traps ui` on the head"
-    ):
+    with raises(TrapsError, by, workspace.study.name, "`traps ui`"):
         required()
