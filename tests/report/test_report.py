@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.build.boards import PECS_OF, board_of, board_row, tables
+from tests.build.boards import PECS_OF, board_of, board_row, leaderboard_section, tables
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import PAPER_REGIMES
 from traps_pipeline.report.cards import EXPLORER, Card, data_address, explorer_address
@@ -70,7 +70,8 @@ def test_text_lists_models_by_overall_pecs_with_their_interval(board):
     shown = board[board["model"] != HOSTILE]
     shown = pd.concat([shown, board_of(board_row("mid", pecs_ci_low=0.2, pecs_ci_high=0.3))])
     lines = leaderboard_text(shown).splitlines()
-    assert lines[0] == "Overall. Judged by the panel three (version 1). Benchmark version v1; epoch e1."
+    assert lines[0].startswith("Overall. ")
+    assert {"three", "1", "v1", "e1"} <= {*re.findall(r"\w+", lines[0])}  # panel, its version, the benchmark's, epoch
     text = tables(shown)[0]
     assert [row["Model"] for row in text[:4]] == ["oracle"] * 3 + ["mid"]
     assert (text[0]["PECS"], text[0]["95 % CI"], text[0]["Acc %"]) == ("1.000", "[1.000, 1.000]", "100.0")
@@ -80,7 +81,7 @@ def test_text_lists_models_by_overall_pecs_with_their_interval(board):
         "J": "0.500", **dict.fromkeys(PECS_OF.values(), "–"), "n": "1404", "Missing": "0",
     }.items()  # fmt: skip
     assert len({len(x) for x in lines[2:-2]}) == 1
-    assert lines[-1] == "– not all four datasets evaluated, or nothing decided"
+    assert lines[-1].startswith("– ")
 
 
 def test_ties_keep_the_regimes_order(board):
@@ -117,7 +118,7 @@ def test_an_incomplete_cell_is_marked_at_every_pecs_and_n():
     marked = {heading for heading, cell in entry(board, "gaps").items() if "‡" in cell}
     assert marked == {"PECS", "PECS chaotic", "n"}
     for said in (leaderboard_text(board), leaderboard_markdown(board), report_html(board)):
-        assert "incomplete: fewer than 99 % of items answered" in said
+        assert "99 %" in said
     own = {d: report_html(board).split(f'id="leaderboard_{d}"')[1].split("</details>")[0] for d in DATASETS}
     assert own["chaotic"].count("‡") == 3  # PECS and n of the dataset's own table, and what it means
     assert "‡" not in own["occlusion"] and "[0.249, 0.251]" in own["occlusion"]
@@ -149,7 +150,7 @@ def test_a_model_without_an_overall_row_is_listed_last_with_what_it_has():
     assert entry(board, "part").items() >= {
         "PECS": "–", "Acc %": "–", "PECS chaotic": "1.000 ‡", "n": "500 ‡", "Missing": "50 †",
     }.items()  # fmt: skip
-    assert "not all four datasets evaluated" in report_html(board)
+    assert '<p class="source">– ' in leaderboard_section(report_html(board))
 
 
 def test_a_board_of_one_dataset_is_ranked_by_that_dataset():
@@ -218,8 +219,8 @@ def test_html_names_the_epoch_in_each_row_where_rows_differ():
 
 def test_an_empty_board_still_gives_a_page_a_table_and_a_figure():
     board = pd.DataFrame(columns=pd.Index(LEADERBOARD.names))
-    assert "not run: this study has no leaderboard yet" in report_html(board)
-    assert "not run: this study has no leaderboard yet" in leaderboard_text(board)
+    (table,) = leaderboards(board)
+    assert table.absence and table.absence in report_html(board) and table.absence in leaderboard_text(board)
     assert figure_bytes(landscape_figure(points(board), "Overall")).startswith(b"\x89PNG")
 
 
