@@ -41,6 +41,11 @@ def board_of(*rows):
     return pd.DataFrame(list(rows))[LEADERBOARD.names]
 
 
+def leaderboard_section(page):
+    """The part of a report page with its first leaderboard."""
+    return page.partition('id="leaderboard"')[2].partition("</section>")[0]
+
+
 class Rows(HTMLParser):
     """The cells' texts of every table row of a page."""
 

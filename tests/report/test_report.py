@@ -13,7 +13,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.build.boards import PECS_OF, board_of, board_row, tables
+from tests.build.boards import PECS_OF, board_of, board_row, leaderboard_section, tables
+from traps_pipeline.models.judges import BY_RULES
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import PAPER_REGIMES
 from traps_pipeline.report.cards import EXPLORER, Card, data_address, explorer_address
@@ -70,7 +71,8 @@ def test_text_lists_models_by_overall_pecs_with_their_interval(board):
     shown = board[board["model"] != HOSTILE]
     shown = pd.concat([shown, board_of(board_row("mid", pecs_ci_low=0.2, pecs_ci_high=0.3))])
     lines = leaderboard_text(shown).splitlines()
-    assert lines[0] == "Overall. Judged by the panel three (version 1). Benchmark version v1; epoch e1."
+    assert lines[0].startswith("Overall. ")
+    assert {"three", "1", "v1", "e1"} <= {*re.findall(r"\w+", lines[0])}  # panel, its version, the benchmark's, epoch
     text = tables(shown)[0]
     assert [row["Model"] for row in text[:4]] == ["oracle"] * 3 + ["mid"]
     assert (text[0]["PECS"], text[0]["95 % CI"], text[0]["Acc %"]) == ("1.000", "[1.000, 1.000]", "100.0")
@@ -80,7 +82,7 @@ def test_text_lists_models_by_overall_pecs_with_their_interval(board):
         "J": "0.500", **dict.fromkeys(PECS_OF.values(), "–"), "n": "1404", "Missing": "0",
     }.items()  # fmt: skip
     assert len({len(x) for x in lines[2:-2]}) == 1
-    assert lines[-1] == "– not all four datasets evaluated, or nothing decided"
+    assert lines[-1].startswith("– ")
 
 
 def test_ties_keep_the_regimes_order(board):
@@ -100,7 +102,7 @@ def cells_with_gaps(model="gaps"):
 
 
 @pytest.mark.slow
-def test_text_markdown_and_html_show_the_same_marks_counts_and_bounds():
+def test_text_markdown_and_html_show_the_same_counts_and_bounds_and_mark_an_incomplete_cell_at_every_pecs_and_n():
     board = board_of(*cells_with_gaps(), *(board_row("whole", dataset=d, shares=(1, 0, 1)) for d in BOARDS))
     assert entry(board, "whole").items() >= {
         "PECS": "1.000", "PECS chaotic": "1.000", "n": "1404", "Missing": "0", "Refused": "0", "Empty": "0",
@@ -109,15 +111,10 @@ def test_text_markdown_and_html_show_the_same_marks_counts_and_bounds():
         "PECS occlusion": "0.250", "PECS chaotic": "0.250 ‡", "PECS chaotic ill-posed": "0.250", "n": "1404 ‡",
         "Missing": "61 †", "Refused": "41", "Empty": "7", BOUNDS: "[0.200, 0.310]",
     }.items()  # fmt: skip
-
-
-@pytest.mark.slow
-def test_an_incomplete_cell_is_marked_at_every_pecs_and_n():
-    board = board_of(*cells_with_gaps())
     marked = {heading for heading, cell in entry(board, "gaps").items() if "‡" in cell}
     assert marked == {"PECS", "PECS chaotic", "n"}
     for said in (leaderboard_text(board), leaderboard_markdown(board), report_html(board)):
-        assert "incomplete: fewer than 99 % of items answered" in said
+        assert "99 %" in said
     own = {d: report_html(board).split(f'id="leaderboard_{d}"')[1].split("</details>")[0] for d in DATASETS}
     assert own["chaotic"].count("‡") == 3  # PECS and n of the dataset's own table, and what it means
     assert "‡" not in own["occlusion"] and "[0.249, 0.251]" in own["occlusion"]
@@ -149,7 +146,7 @@ def test_a_model_without_an_overall_row_is_listed_last_with_what_it_has():
     assert entry(board, "part").items() >= {
         "PECS": "–", "Acc %": "–", "PECS chaotic": "1.000 ‡", "n": "500 ‡", "Missing": "50 †",
     }.items()  # fmt: skip
-    assert "not all four datasets evaluated" in report_html(board)
+    assert '<p class="source">– ' in leaderboard_section(report_html(board))
 
 
 def test_a_board_of_one_dataset_is_ranked_by_that_dataset():
@@ -218,8 +215,8 @@ def test_html_names_the_epoch_in_each_row_where_rows_differ():
 
 def test_an_empty_board_still_gives_a_page_a_table_and_a_figure():
     board = pd.DataFrame(columns=pd.Index(LEADERBOARD.names))
-    assert "not run: this study has no leaderboard yet" in report_html(board)
-    assert "not run: this study has no leaderboard yet" in leaderboard_text(board)
+    (table,) = leaderboards(board)
+    assert table.absence and table.absence in report_html(board) and table.absence in leaderboard_text(board)
     assert figure_bytes(landscape_figure(points(board), "Overall")).startswith(b"\x89PNG")
 
 
@@ -329,10 +326,8 @@ def test_the_worked_example_is_a_pair_with_both_answers_and_their_verdicts(tmp_p
     votes = [{"valid": True, "task": "abstention", "abstained": k == 0, "extracted_value": None} for k in range(3)]
     votes += [{"valid": k > 0, "task": "correctness", "abstained": None, "extracted_value": "left"} for k in range(3)]
     words = reading("It goes left.", votes, rows[2])
-    assert words[1:] == [
-        "Reading: an abstention for 1 of 3 judges; they extract left.", "Verdict: answered, correct.",
-    ]  # fmt: skip
-    assert reading("Left.", votes[:3], rows[3])[2] == "Verdict: answered, though the outcome cannot be known."
+    assert re.findall(r"\d|left", words[1]) == ["1", "3", "left"] and "correct" in words[2]
+    assert "correct" not in reading("Left.", votes[:3], rows[3])[2]
     pair = pd.DataFrame(pair_rows("plinko-0", tmp_path, kept=5)).set_index("side")
     figure = example_figure(Example(pair, "a model", {"control": words, "void": words}), tmp_path)
     assert figure_bytes(figure).startswith(b"\x89PNG")
@@ -345,12 +340,13 @@ def test_panels_have_tables_of_their_own_and_a_model_judged_by_rules_is_said_not
     )
     by_paper, by_rules = leaderboards(both)
     assert [list(table.rows["model"]) for table in (by_paper, by_rules)] == [["gpt-5-high"], ["oracle", "pocket"]]
-    assert "not comparable" not in table_latex(by_paper) and "Judged by the panel paper (version 2)" in by_paper.lead
-    assert "Judged by rules, not comparable: pocket." in table_latex(by_rules)
-    for said in (leaderboard_text(both), leaderboard_markdown(both), report_html(both)):
-        assert "Judged by rules, not comparable: pocket." in said
-    assert "not comparable" not in leaderboard_text(both.loc[both["model"] == "oracle"])
+    assert {"paper", "2"} <= {*re.findall(r"\w+", by_paper.lead)}
+    for said in (table_latex(by_rules), leaderboard_text(both), leaderboard_markdown(both), report_html(both)):
+        assert f"{BY_RULES[1:]}: pocket." in said
+    for said in (table_latex(by_paper), leaderboard_text(both.loc[both["model"] == "oracle"])):
+        assert BY_RULES[1:] not in said
 
 
 def test_a_panel_of_one_judge_is_marked():
-    assert "panel mine (version ab12, one judge" in leaderboard_text(board_of(board_row("m", panel="mine@ab12.1")))
+    one, several = (leaderboard_text(board_of(board_row("m", panel=f"mine@ab12{judges}"))) for judges in (".1", ""))
+    assert "mine" in one and "ab12" in one and "ab12.1" not in one and one != several

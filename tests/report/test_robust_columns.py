@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -44,15 +45,14 @@ def test_an_entry_with_arms_has_their_figures_and_one_without_says_not_run() -> 
     assert [cells[heading] for heading in HEADINGS] == [["not run", said] for said in ("12.5", "0.050", "62.5")]
     for text in shown(robust_of()):
         assert text.count("not run") >= 3 and "0.050" in text
-        assert f"all over {len(ARMS)} of {len(ARMS)} arms: decoy, " in text.replace("\\", "")
+        assert re.search(rf"\b{len(ARMS)}\b[^:]*\b{len(ARMS)}\b[^:]*: decoy, ", text.replace("\\", ""))
 
 
 def test_entries_over_different_arms_are_told_apart() -> None:
     both = pd.concat([robust_of(arms=["decoy"]), robust_of(arms=["crossed"]).assign(model="alone")])
     for text in shown(both):
-        plain = text.replace("\\", "")
-        assert f"asked standard over 1 of {len(ARMS)} arms: decoy" in plain
-        assert f"alone standard over 1 of {len(ARMS)} arms: crossed" in plain
+        for entry, arm in (("asked standard", "decoy"), ("alone standard", "crossed")):
+            assert re.search(rf"{entry}\b[^:]*\b1\b[^:]*\b{len(ARMS)}\b[^:]*: {arm}", text.replace("\\", ""))
 
 
 def test_figures_that_cannot_join_pairs_and_arms_are_dashes_with_the_reason() -> None:
@@ -60,7 +60,7 @@ def test_figures_that_cannot_join_pairs_and_arms_are_dashes_with_the_reason() ->
     cells = {line.heading: column for line, column in _columns(refused)}
     assert cells["Conjunction %"] == cells["Robust"] == ["not run", "–"]
     for text in shown(refused):
-        assert "no conjunction and no robust figure: pairs of epoch e1, arms of epoch e2" in text
+        assert "pairs of epoch e1, arms of epoch e2" in text
 
 
 def _columns(robust: pd.DataFrame) -> list[tuple[Any, list[str]]]:

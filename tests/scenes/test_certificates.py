@@ -21,6 +21,7 @@ from traps_pipeline.scenes.certification.certificates import (
     OPEN,
     ORDER,
     OUTCOME,
+    REFERENT_PIXELS,
     REFERENTS,
     TURNS,
     WALLS,
@@ -89,7 +90,7 @@ def test_an_occluder_that_rises_over_the_flags_hides_what_the_question_names() -
     assert said["released"] is None
     assert measured["released"]["referents"] == case.spec.evidence["referents"]
     assert measured["released"]["referents"]["ball"] == measured["released"]["referents"]["box"] == "marked"
-    assert "has 0 pixels in a void frame, 80 wanted" in str(said["raised"])
+    assert measured["raised"]["referents_px"] == 0 and f"{REFERENT_PIXELS:.0f}" in str(said["raised"])
     assert measured["raised"]["panel_covers"] >= measured["released"]["panel_covers"] > 0
 
 
@@ -97,9 +98,8 @@ def test_an_occluder_that_rises_over_the_flags_hides_what_the_question_names() -
 def test_another_hidden_element_is_not_the_scene_of_the_trajectory(race: Released) -> None:
     lanes = len(race.spec.params["colours"])
     params = race.spec.params | {"clear_lane": (race.spec.params["clear_lane"] + 1) % lanes}
-    found = failures(race, altered(race.spec, params=params))
-    assert "physics" in found or "twin" in found
-    assert "simulated here, the scene ends in" in found["physics"]
+    verdict = certify(altered(race.spec, params=params), race.qpos, race.twin, frame_step=10)
+    assert repr(verdict.measured["simulated_answer"]) in verdict.failures["physics"]
 
 
 @pytest.mark.slow
@@ -108,7 +108,8 @@ def test_a_twin_that_differs_in_what_is_seen_is_no_twin(race: Released) -> None:
     other = next(colour for colour in ("wood", "grey") if colour != race.spec.twin.params["deck_colour"])
     seen = race.spec.twin.params | {"deck_colour": other}
     twin = race.spec.twin.model_copy(update={"params": seen})
-    assert "more, or in less, than the hidden element" in failures(race, altered(race.spec, twin=twin))["twin"]
+    verdict = certify(altered(race.spec, twin=twin), race.qpos, race.twin, frame_step=10)
+    assert not verdict.measured["hidden_alone"] and "twin" in verdict.failures
 
 
 @pytest.mark.slow
@@ -120,7 +121,8 @@ def test_a_camera_that_looks_away_loses_the_scene(race: Released) -> None:
 def test_what_is_too_small_in_a_frame_that_any_model_is_shown_is_not_legible(race: Released) -> None:
     far = race.spec.camera | {"distance": 4 * race.spec.camera["distance"]}
     pair = pair_of(altered(race.spec, camera=far), race.qpos, race.twin)
-    assert "too small at the end" in str(LEGIBLE.failure(LEGIBLE.measured(pair), pair.claim))
+    measured = LEGIBLE.measured(pair)
+    assert measured["too_small"][0] in str(LEGIBLE.failure(measured, pair.claim))
 
 
 def test_what_the_question_names_is_measured_as_the_record_says(race: Released) -> None:
@@ -142,7 +144,7 @@ def test_an_order_that_two_frames_a_second_do_not_show_is_lost(race: Released) -
 
     frames = [seen(span)["order_frames"] for span in ((21, 25), (20, 25))]  # 2 FPS shows frames 20 and 25
     assert frames == [0, 1]
-    assert "no sampled frame shows" in str(ORDER.failure(seen((21, 25)), pair.claim))
+    assert ORDER.failure(seen((21, 25)), pair.claim) is not None
     released = seen(pair.control.outcome.in_order)
     assert released["order_frames"] >= 1
     assert ORDER.contradiction(released, race.spec.evidence, exact=False) is None
@@ -153,9 +155,9 @@ def test_an_order_that_two_frames_a_second_do_not_show_is_lost(race: Released) -
 @pytest.mark.promise
 def test_an_answerable_question_is_not_ill_posed(race: Released) -> None:
     found = failures(race, altered(race.spec, ill_posed_question="Which ball is in front?"))
-    assert "nothing shows that 'Which ball is in front?' has no answer" in found["words"]
+    assert "'Which ball is in front?'" in found["words"]
     found = failures(race, altered(race.spec, question="How much does the ball weigh?"))
-    assert "reads as ill-posed: mass" in found["words"]
+    assert "'How much does the ball weigh?'" in found["words"] and "mass" in found["words"]
 
 
 @pytest.mark.slow
@@ -181,19 +183,18 @@ def test_an_outcome_that_settles_at_the_end_or_by_less_than_the_familys_margin_i
 def test_a_margin_that_is_not_the_records_is_refused(race: Released) -> None:
     margin = race.spec.evidence["margin_m"]
     wider = altered(race.spec, evidence=race.spec.evidence | {"margin_m": round(margin + 1e-5, 5)})
-    assert f"the record says {wider.evidence['margin_m']}" in failures(race, wider)["outcome"]
+    assert str(wider.evidence["margin_m"]) in failures(race, wider)["outcome"]
     without = {name: value for name, value in race.spec.evidence.items() if name != "margin_m"}
     measured = OUTCOME.measured(pair_of(race.spec, race.qpos, race.twin))
-    assert OUTCOME.contradiction(measured, without, exact=True) == "the record has no evidence 'margin_m'"
+    assert "margin_m" in str(OUTCOME.contradiction(measured, without, exact=True))
 
 
 def test_on_another_machine_a_margin_may_differ_in_its_last_stored_digit_alone(race: Released) -> None:
     margin = race.spec.evidence["margin_m"]
     measured = OUTCOME.measured(pair_of(race.spec, race.qpos, race.twin))
-    for off, said in ((1e-5, None), (2e-5, "margin_m is")):
-        stored = race.spec.evidence | {"margin_m": round(margin + off, 5)}
-        found = OUTCOME.contradiction(measured, stored, exact=False)
-        assert found == said or (said is not None and found is not None and found.startswith(said))
+    last, more = (race.spec.evidence | {"margin_m": round(margin + off, 5)} for off in (1e-5, 2e-5))
+    assert OUTCOME.contradiction(measured, last, exact=False) is None
+    assert "margin_m" in str(OUTCOME.contradiction(measured, more, exact=False))
 
 
 @pytest.mark.parametrize("scenario_id", [*first_of_each("occluder"), *first_of_each("truncation")])
@@ -204,8 +205,8 @@ def test_a_family_whose_margin_is_a_constant_does_not_give_its_records(scenario_
     pair = pair_of(case.spec, case.qpos, case.twin)
     measured = OUTCOME.measured(replace(pair, control=replace(pair.control, family=constant)))
     assert OUTCOME.failure(measured, pair.claim) is None
-    found = OUTCOME.contradiction(measured, case.spec.evidence, exact=True)
-    assert found == f"margin_m is 1.0, the record says {case.spec.evidence['margin_m']}"
+    found = str(OUTCOME.contradiction(measured, case.spec.evidence, exact=True))
+    assert [name in found for name in ("margin_m", "1.0", str(case.spec.evidence["margin_m"]))] == [True] * 3
     assert OUTCOME.contradiction(OUTCOME.measured(pair), case.spec.evidence, exact=True) is None
 
 
@@ -268,60 +269,61 @@ GOOD: dict[str, Any] = {
     },
     "words": {"ill_posed_for": "mass", "question_refuted": None, "premises": 1, "true_answer": None},
 }
+# Evidence that is good but for one number, and what the failure names besides.
 BAD: list[tuple[str, dict[str, Any], str]] = [
-    ("outcome", {"label": None}, "the outcome is undecided"),
-    ("outcome", {"label": "teal"}, "the control shows 'teal'"),
-    ("outcome", {"commit_s": 4.4}, "is committed only 0.5 s before the end"),
-    ("outcome", {"margin_m": 0.0}, "has a margin of 0.0000 m, below"),
-    ("outcome", {"margin_m": float("nan")}, "has a margin of nan m, below"),
-    ("pace", {"settles_share": 0.29}, "settles after 29% of the clip, 30% is wanted"),
-    ("pace", {"settles_share": 0.82}, "settles after 82% of the clip, 80% at most is wanted"),
-    ("turns", {"turns_deg": 9.9}, "turns by 9.9 degrees, 10 wanted"),
-    ("walls", {"walls_px": {"pane": 149.75}}, "the edges of 'pane', a wall that is not drawn, have 150 pixels"),
-    ("physics", {"simulated_answer": "teal"}, "simulated here, the scene ends in 'teal'"),
-    ("physics", {"parted_m": 0.0051}, "parts from its trajectory at once"),
-    ("in_frame", {"in_frame": False}, "leaves the frame"),
-    ("legible", {"too_small": ["149 of 150 pixels of ball"]}, "too small at the end: 149 of 150 pixels of ball"),
-    ("legible", {"least_visible_px": 149.75}, "too small at the end"),
-    ("order", {"order_frames": 0}, "no sampled frame shows the first of two events"),
-    ("hidden", {"past_panel_px": 0.25}, "seen past it"),
-    ("hidden", {"hidden_from_s": 2.3}, "does not hide the outcome before it is committed"),
-    ("ablation", {"ablation_px": 1}, "changes 1 pixels"),
-    ("referents", {"referents": {}}, "names nothing that is in the scene"),
-    ("referents", {"referents_px": 79.75}, "has 80 pixels in a void frame"),
-    ("referents", {"referents_moving_s": 0.4}, "the question names is seen moving for 0.4 s"),
-    ("referents", {"cause_moving_s": 0.4}, "the cause is seen moving for 0.4 s"),
-    ("twin behind occluder", {"hidden_alone": False}, "in more, or in less, than the hidden element"),
-    ("twin behind occluder", {"twin_answer": CLAIM.answer}, "the twin ends in"),
-    ("twin behind occluder", {"twin_answer": None}, "the twin ends in None"),
-    ("twin behind occluder", {"twin_px": 1}, "differs from the void: in 1 pixels"),
-    ("cut", {"last_shown_s": 0.9, "cut_s": 1.0}, "is before 1.0 s or after commitment"),
-    ("cut", {"cut_s": 1.2}, "is before 1.0 s or after commitment"),
-    ("open", {"accepted": 63}, "63 futures"),
-    ("open", {"entropy_bits": 0.99}, "disagree by 0.99 bits, 1.0 wanted"),
-    ("open", {"top_share": 0.601}, "the best guess is right in 60.1% of the futures"),
-    ("open", {"cut_settled": 15}, "15 futures of the state at the cut have an outcome, 16 wanted"),
-    ("open", {"cut_top_share": 0.76}, "76.0% of the futures of the state at the cut agree, at most 75% may"),
-    ("open", {"cut_truth_share": 0.04}, "the recorded outcome is a rare one, of 4.0% of the futures"),
-    ("twin of cut", {"twin_answer": CHAOTIC.answer}, "the twin ends in"),
-    ("twin of cut", {"twin_deviation_px": 0.51}, "0.51 pixels off before the cut"),
-    ("twin of cut", {"start_off": 2.6e-7}, "begins 2.6e-07 beside the start that the record names"),
-    ("twin of cut", {"rebuilt": False}, "its trajectory is of another start"),
-    ("closing", {"read_answer": "teal"}, "before the occluder comes the control shows 'teal'"),
-    ("closing", {"read_s": 0.7}, "less than 0.8 s after the outcome has settled"),
-    ("closing", {"commit_s": 3.8}, "less than 0.8 s after the outcome has settled"),
-    ("closing", {"closes_s": 4.6}, "a model is shown no frame after 4.5 s"),
-    ("closing", {"closed_px": 0.25}, "0.25 pixels of what the occluder must hide are seen past it"),
-    ("closing", {"closed_change_px": 1}, "the outcome changes 1 pixels of the control's end"),
-    ("exchange", {"other_settings": ["length", "camera"]}, "the length and the camera would be another"),
-    ("exchange", {"lost_exchanged": "pace: too late"}, "with the twin as the control: pace: too late"),
-    ("exchange", {"hidden_from_s": 3.7}, "does not hide the outcome of the twin before it is settled"),
-    ("exchange", {"twin_read_answer": "teal"}, "before the occluder comes the twin shows 'teal'"),
-    ("exchange", {"twin_commit_s": 3.8}, "less than 0.8 s after the twin's outcome settles"),
-    ("words", {"ill_posed_for": None}, "has no answer"),
-    ("words", {"question_refuted": "mass"}, "reads as ill-posed: mass"),
-    ("words", {"premises": 2}, "presumes 2 things that are not so"),
-    ("words", {"true_answer": "zero"}, "has a true answer: zero"),
+    ("outcome", {"label": None}, ""),
+    ("outcome", {"label": "teal"}, "'teal'"),
+    ("outcome", {"commit_s": 4.4}, "0.5"),
+    ("outcome", {"margin_m": 0.0}, "0.0000"),
+    ("outcome", {"margin_m": float("nan")}, "nan"),
+    ("pace", {"settles_share": 0.29}, "29% 30%"),
+    ("pace", {"settles_share": 0.82}, "82% 80%"),
+    ("turns", {"turns_deg": 9.9}, "9.9 10"),
+    ("walls", {"walls_px": {"pane": 149.75}}, "'pane' 150"),
+    ("physics", {"simulated_answer": "teal"}, "'teal'"),
+    ("physics", {"parted_m": 0.0051}, "0.005"),
+    ("in_frame", {"in_frame": False}, ""),
+    ("legible", {"too_small": ["149 of 150 pixels of ball"]}, "149 150 ball"),
+    ("legible", {"least_visible_px": 149.75}, "150"),
+    ("order", {"order_frames": 0}, ""),
+    ("hidden", {"past_panel_px": 0.25}, "0"),
+    ("hidden", {"hidden_from_s": 2.3}, ""),
+    ("ablation", {"ablation_px": 1}, "1"),
+    ("referents", {"referents": {}}, ""),
+    ("referents", {"referents_px": 79.75}, "80"),
+    ("referents", {"referents_moving_s": 0.4}, "0.4 0.5"),
+    ("referents", {"cause_moving_s": 0.4}, "0.4 0.5"),
+    ("twin behind occluder", {"hidden_alone": False}, ""),
+    ("twin behind occluder", {"twin_answer": CLAIM.answer}, repr(CLAIM.answer)),
+    ("twin behind occluder", {"twin_answer": None}, "None"),
+    ("twin behind occluder", {"twin_px": 1}, "1"),
+    ("cut", {"last_shown_s": 0.9, "cut_s": 1.0}, "1.0"),
+    ("cut", {"cut_s": 1.2}, "1.2 1.0"),
+    ("open", {"accepted": 63}, "63 64"),
+    ("open", {"entropy_bits": 0.99}, "0.99 1.0"),
+    ("open", {"top_share": 0.601}, "60.1% 60%"),
+    ("open", {"cut_settled": 15}, "15 16"),
+    ("open", {"cut_top_share": 0.76}, "76.0% 75%"),
+    ("open", {"cut_truth_share": 0.04}, "4.0% 5%"),
+    ("twin of cut", {"twin_answer": CHAOTIC.answer}, repr(CHAOTIC.answer)),
+    ("twin of cut", {"twin_deviation_px": 0.51}, "0.51"),
+    ("twin of cut", {"start_off": 2.6e-7}, "2.6e-07"),
+    ("twin of cut", {"rebuilt": False}, repr(CHAOTIC.twin_answer)),
+    ("closing", {"read_answer": "teal"}, "'teal'"),
+    ("closing", {"read_s": 0.7}, "0.8"),
+    ("closing", {"commit_s": 3.8}, "0.8"),
+    ("closing", {"closes_s": 4.6}, "4.6 4.5"),
+    ("closing", {"closed_px": 0.25}, "0.25"),
+    ("closing", {"closed_change_px": 1}, "1"),
+    ("exchange", {"other_settings": ["length", "camera"]}, "length camera"),
+    ("exchange", {"lost_exchanged": "pace: too late"}, "pace: too late"),
+    ("exchange", {"hidden_from_s": 3.7}, ""),
+    ("exchange", {"twin_read_answer": "teal"}, "'teal'"),
+    ("exchange", {"twin_commit_s": 3.8}, "0.8"),
+    ("words", {"ill_posed_for": None}, repr(CLAIM.ill_posed_question)),
+    ("words", {"question_refuted": "mass"}, "mass"),
+    ("words", {"premises": 2}, "2"),
+    ("words", {"true_answer": "zero"}, "zero"),
 ]
 JUDGES = dict(zip(GOOD, CERTIFICATES, strict=True))
 
@@ -334,18 +336,18 @@ def judged(name: str, evidence: dict[str, Any]) -> str | None:
 @pytest.mark.parametrize("name", GOOD)
 def test_evidence_at_its_thresholds_is_enough(name: str) -> None:
     assert judged(name, GOOD[name]) is None
-    assert name in {bad for bad, _, _ in BAD}
+    assert name in {bad for bad, *_ in BAD}
 
 
-@pytest.mark.parametrize(("name", "worse", "said"), BAD, ids=lambda value: value if isinstance(value, str) else "")
-def test_evidence_beyond_a_threshold_is_not(name: str, worse: dict[str, Any], said: str) -> None:
+@pytest.mark.parametrize(("name", "worse", "named"), BAD, ids=[name for name, *_ in BAD])
+def test_evidence_beyond_a_threshold_is_not(name: str, worse: dict[str, Any], named: str) -> None:
     found = judged(name, GOOD[name] | worse)
-    assert found is not None and said in found
+    assert found is not None and all(each in found for each in named.split())
 
 
 def test_a_twin_that_ends_as_its_scenario_does_is_refused_though_its_record_says_so_too() -> None:
     alike, good = replace(CLAIM, twin_answer=CLAIM.answer), GOOD["twin behind occluder"] | {"twin_answer": CLAIM.answer}
-    assert "the twin ends in" in str(JUDGES["twin behind occluder"].failure(good, alike))
+    assert repr(CLAIM.answer) in str(JUDGES["twin behind occluder"].failure(good, alike))
 
 
 def test_a_seesaw_that_nothing_strikes_loses_and_what_turns_nothing_is_not_asked() -> None:
@@ -356,7 +358,7 @@ def test_a_seesaw_that_nothing_strikes_loses_and_what_turns_nothing_is_not_asked
     still = case.qpos.copy()
     still[:, hinge] = 0
     measured = TURNS.measured(replace(pair, control=replace(pair.control, qpos=still)))
-    assert TURNS.failure(measured, pair.claim) == "what the scene is about turns by 0.0 degrees, 10 wanted"
+    assert measured["turns_deg"] == 0 and "0.0" in str(TURNS.failure(measured, pair.claim))
     assert TURNS.failure({"turns_deg": None}, CHAOTIC) is None
 
 
@@ -373,14 +375,13 @@ def test_panes_are_walls_that_nobody_can_know_of_once_their_edges_are_not_drawn(
         assert WALLS.failure(measured, pair.claim) is None
     else:
         assert {*measured["walls_px"].values()} == {0}
-        said = "the edges of 'fence_front', a wall that is not drawn, have 0 pixels, 150 wanted"
-        assert WALLS.failure(measured, pair.claim) == said
+        assert "'fence_front'" in str(WALLS.failure(measured, pair.claim))
 
 
 def test_three_answers_need_less_entropy_than_two() -> None:
     evidence = GOOD["open"] | {"entropy_bits": 0.9}
     assert OPEN.failure(evidence, replace(CHAOTIC, labels=3)) is None
-    assert "1.0 wanted" in str(OPEN.failure(evidence, replace(CHAOTIC, labels=2)))
+    assert "1.0" in str(OPEN.failure(evidence, replace(CHAOTIC, labels=2)))
 
 
 def test_the_futures_of_another_machine_are_another_sample_and_are_judged_as_one() -> None:
@@ -388,9 +389,9 @@ def test_the_futures_of_another_machine_are_another_sample_and_are_judged_as_one
     for narrow in ({"accepted": 48}, {"top_share": 0.80}, {"entropy_bits": 0.65}):
         assert OPEN.failure(elsewhere | narrow, CHAOTIC) is None
         assert OPEN.failure(elsewhere | narrow | {"same_physics": True}, CHAOTIC) is not None
-    assert "47 futures" in str(OPEN.failure(elsewhere | {"accepted": 47}, CHAOTIC))
-    assert "80.1% of the futures" in str(OPEN.failure(elsewhere | {"top_share": 0.801}, CHAOTIC))
-    assert "0.65 wanted" in str(OPEN.failure(elsewhere | {"entropy_bits": 0.64}, CHAOTIC))
+    assert "47" in str(OPEN.failure(elsewhere | {"accepted": 47}, CHAOTIC))
+    assert "80.1%" in str(OPEN.failure(elsewhere | {"top_share": 0.801}, CHAOTIC))
+    assert "0.65" in str(OPEN.failure(elsewhere | {"entropy_bits": 0.64}, CHAOTIC))
     assert OPEN.contradiction(elsewhere, {"perturbation": 1e-4}, exact=False) is None
     assert "accepted" in str(OPEN.contradiction({"accepted": 64}, {"accepted": 65}, exact=True))
 
@@ -426,7 +427,8 @@ def test_a_certificate_that_is_added_reaches_draws_records_asset_checks_and_the_
     with raises(Rejected, "scenes.certification.evidence.require_certificates"):
         resolve(race.family, race.params, wording, "?", scenario_id="race-1", seed=0)
     assert "looks down by" in failures(race, race.spec)["level"]
-    assert unanswerable_controls([race.spec]) == ["hidden_race-0001: level: no evidence 'elevation_deg'"]
+    (lost,) = unanswerable_controls([race.spec])
+    assert lost.startswith("hidden_race-0001: level: ") and "elevation_deg" in lost
     assert "| `level` | the camera looks straight ahead |  | `elevation_deg` |" in certificates.table()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -184,8 +185,8 @@ def test_families_that_cannot_be_drawn_like_this_are_named(tmp_path: Path, capsy
     sample = ["benchmark", "sample", "--seed", "1", "--count", "1", "--out", str(tmp_path / "out")]
     assert main([*sample, "--families", "plinko", "chain", "bounce", "--speed", "2", "--longer"]) == 1
     told = capsys.readouterr().err
-    assert "plinko: no --speed, no --longer" in told and "bounce: no --longer" in told and "chain: no" not in told
-    assert told.rstrip().endswith("--families: chain, domino_branch")
+    wanted = ["bounce", "--longer", "plinko", "--speed", "--longer", "--families", "chain", "domino_branch"]
+    assert [word for word in re.findall(r"[a-z_-]+", told) if word in wanted or word[:2] == "--"] == wanted
     assert not (tmp_path / "out").exists()
     assert {*MAX_SPEEDS.values()} <= {*SPEEDS}
     assert {f.name for f in families() if not unsupported_settings(f, Difficulty(speed=1.5))} == {*MAX_SPEEDS}

@@ -184,8 +184,10 @@ def test_a_browser_shows_the_pixels_that_a_model_is_shown(tmp_path: Path, width:
     assert difference.mean() < 2 and difference.max() <= 10  # of 255; 6.3 and 40 at 720 lines where none are stated
 
 
-@pytest.mark.parametrize("shape", [(360, 481, 3), (359, 480, 3)])
-def test_a_clip_with_an_odd_side_is_refused_before_a_file_is_written(shape: tuple[int, ...], tmp_path: Path) -> None:
-    with pytest.raises(TrapsError, match=r"draw them at 48[02] x 360"):
+@pytest.mark.parametrize(("shape", "wanted"), [((360, 481, 3), "482 x 360"), ((359, 480, 3), "480 x 360")])
+def test_a_clip_with_an_odd_side_is_refused_before_a_file_is_written(
+    shape: tuple[int, ...], wanted: str, tmp_path: Path
+) -> None:
+    with raises(TrapsError, "video.encode.encode", "clip.mp4", wanted):
         encode([np.zeros(shape, np.uint8)], tmp_path / "clip.mp4", 5)
     assert not list(tmp_path.iterdir())

@@ -91,7 +91,7 @@ def test_a_length_that_follows_from_the_control_alone_is_found() -> None:
     found, (control, twin) = pair(BOUNCE), wholes(BOUNCE)
     early = replace(found, control=shortened(control, 36), twin=shortened(twin, 36))
     assert 36 in {n for seed in range(60) for n in lengths([control], seed)}
-    assert "had the twin been the control, the length" in str(failure(early))
+    assert "length" in str(failure(early))
 
 
 def test_a_moment_of_closing_that_no_draw_tries_is_found() -> None:
@@ -101,10 +101,11 @@ def test_a_moment_of_closing_that_no_draw_tries_is_found() -> None:
     tried = set(moments((found.control, found.other_world), found.claim.seed))
     other = next(frame for frame in range(29, 39) if frame not in tried)
     moved = of_both(found, lambda world: replace(world, closing=replace(closing, frame=other)))
-    assert "had the twin been the control, the closing would be another" in str(failure(moved))
+    said = str(failure(moved))
+    assert "closing" in said and "length" not in said
 
 
 def test_a_twin_that_does_not_pass_as_a_control_is_found() -> None:
     found = pair(RACE)
     lost = failure(replace(found, claim=replace(found.claim, twin_answer="teal")))
-    assert str(lost).startswith("with the twin as the control: outcome: the control shows ")
+    assert "outcome: " in str(lost) and "'teal'" in str(lost)

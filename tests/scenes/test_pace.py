@@ -60,9 +60,9 @@ def test_a_clip_that_ends_earlier_is_the_beginning_of_the_same_motion() -> None:
     assert len(case.qpos) == len(case.twin) < 50
 
 
-@pytest.mark.parametrize(("n_frames", "failure"), [(50, "after 16% of the clip"), (24, None)])
-def test_a_clip_that_goes_on_for_too_long_loses_the_certificate(n_frames: int, failure: str | None) -> None:
-    case, world = load(EARLY), shortened(whole(EARLY), n_frames)
-    pair = replace(pair_of(case.spec, case.qpos, case.twin), control=world)
-    said = PACE.failure(PACE.measured(pair), pair.claim)
-    assert (said is None) if failure is None else (said is not None and failure in said)
+def test_a_clip_that_goes_on_for_too_long_loses_the_certificate() -> None:
+    case, said = load(EARLY), []
+    for n_frames in (50, 24):
+        pair = replace(pair_of(case.spec, case.qpos, case.twin), control=shortened(whole(EARLY), n_frames))
+        said.append(PACE.failure(PACE.measured(pair), pair.claim))
+    assert "16%" in str(said[0]) and said[1] is None

@@ -162,15 +162,10 @@ def test_a_question_is_filled_and_read_back() -> None:
 
 
 def test_what_rests_beyond_a_mark_is_seen_there() -> None:
-    frames = np.full((5, 360, 480, 3), 200, np.uint8)
-    frames[:, 150:170, 240:260] = np.array(COLOURS["blue"]) * 255
-    for frame, x in zip(frames, (40, 140, 340, 340, 340), strict=True):
-        frame[150:170, x : x + 20] = np.array(COLOURS["red"]) * 255
-    see = observers.beyond("ball", "line")
-    assert see(frames, {"ball": "red", "line": "blue"}) == "yes"
-    assert see(frames[:2], {"ball": "red", "line": "blue"}) is None
-    assert see(frames[[0, 1, 1, 1]], {"ball": "red", "line": "blue"}) == "no"
-    assert see(frames, {"ball": "red", "line": "purple"}) is None
+    frames, see = moving("red", (40, 140, 340, 340, 340)), observers.beyond("ball", "line")
+    named = {"ball": "red", "line": "blue"}
+    assert (see(frames, named), see(frames[:2], named), see(frames[[0, 1, 1, 1]], named)) == ("yes", None, "no")
+    assert see(frames, named | {"line": "purple"}) is None
 
 
 def moving(colour: str, xs: tuple[int, ...], ys: tuple[int, ...] | None = None) -> np.ndarray:

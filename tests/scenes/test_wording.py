@@ -51,18 +51,25 @@ def test_every_template_asks_for_its_own_property() -> None:
 
 
 @pytest.mark.parametrize(
-    ("question", "why"),
+    ("question", "refuted"),
     [
-        ("What material are the triangles made of?", "there is no triangle"),  # the paper's own
-        ("What is the weight of the red color?", "a colour has no weight"),  # and this one
-        ("What is the weight of the colour red?", "a colour has no weight"),
-        ("Where does the blue ball end up?", "nothing is blue"),
-        ("Where does the red ball end up?", None),
-        ("How often does the ball hit the magnet?", "there is no magnet"),
+        ("What material are the triangles made of?", ["triangle"]),  # the paper's own
+        ("What is the weight of the red color?", ["weight"]),  # and this one
+        ("What is the weight of the colour red?", ["weight"]),
+        ("Where does the blue ball end up?", ["blue"]),
+        ("Where does the red ball end up?", []),
+        ("How often does the ball hit the magnet?", ["magnet"]),
     ],
 )
-def test_a_false_premise_is_refuted_by_the_inventory(question: str, why: str | None) -> None:
-    assert false_premise(question, SCENE) == why
+def test_a_false_premise_is_refuted_by_the_inventory(question: str, refuted: list[str]) -> None:
+    assert presumed(question, SCENE) == refuted
+    assert (false_premise(question, SCENE) is None) == (refuted == [])
+
+
+def presumed(question: str, inventory: Inventory) -> list[str]:
+    """What a question presumes falsely, as its reasons name it."""
+    named = "triangle", "magnet", "arrow", "weight", "blue", "green", "gold"
+    return [word for reason in false_premises(question, inventory) for word in reason.split() if word in named]
 
 
 @pytest.mark.parametrize("taxonomy", ["occlusion", "chaotic"])
@@ -114,12 +121,11 @@ def test_a_colour_that_is_nearly_there_refutes_nothing() -> None:
     assert colour_distance("gold", "yellow") < 10
     assert colour_distance("black", "white") > 60
     yellow = Inventory(colours=("yellow", "wood"), objects=("ball",))
-    assert false_premise("Where does the gold ball end up?", yellow) is None
-    assert false_premise("Where does the green ball end up?", yellow) == "nothing is green"
-    assert false_premises("Which way does the gold arrow point?", yellow) == ["there is no arrow"]
+    assert presumed("Where does the gold ball end up?", yellow) == []
+    assert presumed("Where does the green ball end up?", yellow) == ["green"]
+    assert presumed("Which way does the gold arrow point?", yellow) == ["arrow"]
     assert len(false_premises("Which way does the gold arrow point?", yellow, near=True)) == 2
-    both = false_premises("Which way does the green arrow point?", yellow)
-    assert both == ["there is no arrow", "nothing is green"]
+    assert presumed("Which way does the green arrow point?", yellow) == ["arrow", "green"]
 
 
 def test_a_scene_with_every_question_taken_is_refused() -> None:

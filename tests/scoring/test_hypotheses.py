@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 
 import pandas as pd
@@ -84,7 +85,7 @@ def test_j_accuracy_and_chance_of_numbers_of_answers(rows: Rows):
 def test_doses_of_two_campaigns_are_not_compared(rows: Rows):
     pair = [(True, False, True)]
     made = table(of(rows, "labels_two", pair), of(rows, "labels_six", pair, epoch="e2")).set_index("dose")
-    assert made.loc["6 answers", "refused"] == "the dose is of epoch e2, its reference of epoch e1"
+    assert re.findall(r"\be\d\b", made.loc["6 answers", "refused"]) == ["e2", "e1"]
     assert pd.isna(made.loc["6 answers", "change"]) and made.loc["6 answers", "j"] == 1
 
 
@@ -96,7 +97,7 @@ def test_pairs_alone_have_no_doses_and_the_report_says_not_run(rows: Rows):
         is_study = True
 
     for one in printed(Study()):
-        assert one.cells == [] and one.why == "no variation was run (traps run hypotheses)"
+        assert one.cells == [] and "traps run hypotheses" in one.why
 
 
 def test_the_report_has_an_interval_and_a_rule_beside_each_number(rows: Rows):

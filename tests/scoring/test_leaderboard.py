@@ -132,7 +132,7 @@ def test_models_of_two_panels_are_neither_ranked_nor_contrasted_together_and_a_m
     of_j = table.loc[table["figure"] == "j"].to_dict("records")
     refused = {(row["left_model"], row["right_model"]): row["refused"] for row in of_j}
     assert {pair for pair, why in refused.items() if pd.isna(why)} == {("a", "b")}
-    assert "judged by one@1 on one side and by two@1 on the other" in refused["a", "c"]
+    assert "one@1" in refused["a", "c"] and "two@1" in refused["a", "c"]
 
 
 @pytest.mark.parametrize(("lost", "incomplete"), [(0, False), (1, False), (2, True)])

@@ -68,7 +68,5 @@ def test_the_plan_names_the_difference_that_all_models_of_the_experiment_leave(
 ) -> None:
     assert main(["plan", "paper", "--workspace", str(tmp_path / "none")]) == 0
     found = precision(dict(zip(DATASETS, (202, 202, 500, 500), strict=True)), models=16)
-    printed = capsys.readouterr().out
-    assert f"interval of PECS about {found.width:.3f} wide" in printed
-    among = "between two of 16 models, after Holm's correction over their 120 comparisons"
-    assert f"80 % of studies find a difference of {found.among_all:.3f} {among}" in printed
+    _, width, said = capsys.readouterr().out.partition(f" {found.width:.3f} ")
+    assert width and {f"{found.among_all:.3f}", "16", "120"} <= {*said.split()}  # of 16 models there are 120 pairs
