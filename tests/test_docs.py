@@ -123,8 +123,8 @@ def test_the_finding_in_the_readme_is_what_the_paper_printed() -> None:
     readme = " ".join((ROOT / "README.md").read_text().split())
     plain, guided = (overall["abs_rec"][regime].mul(100).round() for regime in ("standard", "guided"))
     assert len(overall) == 16
-    assert f"Asked plainly, the paper's sixteen models abstain on {plain.min():.0f} to {plain.max():.0f} %" in readme
-    assert f"Told not to guess, they abstain on {guided.min():.0f} to {guided.max():.0f} %" in readme
+    for shares in (plain, guided):
+        assert f"{shares.min():.0f} to {shares.max():.0f} %" in readme
     changed = (overall["acc"]["guided"] - overall["acc"]["standard"]).abs().mul(100).round().max()
-    assert changed == 2 and "their accuracy on the others changes by two points at most" in readme
+    assert changed == 2 and "two points" in readme
     assert (ROOT / "docs" / "moving_pair.gif").stat().st_size < 1_500_000

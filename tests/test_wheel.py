@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import ROOT, Finished
+from traps_pipeline.base.extras import EXTRAS, ExtraName
 
 pytestmark = pytest.mark.slow
 SHIPPED = "traps_pipeline/shipped"
@@ -26,9 +27,9 @@ panel: rules
 epoch: tiny
 scenarios: [domino_chain-0001, hidden_race-0001]
 """
-NEEDING = {  # an experiment that wants an extra, and the beginning of what is said
-    "models: [pocket]\npanel: rules\njudged_by_rules: true": "a model on this machine needs torch and torchvision and",
-    "models: [gpt-5-mini]\npanel: paper": "asking models over the network needs litellm and mcp and aiohttp, which",
+NEEDING: dict[str, ExtraName] = {  # an experiment, and the extra that it wants
+    "models: [pocket]\npanel: rules\njudged_by_rules: true": "local",
+    "models: [gpt-5-mini]\npanel: paper": "api",
 }
 
 
@@ -134,8 +135,9 @@ def test_a_study_that_wants_more_says_so_before_it_renders(installed: Installed,
     for options in ([], ["--no-preflight"]):
         finished = installed.traps("run", f"{name}.yaml", "--workspace", folder, *options)
         assert finished.code == 1
-        assert finished.err.startswith(f"traps: {NEEDING[wants]}")
-        assert re.search(r"installed: `python -m pip install 'traps-pipeline\[(api|local)\]'`$", finished.err.rstrip())
+        extra = NEEDING[wants]
+        named = [*EXTRAS[extra].modules, f"`python -m pip install 'traps-pipeline[{extra}]'`"]
+        assert finished.err.startswith("traps: ") and [one for one in named if one not in finished.err] == []
         assert not [*(folder / "clips").rglob("*.mp4")]
 
 
@@ -144,7 +146,7 @@ def test_a_command_that_wants_more_is_one_sentence(installed: Installed, command
     finished = installed.traps(*command.split())
     assert (finished.code, finished.out) == (1, "")
     assert len(finished.err.splitlines()) == 1
-    assert finished.err.endswith(f"not installed: `python -m pip install 'traps-pipeline[{extra}]'`\n")
+    assert finished.err.endswith(f"`python -m pip install 'traps-pipeline[{extra}]'`\n")
 
 
 def test_the_shipped_benchmark_is_not_changed_and_a_copy_of_it_is(installed: Installed) -> None:
@@ -158,7 +160,7 @@ def test_the_shipped_benchmark_is_not_changed_and_a_copy_of_it_is(installed: Ins
     before = {path: path.stat().st_mtime_ns for path in installed.shipped.rglob("*")}
     refused = installed.run(installed.python, "-c", code)
     assert refused.code == 1
-    assert "came with the installed package and is not changed; copy" in refused.err
+    assert str(installed.shipped / "scene_specs") in refused.err and "TRAPS_SCENE_SPECS" in refused.err
     assert {path: path.stat().st_mtime_ns for path in installed.shipped.rglob("*")} == before
     subprocess.run(["cp", "-r", installed.shipped / "scene_specs", installed.work / "mine"], check=True)
     installed.run(installed.python, "-c", code, TRAPS_SCENE_SPECS=str(installed.work / "mine")).ok()

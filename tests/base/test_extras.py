@@ -81,17 +81,15 @@ def test_the_bill_of_materials_names_every_pin_and_is_written_twice_to_the_same_
 
 
 @pytest.mark.parametrize(
-    ("name", "blocked", "said"),
-    [
-        ("api", ["litellm"], "asking models over the network needs litellm, which is not installed: `make setup`"),
-        ("web", ["fastapi", "uvicorn"], "a page that listens needs fastapi and uvicorn, which are not installed: "),
-    ],
+    ("name", "blocked"),
+    [("api", ["litellm"]), ("web", ["fastapi", "uvicorn"])],
 )
-def test_a_missing_extra_is_one_sentence_with_the_line_to_type(name: ExtraName, blocked: list[str], said: str) -> None:
+def test_a_missing_extra_is_one_sentence_with_the_line_to_type(name: ExtraName, blocked: list[str]) -> None:
     code = f"{BLOCK.format(blocked=blocked)}\nfrom traps_pipeline.base.extras import require; require({name!r})"
     finished = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert finished.returncode == 1
-    assert said in finished.stderr.splitlines()[-1]
+    told = finished.stderr.splitlines()[-1]
+    assert [one for one in (*EXTRAS[name].modules, "`make setup`") if one in told] == [*blocked, "`make setup`"]
 
 
 @pytest.mark.slow
@@ -101,4 +99,5 @@ def test_an_import_that_nobody_looked_after_is_told_in_the_same_sentence(tmp_pat
     arguments = ["train", "--data", tmp_path / "data", "--out", tmp_path / "out"]
     finished = subprocess.run([sys.executable, "-c", code, *arguments], cwd=ROOT, capture_output=True, text=True)
     assert (finished.returncode, finished.stdout) == (1, "")
-    assert finished.stderr == "traps: a model on this machine needs torch, which is not installed: `make setup`\n"
+    (told,) = finished.stderr.splitlines()
+    assert told.startswith("traps: ") and " torch" in told and "`make setup`" in told

@@ -14,7 +14,8 @@ KNOWN = ("gpt-5-mini", "oracle", "always-abstain")
 )
 def test_a_word_is_like_one_of_the_known_or_like_none(word: str, near: str | None) -> None:
     assert nearest(word, KNOWN) == near
-    assert did_you_mean(word, KNOWN) == (f"; did you mean {near}?" if near else "")
+    told = did_you_mean(word, KNOWN)
+    assert near in told if near else told == ""
 
 
 def test_a_word_of_any_length_is_compared_at_once() -> None:

@@ -51,7 +51,8 @@ def test_a_terminal_gets_headings_with_a_rule_and_the_columns_that_fit(columns: 
     assert set(lines[1].rstrip()) == {"─"}
     if columns == 40:
         assert lines[0].split() == ["model", "n"] and lines[3].split() == ["a-model-of-a-long-name", "1234"]
-        assert lines[4:] == ["not shown in 40 columns: what was", "refused"]
+        hidden = " ".join(lines[4:])
+        assert "40" in hidden and hidden.endswith(HEADINGS[2])
     else:
         assert lines[0].split() == " ".join(HEADINGS).split()
         assert lines[3].endswith(REFUSED)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -38,18 +39,9 @@ def test_what_is_shipped_reads_as_any_reader_reads_it() -> None:
         "a: &x [1]\nb: &y [*x, *x]",
         "a: &x [1]\nb: [" + "*x, " * 300 + "]",
         "a: !!python/object/apply:os.system [ls]",
-        "a: !!timestamp 2026-11-21",
-        "a: !!binary aGk=",
         "a: !!float .inf",
-        "b: 1\na: !!bool abc",
-        "a: !!int x",
-        "a: !!str 5",
         "!!int a: 5",
-        "a: !!null x",
-        "a: !!seq {b: 1}",
         "a: !!map [1]",
-        "a: !!set {b}",
-        "a: !!merge x",
         "a: !own {b: 1}",
         "a: ! 5",
         "%TAG !e! tag:yaml.org,2002:\n---\na: !e!bool abc",
@@ -106,16 +98,17 @@ def test_an_ambiguous_line_is_named(file: Path, line: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("line", "sentence"),
+    ("line", "field", "near"),
     [
-        ("modls: [oracle]", "modls: there is no such key; did you mean models?"),
-        ("mechanism: {promts: [guided]}", "mechanism.promts: there is no such key; did you mean prompts?"),
-        ("weather: fine", "weather: there is no such key"),
+        ("modls: [oracle]", "modls", "models"),
+        ("mechanism: {promts: [guided]}", "mechanism.promts", "prompts"),
+        ("weather: fine", "weather", ""),
     ],
 )
-def test_an_unknown_key_is_told_with_the_known_one_that_it_resembles(line: str, sentence: str, file: Path) -> None:
+def test_an_unknown_key_is_told_with_the_known_one_that_it_resembles(
+    line: str, field: str, near: str, file: Path
+) -> None:
     file.write_text(line)
-    with pytest.raises(TrapsError) as refused:
+    with raises(TrapsError, "base.yamlfile.parse_yaml_model", field) as refused:
         load_experiment(str(file))
-    assert sentence in str(refused.value)
-    assert ("did you mean" in str(refused.value)) == ("did you mean" in sentence)
+    assert re.findall(r"(\w+)\?", str(refused.value)) == ([near] if near else [])

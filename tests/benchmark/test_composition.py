@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -66,36 +67,39 @@ def race(answers: str) -> list[SceneSpec]:
     ]
 
 
+def is_one(problems: Iterable[str], *names: str) -> bool:
+    """Whether there is one problem, which names these."""
+    (problem,) = problems
+    return all(name in problem for name in names)
+
+
 def test_an_answer_may_come_once_more_than_the_even_split() -> None:
     assert problems(race("yyyyynnn")) == []
-    assert problems(race("yyyyyynn")) == ["domino_chain: answer 'yes' occurs 6 times, at most 5 allowed"]
+    assert is_one(problems(race("yyyyyynn")), "domino_chain", "'yes'", "6", "5")
 
 
 def test_of_ten_or_more_an_answer_of_two_may_be_60_percent() -> None:
     assert problems(race("y" * 12 + "n" * 8)) == []
-    assert problems(race("y" * 13 + "n" * 7)) == ["domino_chain: answer 'yes' occurs 13 times, at most 12 allowed"]
+    assert is_one(problems(race("y" * 13 + "n" * 7)), "domino_chain", "'yes'", "13", "12")
 
 
 def test_a_text_or_a_scene_that_occurs_twice_is_named() -> None:
     specs = race("ynyn")
     twice = [*specs[:3], specs[3].model_copy(update={"ill_posed_question": specs[0].ill_posed_question})]
-    assert problems(twice) == [
-        "domino_chain: 'How many grams does domino 0 weigh?' is asked 2 times, at most 1 allowed"
-    ]
+    assert is_one(problems(twice), "domino_chain", "'How many grams does domino 0 weigh?'", "2", "1")
     copied = [*specs[:3], specs[0].model_copy(update={"scenario_id": "domino_chain-0099", "ill_posed_question": "?"})]
-    assert problems(copied) == ["domino_chain-0000, domino_chain-0099: the same trajectory"]
+    assert is_one(problems(copied), "domino_chain-0000, domino_chain-0099")
 
 
 def test_a_family_whose_margin_is_a_constant_is_named() -> None:
     constant = [spec.model_copy(update={"evidence": spec.evidence | {"margin_m": 1.0}}) for spec in race("ynyn")]
-    assert problems(constant) == ["domino_chain: every scenario has the margin 1.0 m"]
+    assert is_one(problems(constant), "domino_chain", "1.0 m")
     assert problems(constant[:1]) == []
     assert problems([*constant[:3], race("ynyn")[3]]) == []
 
 
 def test_missing_scenarios_are_counted() -> None:
-    found = problems(race("yn"), {"domino_chain": 2, "plinko": 1})
-    assert found == ["plinko: 0 scenarios, 1 wanted"]
+    assert is_one(problems(race("yn"), {"domino_chain": 2, "plinko": 1}), "plinko", "0", "1")
 
 
 def test_the_prior_knows_only_the_commonest_answer_of_a_sub_scenario() -> None:
@@ -123,25 +127,26 @@ def test_a_record_whose_cut_was_moved_is_found_without_a_trajectory() -> None:
     spec = load_released()["plinko-0001"]
     assert list(answerable_voids([spec])) == []
     early = spec.model_copy(update={"void": spec.void | {"cut_frame": 9}})  # its last frame is shown at 0.8 s
-    (said,) = answerable_voids([early])
-    assert said == "plinko-0001: cut: the cut at 0.9 s is before 1.0 s or after commitment"
+    assert is_one(answerable_voids([early]), "plinko-0001: cut", "0.9 s", "1.0 s")
 
 
 def test_a_record_without_evidence_loses_every_certificate_that_stores_some() -> None:
     bare = load_released()["domino_chain-0001"].model_copy(update={"evidence": {}})
-    lost = [said.split(": ")[1:] for said in (*unanswerable_controls([bare]), *answerable_voids([bare]))]
-    assert lost == [
-        ["outcome", "no evidence 'commit_s'"],
-        ["pace", "no evidence 'settles_share'"],
-        ["legible", "no evidence 'least_visible_px'"],
-        ["order", "no evidence 'order_frames'"],
-        ["hidden", "no evidence 'hidden_from_s'"],
-        ["ablation", "no evidence 'ablation_px'"],
-        ["referents", "no evidence 'referents'"],
-        ["twin", "no evidence 'twin_px'"],
-        ["closing", "no evidence 'read_s'"],
-        ["exchange", "no evidence 'hidden_from_s'"],
-    ]
+    lost = {
+        "outcome": "commit_s",
+        "pace": "settles_share",
+        "legible": "least_visible_px",
+        "order": "order_frames",
+        "hidden": "hidden_from_s",
+        "ablation": "ablation_px",
+        "referents": "referents",
+        "twin": "twin_px",
+        "closing": "read_s",
+        "exchange": "hidden_from_s",
+    }
+    said = [*unanswerable_controls([bare]), *answerable_voids([bare])]
+    assert [one.split(": ")[1] for one in said] == [*lost]
+    assert all(f"'{evidence}'" in one for evidence, one in zip(lost.values(), said, strict=True))
 
 
 def test_the_lite_set_is_the_one_that_its_rule_chooses_from_the_released_records() -> None:
@@ -163,7 +168,7 @@ def test_seesaws_whose_side_the_state_at_the_cut_predicts_are_reported_and_the_r
     middle = sorted(place.values())[len(place) // 2]
     sides = [s.model_copy(update={"ground_truth": "left" if place[s.scenario_id] < middle else "right"}) for s in specs]
     (said,) = foreseeable(sides, verdicts)
-    assert said.startswith("seesaw_sorter: the state at the cut predicts 0.9") or "predicts 1.000" in said
+    assert "seesaw_sorter" in said and max(map(float, re.findall(r"[01]\.\d{3}", said))) >= 0.9
     assert foreseeable(sides[:99], verdicts) == []  # too few to tell
 
 
@@ -181,7 +186,7 @@ def start_the_twin_elsewhere(record: Record) -> None:
 # What each certificate finds is in tests/scenes/test_certificates.py.
 ALTERED: dict[str, tuple[Callable[[Record], None], str]] = {
     "head_on-0001": (change_answer, "outcome"),
-    "pachinko_waterfall-0001": (start_the_twin_elsewhere, "twin: the twin's trajectory begins"),
+    "pachinko_waterfall-0001": (start_the_twin_elsewhere, "twin"),
 }
 UNTOUCHED = "slide-0001"
 
@@ -208,4 +213,4 @@ def test_altered_records_are_named_with_the_certificate_that_they_lose_and_an_un
     assert finished.code == 1 and "Traceback" not in finished.err
     for scenario_id, (_, lost) in ALTERED.items():
         assert f"traps: {scenario_id}: {lost}" in finished.err, finished.err
-    assert f"traps: {UNTOUCHED}" not in finished.err and "1 of 3 scenarios certified" in finished.out
+    assert f"traps: {UNTOUCHED}" not in finished.err and re.search(r"\b1 \w+ 3\b", finished.out)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.corrections import Correction, Scenario, fold
@@ -73,7 +74,8 @@ def test_an_answer_that_the_simulation_contradicts_is_refused(workspace: Workspa
     wrong = next(label for label in released.labels if label != released.ground_truth)
     azimuth = released.params["azimuth_deg"] + 2.0
     change = {"scenario_id": "domino_chain-0001", "params": {"azimuth_deg": azimuth}, "answer": wrong}
-    with pytest.raises(TrapsError, match=r"review\.jsonl:1: .* the correction says"):
+    by, answers = "benchmark.specs.resolve_scenario", (repr(wrong), repr(released.ground_truth))
+    with raises(TrapsError, by, "review.jsonl:1", *answers):
         resolve_scenario(workspace, corrected(change))
 
 
@@ -84,7 +86,7 @@ def test_a_corrected_question_replays_no_scene_again(tmp_path: Path, monkeypatch
     trajectory, absent = RELEASED / "trajectories" / "plinko-0003.npz", tmp_path / "absent.npz"
     other_evidence = spec.model_copy(update={"evidence": {**spec.evidence, "commit_s": 0.0}})
     assert len(unsettled_outcomes([ResolvedScenario(other_evidence, trajectory)])) == 1
-    with pytest.raises(ValueError, match="no such trajectory"):
+    with raises(ValueError, "scenes.worlds.spec.load_trajectory", str(absent)):
         unsettled_outcomes([ResolvedScenario(spec, absent)])
     assert unsettled_outcomes([ResolvedScenario(spec, trajectory)]) == []
     asked = spec.model_copy(update={"ill_posed_question": "How heavy is the blue square?"})

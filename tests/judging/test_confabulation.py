@@ -283,7 +283,7 @@ def test_the_papers_six_models_are_sampled_and_half_of_them_show_their_trace() -
     [
         ("paper: judge-claude-opus-4.6", "paper: rule-1", "judges.paper"),
         ("gemini-3.1-pro:", "gemini-9:", "gemini-9"),
-        ("run: 1", "run: 4", "run is 4"),
+        ("run: 1", "run: 4", "gemini-2.5-flash"),
         ("n: 100\nseed", "n: 0\nseed", "n: "),
         ("qwen3-vl-instruct: output", "qwen3-vl-instruct: trace", "models.qwen3-vl-instruct: "),
         ("models: [gemini-2.5-flash,", "models: [gpt-5-pro,", "validation.models: gpt-5-pro"),

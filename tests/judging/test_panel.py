@@ -134,20 +134,16 @@ def test_a_number_that_is_none_makes_a_vote_invalid_and_not_wrong(value: str) ->
 @pytest.mark.parametrize(
     ("text", "outcome", "reason"),
     [
-        (None, "empty", "judge returned empty"),
-        (None, "refused", "judge returned refused"),
-        (None, "error", "judge returned error"),
+        (None, "empty", "empty"),
+        (None, "refused", "refused"),
+        (None, "error", "error"),
         ("", "answer", "Invalid JSON"),
         ("It abstained.", "answer", "Invalid JSON"),
         ('{"abstained": true', "truncated", "Invalid JSON"),
         ("[]", "answer", "should be an object"),
         ('{"abstained": true, "confidence": "high"}', "answer", "reasoning: Field required"),
         ('{"abstained": "yes", "confidence": "high", "reasoning": ""}', "answer", "abstained: "),
-        (
-            '{"abstained": false, "abstained": true, "confidence": "high", "reasoning": ""}',
-            "answer",
-            "a key stands twice",
-        ),
+        ('{"abstained": false, "abstained": true, "confidence": "high", "reasoning": ""}', "answer", ""),  # a key twice
         ("unread", "answer", "unread"),  # of a rule judge
         ('{"abstained": 1, "confidence": "high", "reasoning": ""}', "answer", "abstained: "),
         ('{"abstained": null, "confidence": "high", "reasoning": ""}', "answer", "abstained: "),
@@ -157,7 +153,7 @@ def test_a_number_that_is_none_makes_a_vote_invalid_and_not_wrong(value: str) ->
 def test_a_vote_that_breaks_the_schema_is_invalid_for_a_reason(text: str | None, outcome: str, reason: str) -> None:
     invalid = vote("abstention", text, outcome)
     assert (invalid.valid, invalid.decision) == (False, None)
-    assert invalid.invalid_reason is not None and reason in invalid.invalid_reason
+    assert invalid.invalid_reason and reason in invalid.invalid_reason
 
 
 @pytest.mark.parametrize(
@@ -241,7 +237,7 @@ def test_judges_that_ask_no_language_model_sit_in_panels_named_after_rules_and_n
     if is_allowed:
         assert load_panel(name, path)
     else:
-        with raises(TrapsError, "", "judges.yaml", "no language model"):
+        with raises(TrapsError, "models.judges.load_panel", "judges.yaml", repr(name), "'rules-..'"):
             load_panel(name, path)
 
 

@@ -102,8 +102,8 @@ def test_an_attack_moved_a_vote_only_if_it_was_right_without_it(expected, clean,
     ("old", "new", "named"),
     [
         ("answer: wrong", "answer: missing", "'missing'"),
-        ("id: threat", "id: authority", "an id occurs twice"),
-        ("\n      {answer}\n\n      Judge: set", "\n      Judge: set", "dictated-value: text"),
+        ("id: threat", "id: authority", "attacks: "),
+        ("\n      {answer}\n\n      Judge: set", "\n      Judge: set", "dictated-value"),
         ("kind: dilution", "colour: red", "colour: "),
     ],
 )
@@ -122,4 +122,5 @@ def test_the_command_prints_what_moved_by_judge(tmp_path: Path, capsys: pytest.C
     (line,) = (row for row in out if row.startswith("rule-2 "))
     assert line.split() == ["rule-2", "42", "24", "0", "18", "0"]
     assert main(["models", "test-panel", "nobody", "--workspace", str(tmp_path)]) == 1
-    assert "no panel 'nobody'; it has rules, " in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "'nobody'" in told and "rules, " in told

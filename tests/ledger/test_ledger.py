@@ -160,9 +160,8 @@ def test_a_row_that_is_not_what_was_written_is_told_and_asked_again(ledger: Ledg
     damage(ledger, "a", encode_row(answer("a", "left")).replace(b"left", b"lift"))
     known = ledger.read("m")
     assert list(known.rows) == ["b"]
-    (note,) = known.notes.values()
-    assert "not what was written: it is not believed; its answer is asked again" in note
-    assert len(list(ledger.damage())) == 1
+    (place,), (told,) = known.notes, ledger.damage()
+    assert place in told and ledger.database.place in place
     write(ledger, answer("a", "right"))
     assert ledger.read("m").settled["a"]["text"] == "right"
 
@@ -175,11 +174,11 @@ def test_values_that_no_table_holds_are_unknown_and_told(ledger: Ledger) -> None
     known = ledger.read("m")
     assert known.rows["a"] == answer("a", "left") | dict.fromkeys(odd)
     (note,) = known.notes.values()
-    assert "cost_usd" in note and "counted as unknown" in note
+    assert [name for name in odd if name not in note] == []
 
 
 def test_a_row_that_no_line_can_hold_is_refused_and_the_others_are_kept(ledger: Ledger) -> None:
-    with pytest.raises(ValueError, match="JSON compliant"):
+    with raises(ValueError, "ledger.rows.encode_row"):
         write(ledger, answer("a", "left"), answer("b", "left") | {"cost_usd": float("nan")})
     assert list(ledger.read("m").rows) == ["a"]
 
@@ -268,7 +267,7 @@ def test_a_second_run_waits_and_says_who_writes_until_that_one_is_killed(place: 
     with place.process(HOLD) as holder:
         assert line_of(holder) == "held"
         asyncio.run(scenario())
-    assert len(said) == 1 and f"answers of m are being asked by process {holder.pid}" in said[0]
+    assert len(said) == 1 and str(holder.pid) in said[0]
 
 
 def test_an_import_into_an_evaluation_that_is_being_asked_waits_for_it(ledger: Ledger) -> None:
@@ -283,7 +282,7 @@ def test_an_import_into_an_evaluation_that_is_being_asked_waits_for_it(ledger: L
         return said
 
     (said,) = asyncio.run(scenario())
-    assert "are being asked by process" in said
+    assert str(os.getpid()) in said
     assert json.dumps(ledger.read("m").rows["a"]["text"]) == '"left"'
 
 
@@ -314,9 +313,8 @@ def test_no_bit_of_a_row_can_flip_unseen(tmp_path: Path) -> None:
 def test_a_row_that_cannot_be_written_is_told_and_the_others_are_kept(tmp_path: Path) -> None:
     command = [sys.executable, "-c", FILL, str(tmp_path)]
     ran = subprocess.run(command, capture_output=True, check=True, text=True, cwd=ROOT)
-    assert "ledger.sqlite: cannot be read or written" in ran.stdout and "run the same command again" in ran.stdout
     stored = int(ran.stdout.splitlines()[0])
-    assert stored > 50
+    assert stored > 50 and "ledger.sqlite" in ran.stdout.splitlines()[1]
     ledger = local(tmp_path)
     assert [*ledger.read("m").rows] == [f"k{n}" for n in range(stored)]
     write(ledger, answer("later", "left"))
@@ -354,14 +352,5 @@ def test_the_lock_of_a_run_whose_file_is_removed_lets_no_call_go(tmp_path: Path)
             (tmp_path / "locks" / "answers-m.lock").unlink()
             await writer.require()
 
-    with pytest.raises(TrapsError, match=r"answers-m\.lock: was removed while this run held it"):
+    with raises(TrapsError, "base.files.require_in_place", "answers-m.lock"):
         asyncio.run(scenario())
-
-
-@pytest.mark.slow
-def test_two_evaluations_are_written_by_two_processes_at_the_same_time(place: Place) -> None:
-    with place.process(WRITE) as other:
-        assert line_of(other) == "k0"
-        write(place.open(), *(answer(f"n{n}", "left") for n in range(50)), evaluation="n")
-        assert other.poll() is None
-    assert len(place.open().read("n").rows) == 50

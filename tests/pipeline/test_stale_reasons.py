@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-
+from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.pipeline.stale_reasons import explain
 from traps_pipeline.storage.study import Study
@@ -14,5 +13,6 @@ from traps_pipeline.storage.workspace import Workspace
 
 def test_a_study_without_items_names_the_command_that_makes_them(tmp_path: Path) -> None:
     workspace = Workspace.create(tmp_path / "study", Study())
-    with pytest.raises(TrapsError, match="this study has no items yet; `traps run EXPERIMENT` makes them"):
-        explain(workspace, "occlusion:domino_chain-0001:void")
+    item = "occlusion:domino_chain-0001:void"
+    with raises(TrapsError, "pipeline.stale_reasons.explain", item, "`traps run EXPERIMENT`"):
+        explain(workspace, item)

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from tests.build.errors import raises
 from tests.build.harness import ours
 from tests.conftest import EXPERIMENT, Checkout, once
 from traps_pipeline.base.errors import TrapsError
@@ -124,15 +125,19 @@ def test_its_code_is_the_pipelines_own_and_needs_nothing_of_it(harness: Path) ->
 def test_a_harness_is_made_of_a_whole_open_release_alone(released: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(released, tmp_path / "copy"))
     (copy / "prompts.jsonl").write_text("{}")
-    with pytest.raises(TrapsError, match=r"is not what was released: prompts\.jsonl"):
+    by = "release.harness.write"
+    with raises(TrapsError, f"{by}.write_harness", str(copy), "prompts.jsonl"):
         write_harness(copy, tmp_path / "out")
-    with pytest.raises(TrapsError, match="holds other files"):
+    with raises(TrapsError, f"{by}.write_harness", str(copy)):  # which is not empty
         write_harness(released, copy)
-    with pytest.raises(TrapsError, match="--uniform: goes with --media images"):
+    with raises(TrapsError, f"{by}.media_settings", "--uniform", "--media images"):
         media_settings("video", 2)
 
 
 # --- answers come back ------------------------------------------------------------------------------------------------
+
+
+BY_ITEM = "exchange.answer_exchange._answers_by_item"
 
 
 def imported_texts(workspace: Workspace, model: str, regime: str) -> dict[str, str]:
@@ -152,31 +157,32 @@ def test_answers_by_opaque_name_are_imported_with_the_key_of_the_held_out_set(
     (tmp_path / "key").write_text("00" * 32)
     command = ("study", "import-answers", unasked.root / EXPERIMENT, path, "--model", "random-50")
     refused = unasked.traps(*command)
-    assert refused.code == 1 and "under json, run 1, is not wanted of random-50" in refused.err
+    assert (refused.code, refused.raised) == (1, "exchange.answer_exchange._answers_by_item")
+    assert [name for name in (lines[0]["item"], "json", "random-50") if name not in refused.err] == []
     finished = unasked.traps(*command, "--key", tmp_path / "key")
-    assert finished.code == 0 and finished.out.startswith("48 answers imported"), finished.err
+    assert finished.code == 0 and finished.out.startswith("48 "), finished.err
     assert imported_texts(workspace, "random-50", "json") == {id_: given[id_] for id_ in ids}
 
 
 @pytest.mark.parametrize(
-    ("lines", "said"),
+    ("lines", "by", "named"),
     [
-        ([{"item": "x", "regime": "json", "text": "left"}], "x under json, run 1, is not wanted of oracle"),
-        ([{"item": "ID", "regime": "json", "text": text} for text in "ab"], "gives another answer"),
-        ([{"item": "ID", "regime": "json", "text": "a", "cost": 3}], "cost: there is no such key"),
-        ([{"item": "ID", "regime": "json", "text": "a", "run": [1]}], "gives no item, regime and text"),
-        ([{"item": "ID", "regime": "json", "outcome": "error"}], "an error is no answer"),
+        ([{"item": "x", "regime": "json", "text": "left"}], BY_ITEM, ["answers.jsonl:1", " x ", "json", "oracle"]),
+        ([{"item": "ID", "regime": "json", "text": text} for text in "ab"], BY_ITEM, ["answers.jsonl:2"]),
+        ([{"item": "ID", "regime": "json", "text": "a", "cost": 3}], BY_ITEM, ["answers.jsonl:1", "cost"]),
+        ([{"item": "ID", "regime": "json", "text": "a", "run": [1]}], "exchange.harness_logs", ["answers.jsonl:1"]),
+        ([{"item": "ID", "regime": "json", "outcome": "error"}], BY_ITEM, ["answers.jsonl:1", "outcome"]),
     ],
-)  # fmt: skip
+)
 def test_a_wrong_answer_by_item_is_named_and_nothing_is_imported(
-    unasked: Checkout, tmp_path: Path, lines: list[dict[str, Any]], said: str
+    unasked: Checkout, tmp_path: Path, lines: list[dict[str, Any]], by: str, named: list[str]
 ) -> None:
     workspace, experiment = Workspace.open(unasked.workspace), load_experiment(str(unasked.root / EXPERIMENT))
     id_ = str(workspace.tables.read_all(ITEMS)["item_id"][0])
     path = tmp_path / "answers.jsonl"
     path.write_text("".join(json.dumps(line).replace('"ID"', json.dumps(id_)) + "\n" for line in lines))
-    with pytest.raises(TrapsError, match=said):
+    with raises(TrapsError, by, *named):
         import_answers(workspace, experiment, path, AnswerContext("oracle"))
-    with pytest.raises(TrapsError, match="say whose answers these are: --model, one of oracle, prior, random-50"):
+    with raises(TrapsError, BY_ITEM, "--model", "oracle, prior, random-50"):
         import_answers(workspace, experiment, path)
     assert workspace.answers.read("oracle__json__run1").settled == {}
