@@ -159,10 +159,10 @@ def test_a_reference_model_may_answer_with_the_label_of_any_family(regime: str) 
     assert read_statement(phrase("I don't know", request), "Where is it?") == ABSTENTION
 
 
-def test_an_answer_is_correct_where_it_is_the_ground_truth_and_not_where_it_contains_it() -> None:
+def test_the_judge_finds_an_answer_correct_where_it_is_the_ground_truth_and_not_where_it_contains_it() -> None:
     between = '{"reason": "I counted.", "final_answer": "3-5"}'
-    assert vote("correctness", between, "3-5").decision is True
-    assert vote("correctness", between, "3").decision is False
+    assert vote("correctness", between, "3-5").judge_correct is True
+    assert vote("correctness", between, "3").judge_correct is False
 
 
 INJECTIONS = [
