@@ -8,7 +8,7 @@ test-newest: render-packages ## the newest libraries that pyproject.toml admits:
 	rm -rf .workspaces/newest
 	$(make-venv)
 	$(PIP_INSTALL) $(TORCH)
-	$(PIP_INSTALL) $(firstword $(TORCH)) --editable '.[all,test,docs]' hatchling
+	$(PIP_INSTALL) $(firstword $(TORCH)) --editable '.[all,test,docs]' hatchling hatch-vcs
 	$(compile)
 	$(BIN)/python -m pip --disable-pip-version-check list
 	$(BIN)/traps models check

@@ -1,6 +1,7 @@
 """The code of each stage that states one by hand, and a digest of the files that decide what it makes.
 
-`python -m tests.pipeline.stage_codes` writes both to `stage_codes.json`. Comments, docstrings and layout do not count.
+`python -m tests.pipeline.stage_codes` writes both to `stage_codes.json`. Comments, docstrings, layout and the
+sentences of errors do not count.
 """
 
 from __future__ import annotations
@@ -58,7 +59,10 @@ def is_followed(code: str) -> bool:
 
 
 def statements(path: Path) -> str:
-    """Return a module's source without comments, docstrings and white space: the same for all versions of Python."""
+    """Return a module's source without comments, docstrings, errors' sentences and white space.
+
+    It is the same for all versions of Python.
+    """
     source = path.read_text(encoding="utf-8")
     lines = source.splitlines()
     comments = [t for t in tokenize.generate_tokens(io.StringIO(source).readline) if t.type == tokenize.COMMENT]
@@ -66,9 +70,12 @@ def statements(path: Path) -> str:
         lines[comment.start[0] - 1] = lines[comment.start[0] - 1][: comment.start[1]]
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
-            docstring = node.body[0]
-            for number in range(docstring.lineno, (docstring.end_lineno or 0) + 1):
-                lines[number - 1] = ""
+            unread, kept = node.body[0], ""
+        elif isinstance(node, ast.Raise):
+            unread, kept = node, "raise"
+        else:
+            continue
+        lines[unread.lineno - 1 : unread.end_lineno] = [kept] + [""] * ((unread.end_lineno or 0) - unread.lineno)
     return "".join("".join(lines).split())
 
 

@@ -52,7 +52,9 @@ def test_a_dear_stage_whose_formula_changed_has_a_reviewed_code() -> None:
     )
 
 
-def test_comments_docstrings_and_layout_are_no_change_of_a_formula_and_a_number_is(tmp_path: Path) -> None:
+def test_comments_docstrings_errors_sentences_and_layout_are_no_change_of_a_formula_and_a_number_is(
+    tmp_path: Path,
+) -> None:
     def of(source: str) -> str:
         path = tmp_path / "formula.py"
         path.write_text(source, encoding="utf-8")
@@ -61,3 +63,7 @@ def test_comments_docstrings_and_layout_are_no_change_of_a_formula_and_a_number_
     formula = of("def half(x):\n    return x / 2\n")
     assert of('"""About."""\n\n\ndef half(x):  # of it\n    """Return half."""\n    return x / 2\n') == formula
     assert of("def half(x):\n    return x / 3\n") != formula
+    refusals = [
+        f"def half(x):\n    if x {sign} 0:\n        raise ValueError({why!r})\n" for sign in "<>" for why in ("no", "")
+    ]
+    assert [of(one) == of(refusals[0]) for one in refusals] == [True, True, False, False]
