@@ -47,7 +47,8 @@ def budget(
     cap_usd: float, caps_usd: Mapping[str, float] | None = None, spent_usd: Mapping[str, float] | None = None
 ) -> Budget:
     """A budget in a ledger of its own."""
-    database = SqliteDatabase(Path(tempfile.mkdtemp()), "study")
+    KEPT.append(folder := tempfile.TemporaryDirectory())  # removed when the process ends
+    database = SqliteDatabase(Path(folder.name), "study")
     KEPT.append(entered := database.writing())
     entered.__enter__()
     spend(database, spent_usd or {})

@@ -138,8 +138,9 @@ def _turn_problems(turns: Sequence[tuple[str, list[str | ClipPart | None]]], req
     if not user or user[-1] != request.user:
         yield "the question does not arrive verbatim, as the last part"
     clips = [part for part in user if isinstance(part, ClipPart)]
-    if len(clips) != len(user) - 1:
-        yield "something other than clip and question arrives"
+    others = ["a part of unknown form" if p is None else p for p in user[:-1] if not isinstance(p, ClipPart)]
+    if others:
+        yield f"something other than clip and question arrives: {_short(others)}"
     if request.sent is not None:
         yield from _clip_problems(clips, request.sent)
 

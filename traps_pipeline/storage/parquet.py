@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
@@ -372,9 +371,7 @@ def _column(rows: Sequence[Any], field: pa.Field) -> pa.Array:
     """Return a column of rows, with NaN as a missing value, as in a data frame."""
     import pyarrow as pa
 
-    values = (getattr(row, field.name, None) for row in rows)
-    missing = (None if isinstance(value, float) and math.isnan(value) else value for value in values)
-    return pa.array(list(missing), field.type)
+    return pa.array([getattr(row, field.name, None) for row in rows], field.type, from_pandas=True)
 
 
 def _schema_of(table: Table, columns: Sequence[str] | None) -> pa.Schema:
