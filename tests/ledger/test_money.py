@@ -92,7 +92,7 @@ def test_what_a_killed_process_may_have_spent_is_counted_until_it_is_released(pl
         assert sum(money.spent().values()) == pytest.approx(0.2)
         assert money.release("m", None, "the rest", "me", "2026-11-25") == pytest.approx(0.2)
         assert [record["why"] for record in money.releases()] == ["killed before it connected", "the rest"]
-        with raises(TrapsError, "ledger.money.Money.release", "m", "$1.0000"):
+        with raises(TrapsError, "ledger.money.Money.release", "m: $1.0000"):
             money.release("m", 1.0, "once more", "me", "2026-11-25")
 
 

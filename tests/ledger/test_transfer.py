@@ -9,9 +9,9 @@ import pytest
 
 from tests.build.errors import raises
 from tests.build.ledger import answer, budget_in, local, paid, write
+from tests.conftest import ROOT, Checkout
 from tests.ledger.conftest import Place
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cli import main
 from traps_pipeline.ledger.ledger import Ledger
 from traps_pipeline.ledger.money import Money, Releasable
 from traps_pipeline.ledger.row_transfer import copy_ledger, export_ledger, import_ledger
@@ -79,19 +79,16 @@ def test_nothing_is_moved_into_a_study_that_has_answers_or_while_somebody_asks(a
     assert local(tmp_path / "third").evaluations() == []
 
 
-def test_the_commands_write_a_file_once_and_read_what_they_wrote(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_commands_write_a_file_once_and_read_what_they_wrote(tmp_path: Path) -> None:
     one, two = (Workspace.create(tmp_path / name, Study()) for name in ("one", "two"))
     write(one.answers, answer("a", "left"))
-    file = tmp_path / "answers.sqlite"
-    assert main(["study", "export-ledger", "--workspace", str(one.root), str(file)]) == 0
-    assert f" {file}" in capsys.readouterr().out
-    written = file.read_bytes()
-    assert main(["study", "export-ledger", "--workspace", str(one.root), str(file)]) == 1
-    assert f"{file}" in capsys.readouterr().err and file.read_bytes() == written
-    assert main(["study", "import-ledger", "--workspace", str(two.root), str(file)]) == 0
+    file, source, target = tmp_path / "answers.sqlite", Checkout(ROOT, one.root), Checkout(ROOT, two.root)
+    assert f" {file}" in source.traps("study", "export-ledger", file).ok().out
+    written, again = file.read_bytes(), source.traps("study", "export-ledger", file)
+    assert (again.code, again.raised) == (1, "ledger.row_transfer.export_ledger")
+    assert str(file) in again.err and file.read_bytes() == written
+    target.traps("study", "import-ledger", file).ok()
     assert [*two.answers.read("m").rows] == ["a"]
     file.write_bytes(b"no ledger")
-    assert main(["study", "import-ledger", "--workspace", str(two.root), str(file)]) == 1
-    assert str(file) in capsys.readouterr().err
+    refused = target.traps("study", "import-ledger", file)
+    assert refused.code == 1 and str(file) in refused.err

@@ -97,7 +97,7 @@ def test_a_second_study_stops_where_the_first_has_spent_the_accounts_money(tmp_p
         asyncio.run(pay(one, 6))
         with open_budget(study(tmp_path / "two", folder), [entry]) as two:  # at the same time
             asyncio.run(pay(two, 5))
-            names = "openai", "$9.00", "$10.00", str(folder / "budget.yaml")
+            names = "openai", " 2 ", "$9.00", "$10.00", str(folder / "budget.yaml")
             with raises(BudgetReached, "models.budget.Budget.reserve", *names):
                 asyncio.run(pay(two, 2))
             asyncio.run(two.reserve("gemini-2.5-pro", 2))  # another account

@@ -113,7 +113,7 @@ def test_twenty_refusals_of_one_kind_in_a_row_stop_a_model_and_nineteen_do_not()
 
 def test_a_call_that_the_provider_refuses_as_it_is_counts_as_a_refusal() -> None:
     breaker = CircuitBreaker("m")
-    with raises(ParticipantStopped, "models.traffic.CircuitBreaker._stop"):
+    with raises(ParticipantStopped, "models.traffic.CircuitBreaker._stop", " 20 ", "(http_401)"):
         for _ in range(20):
             breaker.watch(Outcome("error", error="http_401"))
 
@@ -139,7 +139,7 @@ def test_more_than_ten_errors_in_a_hundred_calls_stop_a_model() -> None:
     breaker = CircuitBreaker("m")
     for n in range(100):
         breaker.watch(ERROR if n % 10 == 0 else ANSWER)  # ten: at the limit
-    with raises(ParticipantStopped, "models.traffic.CircuitBreaker._stop"):
+    with raises(ParticipantStopped, "models.traffic.CircuitBreaker._stop", " 11 ", " 100 "):
         for n in range(1, 12):
             breaker.watch(ERROR if n % 2 else ANSWER)
 

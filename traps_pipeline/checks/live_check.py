@@ -158,7 +158,7 @@ def check_server(entry: Entry, account: Account) -> ServerCheck:
 def nobody_at(address: str, why: str = "the cause stands above") -> str:
     """Return the error message for an address at which no server listens."""
     is_here = is_loopback(urlsplit(address).hostname or "")
-    remedy = "start the server there" if is_here else "look at this machine's network and proxy variables"
+    remedy = "start the server there" if is_here else "look at this machine's network, proxy variables and NO_PROXY"
     return f"nothing answers at {address} ({why}): {remedy}, or mend its `base_url`"
 
 
