@@ -53,7 +53,7 @@ def test_the_seed_draws_the_committed_records_again(committed: Path, tmp_path: P
     given = committed / "commitment.json", committed / "reveal.json", "--specs", committed / "private"
     finished = checkout.traps("benchmark", "prove", *given, "--workers", "1")
     assert finished.code == 0, finished.out + finished.err
-    assert "hidden_drop" in finished.out  # which is drawn
+    assert "hidden_drop-0001: " in finished.out  # which is drawn
     outcome = json.loads(checkout.traps("benchmark", "prove", *given, "--without-drawing", "--json").ok().out)
     assert outcome["problems"] == [] and len(outcome["proven"]) == 1
 

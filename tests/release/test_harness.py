@@ -138,6 +138,7 @@ def test_a_harness_is_made_of_a_whole_open_release_alone(released: Path, tmp_pat
 
 
 BY_ITEM = "exchange.answer_exchange._answers_by_item"
+BY_LINE = "exchange.harness_logs._plain_lines"
 
 
 def imported_texts(workspace: Workspace, model: str, regime: str) -> dict[str, str]:
@@ -170,7 +171,7 @@ def test_answers_by_opaque_name_are_imported_with_the_key_of_the_held_out_set(
         ([{"item": "x", "regime": "json", "text": "left"}], BY_ITEM, ["answers.jsonl:1", " x ", "json", "oracle"]),
         ([{"item": "ID", "regime": "json", "text": text} for text in "ab"], BY_ITEM, ["answers.jsonl:2"]),
         ([{"item": "ID", "regime": "json", "text": "a", "cost": 3}], BY_ITEM, ["answers.jsonl:1", "cost"]),
-        ([{"item": "ID", "regime": "json", "text": "a", "run": [1]}], "exchange.harness_logs", ["answers.jsonl:1"]),
+        ([{"item": "ID", "regime": "json", "text": "a", "run": [1]}], BY_LINE, ["answers.jsonl:1", "run"]),
         ([{"item": "ID", "regime": "json", "outcome": "error"}], BY_ITEM, ["answers.jsonl:1", "outcome"]),
     ],
 )
@@ -181,8 +182,9 @@ def test_a_wrong_answer_by_item_is_named_and_nothing_is_imported(
     id_ = str(workspace.tables.read_all(ITEMS)["item_id"][0])
     path = tmp_path / "answers.jsonl"
     path.write_text("".join(json.dumps(line).replace('"ID"', json.dumps(id_)) + "\n" for line in lines))
-    with raises(TrapsError, by, *named):
+    with raises(TrapsError, by, *named) as refused:
         import_answers(workspace, experiment, path, AnswerContext("oracle"))
+    assert str(refused.value).count("answers.jsonl:") == 1  # no other line
     with raises(TrapsError, BY_ITEM, "--model", "oracle, prior, random-50"):
         import_answers(workspace, experiment, path)
     assert workspace.answers.read("oracle__json__run1").settled == {}

@@ -18,7 +18,7 @@ from tests.build.errors import raises
 from tests.conftest import Checkout
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.verdicts import decide
-from traps_pipeline.models.judges import RULES_VERSION
+from traps_pipeline.models.judges import BY_RULES, RULES_VERSION
 from traps_pipeline.release.content import content_of
 from traps_pipeline.release.folder import Options, write_release
 from traps_pipeline.release.released_rows import SUBMITTED
@@ -114,6 +114,7 @@ def test_an_edited_answer_is_named(packed: Path, tmp_path: Path) -> None:
     judges = ("rule-1", "rule-2", "rule-3")
     assert [f"prior (standard, run 1) on {ITEM}" in one for one in found] == [True] * 6
     assert [sum(judge in one for one in found) for judge in judges] == [2, 2, 2]
+    assert not [one for one in found if "correctness" in one or "abstention" in one]  # the answer is at fault, no vote
 
 
 def test_an_edited_vote_is_named_though_all_numbers_were_made_anew(packed: Path, tmp_path: Path) -> None:
@@ -178,7 +179,7 @@ def test_prompts_and_judges_of_another_version_are_named(packed: Path, tmp_path:
     assert [regime in one for regime, one in zip(("standard", "json"), problems(path), strict=True)] == [True, True]
     seats = [{"id": f"rule-{k}", "backend": "rule", "endpoint": "rule", "params": {"rules": 1}} for k in "123"]
     found = problems(forged(packed, tmp_path / "g.zip", lambda frames: None, judges=seats))
-    assert any("rules@" in one for one in found)
+    assert any(one.count("rules@") == 2 for one in found)  # the panel that voted, and the one of these judges
     assert any("'rules'" in one and str(RULES_VERSION) in one for one in found)
 
 
@@ -236,7 +237,7 @@ def test_submissions_of_the_same_items_and_panel_are_ranked_together(
     assert rows.schema.equals(SUBMITTED.arrow_schema())
     assert {*rows["submission"].to_pylist()} == {"small", "other"}
     page = (tmp_path / "board" / "index.html").read_text()
-    assert "oracle@other" in page and page.count('class="chapter"') == 1
+    assert "oracle@other" in page and page.count('class="chapter"') == 1 and BY_RULES[1:] not in page
     with raises(TrapsError, "release.submissions.gather", "'small'"):
         gather([packed, packed])
 

@@ -23,6 +23,7 @@ from traps_pipeline.scenes.parts.look import MATERIALS, OCCLUDERS, PARTS, Look, 
 from traps_pipeline.scenes.physics.kit import params_to_dict
 from traps_pipeline.scenes.picture.render import Renderer
 from traps_pipeline.scenes.worlds.outcome import compile_scene, simulated
+from traps_pipeline.scenes.worlds.pace import IN_VIEW_S
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 from traps_pipeline.scenes.worlds.world import World
 
@@ -191,6 +192,7 @@ def test_under_another_look_a_record_loses_every_certificate_that_it_does_not_pa
     all."""
     case = load("tumbling_dice-0005")
     assert case.spec.control is not None and isinstance(with_look(case.spec, None, case.qpos, case.twin), SceneSpec)
-    soon = round(case.spec.evidence["commit_s"] * case.physics.fps) + 4  # 0.6 s are wanted
+    soon = round(case.spec.evidence["commit_s"] * case.physics.fps) + 4
     early = case.spec.model_copy(update={"control": {**case.spec.control, "closes_frame": soon}})
-    assert str(with_look(early, None, case.qpos, case.twin)).startswith("closing: ")
+    lost = str(with_look(early, None, case.qpos, case.twin))
+    assert lost.startswith("closing: ") and f"{soon / case.physics.fps:.1f} s" in lost and f"{IN_VIEW_S} s" in lost
