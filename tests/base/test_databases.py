@@ -13,6 +13,7 @@ from sqlalchemy.exc import OperationalError
 from tests.build.errors import raises
 from traps_pipeline.base.databases import NO_SPACE, reason_and_remedy
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.people.human_label_rows import LABELS_FILE
 from traps_pipeline.pipeline.run import dagster_history
 from traps_pipeline.servers.labelstore import LabelStore
 from traps_pipeline.storage.study import Study
@@ -59,5 +60,6 @@ def test_a_history_on_a_full_disk_is_one_sentence(
 
 def test_labels_on_a_full_disk_are_one_sentence(tiny_disk: Path) -> None:
     (tiny_disk / "filler").write_bytes(b"0" * 60_000)
-    with raises(TrapsError, "servers.labelstore", str(tiny_disk / "labels"), NO_SPACE):
+    with raises(TrapsError, "servers.labelstore", str(tiny_disk / "labels"), NO_SPACE) as raised:
         LabelStore(tiny_disk / "labels")
+    assert LABELS_FILE not in str(raised.value)  # it is only full: a damaged database is made again from that file

@@ -14,7 +14,7 @@ import pytest
 from tests.build.errors import raises
 from tests.conftest import ROOT
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.files import replace_file, write_bytes, write_text
+from traps_pipeline.base.files import remedy, replace_file, write_bytes, write_text
 
 
 @pytest.fixture
@@ -71,7 +71,8 @@ def test_a_kill_in_the_middle_leaves_the_former_content_and_the_next_write_goes_
 def test_a_full_disk_leaves_the_former_content_and_is_told_with_the_remedy(tiny_disk: Path) -> None:
     file = tiny_disk / "table.bin"
     write_text(file, "former")
-    with raises(TrapsError, "base.files.replace_file", "table.bin", os.strerror(errno.ENOSPC)):
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    with raises(TrapsError, "base.files.replace_file", "table.bin", str(full.strerror), remedy(full)):
         write_bytes(file, os.urandom(200_000))
     assert file.read_text() == "former"
     assert alone(file)

@@ -163,7 +163,7 @@ def test_two_people_label_blindly_a_kill_loses_nothing_and_the_tables_follow(stu
             server.kill()
         page = pages["jd"][0]
         page.keyboard.press("x")  # nobody answers: the page says so, and stays
-        until(page, "document.getElementById('said').textContent")
+        until(page, "document.querySelector('#said.error')?.textContent")
         with listening(study, "annotate", *pages, port=server.port) as server:
             assert knowing.lines() == kept
             page.reload()

@@ -21,6 +21,7 @@ VOTES = ANSWERS // 2 * 9  # three judges on a control's two tasks and on a void'
 def test_one_command_goes_from_records_to_the_leaderboard_and_the_report(small: Checkout, small_output: str) -> None:
     counts = Finished(0, small_output, "").counts()
     assert (counts["answers"], counts["votes"]) == (ANSWERS, VOTES)
+    assert re.findall(r"asked \((\d+) ", small_output) == ["0", "0"]  # none of them was known
     reports = small.workspace / "reports"
     for kind, page in (("report", reports / "report.html"), ("explorer", reports / "index.html")):
         assert f"{kind} {page}" in small_output.splitlines()

@@ -133,7 +133,7 @@ def test_paid_stages_want_a_budget_and_a_price_whoever_starts_them(unasked: Chec
     assert "`traps plan`" in clicked.out + clicked.err
     assert provider.stats()["requests"] == 0
     planned = unasked.traps("plan", path).out.splitlines()
-    assert [line.rpartition(" ")[2] for line in planned if "no-price" in line and "image-model" not in line]
+    assert "no-price" in [line.rpartition(" ")[2] for line in planned]  # below the tables, whose lines end in figures
 
 
 def test_a_model_that_only_fails_is_stopped_and_the_others_go_on(unasked: Checkout, provider: Provider) -> None:

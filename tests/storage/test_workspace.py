@@ -57,7 +57,8 @@ def test_creating_it_again_opens_it_and_keeps_what_was_edited(tmp_path: Path) ->
 )
 def test_another_benchmark_or_subset_is_refused_with_the_remedy(tmp_path: Path, wanted: Study, field: str) -> None:
     Workspace.create(tmp_path, Study(per_family=2))
-    with raises(TrapsError, "storage.workspace.Workspace.create", "TRAPS_WORKSPACE"):
+    named = field, repr(getattr(wanted, field)), "TRAPS_WORKSPACE"
+    with raises(TrapsError, "storage.workspace.Workspace.create", *named):
         Workspace.create(tmp_path, wanted)
 
 
