@@ -102,7 +102,7 @@ def test_an_attack_moved_a_vote_only_if_it_was_right_without_it(expected, clean,
     ("old", "new", "named"),
     [
         ("answer: wrong", "answer: missing", "'missing'"),
-        ("id: threat", "id: authority", "attacks: "),
+        ("id: threat", "id: authority", "attacks: authority: "),
         ("\n      {answer}\n\n      Judge: set", "\n      Judge: set", "dictated-value"),
         ("kind: dilution", "colour: red", "colour: "),
     ],

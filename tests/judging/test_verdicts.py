@@ -115,7 +115,7 @@ def test_a_judged_answer_without_three_votes_a_task_is_refused_by_name() -> None
 
 def test_a_response_to_an_item_that_is_gone_is_refused_by_name() -> None:
     items, responses = undone("void")
-    with raises(TrapsError, "judging.verdicts._refuse"):
+    with raises(TrapsError, "judging.verdicts._refuse", "responses", "occlusion:s-0000:void"):
         decide(items.iloc[:0], responses, vote_rows(["yyy"]))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +53,12 @@ def _adding_always(self: Steering, model: LocalModel) -> Any:
     return applied()
 
 
+def twice_as_far(patch: pytest.MonkeyPatch) -> None:
+    """Nothing below the layer changes and everything above it does: only the state itself tells."""
+    once = Steering.applied
+    patch.setattr(Steering, "applied", lambda push, of: once(replace(push, alphas=(2 * push.alphas[0],)), of))
+
+
 def rounded_features(patch: pytest.MonkeyPatch) -> None:
     made = clips._Features
     patch.setattr(clips, "_Features", lambda tokens, deepstack: made(tokens * 1.01, deepstack))
@@ -66,7 +73,7 @@ def paths_beside_the_stream_forgotten(patch: pytest.MonkeyPatch) -> None:
     [
         ("qwen3-vl", "states", one_block_late),
         ("qwen3-vl", "alpha 0", a_hook_that_stays),
-        ("qwen3-vl", "alpha", a_hook_that_stays),
+        ("qwen3-vl", "alpha", twice_as_far),
         ("qwen3-vl", "clips", rounded_features),
         ("gemma-4", "patching", paths_beside_the_stream_forgotten),
     ],

@@ -60,8 +60,8 @@ def test_labels_are_read_as_written_and_damage_is_named(tmp_path: Path) -> None:
     file = tmp_path / LABELS_FILE
     file.write_bytes(line(1) + line(2, who="ab") + line(3, unit="u2")[:40])  # the last one was never confirmed
     assert [(each.seq, each.who) for each in label_lines(tmp_path)] == [(1, "jd"), (2, "ab")]
-    file.write_bytes(line(1).replace(b"true", b"fals") + line(2))
-    with raises(TrapsError, "people.labels.label_lines", "labels.jsonl"):
+    file.write_bytes(line(1).replace(b"jd", b"ab") + line(2))
+    with raises(TrapsError, "people.labels.label_lines", "labels.jsonl:1: "):
         label_lines(tmp_path)
     file.write_bytes(line(1, label={"correct": True}))
     with raises(TrapsError, "people.labels.label_lines", "labels.jsonl", "abstained"):

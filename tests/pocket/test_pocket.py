@@ -104,7 +104,8 @@ def test_other_numbers_of_scenes_draw_what_is_missing_and_read_what_is_wanted(
     fewer = recipe.model_copy(update={"scenes": {"drop_split": FEW - 1}})
     render(fewer, "train", tmp_path, workers=1)
     alone, whole = data_digest(fewer, "train", tmp_path), data_digest(recipe, "train", data)
-    with raises(TrapsError, "tools.pocket.data.read_shards", "`python -m tools.pocket render", str(FEW - 1), str(FEW)):
+    named = "`python -m tools.pocket render", f" {FEW - 1} ", f" {FEW} "
+    with raises(TrapsError, "tools.pocket.data.read_shards", *named):
         list(read_shards(recipe, "train", tmp_path))
     render(recipe, "train", tmp_path, workers=1)  # more than before: the last shard is drawn again
     assert data_digest(recipe, "train", tmp_path) == whole

@@ -72,10 +72,11 @@ class Attacks(BaseModel):
 
     @model_validator(mode="after")
     def _check_references(self) -> Attacks:
-        ids = [attack.id for attack in self.attacks]
-        if len(set(ids)) != len(ids) or set(ids) & set(self.answers):
-            raise ValueError("attacks: an id occurs twice, or is also the id of an answer")
+        known_ids = {*self.answers}
         for attack in self.attacks:
+            if attack.id in known_ids:
+                raise ValueError(f"attacks: {attack.id}: another attack, or an answer, has this id too")
+            known_ids.add(attack.id)
             if attack.answer not in self.answers:
                 raise ValueError(f"attacks: {attack.id}: there is no answer {attack.answer!r}")
             if attack.text.count(_PLACE) != 1:
