@@ -132,7 +132,7 @@ def quantile(draws: np.ndarray, q: float) -> np.ndarray:
     flat = draws.reshape(-1, draws.shape[-1])
     is_complete = ~np.isnan(flat).any(axis=1)
     values = np.full(len(flat), np.nan)
-    values[is_complete] = np.quantile(flat[is_complete], q, axis=1)
+    values[is_complete] = np.quantile(flat[is_complete], q, axis=1, overwrite_input=True)  # a copy already
     for row in np.flatnonzero(~is_complete):
         valid = flat[row][~np.isnan(flat[row])]
         if len(valid):
