@@ -11,16 +11,13 @@ from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from importlib.metadata import version
 from itertools import chain, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.protocol.datasets import DATASETS
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_array
 
 FOLDS = 5
 THUMBNAIL = (32, 24)  # pixels of a first frame that the classifier sees, width and height
@@ -131,8 +128,8 @@ def by_words(texts: np.ndarray, void: np.ndarray, others: np.ndarray) -> np.ndar
     appears_in = np.bincount([column[term] for text_terms in terms for term in {*text_terms}], minlength=len(column))
     idf = np.log((1 + len(texts)) / (1 + appears_in)) + 1
     rows, other_rows = (_weighted(part, column, idf) for part in (terms, [_terms(text) for text in others]))
-    *weights, intercept = _logistic_regression(rows, void, len(column))
-    return other_rows @ weights + intercept > 0
+    *of_rows, intercept = _logistic_regression(rows @ rows.T, void)
+    return other_rows @ (rows.T @ of_rows) + intercept > 0
 
 
 def _terms(text: str) -> list[str]:
@@ -140,31 +137,34 @@ def _terms(text: str) -> list[str]:
     return words + [" ".join(pair) for pair in pairwise(words)]
 
 
-def _weighted(terms: Sequence[Sequence[str]], column: Mapping[str, int], idf: np.ndarray) -> csr_array:
+def _weighted(terms: Sequence[Sequence[str]], column: Mapping[str, int], idf: np.ndarray) -> np.ndarray:
     """Return the TF-IDF of each text's known terms, (n, terms), of length sqrt(10): C = 10 of rows of length 1."""
-    from scipy.sparse import csr_array
-
-    known = [[column[term] for term in text_terms if term in column] for text_terms in terms]
-    columns = np.array([*chain(*known)], int)
-    counts = csr_array((idf[columns], columns, np.cumsum([0, *map(len, known)])), shape=(len(terms), len(column)))
-    counts.sum_duplicates()
-    length = np.sqrt(counts.power(2) @ np.ones(len(column)))
-    return counts.multiply(np.sqrt(10) / np.where(length > 0, length, 1.0).reshape(-1, 1)).tocsr()
+    counts = np.zeros((len(terms), len(column)))
+    for row, text_terms in zip(counts, terms, strict=True):
+        np.add.at(row, [column[term] for term in text_terms if term in column], 1)
+    rows = counts * idf
+    length = np.linalg.norm(rows, axis=1, keepdims=True)
+    return rows * (np.sqrt(10) / np.where(length > 0, length, 1.0))
 
 
-def _logistic_regression(rows: csr_array, label: np.ndarray, n_terms: int) -> np.ndarray:
-    """Return weights and, last, the intercept, (n_terms + 1,); C is 1. rows: (n, n_terms)."""
-    from scipy.optimize import minimize
-    from scipy.special import expit
+def _logistic_regression(products: np.ndarray, label: np.ndarray) -> np.ndarray:
+    """Return the weight of each row and, last, the intercept, (n + 1,), by Newton's method; C is 1.
 
-    sign = np.where(label, 1.0, -1.0)
-
-    def loss(point: np.ndarray) -> tuple[float, np.ndarray]:
-        weights, margin = point[:-1], sign * (rows @ point[:-1] + point[-1])
-        slope = -sign * expit(-margin)
-        return np.logaddexp(0, -margin).sum() + weights @ weights / 2, np.append(rows.T @ slope + weights, slope.sum())
-
-    return minimize(loss, np.zeros(n_terms + 1), jac=True, method="L-BFGS-B", options={"gtol": 1e-6}).x
+    products: of the rows with each other, (n, n). There are fewer rows than terms.
+    """
+    n = len(label)
+    system = np.block([[products, np.ones((n, 1))], [np.ones((1, n)), np.zeros((1, 1))]])
+    point = np.zeros(n + 1)
+    for _ in range(100):
+        margin = system[:n] @ point
+        share = 1 / (1 + np.exp(-margin))
+        curvature = np.maximum(share * (1 - share), 1e-12)
+        step_system = system + np.diag(np.append(1 / curvature, 0))
+        target = np.append(margin + (label - share) / curvature, 0)
+        previous, point = point, np.linalg.solve(step_system, target)
+        if np.allclose(point, previous, atol=1e-9):
+            break
+    return point
 
 
 def _by_picture(pictures: np.ndarray, void: np.ndarray, others: np.ndarray) -> np.ndarray:

@@ -19,6 +19,7 @@ from zlib import crc32
 
 import numpy as np
 import pandas as pd
+from threadpoolctl import threadpool_limits
 
 from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 from traps_pipeline.scoring.metrics import COUNTS, decision_counts, pecs_of
@@ -66,13 +67,14 @@ def resample(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEE
     items["taxonomy"] = items["dataset"].map(taxonomy_of)
     resampling = draw_scenarios(items, resamples, seed)
     entries, observed, values = list[tuple[str, str, str]](), list[np.ndarray](), list[np.ndarray]()
-    for key, group in items.groupby(["model", "regime"], sort=True):
-        model, regime = cast(tuple[str, str], key)
-        sums = run_sums(group, resampling, f"{model}|{regime}")
-        for dataset, mean in means_over_runs(sums, figures_of, resamples + 1).items():
-            entries.append((model, regime, dataset))
-            observed.append(mean[1, :, 0])
-            values.append(mean[..., 1:].astype(np.float32))  # half the memory, and the time of quantiles
+    with threadpool_limits(1):  # threads of products this small wait for each other, which takes as long again
+        for key, group in items.groupby(["model", "regime"], sort=True):
+            model, regime = cast(tuple[str, str], key)
+            sums = run_sums(group, resampling, f"{model}|{regime}")
+            for dataset, mean in means_over_runs(sums, figures_of, resamples + 1).items():
+                entries.append((model, regime, dataset))
+                observed.append(mean[1, :, 0])
+                values.append(mean[..., 1:].astype(np.float32))  # half the memory, and the time of quantiles
     no_values = np.zeros((0, 2, len(RESAMPLED_FIGURES), resamples), np.float32)
     return ResampledFigures(
         entries,
@@ -128,16 +130,16 @@ def percentiles(draws: np.ndarray, level: float = _LEVEL) -> np.ndarray:
 
 
 def quantile(draws: np.ndarray, q: float) -> np.ndarray:
-    """Return a quantile over the last axis, (.., n) -> (..), ignoring NaN."""
-    flat = draws.reshape(-1, draws.shape[-1])
-    is_complete = ~np.isnan(flat).any(axis=1)
-    values = np.full(len(flat), np.nan)
-    values[is_complete] = np.quantile(flat[is_complete], q, axis=1, overwrite_input=True)  # a copy already
-    for row in np.flatnonzero(~is_complete):
-        valid = flat[row][~np.isnan(flat[row])]
-        if len(valid):
-            values[row] = np.quantile(valid, q)
-    return values.reshape(draws.shape[:-1])
+    """Return a quantile over the last axis, (.., n) -> (..), ignoring NaN.
+
+    It is that of `np.nanquantile`, in a fifth of the time.
+    """
+    n = np.count_nonzero(~np.isnan(draws), axis=-1, keepdims=True)
+    last, ordered = np.maximum(n - 1, 0), np.sort(draws, axis=-1)  # NaN behind all others
+    place = q * last
+    lower = place.astype(int)
+    low, high = (np.take_along_axis(ordered, np.minimum(k, last), axis=-1) for k in (lower, lower + 1))
+    return (low + (high - low) * (place - lower).astype(draws.dtype))[..., 0].astype(float)
 
 
 def scenario_weights(scenarios: int, resamples: int, seed: int | list[int]) -> np.ndarray:

@@ -34,8 +34,8 @@ _SMALL_BYTES = 2**20  # handing a smaller file to threads takes twice as long as
 _ROWS_AT_ONCE = 1000  # rows converted to Python values at a time
 _VERIFIED: dict[Path, str] = {}  # files whose digest this process has verified, with their stamp
 _FOOTERS: dict[Path, tuple[str, State, list[str]]] = {}  # footers by file, with its stamp
-# Small tables by file and columns, with the file's stamp: a dozen stages of one run read the same hundreds of files.
-_TABLES: dict[tuple[Path, tuple[str, ...]], tuple[str, pa.Table]] = {}
+# Small tables by file, with the file's stamp: a dozen stages of one run read the same hundreds of files.
+_TABLES: dict[str, tuple[str, pa.Table]] = {}
 _KEPT_TABLES, _KEPT_BYTES = 1024, 2**16  # at most: 64 MB together
 
 
@@ -239,17 +239,21 @@ class TableStore:
 
         try:
             names, file = _schema_of(table, columns), self._store.here(path)
-            key, stamp = (file, tuple(names.names)), _stamp(file.stat())
-            if (kept := _TABLES.get(key)) is not None and kept[0] == stamp:
-                return kept[1]
-            content = _sound_bytes(file)
-            data = pq.ParquetFile(content).read(columns=names.names, use_threads=content.size() > _SMALL_BYTES)
+            stamp, kept = _stamp(file.stat()), _TABLES.get(str(file))
+            if kept is not None and kept[0] == stamp:
+                data = kept[1]
+            else:
+                content = _sound_bytes(file)
+                is_small = content.size() <= _SMALL_BYTES  # then all columns cost no more than some of them
+                data = pq.ParquetFile(content).read(None if is_small else names.names, use_threads=not is_small)
+                if is_small and data.nbytes <= _KEPT_BYTES:
+                    if len(_TABLES) >= _KEPT_TABLES:
+                        _TABLES.clear()
+                    _TABLES[str(file)] = stamp, data
+            there = {*data.schema.names}
+            data = data.select([name for name in names.names if name in there])
             if not data.schema.equals(names):
                 raise pa.ArrowInvalid("its columns are not those of this version")
-            if data.nbytes <= _KEPT_BYTES:
-                if len(_TABLES) >= _KEPT_TABLES:
-                    _TABLES.clear()
-                _TABLES[key] = stamp, data
             return data
         except FileNotFoundError:
             raise TrapsError(f"{path}: not there yet; materialize {table.name} for this partition first") from None
