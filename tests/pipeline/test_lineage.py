@@ -196,3 +196,14 @@ def test_another_formula_makes_metrics_stale(study: Workspace) -> None:
 def test_partitions_that_lost_their_own_parent_are_one_line_of_the_status():
     stale = {key: (f"responses/{key} is gone", "judges changed") for key in ("occlusion|a__json__run1", "chaotic|b")}
     assert StageStatus("votes", 0, stale, []).by_reason() == {"responses is gone; judges changed": [*stale]}
+
+
+def test_a_snapshot_sees_what_was_built_since_when_it_is_renewed(study):
+    seen = Lineage(study)
+    assert seen.status("metrics", "chaotic").kind == "fresh"
+    decide(study, CELL, abstained=False)
+    assert seen.status("metrics", "chaotic").kind == "fresh"
+    seen.renew("metrics")  # which looks at nothing upstream
+    assert seen.status("metrics", "chaotic").kind == "fresh"
+    seen.renew("verdicts")
+    assert seen.status("metrics", "chaotic") == Status("stale", (f"{NAME} changed",))

@@ -9,7 +9,7 @@ from statsmodels.stats.proportion import proportion_confint
 
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring import bootstrap
-from traps_pipeline.scoring.bootstrap import ENTRY, INTERVAL_COLUMNS, draw_scenarios, intervals, resample
+from traps_pipeline.scoring.bootstrap import ENTRY, INTERVAL_COLUMNS, draw_scenarios, intervals, quantile, resample
 
 
 def random_pairs(n, seed, acc=0.7, false_abs=0.1, abs_rec=0.6):
@@ -128,3 +128,12 @@ def test_the_same_seed_gives_the_same_interval_and_another_seed_another(rows):
     verdicts = rows(random_pairs(40, 6))
     assert pecs_intervals(verdicts, 200, seed=1).equals(pecs_intervals(verdicts, 200, seed=1))
     assert not pecs_intervals(verdicts, 200, seed=1).equals(pecs_intervals(verdicts, 200, seed=2))
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_quantiles_are_those_of_numpy_over_what_is_defined(kind):
+    draws = np.random.default_rng(1).normal(size=(3, 4, 101)).astype(kind)
+    draws[0, 1, :40], draws[1, 2, 1:], draws[2] = np.nan, np.nan, np.round(draws[2])
+    for q in (0.0, 0.025, 0.5, 0.975, 1.0):
+        assert quantile(draws, q) == pytest.approx(np.nanquantile(draws, q, axis=-1), abs=1e-6)
+    assert np.isnan(quantile(np.full((2, 5), np.nan), 0.5)).all()

@@ -221,6 +221,15 @@ class Graph:
         """Return the stages directly downstream of a stage."""
         return {child for child, parents in self.parents_of.items() if name in parents}
 
+    def all_below(self, name: str) -> set[str]:
+        """Return a stage and all stages downstream of it."""
+        found, remaining = set[str](), [name]
+        while remaining:
+            if (name := remaining.pop()) not in found:
+                found.add(name)
+                remaining += self.below(name)
+        return found
+
     @cache  # noqa: B019 - a graph lives as long as its process
     def keys(self, name: str) -> list[str | None]:
         """Return all partition keys of a stage or source."""

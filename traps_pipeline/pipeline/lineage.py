@@ -9,11 +9,12 @@ tables, failed calls.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Set
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Set
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
-from typing import Literal
+from typing import Generic, Literal, TypeVar
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.wording import count_noun
@@ -23,6 +24,7 @@ from traps_pipeline.storage.parquet import State
 from traps_pipeline.storage.workspace import Workspace
 
 DAMAGED = "damaged"  # the version of damaged data
+Value = TypeVar("Value")
 
 
 def failed_calls(count: int) -> str:
@@ -49,6 +51,23 @@ class Status:
         return (*self.outdated, failed_calls(self.failed)) if self.failed else self.outdated
 
 
+class _Once(Generic[Value]):
+    """Looks something of a partition up once, until its stage is renewed."""
+
+    def __init__(self, find: Callable[[str, str | None], Value]) -> None:
+        self._find, self._found = find, defaultdict[str, dict[str | None, Value]](dict)
+
+    def __call__(self, name: str, key: str | None = None) -> Value:
+        of_stage = self._found[name]
+        if key not in of_stage:
+            of_stage[key] = self._find(name, key)
+        return of_stage[key]
+
+    def renew(self, names: Iterable[str]) -> None:
+        for name in names:
+            self._found.pop(name, None)
+
+
 class Lineage:
     """A snapshot of a workspace that looks each version up once.
 
@@ -58,10 +77,16 @@ class Lineage:
     def __init__(self, workspace: Workspace, graph: Graph | None = None, *, thorough: bool = False) -> None:
         self._workspace, self.graph, self._thorough = workspace, graph or the_graph(), thorough
         workspace.store.look()
-        self.version, self.state, self.damage = cache(self._version), cache(self._state), cache(self._damage)
-        self.status, self._failed_checks = cache(self._status), cache(workspace.failed_checks)
+        self.version, self.state, self.damage = _Once(self._version), _Once(self._state), _Once(self._damage)
+        self.status, self._there = _Once(self._status), _Once(lambda name, _: self._keys_there(name))
+        self._failed_checks = _Once(lambda name, _: workspace.failed_checks(name))
         self._wanted = cache(lambda name: {*self.graph[name].wanted(StudyPartitions(workspace))})
-        self._there = cache(self._keys_there)
+
+    def renew(self, stage: str) -> None:
+        """Look again at a stage, which has been built meanwhile, and at all downstream of it."""
+        stages = self.graph.all_below(stage)
+        for known in (self.version, self.state, self.damage, self.status, self._there, self._failed_checks):
+            known.renew(stages)
 
     def inputs(self, stage: str, key: str | None) -> dict[str, str]:
         """Return the versions of all existing inputs of a partition, by name."""

@@ -40,6 +40,7 @@ RESUMED_ELSEWHERE = 5  # the exit code of a process whose run another process ha
 Event = dg.AssetMaterialization | dg.AssetCheckEvaluation | dg.MaterializeResult | dg.Output
 Events = Generator[Event, None, None]
 _ATTEMPTS: dict[str, int] = {}  # by run: how often it had been resumed when this process started on it
+_LINEAGE: dict[str, Lineage] = {}  # of the run in progress
 
 
 def run_step(stage: Stage, context: dg.AssetExecutionContext, workspace: Workspace) -> Events:
@@ -65,12 +66,25 @@ def run_step(stage: Stage, context: dg.AssetExecutionContext, workspace: Workspa
         else:
             yield step.history.event(stage, key, version, step.provenance, metadata)
             yield from step.checks.of_made(key, failures)
+    step.lineage.renew(stage.name)
     yield from step.tell_taken()
     yield from step.tell_fresh()
     yield from step.tell_unmade()
     yield from step.hand_on(made_result)
     if not step.stages_below():
         raise_for_run(context, step.graph, stage.name)
+
+
+def _lineage_of(run_id: str, workspace: Workspace) -> Lineage:
+    """Return what the steps of a run know of the study, or a new snapshot if other hosts build beside them.
+
+    Of what another process builds between two steps, the later one records an older version than it reads: it is made
+    once more, by the next run.
+    """
+    if run_id not in _LINEAGE or workspace.is_shared:
+        _LINEAGE.clear()
+        _LINEAGE[run_id] = Lineage(workspace, thorough=True)
+    return _LINEAGE[run_id]
 
 
 class _Step:
@@ -83,7 +97,7 @@ class _Step:
             _ATTEMPTS[context.run.run_id] = context.instance.count_resume_run_attempts(context.run.run_id)
         partitions = StudyPartitions(workspace, self.tags.get(EXPERIMENT_TAG))
         require_machine(workspace, parts_of_run(context, stage, partitions))
-        self.history, self.lineage = History(context.instance, self.graph), Lineage(workspace, thorough=True)
+        self.history, self.lineage = History(context.instance, self.graph), _lineage_of(context.run.run_id, workspace)
         self.history.observe(self.lineage, [p for p in stage.parents if self.graph.source(p)])
         self.provenance = self.history.provenance(stage) if stage.scheme else {}
         self.checks = StageChecks(workspace, self.history, self.graph, stage)

@@ -66,21 +66,21 @@ def resample(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEE
     )
     items["taxonomy"] = items["dataset"].map(taxonomy_of)
     resampling = draw_scenarios(items, resamples, seed)
-    entries, observed, values = list[tuple[str, str, str]](), list[np.ndarray](), list[np.ndarray]()
+    groups = items.groupby(["model", "regime"], sort=True)
+    entries, observed = list[tuple[str, str, str]](), list[np.ndarray]()
+    n_entries = groups.ngroups * (len(DATASETS) + 1)  # at most
+    # float32 takes half the memory, and half the time of quantiles.
+    values = np.empty((n_entries, 2, len(RESAMPLED_FIGURES), resamples), np.float32)
     with threadpool_limits(1):  # threads of products this small wait for each other, which takes as long again
-        for key, group in items.groupby(["model", "regime"], sort=True):
+        for key, group in groups:
             model, regime = cast(tuple[str, str], key)
             sums = run_sums(group, resampling, f"{model}|{regime}")
             for dataset, mean in means_over_runs(sums, figures_of, resamples + 1).items():
-                entries.append((model, regime, dataset))
+                values[len(entries)] = mean[..., 1:]
                 observed.append(mean[1, :, 0])
-                values.append(mean[..., 1:].astype(np.float32))  # half the memory, and the time of quantiles
-    no_values = np.zeros((0, 2, len(RESAMPLED_FIGURES), resamples), np.float32)
-    return ResampledFigures(
-        entries,
-        np.array(observed).reshape(len(entries), len(RESAMPLED_FIGURES)),
-        np.stack(values) if values else no_values,
-    )
+                entries.append((model, regime, dataset))
+    figures = np.array(observed).reshape(len(entries), len(RESAMPLED_FIGURES))
+    return ResampledFigures(entries, figures, values[: len(entries)])
 
 
 def intervals(resampled: ResampledFigures, level: float = _LEVEL) -> pd.DataFrame:

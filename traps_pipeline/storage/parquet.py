@@ -161,8 +161,6 @@ class TableStore:
         unreadable.
         """
         path = self.path(table, partition)
-        if not self._store.has(path):
-            return None
         try:
             if (note := self._store.note(path)) is not None:
                 noted = json.loads(note)
@@ -171,6 +169,8 @@ class TableStore:
             else:
                 state, names = _footer_of(self._store.here(path))
             return state if names == table.names else None
+        except FileNotFoundError:
+            return None
         except (OSError, KeyError, ValueError, TypeError) as error:
             raise _unreadable(path, table, error) from error
 
