@@ -295,7 +295,7 @@ def forget_answers(study: Checkout) -> Checkout:
     for table in (study.workspace / "tables").iterdir():
         if table.name not in ("scene_specs", "videos", "items"):
             shutil.rmtree(table)
-    shutil.rmtree(study.workspace / "ledger")
+    shutil.rmtree(study.workspace / "ledger", ignore_errors=True)  # there is none before the first answer
     shutil.rmtree(study.workspace / "reports")
     (study.workspace / "reports").mkdir()
     return study
