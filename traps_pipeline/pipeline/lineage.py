@@ -52,7 +52,7 @@ class Status:
 
 
 class _Once(Generic[Value]):
-    """Looks something of a partition up once, until its stage is renewed."""
+    """A function of a partition that is evaluated once, until its stage is renewed."""
 
     def __init__(self, find: Callable[[str, str | None], Value]) -> None:
         self._find, self._found = find, defaultdict[str, dict[str | None, Value]](dict)
@@ -83,7 +83,7 @@ class Lineage:
         self._wanted = cache(lambda name: {*self.graph[name].wanted(StudyPartitions(workspace))})
 
     def renew(self, stage: str) -> None:
-        """Look again at a stage, which has been built meanwhile, and at all downstream of it."""
+        """Forget a stage that has been built since, and all stages downstream of it."""
         stages = self.graph.all_below(stage)
         for known in (self.version, self.state, self.damage, self.status, self._there, self._failed_checks):
             known.renew(stages)

@@ -40,7 +40,7 @@ RESUMED_ELSEWHERE = 5  # the exit code of a process whose run another process ha
 Event = dg.AssetMaterialization | dg.AssetCheckEvaluation | dg.MaterializeResult | dg.Output
 Events = Generator[Event, None, None]
 _ATTEMPTS: dict[str, int] = {}  # by run: how often it had been resumed when this process started on it
-_LINEAGE: dict[str, Lineage] = {}  # of the run in progress
+_LINEAGE: dict[str, Lineage] = {}  # by run: its snapshot of the study; only of the run in progress
 
 
 def run_step(stage: Stage, context: dg.AssetExecutionContext, workspace: Workspace) -> Events:
@@ -76,10 +76,10 @@ def run_step(stage: Stage, context: dg.AssetExecutionContext, workspace: Workspa
 
 
 def _lineage_of(run_id: str, workspace: Workspace) -> Lineage:
-    """Return what the steps of a run know of the study, or a new snapshot if other hosts build beside them.
+    """Return the snapshot that a run's steps share; a new one for each step if other hosts build beside them.
 
-    Of what another process builds between two steps, the later one records an older version than it reads: it is made
-    once more, by the next run.
+    If another process builds a partition between two steps, the later step records its older version, so that the next
+    run makes the result once more.
     """
     if run_id not in _LINEAGE or workspace.is_shared:
         _LINEAGE.clear()

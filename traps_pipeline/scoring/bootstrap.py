@@ -132,7 +132,7 @@ def percentiles(draws: np.ndarray, level: float = _LEVEL) -> np.ndarray:
 def quantile(draws: np.ndarray, q: float) -> np.ndarray:
     """Return a quantile over the last axis, (.., n) -> (..), ignoring NaN.
 
-    It is that of `np.nanquantile`, in a fifth of the time.
+    Equals `np.nanquantile`, which partitions each row several times; one sort takes a fifth of that.
     """
     n = np.count_nonzero(~np.isnan(draws), axis=-1, keepdims=True)
     last, ordered = np.maximum(n - 1, 0), np.sort(draws, axis=-1)  # NaN behind all others

@@ -40,7 +40,7 @@ VERSION_SIDES = ("n_missing", "epoch", "benchmark_version")  # columns that `ver
 _FAMILY = ["kind", "dataset", "figure", "_regime"]
 _SIDE_COLUMNS = (("left_model", "left_regime"), ("right_model", "right_regime"))
 _SIDES = [column for columns in _SIDE_COLUMNS for column in columns]
-_AT_ONCE = 16  # paired differences whose resamples are in memory at once: few MB, which stay in a cache
+_AT_ONCE = 16  # paired differences whose resamples are in memory at once: so few that their memory is used again
 _Side = tuple[str, str]  # model, regime
 
 
