@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import ast
 import re
+import shutil
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -12,6 +14,7 @@ from pathlib import Path
 import pytest
 
 import traps_pipeline
+from tests.room_lines import TOTAL, excesses, lines_by_room, read_budgets
 
 PACKAGE = Path(traps_pipeline.__file__).parent
 # From bottom to top. A room imports rooms that stand before it here, and none that stands behind it: neither at the top
@@ -130,3 +133,28 @@ def test_files_are_short_but_for_those_that_the_rules_defend() -> None:
     assert lines and min(lines.values()) > 400, f"no longer in need of a defence: {lines}"
     long = {str(path.relative_to(PACKAGE)) for path in PACKAGE.rglob("*.py") if path.read_text().count("\n") > 400}
     assert long == set(defended)
+
+
+def test_no_room_is_larger_than_its_budget_and_all_together_no_larger_than_at_030() -> None:
+    budgets = read_budgets()
+    assert [*excesses(lines_by_room(), budgets)] == []
+    assert sum(budget.lines_030 for budget in budgets.values()) == TOTAL
+
+
+def test_a_planted_growth_is_named_with_its_room(tmp_path: Path) -> None:
+    budgets = {room: replace(budget, lines=lines_by_room()[room]) for room, budget in read_budgets().items()}
+    shutil.copytree(PACKAGE, tmp_path / "package", ignore=shutil.ignore_patterns("__pycache__"))
+    with (tmp_path / "package" / "video" / "encode.py").open("a") as file:
+        file.write("\n")
+    (sentence,) = excesses(lines_by_room(tmp_path / "package"), budgets)
+    assert sentence.startswith("video: ") and ", 1 above its budget" in sentence
+
+
+def test_a_budget_is_raised_with_a_reason_and_paid_by_another_room() -> None:
+    budgets = read_budgets()
+    counts = {room: budget.lines for room, budget in budgets.items()}
+    more = TOTAL - sum(counts.values()) + 1
+    raised = replace(budgets["video"], lines=budgets["video"].lines_030 + more, reason="")
+    broken = [*excesses(counts | {"video": raised.lines}, budgets | {"video": raised})]
+    assert "has no reason" in broken[0] and f"above {TOTAL}" in broken[1]
+    assert len(broken) == 2
