@@ -21,7 +21,7 @@ from playwright.sync_api import Page, expect
 from tests.conftest import CLIP_CACHE, EXPERIMENT, SMALL, Checkout, make_checkout
 from tests.pages import a_browser, patient
 from tests.providers.servers import closed_port
-from traps_pipeline.models.answer_rows import RESPONSES
+from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.pipeline.automation import INTERVAL_S
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.tables import Table

@@ -42,7 +42,7 @@ def create(arguments: argparse.Namespace, experiment: Experiment, database: str 
     if the existing study differs from the one that the experiment needs, or keeps its ledger elsewhere.
     """
     from traps_pipeline.benchmark.corrections import load_scenarios
-    from traps_pipeline.models.user_registry import save_entries
+    from traps_pipeline.models.registry.user_registry import save_entries
     from traps_pipeline.storage.workspace import Workspace
 
     place, is_judged_by_rules = place_of(arguments), arguments.judged_by_rules

@@ -224,8 +224,8 @@ def _allow(workspace: Workspace, experiment: Experiment, arguments: argparse.Nam
 
 def _check_participant(name: str) -> None:
     """Raise TrapsError with the known names if no model or judge has this name."""
-    from traps_pipeline.models.judges import load_judges
-    from traps_pipeline.models.registry import get_model
+    from traps_pipeline.models.registry.entries import get_model
+    from traps_pipeline.models.registry.judges import load_judges
 
     if name not in load_judges():
         get_model(name)

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 from traps_pipeline.base import progress
 from traps_pipeline.base.extras import require
 from traps_pipeline.base.progress import Tally
-from traps_pipeline.models.backends import require_libraries
-from traps_pipeline.models.judges import load_panel
-from traps_pipeline.models.registry import LOCAL, NETWORK, Entry, get_model
+from traps_pipeline.models.asking.backends import require_libraries
+from traps_pipeline.models.registry.entries import LOCAL, NETWORK, Entry, get_model
+from traps_pipeline.models.registry.judges import load_panel
 from traps_pipeline.pipeline.experiment import Experiment
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.pipeline.selection import failed_checks, is_nothing_to_do, note_versions, require_work, stages_until

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 from traps_pipeline.base.files import check_disk
 from traps_pipeline.base.network import check_network
-from traps_pipeline.models.answer_rows import RESPONSES
-from traps_pipeline.models.judges import load_panel
-from traps_pipeline.models.registry import NETWORK, Entry, get_model
+from traps_pipeline.models.asking.answer_rows import RESPONSES
+from traps_pipeline.models.registry.entries import NETWORK, Entry, get_model
+from traps_pipeline.models.registry.judges import load_panel
 from traps_pipeline.pipeline.graph import Stage, the_graph
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.pipeline.wanted import StudyPartitions

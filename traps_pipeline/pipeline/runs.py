@@ -15,7 +15,7 @@ from typing import Any
 import dagster as dg
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.models.budget import BudgetReached
+from traps_pipeline.models.money.budget import BudgetReached
 from traps_pipeline.pipeline.graph import Stage
 from traps_pipeline.pipeline.ranges import Range, batches
 from traps_pipeline.pipeline.translation import asset_key
