@@ -89,12 +89,12 @@ def test_one_command_cuts_a_version_and_leaves_nothing_where_it_cannot(tmp_path:
         asked("config", key, value)
     head = asked("rev-parse", "HEAD")
     refused = make(checkout, "release", "VERSION=9.0.0")
-    assert refused.returncode != 0 and "OWNER" in refused.stderr
+    assert refused.returncode != 0 and "OWNER" in refused.stderr and "host.invalid" in refused.stderr
     for name in TO_FILL:
         text = (checkout / name).read_text()
         (checkout / name).write_text(PLACEHOLDERS.sub("example", text))
     dirty = make(checkout, "release", "VERSION=9.0.0")
-    assert dirty.returncode != 0 and "SECURITY.md" in dirty.stderr and "OWNER" not in dirty.stderr
+    assert dirty.returncode != 0 and "SECURITY.md" in dirty.stderr and "host.invalid" not in dirty.stderr
     assert (asked("rev-parse", "HEAD"), asked("tag", "--list", "v9*")) == (head, "")
     asked("commit", "--quiet", "--all", "--message", "Name the publisher")
     assert "no version" in make(checkout, "release", "VERSION=9.0.x").stderr
