@@ -36,9 +36,9 @@ def asked(tmp_path: Path) -> Ledger:
 
 
 def test_a_ledger_goes_through_a_file_with_all_that_was_paid(asked: Ledger, place: Place, tmp_path: Path) -> None:
-    assert export_ledger(asked.database, tmp_path / "moved.sqlite") == 4
+    assert export_ledger(asked.database, tmp_path / "moved.sqlite", print) == 4
     other = place.open()
-    assert import_ledger(tmp_path / "moved.sqlite", other.database) == 4
+    assert import_ledger(tmp_path / "moved.sqlite", other.database, print) == 4
     assert [*other.rows("m")] == [*asked.rows("m")] and other.totals() == asked.totals()
     assert [*Ledger(other.database, "votes").rows("n")] == [(answer("v", "yes"), {})]
     with other.database.writing():
@@ -56,24 +56,24 @@ def test_a_copy_that_was_killed_before_its_end_is_made_again(asked: Ledger, plac
 
     other = place.open() if place.kind == "postgres" else local(Path(place.where[1]) / "other")
     with pytest.raises(KeyboardInterrupt):
-        copy_ledger(asked.database, other.database, killed)
-    assert copy_ledger(asked.database, other.database) == 4
+        copy_ledger(asked.database, other.database, print, killed)
+    assert copy_ledger(asked.database, other.database, print) == 4
     assert [*other.rows("m")] == [*asked.rows("m")] and other.totals() == asked.totals()
-    with raises(TrapsError, "ledger.row_transfer._copy", other.database.place):
-        copy_ledger(asked.database, other.database)
+    with raises(TrapsError, "ledger.row_transfer._Copy.into", other.database.place):
+        copy_ledger(asked.database, other.database, print)
 
 
 def test_nothing_is_moved_into_a_study_that_has_answers_or_while_somebody_asks(asked: Ledger, tmp_path: Path) -> None:
     other = local(tmp_path / "other")
     write(other, answer("a", "right"))
-    with raises(TrapsError, "ledger.row_transfer._copy", other.database.place):
-        copy_ledger(asked.database, other.database)
+    with raises(TrapsError, "ledger.row_transfer._Copy.into", other.database.place):
+        copy_ledger(asked.database, other.database, print)
     assert [row["text"] for row in other.read("m").rows.values()] == ["right"]
 
     async def while_asking() -> None:
         async with asked.writing("m", print):
             with raises(TrapsError, "ledger.row_transfer.copy_ledger", asked.database.place, "answers", " m "):
-                copy_ledger(asked.database, local(tmp_path / "third").database)
+                copy_ledger(asked.database, local(tmp_path / "third").database, print)
 
     asyncio.run(while_asking())
     assert local(tmp_path / "third").evaluations() == []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sqlite3
 
 from traps_pipeline.base.terminal import plain
 
@@ -14,6 +15,7 @@ _UNWRITABLE = (
     (r"readonly database|read-only file system", "it is read-only", "make its folder writable for this user"),
     (r"disk I/O error|input/output error", "its disk fails or is full", "free some space"),
 )
+_PG_DAMAGED = ("XX001", "XX002")  # PostgreSQL: a table, an index is damaged
 _SERVER = r"connection to server|could not translate host name|server closed the connection|terminating connection"
 
 
@@ -23,11 +25,18 @@ def reason_and_remedy(error: BaseException) -> tuple[str, str, bool]:
     for pattern, reason, remedy in _UNWRITABLE:
         if re.search(pattern, words, re.IGNORECASE):
             return reason, remedy, True
-    if re.search(r"not a database|disk image is malformed", words, re.IGNORECASE):
+    if is_damaged(error):
         return "it is damaged, or no database", "move that file away, or restore a copy of it", False
     if re.search(_SERVER, words, re.IGNORECASE):
         return words, "see that the server runs and that address, user and password are right on this host", False
     return words or "it gives no reason", "free some space, or move that folder away", False
+
+
+def is_damaged(error: BaseException) -> bool:
+    """Return whether a database says that it is damaged, or that a file is none, by the code of its error."""
+    cause = getattr(error, "orig", None) or error
+    code = getattr(cause, "sqlite_errorcode", 0) & 0xFF  # the lowest byte is the kind
+    return code in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB) or getattr(cause, "sqlstate", "") in _PG_DAMAGED
 
 
 def database_error(error: BaseException) -> BaseException | None:

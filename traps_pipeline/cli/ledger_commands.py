@@ -57,7 +57,7 @@ def export(arguments: argparse.Namespace) -> int:
     """See `traps study export-ledger --help`."""
     from traps_pipeline.ledger.row_transfer import export_ledger
 
-    count = export_ledger(open_workspace(arguments).ledger, arguments.file.absolute())
+    count = export_ledger(open_workspace(arguments).ledger, arguments.file.absolute(), print)
     print(
         f"wrote {count_noun(count, 'row')} to {arguments.file}; `traps study import-ledger` reads it into another study"
     )
@@ -69,7 +69,7 @@ def import_(arguments: argparse.Namespace) -> int:
     from traps_pipeline.ledger.row_transfer import import_ledger
 
     workspace = open_workspace(arguments)
-    count = import_ledger(arguments.file.absolute(), workspace.ledger)
+    count = import_ledger(arguments.file.absolute(), workspace.ledger, print)
     print(f"read {count_noun(count, 'row')} into {workspace.ledger.place}")
     return OK
 

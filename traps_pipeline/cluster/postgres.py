@@ -23,7 +23,7 @@ from urllib.parse import urlsplit
 import sqlalchemy as sa
 from sqlalchemy import exc
 
-from traps_pipeline.base.databases import reason_and_remedy
+from traps_pipeline.base.databases import is_damaged, reason_and_remedy
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.extras import require
 from traps_pipeline.base.keys import check_key
@@ -52,6 +52,12 @@ _END_FORMER = (
 class PostgresDatabase(NumberedDatabase):
     """A ledger shared by hosts; the environment variable `variable` has its address."""
 
+    additions = (
+        "select 'the trigger ' || trigger_name from information_schema.triggers "
+        "where starts_with(event_object_table, 'traps_') union "
+        "select 'the view ' || table_name from information_schema.views where starts_with(table_name, 'traps_')"
+    )
+
     def __init__(self, address: str, variable: str, study: str, idle_s: float = IDLE_S) -> None:
         self.variable, self.patience_s = variable, PATIENCE_S
         self.application = f"traps {secrets.token_hex(8)}"  # the server's ids of this process's connections
@@ -79,7 +85,7 @@ class PostgresDatabase(NumberedDatabase):
 
     def read(self) -> sa.Connection:
         """See `Database.read`."""
-        return self._patient(self._engine.connect)
+        return self._patient(self._engine.connect).execution_options(isolation_level="REPEATABLE READ")
 
     def run(self, work: Callable[[sa.Connection], T], patience_s: float | None = None) -> T:
         """See `Database.run`; in one thread, a nested `run` joins the outer transaction."""
@@ -101,7 +107,7 @@ class PostgresDatabase(NumberedDatabase):
                 if is_broken:
                     clean_up()
                 if not is_broken or time.monotonic() >= until:
-                    raise self._sentence(error) from None
+                    raise self.sentence(error) from None
                 time.sleep(RETRY_S)
 
     def connect(self) -> sa.Connection:
@@ -140,6 +146,11 @@ class PostgresDatabase(NumberedDatabase):
     def now_s(self, connection: sa.Connection) -> float:
         """See `Database.now_s`."""
         return float(connection.execute(sa.text("select extract(epoch from clock_timestamp())")).scalar_one())
+
+    @property
+    def put_aside(self) -> str:
+        """See `Database.put_aside`."""
+        return f"set {self.variable} to the address of an empty database"
 
     def sync(self) -> None:
         """See `Database.sync`; PostgreSQL has synced already."""
@@ -194,7 +205,10 @@ class PostgresDatabase(NumberedDatabase):
             self.run(lambda connection: connection.execute(sa.select(sa.literal(1))))
             self._seen_s = began
 
-    def _sentence(self, error: Exception) -> TrapsError:
+    def sentence(self, error: Exception) -> TrapsError:
+        """See `Database.sentence`."""
+        if is_damaged(error):
+            return super().sentence(error)
         reason, _, _ = reason_and_remedy(error)
         return TrapsError(
             f"{self.variable}: the database at {self.place} cannot be used from the host {socket.gethostname()} "

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import json
 import os
 import socket
 import time
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from hashlib import blake2b
+from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 from sqlalchemy import exc
 
-from traps_pipeline.ledger.rows import AVERAGED_COLUMNS, Totals
-from traps_pipeline.ledger.schema import EVALUATIONS, RELEASES, RESERVATIONS, ROWS, TOTALS
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.ledger.rows import AVERAGED_COLUMNS, Totals, is_amount, is_whole, participant_of
+from traps_pipeline.ledger.schema import EVALUATIONS, RELEASES, RESERVATIONS, ROWS, SEALS, TOTALS
 
 CENT = 1e-9  # below this, dollars are rounding
+LOST = "lost-rows"  # the session of money whose rows were lost; it never lives, so that a person can release it
 
 
 @dataclass(frozen=True)
@@ -47,11 +51,29 @@ class Request:
     exhausted: CapExhausted | None = None
 
 
-class Batch:
-    """A transaction of the commit thread: collects changes, which `flush` writes."""
+class Amount(NamedTuple):
+    """Money of one row of `table`; name: its id, or the kind of a total. failed: the part of failed calls."""
 
-    def __init__(self, connection: sa.Connection, study: int, session: str) -> None:
-        self.connection, self.study, self.session = connection, study, session
+    table: str
+    name: str
+    session: str
+    participant: str
+    usd: float
+    failed: float
+
+
+class Batch:
+    """A transaction of the commit thread: collects changes, which `flush` writes and seals.
+
+    damaged: makes the error about what is no money, or not what was written.
+    """
+
+    def __init__(
+        self, connection: sa.Connection, study: int, session: str, damaged: Callable[[str], TrapsError]
+    ) -> None:
+        self.connection, self.study, self.session, self._damaged = connection, study, session, damaged
+        self.booked = dict[str, float]()  # by participant, after `flush`: dollars of rows, lost ones included
+        self.sealed_rows = 0  # after `flush`
         self.rows: list[dict[str, Any]] = []
         self.totals = defaultdict[tuple[str, str], Totals](Totals)
         self._writers: dict[int, bool] = {}
@@ -77,9 +99,21 @@ class Batch:
             self._writers[evaluation] = self._execute(_WRITER, {"of_id": evaluation}).fetchone() == (self.session,)
         return self._writers[evaluation]
 
-    def taken_usd(self) -> dict[str, float]:
+    def amounts(self) -> list[Amount]:
+        """Return all money of the study. Raises TrapsError for what is no amount."""
+        amounts = [*map(Amount._make, self._execute(_AMOUNTS, {"of_study": self.study}).fetchall())]
+        for each in amounts:
+            if not (is_amount(each.usd) and is_amount(each.failed)):
+                value = each.failed if is_amount(each.usd) else each.usd
+                raise self._damaged(f"traps_{each.table} has {value!r:.40} as dollars of {each.participant}")
+        return amounts
+
+    def taken_usd(self, amounts: Iterable[Amount] | None = None) -> dict[str, float]:
         """Return dollars by participant: costs of rows less released ones, and reservations."""
-        return dict(self._execute(_TAKEN, {"of_study": self.study}).fetchall())
+        taken = defaultdict[str, float](float)
+        for each in self.amounts() if amounts is None else amounts:
+            taken[each.participant] += -each.failed if each.table == "releases" else each.usd
+        return taken
 
     def other_sessions(self) -> frozenset[str]:
         """Return the sessions of other processes that hold reservations."""
@@ -87,15 +121,20 @@ class Batch:
         return frozenset(self.connection.execute(query).scalars()) - {self.session}
 
     def flush(self) -> None:
-        """Write the collected changes."""
+        """Write the collected changes, and seal what they leave."""
         self._execute(_ADD_ROW, *self.rows)
         self._execute(_REMOVE, *({"of_study": self.study, "of_id": reservation} for reservation in self._gone))
         settled = ({"of_study": self.study, "of_id": each, "new_usd": usd} for each, usd in self._settled.items())
         self._execute(_SETTLE, *settled)
         for (kind, participant), totals in self.totals.items():
             self._add_totals(kind, participant, totals)
-        if self._requests:
-            self._execute(_RESERVE, *self._granted())
+        amounts = self.amounts()
+        granted = self._granted(amounts)
+        self._execute(_RESERVE, *granted)
+        amounts += (Amount("reservations", r["id"], r["session"], r["participant"], r["usd"], 0.0) for r in granted)
+        sealed = {"of_study": self.study, "more_rows": len(self.rows), "new_money": _digest(amounts)}
+        (self.sealed_rows,) = self._execute(_SEAL, sealed).fetchone() or (0,)
+        self.booked = self.taken_usd(each for each in amounts if each.table == "totals" or each.session == LOST)
         for collected in (self.rows, self.totals, self._requests, self._settled, self._gone):
             collected.clear()
 
@@ -113,9 +152,66 @@ class Batch:
                 raise exc.DBAPIError.instance(sql, None, error, driver.Error) from error
         return cursor
 
-    def _granted(self) -> list[dict[str, Any]]:
+    def is_sealed(self) -> bool:
+        """Return whether the study has a seal.
+
+        Raises TrapsError if money, rows or evaluations are not those of the last transaction.
+        """
+        query, amounts = sa.select(SEALS).where(SEALS.c.study == self.study), self.amounts()
+        if (seal := self.connection.execute(query).first()) is None:
+            return False
+        count = self._row_count()
+        if count != seal.rows:
+            raise self._damaged(f"{seal.rows} rows were written, and {count} are there")
+        if _digest(amounts) != seal.money:
+            raise self._damaged("totals, reservations or releases are not what was written")
+        if self._evaluations() != seal.evaluations:
+            raise self._damaged("the names of evaluations are not what was written")
+        return True
+
+    def reseal(self) -> None:
+        """Seal what is there; totals below the costs of the rows are raised to them."""
+        for (kind, participant), its in self._row_totals().items():
+            query = sa.select(TOTALS.c.dollars, TOTALS.c.failed).where(
+                TOTALS.c.study == self.study, TOTALS.c.kind == kind, TOTALS.c.participant == participant
+            )
+            if (stored := self.connection.execute(query).first()) is not None:
+                its = Totals(max(0.0, its.dollars - stored.dollars), max(0.0, its.failed - stored.failed))
+            if stored is None or its.dollars > CENT or its.failed > CENT:
+                self._add_totals(kind, participant, its)
+        self.connection.execute(sa.delete(SEALS).where(SEALS.c.study == self.study))
+        values = {"rows": self._row_count(), "money": _digest(self.amounts()), "evaluations": self._evaluations()}
+        self.connection.execute(sa.insert(SEALS).values(study=self.study, **values))
+
+    def seal_evaluations(self) -> None:
+        """Seal the evaluations' names, after one was added."""
+        change = sa.update(SEALS).where(SEALS.c.study == self.study).values(evaluations=self._evaluations())
+        self.connection.execute(change)
+
+    def _evaluations(self) -> bytes:
+        query = sa.select(EVALUATIONS.c.id, EVALUATIONS.c.kind, EVALUATIONS.c.name)
+        return _digest(self.connection.execute(query.where(EVALUATIONS.c.study == self.study)))
+
+    def _row_count(self) -> int:
+        mine = ROWS.c.evaluation.in_(sa.select(EVALUATIONS.c.id).where(EVALUATIONS.c.study == self.study))
+        return self.connection.execute(sa.select(sa.func.count()).select_from(ROWS).where(mine)).scalar_one()
+
+    def _row_totals(self) -> dict[tuple[str, str], Totals]:
+        """Return totals by kind and participant of all rows that are whole."""
+        totals = defaultdict[tuple[str, str], Totals](Totals)
+        query = sa.select(EVALUATIONS.c.kind, EVALUATIONS.c.name, ROWS).join(
+            ROWS, ROWS.c.evaluation == EVALUATIONS.c.id
+        )
+        query = query.where(EVALUATIONS.c.study == self.study).execution_options(yield_per=1000)
+        for row in self.connection.execute(query):
+            if is_whole(row, f"{row.kind}/{row.name}"):
+                content = json.loads(row.content)
+                totals[row.kind, participant_of(content)].add(content)
+        return totals
+
+    def _granted(self, amounts: Iterable[Amount]) -> list[dict[str, Any]]:
         """Return the reservations for which there is room, in the order of the requests."""
-        by_participant, granted = self.taken_usd(), list[dict[str, Any]]()
+        by_participant, granted = self.taken_usd(amounts), list[dict[str, Any]]()
         taken = defaultdict[str | None, float](float, by_participant | {None: sum(by_participant.values())})
         for request in self._requests.values():
             slots, request.exhausted = (None, request.participant), None
@@ -127,7 +223,7 @@ class Batch:
                 for slot in slots:
                     taken[slot] += request.usd
                 values = {"study": self.study, "id": request.id, "session": self.session}
-                granted.append({**values, "participant": request.participant, "usd": request.usd})
+                granted.append({**values, "participant": request.participant, "usd": float(request.usd)})
         return granted
 
     def _add_totals(self, kind: str, participant: str, its: Totals) -> None:
@@ -141,6 +237,11 @@ class Batch:
             self.connection.execute(sa.insert(TOTALS).values(**new, **values))
 
 
+def _digest(entries: Iterable[Iterable[object]]) -> bytes:
+    """Return a digest of entries, in whatever order."""
+    return blake2b("\n".join(sorted(map(repr, map(tuple, entries)))).encode(), digest_size=16).digest()
+
+
 @lru_cache
 def _compiled(statement: Any, dialect: sa.Dialect, names: tuple[str, ...]) -> str:
     return str(statement.compile(dialect=dialect, column_keys=names))
@@ -151,16 +252,41 @@ def _is(*columns: sa.Column[Any]) -> sa.ColumnElement[bool]:
     return sa.and_(*(column == sa.bindparam(f"of_{column.name}") for column in columns))
 
 
+_NO_TEXT = sa.literal_column("''")
 _ADD_ROW, _RESERVE = sa.insert(ROWS).inline(), sa.insert(RESERVATIONS).inline()
 _REMOVE = sa.delete(RESERVATIONS).where(_is(*RESERVATIONS.primary_key))
 _SETTLE = sa.update(RESERVATIONS).where(_is(*RESERVATIONS.primary_key)).values(usd=sa.bindparam("new_usd"))
 _WRITER = sa.select(EVALUATIONS.c.writer).where(_is(EVALUATIONS.c.id))
 _AMOUNTS = sa.union_all(
-    sa.select(TOTALS.c.participant, TOTALS.c.dollars.label("usd")).where(_is(TOTALS.c.study)),
-    sa.select(RELEASES.c.participant, -RELEASES.c.failed).where(_is(RELEASES.c.study)),
-    sa.select(RESERVATIONS.c.participant, RESERVATIONS.c.usd).where(_is(RESERVATIONS.c.study)),
-).subquery()
-_TAKEN = sa.select(_AMOUNTS.c.participant, sa.func.sum(_AMOUNTS.c.usd)).group_by(_AMOUNTS.c.participant)
+    *(
+        sa.select(sa.literal_column(f"'{table.name.removeprefix('traps_')}'"), *columns).where(_is(table.c.study))
+        for table, *columns in (
+            (TOTALS, TOTALS.c.kind, _NO_TEXT, TOTALS.c.participant, TOTALS.c.dollars, TOTALS.c.failed),
+            (
+                RELEASES,
+                sa.cast(RELEASES.c.id, sa.Text),
+                _NO_TEXT,
+                RELEASES.c.participant,
+                RELEASES.c.in_flight,
+                RELEASES.c.failed,
+            ),
+            (
+                RESERVATIONS,
+                RESERVATIONS.c.id,
+                RESERVATIONS.c.session,
+                RESERVATIONS.c.participant,
+                RESERVATIONS.c.usd,
+                sa.literal_column("0.0"),
+            ),
+        )
+    )
+)
+_SEAL = (
+    sa.update(SEALS)
+    .where(_is(SEALS.c.study))
+    .values(rows=SEALS.c.rows + sa.bindparam("more_rows", type_=sa.BigInteger), money=sa.bindparam("new_money"))
+    .returning(SEALS.c.rows)
+)
 _DEAREST = sa.bindparam("its_dearest", type_=sa.Double)
 _SUMS = ("dollars", "failed", "unknown", *(f"{column}_{what}" for column in AVERAGED_COLUMNS for what in ("sum", "n")))
 _ADD_TOTALS = (
@@ -183,4 +309,5 @@ def claim(batch: Batch, kind: str, name: str) -> int:
     values: Mapping[str, Any] = {"writer": batch.session, "holder": holder()}
     if not batch.connection.execute(sa.update(EVALUATIONS).where(is_own_row).values(**values)).rowcount:
         batch.connection.execute(sa.insert(EVALUATIONS).values(**own_key, **values))
+        batch.seal_evaluations()
     return batch.connection.execute(sa.select(EVALUATIONS.c.id).where(is_own_row)).scalar_one()

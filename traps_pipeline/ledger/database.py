@@ -23,10 +23,10 @@ from typing import Any, TypeVar
 import sqlalchemy as sa
 from sqlalchemy import exc
 
-from traps_pipeline.base.databases import reason_and_remedy
+from traps_pipeline.base.databases import is_damaged, reason_and_remedy
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.ledger.batch import Batch
-from traps_pipeline.ledger.schema import METADATA, SESSIONS, SHARERS, STUDIES
+from traps_pipeline.ledger.schema import METADATA, SEALS, SESSIONS, SHARERS, STUDIES
 
 T = TypeVar("T")
 BEAT_S = 0.5  # how often a process renews its locks and reservations
@@ -36,6 +36,10 @@ SHARE_S, SHARER_S = 2.0, 10.0  # how often a process announces that it uses an a
 
 Change = Callable[[Batch], Any]
 AnyFuture = Future[Any] | asyncio.Future[Any]
+
+
+class _Refused(Exception):
+    """A change of a transaction was refused: the others are applied without it."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +58,11 @@ class Lock:
 class Database(ABC):
     """The ledger's database of one study in this process; thread-safe.
 
-    place: its location for people, without a password.
+    place: its location for people, without a password. additions: SQL for the names of triggers, and of views with a
+    table's name, which could change or hide what is written.
     """
+
+    additions: str
 
     def __init__(self, study: str, place: str) -> None:
         self.study_name, self.place = study, place
@@ -65,7 +72,9 @@ class Database(ABC):
         self._users, self._guard = 0, threading.Lock()
         self._thread: threading.Thread | None = None
         self._session_lock: Lock | None = None
-        self.sharers: dict[str, int] = {}  # by account in use: the number of processes that use it now
+        self._accounts: tuple[str, ...] = ()  # in use, once for each use; replaced under `_guard`, never changed
+        self._sharers: dict[str, int] = {}  # by account: the number of processes that use it; of the commit thread
+        self.booked: tuple[int, dict[str, float]] | None = None  # rows, and dollars by participant, of the last commit
         self._connection: sa.Connection | None = None  # for writing; `end` closes it
         self._transaction = threading.RLock()
 
@@ -106,13 +115,45 @@ class Database(ABC):
     def sync(self) -> None:
         """Sync to disk everything that was committed. Raises TrapsError."""
 
+    def book_lost(self, connection: sa.Connection) -> None:
+        """Count the money of rows that were lost, where something tells of them."""
+
     def faults(self) -> Iterator[str]:
-        """Yield faults of the database itself, if it can check. Raises TrapsError."""
-        yield from ()
+        """Yield faults of the database itself, and of its money. Raises TrapsError."""
+        with self.read() as connection:
+            try:
+                if sa.inspect(connection).has_table(SEALS.name) and (study := self._study(connection)):
+                    self._is_sealed(connection, study)
+            except exc.DBAPIError as error:
+                yield str(self.sentence(error))
+            except TrapsError as error:
+                yield str(error)
 
     @abstractmethod
     def beat(self) -> None:
         """Renew this process's locks if they could expire. Raises TrapsError."""
+
+    @property
+    @abstractmethod
+    def put_aside(self) -> str:
+        """What a person does to go on in an empty database."""
+
+    def damaged(self, what: str) -> TrapsError:
+        """Return the error of a ledger that must not be written on, with the way to save it."""
+        return TrapsError(
+            f"{self.place}: {what}, so nothing is asked; `traps study export-ledger FILE` saves what is whole, then "
+            f"{self.put_aside}, and `traps study import-ledger FILE` brings it back"
+        )
+
+    def sentence(self, error: Exception) -> TrapsError:
+        """Return a database error as a sentence, without the statement and its values."""
+        if is_damaged(error):
+            return self.damaged("it is damaged, or no database")
+        reason, remedy, _ = reason_and_remedy(error)
+        return TrapsError(
+            f"{self.place}: cannot be read or written ({reason}); {remedy} and run the same command again: everything "
+            "answered before is kept, only what was in flight is asked again"
+        )
 
     # --- writing ------------------------------------------------------------------------------------------------------
 
@@ -178,39 +219,45 @@ class Database(ABC):
         beat. Raises TrapsError.
         """
         with self.writing():
-            self.sharers |= dict.fromkeys(accounts, 1)
-            self.submit(self._share).result()
+            with self._guard:
+                self._accounts += tuple(accounts)
             try:
-                yield lambda account: max(1, self.sharers.get(account, 1))
+                self.submit(self._share).result()
+                yield lambda account: max(1, self._sharers.get(account, 1))
             finally:
-                for account in accounts:
-                    self.sharers.pop(account, None)
-                self.submit(self._unshare).result()
+                with self._guard:
+                    remaining = [*self._accounts]
+                    for account in accounts:
+                        remaining.remove(account)
+                    self._accounts = tuple(remaining)
+                self.submit(self._share).result()
 
     def _share(self, batch: Batch) -> None:
         """Announce that this process uses its accounts, and count the processes that do."""
-        now_s = self.now_s(batch.connection)
-        self._unshare(batch)
-        for account in self.sharers:
+        now_s, accounts = self.now_s(batch.connection), {*self._accounts}
+        expired = (SHARERS.c.session == self.session) | (SHARERS.c.seen_s < now_s - SHARER_S)
+        batch.connection.execute(sa.delete(SHARERS).where(expired))
+        for account in accounts:
             batch.connection.execute(sa.insert(SHARERS).values(session=self.session, account=account, seen_s=now_s))
         counts = sa.select(SHARERS.c.account, sa.func.count()).where(SHARERS.c.seen_s > now_s - SHARER_S)
-        for account, count in batch.connection.execute(counts.group_by(SHARERS.c.account)):
-            if account in self.sharers:
-                self.sharers[account] = count
-
-    def _unshare(self, batch: Batch) -> None:
-        expired = (SHARERS.c.session == self.session) | (SHARERS.c.seen_s < self.now_s(batch.connection) - SHARER_S)
-        batch.connection.execute(sa.delete(SHARERS).where(expired))
+        self._sharers = dict(batch.connection.execute(counts.group_by(SHARERS.c.account)).all())
 
     def _begin(self) -> None:
         self.session = secrets.token_hex(8)
-        self.run(self.prepare)
+        try:
+            self.run(self.prepare)
+        except BaseException:
+            self.end()  # the file may be replaced before the next try
+            raise
         self._session_lock = self.try_lock(f"session-{self.session}")
         self._thread = threading.Thread(target=self._work, name="ledger", daemon=True)
         self._thread.start()
 
     def prepare(self, connection: sa.Connection) -> None:
-        """Create missing tables, and the rows of the study and of this session."""
+        """Create missing tables, and the rows of the study and of this session; verify the rest.
+
+        Raises TrapsError for a ledger that must not be written on.
+        """
         METADATA.create_all(connection)
         self.study = (
             self._study(connection)
@@ -218,6 +265,21 @@ class Database(ABC):
         )
         if connection.execute(sa.select(SESSIONS.c.id).where(SESSIONS.c.id == self.session)).first() is None:
             connection.execute(sa.insert(SESSIONS).values(id=self.session, study=self.study))
+        self.lock_study(connection)
+        if not self._is_sealed(connection, self.study):
+            Batch(connection, self.study, self.session, self.damaged).reseal()
+
+    def lock_study(self, connection: sa.Connection) -> None:
+        """Let no other process change the study until the commit."""
+
+    def _is_sealed(self, connection: sa.Connection, study: int) -> bool:
+        """Return whether the ledger is sealed, as before 0.4 none was.
+
+        Raises TrapsError if money, rows or evaluations are not what was written, or something could change them.
+        """
+        if names := [*connection.exec_driver_sql(self.additions).scalars()]:
+            raise self.damaged(f"it has {', '.join(map(str, names))}, which this program did not make")
+        return Batch(connection, study, self.session, self.damaged).is_sealed()
 
     def _study(self, connection: sa.Connection) -> int | None:
         return connection.execute(sa.select(STUDIES.c.id).where(STUDIES.c.name == self.study_name)).scalar()
@@ -252,35 +314,42 @@ class Database(ABC):
                 is_last = queued is None
             except Empty:
                 pass
-            if self.sharers and time.monotonic() - shared_at > SHARE_S:
+            if self._accounts and time.monotonic() - shared_at > SHARE_S:
                 shared_at = time.monotonic()
                 changes.append((self._share, Future()))
             if changes:
                 self._commit(changes)
-            if is_last:
-                return
-            if time.monotonic() - beaten_at > BEAT_S:
+            if is_last or time.monotonic() - beaten_at > BEAT_S:
                 beaten_at = time.monotonic()
                 with suppress(TrapsError):  # reported to the next caller
                     self.beat()
+            if is_last:
+                return
 
     def _commit(self, changes: list[tuple[Change, AnyFuture]]) -> None:
-        """Apply changes in one transaction; skip any that raises TrapsError."""
+        """Apply changes in one transaction, without any that raises TrapsError: nothing of it is kept."""
+        refused = dict[int, TrapsError]()
 
-        def work(connection: sa.Connection) -> list[Any]:
-            results, batch = list[Any](), Batch(connection, self.study, self.session)
-            for change, _ in changes:
+        def work(connection: sa.Connection) -> tuple[list[Any], Batch]:
+            results, batch = list[Any](), Batch(connection, self.study, self.session, self.damaged)
+            for number, (change, _) in enumerate(changes):
                 try:
-                    results.append(change(batch))
+                    results.append(refused.get(number) or change(batch))
                 except TrapsError as error:
-                    results.append(error)
+                    refused[number] = error
+                    raise _Refused from error
             batch.flush()
-            return results
+            return results, batch
 
-        try:
-            results = self.run_once(work)
-        except Exception as error:  # noqa: BLE001 - handed to those who wait for these changes
-            results = [error] * len(changes)
+        results = list[Any]()
+        while not results:
+            try:
+                results, batch = self.run_once(work)
+                self.booked = batch.sealed_rows, batch.booked
+            except _Refused:
+                continue
+            except Exception as error:  # noqa: BLE001 - handed to those who wait for these changes
+                results = [error] * len(changes)
         by_loop = defaultdict[asyncio.AbstractEventLoop | None, list[tuple[AnyFuture, Any]]](list)
         for (_, future), result in zip(changes, results, strict=True):
             by_loop[future.get_loop() if isinstance(future, asyncio.Future) else None].append((future, result))
@@ -311,15 +380,6 @@ def taken_over(place: str) -> TrapsError:
     )
 
 
-def sentence(error: Exception, place: str) -> TrapsError:
-    """Return a database error as a sentence, without the statement and its values."""
-    reason, remedy, _ = reason_and_remedy(error)
-    return TrapsError(
-        f"{place}: cannot be read or written ({reason}); {remedy} and run the same command again: everything answered "
-        "before is kept, only what was in flight is asked again"
-    )
-
-
 _LOCK_STUDY = sa.select(STUDIES.c.id).where(STUDIES.c.id == sa.bindparam("of_study")).with_for_update()
 _NUMBER = sa.bindparam("number", type_=sa.BigInteger)
 _COUNT = (
@@ -339,12 +399,16 @@ class NumberedDatabase(Database):
         super().prepare(connection)
         self._batch = 0
 
+    def lock_study(self, connection: sa.Connection) -> None:
+        """See `Database.lock_study`."""
+        connection.execute(_LOCK_STUDY, {"of_study": self.study})
+
     def run_once(self, work: Callable[[sa.Connection], T]) -> T:
         """See `Database.run_once`; one transaction of a study runs at a time."""
         results, number = list[T](), self._batch + 1
 
         def numbered(connection: sa.Connection) -> T:
-            connection.execute(_LOCK_STUDY, {"of_study": self.study})
+            self.lock_study(connection)
             is_first = connection.execute(_COUNT, {"of_session": self.session, "number": number}).rowcount
             if is_first or not results:
                 results[:] = [work(connection)]

@@ -11,13 +11,14 @@ import json
 from collections.abc import AsyncIterator, Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy import exc
 
 from traps_pipeline.ledger.batch import Batch, claim
-from traps_pipeline.ledger.database import Database, Lock, sentence, taken_over
+from traps_pipeline.ledger.database import Database, Lock, taken_over
 from traps_pipeline.ledger.rows import (
     AVERAGED_COLUMNS,
     NOT_WHOLE,
@@ -27,6 +28,8 @@ from traps_pipeline.ledger.rows import (
     Totals,
     digest_of,
     encode_row,
+    is_amount,
+    is_whole,
     participant_of,
     replace_impossible,
     settles,
@@ -67,7 +70,7 @@ class Ledger:
         """
         rows = EvaluationRows()
         for entry in self._rows(evaluation, wanted):
-            self._add(rows, entry)
+            self._add(rows, entry, evaluation)
         return rows
 
     def naming(self, text: str) -> dict[str, EvaluationRows]:
@@ -76,7 +79,7 @@ class Ledger:
         rows = dict[str, EvaluationRows]()
         for entry in self._select(query.where(self._is_own_kind(EVALUATIONS)).order_by(ROWS.c.id)):
             if isinstance(entry.content, bytes) and text.encode() in entry.content:  # a flipped bit makes another kind
-                self._add(rows.setdefault(entry.name, EvaluationRows()), entry)
+                self._add(rows.setdefault(entry.name, EvaluationRows()), entry, entry.name)
         return rows
 
     def reasoning(self, evaluation: str, wanted: Collection[str] | None = None) -> dict[str, str]:
@@ -84,13 +87,13 @@ class Ledger:
         return {
             row.key: row.reasoning.decode()
             for row in self._rows(evaluation, wanted)
-            if row.reasoning is not None and _is_whole(row)
+            if row.reasoning is not None and self._is_whole(row, evaluation)
         }
 
     def rows(self, evaluation: str) -> Iterator[Stored]:
         """Yield an evaluation's intact rows, oldest first. Raises TrapsError."""
         for row in self._rows(evaluation):
-            if _is_whole(row):
+            if self._is_whole(row, evaluation):
                 asides = {name: getattr(row, name) for name in SIDE_TEXTS}
                 yield (
                     json.loads(row.content),
@@ -103,7 +106,7 @@ class Ledger:
             yield from self.database.faults()
         for evaluation in self.evaluations():
             for row in self._rows(evaluation):
-                if not _is_whole(row):
+                if not self._is_whole(row, evaluation):
                     yield f"{self._place(row)}: {NOT_WHOLE}, and not believed"
 
     def evaluations(self) -> list[str]:
@@ -119,6 +122,9 @@ class Ledger:
         totals = dict[str, Totals]()
         for row in self._select(sa.select(TOTALS).where(self._is_own_kind(TOTALS))):
             sums = {name: (getattr(row, f"{name}_sum"), getattr(row, f"{name}_n")) for name in AVERAGED_COLUMNS}
+            values = (row.dollars, row.failed, row.dearest, row.unknown, *chain(*sums.values()))
+            if not all(map(is_amount, values)):
+                raise self.database.damaged(f"the totals of {row.participant} hold what is no amount")
             means = {name: its for name, its in sums.items() if its[1]}
             totals[row.participant] = Totals(row.dollars, row.failed, row.dearest, row.unknown, means)
         return totals
@@ -137,9 +143,9 @@ class Ledger:
             except (exc.OperationalError, exc.ProgrammingError) as error:
                 if not sa.inspect(connection.engine).has_table(STUDIES.name):
                     return
-                raise sentence(error, self.database.place) from error
+                raise self.database.sentence(error) from error
             except exc.DBAPIError as error:
-                raise sentence(error, self.database.place) from error
+                raise self.database.sentence(error) from error
 
     def _rows(self, evaluation: str, wanted: Collection[str] | None = None) -> Iterator[sa.Row[Any]]:
         ids = sa.select(EVALUATIONS.c.id).where(self._is_own_kind(EVALUATIONS), EVALUATIONS.c.name == evaluation)
@@ -152,9 +158,12 @@ class Ledger:
             keys = frozenset(wanted)
             yield from (row for row in self._select(query) if row.key in keys)
 
-    def _add(self, rows: EvaluationRows, entry: sa.Row[Any]) -> None:
+    def _is_whole(self, row: sa.Row[Any], evaluation: str) -> bool:
+        return is_whole(row, f"{self.kind}/{evaluation}")
+
+    def _add(self, rows: EvaluationRows, entry: sa.Row[Any], evaluation: str) -> None:
         """Add a row and a note about impossible values, or only a note if it is damaged."""
-        if not _is_whole(entry):
+        if not self._is_whole(entry, evaluation):
             rows.notes[self._place(entry)] = f"{NOT_WHOLE}: it is not believed; its answer is asked again"
             return
         row = json.loads(entry.content)
@@ -177,7 +186,7 @@ class Ledger:
             lock = await self._lock(evaluation, waiting, give_up)
             try:
                 number = await self.database.apply(partial(claim, kind=self.kind, name=evaluation))
-                yield Writer(self.database, self.kind, number, lock)
+                yield Writer(self.database, self.kind, (number, evaluation), lock)
             finally:
                 lock.release()
 
@@ -226,8 +235,9 @@ class Ledger:
 class Writer:
     """The only writer of an evaluation: adds rows to it."""
 
-    def __init__(self, database: Database, kind: str, evaluation: int, lock: Lock) -> None:
-        self._database, self._kind, self._evaluation, self._lock = database, kind, evaluation, lock
+    def __init__(self, database: Database, kind: str, evaluation: tuple[int, str], lock: Lock) -> None:
+        self._database, self._kind, self._lock = database, kind, lock
+        self._evaluation, self._bound = evaluation[0], f"{kind}/{evaluation[1]}"
         self._is_synced = True
 
     async def require(self) -> None:
@@ -253,7 +263,7 @@ class Writer:
         """Return a row of the table, without its id. Raises ValueError if JSON cannot hold the row."""
         content = encode_row(row)
         texts = {name: beside[name].encode("utf-8", "replace") if name in beside else None for name in SIDE_TEXTS}
-        digest = digest_of(row["key"], content, **texts)
+        digest = digest_of(row["key"], content, **texts, evaluation=self._bound)
         return {"evaluation": self._evaluation, "key": row["key"], "content": content, "digest": digest, **texts}
 
     def add(self, batch: Batch, row: Mapping[str, Any], values: dict[str, Any], paid_by: Sequence[str] = ()) -> None:
@@ -274,10 +284,3 @@ class Writer:
         if not self._is_synced:
             self._is_synced = True
             await asyncio.to_thread(self._database.sync)
-
-
-def _is_whole(row: sa.Row[Any]) -> bool:
-    try:
-        return digest_of(row.key, row.content, row.reasoning, row.raw) == row.digest
-    except (TypeError, AttributeError):  # a flipped bit can make another kind of value of a column
-        return False

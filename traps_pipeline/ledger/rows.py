@@ -28,6 +28,11 @@ def is_cost(value: Any) -> bool:
     return type(value) in (int, float) and math.isfinite(value) and 0 <= value <= MAX_USD
 
 
+def is_amount(value: Any) -> bool:
+    """Return whether a value is a possible sum of dollars, of tokens, or of seconds."""
+    return type(value) in (int, float) and math.isfinite(value) and value >= 0
+
+
 def is_seconds(value: Any) -> bool:
     """Return whether a value is a possible duration of one call."""
     return type(value) in (int, float) and 0 <= value < math.inf
@@ -94,12 +99,26 @@ def encode_row(row: Mapping[str, Any]) -> bytes:
     return _ENCODER.encode(row).encode()
 
 
-def digest_of(key: str, content: bytes, reasoning: bytes | None, raw: bytes | None) -> bytes:
-    """Return the digest (16 bytes) that is stored with a row and verified on reading."""
-    digest = blake2b(key.encode(), digest_size=16)
-    for part in (content, reasoning, raw):
+def digest_of(
+    key: str, content: bytes, reasoning: bytes | None, raw: bytes | None, evaluation: str | None = None
+) -> bytes:
+    """Return the digest that is stored with a row and verified on reading.
+
+    It has 17 bytes and binds the evaluation, KIND/NAME; rows of versions before 0.4 have 16 bytes (None), which do not.
+    """
+    digest = blake2b(key.encode(), digest_size=16 if evaluation is None else 17)
+    for part in (*(() if evaluation is None else (evaluation.encode(),)), content, reasoning, raw):
         digest.update(b"\0" if part is None else b"\1" + part)
     return digest.digest()
+
+
+def is_whole(row: Any, evaluation: str) -> bool:
+    """Return whether a row of the table is what was written into an evaluation, KIND/NAME."""
+    try:
+        bound = evaluation if len(row.digest) == 17 else None
+        return digest_of(row.key, row.content, row.reasoning, row.raw, bound) == row.digest
+    except (TypeError, AttributeError):  # a flipped bit can make another kind of value of a column
+        return False
 
 
 @dataclass

@@ -99,6 +99,15 @@ RELEASES = sa.Table(
     sa.Column("by", sa.Text, nullable=False),
     sa.Column("at", sa.Text, nullable=False),
 )
+# What each transaction leaves: the number of rows, and digests of all money and of the evaluations' names (`Batch`).
+SEALS = sa.Table(
+    "traps_seals",
+    METADATA,
+    _study(primary_key=True),
+    sa.Column("rows", sa.BigInteger, nullable=False),
+    sa.Column("money", sa.LargeBinary, nullable=False),
+    sa.Column("evaluations", sa.LargeBinary, nullable=False),
+)
 # Sessions that use an account; each renews its row about every second (`seen_s`, seconds since 1970).
 SHARERS = sa.Table(
     "traps_sharers",

@@ -6,7 +6,9 @@ disk: SQLite's write-ahead log does not work over a network.
 
 from __future__ import annotations
 
+import json
 import os
+import secrets
 import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -17,24 +19,36 @@ from urllib.parse import quote
 import sqlalchemy as sa
 from sqlalchemy import event, exc
 
+from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.files import remedy, require_in_place, sync_folder, try_lock
-from traps_pipeline.ledger.database import Database, Lock, sentence
+from traps_pipeline.base.files import remedy, require_in_place, sync_folder, try_lock, write_text
+from traps_pipeline.ledger.batch import LOST, Batch, Request
+from traps_pipeline.ledger.database import Database, Lock
+from traps_pipeline.ledger.rows import is_amount
+from traps_pipeline.ledger.schema import ROWS, STUDIES
 
 T = TypeVar("T")
 FILE = "ledger.sqlite"
+NOTE = "ledger.booked.json"
+QUICK_BYTES = 200_000_000  # larger files are checked in part when they are opened for writing
+SAMPLED = 64  # rows, evenly over a large file
+ROUNDING_USD = 1e-6
 WAIT_S = 600.0  # to wait for another process's transaction on a slow disk
 
 
 class SqliteDatabase(Database):
     """The ledger in a folder, created on the first write.
 
-    A file holds one study, whatever its name: it can be copied into another study's folder.
+    A file holds one study, whatever its name: it can be copied into another study's folder. What is booked is noted
+    beside it every half second: rows that vanish, as with a lost log, are told and their money counts.
     """
+
+    additions = "select 'the ' || type || ' ' || name from sqlite_master where type in ('trigger', 'view')"
 
     def __init__(self, folder: Path, study: str = "study", file: str = FILE) -> None:
         super().__init__(study, str(folder / file))
         self.folder, self.path = folder, folder / file
+        self._is_checked, self._noted = False, (0, dict[str, float]())
         # paramstyle: `Batch` hands dicts to either driver.
         self._engine = sa.create_engine("sqlite://", creator=self._open, poolclass=sa.NullPool, paramstyle="named")
         event.listen(self._engine, "begin", _begin)
@@ -60,12 +74,55 @@ class SqliteDatabase(Database):
         try:
             return self._engine.connect().execution_options(is_reading=True)
         except exc.DBAPIError as error:
-            raise sentence(error, self.place) from error
+            raise self.sentence(error) from error
 
     def connect(self) -> sa.Connection:
         """See `Database.connect`."""
         self.folder.mkdir(parents=True, exist_ok=True)
         return self._engine.connect()
+
+    def prepare(self, connection: sa.Connection) -> None:
+        """See `Database.prepare`; the file is checked first, once a process."""
+        if not self._is_checked:
+            self._check(connection)
+        super().prepare(connection)
+        if not self._is_checked and self.path.name == FILE:
+            self._noted = _read_note(self.path.with_name(NOTE))
+            self.book_lost(connection)
+        self._is_checked = True
+
+    def _check(self, connection: sa.Connection) -> None:
+        """Raise TrapsError if the file is damaged; of a large one, some rows stand for all (`faults` reads each)."""
+        tables = {*connection.exec_driver_sql("select name from sqlite_master where type = 'table'").scalars()}
+        is_large = self.path.stat().st_size > QUICK_BYTES
+        for table in (f"('{name}')" for name in tables - {ROWS.name}) if is_large else ("(1)",):
+            if (fault := connection.exec_driver_sql(f"pragma quick_check{table}").scalar()) != "ok":
+                raise self.damaged(f"it is damaged ({fault})")
+        if is_large:
+            last = connection.execute(sa.select(sa.func.max(ROWS.c.id))).scalar() or 0
+            some = {last * number // SAMPLED for number in range(SAMPLED + 1)}
+            connection.execute(sa.select(ROWS.c.key).where(ROWS.c.id.in_(some))).all()
+        names = [*connection.execute(sa.select(STUDIES.c.name)).scalars()] if STUDIES.name in tables else []
+        if names and self.study_name not in names:
+            raise self.damaged(f"it holds the study {names[0]}, and not {self.study_name}")
+
+    def book_lost(self, connection: sa.Connection) -> None:
+        """Reserve what was noted as booked and is no longer, until a person releases it; say what is gone."""
+        batch = Batch(connection, self.study, LOST, self.damaged)
+        batch.flush()
+        rows, booked = self._noted
+        lost = {name: usd - batch.booked.get(name, 0.0) for name, usd in booked.items()}
+        for participant, usd in lost.items():
+            if usd > ROUNDING_USD:
+                batch.reserve(Request(secrets.token_hex(8), participant, usd, {}))
+        batch.flush()
+        self.booked = batch.sealed_rows, batch.booked
+        if rows > batch.sealed_rows or any(usd > ROUNDING_USD for usd in lost.values()):
+            usd = sum(usd for usd in lost.values() if usd > ROUNDING_USD)
+            progress.current().note(
+                f"{self.path}: of {rows} rows that were written {batch.sealed_rows} are there; ${usd:.4f} of the others "
+                f"count until `traps study release-money` releases them, and `traps doctor --verify` names their tables"
+            )
 
     def run(self, work: Callable[[sa.Connection], T]) -> T:
         """See `Database.run`."""
@@ -74,7 +131,7 @@ class SqliteDatabase(Database):
                 return self._attempt(work)
             except (exc.DBAPIError, sqlite3.Error) as error:
                 self.end()
-                raise sentence(error, self.place) from error
+                raise self.sentence(error) from error
             except OSError as error:
                 raise TrapsError(f"{self.path}: cannot be written ({error.strerror}); {remedy(error)}") from error
 
@@ -115,14 +172,32 @@ class SqliteDatabase(Database):
         """See `Database.faults`; finds rows that are in an index but not in the table."""
         with self.read() as connection:
             try:
-                for (fault,) in connection.exec_driver_sql("pragma integrity_check(5)"):
+                for fault in connection.exec_driver_sql("pragma integrity_check(5)").scalars():
                     if fault != "ok":
-                        yield f"{self.path}: {fault}; what can be read goes on elsewhere by `traps study export-ledger`"
+                        yield str(self.damaged(f"it is damaged ({fault})"))
             except exc.DBAPIError as error:
-                raise sentence(error, self.place) from error
+                raise self.sentence(error) from error
+        yield from super().faults()
+
+    @property
+    def put_aside(self) -> str:
+        """See `Database.put_aside`."""
+        return f"move {self.path}* away"
 
     def beat(self) -> None:
-        """See `Database.beat`; the kernel keeps the locks."""
+        """See `Database.beat`; the kernel keeps the locks, and what is booked is noted beside the file."""
+        if self.booked not in (None, self._noted) and self.path.name == FILE:
+            write_text(self.path.with_name(NOTE), json.dumps(self.booked))
+            self._noted = self.booked
+
+
+def _read_note(path: Path) -> tuple[int, dict[str, float]]:
+    """Return the noted number of rows, and dollars by participant; none where the note is damaged or missing."""
+    try:
+        rows, booked = json.loads(path.read_bytes())
+        return int(rows), {str(name): float(usd) for name, usd in booked.items() if is_amount(usd)}
+    except (OSError, ValueError, TypeError, AttributeError, RecursionError):
+        return 0, {}
 
 
 def _begin(connection: sa.Connection) -> None:

@@ -14,7 +14,7 @@ import dagster as dg
 import yaml
 
 from traps_pipeline.base import progress
-from traps_pipeline.base.databases import database_error, reason_and_remedy
+from traps_pipeline.base.databases import database_error, is_damaged, reason_and_remedy
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import remedy, write_text
 from traps_pipeline.base.paths import require_history_path
@@ -90,7 +90,7 @@ def _open_history(workspace: Workspace, home: Path) -> dg.DagsterInstance:
         except OperationalError:
             raise  # a full disk or another process's lock: the history is intact
         except DatabaseError as error:
-            if is_retry or ("not a database" not in str(error) and "malformed" not in str(error)):
+            if is_retry or not is_damaged(error):
                 raise
             backup = home / f"broken-{time.strftime('%Y%m%dT%H%M%S')}"
             for name in ("history", "schedules", "storage"):

@@ -50,7 +50,10 @@ def move_to_store(workspace: Workspace, address: Place) -> int:
         target.save_study()  # last: it makes the address a study
         (workspace.root / STUDY).rename(workspace.root / MOVED_STUDY)
 
-    return copy_ledger(workspace.ledger, target.ledger, settle)
+    def lost(fault: str) -> None:
+        raise TrapsError(fault)
+
+    return copy_ledger(workspace.ledger, target.ledger, lost, settle)
 
 
 def _move_files(workspace: Workspace, target: Workspace) -> None:
