@@ -7,7 +7,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -23,9 +23,11 @@ from traps_pipeline.storage.place import Place, scratch_of
 
 if TYPE_CHECKING:
     from traps_pipeline.mechanism.adapter_checks import Subject
+    from traps_pipeline.storage.workspace import Workspace
 
 MIN_FREE_GB = 1.0
 STATES = ("*.safetensors", "*.parquet")  # files of an extraction
+LEDGER_KEYS = ("request_key", "vote_key", "label_key")  # columns of tables
 FOLDERS = ("tables", "clips", "media", "trajectories", "states", "directions", "reports")
 MAX_FILES = 5  # damaged files named per kind
 UNFINISHED_AFTER_S = 24 * 3600.0  # longer than the writing of any file
@@ -132,7 +134,7 @@ def examine_files(place: Place) -> Iterator[Finding]:
             f"; and {len(messages) - MAX_FILES} more" if len(messages) > MAX_FILES else ""
         )
         yield Finding(not messages, topic, summary or f"{count_noun(len(files), 'file')} read, as written")
-    message = [*workspace.answers.damage(), *workspace.votes.damage()]
+    message = [*dict.fromkeys((*workspace.answers.damage(), *workspace.votes.damage(), *_lost_rows(workspace)))]
     yield Finding(not message, "ledger", "; ".join(message[:MAX_FILES]) or "all rows are what was written")
     yield Finding(True, "unfinished", _remove_unfinished(workspace.root))
 
@@ -161,6 +163,30 @@ def examine_unused(place: Place, *, is_removed: bool) -> Finding:
     return Finding(
         True, "unused", f"{effect}, since nobody names them and they are older than {GRACE_DAYS:.0f} days: {volume}"
     )
+
+
+def _lost_rows(workspace: Workspace) -> Iterator[str]:
+    """Yield which tables hold answers and votes that the ledger lacks, with the money paid for them."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        known = workspace.answers.keys() | workspace.votes.keys()
+        for path in sorted((workspace.root / "tables").rglob("*.parquet")):
+            with suppress(pa.ArrowException, OSError):  # named as damaged by `bytes_damage`
+                columns = {*pq.read_schema(path).names} & {*LEDGER_KEYS, "cost_usd"}
+                for key in columns & {*LEDGER_KEYS}:
+                    rows = pq.ParquetFile(path).read(columns=[*columns]).to_pylist()
+                    lost = {row[key]: row.get("cost_usd") or 0.0 for row in rows if row[key] not in known}
+                    lost.pop(None, None)
+                    if lost:
+                        yield (
+                            f"{path}: the ledger lacks {count_noun(len(lost), 'row')} that it was made from "
+                            f"(${sum(lost.values()):.4f}); put a whole copy of the ledger in its place, or run "
+                            "`traps run` again, which asks only what is missing where a table is made again"
+                        )
+    except TrapsError as error:
+        yield str(error)
 
 
 def _clip_damage(path: Path) -> str:

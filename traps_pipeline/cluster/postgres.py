@@ -27,8 +27,8 @@ from traps_pipeline.base.databases import is_damaged, reason_and_remedy
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.extras import require
 from traps_pipeline.base.keys import check_key
-from traps_pipeline.ledger.database import Lock, NumberedDatabase, taken_over
-from traps_pipeline.ledger.schema import EVALUATIONS, SESSIONS
+from traps_pipeline.ledger.database import Database, Lock, taken_over
+from traps_pipeline.ledger.schema import EVALUATIONS, METADATA, SESSIONS, STUDIES
 from traps_pipeline.storage.store import Lease
 
 T = TypeVar("T")
@@ -47,6 +47,44 @@ _END_FORMER = (
     "select pg_terminate_backend(pid) from pg_stat_activity "
     "where application_name = :application and pid <> pg_backend_pid()"
 )
+
+
+_LOCK_STUDY = sa.select(STUDIES.c.id).where(STUDIES.c.id == sa.bindparam("of_study")).with_for_update()
+_NUMBER = sa.bindparam("number", type_=sa.BigInteger)
+_COUNT = (
+    sa.update(SESSIONS)
+    .where(SESSIONS.c.id == sa.bindparam("of_session"), SESSIONS.c.batch == _NUMBER - 1)
+    .values(batch=_NUMBER)
+)
+
+
+class NumberedDatabase(Database):
+    """A database over a network, where the answer to a commit may be lost: transactions are numbered."""
+
+    _batch = 0  # the number of this session's last transaction
+
+    def prepare(self, connection: sa.Connection) -> None:
+        """See `Database.prepare`."""
+        METADATA.create_all(connection)
+        mine = sa.select(STUDIES.c.id).where(STUDIES.c.name == self.study_name)
+        connection.execute(mine.with_for_update())  # no other process changes it while it is verified
+        super().prepare(connection)
+        self._batch = 0
+
+    def run_once(self, work: Callable[[sa.Connection], T]) -> T:
+        """See `Database.run_once`; one transaction of a study runs at a time."""
+        results, number = list[T](), self._batch + 1
+
+        def numbered(connection: sa.Connection) -> T:
+            connection.execute(_LOCK_STUDY, {"of_study": self.study})
+            is_first = connection.execute(_COUNT, {"of_session": self.session, "number": number}).rowcount
+            if is_first or not results:
+                results[:] = [work(connection)]
+            return results[0]
+
+        result = self.run(numbered)
+        self._batch = number
+        return result
 
 
 class PostgresDatabase(NumberedDatabase):

@@ -17,7 +17,7 @@ import sqlalchemy as sa
 from sqlalchemy import exc
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.ledger.rows import AVERAGED_COLUMNS, Totals, is_amount, is_whole, participant_of
+from traps_pipeline.ledger.rows import AVERAGED_COLUMNS, NOT_WHOLE, Totals, is_amount, is_whole, participant_of
 from traps_pipeline.ledger.schema import EVALUATIONS, RELEASES, RESERVATIONS, ROWS, SEALS, TOTALS
 
 CENT = 1e-9  # below this, dollars are rounding
@@ -105,14 +105,14 @@ class Batch:
         for each in amounts:
             if not (is_amount(each.usd) and is_amount(each.failed)):
                 value = each.failed if is_amount(each.usd) else each.usd
-                raise self._damaged(f"traps_{each.table} has {value!r:.40} as dollars of {each.participant}")
+                raise self._damaged(f"{each.table} has {value!r:.40} as dollars of {each.participant}")
         return amounts
 
     def taken_usd(self, amounts: Iterable[Amount] | None = None) -> dict[str, float]:
         """Return dollars by participant: costs of rows less released ones, and reservations."""
         taken = defaultdict[str, float](float)
         for each in self.amounts() if amounts is None else amounts:
-            taken[each.participant] += -each.failed if each.table == "releases" else each.usd
+            taken[each.participant] += -each.failed if each.table == RELEASES.name else each.usd
         return taken
 
     def other_sessions(self) -> frozenset[str]:
@@ -131,10 +131,10 @@ class Batch:
         amounts = self.amounts()
         granted = self._granted(amounts)
         self._execute(_RESERVE, *granted)
-        amounts += (Amount("reservations", r["id"], r["session"], r["participant"], r["usd"], 0.0) for r in granted)
+        amounts += (Amount(RESERVATIONS.name, r["id"], r["session"], r["participant"], r["usd"], 0.0) for r in granted)
         sealed = {"of_study": self.study, "more_rows": len(self.rows), "new_money": _digest(amounts)}
         (self.sealed_rows,) = self._execute(_SEAL, sealed).fetchone() or (0,)
-        self.booked = self.taken_usd(each for each in amounts if each.table == "totals" or each.session == LOST)
+        self.booked = self.taken_usd(each for each in amounts if each.table == TOTALS.name or each.session == LOST)
         for collected in (self.rows, self.totals, self._requests, self._settled, self._gone):
             collected.clear()
 
@@ -160,45 +160,23 @@ class Batch:
         query, amounts = sa.select(SEALS).where(SEALS.c.study == self.study), self.amounts()
         if (seal := self.connection.execute(query).first()) is None:
             return False
-        count = self._row_count()
-        if count != seal.rows:
-            raise self._damaged(f"{seal.rows} rows were written, and {count} are there")
-        if _digest(amounts) != seal.money:
-            raise self._damaged("totals, reservations or releases are not what was written")
-        if self._evaluations() != seal.evaluations:
-            raise self._damaged("the names of evaluations are not what was written")
+        for what, value, sealed in (
+            ("the number of rows", self._row_count(), seal.rows),
+            ("totals, reservations or releases", _digest(amounts), seal.money),
+            ("the names of evaluations", self.evaluations(), seal.evaluations),
+        ):
+            if value != sealed:
+                counts = f" ({value}, and {sealed} were written)" if isinstance(value, int) else ""
+                raise self._damaged(f"{what}: {NOT_WHOLE}{counts}")
         return True
 
     def reseal(self) -> None:
-        """Seal what is there; totals below the costs of the rows are raised to them."""
-        for (kind, participant), its in self._row_totals().items():
-            query = sa.select(TOTALS.c.dollars, TOTALS.c.failed).where(
-                TOTALS.c.study == self.study, TOTALS.c.kind == kind, TOTALS.c.participant == participant
-            )
-            if (stored := self.connection.execute(query).first()) is not None:
-                its = Totals(max(0.0, its.dollars - stored.dollars), max(0.0, its.failed - stored.failed))
-            if stored is None or its.dollars > CENT or its.failed > CENT:
-                self._add_totals(kind, participant, its)
-        self.connection.execute(sa.delete(SEALS).where(SEALS.c.study == self.study))
-        values = {"rows": self._row_count(), "money": _digest(self.amounts()), "evaluations": self._evaluations()}
-        self.connection.execute(sa.insert(SEALS).values(study=self.study, **values))
-
-    def seal_evaluations(self) -> None:
-        """Seal the evaluations' names, after one was added."""
-        change = sa.update(SEALS).where(SEALS.c.study == self.study).values(evaluations=self._evaluations())
-        self.connection.execute(change)
-
-    def _evaluations(self) -> bytes:
-        query = sa.select(EVALUATIONS.c.id, EVALUATIONS.c.kind, EVALUATIONS.c.name)
-        return _digest(self.connection.execute(query.where(EVALUATIONS.c.study == self.study)))
-
-    def _row_count(self) -> int:
-        mine = ROWS.c.evaluation.in_(sa.select(EVALUATIONS.c.id).where(EVALUATIONS.c.study == self.study))
-        return self.connection.execute(sa.select(sa.func.count()).select_from(ROWS).where(mine)).scalar_one()
-
-    def _row_totals(self) -> dict[tuple[str, str], Totals]:
-        """Return totals by kind and participant of all rows that are whole."""
-        totals = defaultdict[tuple[str, str], Totals](Totals)
+        """Seal what is there; totals below the costs of the whole rows are raised to them."""
+        totals = self.connection.execute(sa.select(TOTALS).where(TOTALS.c.study == self.study))
+        stored, sums = (
+            {(row.kind, row.participant): row for row in totals},
+            defaultdict[tuple[str, str], Totals](Totals),
+        )
         query = sa.select(EVALUATIONS.c.kind, EVALUATIONS.c.name, ROWS).join(
             ROWS, ROWS.c.evaluation == EVALUATIONS.c.id
         )
@@ -206,8 +184,23 @@ class Batch:
         for row in self.connection.execute(query):
             if is_whole(row, f"{row.kind}/{row.name}"):
                 content = json.loads(row.content)
-                totals[row.kind, participant_of(content)].add(content)
-        return totals
+                sums[row.kind, participant_of(content)].add(content)
+        for key, its in sums.items():
+            if old := stored.get(key):
+                its = Totals(max(0.0, its.dollars - old.dollars), max(0.0, its.failed - old.failed))
+            self._add_totals(*key, its)
+        self.connection.execute(sa.delete(SEALS).where(SEALS.c.study == self.study))
+        values = {"rows": self._row_count(), "money": _digest(self.amounts()), "evaluations": self.evaluations()}
+        self.connection.execute(sa.insert(SEALS).values(study=self.study, **values))
+
+    def evaluations(self) -> bytes:
+        """Return the digest of the evaluations' names, for the seal."""
+        query = sa.select(EVALUATIONS.c.id, EVALUATIONS.c.kind, EVALUATIONS.c.name)
+        return _digest(self.connection.execute(query.where(EVALUATIONS.c.study == self.study)))
+
+    def _row_count(self) -> int:
+        mine = ROWS.c.evaluation.in_(sa.select(EVALUATIONS.c.id).where(EVALUATIONS.c.study == self.study))
+        return self.connection.execute(sa.select(sa.func.count()).select_from(ROWS).where(mine)).scalar_one()
 
     def _granted(self, amounts: Iterable[Amount]) -> list[dict[str, Any]]:
         """Return the reservations for which there is room, in the order of the requests."""
@@ -252,33 +245,20 @@ def _is(*columns: sa.Column[Any]) -> sa.ColumnElement[bool]:
     return sa.and_(*(column == sa.bindparam(f"of_{column.name}") for column in columns))
 
 
-_NO_TEXT = sa.literal_column("''")
 _ADD_ROW, _RESERVE = sa.insert(ROWS).inline(), sa.insert(RESERVATIONS).inline()
 _REMOVE = sa.delete(RESERVATIONS).where(_is(*RESERVATIONS.primary_key))
 _SETTLE = sa.update(RESERVATIONS).where(_is(*RESERVATIONS.primary_key)).values(usd=sa.bindparam("new_usd"))
 _WRITER = sa.select(EVALUATIONS.c.writer).where(_is(EVALUATIONS.c.id))
+# By table: the columns of `Amount`, or SQL where it has none.
+_MONEY = {
+    TOTALS: ("kind", "''", "participant", "dollars", "failed"),
+    RELEASES: ("cast(id as text)", "''", "participant", "in_flight", "failed"),
+    RESERVATIONS: ("id", "session", "participant", "usd", "0.0"),
+}
 _AMOUNTS = sa.union_all(
     *(
-        sa.select(sa.literal_column(f"'{table.name.removeprefix('traps_')}'"), *columns).where(_is(table.c.study))
-        for table, *columns in (
-            (TOTALS, TOTALS.c.kind, _NO_TEXT, TOTALS.c.participant, TOTALS.c.dollars, TOTALS.c.failed),
-            (
-                RELEASES,
-                sa.cast(RELEASES.c.id, sa.Text),
-                _NO_TEXT,
-                RELEASES.c.participant,
-                RELEASES.c.in_flight,
-                RELEASES.c.failed,
-            ),
-            (
-                RESERVATIONS,
-                RESERVATIONS.c.id,
-                RESERVATIONS.c.session,
-                RESERVATIONS.c.participant,
-                RESERVATIONS.c.usd,
-                sa.literal_column("0.0"),
-            ),
-        )
+        sa.select(*map(sa.literal_column, (f"'{table.name}'", *columns))).select_from(table).where(_is(table.c.study))
+        for table, columns in _MONEY.items()
     )
 )
 _SEAL = (
@@ -309,5 +289,6 @@ def claim(batch: Batch, kind: str, name: str) -> int:
     values: Mapping[str, Any] = {"writer": batch.session, "holder": holder()}
     if not batch.connection.execute(sa.update(EVALUATIONS).where(is_own_row).values(**values)).rowcount:
         batch.connection.execute(sa.insert(EVALUATIONS).values(**own_key, **values))
-        batch.seal_evaluations()
+        change = sa.update(SEALS).where(SEALS.c.study == batch.study)
+        batch.connection.execute(change.values(evaluations=batch.evaluations()))
     return batch.connection.execute(sa.select(EVALUATIONS.c.id).where(is_own_row)).scalar_one()

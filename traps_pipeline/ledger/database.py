@@ -23,13 +23,15 @@ from typing import Any, TypeVar
 import sqlalchemy as sa
 from sqlalchemy import exc
 
+from traps_pipeline.base import progress
 from traps_pipeline.base.databases import is_damaged, reason_and_remedy
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.ledger.batch import Batch
+from traps_pipeline.ledger.batch import LOST, Batch, Request
 from traps_pipeline.ledger.schema import METADATA, SEALS, SESSIONS, SHARERS, STUDIES
 
 T = TypeVar("T")
 BEAT_S = 0.5  # how often a process renews its locks and reservations
+ROUNDING_USD = 1e-6  # sums of dollars may differ by as much
 MAX_CHANGES = 1000  # per transaction
 SHARE_S, SHARER_S = 2.0, 10.0  # how often a process announces that it uses an account, and how long that is valid
 
@@ -74,7 +76,8 @@ class Database(ABC):
         self._session_lock: Lock | None = None
         self._accounts: tuple[str, ...] = ()  # in use, once for each use; replaced under `_guard`, never changed
         self._sharers: dict[str, int] = {}  # by account: the number of processes that use it; of the commit thread
-        self.booked: tuple[int, dict[str, float]] | None = None  # rows, and dollars by participant, of the last commit
+        # Rows, and dollars by participant: of the last commit, and as noted outside of the database (none: 0).
+        self.booked, self.noted = (0, dict[str, float]()), (0, dict[str, float]())
         self._connection: sa.Connection | None = None  # for writing; `end` closes it
         self._transaction = threading.RLock()
 
@@ -115,14 +118,11 @@ class Database(ABC):
     def sync(self) -> None:
         """Sync to disk everything that was committed. Raises TrapsError."""
 
-    def book_lost(self, connection: sa.Connection) -> None:
-        """Count the money of rows that were lost, where something tells of them."""
-
     def faults(self) -> Iterator[str]:
         """Yield faults of the database itself, and of its money. Raises TrapsError."""
         with self.read() as connection:
             try:
-                if sa.inspect(connection).has_table(SEALS.name) and (study := self._study(connection)):
+                if sa.inspect(connection).has_table(STUDIES.name) and (study := self._study(connection)):
                     self._is_sealed(connection, study)
             except exc.DBAPIError as error:
                 yield str(self.sentence(error))
@@ -265,12 +265,24 @@ class Database(ABC):
         )
         if connection.execute(sa.select(SESSIONS.c.id).where(SESSIONS.c.id == self.session)).first() is None:
             connection.execute(sa.insert(SESSIONS).values(id=self.session, study=self.study))
-        self.lock_study(connection)
         if not self._is_sealed(connection, self.study):
             Batch(connection, self.study, self.session, self.damaged).reseal()
 
-    def lock_study(self, connection: sa.Connection) -> None:
-        """Let no other process change the study until the commit."""
+    def book_lost(self, connection: sa.Connection) -> None:
+        """Reserve what was noted as booked and is no longer, until a person releases it; say what is gone."""
+        batch, (rows, noted) = Batch(connection, self.study, LOST, self.damaged), self.noted
+        batch.flush()
+        lost = {name: usd - batch.booked.get(name, 0.0) for name, usd in noted.items()}
+        lost = {name: usd for name, usd in lost.items() if usd > ROUNDING_USD}
+        if lost or rows > batch.sealed_rows:
+            progress.current().note(
+                f"{self.place}: {batch.sealed_rows} of {rows} written rows are there; ${sum(lost.values()):.4f}"
+                " of lost ones count until `traps study release-money` releases them; `traps doctor --verify` says more"
+            )
+        for participant, usd in lost.items():
+            batch.reserve(Request(secrets.token_hex(8), participant, usd, {}))
+        batch.flush()
+        self.booked = batch.sealed_rows, batch.booked
 
     def _is_sealed(self, connection: sa.Connection, study: int) -> bool:
         """Return whether the ledger is sealed, as before 0.4 none was.
@@ -279,6 +291,8 @@ class Database(ABC):
         """
         if names := [*connection.exec_driver_sql(self.additions).scalars()]:
             raise self.damaged(f"it has {', '.join(map(str, names))}, which this program did not make")
+        if not sa.inspect(connection).has_table(SEALS.name):
+            return False
         return Batch(connection, study, self.session, self.damaged).is_sealed()
 
     def _study(self, connection: sa.Connection) -> int | None:
@@ -378,42 +392,3 @@ def taken_over(place: str) -> TrapsError:
         f"{place}: another process has begun to ask the same calls, since this one was away; nothing more is sent. Run "
         "the same command again when the other one has ended"
     )
-
-
-_LOCK_STUDY = sa.select(STUDIES.c.id).where(STUDIES.c.id == sa.bindparam("of_study")).with_for_update()
-_NUMBER = sa.bindparam("number", type_=sa.BigInteger)
-_COUNT = (
-    sa.update(SESSIONS)
-    .where(SESSIONS.c.id == sa.bindparam("of_session"), SESSIONS.c.batch == _NUMBER - 1)
-    .values(batch=_NUMBER)
-)
-
-
-class NumberedDatabase(Database):
-    """A database over a network, where the answer to a commit may be lost: transactions are numbered."""
-
-    _batch = 0  # the number of this session's last transaction
-
-    def prepare(self, connection: sa.Connection) -> None:
-        """See `Database.prepare`."""
-        super().prepare(connection)
-        self._batch = 0
-
-    def lock_study(self, connection: sa.Connection) -> None:
-        """See `Database.lock_study`."""
-        connection.execute(_LOCK_STUDY, {"of_study": self.study})
-
-    def run_once(self, work: Callable[[sa.Connection], T]) -> T:
-        """See `Database.run_once`; one transaction of a study runs at a time."""
-        results, number = list[T](), self._batch + 1
-
-        def numbered(connection: sa.Connection) -> T:
-            self.lock_study(connection)
-            is_first = connection.execute(_COUNT, {"of_session": self.session, "number": number}).rowcount
-            if is_first or not results:
-                results[:] = [work(connection)]
-            return results[0]
-
-        result = self.run(numbered)
-        self._batch = number
-        return result

@@ -15,7 +15,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.wording import count_noun
 from traps_pipeline.ledger.batch import Batch
 from traps_pipeline.ledger.database import Database
-from traps_pipeline.ledger.rows import is_amount, is_whole
+from traps_pipeline.ledger.rows import NOT_WHOLE, is_amount, is_whole
 from traps_pipeline.ledger.schema import EVALUATIONS, RELEASES, RESERVATIONS, ROWS, SEALS, STUDIES, TOTALS
 from traps_pipeline.ledger.sqlite import SqliteDatabase
 
@@ -96,8 +96,8 @@ class _Copy:
             sa.select(ROWS.c.id).where(ROWS.c.evaluation.in_(unmarked_evaluations)).limit(1)
         ).first():
             raise TrapsError(
-                f"{target.place}: holds rows of this study already; import into a study that has none, or bring answers "
-                "into it one by one with `traps study import-answers`"
+                f"{target.place}: holds rows of this study already; import into a study that has none, or bring "
+                "answers into it one by one with `traps study import-answers`"
             )
         # Remove leftovers of a killed copy, and evaluations without a row.
         batch.connection.execute(sa.delete(ROWS).where(ROWS.c.evaluation.in_(evaluations)))
@@ -122,9 +122,8 @@ class _Copy:
                 batch.connection.execute(sa.insert(ROWS), values)
             count += len(whole)
         if lost:
-            self._lost(
-                f"{self.source.place}: {count_noun(len(lost), 'row')} cannot be read or are not what was written: {_ranges(lost)}"
-            )
+            words = f"{count_noun(len(lost), 'row')} lost ({_ranges(lost)}): unreadable, or {NOT_WHOLE}"
+            self._lost(f"{self.source.place}: {words}")
         for table in (TOTALS, RELEASES, RESERVATIONS):
             for row in self._rows(table):
                 values = {**row._mapping, "study": batch.study}

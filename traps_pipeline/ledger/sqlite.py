@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import os
-import secrets
 import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -19,10 +18,8 @@ from urllib.parse import quote
 import sqlalchemy as sa
 from sqlalchemy import event, exc
 
-from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import remedy, require_in_place, sync_folder, try_lock, write_text
-from traps_pipeline.ledger.batch import LOST, Batch, Request
 from traps_pipeline.ledger.database import Database, Lock
 from traps_pipeline.ledger.rows import is_amount
 from traps_pipeline.ledger.schema import ROWS, STUDIES
@@ -32,7 +29,6 @@ FILE = "ledger.sqlite"
 NOTE = "ledger.booked.json"
 QUICK_BYTES = 200_000_000  # larger files are checked in part when they are opened for writing
 SAMPLED = 64  # rows, evenly over a large file
-ROUNDING_USD = 1e-6
 WAIT_S = 600.0  # to wait for another process's transaction on a slow disk
 
 
@@ -48,7 +44,7 @@ class SqliteDatabase(Database):
     def __init__(self, folder: Path, study: str = "study", file: str = FILE) -> None:
         super().__init__(study, str(folder / file))
         self.folder, self.path = folder, folder / file
-        self._is_checked, self._noted = False, (0, dict[str, float]())
+        self._is_checked = False
         # paramstyle: `Batch` hands dicts to either driver.
         self._engine = sa.create_engine("sqlite://", creator=self._open, poolclass=sa.NullPool, paramstyle="named")
         event.listen(self._engine, "begin", _begin)
@@ -87,42 +83,27 @@ class SqliteDatabase(Database):
             self._check(connection)
         super().prepare(connection)
         if not self._is_checked and self.path.name == FILE:
-            self._noted = _read_note(self.path.with_name(NOTE))
+            self.noted = _read_note(self.path.with_name(NOTE))
             self.book_lost(connection)
         self._is_checked = True
 
     def _check(self, connection: sa.Connection) -> None:
         """Raise TrapsError if the file is damaged; of a large one, some rows stand for all (`faults` reads each)."""
-        tables = {*connection.exec_driver_sql("select name from sqlite_master where type = 'table'").scalars()}
-        is_large = self.path.stat().st_size > QUICK_BYTES
-        for table in (f"('{name}')" for name in tables - {ROWS.name}) if is_large else ("(1)",):
-            if (fault := connection.exec_driver_sql(f"pragma quick_check{table}").scalar()) != "ok":
-                raise self.damaged(f"it is damaged ({fault})")
-        if is_large:
+        if self.path.stat().st_size > QUICK_BYTES:
             last = connection.execute(sa.select(sa.func.max(ROWS.c.id))).scalar() or 0
             some = {last * number // SAMPLED for number in range(SAMPLED + 1)}
             connection.execute(sa.select(ROWS.c.key).where(ROWS.c.id.in_(some))).all()
-        names = [*connection.execute(sa.select(STUDIES.c.name)).scalars()] if STUDIES.name in tables else []
-        if names and self.study_name not in names:
-            raise self.damaged(f"it holds the study {names[0]}, and not {self.study_name}")
+        elif (fault := connection.exec_driver_sql("pragma quick_check(1)").scalar()) != "ok":
+            raise self._fault(fault)
 
-    def book_lost(self, connection: sa.Connection) -> None:
-        """Reserve what was noted as booked and is no longer, until a person releases it; say what is gone."""
-        batch = Batch(connection, self.study, LOST, self.damaged)
-        batch.flush()
-        rows, booked = self._noted
-        lost = {name: usd - batch.booked.get(name, 0.0) for name, usd in booked.items()}
-        for participant, usd in lost.items():
-            if usd > ROUNDING_USD:
-                batch.reserve(Request(secrets.token_hex(8), participant, usd, {}))
-        batch.flush()
-        self.booked = batch.sealed_rows, batch.booked
-        if rows > batch.sealed_rows or any(usd > ROUNDING_USD for usd in lost.values()):
-            usd = sum(usd for usd in lost.values() if usd > ROUNDING_USD)
-            progress.current().note(
-                f"{self.path}: of {rows} rows that were written {batch.sealed_rows} are there; ${usd:.4f} of the others "
-                f"count until `traps study release-money` releases them, and `traps doctor --verify` names their tables"
-            )
+    def _fault(self, words: object) -> TrapsError:
+        return self.damaged(f"it is damaged ({str(words).splitlines()[-1]})")
+
+    def _study(self, connection: sa.Connection) -> int | None:
+        number, other = super()._study(connection), sa.select(STUDIES.c.name).limit(1)
+        if number is None and (name := connection.execute(other).scalar()) is not None:
+            raise self.damaged(f"it holds the study {name}, and not {self.study_name}")
+        return number
 
     def run(self, work: Callable[[sa.Connection], T]) -> T:
         """See `Database.run`."""
@@ -174,9 +155,9 @@ class SqliteDatabase(Database):
             try:
                 for fault in connection.exec_driver_sql("pragma integrity_check(5)").scalars():
                     if fault != "ok":
-                        yield str(self.damaged(f"it is damaged ({fault})"))
+                        yield str(self._fault(fault))
             except exc.DBAPIError as error:
-                raise self.sentence(error) from error
+                yield str(self.sentence(error))
         yield from super().faults()
 
     @property
@@ -186,9 +167,9 @@ class SqliteDatabase(Database):
 
     def beat(self) -> None:
         """See `Database.beat`; the kernel keeps the locks, and what is booked is noted beside the file."""
-        if self.booked not in (None, self._noted) and self.path.name == FILE:
+        if self.booked != self.noted and self.path.name == FILE:
             write_text(self.path.with_name(NOTE), json.dumps(self.booked))
-            self._noted = self.booked
+            self.noted = self.booked
 
 
 def _read_note(path: Path) -> tuple[int, dict[str, float]]:
