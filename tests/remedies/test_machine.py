@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import os
 import shutil
+import sqlite3
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from tests.build.ledger import answer, local, write
+from tests.build.ledger import answer, local, paid, write
 from tests.ledger.conftest import VARIABLE
 from tests.postgres import Postgres
-from tests.remedies.remedied import refused, remedied
+from tests.remedies.remedied import command, refused, remedied
 from traps_pipeline.cluster.postgres import PostgresDatabase
+from traps_pipeline.ledger.money import Money
 from traps_pipeline.pipeline.run import dagster_history
 from traps_pipeline.report.explorer import site
 from traps_pipeline.storage.study import Study
@@ -53,6 +56,44 @@ def test_a_ledger_on_a_full_disk_goes_on_once_there_is_space(tiny_disk: Path) ->
     rows = [answer(f"k{n}", "x" * 300) for n in range(20)]
     remedied(lambda: write(local(tiny_disk), *rows), "ledger.sqlite", filler.unlink)
     assert set(local(tiny_disk).read("m").rows) == {"k", *(row["key"] for row in rows)}
+
+
+def cut(file: Path) -> None:
+    file.write_bytes(file.read_bytes()[: file.stat().st_size * 2 // 3])
+
+
+def lower_total(file: Path) -> None:
+    with sqlite3.connect(file) as connection:
+        connection.execute("update traps_totals set dollars = 0")
+
+
+def add_trigger(file: Path) -> None:
+    with sqlite3.connect(file) as connection:
+        connection.execute("create trigger t after insert on traps_rows begin delete from traps_totals; end")
+
+
+@pytest.mark.parametrize("damage", [cut, lower_total, add_trigger])
+def test_a_damaged_ledger_goes_on_once_what_is_whole_is_exported_and_imported(
+    tmp_path: Path, damage: Callable[[Path], None]
+) -> None:
+    workspace = Workspace.create(tmp_path / "study", Study())
+    write(workspace.answers, *(paid(f"k{number}", 0.25) | {"text": "x" * 2000} for number in range(100)))
+    file, saved = workspace.ledger_folder / "ledger.sqlite", tmp_path / "whole.sqlite"
+    damage(file)
+
+    def follow() -> None:
+        command("study", "export-ledger", saved, "--workspace", workspace.root)
+        (tmp_path / "away").mkdir()
+        for part in file.parent.glob(f"{file.name}*"):
+            part.rename(tmp_path / "away" / part.name)
+        command("study", "import-ledger", saved, "--workspace", workspace.root)
+
+    remedied(lambda: write(Workspace.open(workspace.root).answers, answer("later", "left")), "ledger", follow)
+    answers = Workspace.open(workspace.root).answers
+    assert len(answers.read("m").settled) == 101 if damage is not cut else 30 < len(answers.read("m").settled) < 101
+    with answers.database.writing():
+        assert Money(answers.database).spent() == {"m": 25.0}  # of rows that were lost, too
+    assert [*answers.damage()] == []
 
 
 def test_a_host_whose_clock_is_an_hour_off_works_once_it_is_set(postgres: Postgres) -> None:

@@ -18,7 +18,7 @@ from sqlalchemy import exc
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.ledger.rows import AVERAGED_COLUMNS, NOT_WHOLE, Totals, is_amount, is_whole, participant_of
-from traps_pipeline.ledger.schema import EVALUATIONS, RELEASES, RESERVATIONS, ROWS, SEALS, TOTALS
+from traps_pipeline.ledger.schema import EVALUATIONS, RELEASES, RESERVATIONS, ROWS, SEALS, STUDIES, TOTALS
 
 CENT = 1e-9  # below this, dollars are rounding
 LOST = "lost-rows"  # the session of money whose rows were lost; it never lives, so that a person can release it
@@ -159,6 +159,9 @@ class Batch:
         """
         query, amounts = sa.select(SEALS).where(SEALS.c.study == self.study), self.amounts()
         if (seal := self.connection.execute(query).first()) is None:
+            orphans = sa.select(EVALUATIONS.c.study).where(EVALUATIONS.c.study.not_in(sa.select(STUDIES.c.id)))
+            if self.connection.execute(orphans).first():
+                raise self._damaged(f"the number of the study: {NOT_WHOLE}")
             return False
         for what, value, sealed in (
             ("the number of rows", self._row_count(), seal.rows),

@@ -95,6 +95,10 @@ class Database(ABC):
     def read(self) -> sa.Connection:
         """Return a read connection, which the caller closes. Raises TrapsError."""
 
+    def salvage(self) -> sa.Connection:
+        """Return a read connection that reads past damage where the database can. Raises TrapsError."""
+        return self.read()
+
     @abstractmethod
     def run(self, work: Callable[[sa.Connection], T]) -> T:
         """Run `work` in one transaction, repeated if the connection breaks.
@@ -120,14 +124,15 @@ class Database(ABC):
 
     def faults(self) -> Iterator[str]:
         """Yield faults of the database itself, and of its money. Raises TrapsError."""
-        with self.read() as connection:
-            try:
-                if sa.inspect(connection).has_table(STUDIES.name) and (study := self._study(connection)):
-                    self._is_sealed(connection, study)
-            except exc.DBAPIError as error:
-                yield str(self.sentence(error))
-            except TrapsError as error:
-                yield str(error)
+        try:
+            with self.read() as connection:
+                self._check_additions(connection)
+                if sa.inspect(connection).has_table(SEALS.name) and (study := self._study(connection)):
+                    Batch(connection, study, self.session, self.damaged).is_sealed()
+        except exc.DBAPIError as error:
+            yield str(self.sentence(error))
+        except TrapsError as error:
+            yield str(error)
 
     @abstractmethod
     def beat(self) -> None:
@@ -258,6 +263,7 @@ class Database(ABC):
 
         Raises TrapsError for a ledger that must not be written on.
         """
+        self._check_additions(connection)
         METADATA.create_all(connection)
         self.study = (
             self._study(connection)
@@ -265,8 +271,9 @@ class Database(ABC):
         )
         if connection.execute(sa.select(SESSIONS.c.id).where(SESSIONS.c.id == self.session)).first() is None:
             connection.execute(sa.insert(SESSIONS).values(id=self.session, study=self.study))
-        if not self._is_sealed(connection, self.study):
-            Batch(connection, self.study, self.session, self.damaged).reseal()
+        batch = Batch(connection, self.study, self.session, self.damaged)
+        if not batch.is_sealed():  # as before 0.4
+            batch.reseal()
 
     def book_lost(self, connection: sa.Connection) -> None:
         """Reserve what was noted as booked and is no longer, until a person releases it; say what is gone."""
@@ -284,16 +291,9 @@ class Database(ABC):
         batch.flush()
         self.booked = batch.sealed_rows, batch.booked
 
-    def _is_sealed(self, connection: sa.Connection, study: int) -> bool:
-        """Return whether the ledger is sealed, as before 0.4 none was.
-
-        Raises TrapsError if money, rows or evaluations are not what was written, or something could change them.
-        """
+    def _check_additions(self, connection: sa.Connection) -> None:
         if names := [*connection.exec_driver_sql(self.additions).scalars()]:
             raise self.damaged(f"it has {', '.join(map(str, names))}, which this program did not make")
-        if not sa.inspect(connection).has_table(SEALS.name):
-            return False
-        return Batch(connection, study, self.session, self.damaged).is_sealed()
 
     def _study(self, connection: sa.Connection) -> int | None:
         return connection.execute(sa.select(STUDIES.c.id).where(STUDIES.c.name == self.study_name)).scalar()

@@ -47,7 +47,7 @@ def copy_ledger(source: Database, target: Database, lost: Lost, settle: Callable
     """
     mark = f"copied from {source.place}"
     with ExitStack() as stack:
-        copy = _Copy(source, stack.enter_context(source.read()) if source.exists() else None, lost)
+        copy = _Copy(source, stack.enter_context(source.salvage()) if source.exists() else None, lost)
         stack.enter_context(target.writing())
         for each in copy.evaluations:
             lock = source.try_lock(f"{each.kind}-{each.name}")
@@ -161,7 +161,9 @@ class _Copy:
                 if not rows:
                     return
                 last = rows[-1].id
-            except exc.DBAPIError:
+            except exc.DBAPIError as error:
+                if error.connection_invalidated:  # the server has gone
+                    raise self.source.sentence(error) from error
                 top = self._last_row() if top is None else top
                 rows = list[sa.Row[Any]]()
                 for number in range(last + 1, min(last + _FETCHED, top) + 1):

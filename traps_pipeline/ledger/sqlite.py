@@ -72,6 +72,17 @@ class SqliteDatabase(Database):
         except exc.DBAPIError as error:
             raise self.sentence(error) from error
 
+    def salvage(self) -> sa.Connection:
+        """See `Database.salvage`; a file that is shorter than it says is otherwise refused as a whole."""
+
+        def open_cut() -> sqlite3.Connection:
+            uri = f"file:{quote(str(self.path))}?mode=ro"
+            connection = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
+            connection.execute("pragma writable_schema = 1")
+            return connection
+
+        return sa.create_engine("sqlite://", creator=open_cut, poolclass=sa.NullPool).connect()
+
     def connect(self) -> sa.Connection:
         """See `Database.connect`."""
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -101,8 +112,8 @@ class SqliteDatabase(Database):
 
     def _study(self, connection: sa.Connection) -> int | None:
         number, other = super()._study(connection), sa.select(STUDIES.c.name).limit(1)
-        if number is None and (name := connection.execute(other).scalar()) is not None:
-            raise self.damaged(f"it holds the study {name}, and not {self.study_name}")
+        if number is None and (row := connection.execute(other).first()):
+            raise self.damaged(f"it holds the study {row.name}, and not {self.study_name}")
         return number
 
     def run(self, work: Callable[[sa.Connection], T]) -> T:
@@ -151,7 +162,7 @@ class SqliteDatabase(Database):
 
     def faults(self) -> Iterator[str]:
         """See `Database.faults`; finds rows that are in an index but not in the table."""
-        with self.read() as connection:
+        with self.salvage() as connection:
             try:
                 for fault in connection.exec_driver_sql("pragma integrity_check(5)").scalars():
                     if fault != "ok":
