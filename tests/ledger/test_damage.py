@@ -27,6 +27,7 @@ from traps_pipeline.ledger.money import Money
 from traps_pipeline.ledger.row_transfer import export_ledger
 from traps_pipeline.ledger.rows import digest_of
 from traps_pipeline.ledger.schema import EVALUATIONS, METADATA, ROWS
+from traps_pipeline.ledger.sqlite import SqliteDatabase
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 
@@ -276,7 +277,7 @@ def test_a_refused_change_leaves_nothing_of_what_it_wrote_and_the_others_are_kep
         batch.flush()
         raise TrapsError("no")
 
-    async def run() -> list[object]:
+    async def run() -> tuple[object, ...]:
         async with ledger.writing("m", print) as writer:
             await writer.write(paid("a", 0.5))
             changes = writer.write(paid("b", 0.5)), ledger.database.apply(refused), writer.write(paid("c", 0.5))
@@ -304,7 +305,7 @@ def test_what_is_whole_of_a_cut_ledger_is_saved_and_the_rest_is_told(tmp_path: P
     content = file.read_bytes()
     file.write_bytes(content[: len(content) * 2 // 3])
     count = export_ledger(local(tmp_path).database, tmp_path / "saved" / "whole.sqlite", told.append)
-    saved = Ledger(type(local(tmp_path).database)(tmp_path / "saved", file="whole.sqlite"), "answers")
+    saved = Ledger(SqliteDatabase(tmp_path / "saved", file="whole.sqlite"), "answers")
     assert 100 < count < 200 and len(saved.read("m").settled) == count
     assert all(saved.read("m").rows[key] == rows[int(key[1:])] for key in saved.read("m").rows)
     assert f"{200 - count} rows" in told[0] and all(str(file) in words for words in told)

@@ -92,7 +92,7 @@ def test_a_damaged_ledger_goes_on_once_what_is_whole_is_exported_and_imported(
     answers = Workspace.open(workspace.root).answers
     assert len(answers.read("m").settled) == 101 if damage is not cut else 30 < len(answers.read("m").settled) < 101
     with answers.database.writing():
-        assert Money(answers.database).spent() == {"m": 25.0}  # of rows that were lost, too
+        assert sum(Money(answers.database).spent().values()) == 25.0  # of rows that were lost, too
     assert [*answers.damage()] == []
 
 

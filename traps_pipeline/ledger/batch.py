@@ -117,8 +117,7 @@ class Batch:
 
     def other_sessions(self) -> frozenset[str]:
         """Return the sessions of other processes that hold reservations."""
-        query = sa.select(RESERVATIONS.c.session).where(RESERVATIONS.c.study == self.study).distinct()
-        return frozenset(self.connection.execute(query).scalars()) - {self.session}
+        return frozenset(each.session for each in self.amounts()) - {self.session, ""}
 
     def flush(self) -> None:
         """Write the collected changes, and seal what they leave."""

@@ -17,7 +17,7 @@ import sqlalchemy as sa
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.ledger.batch import CENT, Batch, CapExhausted, Request
 from traps_pipeline.ledger.database import Database
-from traps_pipeline.ledger.schema import RELEASES, RESERVATIONS, TOTALS
+from traps_pipeline.ledger.schema import RELEASES, RESERVATIONS
 
 
 @dataclass(frozen=True)
@@ -111,15 +111,10 @@ class Money:
     def _releasable(self, batch: Batch) -> dict[str, Releasable]:
         dead_sessions = self._dead_sessions(batch)
         in_flight_usd, failed = defaultdict[str, float](float), defaultdict[str, float](float)
-        query = sa.select(RESERVATIONS).where(
-            RESERVATIONS.c.study == batch.study, RESERVATIONS.c.session.in_(dead_sessions)
-        )
-        for row in batch.connection.execute(query):
-            in_flight_usd[row.participant] += row.usd
-        for row in batch.connection.execute(sa.select(TOTALS).where(TOTALS.c.study == batch.study)):
-            failed[row.participant] += row.failed
-        for row in batch.connection.execute(sa.select(RELEASES).where(RELEASES.c.study == batch.study)):
-            failed[row.participant] -= row.failed
+        for each in batch.amounts():
+            failed[each.participant] += -each.failed if each.table == RELEASES.name else each.failed
+            if each.session in dead_sessions:
+                in_flight_usd[each.participant] += each.usd
         rooms = {
             name: Releasable(in_flight_usd[name], max(0.0, failed[name])) for name in sorted({*in_flight_usd, *failed})
         }

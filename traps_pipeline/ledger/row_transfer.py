@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from itertools import groupby
 from pathlib import Path
@@ -149,7 +149,7 @@ class _Copy:
         except exc.DBAPIError as error:
             self._lost(f"{self.source.sentence(error)} ({table.name} are read in part)")
 
-    def _row_chunks(self, lost: list[int]) -> Iterator[list[sa.Row[Any]]]:
+    def _row_chunks(self, lost: list[int]) -> Iterator[Sequence[sa.Row[Any]]]:
         """Yield rows; the numbers of those that cannot be read go to `lost`."""
         assert self._connection is not None, "only then it has rows"
         query, last, top = sa.select(ROWS).order_by(ROWS.c.id), 0, None
@@ -165,7 +165,7 @@ class _Copy:
                 if error.connection_invalidated:  # the server has gone
                     raise self.source.sentence(error) from error
                 top = self._last_row() if top is None else top
-                rows = list[sa.Row[Any]]()
+                rows = []
                 for number in range(last + 1, min(last + _FETCHED, top) + 1):
                     try:
                         rows += self._connection.execute(query.where(ROWS.c.id == number)).all()
