@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from tests.build.errors import raises
+from tools.redraw import draw_again
 from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.scenes.draw.likeness import (
@@ -21,7 +22,6 @@ from traps_pipeline.scenes.draw.likeness import (
     lookalikes,
     perceptual_hash,
 )
-from traps_pipeline.scenes.draw.redraw import draw_again
 from traps_pipeline.scenes.draw.sample import (
     Draw,
     _full_answers,

@@ -49,3 +49,14 @@ class CellRow:
     model: Model
     regime: Regime
     run: Run
+
+
+@dataclass(frozen=True, kw_only=True)
+class EntryRow:
+    """The columns of a row of scores: a model under a regime, and the verdicts that they are from."""
+
+    model: Model
+    regime: Regime
+    panel: Panels
+    epoch: AnswerEpochs
+    benchmark_version: BenchmarkVersion
