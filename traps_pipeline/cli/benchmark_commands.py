@@ -90,7 +90,6 @@ def add(commands: Commands) -> None:
 
 
 def certify(arguments: argparse.Namespace) -> int:
-    """See `traps benchmark certify --help`."""
     from traps_pipeline.base.paths import SCENE_SPECS, WORKSPACES
     from traps_pipeline.benchmark.certify_all import certify_all, family_table
 
@@ -116,7 +115,6 @@ def certify(arguments: argparse.Namespace) -> int:
 
 
 def sample(arguments: argparse.Namespace) -> int:
-    """See `traps benchmark sample --help`."""
     from traps_pipeline.base.names import check_name
     from traps_pipeline.benchmark.composition import load_composition, sample_benchmark
     from traps_pipeline.benchmark.records import load_release
@@ -160,7 +158,6 @@ def sample(arguments: argparse.Namespace) -> int:
 
 
 def commit_benchmark(arguments: argparse.Namespace) -> int:
-    """See `traps benchmark commit --help`."""
     from traps_pipeline.release.commitment import commit
 
     public = commit(arguments.benchmark.absolute(), arguments.out, arguments.reveal)
@@ -171,7 +168,6 @@ def commit_benchmark(arguments: argparse.Namespace) -> int:
 
 
 def verify_commitment(arguments: argparse.Namespace) -> int:
-    """See `traps benchmark prove --help`."""
     from traps_pipeline.release import commitment as sealed
 
     published, reveal = sealed.read_commitment(arguments.commitment), sealed.read_reveal(arguments.reveal)

@@ -22,6 +22,7 @@ from typing import Any, TypeVar
 
 import sqlalchemy as sa
 from sqlalchemy import exc
+from typing_extensions import override
 
 from traps_pipeline.base.databases import reason_and_remedy
 from traps_pipeline.base.errors import TrapsError
@@ -334,13 +335,14 @@ class NumberedDatabase(Database):
 
     _batch = 0  # the number of this session's last transaction
 
+    @override
     def prepare(self, connection: sa.Connection) -> None:
-        """See `Database.prepare`."""
         super().prepare(connection)
         self._batch = 0
 
+    @override
     def run_once(self, work: Callable[[sa.Connection], T]) -> T:
-        """See `Database.run_once`; one transaction of a study runs at a time."""
+        """One transaction of a study runs at a time."""
         results, number = list[T](), self._batch + 1
 
         def numbered(connection: sa.Connection) -> T:

@@ -16,6 +16,7 @@ from urllib.parse import quote
 
 import sqlalchemy as sa
 from sqlalchemy import event, exc
+from typing_extensions import override
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import remedy, require_in_place, sync_folder, try_lock
@@ -39,8 +40,8 @@ class SqliteDatabase(Database):
         self._engine = sa.create_engine("sqlite://", creator=self._open, poolclass=sa.NullPool, paramstyle="named")
         event.listen(self._engine, "begin", _begin)
 
+    @override
     def exists(self) -> bool:
-        """See `Database.exists`."""
         return self.path.is_file()
 
     def _open(self) -> sqlite3.Connection:
@@ -55,20 +56,20 @@ class SqliteDatabase(Database):
             connection.execute("pragma synchronous=normal")
         return connection
 
+    @override
     def read(self) -> sa.Connection:
-        """See `Database.read`."""
         try:
             return self._engine.connect().execution_options(is_reading=True)
         except exc.DBAPIError as error:
             raise sentence(error, self.place) from error
 
+    @override
     def connect(self) -> sa.Connection:
-        """See `Database.connect`."""
         self.folder.mkdir(parents=True, exist_ok=True)
         return self._engine.connect()
 
+    @override
     def run(self, work: Callable[[sa.Connection], T]) -> T:
-        """See `Database.run`."""
         with self._transaction:
             try:
                 return self._attempt(work)
@@ -78,8 +79,9 @@ class SqliteDatabase(Database):
             except OSError as error:
                 raise TrapsError(f"{self.path}: cannot be written ({error.strerror}); {remedy(error)}") from error
 
+    @override
     def try_lock(self, name: str) -> Lock | None:
-        """See `Database.try_lock`; the lock is a file's."""
+        """The lock is a file's."""
         path = self.folder / "locks" / f"{name}.lock"
         try:
             descriptor = try_lock(path)
@@ -95,8 +97,9 @@ class SqliteDatabase(Database):
 
         return Lock(release, lambda: require_in_place(descriptor, path))
 
+    @override
     def sync(self) -> None:
-        """See `Database.sync`; syncs the log, which SQLite does only at a checkpoint.
+        """Sync the log, which SQLite does only at a checkpoint.
 
         The file itself must not be opened here: closing it would release the locks by which SQLite tells other
         processes that this one uses the log, and the next process to end would remove the log.
@@ -111,8 +114,9 @@ class SqliteDatabase(Database):
         except OSError as error:
             raise TrapsError(f"{path}: could not be written ({error.strerror}); {remedy(error)}") from error
 
+    @override
     def faults(self) -> Iterator[str]:
-        """See `Database.faults`; finds rows that are in an index but not in the table."""
+        """Find rows that are in an index but not in the table."""
         with self.read() as connection:
             try:
                 for (fault,) in connection.exec_driver_sql("pragma integrity_check(5)"):
@@ -121,8 +125,9 @@ class SqliteDatabase(Database):
             except exc.DBAPIError as error:
                 raise sentence(error, self.place) from error
 
+    @override
     def beat(self) -> None:
-        """See `Database.beat`; the kernel keeps the locks."""
+        """The kernel keeps the locks."""
 
 
 def _begin(connection: sa.Connection) -> None:

@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 import pandas as pd
+from typing_extensions import override
 
 from traps_pipeline.base.wording import count_noun
 from traps_pipeline.mechanism.mechanism_rows import COSINES, STEERING_EFFECTS
@@ -167,8 +168,8 @@ class StudyResults(Results):
         return own_panel if own_panel in panels or not panels else panels[0]
 
     @cached_property
+    @override
     def judged_by(self) -> str:
-        """See `Results.judged_by`."""
         if self.board.empty:
             return ""
         sentence = judged_by(_panel_rows(self, self.board)).rstrip(".")
