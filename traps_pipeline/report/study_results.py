@@ -13,13 +13,7 @@ from traps_pipeline.mechanism.mechanism_rows import COSINES, STEERING_EFFECTS
 from traps_pipeline.models.registry.judges import panel_id
 from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 from traps_pipeline.report.leaderboard_page import judged_by
-from traps_pipeline.report.result_frames import (
-    CELL_COLUMNS,
-    RATE_COLUMNS,
-    SUB_COLUMNS,
-    Results,
-    concat_frames,
-)
+from traps_pipeline.report.result_frames import CELL_COLUMNS, RATE_COLUMNS, SUB_COLUMNS, Results, concat_frames
 from traps_pipeline.scoring import analyses
 from traps_pipeline.scoring.epochs import EpochMismatch
 from traps_pipeline.scoring.metrics import joined_epochs

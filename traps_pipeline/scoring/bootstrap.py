@@ -294,10 +294,7 @@ def means_over_runs(
     }
     complete_runs = [sums[d, run] for run in runs if all((d, run) in sums for d in DATASETS) for d in DATASETS]
     undefined = np.full((2, len(RESAMPLED_FIGURES), draws), np.nan)
-    return {
-        **means,
-        "overall": _mean([figures(own, True) for own in complete_runs]) if complete_runs else undefined,
-    }
+    return {**means, "overall": _mean([figures(own, True) for own in complete_runs]) if complete_runs else undefined}
 
 
 def _mean(values: Sequence[np.ndarray]) -> np.ndarray:

@@ -281,14 +281,8 @@ class LeaveOneOutRow:
     pecs: Annotated[float | None, "mean over runs of the per-run PECS of the two judges"]
     pecs_panel: Annotated[float | None, "mean over runs of the per-run PECS of the three judges"]
     difference: Annotated[float | None, "pecs - pecs_panel"]
-    pecs_low: Annotated[
-        float,
-        "mean over runs: pecs of the two if every missing decision were the worst for the model",
-    ]
-    pecs_high: Annotated[
-        float,
-        "mean over runs: pecs of the two if every missing decision were the best for the model",
-    ]
+    pecs_low: Annotated[float, "mean over runs: pecs of the two if every missing decision were the worst for the model"]
+    pecs_high: Annotated[float, "mean over runs: pecs of the two if every missing decision were the best for the model"]
     epoch: shared.AnswerEpochs
     benchmark_version: shared.BenchmarkVersion
 

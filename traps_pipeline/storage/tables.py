@@ -54,10 +54,7 @@ class StoredColumn:
 
 @dataclass(frozen=True)
 class ExtraColumns:
-    """A mark of a column that has further columns beside it.
-
-    They have these suffixes, this type and this meaning.
-    """
+    """A mark of a column that has further columns beside it. They have these suffixes, this type and this meaning."""
 
     suffixes: tuple[str, ...]
     column: Any

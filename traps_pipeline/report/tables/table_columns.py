@@ -70,10 +70,7 @@ def combined_counts(sides: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def with_counts(rows: pd.DataFrame, entries: pd.DataFrame, sides: Sequence[Sequence[str]]) -> pd.DataFrame:
-    """Return rows that compare entries, `marked` and with COUNTED.
-
-    sides: their columns of model, regime, dataset.
-    """
+    """Return rows that compare entries, `marked` and with COUNTED. sides: their columns of model, regime, dataset."""
     import pandas as pd
 
     entry_of = {(e["model"], e["regime"], e["dataset"]): e for e in entries.to_dict("records")}
