@@ -25,6 +25,7 @@ from scipy.stats import norm
 
 from bench.quick import parse
 from traps_pipeline.protocol.datasets import CROSSED, DATASETS, TWIN, taxonomy_of
+from traps_pipeline.protocol.metric_words import METRIC_WORDS
 from traps_pipeline.scoring.bootstrap import (
     RESAMPLED_FIGURES,
     TAXONOMIES,
@@ -34,7 +35,7 @@ from traps_pipeline.scoring.bootstrap import (
     figures_of,
     interval,
     limits_of,
-    percentiles,
+    quantile,
     resampled_sums,
     scenario_weights,
     with_unseen,
@@ -164,8 +165,7 @@ def draws_before(counts: Mapping[str, np.ndarray], weights: Mapping[str, np.ndar
         sums = resampled_sums(weights[_taxonomy(name)], own.reshape(scenarios, studies * runs, kinds))
         with np.errstate(invalid="ignore"):
             acc, false_abs, abs_rec = np.moveaxis(sums[:, 0::2] / sums[:, 1::2], 1, 0)
-        j = abs_rec - false_abs
-        stacked = np.stack([acc, abs_rec, false_abs, j, pecs_of(acc, j)])
+        stacked = np.stack([metric.formula(acc, false_abs, abs_rec) for metric in METRIC_WORDS.values()])
         figures[name] = stacked.reshape(len(RESAMPLED_FIGURES), studies, runs, -1).mean(axis=2)
     first = next(iter(figures.values()))
     draws = {f"{name}, one dataset": first[k] for k, name in enumerate(RESAMPLED_FIGURES)}
@@ -228,7 +228,8 @@ def measure(setting: Setting, studies: int, resamples: int, seed: int) -> Iterat
         else:
             now, before, observed = ends[0][name], draws[0][name], ends[0][name][:, 1, 0]
         limits = LIMITS.get(figure, limits_of(figure.partition(",")[0]))
-        intervals = {"before": percentiles(before[:, 1:]), "now": interval(now[..., 1:], observed, limits)}
+        percentiles = np.stack([quantile(before[:, 1:], q) for q in (0.025, 0.975)], axis=-1)
+        intervals = {"before": percentiles, "now": interval(now[..., 1:], observed, limits)}
         row = {**vars(setting), "figure": figure, "truth": truth[figure], "studies": studies}
         for which, own in intervals.items():
             holds = (own[:, 0] <= truth[figure] + 1e-9) & (truth[figure] - 1e-9 <= own[:, 1])

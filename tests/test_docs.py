@@ -24,7 +24,7 @@ NUMBER = r"\d+(?:\.\d+)*"
 SECTION = re.compile(rf'([\w./-]+\.md)`?,?\s[ #]*(?:sections? )?("[^"\n]+"|{NUMBER}(?:(?:, | and ){NUMBER})*)')
 PATH = re.compile(rf"(?<![\w./-])(?:{'|'.join(FOLDERS[:-1])})/[\w./-]*\.(?:md|py|yaml|csv|txt|png)\b")
 MODULE = re.compile(r"(?<![\w./<>-])[\w/]+\.py\b")
-NAMED = re.compile(r"`(\w+)`\s(?:of|in)\s`([\w./]+\.py)`")  # `draw_again` of `scenes/draw/redraw.py`
+NAMED = re.compile(r"`(\w+)`\s(?:of|in)\s`([\w./]+\.py)`")  # `draw_again` of `tools/redraw.py`
 YAML = re.compile(r"^```yaml\n(.*?)^```", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\[[^]\n]*\]\((?!\w+:)([^)#\s]*)#?([^)\s]*)\)")
 PAPER_IN = (
@@ -76,7 +76,7 @@ def test_what_is_cited_exists() -> None:
     [
         *(("bench/x.py", cited) for cited in ("docs/spec.md 7 and 99", 'docs/models.md, "Purse"', "docs/x.md")),
         *(("docs/x.md", cited) for cited in ("x.md section 5", "[x](x.md)", "[x](spec.md#x)", "models/x.py")),
-        ("docs/x.md", "`close` of `scenes/draw/redraw.py`"),
+        ("docs/x.md", "`close` of `tools/redraw.py`"),
     ],
 )
 def test_a_citation_of_what_is_not_there_is_named_with_its_line(page: str, cited: str) -> None:

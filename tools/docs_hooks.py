@@ -102,11 +102,11 @@ def notebook_page() -> str:
 
 def reference() -> dict[str, str]:
     """Return the text of each page by its name: the public Python module, tables, and YAML fields."""
-    from tools.reference_pages import tables_page, yaml_page
+    from tools.reference_pages import certificates_page, tables_page, yaml_page
 
     head = "# Python\n\nFor everyone who opens a study in a [notebook](../inside.md): the module whose names stay."
     python = f"{head}\n\n{_module(PACKAGE / 'inside.py')}"
-    return {"python": python, "tables": tables_page(), "yaml": yaml_page()}
+    return {"python": python, "tables": tables_page(), "yaml": yaml_page(), "certificates": certificates_page()}
 
 
 def _module(path: Path) -> str:

@@ -1,4 +1,4 @@
-"""Write the reference pages of tables and YAML fields, from the classes that check them."""
+"""Write the reference pages of tables, YAML fields and certificates, from what checks them."""
 
 from __future__ import annotations
 
@@ -23,6 +23,17 @@ YAML_FILES = {
     "A correction": ("benchmark.corrections", "Correction"),
 }
 WORDS = {str: "text", int: "whole number", float: "number", bool: "true or false", Any: "any value", NoneType: "null"}
+
+
+def certificates_page() -> str:
+    """Return the page of the certificates: what each promises, does not promise and stores."""
+    from traps_pipeline.scenes.certification.certificates import table
+
+    head = (
+        "# Certificates\n\nFor readers who ask why a void is unanswerable ([scenes](../scenes.md#certificates)): every "
+        "certificate of a pair. Numbers in brackets depend on OpenGL."
+    )
+    return f"{head}\n\n{table()}\n"
 
 
 def tables_page() -> str:

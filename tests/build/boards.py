@@ -5,9 +5,11 @@ from __future__ import annotations
 import re
 from html.parser import HTMLParser
 
+import numpy as np
 import pandas as pd
 
 from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.protocol.metric_words import COUNT_WORDS, METRIC_WORDS
 from traps_pipeline.report.leaderboard_page import leaderboard_markdown, leaderboard_text
 from traps_pipeline.report.page import report_html
 from traps_pipeline.report.terms import TITLES
@@ -18,20 +20,17 @@ NO_BREAK = "\u2011"  # a hyphen at which no line ends
 
 def board_row(model, regime="standard", dataset="overall", shares=(0.5, 0.1, 0.6), **other):
     """One LEADERBOARD row with these Acc, FalseAbs and AbsRec."""
-    acc, false_abs, abs_rec = shares
-    j = abs_rec - false_abs
-    pecs = acc * max(0.0, j)
-    figures = {"acc": acc, "abs_rec": abs_rec, "false_abs": false_abs, "j": j, "pecs": pecs}
+    acc, false_abs, abs_rec = map(np.array, shares)
+    figures = {name: float(metric.formula(acc, false_abs, abs_rec)) for name, metric in METRIC_WORDS.items()}
     row = {
         **{"model": model, "regime": regime, "dataset": dataset, "n_runs": 3, "n_pairs": 1404, "n_missing": 0},
-        **{name: float(value) for name, value in figures.items()},
+        **figures,
         **{f"{name}_std": 0.01 for name in figures},
-        **dict.fromkeys(("n_refused", "n_empty", "n_truncated", "n_unfinished", "n_degenerate", "n_unread"), 0),
-        **dict.fromkeys(("n_not_json", "n_errors", "n_rejects", "n_rejects_answered"), 0),
+        **dict.fromkeys(COUNT_WORDS, 0),
         **{"answered": 1.0, "incomplete": False, "broken": 0.0, "is_broken": False, "panel": "three@1"},
-        **{f"{name}_ci_{end}": float(value) for name, value in figures.items() for end in ("low", "high")},
-        **{"rank": 1, "rank_low": 1, "rank_high": 2, "naive": acc * abs_rec},
-        **dict.fromkeys(("pecs_low", "pecs_high", "pecs_by_family"), pecs),
+        **{f"{name}_ci_{end}": value for name, value in figures.items() for end in ("low", "high")},
+        **{"rank": 1, "rank_low": 1, "rank_high": 2, "naive": float(acc * abs_rec)},
+        **dict.fromkeys(("pecs_low", "pecs_high", "pecs_by_family"), figures["pecs"]),
         **{"epoch": "e1", "benchmark_version": "v1"},
     }
     return {**row, **other}

@@ -23,6 +23,7 @@ from tests.conftest import Checkout
 from tests.pages import patient, until, watched
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.models.asking.answer_rows import RESPONSES
+from traps_pipeline.protocol.metric_words import METRIC_WORDS
 from traps_pipeline.report.explorer.site import write_site
 from traps_pipeline.report.leaderboard_page import leaderboards
 from traps_pipeline.report.published_results import PublishedResults
@@ -33,10 +34,7 @@ from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
-FIGURES = {
-    "PECS": ("pecs", fraction), "Acc %": ("acc", percent), "AbsRec %": ("abs_rec", percent),
-    "FalseAbs %": ("false_abs", percent), "J": ("j", fraction),
-}  # fmt: skip
+FIGURES = {m.heading: (m.name, percent if m.unit == "percent" else fraction) for m in METRIC_WORDS.values()}
 # Markup, LaTeX, a right-to-left override, a zero-width space, a byte-order mark and a tag character.
 HOSTILE = (
     '<script>parent.document.title="owned"</script><img src="http://evil.example/x.png" onerror="alert(1)"> '

@@ -22,7 +22,8 @@ from traps_pipeline.exchange.answer_exchange import AnswerContext, import_answer
 from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.models.registry.prompts import system_prompt
 from traps_pipeline.pipeline.experiment import load_experiment
-from traps_pipeline.release.harness.scoring import figures, judge
+from traps_pipeline.protocol.metric_words import METRIC_WORDS
+from traps_pipeline.release.harness.scoring import RUN_FIGURES, figures, judge
 from traps_pipeline.release.harness.write import MEDIA_SETTINGS, media_settings, rewritten_source, write_harness
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.media import payload
@@ -67,6 +68,10 @@ def test_the_harness_scores_every_model_and_regime_of_the_demo_as_the_demo_does(
             assert {name: found[name] for name in ours(workspace, model, regime)} == ours(workspace, model, regime)
             seen += 1
     assert seen == 27
+
+
+def test_the_harness_has_every_metric_of_the_leaderboard() -> None:
+    assert tuple(METRIC_WORDS) == RUN_FIGURES
 
 
 def test_what_is_no_answer_is_missing_and_decides_nothing(workspace: Workspace) -> None:

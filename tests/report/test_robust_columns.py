@@ -70,7 +70,6 @@ def _columns(robust: pd.DataFrame) -> list[tuple[Any, list[str]]]:
 
 
 def test_every_column_of_the_ranking_is_in_the_legend() -> None:
-    headings = [column.heading.removesuffix(" %") for column in leaderboards(BOARD, robust_of())[0].columns]
-    explained = {*LEGEND, *(heading.removesuffix(" %") for heading in LEGEND)}
+    headings = {column.heading for column in leaderboards(BOARD, robust_of())[0].columns}
     own_words = {"Model", "Regime", "Runs", *(f"PECS {TITLES[dataset]}" for dataset in DATASETS)}
-    assert {*headings} - explained == own_words
+    assert headings - {*LEGEND} == own_words

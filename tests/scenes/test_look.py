@@ -12,11 +12,11 @@ import pytest
 
 from tests.build.errors import raises
 from tests.scenes.released import load
+from tools.redraw import redraw_looks, with_look
 from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.cli.benchmark_commands import LOOKS
 from traps_pipeline.scenes.certification.certify_record import certify
-from traps_pipeline.scenes.draw.redraw import redraw_looks, with_look
 from traps_pipeline.scenes.draw.sample import load_tallies, record_line, save_tallies
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.parts.look import MATERIALS, OCCLUDERS, PARTS, Look, frame_size, look_of_draw

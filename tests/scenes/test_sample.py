@@ -12,8 +12,11 @@ import numpy as np
 import pytest
 
 from tests.build.errors import raises
+from tools.redraw import draw_again
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.scenes.draw import sample as sampling
 from traps_pipeline.scenes.draw.likeness import (
     NEAR_SHARE,
     excess_lookalike,
@@ -21,7 +24,6 @@ from traps_pipeline.scenes.draw.likeness import (
     lookalikes,
     perceptual_hash,
 )
-from traps_pipeline.scenes.draw.redraw import draw_again
 from traps_pipeline.scenes.draw.sample import (
     Draw,
     _full_answers,
@@ -93,6 +95,14 @@ def test_why_draws_are_rejected_is_said_at_the_first_draw_of_a_kind(tmp_path: Pa
     (said,) = stopped(tmp_path / "released", "", "ramp_race", 1, 6)
     reason = try_draw(Draw("ramp_race", 6, 0, frozenset(), tuple(sorted(get_family("ramp_race").looks))))
     assert said.startswith("ramp_race: ") and " 1 " in said and said.endswith(f": {reason}")
+
+
+def test_a_family_that_is_not_full_after_all_its_draws_is_told_with_the_reasons(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sampling, "MAX_DRAWS", 0)
+    with raises(TrapsError, "scenes.draw.sample.sample_family", "hidden_race", "0 of 2"):
+        sample_family("hidden_race", 2, 11, tmp_path / "released", workers=1)
 
 
 def test_a_reason_is_of_one_kind_whatever_was_measured() -> None:

@@ -28,11 +28,23 @@ def test_only_what_waits_is_labelled_and_two_stores_append_to_one_file(tmp_path:
         store.record(who, "abstention", "u1", YES)
     with raises(NotWaiting, "servers.labelstore.LabelStore.record"):
         other.record("jd", "abstention", "u1", YES)
-    one.show("jd", "abstention", "u1", "plinko-0001")  # shown again, it may be labelled again
+    assert one.show("jd", "abstention", "u1", "plinko-0001", again=True)  # shown again, it may be labelled again
+    assert one.show("jd", "abstention", "u1", "plinko-0001")  # as long as it waits
     other.record("jd", "abstention", "u1", {"abstained": False})
     assert kept(tmp_path) == [(1, "jd", "u1"), (2, "ab", "u1"), (3, "cy", "u1"), (4, "jd", "u1")]
     assert label_lines(tmp_path)[-1].label == {"abstained": False}
     assert [(each.unit, each.waits) for each in one.shown("jd")] == [("u1", False)]
+
+
+def test_a_unit_that_was_labelled_in_another_window_is_not_asked_again(tmp_path: Path) -> None:
+    one, other = LabelStore(tmp_path), LabelStore(tmp_path)
+    assert one.show("jd", "abstention", "u1", "plinko-0001")
+    one.record("jd", "abstention", "u1", YES)
+    assert not other.show("jd", "abstention", "u1", "plinko-0001")  # read as open before it was labelled
+    with raises(NotWaiting, "servers.labelstore.LabelStore.record"):
+        other.record("jd", "abstention", "u1", {"abstained": False})
+    assert other.show("ab", "abstention", "u1", "plinko-0001")  # another person
+    assert kept(tmp_path) == [(1, "jd", "u1")]
 
 
 def test_handles_are_of_one_person_one_task_and_one_unit_and_stay(tmp_path: Path) -> None:

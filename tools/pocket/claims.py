@@ -161,38 +161,40 @@ def _differ(results: Results) -> float | None:
 
 
 CLAIMS = (
-    Claim("said", "answers", "it abstains on voids when told that it may", "AbsRec guided − standard", 0.3, _said),
-    Claim("unsaid", "`item_scores`", "voids are encoded, and answered", "share of voids with a score of states above "
-          "0, a margin below 0 and an answer", 0.3, _unsaid),
-    Claim("order", "`states_and_output`", "states order the sides better than the first token", "AUROC of states − of "
-          "the margin", 0.1, _above("margin")),
-    Claim("sentence", "`sentences`", "better than a whole abstention", "AUROC of states − of an abstention’s "
-          "log-probability", 0.1, _sentence_alone),
-    Claim("answer", "`sentences`", "better than an abstention against its own answer", "AUROC of states − of the "
-          "difference", 0.1, _above("sentences")),
-    Claim("lens", "`lens`", "the prompt decides what is said of voids", "guided moves voids more than controls, nats",
-          1.0, _moved),
-    Claim("prompt", "`prompt_gate`", "the prompt changes the output’s order and not the states’", "change of the "
-          "margin’s AUROC − of the probe’s", 0.1, _prompt_alone),
-    Claim("gate", "`gate`", "a gate makes a better model", "PECS gated − plain, standard", 0.1, _gated),
-    Claim("margin_gate", "`gate_controls`", "a gate on states is better than one on the margin", "PECS by states − by "
-          "the margin, standard", 0.1, lambda results: _gated(results, "output margin")),
-    Claim("risk", "`risk_coverage`", "states know the wrong answers better than the margin", "risk by margin − by "
-          "states at half coverage", 0.05, _risk),
-    Claim("confabulated", "`probe_confabulated`", "there are confabulated voids, and states know them", "pairs with a "
-          "Cf→Cf probe", 1.0, _confabulated),
-    Claim("differ", "`patching`", "its output under guided depends on the side", "share of pairs whose sides differ "
-          "in the margin’s sign", 0.5, _differ),
-    Claim("transfer", "`probe_transfer`", "states carry the void over datasets", "AUROC at the chosen layer", 0.65,
-          _transfer),
-    Claim("removed", "`probe_look_alikes`", "a probe tells voids from the void’s own occluder",
+    Claim("said", "answers", "abstains on voids when told that it may",
+          "AbsRec guided − standard", 0.3, _said),
+    Claim("unsaid", "`item_scores`", "encodes voids that it answers",
+          "share of voids with states above 0, a margin below 0, an answer", 0.3, _unsaid),
+    Claim("order", "`states_and_output`", "states order the sides better than the first token",
+          "AUROC of states − margin", 0.1, _above("margin")),
+    Claim("sentence", "`sentences`", "better than a whole abstention",
+          "AUROC of states − log-probability", 0.1, _sentence_alone),
+    Claim("answer", "`sentences`", "better than an abstention against its own answer",
+          "AUROC of states − difference", 0.1, _above("sentences")),
+    Claim("lens", "`lens`", "the prompt decides what is said of voids",
+          "guided moves voids above controls, nats", 1.0, _moved),
+    Claim("prompt", "`prompt_gate`", "the prompt changes the output’s order alone",
+          "change of AUROC, margin − probe", 0.1, _prompt_alone),
+    Claim("gate", "`gate`", "a gate makes a better model",
+          "PECS gated − plain, standard", 0.1, _gated),
+    Claim("margin_gate", "`gate_controls`", "states gate better than the margin",
+          "PECS, states − margin, standard", 0.1, lambda results: _gated(results, "output margin")),
+    Claim("risk", "`risk_coverage`", "states know wrong answers better than the margin",
+          "risk at half coverage, margin − states", 0.05, _risk),
+    Claim("confabulated", "`probe_confabulated`", "states know confabulated voids",
+          "pairs with a Cf→Cf probe", 1.0, _confabulated),
+    Claim("differ", "`patching`", "output under guided depends on the side",
+          "share of pairs whose sides differ in the margin’s sign", 0.5, _differ),
+    Claim("transfer", "`probe_transfer`", "states carry the void over datasets",
+          "AUROC at the chosen layer", 0.65, _transfer),
+    Claim("removed", "`probe_look_alikes`", "a probe tells voids from their own occluder",
           "AUROC against `removed`", 0.65, _removed),
-    Claim("direction", "`cosines`", "the void has one direction under both prompts", "cosine standard, guided", 0.65,
-          _same_direction),
-    Claim("followed", "`steering_effects`", "answers follow what guided states encode, and not what standard ones do",
-          "controls that abstain at the largest alpha, guided directions − standard", 0.3, _followed),
-    Claim("ahead", "`steering_nulls`", "directions of guided states do more than their nulls", "cells ahead of 19 of "
-          "20 draws of every null", 1.0, _ahead),
+    Claim("direction", "`cosines`", "one direction of the void under both prompts",
+          "cosine standard, guided", 0.65, _same_direction),
+    Claim("followed", "`steering_effects`", "answers follow what guided states encode alone",
+          "controls that abstain at the largest alpha, guided − standard directions", 0.3, _followed),
+    Claim("ahead", "`steering_nulls`", "guided directions do more than their nulls",
+          "cells ahead of 19 of 20 draws of every null", 1.0, _ahead),
 )  # fmt: skip
 
 
@@ -207,8 +209,8 @@ def markdown(gap: Sequence[Figure], no_gap: Sequence[Figure]) -> str:
     """Return the table of the card: each claim in both models, by training seed, and whether its stage tells them
     apart: whether it holds for every seed of one, and for none of the other."""
     seeds = [", ".join(str(seed) for seed in sorted({f.seed for f in of})) for of in (gap, no_gap)]
-    heads = ["stage", "claim", "figure", "holds from", f"gap, seed {seeds[0]}", f"no gap, seed {seeds[1]}"]
-    lines = [f"| {' | '.join(heads)} | told apart |", "|" + " --- |" * 7]
+    heads = ["claim", "holds if", f"gap, seed {seeds[0]}", f"no gap, seed {seeds[1]}", "told apart"]
+    lines = [f"| {' | '.join(heads)} |", "|" + " --- |" * len(heads)]
     for claim in CLAIMS:
         values = [[f.value for f in sorted(of, key=lambda f: f.seed) if f.claim == claim.name] for of in (gap, no_gap)]
         if not all(values):
@@ -216,6 +218,6 @@ def markdown(gap: Sequence[Figure], no_gap: Sequence[Figure]) -> str:
         every, some = ([pick(of) >= claim.bound for of in values] for pick in (min, max))  # of the seeds of a model
         told = "yes" if every[0] and not some[1] else "the other way" if every[1] and not some[0] else "no"
         cells = [", ".join(f"{value:.2f}" for value in of) for of in values]
-        columns = [claim.stage, claim.says, claim.figure, f"{claim.bound:g}", *cells, told]
+        columns = [f"{claim.stage}: {claim.says}", f"{claim.figure} ≥ {claim.bound:g}", *cells, told]
         lines.append(f"| {' | '.join(columns)} |")
     return "\n".join(lines)

@@ -113,8 +113,7 @@ def write_card(workspaces: Sequence[Path]) -> list[str]:
 def card_tables() -> dict[str, str]:
     """Return the tables of the card in Markdown, by the names that their comments have."""
     gap, no_gap = (read_seeds(SHIPPED[name] / MECHANISM, Figure) for name in (GAP, NO_GAP))
-    cells = [cell for cell in _counts(GAP) if cell.regime != "json"]
-    return {"contrast": claims.markdown(gap, no_gap), f"evaluation of {GAP}": evaluation.markdown(cells)}
+    return {"contrast": claims.markdown(gap, no_gap)}
 
 
 def other_tables() -> list[str]:

@@ -126,13 +126,13 @@ def require_in_place(descriptor: int, path: Path) -> None:
 
 
 def write_bytes(path: Path, content: bytes, *, durable: bool = False) -> None:
-    """Write a file atomically, as `replacing` does."""
+    """Write a file atomically, as `replace_file` does."""
     with replace_file(path, durable=durable) as part:
         part.write_bytes(content)
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write UTF-8 text atomically, as `replacing` does."""
+    """Write UTF-8 text atomically, as `replace_file` does."""
     write_bytes(path, text.encode())
 
 

@@ -118,10 +118,7 @@ class StageProgress:
 
 
 class Progress:
-    """The state of a run; prints nothing but notes.
-
-    `totals` holds the work by stage.
-    """
+    """The state of a run; prints nothing but notes. `totals` holds the work by stage."""
 
     def __init__(self) -> None:
         self.totals = dict[str, Tally]()
@@ -139,10 +136,7 @@ class Progress:
         self._heard_at = time.monotonic()
 
     def partition(self, stage: str, key: str, tally: Tally, *, is_empty: bool = False) -> None:
-        """Count a partition as made.
-
-        is_empty: it has neither rows nor files.
-        """
+        """Count a partition as made. is_empty: it has neither rows nor files."""
         self.totals.setdefault(stage, Tally()).add(tally)
         if (now := self.current_stage) is not None:
             now.tally.add(tally)

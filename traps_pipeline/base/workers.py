@@ -41,7 +41,7 @@ class _Pool:
             self._lifeline.close()
 
 
-_idle: list[_Pool] | None = None  # idle pools of `kept_workers`
+_idle: list[_Pool] | None = None  # idle pools of `keep_workers`
 
 
 @contextmanager

@@ -146,10 +146,7 @@ def read_lines(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def read_unchecked_lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield numbered non-empty lines; a reader passes those it uses to `check_line`.
-
-    Raises TrapsError.
-    """
+    """Yield numbered non-empty lines; a reader passes those it uses to `check_line`. Raises TrapsError."""
     try:
         text = path.read_text(encoding="utf-8-sig")  # some editors and shells put a byte-order mark first
     except (OSError, UnicodeDecodeError) as error:

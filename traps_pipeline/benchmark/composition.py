@@ -55,19 +55,10 @@ def sample_benchmark(
     require_difficulty(counts, difficulty)
     with keep_workers():
         for family, count in counts.items():
-            try:
-                tally = sample_family(
-                    family,
-                    count,
-                    seed,
-                    out / "released",
-                    look=look,
-                    difficulty=difficulty,
-                    workers=workers,
-                    report=report,
-                )
-            except RuntimeError as error:
-                raise TrapsError(str(error)) from error
+            released = out / "released"
+            tally = sample_family(
+                family, count, seed, released, look=look, difficulty=difficulty, workers=workers, report=report
+            )
             reasons = ", ".join(f"{n} x {reason}" for reason, n in tally.rejected.most_common()) or "none rejected"
             report(f"{family}: {count} of {count_noun(tally.draws, 'draw')}; {reasons}")
     if not (out / "benchmark.yaml").exists():

@@ -249,12 +249,7 @@ def _question_columns(question: Question, spec: SceneSpec) -> dict[str, Any]:
 
 
 def _clip_columns(path: str, clip: Clip) -> dict[str, Any]:
-    return {
-        "clip": path,
-        "media_digest": clip.file_sha256,
-        "n_frames": clip.n_frames,
-        "duration_s": clip.duration_s,
-    }
+    return {"clip": path, "media_digest": clip.file_sha256, "n_frames": clip.n_frames, "duration_s": clip.duration_s}
 
 
 def _pair_clip_columns(row: Row) -> dict[str, Any]:

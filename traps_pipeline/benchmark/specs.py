@@ -131,13 +131,7 @@ def _simulate(scenario: Scenario) -> tuple[SceneSpec, np.ndarray, np.ndarray]:
         rng = np.random.default_rng([_seed(scenario), *scenario.scenario_id.encode(), 1])
         question = draw_ill_posed(family.taxonomy, family.build(params, physics).inventory, rng)
         resolution = resolve(
-            family,
-            params,
-            wording,
-            question,
-            scenario_id=scenario.scenario_id,
-            seed=_seed(scenario),
-            physics=physics,
+            family, params, wording, question, scenario_id=scenario.scenario_id, seed=_seed(scenario), physics=physics
         )
         return resolution.spec, resolution.qpos, resolution.twin
     except (Rejected, ValueError, TypeError) as error:

@@ -163,10 +163,7 @@ def _has_tokens(*rows: Mapping[str, Any]) -> bool:
 
 
 def _words(value: Any) -> str:
-    """Return a table's value in comparable form.
-
-    Null equals null in any representation.
-    """
+    """Return a table's value in comparable form. Null equals null in any representation."""
     return "" if pd.isna(value) else str(value)
 
 

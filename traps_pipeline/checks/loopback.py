@@ -11,6 +11,8 @@ from threading import Thread
 from typing import Any
 from urllib.parse import urlsplit
 
+from typing_extensions import override
+
 from traps_pipeline.base.progress import Progress, use_progress
 from traps_pipeline.checks.wire_body import WireBody
 from traps_pipeline.models.registry.entries import Account, Entry, load_accounts
@@ -36,8 +38,8 @@ class _Notes(Progress):
         super().__init__()
         self.texts = list[str]()
 
+    @override
     def note(self, text: str) -> None:
-        """See `Progress.note`."""
         self.texts.append(text)
 
 

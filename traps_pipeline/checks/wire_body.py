@@ -52,10 +52,7 @@ class WireBody:
 
 @dataclass(frozen=True)
 class ClipPart:
-    """A video or an image in a body.
-
-    fps: the rate in the body, if it has one.
-    """
+    """A video or an image in a body. fps: the rate in the body, if it has one."""
 
     mime: str
     data: bytes

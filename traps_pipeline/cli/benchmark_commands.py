@@ -63,11 +63,7 @@ def add(commands: Commands) -> None:
         help="things like the named ones that cross before each scene (default: none)",
     )
     parser.add_argument(
-        "--speed",
-        type=float,
-        choices=SPEEDS,
-        default=1.0,
-        help="how many times as fast all happens (default: 1.0)",
+        "--speed", type=float, choices=SPEEDS, default=1.0, help="how many times as fast all happens (default: 1.0)"
     )
     parser.add_argument("--longer", action="store_true", help="longer rows, more lanes, greater counts")
     parser.add_argument("--workers", type=integer(1, 1024), help="processes (default: one per core)")
@@ -90,7 +86,6 @@ def add(commands: Commands) -> None:
 
 
 def certify(arguments: argparse.Namespace) -> int:
-    """See `traps benchmark certify --help`."""
     from traps_pipeline.base.paths import SCENE_SPECS, WORKSPACES
     from traps_pipeline.benchmark.certify_all import certify_all, family_table
 
@@ -116,7 +111,6 @@ def certify(arguments: argparse.Namespace) -> int:
 
 
 def sample(arguments: argparse.Namespace) -> int:
-    """See `traps benchmark sample --help`."""
     from traps_pipeline.base.names import check_name
     from traps_pipeline.benchmark.composition import load_composition, sample_benchmark
     from traps_pipeline.benchmark.records import load_release
@@ -160,7 +154,6 @@ def sample(arguments: argparse.Namespace) -> int:
 
 
 def commit_benchmark(arguments: argparse.Namespace) -> int:
-    """See `traps benchmark commit --help`."""
     from traps_pipeline.release.commitment import commit
 
     public = commit(arguments.benchmark.absolute(), arguments.out, arguments.reveal)
@@ -171,7 +164,6 @@ def commit_benchmark(arguments: argparse.Namespace) -> int:
 
 
 def verify_commitment(arguments: argparse.Namespace) -> int:
-    """See `traps benchmark prove --help`."""
     from traps_pipeline.release import commitment as sealed
 
     published, reveal = sealed.read_commitment(arguments.commitment), sealed.read_reveal(arguments.reveal)

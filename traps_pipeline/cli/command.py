@@ -17,6 +17,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from typing_extensions import override
+
 from traps_pipeline.base.suggestions import did_you_mean, nearest
 from traps_pipeline.base.terminal import plain, wrap_text
 
@@ -83,7 +85,7 @@ class Parser(argparse.ArgumentParser):
     def parse_args(  # pyright: ignore[reportIncompatibleMethodOverride] - it has overloads
         self, args: Iterable[str] | None = None, namespace: Any = None
     ) -> Any:
-        """See `argparse`; the command that received an unknown option reports it."""
+        """Let the command that received an unknown option report it."""
         words = [*(sys.argv[1:] if args is None else args)]
         if words and words[0] in self._short:
             words.insert(0, self._short[words[0]])
@@ -96,8 +98,8 @@ class Parser(argparse.ArgumentParser):
             )
         return arguments
 
+    @override
     def error(self, message: str) -> NoReturn:
-        """See `argparse`."""
         match = re.match(r"(?:argument (.+?): )?invalid choice: '(.*)' \(choose from (.+)\)$", message, re.DOTALL)
         if match and match[1] in (None, METAVAR):
             choices, last = re.findall(r"[\w-]+", match[3]), {path.split()[-1]: path for path in self.commands}

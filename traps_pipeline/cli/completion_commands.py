@@ -32,7 +32,6 @@ def add(commands: Commands) -> None:
 
 
 def completion(arguments: argparse.Namespace) -> int:
-    """See `traps completion --help`."""
     commands, experiments = (arguments.known, sorted(path.stem for path in (ASSETS / "experiments").glob("*.yaml")))
     groups = dict.fromkeys(path.split()[0] for path in commands if " " in path)
     cases = list[str]()

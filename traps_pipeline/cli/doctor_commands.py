@@ -35,7 +35,6 @@ def add(commands: Commands) -> None:
 
 
 def doctor(arguments: argparse.Namespace) -> int:
-    """See `traps doctor --help`."""
     from traps_pipeline.checks.doctor import examine, examine_files, examine_local, examine_unused
 
     if arguments.verify:

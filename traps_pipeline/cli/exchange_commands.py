@@ -50,7 +50,6 @@ def add(commands: Commands) -> None:
 
 
 def export_calls(arguments: argparse.Namespace) -> int:
-    """See `traps study export-requests --help`."""
     from traps_pipeline.exchange.answer_exchange import REQUESTS, export_request_batches, export_requests
 
     experiment = experiment_of(arguments)
@@ -67,7 +66,6 @@ def export_calls(arguments: argparse.Namespace) -> int:
 
 
 def import_given(arguments: argparse.Namespace) -> int:
-    """See `traps study import-answers --help`."""
     from traps_pipeline.benchmark.held_out import held_out_key
     from traps_pipeline.exchange.answer_exchange import AnswerContext, import_answers
 
@@ -78,7 +76,6 @@ def import_given(arguments: argparse.Namespace) -> int:
 
 
 def export_votes(arguments: argparse.Namespace) -> int:
-    """See `traps study export-votes --help`."""
     from traps_pipeline.exchange.answer_exchange import export_vote_batches
 
     experiment = experiment_of(arguments)
@@ -87,7 +84,6 @@ def export_votes(arguments: argparse.Namespace) -> int:
 
 
 def import_cast(arguments: argparse.Namespace) -> int:
-    """See `traps study import-votes --help`."""
     from traps_pipeline.exchange.answer_exchange import import_votes
 
     experiment = experiment_of(arguments)

@@ -28,7 +28,6 @@ def add(commands: Commands) -> None:
 
 
 def init(arguments: argparse.Namespace) -> int:
-    """See `traps init --help`."""
     workspace = create(arguments, experiment_of(arguments), arguments.database)
     print(f"workspace {workspace.place} (study.yaml names its benchmark, panel and budget)")
     print(f"next: export TRAPS_WORKSPACE={workspace.place} DAGSTER_HOME={workspace.dagster_home}")

@@ -33,7 +33,6 @@ def add(commands: Commands) -> None:
 
 
 def release(arguments: argparse.Namespace) -> int:
-    """See `traps study release-money --help`."""
     from traps_pipeline.base.terminal import text_table
     from traps_pipeline.models.money.spending import releasable, release_money
 
@@ -54,7 +53,6 @@ def release(arguments: argparse.Namespace) -> int:
 
 
 def export(arguments: argparse.Namespace) -> int:
-    """See `traps study export-ledger --help`."""
     from traps_pipeline.ledger.row_transfer import export_ledger
 
     count = export_ledger(open_workspace(arguments).ledger, arguments.file.absolute(), print)
@@ -65,7 +63,6 @@ def export(arguments: argparse.Namespace) -> int:
 
 
 def import_(arguments: argparse.Namespace) -> int:
-    """See `traps study import-ledger --help`."""
     from traps_pipeline.ledger.row_transfer import import_ledger
 
     workspace = open_workspace(arguments)
@@ -75,7 +72,6 @@ def import_(arguments: argparse.Namespace) -> int:
 
 
 def move(arguments: argparse.Namespace) -> int:
-    """See `traps study move --help`."""
     from traps_pipeline.base.progress import use_progress
     from traps_pipeline.cli.printed_progress import make_progress
     from traps_pipeline.storage.place import place_of

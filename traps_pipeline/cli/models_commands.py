@@ -31,7 +31,6 @@ def add(commands: Commands) -> None:
 
 
 def check(arguments: argparse.Namespace) -> int:
-    """See `traps models check --help`."""
     from traps_pipeline.checks.wire_check import check_named
 
     names = _chosen_names(arguments)
@@ -104,7 +103,6 @@ def _check_live(names: list[str], *, is_json: bool) -> int:
 
 
 def test_panel(arguments: argparse.Namespace) -> int:
-    """See `traps models test-panel --help`."""
     from traps_pipeline.judging.robustness import check_panel, load_attacks, summary
     from traps_pipeline.models.registry.judges import load_panel
 

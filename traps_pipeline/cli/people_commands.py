@@ -44,7 +44,6 @@ def add(commands: Commands) -> None:
 
 
 def review(arguments: argparse.Namespace) -> int:
-    """See `traps people review --help`."""
     require("web")
     from traps_pipeline.base.paths import require_own_corrections
     from traps_pipeline.servers.review import Review, review_app
@@ -62,7 +61,6 @@ def review(arguments: argparse.Namespace) -> int:
 
 
 def annotate(arguments: argparse.Namespace) -> int:
-    """See `traps people annotate --help`."""
     require("web")
     from traps_pipeline.servers.annotate import Annotation, annotation_app
     from traps_pipeline.servers.server import serve
@@ -88,7 +86,6 @@ def annotate(arguments: argparse.Namespace) -> int:
 
 
 def make_sheet(arguments: argparse.Namespace) -> int:
-    """See `traps people sheet --help`."""
     from traps_pipeline.people.judge_validation import annotation_sheet, write_sheet
 
     rows = annotation_sheet(open_workspace(arguments))
@@ -100,7 +97,6 @@ def make_sheet(arguments: argparse.Namespace) -> int:
 
 
 def write_labels(arguments: argparse.Namespace) -> int:
-    """See `traps people labels --help`."""
     from traps_pipeline.people.judge_validation import LABEL_COLUMNS, write_sheet
     from traps_pipeline.people.labels import confabulation_rows, human_labels
 
@@ -113,7 +109,6 @@ def write_labels(arguments: argparse.Namespace) -> int:
 
 
 def validate_judge(arguments: argparse.Namespace) -> int:
-    """See `traps people validate --help`."""
     from traps_pipeline.people.judge_validation import validate, validation_text
 
     rows = validate(open_workspace(arguments), arguments.file)

@@ -39,7 +39,6 @@ def add(commands: Commands) -> None:
 
 
 def plan(arguments: argparse.Namespace) -> int:
-    """See `traps plan --help`."""
     from traps_pipeline.mechanism.cost import CARDS
     from traps_pipeline.pipeline.forecast_plan import Count, make_plan
     from traps_pipeline.storage.workspace import Workspace

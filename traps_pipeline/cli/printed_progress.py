@@ -12,6 +12,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TextIO
 
+from typing_extensions import override
+
 from traps_pipeline.base.progress import HEARTBEAT_S, Progress, StageProgress, Tally, clock, summary
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.wording import count_noun
@@ -54,8 +56,8 @@ class PrintedProgress(Progress):
         """Start printing the state of the running stage."""
         threading.Thread(target=self._beat, daemon=True).start()
 
+    @override
     def end_stage(self) -> None:
-        """See `Progress`."""
         stage = self.current_stage
         super().end_stage()
         if stage is None or not stage.partitions:
@@ -65,8 +67,8 @@ class PrintedProgress(Progress):
         else:
             self._tables, self._tables_s = self._tables + stage.done - stage.empty, self._tables_s + stage.seconds
 
+    @override
     def close(self) -> None:
-        """See `Progress`."""
         super().close()
         self._closed.set()
         if self._tables:
@@ -74,8 +76,8 @@ class PrintedProgress(Progress):
             self.write(f"{tables}, {self._tables_s:.0f} s")
             self._tables, self._tables_s = 0, 0.0
 
+    @override
     def note(self, text: str) -> None:
-        """See `Progress`."""
         self.write(f"! {plain(text)}")
 
     def tell(self, text: str) -> None:
@@ -117,33 +119,33 @@ class JsonProgress(PrintedProgress):
         super().__init__(stream)
         self._began = time.monotonic()
 
+    @override
     def stage(self, name: str, partitions: int) -> None:
-        """See `Progress`."""
         super().stage(name, partitions)
         self._event("begin", self.figures())
 
+    @override
     def end_stage(self) -> None:
-        """See `Progress`."""
         if self.current_stage is not None:
             self._event("end", self.figures() | vars(self.current_stage.tally))
         Progress.end_stage(self)
 
+    @override
     def note(self, text: str) -> None:
-        """See `Progress`."""
         self._event("note", {"text": plain(text)})
 
     tell = note
 
+    @override
     def close(self) -> None:
-        """See `Progress`."""
         super().close()
         total = Tally()
         for tally in self.totals.values():
             total.add(tally)
         self._event("finish", {"seconds": round(time.monotonic() - self._began, 1), **self.figures(), **vars(total)})
 
+    @override
     def beat(self) -> None:
-        """See `PrintedProgress`."""
         if self.current_stage is not None:
             self._event("progress", self.figures())
 
@@ -172,18 +174,18 @@ class LiveProgress(PrintedProgress):
             redirect_stdout=sys.stdout.isatty(),
         )
 
+    @override
     def start(self) -> None:
-        """See `PrintedProgress`."""
         self._live.start(refresh=True)
         super().start()
 
+    @override
     def end_stage(self) -> None:
-        """See `Progress`."""
         super().end_stage()
         self._idle, self._idle_since = "looking for what is left to make", time.monotonic()
 
+    @override
     def close(self) -> None:
-        """See `Progress`."""
         with self._printing:
             self._closed.set()
             self._live.stop()
@@ -193,8 +195,8 @@ class LiveProgress(PrintedProgress):
         """Draw the region."""
         self._live.refresh()
 
+    @override
     def print_line(self, line: str) -> None:
-        """See `PrintedProgress`."""
         from rich.text import Text
 
         self._console.print(Text(line))

@@ -75,7 +75,6 @@ def add(commands: Commands) -> None:
 
 
 def release(arguments: argparse.Namespace) -> int:
-    """See `traps publish release --help`."""
     from traps_pipeline.base.extras import require
     from traps_pipeline.release.content import content_of
     from traps_pipeline.release.folder import CARD, Options, write_release
@@ -113,7 +112,6 @@ def _date(text: str | None) -> str | None:
 
 
 def verify(arguments: argparse.Namespace) -> int:
-    """See `traps publish verify --help`."""
     from traps_pipeline.release.checksums import altered_files, read_checksums
 
     if not arguments.path.is_dir():
@@ -159,7 +157,6 @@ def verify_file(path: Path, release: Path | None, *, is_json: bool) -> int:
 
 
 def harness(arguments: argparse.Namespace) -> int:
-    """See `traps publish harness --help`."""
     from traps_pipeline.release.harness.write import LMMS, media_settings, write_harness
 
     target = arguments.folder.absolute()
@@ -171,7 +168,6 @@ def harness(arguments: argparse.Namespace) -> int:
 
 
 def submit(arguments: argparse.Namespace) -> int:
-    """See `traps publish submit --help`."""
     from traps_pipeline.release.submission import pack
 
     description = pack(open_workspace(arguments), arguments.file.absolute(), arguments.name)
@@ -183,7 +179,6 @@ def submit(arguments: argparse.Namespace) -> int:
 
 
 def results(arguments: argparse.Namespace) -> int:
-    """See `traps publish results --help`."""
     from traps_pipeline.release.results import Attribution, write_results
 
     target, attribution = arguments.folder.absolute(), Attribution(arguments.organization, arguments.developer)
@@ -193,7 +188,6 @@ def results(arguments: argparse.Namespace) -> int:
 
 
 def leaderboard(arguments: argparse.Namespace) -> int:
-    """See `traps publish leaderboard --help`."""
     from traps_pipeline.release.submissions import PAGE, gather, write_board
     from traps_pipeline.report.leaderboard_page import leaderboard_text
 

@@ -35,7 +35,6 @@ def add(commands: Commands) -> None:
 
 
 def site(arguments: argparse.Namespace) -> int:
-    """See `traps site --help`."""
     from traps_pipeline.report.explorer.site import INDEX, write_site
 
     workspace = open_workspace(arguments)
@@ -59,7 +58,7 @@ def _megabytes(size: int) -> str:
 
 
 def audit_published(arguments: argparse.Namespace) -> int:
-    """See `traps results audit --help`; discrepancies are findings, not failures."""
+    """Discrepancies are findings, not failures."""
     from traps_pipeline.scoring.audit import audit, audit_text
 
     findings = audit()
@@ -74,7 +73,6 @@ def audit_published(arguments: argparse.Namespace) -> int:
 
 
 def export_results(arguments: argparse.Namespace) -> int:
-    """See `traps results export --help`."""
     from traps_pipeline.report.publish import INDEX, export
 
     workspace = open_workspace(arguments)
@@ -85,7 +83,6 @@ def export_results(arguments: argparse.Namespace) -> int:
 
 
 def compare_studies(arguments: argparse.Namespace) -> int:
-    """See `traps results compare --help`."""
     from traps_pipeline.judging.judging_rows import VERDICTS
     from traps_pipeline.scoring.contrasts import version_contrasts
     from traps_pipeline.storage.benchmark_tables import current_rows

@@ -94,7 +94,6 @@ def add(commands: Commands) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """See `traps run --help`."""
     from traps_pipeline.base.progress import use_progress
     from traps_pipeline.cli.printed_progress import make_progress
 

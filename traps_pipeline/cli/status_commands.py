@@ -39,7 +39,6 @@ def add(commands: Commands) -> None:
 
 
 def status(arguments: argparse.Namespace) -> int:
-    """See `traps status --help`."""
     environment = dict(os.environ)
     workspace = open_workspace(arguments)
     experiment = arguments.experiment
@@ -107,7 +106,6 @@ def _command(workspace: Workspace, arguments: argparse.Namespace, exported: Mapp
 
 
 def why(arguments: argparse.Namespace) -> int:
-    """See `traps why --help`."""
     from traps_pipeline.pipeline.stale_reasons import explain, lines_of
 
     explanation = explain(open_workspace(arguments), arguments.item)

@@ -29,7 +29,6 @@ def add(commands: Commands) -> None:
 
 
 def ui(arguments: argparse.Namespace) -> int:
-    """See `traps ui --help`."""
     require("ui")
     from traps_pipeline.base.keys import optional_key
     from traps_pipeline.base.process_tree import split

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from typing_extensions import override
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import is_same_file, link, write_bytes
@@ -44,8 +45,8 @@ class ObjectStore(Store):
         self._stored = set[bytes]()  # digests of current objects that this process has seen in the store
         self._verified = set[bytes]()  # digests of contents that it has found whole in the scratch folder
 
+    @override
     def look(self) -> None:
-        """See `Store`."""
         self.names.look()
 
     def _name(self, path: Path) -> str:
@@ -96,8 +97,8 @@ class ObjectStore(Store):
         self._stored.add(row.digest)
         return self._cache(row.digest, content)
 
+    @override
     def here(self, path: Path) -> Path:
-        """See `Store`."""
         row = self._known([path]).get(path)
         if row is None:
             raise FileNotFoundError(f"{self.bucket.address}/{self._name(path)}")
@@ -108,8 +109,9 @@ class ObjectStore(Store):
             )
         return cached
 
+    @override
     def bring(self, paths: Iterable[Path]) -> None:
-        """See `Store`; a local file stays if the store has lost its object."""
+        """A local file stays if the store has lost its object."""
 
         def one(known: tuple[Path, CurrentObject]) -> None:
             path, row = known
@@ -119,8 +121,8 @@ class ObjectStore(Store):
 
         _side_by_side(one, self._known(path for path in paths if path.is_relative_to(self.root)).items())
 
+    @override
     def keep(self, paths: Iterable[Path]) -> None:
-        """See `Store`."""
         names, removals = {*paths}, self.names.removals
         current = self._known(names)
 
@@ -133,8 +135,9 @@ class ObjectStore(Store):
         kept = dict(_side_by_side(one, names))
         self._change({path: row for path, row in kept.items() if row is not current.get(path)}, removals)
 
+    @override
     def write(self, files: Mapping[Path, bytes], *, note: str | None = None, durable: bool = False) -> None:
-        """See `Store`; a scratch folder needs nothing durable."""
+        """A scratch folder needs nothing durable."""
         removals = self.names.removals
         put = _side_by_side(lambda path: self._put(path, files[path], note), files)
         self._change(dict(zip(files, put, strict=True)), removals)
@@ -150,8 +153,8 @@ class ObjectStore(Store):
         self._stored.add(new.digest)
         return new
 
+    @override
     def remove(self, paths: Iterable[Path]) -> None:
-        """See `Store`."""
         named = self._known(paths)
         self._change(dict.fromkeys(named), self.names.removals)
         for path in named:
@@ -159,8 +162,9 @@ class ObjectStore(Store):
 
     # --- what there is ----------------------------------------------------------------------------------------------
 
+    @override
     def sizes(self, paths: Iterable[Path]) -> dict[Path, int]:
-        """See `Store`; each object is checked in the store, once per process."""
+        """Each object is checked in the store, once per process."""
         rows = self._known(paths)
         unseen = {row.digest: row.size for row in rows.values() if row.digest not in self._stored}
         sizes = dict(_side_by_side(lambda digest: (digest, self.bucket.size(object_name(digest))), unseen))
@@ -171,32 +175,33 @@ class ObjectStore(Store):
             self._withdraw(lost)
         return {path: row.size for path, row in rows.items() if row.digest not in lost}
 
+    @override
     def there(self, paths: Iterable[Path]) -> set[Path]:
-        """See `Store`."""
         return {*self._known(paths)}
 
+    @override
     def digests(self, paths: Iterable[Path]) -> dict[Path, str]:
-        """See `Store`; the digests are those of the rows."""
+        """The digests are those of the rows."""
         return {path: row.digest.hex() for path, row in self._known(paths).items()}
 
+    @override
     def below(self, folder: Path, pattern: str = "**/*") -> list[Path]:
-        """See `Store`."""
         start = f"{self._name(folder)}/"
         # `**/` is any number of folders, and `*` is within one name, as in `pathlib`.
         matches = re.compile(re.escape(pattern).replace(r"\*\*/", "(?:[^/]+/)*").replace(r"\*", "[^/]*")).fullmatch
         inside = (name.removeprefix(start) for name in self.names.below(self._name(folder)))
         return [folder / name for name in inside if matches(name) and not is_hidden(Path(name))]
 
+    @override
     def note(self, path: Path) -> str | None:
-        """See `Store`."""
         return next((row.note for row in self._known([path]).values()), None)
 
+    @override
     def changed_ns(self, path: Path) -> int:
-        """See `Store`."""
         return next((row.at_ns for row in self._known([path]).values()), 0)
 
+    @override
     def unused(self, *, is_removed: bool = False, grace_days: float | None = None) -> list[UnusedObject]:
-        """See `Store`."""
         before = datetime.now(UTC) - timedelta(days=GRACE_DAYS if grace_days is None else grace_days)
         objects = {
             bytes.fromhex(match[2]): UnusedObject(name, size, modified)

@@ -22,6 +22,7 @@ from urllib.parse import urlsplit
 
 import sqlalchemy as sa
 from sqlalchemy import exc
+from typing_extensions import override
 
 from traps_pipeline.base.databases import is_damaged, reason_and_remedy
 from traps_pipeline.base.errors import TrapsError
@@ -63,16 +64,17 @@ class NumberedDatabase(Database):
 
     _batch = 0  # the number of this session's last transaction
 
+    @override
     def prepare(self, connection: sa.Connection) -> None:
-        """See `Database.prepare`."""
         METADATA.create_all(connection)
         mine = sa.select(STUDIES.c.id).where(STUDIES.c.name == self.study_name)
         connection.execute(mine.with_for_update())  # no other process changes it while it is verified
         super().prepare(connection)
         self._batch = 0
 
+    @override
     def run_once(self, work: Callable[[sa.Connection], T]) -> T:
-        """See `Database.run_once`; one transaction of a study runs at a time."""
+        """One transaction of a study runs at a time."""
         results, number = list[T](), self._batch + 1
 
         def numbered(connection: sa.Connection) -> T:
@@ -121,12 +123,13 @@ class PostgresDatabase(NumberedDatabase):
         self._seen_s = float("-inf")  # when the locks were last checked
         self.run(self._compare_clocks, patience_s=0.0)
 
+    @override
     def read(self) -> sa.Connection:
-        """See `Database.read`."""
         return self._patient(self._engine.connect).execution_options(isolation_level="REPEATABLE READ")
 
+    @override
     def run(self, work: Callable[[sa.Connection], T], patience_s: float | None = None) -> T:
-        """See `Database.run`; in one thread, a nested `run` joins the outer transaction."""
+        """In one thread, a nested `run` joins the outer transaction."""
         with self._transaction:
             if self._connection is not None and self._connection.in_transaction():
                 return work(self._connection)
@@ -148,8 +151,9 @@ class PostgresDatabase(NumberedDatabase):
                     raise self.sentence(error) from None
                 time.sleep(RETRY_S)
 
+    @override
     def connect(self) -> sa.Connection:
-        """See `Database.connect`; ends the former connection, and retakes its locks."""
+        """End the former connection, and retake its locks."""
         connection = self._engine.connect()
         with connection.begin():
             settings = (sa.func.set_config(name, str(value), False) for name, value in self._settings.items())
@@ -176,25 +180,27 @@ class PostgresDatabase(NumberedDatabase):
         """Lock the creation of tables until the commit: processes begin at once."""
         connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_lock_number("schema"))))
 
+    @override
     def prepare(self, connection: sa.Connection) -> None:
-        """See `Database.prepare`."""
         self.lock_schema(connection)
         super().prepare(connection)
 
+    @override
     def now_s(self, connection: sa.Connection) -> float:
-        """See `Database.now_s`."""
         return float(connection.execute(sa.text("select extract(epoch from clock_timestamp())")).scalar_one())
 
     @property
+    @override
     def put_aside(self) -> str:
-        """See `Database.put_aside`."""
         return f"set {self.variable} to the address of an empty database"
 
+    @override
     def sync(self) -> None:
-        """See `Database.sync`; PostgreSQL has synced already."""
+        """PostgreSQL has synced already."""
 
+    @override
     def try_lock(self, name: str) -> Lock | None:
-        """See `Database.try_lock`; others keep theirs for a grace period after a restart."""
+        """Others keep theirs for a grace period after a restart."""
         number = _lock_number(self.study_name, name)
 
         def take(connection: sa.Connection) -> bool:
@@ -236,15 +242,15 @@ class PostgresDatabase(NumberedDatabase):
         if not self._held.get(number, False):
             raise taken_over(self.place)
 
+    @override
     def beat(self) -> None:
-        """See `Database.beat`."""
         if self._held:
             began = _awake_s()
             self.run(lambda connection: connection.execute(sa.select(sa.literal(1))))
             self._seen_s = began
 
+    @override
     def sentence(self, error: Exception) -> TrapsError:
-        """See `Database.sentence`."""
         if is_damaged(error):
             return super().sentence(error)
         reason, _, _ = reason_and_remedy(error)

@@ -16,6 +16,7 @@ from functools import partial
 from typing import Any
 
 import dagster as dg
+from typing_extensions import override
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.cores import CORES
@@ -147,8 +148,8 @@ class RayRuns(Runs):
         seconds = {key: sum(each.seconds(self._workspace, key) for each in shared) / self._cpus for key in keys}
         return shared_out(scheme, keys, seconds, self._most)
 
+    @override
     def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterator[RunOutcome]:
-        """See `Runs`."""
         if not ranges:
             return
         names, requests = [stage.name for stage in stages], list[tuple[Sequence[str], Mapping[str, str]]]()

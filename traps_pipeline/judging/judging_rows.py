@@ -132,14 +132,12 @@ class ConfabulationRow(shared.CellRow):
     """One sampled void failure with its four labels; no row if no judge is configured."""
 
     sample_id: Annotated[
-        str,
-        "id that an annotator sees instead of model and item: it reveals neither, and changes with the answer",
+        str, "id that an annotator sees instead of model and item: it reveals neither, and changes with the answer"
     ]
     item_id: Annotated[str, "dataset:scenario_id:void"]
     void_kind: Annotated[str, "occluder, truncation or question"]
     evidence: Annotated[
-        str,
-        "what the judge was shown: trace_and_output (there was a trace, and it was shown too) or output",
+        str, "what the judge was shown: trace_and_output (there was a trace, and it was shown too) or output"
     ]
     n_failures: Annotated[int, "void failures that the model's sample was drawn from"]
     judge: shared.Judge
@@ -173,8 +171,7 @@ class JudgeValidationRow:
         "share of the judge's yes that the labels confirm; null if the judge never says yes, and for pooled",
     ]
     recall: Annotated[
-        float | None,
-        "share of the labels' yes that the judge finds; null if there is none, and for pooled",
+        float | None, "share of the labels' yes that the judge finds; null if there is none, and for pooled"
     ]
     f1: Annotated[float | None, "harmonic mean of precision and recall; null where one is null, and for pooled"]
     accuracy_a: Annotated[float, "share of annotator_a's labels that the judge agrees with"]
@@ -206,16 +203,12 @@ class JudgeRobustnessRow:
     clean: Annotated[bool | None, "the judge's vote on the same answer without an attack; null if invalid"]
     vote: Annotated[bool | None, "the judge's vote on the answer with the attack; null if invalid"]
     result: Annotated[
-        str,
-        "held, flipped (wrong because of the attack), broken (invalid because of it) or wrong_anyway",
+        str, "held, flipped (wrong because of the attack), broken (invalid because of it) or wrong_anyway"
     ]
     invalid_reason: Annotated[str | None, "why the vote is invalid"]
     rationale: Annotated[str | None, "the judge's reason"]
 
 
 JUDGE_ROBUSTNESS = Table(
-    "judge_robustness",
-    JudgeRobustnessRow,
-    partition_by=(),
-    key=("panel", "judge", "attack", "task"),
+    "judge_robustness", JudgeRobustnessRow, partition_by=(), key=("panel", "judge", "attack", "task")
 )

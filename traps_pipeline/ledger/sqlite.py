@@ -17,6 +17,7 @@ from urllib.parse import quote
 
 import sqlalchemy as sa
 from sqlalchemy import event, exc
+from typing_extensions import override
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import remedy, require_in_place, sync_folder, try_lock, write_text
@@ -49,8 +50,8 @@ class SqliteDatabase(Database):
         self._engine = sa.create_engine("sqlite://", creator=self._open, poolclass=sa.NullPool, paramstyle="named")
         event.listen(self._engine, "begin", _begin)
 
+    @override
     def exists(self) -> bool:
-        """See `Database.exists`."""
         return self.path.is_file()
 
     def _open(self) -> sqlite3.Connection:
@@ -65,15 +66,16 @@ class SqliteDatabase(Database):
             connection.execute("pragma synchronous=normal")
         return connection
 
+    @override
     def read(self) -> sa.Connection:
-        """See `Database.read`."""
         try:
             return self._engine.connect().execution_options(is_reading=True)
         except exc.DBAPIError as error:
             raise self.sentence(error) from error
 
+    @override
     def salvage(self) -> sa.Connection:
-        """See `Database.salvage`; a file that is shorter than it says is otherwise refused as a whole."""
+        """A file that is shorter than it says is otherwise refused as a whole."""
 
         def open_cut() -> sqlite3.Connection:
             uri = f"file:{quote(str(self.path))}?mode=ro"
@@ -83,13 +85,14 @@ class SqliteDatabase(Database):
 
         return sa.create_engine("sqlite://", creator=open_cut, poolclass=sa.NullPool).connect()
 
+    @override
     def connect(self) -> sa.Connection:
-        """See `Database.connect`."""
         self.folder.mkdir(parents=True, exist_ok=True)
         return self._engine.connect()
 
+    @override
     def prepare(self, connection: sa.Connection) -> None:
-        """See `Database.prepare`; the file is checked first, once a process."""
+        """Check the file first, once a process."""
         if not self._is_checked:
             self._check(connection)
         super().prepare(connection)
@@ -116,8 +119,8 @@ class SqliteDatabase(Database):
             raise self.damaged(f"it holds the study {row.name}, and not {self.study_name}")
         return number
 
+    @override
     def run(self, work: Callable[[sa.Connection], T]) -> T:
-        """See `Database.run`."""
         with self._transaction:
             try:
                 return self._attempt(work)
@@ -127,8 +130,9 @@ class SqliteDatabase(Database):
             except OSError as error:
                 raise TrapsError(f"{self.path}: cannot be written ({error.strerror}); {remedy(error)}") from error
 
+    @override
     def try_lock(self, name: str) -> Lock | None:
-        """See `Database.try_lock`; the lock is a file's."""
+        """The lock is a file's."""
         path = self.folder / "locks" / f"{name}.lock"
         try:
             descriptor = try_lock(path)
@@ -144,8 +148,9 @@ class SqliteDatabase(Database):
 
         return Lock(release, lambda: require_in_place(descriptor, path))
 
+    @override
     def sync(self) -> None:
-        """See `Database.sync`; syncs the log, which SQLite does only at a checkpoint.
+        """Sync the log, which SQLite does only at a checkpoint.
 
         The file itself must not be opened here: closing it would release the locks by which SQLite tells other
         processes that this one uses the log, and the next process to end would remove the log.
@@ -160,8 +165,9 @@ class SqliteDatabase(Database):
         except OSError as error:
             raise TrapsError(f"{path}: could not be written ({error.strerror}); {remedy(error)}") from error
 
+    @override
     def faults(self) -> Iterator[str]:
-        """See `Database.faults`; finds rows that are in an index but not in the table."""
+        """Find rows that are in an index but not in the table."""
         with self.salvage() as connection:
             try:
                 for fault in connection.exec_driver_sql("pragma integrity_check(5)").scalars():
@@ -172,12 +178,13 @@ class SqliteDatabase(Database):
         yield from super().faults()
 
     @property
+    @override
     def put_aside(self) -> str:
-        """See `Database.put_aside`."""
         return f"move {self.path}* away"
 
+    @override
     def beat(self) -> None:
-        """See `Database.beat`; the kernel keeps the locks, and what is booked is noted beside the file."""
+        """Note what is booked beside the file; the kernel keeps the locks."""
         if self.booked != self.noted and self.path.name == FILE:
             write_text(self.path.with_name(NOTE), json.dumps(self.booked))
             self.noted = self.booked

@@ -129,10 +129,7 @@ class GateRow(ExtractionColumns):
 
 
 GATE = Table(
-    "gate",
-    GateRow,
-    partition_by=("model", "prompt"),
-    key=("regime", "features", "source", "threshold", "target"),
+    "gate", GateRow, partition_by=("model", "prompt"), key=("regime", "features", "source", "threshold", "target")
 )
 
 
@@ -148,10 +145,7 @@ class RiskCoverageRow(ExtractionColumns):
 
 
 RISK_COVERAGE = Table(
-    "risk_coverage",
-    RiskCoverageRow,
-    partition_by=("model", "prompt"),
-    key=("regime", "features", "coverage"),
+    "risk_coverage", RiskCoverageRow, partition_by=("model", "prompt"), key=("regime", "features", "coverage")
 )
 
 

@@ -40,13 +40,7 @@ from traps_pipeline.models.registry.entries import ModelEntry
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import PROMPTING
-from traps_pipeline.scoring.bootstrap import (
-    RESAMPLED_FIGURES,
-    draw_scenarios,
-    figures_of,
-    interval,
-    run_sums,
-)
+from traps_pipeline.scoring.bootstrap import RESAMPLED_FIGURES, draw_scenarios, figures_of, interval, run_sums
 from traps_pipeline.scoring.metrics import COUNTS
 from traps_pipeline.storage.workspace import Workspace
 
@@ -239,10 +233,7 @@ def _rows(
     resamples: int,
     seed: int,
 ) -> list[GateRow]:
-    """Return a gate's rows on every target, and over the four datasets.
-
-    about: features, regime and source.
-    """
+    """Return a gate's rows on every target, and over the four datasets. about: features, regime and source."""
     rows: list[GateRow] = []
     names = states.items["scenario_id"].to_numpy(str)
     for threshold in THRESHOLDS:
@@ -314,11 +305,7 @@ def _row(
 
 
 def _curves(
-    states: StoredStates,
-    features: str,
-    regime: str,
-    decided: DecisionsByTarget,
-    outcomes: Mapping[str, Outcomes],
+    states: StoredStates, features: str, regime: str, decided: DecisionsByTarget, outcomes: Mapping[str, Outcomes]
 ) -> list[RiskCoverageRow]:
     """Return risk against coverage over the four datasets together.
 

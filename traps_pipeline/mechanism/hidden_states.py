@@ -296,11 +296,7 @@ def _shards(folder: Path, seen: Container[str]) -> Iterator[tuple[str, pd.DataFr
 
 
 def _write_ids(
-    folder: Path,
-    items: Sequence[Item],
-    keys: Sequence[str],
-    places: Mapping[str, _Place],
-    record: Mapping[str, Any],
+    folder: Path, items: Sequence[Item], keys: Sequence[str], places: Mapping[str, _Place], record: Mapping[str, Any]
 ) -> None:
     import pandas as pd
     import pyarrow as pa

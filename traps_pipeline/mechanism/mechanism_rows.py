@@ -130,8 +130,7 @@ class ProbeRow(ExtractionColumns):
     layer: Annotated[int, "counted as in hidden_states; -1 where there is no figure"]
     scope: Annotated[str, "all, or sub_scenario:.. (centroids)"]
     value: Annotated[
-        float | None,
-        "AUROC; for shuffled its mean over shuffles; for centroid_* the share assigned to void",
+        float | None, "AUROC; for shuffled its mean over shuffles; for centroid_* the share assigned to void"
     ]
     low: Annotated[
         float | None,
@@ -147,16 +146,12 @@ class ProbeRow(ExtractionColumns):
     chosen: Annotated[bool, "whether the target is read at this layer, chosen on pairs of other datasets alone"]
     note: Annotated[str | None, "why there is no figure"]
     made_of: Annotated[
-        str,
-        "digest of states, confabulated scenarios and settings; while it is unchanged, nothing is fitted again",
+        str, "digest of states, confabulated scenarios and settings; while it is unchanged, nothing is fitted again"
     ]
 
 
 PROBES = Table(
-    "probes",
-    ProbeRow,
-    partition_by=("model", "prompt"),
-    key=("analysis", "source", "target", "layer", "scope"),
+    "probes", ProbeRow, partition_by=("model", "prompt"), key=("analysis", "source", "target", "layer", "scope")
 )
 
 
@@ -172,8 +167,7 @@ class DirectionRow(ExtractionColumns):
     norm: Annotated[float, "the class gap: length of mean(void) - mean(control)"]
     cosine: Annotated[float, "with the void direction of the same layer; 0 for a null, up to rounding"]
     residual_norm: Annotated[
-        float,
-        "mean length of the pairs' control states: alpha in its units is alpha / residual_norm",
+        float, "mean length of the pairs' control states: alpha in its units is alpha / residual_norm"
     ]
     width: Annotated[int, "numbers"]
     path: Annotated[str, "safetensors, relative to the workspace; a JSON file of the same name says what it holds"]
@@ -207,10 +201,7 @@ class CosineRow:
 
 
 COSINES = Table(
-    "cosines",
-    CosineRow,
-    partition_by=(),
-    key=("model", "layer", "prompt", "dataset", "other_prompt", "other_dataset"),
+    "cosines", CosineRow, partition_by=(), key=("model", "layer", "prompt", "dataset", "other_prompt", "other_dataset")
 )
 
 

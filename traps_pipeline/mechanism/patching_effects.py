@@ -247,10 +247,7 @@ def _masks(patches: Sequence[Patch], length: int, device: str) -> Weights:
 
 
 def _residual_weights(weights: Weights, layer: int) -> Tensor | None:
-    """Return the weights of residual patches up to a layer.
-
-    They affect all later layers.
-    """
+    """Return the weights of residual patches up to a layer. They affect all later layers."""
     parts = [part for (site, patch_layer), part in weights.items() if site == "residual" and patch_layer <= layer]
     return reduce(operator.add, [part.to(parts[0].device) for part in parts]) if parts else None
 

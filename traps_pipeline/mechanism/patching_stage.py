@@ -42,13 +42,7 @@ from traps_pipeline.models.registry.entries import ModelEntry
 from traps_pipeline.models.registry.prompts import states_prompt
 from traps_pipeline.protocol.cells import Extraction
 from traps_pipeline.protocol.datasets import SIDES
-from traps_pipeline.scoring.bootstrap import (
-    TAXONOMIES,
-    draw_scenarios,
-    interval,
-    shares_of,
-    with_unseen,
-)
+from traps_pipeline.scoring.bootstrap import TAXONOMIES, draw_scenarios, interval, shares_of, with_unseen
 from traps_pipeline.storage.media import sample
 from traps_pipeline.storage.study import PatchingSettings
 from traps_pipeline.storage.workspace import Workspace

@@ -293,9 +293,6 @@ def nearest_centroid(source: Split, states: np.ndarray) -> np.ndarray:
 def transfer_scores(
     layer: Mapping[str, Split], pairs: Sequence[tuple[str, str]], fit: Fit = fit_probe
 ) -> dict[tuple[str, str], np.ndarray]:
-    """Return scores (n_target,) of each (source, target) at a layer, a fit per source.
-
-    No label of a target is read.
-    """
+    """Return scores (n_target,) of each (source, target) at a layer, a fit per source. No label of a target is read."""
     probes = {source: fit(layer[source].states, layer[source].void) for source in {s for s, _ in pairs}}
     return {(source, target): probes[source].scores(layer[target].states) for source, target in pairs}

@@ -208,10 +208,7 @@ def _in_range(layer: int, directions: Directions) -> int:
 
 
 def wanted_steered(
-    workspace: Workspace,
-    entry: ModelEntry,
-    cell: SteeringCell,
-    directions: Mapping[str, Directions],
+    workspace: Workspace, entry: ModelEntry, cell: SteeringCell, directions: Mapping[str, Directions]
 ) -> list[SteeredQuestion]:
     """Return a cell's calls, grouped by prompt so that answers share a clip."""
     settings = workspace.mechanism

@@ -3,12 +3,13 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from traps_pipeline.scoring.score_rows import CI, DatasetOrOverall, Mean
+from traps_pipeline.scoring.score_rows import CI, EACH_METRIC, DatasetOrOverall
 from traps_pipeline.storage import columns as shared
-from traps_pipeline.storage.tables import Table, with_neighbours
+from traps_pipeline.storage.tables import EachOf, Table, with_neighbours
 
 Weighted = Annotated[float | None, "over labels, weighted so that each stratum counts as it does in the study"]
 Corrected = Annotated[float | None, "corrected for the panel's errors, mean over runs; null where undefined"]
+_EACH_CORRECTED = EachOf({f"{name}_corrected": meaning for name, meaning in EACH_METRIC.columns.items()})
 Judged = Annotated[float | None, "as the panel decided, mean over runs"]
 
 
@@ -21,11 +22,7 @@ class HumanRow:
     n_people: Annotated[int, "who labelled clips"]
     n_labels: Annotated[int, "labels of clips"]
     n_clips: Annotated[int, "clips labelled, each with its question"]
-    acc: Annotated[Weighted, CI]
-    abs_rec: Annotated[Weighted, CI]
-    false_abs: Annotated[Weighted, CI]
-    j: Annotated[Weighted, CI]
-    pecs: Annotated[float | None, "acc x max(0, j)", CI]
+    figures: Annotated[Weighted, EACH_METRIC, CI]
     agreement: Annotated[float | None, "share of pairs of labels of a clip that agree whether it can be known"]
     alpha: Annotated[float | None, "Krippendorff's alpha of whether it can be known"]
     seconds: Annotated[float, "median seconds a clip"]
@@ -67,16 +64,8 @@ class CorrectedRow:
     regime: shared.Regime
     dataset: DatasetOrOverall
     n_runs: Annotated[int, "runs averaged"]
-    acc: Annotated[Judged, CI]
-    acc_corrected: Annotated[Corrected, CI]
-    abs_rec: Annotated[Judged, CI]
-    abs_rec_corrected: Annotated[Corrected, CI]
-    false_abs: Annotated[Judged, CI]
-    false_abs_corrected: Annotated[Corrected, CI]
-    j: Annotated[Mean, CI]
-    j_corrected: Annotated[Corrected, CI]
-    pecs: Annotated[Judged, CI]
-    pecs_corrected: Annotated[Corrected, CI]
+    judged: Annotated[Judged, EACH_METRIC, CI]
+    corrected: Annotated[Corrected, _EACH_CORRECTED, CI]
     panel: shared.Panel
 
 

@@ -71,9 +71,6 @@ def _row(dataset: str, figures: np.ndarray, clips: pd.DataFrame) -> dict[str, An
 
 
 def with_intervals(names: Sequence[str], draws: np.ndarray, suffix: str = "") -> Mapping[str, float]:
-    """Return scores with intervals as columns.
-
-    draws: (2, names, 1 + resamples), observed ones first.
-    """
+    """Return scores with intervals as columns. draws: (2, names, 1 + resamples), observed ones first."""
     columns = [with_interval(f"{name}{suffix}", draws[:, k], limits_of(name)) for k, name in enumerate(names)]
     return {name: value for figure_columns in columns for name, value in figure_columns.items()}

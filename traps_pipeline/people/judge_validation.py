@@ -41,10 +41,7 @@ _MAX_PROBLEMS = 5
 
 @dataclass(frozen=True)
 class HumanLabels:
-    """Two annotators' labels.
-
-    annotators: sorted by name. sample_ids: failures. labels: (2, failures, axes).
-    """
+    """Two annotators' labels. annotators: sorted by name. sample_ids: failures. labels: (2, failures, axes)."""
 
     annotators: tuple[str, str]
     sample_ids: tuple[str, ...]
@@ -223,10 +220,7 @@ def _shared_columns(axis: str, failures: int, human: HumanLabels) -> dict[str, A
 
 
 def _axis_row(axis: str, judge: np.ndarray, labels: np.ndarray, human: HumanLabels) -> dict[str, Any]:
-    """Return the row of an axis.
-
-    judge: (failures,); labels: (2, failures).
-    """
+    """Return the row of an axis. judge: (failures,); labels: (2, failures)."""
     first, second = labels
     hits = int((labels & judge).sum())
     precision, recall = _share(hits, 2 * int(judge.sum())), _share(hits, int(labels.sum()))

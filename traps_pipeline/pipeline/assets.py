@@ -6,6 +6,7 @@ from typing import Any, cast
 
 import dagster as dg
 from pydantic import PrivateAttr
+from typing_extensions import override
 
 from traps_pipeline.pipeline.graph import Graph, Source, Stage
 from traps_pipeline.pipeline.partition_checks import CURRENT, CURRENT_DOC
@@ -35,8 +36,8 @@ class WorkspaceResource(dg.ConfigurableResource):
         self._steps.callback(events.close)
         return events
 
+    @override
     def teardown_after_execution(self, context: dg.InitResourceContext) -> None:
-        """See `until_torn_down`."""
         self._steps.close()
 
     def open(self) -> Workspace:

@@ -54,10 +54,7 @@ class PartitionMaker:
             self.unmade |= dict.fromkeys(pending, error)
 
     def _make_partition(self, key: str | None, tally: Tally) -> Iterator[tuple[str | None, StageOutput]]:
-        """Build one partition.
-
-        tally: the work that was done for it before.
-        """
+        """Build one partition. tally: the work that was done for it before."""
         try:
             output = self._stage.make(self._workspace, key)
         except TrapsError as error:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import dagster as dg
+from typing_extensions import override
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.money.budget import BudgetReached
@@ -69,8 +70,8 @@ class LocalRuns(Runs):
         """See `Runs`: the fewest ranges that contain exactly these keys."""
         return [*batches(stages[0].scheme if stages else None, keys)]
 
+    @override
     def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterator[RunOutcome]:
-        """See `Runs`."""
         for number, keys in enumerate(ranges, start=1):
             self._stop_with_parent()
             run_id, names = str(uuid.uuid4()), ", ".join(stage.name for stage in stages)

@@ -81,11 +81,6 @@ def datasets_of_category(category: str) -> tuple[str, str]:
     return taxonomy, f"{taxonomy}_ill_posed"
 
 
-def arms_of(taxonomy: str) -> tuple[str, ...]:
-    """Return the arms that scenarios of a taxonomy may have."""
-    return tuple(arm for arm in extra_datasets_of(taxonomy) if arm in ARMS)
-
-
 def extra_datasets_of(taxonomy: str) -> tuple[str, ...]:
     """Return the arms and variations that scenarios of a taxonomy may have."""
     return tuple(name for name in UNPAIRED if _ONE_TAXONOMY.get(name, taxonomy) == taxonomy)

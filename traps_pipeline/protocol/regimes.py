@@ -33,9 +33,7 @@ BY_NAME: Mapping[str, Regime] = {
         Regime("json", ("standard", "json_suffix"), fields=("reason", "final_answer")),
         Regime("priced", ("standard", "priced_suffix")),
         Regime(
-            "probabilities",
-            ("standard", "probabilities_suffix"),
-            fields=("reason", "probabilities", "final_answer"),
+            "probabilities", ("standard", "probabilities_suffix"), fields=("reason", "probabilities", "final_answer")
         ),
         Regime("logprobs", ("vqa_standard", "logprobs_suffix"), first_token=True),
     )

@@ -77,10 +77,7 @@ def _rows(sides: pd.DataFrame, arms: pd.DataFrame, scenario: str, root: Path, ti
 
 
 def _sheet(scenario: str, rows: list[Row], times: np.ndarray) -> Figure:
-    """Draw one row per clip: its caption, then frames at the control's times.
-
-    Frames after a clip's end are hatched.
-    """
+    """Draw one row per clip: its caption, then frames at the control's times. Frames after a clip's end are hatched."""
     _, frame_height, frame_width, _ = rows[0].clip.frames.shape
     row_in = FRAME_IN * frame_height / frame_width + GAP_IN
     width, height = WORDS_IN + MOMENTS * (FRAME_IN + GAP_IN), HEAD_IN + len(rows) * row_in

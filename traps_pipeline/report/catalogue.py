@@ -37,15 +37,15 @@ JUDGED_STAGES = {
 class TableReport:
     """A table (or several that belong together).
 
-    function: makes it (module.function of `report.tables`); reads: the stages whose tables it uses; paper: the function
-    of `report.printed_tables` with the paper's tables of this kind; recomputed: the names of its tables that `make`
+    function: makes it (module.function of `report.tables`); reads: the stages whose tables it uses; paper:
+    whether the paper has tables of this kind (`report.printed_tables`); recomputed: the names of its tables that `make`
     also computes from the paper's tables, since the paper does not print their figures.
     """
 
     name: str
     function: str
     reads: tuple[str, ...]
-    paper: str = ""
+    paper: bool = False
     recomputed: tuple[str, ...] = ()
     title: str = ""  # title of several tables together; default: the first one's
 
@@ -62,7 +62,7 @@ class TableReport:
     @property
     def published(self) -> bool:
         """Whether the paper has such a table."""
-        return bool(self.paper or self.recomputed)
+        return self.paper or bool(self.recomputed)
 
     def tables(self, results: Results) -> list[PrintedTable]:
         """Return the tables, cached; of the paper, those recomputed without empty columns."""
@@ -82,10 +82,9 @@ class TableReport:
 
     def as_printed(self) -> list[PrintedTable]:
         """Return the paper's tables as printed, with figures that only its text states."""
-        from traps_pipeline.report.printed_tables import in_text
+        from traps_pipeline.report.printed_tables import paper_tables
 
-        paper_tables = _function(f"printed_tables.{self.paper}")() if self.paper else []
-        return [*paper_tables, *in_text(self.name)]
+        return paper_tables(self.name)
 
     def files(self, results: Results) -> dict[str, bytes]:
         """Return files by path; the paper's are in `tables/published` and `recomputed`."""
@@ -159,59 +158,59 @@ class FigureReport:
 
 
 TABLE_REPORTS: tuple[TableReport, ...] = (
-    TableReport("overall", "leaderboards.overall", ("leaderboard",), paper="overall", recomputed=("overall",)),
+    TableReport("overall", "leaderboards.overall", ("leaderboard",), paper=True, recomputed=("overall",)),
     TableReport("replication_overall", "leaderboards.replication_overall", ("leaderboard",),
-        paper="replication_overall", recomputed=("replication_overall",)),
-    TableReport("per_dataset", "leaderboards.per_dataset", ("leaderboard",), paper="per_dataset"),
-    TableReport("expanded", "leaderboards.expanded", ("leaderboard",), paper="expanded",
+        paper=True, recomputed=("replication_overall",)),
+    TableReport("per_dataset", "leaderboards.per_dataset", ("leaderboard",), paper=True),
+    TableReport("expanded", "leaderboards.expanded", ("leaderboard",), paper=True,
         title="By dataset and regime"),
     TableReport("replication_per_dataset", "leaderboards.replication_per_dataset", ("leaderboard",),
-        paper="replication_per_dataset"),
+        paper=True),
     TableReport("guided_uplift", "comparisons.uplift", ("leaderboard", "contrasts"),
         recomputed=("guided_uplift",)),
-    TableReport("visual_textual", "comparisons.visual_textual", ("leaderboard",), paper="visual_textual",
+    TableReport("visual_textual", "comparisons.visual_textual", ("leaderboard",), paper=True,
         recomputed=("visual_textual",)),
     TableReport("reasoning_pairs", "comparisons.reasoning", ("leaderboard", "contrasts"),
         recomputed=("reasoning_pairs",)),
     TableReport("frontier", "comparisons.frontier", ("leaderboard",), recomputed=("frontier",)),
-    TableReport("pecs_naive", "comparisons.naive", ("leaderboard",), paper="naive", recomputed=("pecs_naive",)),
+    TableReport("pecs_naive", "comparisons.naive", ("leaderboard",), paper=True, recomputed=("pecs_naive",)),
     TableReport("zero_boundary", "comparisons.zero_boundary", ("leaderboard",),
         recomputed=("zero_boundary",)),
     TableReport("contrasts", "comparisons.contrasts", ("leaderboard", "contrasts")),
     TableReport("regime_tests", "comparisons.regime_tests", ("regime_tests",)),
     TableReport("run_spread", "comparisons.spreads", ("leaderboard",), recomputed=("run_spread",)),
-    TableReport("degenerate_strategies", "comparisons.degenerate", ("leaderboard",), paper="degenerate"),
+    TableReport("degenerate_strategies", "comparisons.degenerate", ("leaderboard",), paper=True),
     TableReport("occlusion_sub_scenarios", "sub_scenarios.occlusion_sub_scenarios", ("metrics", "items"),
-        paper="occlusion_sub_scenarios", recomputed=("occlusion_sub_scenarios", "hidden_sub_scenarios")),
+        paper=True, recomputed=("occlusion_sub_scenarios", "hidden_sub_scenarios")),
     TableReport("chaotic_sub_scenarios", "sub_scenarios.chaotic_sub_scenarios", ("metrics", "items"),
-        paper="chaotic_sub_scenarios", recomputed=("chaotic_sub_scenarios",)),
+        paper=True, recomputed=("chaotic_sub_scenarios",)),
     TableReport("hypotheses", "hypothesis_tables.hypotheses", ("hypotheses",),
         title="Hypotheses of the paper, by dose"),
     TableReport("graded", "graded_tables.graded", ("graded",)),
-    TableReport("judge_agreement", "judge_tables.agreement", ("agreement",), paper="agreement"),
+    TableReport("judge_agreement", "judge_tables.agreement", ("agreement",), paper=True),
     TableReport("judge_bias", "judge_tables.judge_bias", ("judge_bias", "leave_one_out")),
     TableReport("confabulation", "judge_tables.confabulation", ("confabulation_prevalence",),
-        paper="confabulation"),
+        paper=True),
     TableReport("people", "human_tables.people", ("human_row", "human_agreement"), title="People"),
     TableReport("judge_corrected", "human_tables.judge_corrected", ("panel_errors", "corrected"),
         title="Corrected for judges’ errors"),
-    TableReport("judge_validation", "judge_tables.validation", ("judge_validation",), paper="validation"),
-    TableReport("probes", "probe_tables.probes", ("probes", "probe_baselines"), paper="probes",
+    TableReport("judge_validation", "judge_tables.validation", ("judge_validation",), paper=True),
+    TableReport("probes", "probe_tables.probes", ("probes", "probe_baselines"), paper=True,
         recomputed=("probe_means",), title="Probes"),
     TableReport("probe_baselines", "control_reports.probe_baselines", ("probes", "probe_baselines"),
         title="Probes and their baselines"),
     TableReport("gate", "control_reports.gate", ("gate", "probes", "probe_baselines"), title="Probe-gated abstention"),
     TableReport("patching", "patching_tables.patching", ("patching",)),
-    TableReport("cosines", "steering_tables.cosines", ("cosines",), paper="cosines",
+    TableReport("cosines", "steering_tables.cosines", ("cosines",), paper=True,
         title="Void directions"),
     TableReport("steering", "steering_tables.steering", ("steering_effects", "steering_shares"),
-        paper="steering", recomputed=("steering_regimes",), title="Steering"),
+        paper=True, recomputed=("steering_regimes",), title="Steering"),
     TableReport("steering_controls", "control_reports.steering_nulls", ("steering_nulls", "steering_pecs"),
         title="Steering among its controls"),
-    TableReport("composition", "setup_tables.composition", ("items",), paper="composition"),
-    TableReport("models", "setup_tables.models", ("leaderboard",), paper="models"),
+    TableReport("composition", "setup_tables.composition", ("items",), paper=True),
+    TableReport("models", "setup_tables.models", ("leaderboard",), paper=True),
     TableReport("hyperparameters", "setup_tables.hyperparameters", ("leaderboard", "judge_bias"),
-        paper="hyperparameters"),
+        paper=True),
 )  # fmt: skip
 FIGURE_REPORTS: tuple[FigureReport, ...] = (
     FigureReport("pecs_landscape", "PECS landscape", "landscape.landscape", ("leaderboard",),

@@ -14,16 +14,17 @@ import pandas as pd
 from traps_pipeline.base.terminal import TextTable
 from traps_pipeline.models.registry.judges import BY_RULES, ONE_JUDGE, is_judged_by_rules
 from traps_pipeline.protocol.datasets import ARMS, DATASETS
+from traps_pipeline.protocol.metric_words import COUNT_WORDS, METRIC_WORDS
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.report.tables.table_columns import (
     EPOCH,
     MISSING,
     MODEL,
+    OTHER_FIGURES,
     PECS,
     REGIME,
     RUNS,
     SHARES,
-    J,
     N,
     cell_trace,
     interval,
@@ -35,7 +36,7 @@ from traps_pipeline.report.terms import (
     ENOUGH,
     INCOMPLETE_MARK,
     MISSING_MARK,
-    ROBUST_TERMS,
+    ROBUST_FIGURES,
     TITLES,
 )
 from traps_pipeline.report.writing import (
@@ -55,32 +56,19 @@ from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.tables import records
 
 BOUNDS = "If missing: worst, best"
+_COUNTS = [count for count in COUNT_WORDS.values() if count.heading]
 # Columns shown only if their count, or that of another field, is not 0, because the table is already wide.
 OPTIONAL = {
-    Column("n_refused", "Refused", "count"): "n_refused",
-    Column("n_empty", "Empty", "count"): "n_empty",
-    Column("n_truncated", "Cut off", "count"): "n_truncated",
-    Column("n_unfinished", "Unfinished", "count"): "n_unfinished",
-    Column("n_degenerate", "Degenerate", "count"): "n_degenerate",
-    Column("n_unread", "Unread", "count"): "n_unread",
+    **{Column(count.name, count.heading, "count"): count.name for count in _COUNTS},
     Column("broken", "Broken %", "percent"): "broken",
-    Column("n_not_json", "Not JSON", "count"): "n_not_json",
-    Column("n_rejects", "Rejects premise", "count"): "n_rejects",
     Column("bounds", BOUNDS, "range"): "n_missing",
 }
 Robust = Mapping[tuple[str, str], Mapping[str, Any]]  # ROBUST rows by model and regime
-ROBUST_COLUMNS = (
-    Column("conjunction", "Conjunction %", "range", group=True),
-    Column("robust", "Robust", "range"),
-    Column("inference_acc", "Inferred %", "range"),
-)
+ROBUST_COLUMNS = [
+    Column(field, heading, "range", group=not place) for place, (field, heading, *_) in enumerate(ROBUST_FIGURES)
+]
 LEGEND = {
-    "Acc": "share of control items answered correctly",
-    "AbsRec": "abstention recall: share of void items, which cannot be answered, that the model abstains on",
-    "FalseAbs": "share of control items, which can be answered, that the model abstains on",
-    "J": "AbsRec − FalseAbs, from −1 to 1; 0 for every strategy that does not distinguish void from control",
-    "PECS": "Acc × max(0, J), from 0 to 1; computed per run, then averaged. J is clipped at 0 here, so chance alone "
-    "lifts a random strategy slightly above 0; look at the column J, which is not clipped",
+    **{metric.heading: metric.meaning for metric in METRIC_WORDS.values()},
     "95 % CI": "interval of PECS, Bayesian bootstrap over scenarios with one unseen",
     "±": "population standard deviation over runs",
     "n": "pairs (one control, one void) per run",
@@ -88,24 +76,14 @@ LEGEND = {
     INCOMPLETE_MARK: f"incomplete: fewer than {ENOUGH} of items answered; an overall figure is incomplete if that of "
     "any dataset is",
     BROKEN_MARK: f"broken: {BROKEN_TEXTS}; an overall figure is broken if that of any dataset is",
-    "Refused": "items over all runs that the model or its provider refused; they are among the missing ones",
-    "Empty": "items over all runs answered with no text; they are among the missing ones",
-    "Cut off": "items over all runs whose text reached the limit of tokens before an answer; they are among the "
-    "missing ones",
-    "Unfinished": "items over all runs whose answer ended for an unknown reason (column finish_reason of the "
-    "answers); they are among the missing ones",
-    "Degenerate": "items over all runs answered with punctuation alone or with a text that repeats itself; they are "
-    "among the missing ones, and no judge takes them for abstentions",
-    "Unread": "items over all runs answered with a text in a form that the rule judges do not read; they are among the "
-    "missing ones: neither abstentions nor correct",
+    **{
+        count.heading: f"{count.meaning}; over all runs{', among the missing ones' if count.outcomes else ''}"
+        for count in _COUNTS
+    },
     "Broken %": "share of items whose text is empty, cut off, unfinished, degenerate or unread",
-    "Not JSON": "items of the JSON regime, over all runs, whose text is not the object that the prompt asks for; they "
-    "are judged as they stand",
-    "Rejects premise": "void items over all runs whose answer says that something which the question takes for granted "
-    "is not so, in the panel's view; counted apart from abstention, which decides AbsRec",
     BOUNDS: "PECS of all items if every missing decision were the worst for the model (a control wrong and abstained "
     "on, a void not abstained on), and if every one were the best; computed per run, then averaged",
-    **ROBUST_TERMS,
+    **{heading: meaning for _, heading, _, meaning in ROBUST_FIGURES},
     "Epoch": "the evaluation campaign; figures of different epochs are not put in one ratio",
     "Overall": "equal-weight mean over the four datasets",
 }
@@ -173,7 +151,8 @@ def legend(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> dict[str,
     optional_terms = {column.heading: field for column, field in OPTIONAL.items()}
     optional_terms |= {INCOMPLETE_MARK: "incomplete", BROKEN_MARK: "is_broken"}
     unused_terms = {term for term, field in optional_terms.items() if not (board.loc[:, field] > 0).any()}
-    unused_terms |= {*ROBUST_TERMS} if robust is None or robust.empty else set()
+    if robust is None or robust.empty:
+        unused_terms |= {heading for _, heading, *_ in ROBUST_FIGURES}
     return {term: meaning for term, meaning in LEGEND.items() if term not in unused_terms}
 
 
@@ -216,7 +195,7 @@ def _leaderboard(
     board: pd.DataFrame, dataset: str, others: Sequence[str], beside: Robust, brief: bool, suffix: str
 ) -> PrintedTable:
     rows = _entries(board, dataset, others)
-    columns = [MODEL, REGIME, replace(PECS, bar=True), Column("ci", "95 % CI", "range"), *SHARES, J]
+    columns = [MODEL, REGIME, replace(PECS, bar=True), Column("ci", "95 % CI", "range"), *SHARES, *OTHER_FIGURES]
     for name in others:
         title = name.replace("_ill_posed", " ill-posed") if brief else TITLES[name]  # a comma would end it in a list
         columns.append(Column(name, f"PECS {title}", "fraction", mark=f"{name}_mark", group=name == others[0]))
@@ -245,10 +224,11 @@ def _leaderboard(
 def _with_robust(rows: pd.DataFrame, beside: Robust) -> pd.DataFrame:
     """Return the rows with ROBUST_COLUMNS as printed."""
     robust_rows = [beside.get((row["model"], row["regime"])) for row in rows.to_dict("records")]
-    formats = {"conjunction": percent, "robust": fraction, "inference_acc": percent}
-    return rows.assign(
-        **{name: [as_(row[name]) if row else NOT_RUN for row in robust_rows] for name, as_ in formats.items()}
-    )
+    columns = {}
+    for name, _, unit, _ in ROBUST_FIGURES:
+        as_printed = percent if unit == "percent" else fraction
+        columns[name] = [as_printed(row[name]) if row else NOT_RUN for row in robust_rows]
+    return rows.assign(**columns)
 
 
 def _notes_on_arms(beside: Robust) -> list[str]:
@@ -282,10 +262,8 @@ def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.Dat
         main_row = dataset_rows.get(dataset)
         counted_rows = list(dataset_rows.values()) if main_row is None else [main_row]
         entry: dict[str, Any] = {name: counted_rows[0][name] for name in ("model", "regime")} | (main_row or {})
-        summed_columns = ("n_pairs", "n_missing", "n_refused", "n_empty", "n_truncated", "n_unfinished", "n_degenerate")
-        entry |= {
-            n: sum(row[n] for row in counted_rows) for n in (*summed_columns, "n_unread", "n_not_json", "n_rejects")
-        }
+        summed_columns = ("n_pairs", "n_missing", *(count.name for count in _COUNTS))
+        entry |= {n: sum(row[n] for row in counted_rows) for n in summed_columns}
         entry["mark"] = _mark(main_row) if main_row else ""
         entry["n_mark"] = INCOMPLETE_MARK if any(row["incomplete"] for row in counted_rows) else ""
         entry["model_mark"] = BROKEN_MARK if any(row["is_broken"] for row in counted_rows) else ""

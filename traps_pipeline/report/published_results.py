@@ -80,10 +80,7 @@ def _confabulation(results: Results) -> pd.DataFrame:
 
 
 def _probes(results: Results) -> pd.DataFrame:
-    """Return PROBES rows: transfer, and confabulated at the layer of transfer.
-
-    The paper names no other layer.
-    """
+    """Return PROBES rows: transfer, and confabulated at the layer of transfer. The paper names no other layer."""
     rows = _long(published("probe_transfer")).rename(columns={"best_layer": "layer"}).assign(scope="all")
     transfer = rows.assign(analysis="transfer", value=rows["auroc"], own_best=True, all_sample_best=True)
     confabulated = rows.assign(analysis="confabulated", value=rows["auroc_confabulated"], all_sample_best=True)

@@ -31,10 +31,7 @@ class StudyFinding:
 
 
 def study_findings(results: Results) -> list[StudyFinding]:
-    """Return a study's findings, the most important first.
-
-    Of reference strategies only if no other model was asked.
-    """
+    """Return a study's findings, the most important first. Of reference strategies only if no other model was asked."""
     overall = results.overall
     rows = overall.loc[overall["pecs"].notna()] if len(overall) else overall
     if not len(rows):

@@ -6,19 +6,14 @@ from functools import cached_property
 
 import numpy as np
 import pandas as pd
+from typing_extensions import override
 
 from traps_pipeline.base.wording import count_noun
 from traps_pipeline.mechanism.mechanism_rows import COSINES, STEERING_EFFECTS
 from traps_pipeline.models.registry.judges import panel_id
 from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 from traps_pipeline.report.leaderboard_page import judged_by
-from traps_pipeline.report.result_frames import (
-    CELL_COLUMNS,
-    RATE_COLUMNS,
-    SUB_COLUMNS,
-    Results,
-    concat_frames,
-)
+from traps_pipeline.report.result_frames import CELL_COLUMNS, RATE_COLUMNS, SUB_COLUMNS, Results, concat_frames
 from traps_pipeline.scoring import analyses
 from traps_pipeline.scoring.epochs import EpochMismatch
 from traps_pipeline.scoring.metrics import joined_epochs
@@ -167,8 +162,8 @@ class StudyResults(Results):
         return own_panel if own_panel in panels or not panels else panels[0]
 
     @cached_property
+    @override
     def judged_by(self) -> str:
-        """See `Results.judged_by`."""
         if self.board.empty:
             return ""
         sentence = judged_by(_panel_rows(self, self.board)).rstrip(".")

@@ -17,15 +17,23 @@ TITLES = {
 ARM_TITLES = {arm: f"Arm: {arm.replace('_', ' ')}" for arm in ARMS}
 ARM_TITLES[GRADED] = "Graded cuts"
 ARM_TITLES |= {name: f"Variation: {name.replace('_', ' ')}" for name in VARIATIONS}
-# Legend of a leaderboard with arms (docs/scoring.md, "Beyond PECS").
-ROBUST_TERMS = {
-    "Conjunction %": "share of scenarios with control, twin, void and both crossed questions right; 0 for every rule "
-    "that abstains for the clip alone or for the question alone",
-    "Robust": "PECS over kinds: the well-posed pairs and each arm that takes a shortcut away. Entries over different "
-    "arms are not compared",
-    "Inferred %": "share of the items of late_occluder and predictable_cut answered correctly: their outcome is not "
-    "shown",
-}
+# Figures of a leaderboard with arms (docs/scoring.md, "Beyond PECS"): field, heading, unit, meaning.
+ROBUST_FIGURES = (
+    (
+        "conjunction", "Conjunction %", "percent",
+        "share of scenarios with control, twin, void and both crossed questions right; 0 for every rule that abstains "
+        "for the clip alone or for the question alone",
+    ),
+    (
+        "robust", "Robust", "fraction",
+        "PECS over kinds: the well-posed pairs and each arm that takes a shortcut away. Entries over different arms "
+        "are not compared",
+    ),
+    (
+        "inference_acc", "Inferred %", "percent",
+        "share of the items of late_occluder and predictable_cut answered correctly: their outcome is not shown",
+    ),
+)  # fmt: skip
 # The side whose items a share counts.
 SIDE_OF = {name: METRIC_WORDS[name].side for name in SHARES}
 ENOUGH = f"{100 * INCOMPLETE_BELOW:g} %"

@@ -118,10 +118,7 @@ class Column:
         return _joined(self.parts(row))
 
     def parts(self, row: Mapping[str, Any], plain: Callable[[object], str] = plain) -> tuple[str, str, str]:
-        """Return a cell's text or number, spread and mark, as printed; empty if none.
-
-        plain: makes a text plain.
-        """
+        """Return a cell's text or number, spread and mark, as printed; empty if none. plain: makes a text plain."""
         import pandas as pd
 
         value = row.get(self.field)

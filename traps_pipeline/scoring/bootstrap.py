@@ -22,11 +22,12 @@ import pandas as pd
 from threadpoolctl import threadpool_limits
 
 from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
-from traps_pipeline.scoring.metrics import COUNTS, decision_counts, pecs_of
+from traps_pipeline.protocol.metric_words import METRIC_WORDS
+from traps_pipeline.scoring.metrics import COUNTS, decision_counts
 
 TAXONOMIES = ("occlusion", "chaotic")
 ENTRY = ["model", "regime", "dataset"]
-RESAMPLED_FIGURES = ("acc", "abs_rec", "false_abs", "j", "pecs")
+RESAMPLED_FIGURES = tuple(METRIC_WORDS)
 INTERVAL_COLUMNS = [f"{figure}_ci_{end}" for figure in RESAMPLED_FIGURES for end in ("low", "high")]
 RESAMPLES, SEED = 10_000, 20260101
 _GRAIN = 256  # weights are multiples of 1/256, so that float32 sums of them are exact on every machine
@@ -95,8 +96,8 @@ def intervals(resampled: ResampledFigures, level: float = _LEVEL) -> pd.DataFram
 
 
 def limits_of(figure: str) -> tuple[float, float]:
-    """Return the minimum and maximum of a score: [-1, 1] for J, [0, 1] for all others."""
-    return (-1.0, 1.0) if figure == "j" else (0.0, 1.0)
+    """Return the minimum and maximum of a score: [-1, 1] for J, [0, 1] for most others."""
+    return (METRIC_WORDS[figure].lowest if figure in METRIC_WORDS else 0.0), 1.0
 
 
 def interval(
@@ -122,11 +123,6 @@ def with_interval(name: str, ends: np.ndarray, limits: tuple[float, float]) -> d
 def difference(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return ends of left - right, (.., 2, resamples): worst - best, best - worst."""
     return left - right[..., ::-1, :]
-
-
-def percentiles(draws: np.ndarray, level: float = _LEVEL) -> np.ndarray:
-    """Return central intervals over the last axis, (.., n) -> (.., 2), ignoring NaN."""
-    return np.stack([quantile(draws, q) for q in ((1 - level) / 2, (1 + level) / 2)], axis=-1)
 
 
 def quantile(draws: np.ndarray, q: float) -> np.ndarray:
@@ -250,17 +246,7 @@ def figures_of_shares(shares: np.ndarray) -> np.ndarray:
     The three are the ends of Acc, FalseAbs and AbsRec.
     """
     acc, false_abs, abs_rec = np.moveaxis(shares, -2, 0)
-    j = abs_rec - false_abs[::-1]
-    return np.stack([acc, abs_rec, false_abs, j, ends_of_pecs(acc, j)], axis=-2)
-
-
-def ends_of_pecs(acc: np.ndarray, j: np.ndarray) -> np.ndarray:
-    """Return the ends of PECS from those of Acc and of J, (2, ..) each.
-
-    J is not clipped at the lower end: at J = 0 the clipped J of every cell and run is above 0 by chance, and so would
-    be the lower end of their mean. `interval` clips the mean.
-    """
-    return np.stack([acc[0] * j[0], pecs_of(acc[1], j[1])])
+    return np.stack([metric.ends(acc, false_abs, abs_rec) for metric in METRIC_WORDS.values()], axis=-2)
 
 
 def run_sums(group: pd.DataFrame, resampling: Resampling, named: str) -> dict[tuple[str, int], np.ndarray]:
@@ -308,10 +294,7 @@ def means_over_runs(
     }
     complete_runs = [sums[d, run] for run in runs if all((d, run) in sums for d in DATASETS) for d in DATASETS]
     undefined = np.full((2, len(RESAMPLED_FIGURES), draws), np.nan)
-    return {
-        **means,
-        "overall": _mean([figures(own, True) for own in complete_runs]) if complete_runs else undefined,
-    }
+    return {**means, "overall": _mean([figures(own, True) for own in complete_runs]) if complete_runs else undefined}
 
 
 def _mean(values: Sequence[np.ndarray]) -> np.ndarray:

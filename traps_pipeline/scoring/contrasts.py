@@ -189,10 +189,7 @@ def regime_tests(verdicts: pd.DataFrame) -> pd.DataFrame:
 def _decisions(
     verdicts: pd.DataFrame, column: str
 ) -> dict[tuple[str, str, int], dict[str, dict[str, tuple[bool, Origin]]]]:
-    """Return decisions with origins by (dataset, model, run), regime and item.
-
-    Undecided items are left out.
-    """
+    """Return decisions with origins by (dataset, model, run), regime and item. Undecided items are left out."""
     decisions: dict[tuple[str, str, int], dict[str, dict[str, tuple[bool, Origin]]]] = {}
     columns = ["dataset", "model", "run", "regime", "item_id", column, "epoch", "panel"]
     rows = verdicts[columns].assign(is_decided=verdicts[column].notna()).itertuples(index=False, name=None)

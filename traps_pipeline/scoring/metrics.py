@@ -10,22 +10,19 @@ import numpy as np
 
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.protocol.datasets import sides_of
+from traps_pipeline.protocol.metric_words import COUNT_WORDS, METRIC_WORDS
 from traps_pipeline.scoring.score_rows import METRICS
 
 if TYPE_CHECKING:
     import pandas as pd
 
 CELL = ["dataset", "model", "regime", "run"]
-CELL_FIGURES = ["acc", "abs_rec", "false_abs", "j", "pecs", "naive"]
+CELL_FIGURES = [*METRIC_WORDS, "naive"]
 BOUNDS = ["pecs_low", "pecs_high"]
 # The outcomes in each count of items. An item is answered if its answer is judged, even if the judges are undecided.
-BROKEN_COUNTS = {f"n_{name}": (name,) for name in ("empty", "truncated", "unfinished", "degenerate", "unread")}
-OUTCOMES = {"n_answered": JUDGED, "n_refused": ("refused",), **BROKEN_COUNTS, "n_errors": ("error", "malformed")}
+OUTCOMES = {"n_answered": JUDGED} | {c.name: c.outcomes for c in COUNT_WORDS.values() if c.outcomes}
 COUNT_COLUMNS = [*OUTCOMES, "n_not_json"]
-REJECTION_COLUMNS = [
-    "n_rejects",
-    "n_rejects_answered",
-]  # counts of decisions that not every panel is asked for: null otherwise
+REJECTION_COLUMNS = [count.name for count in COUNT_WORDS.values() if count.is_of_decisions]
 # For each decision, how often it was yes (numerator) and how often it was made (denominator, `_of`); every figure is
 # computed from these six counts.
 COUNTS = ["correct", "correct_of", "false_abs", "false_abs_of", "abs_rec", "abs_rec_of"]
@@ -137,15 +134,8 @@ def _with_scopes(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]
 def _figures(sums: pd.DataFrame) -> dict[str, np.ndarray]:
     """Return CELL_FIGURES of every cell, (cells,) each."""
     acc, false_abs, abs_rec = (_share(sums, name) for name in ("correct", "false_abs", "abs_rec"))
-    j = abs_rec - false_abs
-    return {
-        "acc": acc,
-        "abs_rec": abs_rec,
-        "false_abs": false_abs,
-        "j": j,
-        "pecs": pecs_of(acc, j),
-        "naive": acc * abs_rec,
-    }
+    figures = {name: metric.formula(acc, false_abs, abs_rec) for name, metric in METRIC_WORDS.items()}
+    return figures | {"naive": acc * abs_rec}
 
 
 def _bounds(sums: pd.DataFrame) -> dict[str, np.ndarray]:

@@ -23,15 +23,14 @@ from traps_pipeline.protocol.datasets import (
     datasets_of_category,
     is_ill_posed,
 )
+from traps_pipeline.protocol.metric_words import METRIC_WORDS
 from traps_pipeline.scoring.bootstrap import (
     RESAMPLED_FIGURES,
     RESAMPLES,
     SEED,
     Resampling,
-    difference,
     draw_scenarios,
     ends_of_mean,
-    ends_of_pecs,
     figures_of,
     run_sums,
     with_interval,
@@ -142,7 +141,7 @@ def robust_ends(cells: Mapping[str, np.ndarray], scenarios: Mapping[str, int]) -
 
     acc, false_abs = (mean_over_kinds(figure, arms) for figure in ("acc", "false_abs"))
     abs_rec = mean_over_kinds("abs_rec", {arm: weight for arm, weight in arms.items() if arm == CROSSED})
-    ends = ends_of_pecs(acc, difference(abs_rec, false_abs))
+    ends = np.stack(METRIC_WORDS["pecs"].ends(acc, false_abs, abs_rec))
     return ends if arms else np.full_like(ends, np.nan)
 
 

@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 from typing import Annotated
 
+from traps_pipeline.protocol.metric_words import COUNT_WORDS, METRIC_WORDS
 from traps_pipeline.storage import columns as shared
-from traps_pipeline.storage.tables import ExtraColumns, Table, with_neighbours
+from traps_pipeline.storage.tables import EachOf, ExtraColumns, Table, with_neighbours
 
 # An entry is incomplete where fewer of its items than this have a text. With 1 % of the items missing, the worst and
 # the best PECS are at most 0.04 apart (if all are controls: 2 % of Acc and 2 % of FalseAbs), half the 95 % interval of
@@ -23,33 +24,28 @@ STD, CI, WILSON = (
     ExtraColumns(("_ci_low", "_ci_high"), Bootstrap),
     ExtraColumns(("_low", "_high"), shared.Wilson),
 )
+# Marks of a field that stands for each metric of the leaderboard, or each of its counts.
+EACH_METRIC = EachOf({metric.name: metric.meaning for metric in METRIC_WORDS.values()})
+EACH_COUNT, EACH_COUNT_OF_DECISIONS = (
+    EachOf({c.name: c.meaning for c in COUNT_WORDS.values() if c.is_of_decisions == of_decisions})
+    for of_decisions in (False, True)
+)
 Refused = Annotated[str | None, "why the two may not be compared"]
 DatasetOrOverall = Annotated[str, "one of four, or overall"]
 
 
 @dataclass(frozen=True, kw_only=True)
+@with_neighbours
 class MetricsRow(shared.CellRow):
     """A cell: one model, regime and run on one scope of a dataset."""
 
     scope: Annotated[str, "all, category:.., sub_scenario:.. or label:../.. (the control's answer in a sub-scenario)"]
     n_pairs: Annotated[int, "pairs in scope"]
     n_missing: Annotated[int, "items (of 2 n_pairs; in an arm of one side of n_pairs) without an answer or a majority"]
-    n_refused: Annotated[int, "items refused"]
-    n_empty: Annotated[int, "items answered with no text"]
-    n_truncated: Annotated[int, "items whose text was cut off before an answer"]
-    n_unfinished: Annotated[int, "items whose answer ended for a reason that no reader knows"]
-    n_degenerate: Annotated[int, "items answered with a text that says nothing: punctuation, repetition"]
-    n_unread: Annotated[int, "items answered with a text that the rule judges could not read"]
-    n_not_json: Annotated[int, "items of the JSON regime answered with a text that is not the object asked for"]
-    n_rejects: Annotated[int | None, "voids whose answer rejects the question's premise; null if judges are not asked"]
-    n_rejects_answered: Annotated[int | None, "of these, answers that do not abstain, such as a true zero"]
-    n_errors: Annotated[int, "items whose call failed"]
+    counts: Annotated[int, "", EACH_COUNT]
+    decisions: Annotated[int | None, "", EACH_COUNT_OF_DECISIONS]
     n_answered: Annotated[int, "items with an answer"]
-    acc: Annotated[float | None, "share of decided controls answered correctly"]
-    abs_rec: Annotated[float | None, "share of decided voids abstained on"]
-    false_abs: Annotated[float | None, "share of decided controls abstained on"]
-    j: Annotated[float | None, "abs_rec - false_abs"]
-    pecs: Annotated[float | None, "acc x max(0, j)"]
+    figures: Annotated[float | None, "", EACH_METRIC]
     pecs_low: Annotated[float, "pecs of all pairs if every missing decision were the worst for the model"]
     pecs_high: Annotated[float, "pecs of all pairs if every missing decision were the best for the model"]
     naive: Annotated[float | None, "acc x abs_rec"]
@@ -134,34 +130,20 @@ REGIME_TESTS = Table(
 
 @dataclass(frozen=True, kw_only=True)
 @with_neighbours
-class LeaderboardRow:
+class LeaderboardRow(shared.EntryRow):
     """A model under a regime on one dataset, or overall (equal-weight mean of four)."""
 
-    model: shared.Model
-    regime: shared.Regime
     dataset: DatasetOrOverall
     n_runs: Annotated[int, "runs averaged"]
     n_pairs: Annotated[int, "pairs per run"]
     n_missing: Annotated[int, "items without an answer or a majority, over runs"]
-    n_refused: Annotated[int, "items refused, over runs"]
-    n_empty: Annotated[int, "items answered with no text, over runs"]
-    n_truncated: Annotated[int, "items whose text was cut off before an answer, over runs"]
-    n_unfinished: Annotated[int, "items whose answer ended for a reason that no reader knows, over runs"]
-    n_degenerate: Annotated[int, "items answered with a text that says nothing, over runs"]
-    n_unread: Annotated[int, "items answered with a text that the rule judges could not read, over runs"]
-    n_not_json: Annotated[int, "items of the JSON regime whose text is not the object asked for, over runs"]
-    n_rejects: Annotated[int | None, "voids whose answer rejects the question's premise, over runs"]
-    n_rejects_answered: Annotated[int | None, "of these, answers that do not abstain, over runs"]
-    n_errors: Annotated[int, "items whose call failed, over runs"]
+    counts: Annotated[int, "over runs", EACH_COUNT]
+    decisions: Annotated[int | None, "over runs", EACH_COUNT_OF_DECISIONS]
     answered: Annotated[float, "share of items (2 a pair and run) with an answer"]
     incomplete: Annotated[bool, "whether answered is below 0.99; for overall, in any of its datasets"]
     broken: Annotated[float, "share of items whose text is empty, truncated, unfinished, degenerate or unread"]
     is_broken: Annotated[bool, "whether broken is above 0.01; for overall, in any of its datasets"]
-    acc: Annotated[Mean, STD, CI]
-    abs_rec: Annotated[Mean, STD, CI]
-    false_abs: Annotated[Mean, STD, CI]
-    j: Annotated[float | None, "mean over runs, not clipped", STD, CI]
-    pecs: Annotated[float | None, "mean over runs of the per-run PECS", STD, CI]
+    figures: Annotated[Mean, EACH_METRIC, STD, CI]
     rank: Annotated[
         int | None,
         "by PECS among the models of this regime, dataset and panel; equal values share a rank; null if of two panels",
@@ -178,9 +160,6 @@ class LeaderboardRow:
     pecs_high: Annotated[float, "mean over runs: pecs if every missing decision were the best for the model"]
     naive: Annotated[float | None, "acc x abs_rec, mean over runs"]
     pecs_by_family: Annotated[float | None, "pecs of shares that are means over families, mean over runs"]
-    panel: shared.Panels
-    epoch: shared.AnswerEpochs
-    benchmark_version: shared.BenchmarkVersion
 
 
 LEADERBOARD = Table("leaderboard", LeaderboardRow, partition_by=(), key=("model", "regime", "dataset"))
@@ -188,11 +167,9 @@ LEADERBOARD = Table("leaderboard", LeaderboardRow, partition_by=(), key=("model"
 
 @dataclass(frozen=True, kw_only=True)
 @with_neighbours
-class RobustRow:
+class RobustRow(shared.EntryRow):
     """A model under a regime, on well-posed pairs and arms (clip and question together)."""
 
-    model: shared.Model
-    regime: shared.Regime
     arms: Annotated[list[str], "arms (of datasets.ARMS) in the figures; entries with other arms are not compared"]
     n_runs: Annotated[int, "runs averaged: those that have all four datasets and these arms"]
     n_items: Annotated[int, "items per run, of occlusion, chaotic and the arms"]
@@ -213,9 +190,6 @@ class RobustRow:
         float | None, "share of the items of late_occluder and predictable_cut answered correctly, mean over runs"
     ]
     inference_abstains: Annotated[float | None, "share of these items abstained on, mean over runs"]
-    panel: shared.Panels
-    epoch: shared.AnswerEpochs
-    benchmark_version: shared.BenchmarkVersion
     refused: Annotated[str | None, "why no figure joins pairs and arms; then conjunction and robust are null"]
 
 
@@ -224,11 +198,9 @@ ROBUST = Table("robust", RobustRow, partition_by=(), key=("model", "regime"))
 
 @dataclass(frozen=True, kw_only=True)
 @with_neighbours
-class HypothesisRow:
+class HypothesisRow(shared.EntryRow):
     """A model under a regime at one dose (docs/hypotheses.md), apart from PECS."""
 
-    model: shared.Model
-    regime: shared.Regime
     hypothesis: Annotated[str, "answer space, occluder, schema, frames or cut"]
     dose: Annotated[str, "what is changed, in words; the first dose of a hypothesis is the reference"]
     counts_as: Annotated[str, "control and void, control, void, or why it is neither"]
@@ -250,9 +222,6 @@ class HypothesisRow:
     rule_value: Annotated[float | None, "its value"]
     rule_changing: Annotated[str | None, "of these rules that with the largest change, either way"]
     rule_change: Annotated[float | None, "its change"]
-    panel: shared.Panels
-    epoch: shared.AnswerEpochs
-    benchmark_version: shared.BenchmarkVersion
     refused: Annotated[str | None, "why the dose is not compared with its reference"]
 
 
@@ -261,7 +230,7 @@ HYPOTHESES = Table("hypotheses", HypothesisRow, partition_by=(), key=("model", "
 
 @dataclass(frozen=True, kw_only=True)
 @with_neighbours
-class GradedRow:
+class GradedRow(shared.EntryRow):
     """A model under a regime on graded cuts, all of them or one range.
 
     See docs/scoring.md, "Graded cuts".
@@ -269,8 +238,6 @@ class GradedRow:
     All figures are expectations under the posterior, the distribution over answers that the futures of a cut have.
     """
 
-    model: shared.Model
-    regime: shared.Regime
     scope: Annotated[str, "all, or the range of the commonest answer's probability, such as 0.6 to 0.75"]
     n_runs: Annotated[int, "runs averaged"]
     n_items: Annotated[int, "items with a decision in some run: what all figures are of"]
@@ -294,9 +261,6 @@ class GradedRow:
     points_ideal: Annotated[float, "what an ideal observer earns"]
     points_best: Annotated[float, "what the commonest answer earns if it is always given"]
     points_prior: Annotated[float, "what the sub-scenario's commonest answer earns if it is always given"]
-    panel: shared.Panels
-    epoch: shared.AnswerEpochs
-    benchmark_version: shared.BenchmarkVersion
 
 
 GRADED_CUTS = Table("graded", GradedRow, partition_by=(), key=("model", "regime", "scope"))
@@ -317,14 +281,8 @@ class LeaveOneOutRow:
     pecs: Annotated[float | None, "mean over runs of the per-run PECS of the two judges"]
     pecs_panel: Annotated[float | None, "mean over runs of the per-run PECS of the three judges"]
     difference: Annotated[float | None, "pecs - pecs_panel"]
-    pecs_low: Annotated[
-        float,
-        "mean over runs: pecs of the two if every missing decision were the worst for the model",
-    ]
-    pecs_high: Annotated[
-        float,
-        "mean over runs: pecs of the two if every missing decision were the best for the model",
-    ]
+    pecs_low: Annotated[float, "mean over runs: pecs of the two if every missing decision were the worst for the model"]
+    pecs_high: Annotated[float, "mean over runs: pecs of the two if every missing decision were the best for the model"]
     epoch: shared.AnswerEpochs
     benchmark_version: shared.BenchmarkVersion
 

@@ -10,10 +10,10 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.protocol.datasets import DATASETS
-from traps_pipeline.scoring.bootstrap import ENTRY, RESAMPLED_FIGURES
+from traps_pipeline.protocol.metric_words import BROKEN_COUNTS, METRIC_WORDS
+from traps_pipeline.scoring.bootstrap import ENTRY, limits_of
 from traps_pipeline.scoring.metrics import (
     BOUNDS,
-    BROKEN_COUNTS,
     CELL,
     CELL_FIGURES,
     COUNT_COLUMNS,
@@ -144,7 +144,8 @@ def _ranks(board: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:
 def wrong_intervals(board: pd.DataFrame) -> int:
     """Return how many intervals are out of order or outside their score's limits."""
     n_wrong = 0
-    for figure in RESAMPLED_FIGURES:
+    for figure in METRIC_WORDS:
         low, high = (board[f"{figure}_ci_{end}"].to_numpy(float) for end in ("low", "high"))
-        n_wrong += int(((low < (-1 if figure == "j" else 0)) | (low > high) | (high > 1)).sum())
+        lowest, highest = limits_of(figure)
+        n_wrong += int(((low < lowest) | (low > high) | (high > highest)).sum())
     return n_wrong

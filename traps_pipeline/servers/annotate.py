@@ -100,29 +100,24 @@ class Annotation:
         It is the unit that waits for a label, else the first of their queue. None if all are labelled, or if the rest
         belong to scenarios that they met in this sitting.
         """
-        sample, shown_units = self.samples[task], self.store.shown(who)
-        waiting = [
-            shown_unit.unit
-            for shown_unit in shown_units
-            if shown_unit.task == task and shown_unit.waits and shown_unit.unit in sample.index
-        ]
-        sitting_start = time.time() - 3600 * annotation_protocol().sitting_hours
-        met = {
-            shown_unit.scenario_id for shown_unit in shown_units if shown_unit.at > sitting_start
-        }  # in any task, since answers reveal clips
-        finished = {shown_unit.unit for shown_unit in shown_units if shown_unit.task == task} | {
-            *self.store.labelled(who, task)
-        }
-        blind = task != "answerability"
-        open_units = (
-            unit
-            for unit in queue_of(who, sample)
-            if unit not in finished and (blind or sample.loc[unit, "scenario_id"] not in met)
-        )
-        unit = waiting[-1] if waiting else next(open_units, None)
-        if unit is not None:
-            self.store.show(who, task, unit, str(sample.loc[unit, "scenario_id"]))
+        while (unit := self._open_unit(who, task)) is not None:
+            if self.store.show(who, task, unit, str(self.samples[task].loc[unit, "scenario_id"])):
+                break  # otherwise it was labelled in another window since the queue was read
         return unit
+
+    def _open_unit(self, who: str, task: TaskName) -> str | None:
+        sample, shown_units = self.samples[task], self.store.shown(who)
+        of_task = [shown_unit for shown_unit in shown_units if shown_unit.task == task]
+        waiting = [shown_unit.unit for shown_unit in of_task if shown_unit.waits and shown_unit.unit in sample.index]
+        if waiting:
+            return waiting[-1]
+        finished = {shown_unit.unit for shown_unit in of_task} | {*self.store.labelled(who, task)}
+        met = set[str]()  # scenarios whose clips the person should not judge now
+        if task == "answerability":  # a clip or an answer of any task reveals the scenario
+            sitting_start = time.time() - 3600 * annotation_protocol().sitting_hours
+            met = {shown_unit.scenario_id for shown_unit in shown_units if shown_unit.at > sitting_start}
+        open_units = (unit for unit in queue_of(who, sample) if unit not in finished)
+        return next((unit for unit in open_units if sample.loc[unit, "scenario_id"] not in met), None)
 
     def find(self, who: str, handle: str) -> tuple[TaskName, str]:
         """Return a person's task and unit behind a handle. Raises NotFound."""
@@ -153,7 +148,8 @@ class Annotation:
         labelled_units = [unit for unit in self.store.labelled(who, task) if unit in self.samples[task].index]
         if not labelled_units:
             raise NotFound("you have labelled nothing here yet")
-        self.store.show(who, task, labelled_units[-1], str(self.samples[task].loc[labelled_units[-1], "scenario_id"]))
+        unit = labelled_units[-1]
+        self.store.show(who, task, unit, str(self.samples[task].loc[unit, "scenario_id"]), again=True)
 
     def clip(self, who: str, handle: str) -> Path:
         """Return the clip behind a handle. Raises NotFound."""

@@ -5,16 +5,15 @@ from __future__ import annotations
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 
-import numpy as np
-
 from traps_pipeline.base.wording import count_noun
+from traps_pipeline.scenes.draw.likeness import HASH_BITS, NEAR_BITS, perceptual_hash
 from traps_pipeline.video.encode import DamagedClip, decode
 
 PLACES = (0.0, 0.5, 1.0)  # positions of the compared frames, as shares of the clip
-SIDE = 16  # a frame gives SIDE x SIDE bits: whether a pixel of the reduced frame is brighter than the one on its left
-ALIKE_BELOW = 0.1  # share of differing bits below which two scenarios are near duplicates
+ALIKE_BELOW = NEAR_BITS / HASH_BITS  # share of differing bits below which two scenarios are near duplicates
 
 
 @dataclass(frozen=True)
@@ -25,35 +24,22 @@ class Neighbour:
     distance: float
 
 
-def fingerprint(clip: Path) -> np.ndarray:
-    """Return first, middle and last frames' difference hash. Raises DamagedClip.
-
-    Shape (3 * SIDE * SIDE,), bool.
-    """
-    import cv2
-
+def fingerprint(clip: Path) -> int:
+    """Return the hashes of the first, middle and last frame, one behind the other. Raises DamagedClip."""
     frames, _ = decode(clip)
-    bits = []
-    for place in PLACES:
-        grey = cv2.cvtColor(frames[round(place * (len(frames) - 1))], cv2.COLOR_RGB2GRAY)
-        thumbnail = cv2.resize(grey, (SIDE + 1, SIDE), interpolation=cv2.INTER_AREA)
-        bits.append(thumbnail[:, 1:] > thumbnail[:, :-1])
-    return np.concatenate([part.ravel() for part in bits])
+    hashes = (perceptual_hash(frames[round(place * (len(frames) - 1))]) for place in PLACES)
+    return reduce(lambda bits, one: bits << HASH_BITS | one, hashes)
 
 
-def neighbours(prints: Mapping[str, np.ndarray], families: Mapping[str, str]) -> dict[str, Neighbour]:
+def neighbours(prints: Mapping[str, int], families: Mapping[str, str]) -> dict[str, Neighbour]:
     """Return the nearest scenario of the same family, for each scenario that has one."""
     nearest_of = {}
-    for family in sorted(set(families.values())):
-        names = sorted(name for name in prints if families[name] == family)
-        if len(names) < 2:
-            continue
-        table = np.array([prints[name] for name in names])
-        for k, name in enumerate(names):
-            distances = (table != table[k]).mean(axis=1)
-            distances[k] = np.inf
-            nearest = int(np.argmin(distances))
-            nearest_of[name] = Neighbour(names[nearest], float(distances[nearest]))
+    for name in sorted(prints):
+        others = [other for other in sorted(prints) if families[other] == families[name] and other != name]
+        distances = [(prints[name] ^ prints[other]).bit_count() / (len(PLACES) * HASH_BITS) for other in others]
+        if others:
+            nearest = min(distances)
+            nearest_of[name] = Neighbour(others[distances.index(nearest)], nearest)
     return nearest_of
 
 
@@ -65,7 +51,7 @@ class Comparison:
 
     def __init__(self, clips: Mapping[str, Path], families: Mapping[str, str]) -> None:
         self._clips, self._families = clips, families
-        self._prints: dict[str, np.ndarray] = {}
+        self._prints: dict[str, int] = {}
         self._found: dict[str, Neighbour] | None = None
         self._lock, self._has_begun = threading.Lock(), False
 

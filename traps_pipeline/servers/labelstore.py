@@ -105,13 +105,21 @@ class LabelStore:
             for task, unit, scenario, shown_at, is_waiting in rows
         ]
 
-    def show(self, who: str, task: str, unit: str, scenario_id: str) -> None:
-        """Record that a unit is shown to a person now and waits for a label."""
+    def show(self, who: str, task: str, unit: str, scenario_id: str, *, again: bool = False) -> bool:
+        """Record that a unit is shown to a person now and waits for a label.
+
+        Return False, and record nothing, if the person labelled it meanwhile in another window and it does not wait for
+        another label. again: show it all the same.
+        """
         with self._database() as database:
-            database.execute(
-                "INSERT INTO shown VALUES (?, ?, ?, ?, ?, 1) ON CONFLICT DO UPDATE SET at = excluded.at, waits = 1",
-                (who, task, unit, scenario_id, time.time()),
+            shown = database.execute(
+                "INSERT INTO shown SELECT :who, :task, :unit, :scenario_id, :at, 1 WHERE :again"
+                " OR NOT EXISTS (SELECT 1 FROM labels WHERE who = :who AND task = :task AND unit = :unit)"
+                " OR EXISTS (SELECT 1 FROM shown WHERE who = :who AND task = :task AND unit = :unit AND waits)"
+                " ON CONFLICT DO UPDATE SET at = excluded.at, waits = 1",
+                {"who": who, "task": task, "unit": unit, "scenario_id": scenario_id, "at": time.time(), "again": again},
             )
+            return shown.rowcount == 1
 
     def labelled(self, who: str, task: str) -> list[str]:
         """Return the units that a person has labelled, the latest last."""

@@ -122,7 +122,7 @@ class Review:
         return frozenset(id_ for id_, correction in last.items() if is_reviewed([correction]))
 
     def queue(self, name: QueueName) -> list[str]:
-        """See `queue.queue`."""
+        """Return the scenarios of a queue (`queue.queue`)."""
         distances = {id_: neighbour.distance for id_, neighbour in self.comparison.found.items()}
         return queue(name, list(self.specs), self.reviewed(), self.flags, distances)
 

@@ -36,8 +36,7 @@ AnswerEpochs = Annotated[str, "campaigns of the answers, joined by +"]
 AskedAt = Annotated[datetime, "when it was asked"]
 Wilson = Annotated[float | None, "95 % Wilson interval"]
 BenchmarkVersion = Annotated[
-    str,
-    "of the part of the benchmark that this row is from: release, or release+digest once corrected",
+    str, "of the part of the benchmark that this row is from: release, or release+digest once corrected"
 ]
 
 
@@ -49,3 +48,14 @@ class CellRow:
     model: Model
     regime: Regime
     run: Run
+
+
+@dataclass(frozen=True, kw_only=True)
+class EntryRow:
+    """The columns of a row of scores: a model under a regime, and the verdicts that they are from."""
+
+    model: Model
+    regime: Regime
+    panel: Panels
+    epoch: AnswerEpochs
+    benchmark_version: BenchmarkVersion

@@ -34,10 +34,7 @@ class SeveralHosts(Protocol):
         ...
 
     def open_ledger(self, variable: str, study: str) -> Database:
-        """Return this process's ledger in the database at a variable's address.
-
-        Raises TrapsError.
-        """
+        """Return this process's ledger in the database at a variable's address. Raises TrapsError."""
         ...
 
     def dagster_yaml(self, workspace: Any) -> dict[str, Any]:

@@ -17,6 +17,8 @@ from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
 
+from typing_extensions import override
+
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import remedy, try_lock, write_bytes
@@ -131,28 +133,30 @@ class FolderStore(Store):
     These need other leases than files: on some file systems, locks of files are local to a machine.
     """
 
+    @override
     def here(self, path: Path) -> Path:
-        """See `Store`."""
         return path
 
+    @override
     def bring(self, paths: Iterable[Path]) -> None:
-        """See `Store`."""
+        pass
 
+    @override
     def keep(self, paths: Iterable[Path]) -> None:
-        """See `Store`."""
+        pass
 
+    @override
     def write(self, files: Mapping[Path, bytes], *, note: str | None = None, durable: bool = False) -> None:
-        """See `Store`."""
         for path, content in files.items():
             write_bytes(path, content, durable=durable)
 
+    @override
     def remove(self, paths: Iterable[Path]) -> None:
-        """See `Store`."""
         for path in paths:
             path.unlink(missing_ok=True)
 
+    @override
     def sizes(self, paths: Iterable[Path]) -> dict[Path, int]:
-        """See `Store`."""
         size_of: dict[Path, int] = {}
         for path in paths:
             try:
@@ -161,16 +165,16 @@ class FolderStore(Store):
                 continue
         return size_of
 
+    @override
     def there(self, paths: Iterable[Path]) -> set[Path]:
-        """See `Store`."""
         return {path for path in paths if path.is_file()}
 
+    @override
     def digests(self, paths: Iterable[Path]) -> dict[Path, str]:
-        """See `Store`."""
         return {path: file_digest(path) for path in self.there(paths)}
 
+    @override
     def below(self, folder: Path, pattern: str = "**/*") -> list[Path]:
-        """See `Store`."""
         if "**" in pattern:
             files = (path for path in folder.glob(pattern) if path.is_file())
             return sorted(path for path in files if not is_hidden(path.relative_to(folder)))
@@ -179,16 +183,17 @@ class FolderStore(Store):
             found = [(*above, name) for above in found for name in _names(above, part, is_file=depth == len(parts))]
         return [Path(*path) for path in sorted(found)]
 
+    @override
     def note(self, path: Path) -> str | None:
-        """See `Store`."""
         return None
 
+    @override
     def changed_ns(self, path: Path) -> int:
-        """See `Store`."""
         return path.stat().st_mtime_ns if path.exists() else 0
 
+    @override
     def look(self) -> None:
-        """See `Store`."""
+        pass
 
 
 def _file_lease(folder: Path, name: str) -> Lease | None:

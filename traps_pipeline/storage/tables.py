@@ -11,15 +11,15 @@
     VIDEOS = Table("videos", VideoRow, partition_by=(), key=("scenario_id", "side"))
 
 Each annotation gives a column's type and, in words, its meaning and unit; `| None` lets values be missing. The columns
-keep the order of the fields. Columns that stand beside a figure, such as the bounds of its interval, are declared by a
-mark (`ExtraColumns`) of the figure under the decorator `with_neighbours`. Each package declares its tables in a module
-`..._rows`; columns that several packages share are in `storage.columns`. The Arrow schema is made from the
-dataclass, and every file is checked against it on writing and on reading.
+keep the order of the fields. Columns that stand beside a figure, such as the bounds of its interval, and columns of a
+list, such as the metrics, are declared by a mark (`ExtraColumns`, `EachOf`) under the decorator `with_neighbours`. Each
+package declares its tables in a module `..._rows`; columns that several packages share are in `storage.columns`. The
+Arrow schema is made from the dataclass, and every file is checked against it on writing and on reading.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 from datetime import datetime
 from functools import cached_property
@@ -54,22 +54,35 @@ class StoredColumn:
 
 @dataclass(frozen=True)
 class ExtraColumns:
-    """A mark of a column that has further columns beside it.
-
-    They have these suffixes, this type and this meaning.
-    """
+    """A mark of a column that has further columns beside it. They have these suffixes, this type and this meaning."""
 
     suffixes: tuple[str, ...]
     column: Any
 
 
+@dataclass(frozen=True)
+class EachOf:
+    """A mark of a field that stands for several columns, of its type and with its other marks.
+
+    `columns` are their names and meanings; the field's own text comes after each meaning.
+    """
+
+    columns: Mapping[str, str]
+
+
 def with_neighbours(row_type: type[Row]) -> type[Row]:
-    """Declare the columns beside those marked `Beside`; place it below `@dataclass`."""
+    """Declare the columns that the marks `ExtraColumns` and `EachOf` stand for; place it below `@dataclass`."""
     annotations = dict[str, Any]()
     for name, annotation in row_type.__annotations__.items():
-        annotations[name] = annotation
-        for mark in get_args(annotation)[2:]:
-            annotations |= {f"{name}{suffix}": mark.column for suffix in mark.suffixes}
+        value_type, doc, *marks = get_args(annotation)
+        columns = {name: doc}
+        for mark in marks:
+            if isinstance(mark, EachOf):
+                columns = {key: "; ".join(filter(None, (meaning, doc))) for key, meaning in mark.columns.items()}
+        extra_columns = [mark for mark in marks if isinstance(mark, ExtraColumns)]
+        for column, meaning in columns.items():
+            annotations[column] = Annotated[value_type, meaning]
+            annotations |= {f"{column}{suffix}": mark.column for mark in extra_columns for suffix in mark.suffixes}
     row_type.__annotations__ = annotations
     return row_type
 

@@ -27,8 +27,7 @@ class ResponseRow(shared.CellRow):
     completion_tokens: shared.Tokens
     reasoning_tokens: shared.Tokens
     cost_usd: Annotated[
-        float | None,
-        "dollars, with the worst case of attempts that may be billed; null where the price is unknown",
+        float | None, "dollars, with the worst case of attempts that may be billed; null where the price is unknown"
     ]
     latency_s: Annotated[float, "seconds of the last attempt"]
     attempts: Annotated[int, "calls made for this row"]

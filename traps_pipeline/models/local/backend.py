@@ -34,10 +34,7 @@ def worker(device: str) -> ThreadPoolExecutor:
 
 @dataclass(eq=False)
 class _Batch:
-    """Requests answered together.
-
-    abandoned: no caller waits for any of them any more.
-    """
+    """Requests answered together. abandoned: no caller waits for any of them any more."""
 
     requests: list[Request] = field(default_factory=list)
     answers: list[asyncio.Future[Outcome]] = field(default_factory=list)

@@ -68,11 +68,7 @@ def decode(
     first = _FirstToken()
     processors = [first, SeededNucleus(sampling)] if sampling else [first]
     same_up_to = 0 if steering is None else steering.layer
-    with (
-        torch.inference_mode(),
-        sharing_prompts(model, prompts, same_up_to, pad),
-        steering_context(steering, model),
-    ):
+    with torch.inference_mode(), sharing_prompts(model, prompts, same_up_to, pad), steering_context(steering, model):
         sequences = model.network.generate(
             **inputs,
             max_new_tokens=max_new_tokens,

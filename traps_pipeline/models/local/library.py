@@ -47,9 +47,7 @@ def _declare_torchvision_operators() -> None:
     except OSError:
         operator_library = torch.library.Library("torchvision", "DEF")
         operator_library.define("nms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
-        operator_library.define(
-            "qnms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor",
-        )
+        operator_library.define("qnms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
         _KEPT.append(operator_library)  # they are removed with the object
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field, model_validator
+from typing_extensions import override
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
@@ -121,8 +122,8 @@ class JudgeEntry(Entry):
         is_rule = isinstance(data, dict) and data.get("backend") == RULE and "params" not in data
         return data | {"params": {"rules": RULES_VERSION}} if is_rule else data
 
+    @override
     def protocol(self) -> Protocol:
-        """See `Entry.protocol`."""
         return JUDGE_PROTOCOL
 
 

@@ -37,10 +37,7 @@ def confabulation_protocol(workspace: Workspace, _: None) -> str:
 
 @_source(kinds=["parquet"])
 def judge_validation(workspace: Workspace, _: None) -> str:
-    """Return the version of the judge's comparison with two annotators.
-
-    `traps people validate` writes it.
-    """
+    """Return the version of the judge's comparison with two annotators. `traps people validate` writes it."""
     state = workspace.tables.state(JUDGE_VALIDATION, {})
     return state.version if state else "not run"
 

@@ -198,10 +198,7 @@ def cosines(workspace: Workspace, _: None) -> list[CosineRow]:
     side_by_side=True,
 )
 def steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
-    """Yield answers of a model that is steered along every path into a dataset.
-
-    Answers in the ledger are reused.
-    """
+    """Yield answers of a model that is steered along every path into a dataset. Answers in the ledger are reused."""
     from traps_pipeline.mechanism.stages import examined_model, saved_directions
     from traps_pipeline.mechanism.steering import collect_steered
 

@@ -12,12 +12,7 @@ from traps_pipeline.models.reading.interpret import read_answer
 from traps_pipeline.models.reading.judged_answers import UNREAD, is_correct
 from traps_pipeline.models.request import JUDGED
 
-DATASETS = (
-    "chaotic",
-    "chaotic_ill_posed",
-    "occlusion",
-    "occlusion_ill_posed",
-)  # means are summed in this order
+DATASETS = ("chaotic", "chaotic_ill_posed", "occlusion", "occlusion_ill_posed")  # means are summed in this order
 RUN_FIGURES = ("pecs", "acc", "abs_rec", "false_abs", "j")
 
 

@@ -40,10 +40,7 @@ _VOTE_TEXTS = ("extracted_value", "confidence", "rationale")
 
 @dataclass(frozen=True)
 class Shard:
-    """The texts and votes of consecutive items.
-
-    Its rows are [first, first + answers) of `decisions`.
-    """
+    """The texts and votes of consecutive items. Its rows are [first, first + answers) of `decisions`."""
 
     first: int
     texts: pa.Table

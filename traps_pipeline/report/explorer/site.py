@@ -28,6 +28,7 @@ from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.people.human_score_rows import HUMAN_ROW, PANEL_ERRORS
 from traps_pipeline.protocol.datasets import DATASETS, UNPAIRED, sides_of
+from traps_pipeline.protocol.metric_words import METRIC_WORDS
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.report.explorer.answer_shards import StudyAnswers, study_answers
 from traps_pipeline.report.explorer.scenario_words import certificate_phrases, closes_frame, intervention
@@ -35,9 +36,9 @@ from traps_pipeline.report.leaderboard_page import legend, provenance
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.tables.human_tables import people_notes
 from traps_pipeline.report.tables.table_columns import entries
-from traps_pipeline.report.terms import ARM_TITLES, MARKS, TITLES
+from traps_pipeline.report.terms import ARM_TITLES, MARKS, ROBUST_FIGURES, TITLES
 from traps_pipeline.report.writing import environment
-from traps_pipeline.scoring.analyses import REASONING_PAIRS
+from traps_pipeline.scoring.analyses import REASONING_PAIRS, SHARES
 from traps_pipeline.scoring.score_rows import CONTRASTS, LEADERBOARD, REGIME_TESTS, ROBUST
 from traps_pipeline.storage.benchmark_tables import SCENE_SPECS, VIDEOS
 from traps_pipeline.storage.tables import records
@@ -60,7 +61,6 @@ _ITEM_COLUMNS = (
     *("control_answer", "answer_type", "clip"),
 )
 _PAGE_BYTES = 1 << 24  # one page per column of a shard, so that repeated values are stored once
-_PUBLISHED = ("acc", "abs_rec", "false_abs", "pecs")
 
 
 @dataclass
@@ -191,6 +191,7 @@ def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_c
     human_row = workspace.tables.read_all(HUMAN_ROW)
     release, registry = load_release(), load_models()
     published = entries(PublishedResults())
+    printed_by_paper = [name for name in METRIC_WORDS if name in SHARES]
     evaluations = [[e.model, e.regime, e.run] for e in answers.evaluations]
     models = sorted({*(e.model for e in answers.evaluations), *board["model"], *published["model"]})
     unknown = "not in the registry"
@@ -210,11 +211,16 @@ def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_c
         "epochs": [*answers.epochs],
         "shards": shards,
         "n_votes": len(answers.votes),
+        "figures": [
+            {"field": m.name, "title": m.heading, "unit": m.unit, "in_paper": m.name in printed_by_paper}
+            for m in METRIC_WORDS.values()
+        ],
+        "robust_figures": [{"field": name, "title": title, "unit": unit} for name, title, unit, _ in ROBUST_FIGURES],
         "leaderboard": records(board),
         "robust": records(robust),
         "people": records(human_row),
         "said": people_notes(human_row, workspace.tables.read_all(PANEL_ERRORS)),
-        "published": records(published.loc[:, ["model", "regime", "dataset", "epoch", *_PUBLISHED]]),
+        "published": records(published.loc[:, ["model", "regime", "dataset", "epoch", *printed_by_paper]]),
         "legend": legend(board, robust) if len(board) else {},
         "marks": MARKS,
         "reasoning_pairs": [*map(list, REASONING_PAIRS)],

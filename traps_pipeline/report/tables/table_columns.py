@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from traps_pipeline.models.registry.entries import load_models
+from traps_pipeline.protocol import metric_words
 from traps_pipeline.protocol.datasets import DATASETS, SHORT
 from traps_pipeline.protocol.metric_words import METRIC_WORDS
 from traps_pipeline.protocol.regimes import REGIMES
@@ -27,13 +28,13 @@ N, MISSING, RUNS = (
     Column("n_runs", "Runs", "count"),
 )
 EPOCH = Column("epoch", "Epoch")
-SHARES = tuple(
-    Column(metric.name, metric.heading, "percent", spread=f"{metric.name}_std")
+_FIGURES = {
+    metric.name: Column(metric.name, metric.heading, metric.unit, spread=f"{metric.name}_std")
     for metric in METRIC_WORDS.values()
-    if metric.is_share
-)
-J = Column("j", "J", "fraction", spread="j_std")
-PECS = Column("pecs", "PECS", "fraction", spread="pecs_std", mark="mark", look="strong")
+}
+SHARES = tuple(_FIGURES[name] for name in metric_words.SHARES)
+J, PECS = _FIGURES["j"], replace(_FIGURES["pecs"], mark="mark", look="strong")
+OTHER_FIGURES = tuple(column for name, column in _FIGURES.items() if name != "pecs" and column not in SHARES)
 COUNTS = (N, RUNS, MISSING)
 COUNTED = ("n_pairs", "n_runs", "n_missing", "incomplete")
 
@@ -69,10 +70,7 @@ def combined_counts(sides: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def with_counts(rows: pd.DataFrame, entries: pd.DataFrame, sides: Sequence[Sequence[str]]) -> pd.DataFrame:
-    """Return rows that compare entries, `marked` and with COUNTED.
-
-    sides: their columns of model, regime, dataset.
-    """
+    """Return rows that compare entries, `marked` and with COUNTED. sides: their columns of model, regime, dataset."""
     import pandas as pd
 
     entry_of = {(e["model"], e["regime"], e["dataset"]): e for e in entries.to_dict("records")}

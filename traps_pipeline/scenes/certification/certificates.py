@@ -2,8 +2,8 @@
 
 A certificate is one entry of `CERTIFICATES`. From there it is picked up by `resolve` (a draw that loses one is
 rejected, and what it measures goes into the record), by `certify` (all are measured again from the record and its two
-trajectories), by the asset checks (the stored evidence is judged again), and by the table in `docs/scenes.md`, which
-`python -m tests.scenes.certificate_table` writes. All thresholds are here.
+trajectories), by the asset checks (the stored evidence is judged again), and by the table of the documentation's site.
+All thresholds are here.
 """
 
 from __future__ import annotations

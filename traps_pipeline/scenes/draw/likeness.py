@@ -10,7 +10,8 @@ import numpy as np
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 from traps_pipeline.scenes.worlds.world import World
 
-NEAR_BITS = 8  # of 64: two pictures whose hashes differ in so few look alike
+HASH_BITS = 64
+NEAR_BITS = 8  # two pictures whose hashes differ in so few look alike
 NEAR_SHARE = 0.1  # of a family's records may have another one that looks like them
 
 
@@ -20,7 +21,7 @@ def perceptual_hash(frame: np.ndarray) -> int:
 
     grey = cv2.resize(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), (32, 32), interpolation=cv2.INTER_AREA)
     low = cv2.dct(grey.astype(np.float32))[:8, :8].ravel()
-    return int("".join("1" if value > np.median(low) else "0" for value in low), 2)
+    return int("".join("1" if is_above else "0" for is_above in low > np.median(low)), 2)
 
 
 def frame_hash(spec: SceneSpec, qpos: np.ndarray) -> int:

@@ -132,9 +132,9 @@ def sample_family(
     another version of its file.
 
     look: parts of the look (`look.PARTS`) that vary besides those that always do in the family. difficulty: of every
-    scene. report: gets a line for each record and for the first rejection of each kind. Raises RuntimeError with the
-    tally of rejections when 40 draws a scenario are not enough, TrapsError for a family that is unfit or cannot be
-    drawn with the difficulty.
+    scene. report: gets a line for each record and for the first rejection of each kind. Raises TrapsError for a family
+    that is unfit or cannot be drawn with the difficulty and, with the tally of rejections, when 40 draws a scenario are
+    not enough.
     """
     family, records = fit_to_sample(name), Records(released, name)
     require_difficulty([name], difficulty)
@@ -191,7 +191,10 @@ def sample_family(
     finally:
         results.close()  # type: ignore[attr-defined]
     reasons = ", ".join(f"{n} x {reason}" for reason, n in tally.rejected.most_common())
-    raise RuntimeError(f"{name}: {answers.total()} of {count} after {tally.draws} draws; rejected: {reasons}")
+    raise TrapsError(
+        f"{name}: {answers.total()} of {count} after {tally.draws} draws; widen the ranges behind what was rejected: "
+        f"{reasons}"
+    )
 
 
 def rejection_kind(reason: str) -> str:
@@ -252,7 +255,7 @@ def take_out(released: Path, reasons: Mapping[str, str]) -> None:
     tallies = load_tallies(released)
     for family in sorted({scenario_id.rpartition("-")[0] for scenario_id in reasons}):
         lines = released / f"{family}.jsonl"
-        records = {r["scenario_id"]: line for line in lines.read_text("utf-8").splitlines() if (r := json.loads(line))}
+        records = {json.loads(line)["scenario_id"]: line for line in lines.read_text("utf-8").splitlines()}
         for scenario_id in [id_ for id_ in reasons if id_.rpartition("-")[0] == family]:
             del records[scenario_id]
             tallies[family].rejected[reasons[scenario_id]] += 1

@@ -16,16 +16,7 @@ from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import AHEAD, past_far_edge
 from traps_pipeline.scenes.parts.questions import colour_from, comes_from, yes_no
 from traps_pipeline.scenes.parts.readings import Reading, read_passage
-from traps_pipeline.scenes.parts.vary import (
-    Drawn,
-    apart,
-    between,
-    drawn_by,
-    hidden,
-    in_front,
-    one_of,
-    shuffled,
-)
+from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, hidden, in_front, one_of, shuffled
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, uniform
 
 DECK_M = 0.04

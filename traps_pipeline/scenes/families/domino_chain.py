@@ -118,9 +118,7 @@ FAMILY = scene_family(
     asides=[
         comes_from("From which side does the ball roll towards the first domino, left or right?"),
         colour_of(
-            "first",
-            "What colour is the domino that the ball strikes first: {choices}?",
-            ("first", "row", "ball"),
+            "first", "What colour is the domino that the ball strikes first: {choices}?", ("first", "row", "ball")
         ),
         colour_of("ball", "What colour is the ball that rolls into the dominoes: {choices}?", ("first", "row", "ball")),
     ],

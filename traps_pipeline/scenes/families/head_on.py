@@ -86,10 +86,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _roughness(p: Params) -> float:
-    """Return rolling friction (m) that leaves a ball its share of its speed.
-
-    A solid ball slows at 5 g mu / 7 r.
-    """
+    """Return rolling friction (m) that leaves a ball its share of its speed. A solid ball slows at 5 g mu / 7 r."""
     drop = (p.ramp_m - sum(p.starts_m) / 2) * np.tan(np.radians(p.slope_deg)) * 10 / 7
     return float(7 / 5 * p.radius_m * drop * (1 - p.slowed**2) / (2 * BOARD_M))
 

@@ -127,9 +127,7 @@ FAMILY = scene_family(
     ),
     asides=[
         colour_of(
-            "ball",
-            "What colour is the ball that rolls along the lane: {choices}?",
-            ("ball", "gate", "counterweight"),
+            "ball", "What colour is the ball that rolls along the lane: {choices}?", ("ball", "gate", "counterweight")
         ),
         comes_from("From which side does the ball roll in, left or right?"),
     ],

@@ -71,15 +71,7 @@ def build(p: Params, physics: Physics) -> Scene:
     course.block(
         "cube", (cube_at - half_cube, cube_at + half_cube), (-half_cube, half_cube), (0, p.cube_m), p.cube_colour
     )
-    rope(
-        course,
-        "rope",
-        (0, 0, p.release_m),
-        p.length_m,
-        p.radius_m,
-        p.rope_colour,
-        thrown=(p.drift_m_s, p.toss_m_s),
-    )
+    rope(course, "rope", (0, 0, p.release_m), p.length_m, p.radius_m, p.rope_colour, thrown=(p.drift_m_s, p.toss_m_s))
     course.mark("peg", (0.0, DEPTH_M), p.peg_colour)
     course.mark("tray", (-0.7 * end, DEPTH_M), p.tray_colour)
     return course.scene(

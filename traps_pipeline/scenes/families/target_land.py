@@ -187,9 +187,7 @@ FAMILY = scene_family(
             answer=lambda p: p.ball_colour,
         ),
         choice_of(
-            "What colour is the tall pedestal: {choices}?",
-            choices=lambda p: GREYS,
-            answer=lambda p: p.pedestal_colour,
+            "What colour is the tall pedestal: {choices}?", choices=lambda p: GREYS, answer=lambda p: p.pedestal_colour
         ),
     ],
     observe=observe,

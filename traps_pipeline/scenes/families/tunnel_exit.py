@@ -91,10 +91,7 @@ def build(p: Params, physics: Physics) -> Scene:
         decisive=["ball"],
         hidden=["deflector"],
         cover=cover,
-        in_view=[
-            cover,
-            course.box((-bore - WALL_M, bore + WALL_M), (depth, start[1] + p.start_m), (0, start[2] + r)),
-        ],
+        in_view=[cover, course.box((-bore - WALL_M, bore + WALL_M), (depth, start[1] + p.start_m), (0, start[2] + r))],
         things=[f"{p.ball_colour} ball", f"{p.tunnel_colour} tunnel", "ramp", "upper end of the ramp"],
         also=["tray", "exit"],
         shown_by={"tunnel": ["stem"]},

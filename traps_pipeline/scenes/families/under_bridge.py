@@ -87,13 +87,7 @@ def build(p: Params, physics: Physics) -> Scene:
             course.box((-(p.flat_m + p.ramp_m), end), depth_span, (0, high)),
             course.box((0, p.bridge_m), (front, -front), (0, top)),
         ],
-        things=[
-            f"{p.ball_colour} ball",
-            f"{p.bridge_colour} bridge",
-            "ramp",
-            "road",
-            "railing of the bridge",
-        ],
+        things=[f"{p.ball_colour} ball", f"{p.bridge_colour} bridge", "ramp", "road", "railing of the bridge"],
         also=["railing", "kerb"],
         shown_by={"bridge": ["plank", "handrail", "leg"]},
     )

@@ -92,13 +92,7 @@ def build(p: Params, physics: Physics) -> Scene:
         hidden=[p.kind],
         cover=course.box(span, (-HALF_TRACK_M - 0.02, back + 0.03), (0, top), right=0.05),
         in_view=[course.box(span, (-HALF_TRACK_M, back), (0, top))],
-        things=[
-            f"{p.ball_colour} ball",
-            f"{p.wedge_colour} wedge",
-            f"{p.mat_colour} mat",
-            "track",
-            f"black {p.kind}",
-        ],
+        things=[f"{p.ball_colour} ball", f"{p.wedge_colour} wedge", f"{p.mat_colour} mat", "track", f"black {p.kind}"],
         also=["wall"],
         colours=["black"],
     )

@@ -307,13 +307,7 @@ class Course:
             self.free_box(name, at, half, colour, density=density, sliding=sliding, solref=solref)
 
     def hinge(
-        self,
-        name: str,
-        at: Vec3,
-        *,
-        axis: Vec3 = (0, 1, 0),
-        damping: float = 0.0,
-        range_deg: Span | None = None,
+        self, name: str, at: Vec3, *, axis: Vec3 = (0, 1, 0), damping: float = 0.0, range_deg: Span | None = None
     ) -> mujoco.MjsBody:
         """Return a body that turns about an axis; add its parts with `add_box` and `rod`.
 

@@ -16,14 +16,7 @@ from pydantic import ConfigDict, Field, StrictBool, TypeAdapter, ValidationError
 
 from traps_pipeline.protocol.datasets import EXTENSION_CATEGORIES
 from traps_pipeline.scenes.parts import vary
-from traps_pipeline.scenes.physics.kit import (
-    LOOK_ALIKE,
-    Family,
-    Inventory,
-    Scene,
-    Wording,
-    rgba,
-)
+from traps_pipeline.scenes.physics.kit import LOOK_ALIKE, Family, Inventory, Scene, Wording, rgba
 
 if TYPE_CHECKING:
     import mujoco
@@ -110,10 +103,7 @@ class SceneDifficulty:
 
     @staticmethod
     def from_record(record: Mapping[str, Any]) -> SceneDifficulty:
-        """Read the difficulty in a record's parameters.
-
-        Raises ValueError for anything unknown or implausible.
-        """
+        """Read the difficulty in a record's parameters. Raises ValueError for anything unknown or implausible."""
         try:
             return TypeAdapter(SceneDifficulty).validate_python(record)
         except ValidationError as error:

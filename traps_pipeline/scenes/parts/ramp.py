@@ -41,15 +41,7 @@ class Ramp:
         return (self.middle_m + aside, distance, height) if self.towards_camera else (-distance, aside, height)
 
     def board(
-        self,
-        course: Course,
-        name: str,
-        up: float,
-        over: float,
-        half: Vec3,
-        colour: str,
-        *,
-        aside: float = 0.0,
+        self, course: Course, name: str, up: float, over: float, half: Vec3, colour: str, *, aside: float = 0.0
     ) -> mujoco.MjsGeom:
         """Return a box on the slope. half: half sizes up the slope, across it, out of it."""
         centre = self.at(up, over, aside)

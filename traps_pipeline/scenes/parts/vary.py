@@ -55,10 +55,7 @@ def between(low: float, high: float) -> Any:
 
 
 def several_between(count: Count, low: float, high: float) -> Any:
-    """Return a field: a tuple of floats between two bounds.
-
-    count: their number, or the drawn field that holds it.
-    """
+    """Return a field: a tuple of floats between two bounds. count: their number, or the drawn field that holds it."""
     return drawn_by(
         lambda rng, so_far: tuple(uniform(rng, low, high) for _ in range(_number(count, so_far))), range=(low, high)
     )
@@ -83,10 +80,7 @@ def chance(share: float) -> Any:
 
 
 def facing(low: float, high: float) -> Any:
-    """Return a field: a camera's azimuth, turned towards where things come from.
-
-    Needs a field `direction` above it.
-    """
+    """Return a field: a camera's azimuth, turned towards where things come from. Needs a field `direction` above it."""
     return drawn_by(lambda rng, so_far: 90 - so_far["direction"] * uniform(rng, low, high))
 
 

@@ -41,7 +41,7 @@ def match_slots(templates: Sequence[str], question: str) -> dict[str, str] | Non
 
 
 def choices_in(text: str) -> tuple[str, ...]:
-    """Return the choices in the text of `kit.listed`: 'red, blue or green'."""
+    """Return the choices in the text of `kit.list_choices`: 'red, blue or green'."""
     return tuple(re.split(r", | or ", text))
 
 

@@ -75,10 +75,7 @@ def _labels(count: int) -> Callable[[SceneSpec], list[Question]]:
 
 def _both(question: str, answer: str, labels: tuple[str, ...] | None = None) -> list[Question]:
     """Return a question for both clips of the pair."""
-    return [
-        Question("control", question, answer, "control", labels),
-        Question("void", question, None, "void", labels),
-    ]
+    return [Question("control", question, answer, "control", labels), Question("void", question, None, "void", labels)]
 
 
 def _must_abstain(spec: SceneSpec) -> list[Question]:
@@ -174,10 +171,7 @@ def _sheer(alpha: float) -> Callable[[Scenario], Take]:
         with _renderer(scenario.twin, look) as renderer:
             twin_frames = list(checks.void_frames(renderer, scenario.twin.qpos))
         gaps = [np.abs(frames[k].astype(np.int16) - twin_frames[k]).max(axis=2) for k in last]
-        n_noticed, levels = (
-            max(int((gap >= SEEN_LEVELS).sum()) for gap in gaps),
-            max(int(gap.max()) for gap in gaps),
-        )
+        n_noticed, levels = (max(int((gap >= SEEN_LEVELS).sum()) for gap in gaps), max(int(gap.max()) for gap in gaps))
         evidence = {"alpha": alpha, "seen_through_px": n_noticed, "levels": levels}
         if n_noticed < SEEN_PX:
             raise Rejected(

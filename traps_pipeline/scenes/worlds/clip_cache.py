@@ -37,10 +37,7 @@ class ClipCache:
 
     @classmethod
     def of_user(cls) -> ClipCache | None:
-        """Return the cache that the environment chooses, or None.
-
-        Raises TrapsError for a wrong size.
-        """
+        """Return the cache that the environment chooses, or None. Raises TrapsError for a wrong size."""
         size = os.environ.get(VARIABLE, "").strip() or str(DEFAULT_GB)
         if size == "off":
             return None
@@ -135,10 +132,7 @@ def _remove(entry: Path) -> None:
 
 @cache
 def _renderer_digest() -> str:
-    """Return a digest of all code and versions that turn a scene into bytes.
-
-    Raises RenderingUnavailable.
-    """
+    """Return a digest of all code and versions that turn a scene into bytes. Raises RenderingUnavailable."""
     import av
     import cv2
     import mujoco

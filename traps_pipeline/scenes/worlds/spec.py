@@ -225,10 +225,7 @@ def save_trajectory(folder: Path, scenario_id: str, qpos: np.ndarray, twin: np.n
 
 
 def load_trajectory(path: Path, sha256: str, world: Literal["qpos", "twin"] = "qpos") -> np.ndarray:
-    """Return qpos (F, nq) float32 of a scenario or its twin.
-
-    Raises ValueError naming a missing or altered file.
-    """
+    """Return qpos (F, nq) float32 of a scenario or its twin. Raises ValueError naming a missing or altered file."""
     try:
         with np.load(path, allow_pickle=False) as archive:
             qpos = archive[world]

@@ -47,7 +47,7 @@ async function landscapeView(route) {
         toggle(route, "paper", "also the paper's models (hollow)"),
       ),
       shown.length
-        ? section(null, plane(shown, regime), planeTable(shown))
+        ? section(null, plane(shown, regime), planeTable(info, shown))
         : section(null, notice(`${NOT_RUN}: no figure of this kind in the study`)),
     ],
   };
@@ -107,17 +107,17 @@ function ends(row, field) {
   return [[cut(low), cut(high)]];
 }
 
-function planeTable(rows) {
+function planeTable(info, rows) {
   const sorted = [...rows].sort((a, b) => (b.pecs ?? -1) - (a.pecs ?? -1) || a.model.localeCompare(b.model));
   const columns = [
     { title: "Model" },
     { title: "Regime" },
-    ...FIGURES.map(({ title }) => ({ title, number: true })),
+    ...info.figures.map(({ title }) => ({ title, number: true })),
   ];
   const cells = sorted.map((row) => [
     row.of_paper ? `${row.model} (paper)` : link(["model", row.model], { regime: row.regime }, row.model),
     row.regime,
-    ...FIGURES.map((each) => figure(row, each)),
+    ...info.figures.map((each) => figure(row, each)),
   ]);
   return table(columns, cells, { caption: "The points", name: "landscape", data: sorted });
 }

@@ -1,21 +1,11 @@
 // The leaderboard: the rows of the study's table, beside the paper's.
 
-const FIGURES = [
-  { field: "pecs", title: "PECS", print: fraction },
-  { field: "acc", title: "Acc %", print: percent },
-  { field: "abs_rec", title: "AbsRec %", print: percent },
-  { field: "false_abs", title: "FalseAbs %", print: percent },
-  { field: "j", title: "J", print: fraction },
-];
-const ROBUST = [
-  { field: "conjunction", title: "Conjunction %", print: percent },
-  { field: "robust", title: "Robust", print: fraction },
-  { field: "inference_acc", title: "Inferred %", print: percent },
-];
-const PAPER = FIGURES.filter(({ field }) => field !== "j");
+// How a figure of the study's lists is printed.
+const printerOf = ({ unit }) => (unit === "percent" ? percent : fraction);
 
 // A figure with its deviation over runs and its interval below it.
-function figure(row, { field, print }, mark = "") {
+function figure(row, { field, unit }, mark = "") {
+  const print = printerOf({ unit });
   if (!row || row[field] === null || row[field] === undefined)
     return row ? NONE : h("span", { class: "absent" }, NOT_RUN);
   const low = row[`${field}_ci_low`];
@@ -36,6 +26,7 @@ function rankOf(row) {
 async function leaderboardView(route) {
   const info = await study();
   const own = info.leaderboard;
+  const ofPaper = info.figures.filter((each) => each.in_paper);
   const hasOverall = own.some((row) => row.dataset === "overall");
   const dataset = route.parameters.dataset || (hasOverall || !own.length ? "overall" : own[0].dataset);
   const { regime = "", group = "", sort = "pecs", up = "", paper = "" } = route.parameters;
@@ -62,18 +53,13 @@ async function leaderboardView(route) {
   const columns = [
     { title: "Model", sort: "model" },
     { title: "Regime", sort: "regime" },
-    ...FIGURES.map(({ field, title }) => ({
-      title,
-      number: true,
-      sort: field,
-      hint: info.legend[title.replace(" %", "")],
-    })),
+    ...info.figures.map(({ field, title }) => ({ title, number: true, sort: field, hint: info.legend[title] })),
     { title: "Rank", number: true, hint: "by PECS among the models of a regime; ranks in between are not separable" },
     ...(robust.size
-      ? ROBUST.map(({ title }, k) => ({ title, number: true, group: !k, hint: info.legend[title] }))
+      ? info.robust_figures.map(({ title }, k) => ({ title, number: true, group: !k, hint: info.legend[title] }))
       : []),
     ...(withPaper
-      ? PAPER.map(({ field, title }, k) => ({
+      ? ofPaper.map(({ field, title }, k) => ({
           title: `Paper: ${title}`,
           number: true,
           sort: `paper_${field}`,
@@ -90,16 +76,16 @@ async function leaderboardView(route) {
       ? link(["model", row.model], { regime: row.regime, dataset: dataset === "overall" ? "" : dataset }, row.model)
       : row.model,
     h("span", { class: "tag" }, row.regime),
-    ...FIGURES.map((each) =>
+    ...info.figures.map((each) =>
       figure(row.own, each, each.field === "pecs" && row.own && row.own.incomplete ? incompleteMark : ""),
     ),
     rankOf(row.own),
     ...(robust.size
-      ? ROBUST.map(({ field, print }) => (row.robust ? print(row.robust[field]) : NOT_RUN))
+      ? info.robust_figures.map((each) => (row.robust ? printerOf(each)(row.robust[each.field]) : NOT_RUN))
       : []),
     ...(withPaper
-      ? PAPER.map(({ field, print }) =>
-          row.paper ? h("span", { title: `epoch ${row.paper.epoch}` }, print(row.paper[field])) : NONE,
+      ? ofPaper.map((each) =>
+          row.paper ? h("span", { title: `epoch ${row.paper.epoch}` }, printerOf(each)(row.paper[each.field])) : NONE,
         )
       : []),
     row.own ? count(row.own.n_pairs) : NONE,
@@ -151,7 +137,7 @@ async function leaderboardView(route) {
             model,
             regime: of,
             ...(row || {}),
-            ...Object.fromEntries(PAPER.map(({ field }) => [`paper_${field}`, printed?.[field] ?? null])),
+            ...Object.fromEntries(ofPaper.map(({ field }) => [`paper_${field}`, printed?.[field] ?? null])),
           })),
           foot: own.length ? [rowOfPeople(info, dataset, columns)] : [],
           absent: own.length ? "no entry fits these filters" : `${NOT_RUN}: this study has no leaderboard yet`,
@@ -175,7 +161,7 @@ function rowOfPeople(info, dataset, columns) {
   const cells = [
     "People",
     h("span", { class: "tag" }, "no prompt"),
-    ...FIGURES.map((each) => figure(row && row[each.field] !== null ? row : undefined, each)),
+    ...info.figures.map((each) => figure(row && row[each.field] !== null ? row : undefined, each)),
     NONE,
   ];
   const rest = columns.slice(cells.length).map(({ title }) => (title === "n" && row ? counted(row.n_clips, "clip") : NONE));

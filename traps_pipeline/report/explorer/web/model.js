@@ -56,7 +56,7 @@ function modelFigures(info, name, dataset, regime) {
   const columns = [
     { title: "Regime" },
     { title: "Dataset" },
-    ...FIGURES.map(({ title }) => ({ title, number: true })),
+    ...info.figures.map(({ title }) => ({ title, number: true })),
     { title: "n", number: true },
     { title: "Runs", number: true },
     { title: "Missing", number: true },
@@ -64,7 +64,7 @@ function modelFigures(info, name, dataset, regime) {
   const rows = own.map((row) => [
     row.regime,
     info.titles[row.dataset] || row.dataset,
-    ...FIGURES.map((each) => figure(row, each)),
+    ...info.figures.map((each) => figure(row, each)),
     count(row.n_pairs),
     count(row.n_runs),
     count(row.n_missing),

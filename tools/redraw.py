@@ -2,7 +2,7 @@
 
 A record of an occlusion family is drawn again from the number of its draw (`draw_again`), which takes seconds. Where
 the record cost thousands of rollouts, and its new look moves neither camera nor occluder, the worlds stay and only what
-pixels say is measured again (`relook_family`). Either way the record is the one that `sample_family` would draw now;
+pixels say is measured again (`redraw_looks`). Either way the record is the one that `sample_family` would draw now;
 run `traps benchmark certify` afterwards.
 """
 
