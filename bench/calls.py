@@ -42,7 +42,8 @@ def ours(url: str, connections: int, answers: int) -> dict[str, float]:
     from traps_pipeline.models.asking.ask import Call, Work, run_work
     from traps_pipeline.models.asking.participants import Participants
     from traps_pipeline.models.money.budget import Budget
-    from traps_pipeline.models.registry.entries import Account, Entry, Limits
+    from traps_pipeline.models.registry.accounts import Account, Limits
+    from traps_pipeline.models.registry.entries import Entry
     from traps_pipeline.models.request import Request
     from traps_pipeline.models.wire.api import ApiBackend, load_litellm
     from traps_pipeline.protocol.cells import Cell, Evaluation

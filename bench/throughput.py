@@ -53,7 +53,8 @@ def main() -> None:
     from traps_pipeline.models.asking.ask import Call, Work, run_work
     from traps_pipeline.models.asking.participants import Participants
     from traps_pipeline.models.money.budget import Budget
-    from traps_pipeline.models.registry.entries import Account, ModelEntry
+    from traps_pipeline.models.registry.accounts import Account
+    from traps_pipeline.models.registry.entries import ModelEntry
     from traps_pipeline.models.request import Request
     from traps_pipeline.models.wire.api import ApiBackend, load_litellm
     from traps_pipeline.protocol.cells import Cell, Evaluation

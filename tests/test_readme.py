@@ -25,6 +25,7 @@ def blocks(language: str) -> list[str]:
 
 def in_this_study(study: Checkout, command: str) -> str:
     """The command with the study's folders in place of the README's."""
+    command = re.sub("^pip ", f"{sys.executable} -m pip ", command)
     command = command.replace("mine.yaml", str(study.workspace.parent / "mine.yaml")).replace(
         ".workspaces/mine", str(study.workspace.parent / "mine")
     )
@@ -42,7 +43,7 @@ def run(study: Checkout, command: str) -> Finished:
 
 
 # Left to the campaign: these draw, certify, render or train, or repeat what another test of `make test` holds.
-DEAR = re.compile(r"make |cp |traps (benchmark|run|publish harness|models check --live)|TRAPS_SCENE_SPECS|export ")
+DEAR = re.compile(r"make |pip |traps (benchmark|run|publish harness|models check --live)|TRAPS_SCENE_SPECS|export ")
 
 
 @pytest.mark.promise

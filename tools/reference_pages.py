@@ -19,7 +19,7 @@ YAML_FILES = {
     "study.yaml": ("storage.study", "Study"),
     "A model": ("models.registry.entries", "ModelEntry"),
     "A judge": ("models.registry.judges", "JudgeEntry"),
-    "An account": ("models.registry.entries", "Account"),
+    "An account": ("models.registry.accounts", "Account"),
     "A correction": ("benchmark.corrections", "Correction"),
 }
 WORDS = {str: "text", int: "whole number", float: "number", bool: "true or false", Any: "any value", NoneType: "null"}

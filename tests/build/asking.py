@@ -13,7 +13,8 @@ from tests.build.ledger import local
 from traps_pipeline.models.asking.ask import Call, SettledCell, Work, run_work
 from traps_pipeline.models.asking.participants import Participants
 from traps_pipeline.models.money.budget import Budget
-from traps_pipeline.models.registry.entries import Entry, Limits
+from traps_pipeline.models.registry.accounts import Limits
+from traps_pipeline.models.registry.entries import Entry
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.study import Study

@@ -9,7 +9,8 @@ from typing import Any
 
 from traps_pipeline.models.asking.participants import CallContext
 from traps_pipeline.models.money.budget import Budget
-from traps_pipeline.models.registry.entries import Account, Entry, Limits, Prices
+from traps_pipeline.models.registry.accounts import Account, Limits, Prices
+from traps_pipeline.models.registry.entries import Entry
 from traps_pipeline.models.request import Request
 
 PARAMS = {"temperature": 0.8, "top_p": 0.95, "max_tokens": 8000}

@@ -14,7 +14,8 @@ from tests.providers.servers import closed_port
 from traps_pipeline.base import progress
 from traps_pipeline.checks.live_check import LiveResult, check_live, findings, nobody_at
 from traps_pipeline.models.registry import entries as registry
-from traps_pipeline.models.registry.entries import PROTOCOL, Account, Entry, ModelEntry, Prices
+from traps_pipeline.models.registry.accounts import Account, Prices
+from traps_pipeline.models.registry.entries import PROTOCOL, Entry, ModelEntry
 from traps_pipeline.models.registry.judges import JudgeEntry
 from traps_pipeline.models.request import Outcome
 from traps_pipeline.models.wire import api

@@ -18,7 +18,8 @@ from traps_pipeline.models.asking import participants
 from traps_pipeline.models.asking.answer_rows import RESPONSES, ResponseRow
 from traps_pipeline.models.asking.answers import answer_request, response_row
 from traps_pipeline.models.asking.participants import ledger_row
-from traps_pipeline.models.registry.entries import Account, Limits, Prices, get_model
+from traps_pipeline.models.registry.accounts import Account, Limits, Prices
+from traps_pipeline.models.registry.entries import get_model
 from traps_pipeline.models.registry.judges import JudgeEntry
 from traps_pipeline.models.request import Outcome
 from traps_pipeline.models.wire import api

@@ -19,7 +19,8 @@ import pytest
 from tests.conftest import KEY, ROOT, SECRET
 from tests.providers.server import Provider, answer_to
 from traps_pipeline.base import progress
-from traps_pipeline.models.registry.entries import Account, Entry, Limits, Prices
+from traps_pipeline.models.registry.accounts import Account, Limits, Prices
+from traps_pipeline.models.registry.entries import Entry
 from traps_pipeline.models.request import Outcome, Request, TransientError
 from traps_pipeline.models.wire.api import ApiBackend
 
@@ -85,7 +86,7 @@ IN_A_LOOP = """
 import asyncio, sys
 from types import SimpleNamespace
 import tests.models.test_api as test
-from traps_pipeline.models.registry.entries import Limits
+from traps_pipeline.models.registry.accounts import Limits
 from traps_pipeline.models.request import Request
 
 async def ask():  # the first backend is made, and the client library imported, while the loop runs

@@ -20,7 +20,8 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.asking import participants
 from traps_pipeline.models.asking.answers import answer_request
 from traps_pipeline.models.asking.ask import STOP_SIGNALS, run_work, settle
-from traps_pipeline.models.registry.entries import Limits, get_model
+from traps_pipeline.models.registry.accounts import Limits
+from traps_pipeline.models.registry.entries import get_model
 from traps_pipeline.models.request import Outcome, Request, TransientError
 from traps_pipeline.protocol.cells import Evaluation
 from traps_pipeline.storage.study import Study

@@ -22,7 +22,8 @@ from traps_pipeline.models.asking.ask import Call, Work, run_work
 from traps_pipeline.models.asking.participants import Participants
 from traps_pipeline.models.money.budget import Budget, BudgetReached, check_money, most_tokens, worst_case_usd
 from traps_pipeline.models.money.spending import open_budget
-from traps_pipeline.models.registry.entries import Account, Entry, Limits, Prices
+from traps_pipeline.models.registry.accounts import Account, Limits, Prices
+from traps_pipeline.models.registry.entries import Entry
 from traps_pipeline.models.request import Outcome, Request, TransientError
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.study import Study

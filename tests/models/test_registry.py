@@ -42,7 +42,7 @@ def test_entries_keep_their_order_and_defaults(tmp_path: Path) -> None:
         (entry("a", ", colour: red"), ["2 (a): colour: "]),
         (entry("a", ", limits: {retrys: 3}"), ["2 (a): limits.retrys: "]),
         (entry("a", ", runs: 0"), ["2 (a): runs: "]),
-        (f"id: a, backend: telepathy, {GROUPS}", ["2 (a): backend: ", "'reference'"]),
+        (f"id: a, backend: telepathy, {GROUPS}", ["2 (a): backend: ", "'telepathy'", "reference"]),
         (f"id: a, backend: reference, params: {{strategy: psychic}}, {GROUPS}", ["2 (a): ", "'psychic'", "oracle"]),
         (f"id: a, backend: rule, params: {{rule: thumb}}, {GROUPS}", ["2 (a): ", "'thumb'", "occluder, length"]),
         (f"id: a, backend: reference, {GROUPS}", ["2 (a): ", "strategy"]),

@@ -22,7 +22,8 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.asking.ask import Call, Work, run_work
 from traps_pipeline.models.asking.participants import OVERRUN, Participants, attempt
 from traps_pipeline.models.money.budget import BudgetReached
-from traps_pipeline.models.registry.entries import Account, Entry
+from traps_pipeline.models.registry.accounts import Account
+from traps_pipeline.models.registry.entries import Entry
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.models.wire.api import ApiBackend
 from traps_pipeline.protocol.cells import Cell, Evaluation

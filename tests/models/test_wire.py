@@ -23,7 +23,7 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.asking.participants import Participants, attempt
 from traps_pipeline.models.money.budget import Budget, worst_case_usd
-from traps_pipeline.models.registry.entries import Account
+from traps_pipeline.models.registry.accounts import Account
 from traps_pipeline.models.request import Outcome, TransientError
 from traps_pipeline.models.wire.api import ApiBackend
 from traps_pipeline.models.wire.httpx_transport import get

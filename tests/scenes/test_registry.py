@@ -1,4 +1,4 @@
-"""What the registry refuses, and the family of docs/plank_post.py: drawn, certified, observed."""
+"""What the registry refuses, and the family of docs/plank_post: drawn, certified, observed."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from traps_pipeline.scenes.parts.independence import dependence
 from traps_pipeline.scenes.parts.wording import draw_ill_posed
 from traps_pipeline.scenes.physics.kit import Family
 
-EXAMPLE = (ROOT / "docs" / "plank_post.py").read_text()
+EXAMPLE = (ROOT / "docs" / "plank_post" / "plank_post.py").read_text()
 
 
 Add = Callable[..., None]

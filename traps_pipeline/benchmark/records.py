@@ -100,9 +100,9 @@ def parse_record(line: str, where: str) -> SceneSpec:
     except ValueError as error:
         raise TrapsError(f"{where}: not JSON ({error}); restore the line from git") from error
     if spec.family not in family_names():
-        raise TrapsError(
-            f"{where}: {spec.scenario_id}: unknown family {spec.family!r}; known: {', '.join(family_names())}"
-        )
+        known = f"known: {', '.join(family_names())}"
+        advice = f"install {spec.evidence['package']}, which adds it" if "package" in spec.evidence else known
+        raise TrapsError(f"{where}: {spec.scenario_id}: unknown family {spec.family!r}; {advice}")
     if spec.category not in ALL_CATEGORIES:
         raise TrapsError(
             f"{where}: {spec.scenario_id}: unknown category {spec.category!r}; known: {', '.join(ALL_CATEGORIES)}"

@@ -53,6 +53,7 @@ def examine(place: Place) -> Iterator[Finding]:
         ("clip cache", _clip_cache),
         ("workspace", lambda: _workspace(place)),
         ("keys", _keys),
+        ("packages", _plugins),
         ("network", check_network),
     ):
         yield _finding(topic, look)
@@ -273,6 +274,19 @@ def _workspace(place: Place) -> str:
         return f"{place} not made yet (`traps init` or `traps run demo` makes it)"
     study = Workspace.open(place).study
     return f"{place}: benchmark {study.benchmark}, panel {study.panel}, budget ${study.budget_usd:,.2f}"
+
+
+def _plugins() -> str:
+    """Return what installed packages add. Raises TrapsError for what cannot be loaded."""
+    from traps_pipeline.base.plugins import KINDS, plugins
+    from traps_pipeline.scenes.family_registry import get_family
+
+    for name in plugins("families"):
+        get_family(name)
+    added = [plugin for group in KINDS for plugin in plugins(group).values()]
+    for plugin in added:
+        plugin.load()
+    return ", ".join(f"{KINDS[plugin.group]} {plugin.name} ({plugin.package})" for plugin in added) or "add no part"
 
 
 def _keys() -> str:

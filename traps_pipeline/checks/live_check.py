@@ -31,7 +31,8 @@ from traps_pipeline.models.asking.participants import Row
 from traps_pipeline.models.money.budget import check_money
 from traps_pipeline.models.reading.interpret import degenerate, read_answer
 from traps_pipeline.models.reading.thinking import declaration_line, split_thinking, undeclared_mark
-from traps_pipeline.models.registry.entries import NETWORK, Account, Entry, ModelEntry, account_of
+from traps_pipeline.models.registry.accounts import Account
+from traps_pipeline.models.registry.entries import NETWORK, Entry, ModelEntry, account_of
 from traps_pipeline.models.registry.judges import JudgeEntry, Task
 from traps_pipeline.models.request import (
     MALFORMED,

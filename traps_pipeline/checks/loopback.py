@@ -15,7 +15,8 @@ from typing_extensions import override
 
 from traps_pipeline.base.progress import Progress, use_progress
 from traps_pipeline.checks.wire_body import WireBody
-from traps_pipeline.models.registry.entries import Account, Entry, load_accounts
+from traps_pipeline.models.registry.accounts import Account
+from traps_pipeline.models.registry.entries import Entry, load_accounts
 from traps_pipeline.models.request import Outcome, Request, TransientError
 from traps_pipeline.models.wire.api import ApiBackend
 from traps_pipeline.models.wire.exchange import record_exchange

@@ -32,7 +32,7 @@ from traps_pipeline.judging.judging_rows import VoteRow
 from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.models.asking.answers import answer_request, asked_items
 from traps_pipeline.models.asking.ask import AnyCall, AnyCell, Call, Finished, SettledCell, collect
-from traps_pipeline.models.asking.backends import make_backend
+from traps_pipeline.models.asking.backends import make_backend, make_plugin_backend
 from traps_pipeline.models.asking.participants import Row, call_time_columns
 from traps_pipeline.models.reading.judged_answers import UNREAD, is_correct, leading_object, read_flag, read_object
 from traps_pipeline.models.reading.thinking import Marks, split_thinking, strip_tokens
@@ -289,7 +289,7 @@ def _make_judge(entry: Entry) -> Backend:
         from traps_pipeline.judging.rules import RuleJudge
 
         return RuleJudge()
-    return make_backend(entry)
+    return make_backend(entry) if entry.backend == NETWORK else make_plugin_backend(entry)
 
 
 def wanted_ballots(

@@ -1,4 +1,4 @@
-"""Register scene families by name: a file in `families` adds one.
+"""Register scene families by name: a file in `families` adds one, or an installed package (`base.plugins`).
 
 A family that would spoil a benchmark is refused: an unknown category, a question that two families have, a hidden
 element that is drawn depending on what is seen.
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.plugins import plugins
 from traps_pipeline.protocol.datasets import CHAOTIC_CATEGORIES, EXTENSION_CATEGORIES, OCCLUSION_CATEGORIES
 from traps_pipeline.scenes import families as package
 
@@ -27,8 +28,14 @@ CATEGORIES = {"occlusion": OCCLUSION_CATEGORIES + EXTENSION_CATEGORIES, "chaotic
 
 @cache
 def family_names() -> tuple[str, ...]:
-    """Return the names of all families, sorted; nothing is imported."""
-    return tuple(sorted(module.name for module in pkgutil.iter_modules(package.__path__)))
+    """Return the names of all families, sorted; nothing is imported.
+
+    Raises TrapsError if a package adds a family under a name of ours.
+    """
+    own = {module.name for module in pkgutil.iter_modules(package.__path__)}
+    for name in own & plugins("families").keys():
+        raise plugins("families")[name].error("has the name of a family of this project")
+    return tuple(sorted(own | plugins("families").keys()))
 
 
 @cache
@@ -41,7 +48,8 @@ def get_family(name: str) -> Family:
 
     if name not in family_names():
         raise KeyError(f"unknown family {name!r}; known: {', '.join(family_names())}")
-    module = importlib.import_module(f"{package.__name__}.{name}")
+    plugin = plugins("families").get(name)
+    module = plugin.load() if plugin else importlib.import_module(f"{package.__name__}.{name}")
     family = getattr(module, "FAMILY", None)
     if not isinstance(family, Family):
         raise TrapsError(f"{_file(name)} defines no FAMILY = scene_family(...); write it, or take the file away")
@@ -61,7 +69,8 @@ def get_family(name: str) -> Family:
 
 def family_digest(name: str) -> str:
     """Return the SHA-256 of a family's file, the text that drew its records."""
-    module_spec = importlib.util.find_spec(f"{package.__name__}.{name}")
+    plugin = plugins("families").get(name)
+    module_spec = importlib.util.find_spec(plugin.entry_point.module if plugin else f"{package.__name__}.{name}")
     assert module_spec is not None and module_spec.origin is not None, f"{_file(name)} is a file"
     return file_digest(Path(module_spec.origin))
 
@@ -102,4 +111,5 @@ def fit_to_sample(name: str) -> Family:
 
 
 def _file(name: str) -> str:
-    return f"scenes/families/{name}.py"
+    plugin = plugins("families").get(name)
+    return f"{plugin.package}: {plugin.entry_point.module}.py" if plugin else f"scenes/families/{name}.py"

@@ -30,7 +30,8 @@ from traps_pipeline.models.local.adapter import LocalModel, load_local_model
 from traps_pipeline.models.local.backend import LocalBackend, outcome, seeds, worker
 from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.models.registry import entries as registry
-from traps_pipeline.models.registry.entries import Limits, ModelEntry, effective_params, load_models
+from traps_pipeline.models.registry.accounts import Limits
+from traps_pipeline.models.registry.entries import ModelEntry, effective_params, load_models
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.storage.media import MediaStore, sample
 

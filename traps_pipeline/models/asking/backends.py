@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from traps_pipeline.base.errors import TrapsError
+import inspect
+
 from traps_pipeline.base.extras import require
+from traps_pipeline.base.plugins import plugins
 from traps_pipeline.models.registry.entries import LOCAL, NETWORK, Entry, ModelEntry
 from traps_pipeline.models.request import Backend
 
@@ -45,4 +47,17 @@ def make_backend(entry: Entry) -> Backend:
             from traps_pipeline.models.local.backend import LocalBackend
 
             return LocalBackend(entry)
-    raise TrapsError(f"{entry.id}: unknown backend {entry.backend!r}; known: reference, observer, rule, api, local")
+    return make_plugin_backend(entry)
+
+
+def make_plugin_backend(entry: Entry) -> Backend:
+    """Return the backend of an installed package. Raises TrapsError naming the package."""
+    plugin = plugins(entry.plugins)[entry.backend]
+    make = plugin.load()
+    try:
+        backend: Backend = make(entry)
+    except Exception as error:  # whatever foreign code raises
+        raise plugin.error(f"makes no backend for {entry.id} ({type(error).__name__}: {error})") from error
+    if not inspect.iscoroutinefunction(getattr(backend, "ask", None)):
+        raise plugin.error("makes no backend: its `ask` must be `async def ask(self, request) -> Outcome`")
+    return backend

@@ -29,7 +29,8 @@ from traps_pipeline.models.money.budget import (
     most_tokens,
     worst_case_usd,
 )
-from traps_pipeline.models.registry.entries import NETWORK, Account, Entry, load_accounts
+from traps_pipeline.models.registry.accounts import Account
+from traps_pipeline.models.registry.entries import NETWORK, Entry, load_accounts
 from traps_pipeline.models.request import (
     MALFORMED,
     RATE_LIMITED,

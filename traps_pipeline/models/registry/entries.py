@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-import datetime
 import os
 from collections.abc import Iterable, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.keys import Address, Variable, check_parameters, read_key
+from traps_pipeline.base.keys import check_parameters
 from traps_pipeline.base.names import Name
 from traps_pipeline.base.paths import ASSETS
-from traps_pipeline.base.redaction import hide
+from traps_pipeline.base.plugins import Group, require_known, versioned
 from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.base.yamlfile import explain, parse_yaml_model, read_yaml
 from traps_pipeline.models.reading.thinking import Marks, marks_of
 from traps_pipeline.models.registry import user_registry
+from traps_pipeline.models.registry.accounts import Account, Groups, Limits, Prices
 from traps_pipeline.models.registry.local_settings import DEVICE, LocalParams, MechanismSpec, NetworkSize
 from traps_pipeline.models.registry.schemas import answer_object
 from traps_pipeline.protocol.cells import Evaluation
@@ -46,62 +46,7 @@ OTHER_WAIVERS = ("media", "reasoning", "json_schema", "identifier", "retries")
 NETWORK = "api"  # the backend for network models
 LOCAL = "local"  # the backend for checkpoints on this machine
 LOCAL_TIMEOUT_S = 24 * 3600.0
-
-
-class Limits(BaseModel):
-    """Limits of calls to a participant; none of them is in the ledger key."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-    concurrency: int = Field(default=24, ge=1, description="calls at once")
-    retries: int = Field(default=5, ge=0, description="of a call that failed and may succeed later")
-    backoff_s: float = Field(default=1.0, gt=0, description="first wait; doubles with each retry, full jitter")
-    timeout_s: float = Field(default=600.0, gt=0, description="of one attempt; backend local has a day by default")
-
-
-class Account(BaseModel):
-    """The settings that calls share: key variable, address, calls and tokens a minute."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-    key: Variable | None = Field(default=None, description="environment variable of the key")
-    base_url: Address | None = Field(default=None, description="of an OpenAI-compatible endpoint")
-    batch_price: float = Field(
-        default=1.0, gt=0, le=1, description="price of a call in a batch, relative to a live one"
-    )
-    requests_per_minute: int | None = Field(default=None, ge=1, description="null: no limit here")
-    tokens_per_minute: int | None = Field(default=None, ge=1, description="null: no limit here")
-
-    @model_validator(mode="after")
-    def _is_redacted(self) -> Account:
-        if self.key is not None:
-            hide(self.key)
-        return self
-
-    def secret(self) -> str | None:
-        """Return the key from the environment, None if unneeded. Raises TrapsError."""
-        return read_key(self.key) if self.key is not None else None
-
-
-class Prices(BaseModel):
-    """Dollars per million tokens on a date; completion tokens include reasoning."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-    input: float = Field(ge=0, description="of the prompt")
-    output: float = Field(ge=0, description="of the answer, with its reasoning")
-    as_of: datetime.date = Field(description="day on which the provider asked them")
-
-    def cost(self, prompt_tokens: float, completion_tokens: float) -> float:
-        """Return the cost of a call in dollars."""
-        return (prompt_tokens * self.input + completion_tokens * self.output) / 1e6
-
-
-class Groups(BaseModel):
-    """A model's groups in the paper, by which tables select rows."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-    family: str
-    access: str
-    input: str
-    group: str
+BACKENDS = ("reference", "observer", "rule", NETWORK, LOCAL)  # of models; installed packages add others
 
 
 class Entry(BaseModel):
@@ -112,6 +57,8 @@ class Entry(BaseModel):
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
+    plugins: ClassVar[Group] = "models"  # the group in which packages add backends to these
+    own_backends: ClassVar[tuple[str, ...]] = BACKENDS
     id: Name = Field(description="its name in every table")
     backend: str
     params: dict[str, Any] = Field(default_factory=dict, description="what is sent, and part of the ledger key")
@@ -125,10 +72,13 @@ class Entry(BaseModel):
     prices: Prices | None = Field(default=None, description="None: unknown, and a study must allow that")
     expected_completion_tokens: int = Field(default=500, ge=0, description="estimate for `traps plan`")
     expected_latency_s: float | None = Field(
-        default=None,
-        gt=0,
-        description="of a call, for `traps plan`; by default 4 s, and 60 tokens/s",
+        default=None, gt=0, description="of a call, for `traps plan`; by default 4 s, and 60 tokens/s"
     )
+
+    @field_validator("backend")
+    @classmethod
+    def _backend_is_known(cls, value: str) -> str:
+        return require_known(value, cls.plugins, cls.own_backends)
 
     @field_validator("thinking", mode="before")
     @classmethod
@@ -157,8 +107,8 @@ class Entry(BaseModel):
 
     @property
     def endpoint(self) -> str:
-        """The endpoint in the ledger key: litellm's name, or the kind of backend."""
-        return self.provider_id or self.backend
+        """The endpoint in the ledger key: litellm's name, or the kind of backend with the package that adds it."""
+        return self.provider_id or versioned(self.plugins, self.backend)
 
     @property
     def max_tokens(self) -> int:
@@ -190,8 +140,8 @@ class Entry(BaseModel):
 class ModelEntry(Entry):
     """One model of the registry, with the settings that decide its answers."""
 
-    backend: Literal["reference", "observer", "rule", "api", "local"] = Field(  # pyright: ignore[reportIncompatibleVariableOverride]
-        description="what answers: a strategy, a server, or a checkpoint on this machine"
+    backend: str = Field(
+        description="what answers: reference, observer, rule, api (a server), local (a checkpoint), or a package's name"
     )
     media: MediaSpec | None = Field(default=None, description="how it is shown a clip")
     runs: int = Field(default=3, ge=1, le=9, description="most repetitions that an experiment may ask for")
@@ -226,7 +176,7 @@ class ModelEntry(Entry):
             )
         if self.backend == "rule" and self.params.get("rule") not in RULES:
             raise ValueError(f"params.rule is {self.params.get('rule')!r}; known rules: {', '.join(RULES)}")
-        if (self.backend in (NETWORK, LOCAL)) != (self.media is not None):
+        if self.backend in BACKENDS and (self.backend in (NETWORK, LOCAL)) != (self.media is not None):
             raise ValueError(f"media: backend {self.backend} {'needs it' if self.media is None else 'has none'}")
         if self.media is not None:
             self._check_media(self.media)
@@ -260,7 +210,7 @@ class ModelEntry(Entry):
         return self.mechanism.inside(params) if self.mechanism else params
 
     def _check_media(self, media: MediaSpec) -> None:
-        if (media.profile == "frames") != (self.backend == LOCAL):
+        if self.backend in BACKENDS and (media.profile == "frames") != (self.backend == LOCAL):
             raise ValueError("media.profile: frames goes to local models, video or images over the network")
         if self.backend == NETWORK and (media.fps, media.most) != (5, 25) and "media" not in self.waivers:
             raise ValueError("media: the protocol has fps 5, most 25: send that, or say why under waivers")

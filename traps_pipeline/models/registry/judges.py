@@ -14,13 +14,15 @@ from typing_extensions import override
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import ASSETS
+from traps_pipeline.base.plugins import Group
 from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.base.yamlfile import read_mapping
 from traps_pipeline.models.reading.thinking import Marks
+from traps_pipeline.models.registry.accounts import Limits
 from traps_pipeline.models.registry.entries import (
     JUDGE_PROTOCOL,
+    NETWORK,
     Entry,
-    Limits,
     Protocol,
     is_reference,
     read_entries,
@@ -108,9 +110,9 @@ def vote_schema(seat: Judge, task: Task) -> Mapping[str, Any]:
 class JudgeEntry(Entry):
     """One judge of `assets/judges.yaml`."""
 
-    backend: Literal["rule", "api"] = Field(  # pyright: ignore[reportIncompatibleVariableOverride] - fields are frozen
-        description="rules of this project, or a server"
-    )
+    plugins: typing.ClassVar[Group] = "judges"
+    own_backends: typing.ClassVar[tuple[str, ...]] = (RULE, NETWORK)
+    backend: str = Field(description="rule (of this project), api (a server), or a package's name")
     premise: bool = Field(
         default=False, description="also ask if an answer rejects the question's premise; the paper's judges do not say"
     )

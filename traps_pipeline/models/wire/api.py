@@ -23,7 +23,8 @@ from traps_pipeline.base.wording import count_noun
 from traps_pipeline.models.money.budget import worst_case_usd
 from traps_pipeline.models.reading.endings import Ending
 from traps_pipeline.models.reading.first_token import stored_alternatives
-from traps_pipeline.models.registry.entries import Account, Entry, load_accounts
+from traps_pipeline.models.registry.accounts import Account
+from traps_pipeline.models.registry.entries import Entry, load_accounts
 from traps_pipeline.models.request import (
     MALFORMED,
     RATE_LIMITED,

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from traps_pipeline.base.plugins import plugins
 from traps_pipeline.scenes.certification import ensemble
 from traps_pipeline.scenes.certification.certificates import (
     MIN_ACCEPTED,
@@ -93,7 +94,8 @@ def resolve(
             ground_truth=twin.outcome.answer,
             trajectory_sha256=trajectory_digest(twin.qpos),
         ),
-        evidence={
+        evidence=({"package": plugin.package} if (plugin := plugins("families").get(family.name)) else {})
+        | {
             name: value
             for certificate in certificates_for(void_kind)
             for name, value in certificate.kept(evidence).items()
