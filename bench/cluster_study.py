@@ -162,7 +162,7 @@ def look_inside(folder: Path, experiment: Path) -> dict[str, str]:
     import yaml
 
     from tests.build.inside import ENTRY, MECHANISM
-    from traps_pipeline.models.local.tiny import build_tiny
+    from tools.tiny_checkpoints import build_tiny
 
     build_tiny("qwen3-vl", folder / "tiny")
     registry = folder / "models.yaml"

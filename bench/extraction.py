@@ -24,13 +24,13 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from bench.quick import parse
+from tools.tiny_checkpoints import build_tiny
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.progress import Progress, use_progress
 from traps_pipeline.mechanism.hidden_states import Item, extract
 from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.models.local import adapter
 from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
-from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.models.registry.entries import LOCAL, ModelEntry, load_models
 from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH
 from traps_pipeline.storage.media import MediaSpec, pick

@@ -28,10 +28,10 @@ from typing import TypeVar
 import numpy as np
 
 from bench.quick import parse
+from tools.tiny_checkpoints import build_tiny
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.models.local.adapter import GeneratedAnswer, LocalModel, load_local_model
-from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.models.local.vision_cache import ClipMemory
 from traps_pipeline.models.registry.entries import LOCAL, ModelEntry, get_model
 from traps_pipeline.models.registry.prompts import system_prompt, vqa_prompt

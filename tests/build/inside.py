@@ -8,7 +8,7 @@ import yaml
 
 from tests.conftest import EXPERIMENT, Checkout
 from tests.mechanism.paper_run import words
-from traps_pipeline.models.local.tiny import build_tiny
+from tools.tiny_checkpoints import build_tiny
 
 ENTRY = """
   - id: tiny

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from traps_pipeline.models.local.tiny import Family, build_tiny
+from tools.tiny_checkpoints import Family, build_tiny
 from traps_pipeline.models.registry.prompts import PROMPTS
 from traps_pipeline.pipeline.experiment import EXPERIMENTS
 

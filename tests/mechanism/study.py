@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tools.tiny_checkpoints import build_tiny
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.judging.judging_rows import VERDICTS
-from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.models.registry import entries as registry
 from traps_pipeline.models.registry.entries import ModelEntry
 from traps_pipeline.protocol.datasets import DATASETS, SIDES, is_ill_posed, taxonomy_of

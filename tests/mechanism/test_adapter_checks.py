@@ -27,7 +27,7 @@ BY_NAME = {check.name: check for check in CHECKS}
 
 
 def test_the_page_has_the_table_of_checks(tmp_path: Path) -> None:
-    assert check_table.ON_PAGE.written() == check_table.table(tmp_path)
+    assert check_table.ON_PAGE.written() == check_table.table()
     assert [*check_table.NAMES] == [*FAMILIES]
 
 

@@ -19,13 +19,13 @@ import torch
 
 from tests import local_models
 from tests.local_models import FAMILIES, QUESTIONS, SYSTEM, Family
+from tools.tiny_checkpoints import build_tiny
 from traps_pipeline.mechanism.margin import abstention_tokens
 from traps_pipeline.mechanism.patching_effects import SITES, Patch, Site, patched_changes, record
 from traps_pipeline.mechanism.shared_answers import SharedAnswers
 from traps_pipeline.mechanism.steered_backend import SteeredBackend
 from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
 from traps_pipeline.models.local.library import load_transformers
-from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.models.registry.entries import ModelEntry, get_model
 from traps_pipeline.models.request import Request
 from traps_pipeline.storage.media import Frames, MediaSpec, sample

@@ -17,6 +17,7 @@ from accelerate.hooks import AlignDevicesHook, add_hook_to_module, remove_hook_f
 from tests import local_models
 from tests.build.errors import raises
 from tests.local_models import QUESTIONS, SYSTEM, Family, ask, clip, model
+from tools.tiny_checkpoints import build_tiny
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.adapter_checks import CHECKS, Subject, brightening_clip
 from traps_pipeline.mechanism.margin import abstention_tokens
@@ -30,7 +31,6 @@ from traps_pipeline.mechanism.patching_effects import (
     require_patchable,
 )
 from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
-from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.models.registry.entries import get_model
 from traps_pipeline.storage.media import MediaSpec, sample
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from tests.local_models import ask, model
+from tools.tiny_checkpoints import FAMILIES, Family
 from traps_pipeline.mechanism.sentences import answer_tokens, mean_log_probabilities
-from traps_pipeline.models.local.tiny import FAMILIES, Family
 
 pytestmark = pytest.mark.slow
 SENTENCES = ("I cannot tell.", "It ends left", "No", "I do not know, since it is hidden.")

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from tools.pocket.data import SceneRecord
 from tools.pocket.words import COLUMNS, PROMPTS, ROWS, phrases, place_question, prompt_text, say
+from tools.tiny_checkpoints import make_config, make_processor, make_tokenizer
 from traps_pipeline.models.local.library import load_transformers
-from traps_pipeline.models.local.tiny import make_config, make_processor, make_tokenizer
 
 if TYPE_CHECKING:
     from tokenizers import Tokenizer

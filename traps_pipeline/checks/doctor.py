@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sqlite3
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, suppress
@@ -26,6 +25,7 @@ if TYPE_CHECKING:
     from traps_pipeline.storage.workspace import Workspace
 
 MIN_FREE_GB = 1.0
+SHIPPED_MODEL = "pocket"  # a local model whose weights are in the package
 STATES = ("*.safetensors", "*.parquet")  # files of an extraction
 LEDGER_KEYS = ("request_key", "vote_key", "label_key")  # columns of tables
 FOLDERS = ("tables", "clips", "media", "trajectories", "states", "directions", "reports")
@@ -60,33 +60,24 @@ def examine(place: Place) -> Iterator[Finding]:
 
 
 def examine_local(models: Sequence[str] = ()) -> Iterator[Finding]:
-    """Yield findings on tiny checkpoints, devices, weights and named models."""
-    from traps_pipeline.mechanism import adapter_checks
-    from traps_pipeline.models.local import selfcheck
+    """Yield findings on devices, NF4 and weights, and on the named models (by default the shipped one)."""
+    from traps_pipeline.checks import local_machine
+    from traps_pipeline.mechanism.adapter_checks import Subject, brightening_clip
     from traps_pipeline.models.local.adapter import load_local_model
-    from traps_pipeline.models.local.tiny import FAMILIES
     from traps_pipeline.models.registry.entries import LOCAL, get_model, local_models
 
-    entries = [get_model(model) for model in models]
+    entries = [get_model(model) for model in models or (SHIPPED_MODEL,)]
     for entry in entries:
         if entry.backend != LOCAL:
             raise TrapsError(
                 f"{entry.id}: runs elsewhere, so nobody looks into it; name one of {', '.join(local_models())}"
             )
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        yield _finding("devices", selfcheck.describe_devices)
-        for family in FAMILIES:
-            yield _finding(family, partial(selfcheck.check_family, family, folder))
-            yield from _adapter_findings(family, partial(adapter_checks.tiny_subject, family, folder))
-        yield _finding("nf4", lambda: selfcheck.check_nf4(folder))
-        yield _finding("checkpoints", selfcheck.describe_checkpoints)
+    yield _finding("devices", local_machine.describe_devices)
+    yield _finding("nf4", local_machine.describe_nf4)
+    yield _finding("checkpoints", local_machine.describe_checkpoints)
     for entry in entries:
         yield from _adapter_findings(
-            entry.id,
-            lambda entry=entry: adapter_checks.Subject(
-                load_local_model(entry, inside=True), *adapter_checks.brightening_clip()
-            ),
+            entry.id, lambda entry=entry: Subject(load_local_model(entry, inside=True), *brightening_clip())
         )
 
 

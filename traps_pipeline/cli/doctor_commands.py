@@ -18,7 +18,7 @@ def add(commands: Commands) -> None:
         "--local",
         nargs="*",
         metavar="MODEL",
-        help="check local models instead: devices, NF4, a tiny checkpoint of each family, and the named models",
+        help="check local models instead: devices, NF4, weights, and the named models (by default the pocket model)",
     )
     parser.add_argument(
         "--verify",

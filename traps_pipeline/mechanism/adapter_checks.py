@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,9 +20,7 @@ from traps_pipeline.mechanism.margin import abstention_tokens
 from traps_pipeline.mechanism.patching_effects import SITES, Patch, patched_changes, record, require_patchable
 from traps_pipeline.models.local.model import LocalModel
 from traps_pipeline.models.local.prompt_batches import Prompt
-from traps_pipeline.models.local.selfcheck import tiny_model
 from traps_pipeline.models.local.spans import spans
-from traps_pipeline.models.local.tiny import Family
 from traps_pipeline.models.local.vision_cache import ClipMemory
 
 if TYPE_CHECKING:
@@ -195,9 +192,9 @@ def _check_patching(subject: Subject) -> str:
     all_tokens = np.ones(target.length, bool)
     full_patches = [Patch("residual", layer, all_tokens) for layer in range(model.n_layers + 1)]
     sites = [Patch(site, layer, all_tokens) for site in SITES for layer in range(1, model.n_layers + 1)]
-    self_patched = patched_changes(model, target, target, [*full_patches, *sites], tokens)
-    _require(bool((self_patched == 0).all()), "a patch with itself changes the outcome")
     gap = source.margin - target.margin
+    self_patched = np.abs(patched_changes(model, target, target, [*full_patches, *sites], tokens)).max()
+    _require(self_patched <= CLOSE * abs(gap), f"a patch with itself changes the outcome by {self_patched:.1e}")
     deviations = np.abs(patched_changes(model, target, source, full_patches, tokens) / gap - 1)
     _require(
         bool(gap and deviations.max() <= CLOSE),
@@ -209,7 +206,9 @@ def _check_patching(subject: Subject) -> str:
         "per-layer inputs": bool(target.per_layer),
     }
     path_names = ", ".join(name for name, is_different in side_paths.items() if is_different)
-    return "exactly 0, and 1" + (f" with {path_names}" if path_names else "")
+    return "0 within rounding, and 1" + (
+        f" with {path_names}" if path_names else ""
+    )
 
 
 # --- faster ways ------------------------------------------------------------------------------------------------------
@@ -266,8 +265,3 @@ CHECKS = (
 def brightening_clip() -> tuple[np.ndarray, np.ndarray]:
     """Return a clip for the checks: four frames (4, 64, 96, 3), half a second apart."""
     return np.stack([np.full((64, 96, 3), shade, np.uint8) for shade in range(40, 200, 40)]), np.arange(4) / 2
-
-
-def tiny_subject(family: Family, folder: Path) -> Subject:
-    """Return a tiny checkpoint of a family, built, saved and reloaded, and the clip."""
-    return Subject(tiny_model(family, folder / family), *brightening_clip())

@@ -171,9 +171,9 @@ def patched_changes(
     """Measure the change of the target's outcome by each patch, (patches,).
 
     Patches at one block share passes that begin there; the vision tower is not run again. Every pass has one row
-    without a patch, and changes are relative to that row: a patch that replaces states by equal ones changes nothing,
-    bit for bit, whatever the batch size does to rounding. Raises TrapsError if the two prompts have different numbers
-    of tokens, or different visual positions.
+    without a patch, and changes are relative to that row, so that rounding by the size of a batch does not count; what
+    several threads do to the rounding of one row does. Raises TrapsError if the two prompts have different numbers of
+    tokens, or different visual positions.
     """
     import torch
 

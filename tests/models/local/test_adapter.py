@@ -30,6 +30,7 @@ from tests.local_models import (
     model,
     three_prompts,
 )
+from tools.tiny_checkpoints import build_tiny, make_tokenizer
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.mechanism.probing_versions import loaded_params
@@ -39,7 +40,6 @@ from traps_pipeline.models.local.decoding import decode
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.prompt_batches import batches
 from traps_pipeline.models.local.sampling import SeededNucleus
-from traps_pipeline.models.local.tiny import build_tiny, make_tokenizer
 from traps_pipeline.models.registry.checkpoint import weight_bytes
 from traps_pipeline.models.registry.entries import ModelEntry
 from traps_pipeline.models.registry.local_settings import MechanismSpec

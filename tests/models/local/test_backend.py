@@ -19,7 +19,8 @@ import pytest
 import torch
 
 from tests.build.errors import raises
-from tests.local_models import FAMILIES, QUESTIONS, SIX_FRAMES, SYSTEM, checkpoint, clip, entry, model
+from tests.local_models import QUESTIONS, SIX_FRAMES, SYSTEM, checkpoint, clip, entry, model
+from tools.tiny_checkpoints import build_tiny
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cli import main
@@ -28,7 +29,6 @@ from traps_pipeline.mechanism.probing_versions import loaded_params
 from traps_pipeline.models.asking.backends import make_backend
 from traps_pipeline.models.local.adapter import LocalModel, load_local_model
 from traps_pipeline.models.local.backend import LocalBackend, outcome, seeds, worker
-from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.models.registry import entries as registry
 from traps_pipeline.models.registry.accounts import Limits
 from traps_pipeline.models.registry.entries import ModelEntry, effective_params, load_models
@@ -273,14 +273,11 @@ def test_the_papers_three_local_models_are_asked_as_the_paper_has_it() -> None:
     assert spec.quantisation == "nf4"  # docs/spec.md 7.1
 
 
-def test_the_doctor_tries_every_family_and_says_what_is_not_here(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_doctor_tries_the_shipped_model_and_says_what_is_not_here(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor", "--local", "--json"]) == 0
     found = {finding["what"]: finding["detail"] for finding in json.loads(capsys.readouterr().out)}
-    checks = {f"{family}, {check.name}" for family in FAMILIES for check in CHECKS}
-    assert found.keys() == {"devices", "nf4", "checkpoints", *FAMILIES, *checks}
-    for family, name in (("qwen3-vl", "Qwen3VL"), ("gemma-4", "Gemma4"), ("llava-next-video", "LlavaNextVideo")):
-        states = "7 " if family == "gemma-4" else "5 "
-        assert found[family].startswith(name) and found[f"{family}, states"].startswith(states)
+    assert found.keys() == {"devices", "nf4", "checkpoints", *(f"pocket, {check.name}" for check in CHECKS)}
+    assert found["pocket, states"].endswith("bit for bit") and "NF4" in found["nf4"]
     assert found["devices"].startswith(f"torch {torch.__version__}") and "qwen3-vl-8b" in found["checkpoints"]
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from tests.local_models import ask, model
+from tools.tiny_checkpoints import FAMILIES, Family
 from traps_pipeline.mechanism.hook import Steering
-from traps_pipeline.models.local.tiny import FAMILIES, Family
 
 pytestmark = pytest.mark.slow
 LAYER, TOKENS = 2, 5

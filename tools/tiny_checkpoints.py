@@ -1,6 +1,6 @@
 """Build tiny random checkpoints of the real classes, without downloads.
 
-Tokenizer, chat template and processor are made here. They serve tests and `traps doctor --local`. With larger sizes and
+Tokenizer, chat template and processor are made here. They serve tests and benchmarks. With larger sizes and
 a tokenizer of its own, one is the skeleton of a model that is trained from scratch.
 
     build_tiny("qwen3-vl", folder)                       # 1 to 2 MB, bytes as tokens
