@@ -69,7 +69,7 @@ def test_a_run_for_which_nothing_matches_says_so_and_fails(tmp_path: Path) -> No
         assert study.traps("init", tmp_path / f"{name}.yaml", "--workspace", tmp_path / place).code == 0
     for name, place in (("no-such-run", "study"), ("no-such-arm", "other")):
         ran = study.traps("run", tmp_path / f"{name}.yaml", "--workspace", tmp_path / place)
-        assert (ran.code, ran.raised) == (1, "pipeline.selection.require_work") and name in ran.err
+        assert (ran.code, ran.raised) == (1, "pipeline.run_plan.RunPlan.require_work") and name in ran.err
 
     materialize = ("asset", "materialize", "-m", "traps_pipeline.definitions", "--select", "responses")
     wanted, unwanted = "occlusion|oracle__standard__run1", "chaotic|oracle__standard__run1"

@@ -17,8 +17,8 @@ from traps_pipeline.pipeline.graph import the_graph
 from traps_pipeline.pipeline.history import History
 from traps_pipeline.pipeline.lineage import OTHER_COLUMNS, Lineage, Status
 from traps_pipeline.pipeline.partition_checks import CURRENT, evaluations
+from traps_pipeline.pipeline.run_plan import RunPlan, StageStatus
 from traps_pipeline.pipeline.schemes import CELL as CELLS
-from traps_pipeline.pipeline.study_status import StageStatus, stage_statuses
 from traps_pipeline.pipeline.translation import partitions_of
 from traps_pipeline.scoring.score_rows import METRICS
 from traps_pipeline.storage import columns as shared
@@ -95,7 +95,7 @@ def test_a_table_that_is_gone_makes_metrics_stale(study: Workspace) -> None:
 def test_a_table_of_a_version_with_other_columns_is_to_be_made_again_and_not_told_as_lost(study: Workspace) -> None:
     study.tables.write(Table("metrics", OlderRow, ("dataset",), ("dataset",)), {"dataset": "chaotic"}, [], {})
     assert status(study) == Status("missing", (OTHER_COLUMNS,))
-    (told,) = (one for one in stage_statuses(study, Lineage(study), None) if one.stage == "metrics")
+    (told,) = (one for one in RunPlan(study).statuses() if one.stage == "metrics")
     assert told.by_reason() == {OTHER_COLUMNS: ["chaotic"]}
 
 
@@ -133,7 +133,7 @@ def test_damage_and_a_loss_are_reported_again_after_a_restart_of_the_daemon(stud
         for last in (False, False, True):  # a new process has reported nothing yet
             if last:
                 path.unlink()
-            report_unseen(instance, study, Lineage(study), {})
+            report_unseen(instance, RunPlan(study), {})
         key = dg.AssetCheckKey(dg.AssetKey("verdicts"), CURRENT)
         stored = instance.event_log_storage.get_asset_check_execution_history(key, limit=9)
     found = [each.event.dagster_event.asset_check_evaluation_data for each in stored]  # pyright: ignore
@@ -152,9 +152,9 @@ def test_a_loss_is_told_each_time_that_it_happens_and_taken_back_once_it_is_repa
         for _ in range(2):
             path.unlink()
             for _ in range(2):
-                report_unseen(instance, study, Lineage(study), reported)
+                report_unseen(instance, RunPlan(study), reported)
             score(study, graph["metrics"].code)
-            report_unseen(instance, study, Lineage(study), reported)
+            report_unseen(instance, RunPlan(study), reported)
         key = dg.AssetCheckKey(dg.AssetKey("metrics"), CURRENT)
         stored = instance.event_log_storage.get_asset_check_execution_history(key, limit=9)
     passed = [each.event.dagster_event.asset_check_evaluation_data.passed for each in stored]  # pyright: ignore

@@ -25,6 +25,7 @@ from traps_pipeline.models.registry import LOCAL, NETWORK, Entry, get_model
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.pipeline.experiment import Experiment
 from traps_pipeline.pipeline.lineage import Lineage
+from traps_pipeline.pipeline.run_plan import RunPlan
 from traps_pipeline.protocol.cells import Cell, SteeredEvaluation
 from traps_pipeline.protocol.datasets import DATASETS, UNPAIRED, all_datasets_of, datasets_of_category, sides_of
 from traps_pipeline.storage.benchmark_tables import ITEMS
@@ -53,8 +54,8 @@ class Count:
 
 
 @dataclass(frozen=True)
-class Plan:
-    """The calls of an experiment.
+class CallPlan:
+    """The calls of an experiment, which cost money or time.
 
     calls: answers and votes by model. uncertain: datasets with items that are unknown before a run has made them; their
     calls are counted as new, which is an upper bound. forecasts: tokens, dollars and minutes of the new calls over the
@@ -79,13 +80,13 @@ class Plan:
         return minutes_of(models) + minutes_of(judges)
 
 
-def make_plan(workspace: Workspace | None, experiment: Experiment, study: Study, card: str = "H100") -> Plan:
+def plan_calls(plan: RunPlan | None, experiment: Experiment, study: Study, card: str = "H100") -> CallPlan:
     """Count an experiment's calls and forecast their cost; nothing is sent or written.
 
-    study: the workspace's, or that of a new one, with the panel that judges. card: one of CARDS.
+    plan: of its workspace, None for a new one. study: with the panel that judges. card: one of CARDS.
     """
-    panel = load_panel(study.panel)
-    calls, uncertain_datasets = _count_calls(workspace, experiment, study)
+    panel, workspace, lineage = load_panel(study.panel), plan and plan.workspace, plan and plan.lineage
+    calls, uncertain_datasets = _count_calls(workspace, lineage, experiment, study)
     steered_counts = _count_steered(workspace, experiment, study)
     local = [*_local_costs(workspace, experiment, study, card, calls, steered_counts)]
     votes = sum(count.new for _, count in [*calls.values(), *steered_counts.values()])
@@ -105,12 +106,12 @@ def make_plan(workspace: Workspace | None, experiment: Experiment, study: Study,
     ]
     judge = load_protocol().judge(study.panel)
     if judge is None:
-        return Plan(calls, uncertain_datasets, forecasts, None, steered_counts, pairs, local)
-    labels = _count_labels(workspace, experiment, judge)
+        return CallPlan(calls, uncertain_datasets, forecasts, None, steered_counts, pairs, local)
+    labels = _count_labels(workspace, lineage, experiment, judge)
     if labels.new:
         cost = forecast(judge, labels.new, Experience(prompt_tokens=LABEL_TOKENS))
         forecasts.append(replace(cost, participant="confabulation labels"))
-    return Plan(calls, uncertain_datasets, forecasts, labels, steered_counts, pairs, local)
+    return CallPlan(calls, uncertain_datasets, forecasts, labels, steered_counts, pairs, local)
 
 
 def _count_steered(workspace: Workspace | None, experiment: Experiment, study: Study) -> dict[str, tuple[Count, Count]]:
@@ -166,10 +167,12 @@ def _local_costs(
                 yield cost_of(media, media.media, passes, CARDS[card], quantised=params.quantisation == "nf4")
 
 
-def _count_labels(workspace: Workspace | None, experiment: Experiment, judge: JudgeEntry) -> Count:
+def _count_labels(
+    workspace: Workspace | None, lineage: Lineage | None, experiment: Experiment, judge: JudgeEntry
+) -> Count:
     """Count confabulation labels, a full sample for models without verdicts."""
     protocol, cell_keys = load_protocol(), {cell.key for cell in experiment.cells()}
-    labels, lineage = Count(), Lineage(workspace) if workspace else None
+    labels = Count()
     for model in protocol.models:
         cells = [cell for cell in protocol.cells(model) if cell.key in cell_keys]
         if not cells:
@@ -190,10 +193,10 @@ def _is_judged(lineage: Lineage, cells: Sequence[Cell]) -> bool:
 
 
 def _count_calls(
-    workspace: Workspace | None, experiment: Experiment, study: Study
+    workspace: Workspace | None, lineage: Lineage | None, experiment: Experiment, study: Study
 ) -> tuple[dict[str, tuple[Count, Count]], list[str]]:
     plan = {model: (Count(), Count()) for model in experiment.models}
-    panel, lineage = load_panel(study.panel), Lineage(workspace) if workspace else None
+    panel = load_panel(study.panel)
     scenes = Counter(name for scenario in load_scenarios(study).values() for name in all_datasets_of(scenario.category))
     current = {dataset for dataset in experiment.datasets if lineage and _has_current_items(lineage, dataset)}
     items = {
@@ -208,7 +211,7 @@ def _count_calls(
         if workspace is None or lineage is None:
             continue
         # A fresh cell of current items is complete: skip building its keys and reading its ledger.
-        fresh_answers, cast = (_count_fresh_rows(workspace, lineage, table, cell) for table in (RESPONSES, VOTES))
+        fresh_answers, cast = (_count_fresh_rows(lineage, table, cell) for table in (RESPONSES, VOTES))
         if fresh_answers is not None and cast is not None and cell.dataset in current:
             answers.add(fresh_answers, fresh_answers)
             votes.add(cast, cast)
@@ -267,9 +270,9 @@ def _count_cell(
     votes.add(len(ballots) + n_new, len(workspace.votes.read(folder, ballots).settled))
 
 
-def _count_fresh_rows(workspace: Workspace, lineage: Lineage, table: Table[Any], cell: Cell) -> int | None:
+def _count_fresh_rows(lineage: Lineage, table: Table[Any], cell: Cell) -> int | None:
     """Return the number of rows of a cell's table; None unless it is fresh."""
-    state = workspace.tables.state(table, cell.partition)
+    state = lineage.state(table.name, cell.key)
     return state.rows if state and lineage.status(table.name, cell.key).kind == "fresh" else None
 
 

@@ -46,6 +46,11 @@ class StudyPartitions:
         else:
             self._asked = [e for name, e in workspace.study.experiments.items() if experiment in (None, name)]
 
+    def of(self, experiment: str | None) -> StudyPartitions:
+        """Return the keys of one experiment of the study; None: of all."""
+        is_all = experiment is None or self._workspace is None or [*self._workspace.study.experiments] == [experiment]
+        return self if is_all else StudyPartitions(self._workspace, experiment)
+
     @cached_property
     def categories(self) -> list[str]:
         """Categories with scenarios, or with a table made before all were discarded."""
