@@ -8,6 +8,7 @@ import dagster as dg
 from pydantic import PrivateAttr
 
 from traps_pipeline.pipeline.graph import Graph, Source, Stage
+from traps_pipeline.pipeline.metadata import errors_for_pages
 from traps_pipeline.pipeline.partition_checks import CURRENT, CURRENT_DOC
 from traps_pipeline.pipeline.step import Event, guard_events, run_step
 from traps_pipeline.pipeline.translation import asset_deps, asset_key, partitions_of
@@ -64,10 +65,11 @@ def _observable(source: Source) -> dg.AssetsDefinition:
         metadata={"owner": OWNERS[0]},
     )
     def observe(workspace: WorkspaceResource) -> dg.DataVersion | dg.DataVersionsByPartition:
-        study_workspace = workspace.open()
-        if source.scheme is None:
-            return dg.DataVersion(source.version(study_workspace, None))
-        return dg.DataVersionsByPartition({key: source.version(study_workspace, key) for key in source.scheme.keys})
+        with errors_for_pages():
+            study, keys = workspace.open(), source.scheme.keys if source.scheme else ()
+            if source.scheme is None:
+                return dg.DataVersion(source.version(study, None))
+            return dg.DataVersionsByPartition({key: source.version(study, key) for key in keys})
 
     return cast(dg.AssetsDefinition, observe)
 
@@ -95,8 +97,9 @@ def _asset(graph: Graph, stage: Stage) -> dg.AssetsDefinition:
         ],
     )
     def asset(context: dg.AssetExecutionContext, workspace: WorkspaceResource) -> Iterator[Event]:
-        events = guard_events(run_step(stage, context, workspace.open()), context)
-        yield from workspace.until_torn_down(events)
+        with errors_for_pages():
+            events = guard_events(run_step(stage, context, workspace.open()), context)
+            yield from workspace.until_torn_down(events)
 
     return asset
 

@@ -27,6 +27,7 @@ from traps_pipeline.pipeline.assets import WorkspaceResource
 from traps_pipeline.pipeline.graph import JOB_GROUPS, Stage, name_of, the_graph
 from traps_pipeline.pipeline.history import History
 from traps_pipeline.pipeline.machine import require_machine
+from traps_pipeline.pipeline.metadata import errors_for_pages, visible_metadata
 from traps_pipeline.pipeline.partition_checks import CURRENT
 from traps_pipeline.pipeline.ranges import batches
 from traps_pipeline.pipeline.run import materialize_stale
@@ -78,6 +79,7 @@ def _job(name: str, doc: str, stages: Sequence[Stage]) -> Any:
         return dg.define_asset_job(name, selection=selection, description=doc, tags={MAKE_TAG: STALE_OR_MISSING})
 
     @dg.op(name=f"make_{name}", description=doc)
+    @errors_for_pages()
     def make(context: dg.OpExecutionContext, workspace: WorkspaceResource) -> None:
         reread_sources()
         plan = RunPlan(workspace.open(), stages=[stage.name for stage in stages])
@@ -139,7 +141,7 @@ def _report(instance: dg.DagsterInstance, stage: str, key: str | None, wrong: st
         asset_key=asset_key(stage),
         check_name=CURRENT,
         passed=not wrong,
-        metadata={**({"not current": wrong} if wrong else {}), "partition": key or "all"},
+        metadata=visible_metadata({**({"not current": wrong} if wrong else {}), "partition": key or "all"}),
         target_materialization_data=History(instance, the_graph()).check_target(stage, key),
     )
     try:
@@ -179,6 +181,7 @@ def _sensor(name: str, doc: str, *, costs: bool) -> dg.SensorDefinition:
         default_status=dg.DefaultSensorStatus.STOPPED if costs else dg.DefaultSensorStatus.RUNNING,
         description=doc,
     )
+    @errors_for_pages()
     def follow(context: dg.SensorEvaluationContext) -> dg.SkipReason | list[dg.RunRequest]:
         reread_sources()
         study_workspace = study_here()

@@ -26,7 +26,7 @@ from traps_pipeline.pipeline.history import History
 from traps_pipeline.pipeline.lineage import write_report_state
 from traps_pipeline.pipeline.machine import nothing_to_do_reason, parts_of_run, require_machine
 from traps_pipeline.pipeline.making import PartitionMaker
-from traps_pipeline.pipeline.metadata import partition_metadata, tally_metadata, visible_metadata
+from traps_pipeline.pipeline.metadata import page_text, partition_metadata, tally_metadata, visible_metadata
 from traps_pipeline.pipeline.partition_checks import StageChecks, raise_for_run
 from traps_pipeline.pipeline.run_plan import RunPlan
 from traps_pipeline.pipeline.runs import report_canceling
@@ -201,7 +201,7 @@ def guard_events(events: Events, context: dg.AssetExecutionContext) -> Events:
     """Forward a step's events; log progress, and keep keys out of stored tracebacks."""
     report = progress.current()
     try:
-        with report.heard_by(context.log.info):
+        with report.heard_by(lambda line: context.log.info(page_text(line))):
             yield from events
             report.end_stage()
     except Exception as error:
