@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 import sys
 import tempfile
@@ -127,7 +128,7 @@ def examine_files(place: Place) -> Iterator[Finding]:
         ("states", sorted(file for kind in STATES for file in (workspace.root / "states").rglob(kind)), damage),
         ("history", sorted(workspace.dagster_home.rglob("*.db")), _history_damage),
     ):
-        messages = [message for path in files if (message := damage_of(path))]
+        messages = [message for path in files if (message := _damage(path, damage_of))]
         summary = "; ".join(messages[:MAX_FILES]) + (
             f"; and {len(messages) - MAX_FILES} more" if len(messages) > MAX_FILES else ""
         )
@@ -135,6 +136,13 @@ def examine_files(place: Place) -> Iterator[Finding]:
     message = [*workspace.answers.damage(), *workspace.votes.damage()]
     yield Finding(not message, "ledger", "; ".join(message[:MAX_FILES]) or "all rows are what was written")
     yield Finding(True, "unfinished", _remove_unfinished(workspace.root))
+
+
+def _damage(path: Path, damage_of: Callable[[Path], str]) -> str:
+    try:
+        return damage_of(path)
+    except OSError as error:
+        return f"{path}: cannot be read ({error.strerror}); run this as the study's owner"
 
 
 def examine_unused(place: Place, *, is_removed: bool) -> Finding:
@@ -188,8 +196,10 @@ def _media_damage(note: Path) -> str:
 
 def _history_damage(path: Path) -> str:
     """Return why a history is damaged; the next command puts it aside, losing nothing."""
+    # SQLite keeps notes beside a file of this kind, which a user who may only read cannot let it write.
+    mode = "mode=ro" if os.access(path.parent, os.W_OK) else "immutable=1"
     try:
-        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as connection:
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?{mode}", uri=True)) as connection:
             (result,) = connection.execute("pragma quick_check(1)").fetchone()
     except sqlite3.DatabaseError as error:
         result = str(error)
@@ -199,14 +209,15 @@ def _history_damage(path: Path) -> str:
 def _remove_unfinished(root: Path) -> str:
     """Remove killed runs' unfinished files, but no young ones a run may be writing."""
     old = [path for path in root.rglob(f".*{PART}") if time.time() - path.stat().st_mtime > UNFINISHED_AFTER_S]
-    size = sum(path.stat().st_size for path in old)
+    if not old:
+        return "no killed run left a file"
+    size, effect = sum(path.stat().st_size for path in old), "removed"
     for path in old:
-        path.unlink(missing_ok=True)
-    return (
-        f"{count_noun(len(old), 'file')} of killed runs removed ({size / 1e6:.1f} MB)"
-        if old
-        else "no killed run left a file"
-    )
+        try:
+            path.unlink(missing_ok=True)
+        except OSError:
+            effect = "left, which only the study's owner can remove"
+    return f"{count_noun(len(old), 'file')} of killed runs {effect} ({size / 1e6:.1f} MB)"
 
 
 def _finding(topic: str, look: Callable[[], str]) -> Finding:

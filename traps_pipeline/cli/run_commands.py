@@ -99,7 +99,7 @@ def run(arguments: argparse.Namespace) -> int:
     from traps_pipeline.cli.printed_progress import make_progress
 
     experiment = experiment_of(arguments)
-    workspace = _allow(create(arguments, experiment), experiment, arguments)
+    workspace = create(arguments, experiment, money=_money(experiment, arguments))
     stream = sys.stderr if arguments.json else sys.stdout
     title = f"{experiment.name}: {experiment.description}" if experiment.description else experiment.name
     print(f"{wrap_text(title, stream)}\nworkspace {workspace.place}", file=stream, flush=True)
@@ -196,11 +196,8 @@ def _open_runs(arguments: argparse.Namespace, instance: DagsterInstance, workspa
     yield several_hosts().runs(workspace, instance, arguments)
 
 
-def _allow(workspace: Workspace, experiment: Experiment, arguments: argparse.Namespace) -> Workspace:
-    """Return the workspace with the command's budgets, else the experiment's.
-
-    Raises TrapsError for a wrong one.
-    """
+def _money(experiment: Experiment, arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the budgets of the command, else of the experiment. Raises TrapsError."""
     fields = {name: getattr(experiment, name) for name in MONEY}
     money: dict[str, Any] = {name: value for name, value in fields.items() if value is not None}
     if arguments.allow_unknown_prices:
@@ -213,19 +210,7 @@ def _allow(workspace: Workspace, experiment: Experiment, arguments: argparse.Nam
                 f"--budget-usd {text}: give dollars (20 or 20.50), or MODEL=dollars for one model or judge"
             )
         if name:
-            caps = money.setdefault("model_budgets_usd", dict(workspace.study.model_budgets_usd))
-            caps[name] = dollars
+            money["model_budgets_usd"] = money.get("model_budgets_usd", {}) | {name: dollars}
         else:
             money["budget_usd"] = dollars
-    for name in money.get("model_budgets_usd", {}):
-        _check_participant(name)
-    return workspace.allow(**money) if money else workspace
-
-
-def _check_participant(name: str) -> None:
-    """Raise TrapsError with the known names if no model or judge has this name."""
-    from traps_pipeline.models.judges import load_judges
-    from traps_pipeline.models.registry import get_model
-
-    if name not in load_judges():
-        get_model(name)
+    return money

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.names import Name
@@ -18,20 +18,19 @@ from traps_pipeline.models.user_registry import UserRegistry, add_entries
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import DATASETS, SCHEMAS, UNPAIRED
 from traps_pipeline.protocol.regimes import BY_NAME, PAPER_REGIMES, REGIMES
-from traps_pipeline.storage.study import Asked, MechanismSettings, Study
+from traps_pipeline.storage.study import Asked, MechanismSettings, Settings, Study
 
 EXPERIMENTS = ASSETS / "experiments"
 LITE = "lite"  # the name of the set of 200 scenarios in LITE_FILE
 LITE_FILE = ASSETS / "lite.yaml"
 
 
-class Experiment(BaseModel):
+class Experiment(Settings):
     """The fields of an experiment's file.
 
     benchmark, scenarios, per_family and panel are copied to the study.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
     name: Name = Field(pattern=r"^[a-z0-9-]+$", description="of the experiment in `study.yaml`")
     description: str = Field(default="", description="one line, printed when it runs")
     benchmark: str = Field(default="released", description="name of the benchmark: released, or a private one")
@@ -83,13 +82,6 @@ class Experiment(BaseModel):
     @classmethod
     def _regimes(cls, values: list[str]) -> list[str]:
         return _known_names(values, REGIMES)
-
-    @field_validator("models", "datasets", "regimes", "runs")
-    @classmethod
-    def _require_unique(cls, values: list[Any]) -> list[Any]:
-        if len(set(values)) != len(values):
-            raise ValueError(f"{values} names something twice")
-        return values
 
     @model_validator(mode="after")
     def _check_schemas(self) -> Experiment:
