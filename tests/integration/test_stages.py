@@ -19,6 +19,7 @@ from traps_pipeline.pipeline.graph import the_graph
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.pipeline.run import dagster_history
 from traps_pipeline.pipeline.runs import HOST_TAG, PID_TAG, this_host
+from traps_pipeline.pipeline.stage import SHARED_IN_RUN
 from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.storage.benchmark_tables import ITEMS
@@ -182,3 +183,9 @@ def test_the_code_location_validates_and_imports_nothing_heavy(study: Checkout) 
     assert finished.out.strip() == "[]", finished.err
     valid = study.dagster("definitions", "validate", "-m", "traps_pipeline.definitions").ok()
     assert "BetaWarning" not in valid.err
+
+
+def test_a_run_keeps_nothing_in_memory_for_a_stage_that_does_not_follow(study: Checkout) -> None:
+    shutil.rmtree(study.workspace / "tables" / "contrasts")
+    assert study.traps("run", EXPERIMENT, "--until", "contrasts").code == 0
+    assert (study.workspace / "tables" / "contrasts").exists() and not SHARED_IN_RUN

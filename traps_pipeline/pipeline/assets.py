@@ -10,6 +10,7 @@ from pydantic import PrivateAttr
 from traps_pipeline.pipeline.graph import Graph, Source, Stage
 from traps_pipeline.pipeline.metadata import errors_for_pages
 from traps_pipeline.pipeline.partition_checks import CURRENT, CURRENT_DOC
+from traps_pipeline.pipeline.stage import SHARED_IN_RUN
 from traps_pipeline.pipeline.step import Event, guard_events, run_step
 from traps_pipeline.pipeline.translation import asset_deps, asset_key, partitions_of
 from traps_pipeline.storage.tables import Table
@@ -39,6 +40,7 @@ class WorkspaceResource(dg.ConfigurableResource):
     def teardown_after_execution(self, context: dg.InitResourceContext) -> None:
         """See `until_torn_down`."""
         self._steps.close()
+        SHARED_IN_RUN.clear()
 
     def open(self) -> Workspace:
         """Return the workspace. Raises TrapsError with a remedy where there is none."""
