@@ -24,6 +24,7 @@ from traps_pipeline.models.judges import JudgeEntry, load_panel
 from traps_pipeline.models.registry import LOCAL, NETWORK, Entry, get_model
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.pipeline.experiment import Experiment
+from traps_pipeline.pipeline.graph import Node
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.pipeline.run_plan import RunPlan
 from traps_pipeline.protocol.cells import Cell, SteeredEvaluation
@@ -225,15 +226,15 @@ def _items(
 ) -> tuple[list[dict[str, Any]], Counter[str]]:
     """Return a dataset's items in the next run, and counts by side of unknown ones."""
     unknown_items = Counter(dict.fromkeys(sides_of(dataset), scenes))
-    if workspace is None or lineage is None or lineage.state("items", dataset) is None:
+    if workspace is None or lineage is None or not _is_there(lineage, ("items", dataset)):
         return [], unknown_items
     if is_current:
         return asked_items(workspace, dataset), Counter()
     for stage, key in _input_versions(lineage, dataset):
-        state = lineage.state(stage, key)
-        if lineage.damage(stage, key) or (state and state.code != lineage.graph[stage].code):
+        state, is_lost = lineage.state(stage, key), stage != "items" and lineage.damage(stage, key)
+        if is_lost or (state and state.code != lineage.graph[stage].code):
             return [], unknown_items
-    if dataset in UNPAIRED:  # not every scenario admits all
+    if dataset in UNPAIRED and lineage.state("items", dataset):  # not every scenario admits all
         unknown_items = Counter(workspace.tables.read_all(ITEMS, ["side"], dataset=dataset)["side"])
     items = expected_items(workspace, dataset)
     return items, unknown_items - Counter(item["side"] for item in items)
@@ -281,8 +282,13 @@ def _has_current_items(lineage: Lineage, dataset: str) -> bool:
     return all(lineage.status(*node).kind == "fresh" for node in _input_versions(lineage, dataset))
 
 
-def _input_versions(lineage: Lineage, dataset: str) -> list[tuple[str, str | None]]:
+def _input_versions(lineage: Lineage, dataset: str) -> list[Node]:
     """Return the existing partitions of a dataset's items and of all upstream."""
     parents = lineage.graph.parents("items", dataset).items()
     inputs = [("items", dataset), *((stage, key) for stage, keys in parents for key in keys)]
-    return [node for node in inputs if lineage.state(*node)]
+    return [node for node in inputs if _is_there(lineage, node)]
+
+
+def _is_there(lineage: Lineage, node: Node) -> bool:
+    """Return whether a partition was made, be it damaged since."""
+    return lineage.state(*node) is not None or bool(lineage.damage(*node))
