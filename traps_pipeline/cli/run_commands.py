@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from dagster import DagsterInstance
 
     from traps_pipeline.pipeline.experiment import Experiment
-    from traps_pipeline.pipeline.experiment_run import RunReport
+    from traps_pipeline.pipeline.run_plan import RunReport
     from traps_pipeline.pipeline.runs import Runs
     from traps_pipeline.storage.workspace import Workspace
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.names import Name
@@ -73,15 +73,15 @@ class Experiment(Settings):
     def _lite(cls, value: Any) -> Any:
         return read_yaml(LITE_FILE)["scenarios"] if value == LITE else value
 
-    @field_validator("datasets")
+    @field_validator("datasets", "regimes")
     @classmethod
-    def _datasets(cls, values: list[str]) -> list[str]:
-        return _known_names(values, (*DATASETS, *UNPAIRED))
-
-    @field_validator("regimes")
-    @classmethod
-    def _regimes(cls, values: list[str]) -> list[str]:
-        return _known_names(values, REGIMES)
+    def _require_known(cls, values: list[str], info: ValidationInfo) -> list[str]:
+        names = (*DATASETS, *UNPAIRED) if info.field_name == "datasets" else REGIMES
+        unknown = [value for value in values if value not in names]
+        if unknown or not values:
+            suggestion = did_you_mean(unknown[0], names) if unknown else ""
+            raise ValueError(f"{unknown or 'nothing'} given; choose from {', '.join(names)}{suggestion}")
+        return values
 
     @model_validator(mode="after")
     def _check_schemas(self) -> Experiment:
@@ -92,10 +92,6 @@ class Experiment(Settings):
                 f"datasets {', '.join(schemas)} ask for an object of their own, and so does the regime {objects[0]}: "
                 "leave one of them out"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _study_holds_together(self) -> Experiment:
         _ = self.study  # report an invalid study (two subsets, a wrong epoch) as an error of this file
         return self
 
@@ -159,14 +155,6 @@ class Experiment(Settings):
                     if run <= available:
                         cells += [Cell(dataset, Evaluation(model, regime, run)) for dataset in self.datasets]
         return cells
-
-
-def _known_names(values: list[str], names: tuple[str, ...]) -> list[str]:
-    unknown = [value for value in values if value not in names]
-    if unknown or not values:
-        suggestion = did_you_mean(unknown[0], names) if unknown else ""
-        raise ValueError(f"{unknown or 'nothing'} given; choose from {', '.join(names)}{suggestion}")
-    return values
 
 
 def load_experiment(name: str) -> Experiment:

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from traps_pipeline.base import progress
 from traps_pipeline.base.extras import require
-from traps_pipeline.base.progress import Tally
 from traps_pipeline.models.backends import require_libraries
 from traps_pipeline.models.judges import JudgeEntry
 from traps_pipeline.models.registry import NETWORK, Entry
 from traps_pipeline.pipeline.experiment import Experiment
-from traps_pipeline.pipeline.run_plan import RunPlan, stages_until
+from traps_pipeline.pipeline.run_plan import RunPlan, RunReport, stages_until
 from traps_pipeline.storage.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -23,25 +20,6 @@ if TYPE_CHECKING:
     from traps_pipeline.pipeline.runs import Runs
 
 OpenRuns = Callable[["DagsterInstance", Workspace], AbstractContextManager["Runs"]]
-
-
-@dataclass
-class RunReport:
-    """A run's problems in sentences, whether a budget ended it, and its tallies."""
-
-    problems: list[str] = field(default_factory=list)
-    over_budget: bool = False
-    seconds: float = 0.0
-    tallies: Mapping[str, Tally] = field(default_factory=dict)
-
-    def tally(self, stage: str) -> Tally:
-        """Return the work of one stage."""
-        return self.tallies.get(stage, Tally())
-
-    @property
-    def frames(self) -> int:
-        """Number of rendered frames."""
-        return sum(tally.frames for tally in self.tallies.values())
 
 
 def run_experiment(
@@ -77,10 +55,10 @@ def run_experiment(
         if preflight is not None:
             _preflight(workspace, entries, preflight)
         with open_runs(instance, workspace) as runs:
-            result = materialize_stale(instance, runs, plan)
-    if not result.problems:
+            report = materialize_stale(instance, runs, plan)
+    if not report.problems:
         plan.note_made()
-    return RunReport(result.problems, result.over_budget, result.seconds, progress.current().totals)
+    return report
 
 
 def _preflight(workspace: Workspace, entries: Sequence[Entry], say: Callable[[str], None]) -> None:

@@ -86,10 +86,10 @@ def plan_calls(plan: RunPlan | None, experiment: Experiment, study: Study, card:
 
     plan: of its workspace, None for a new one. study: with the panel that judges. card: one of CARDS.
     """
-    panel, workspace, lineage = load_panel(study.panel), plan and plan.workspace, plan and plan.lineage
-    calls, uncertain_datasets = _count_calls(workspace, lineage, experiment, study)
-    steered_counts = _count_steered(workspace, experiment, study)
-    local = [*_local_costs(workspace, experiment, study, card, calls, steered_counts)]
+    panel = load_panel(study.panel)
+    calls, uncertain_datasets = _count_calls(plan, experiment, study)
+    steered_counts = _count_steered(plan, experiment, study)
+    local = [*_local_costs(plan, experiment, study, card, calls, steered_counts)]
     votes = sum(count.new for _, count in [*calls.values(), *steered_counts.values()])
     new: list[tuple[Entry, int]] = [(get_model(model), answers.new) for model, (answers, _) in calls.items()]
     new += [(judge, votes // len(panel)) for judge in panel]
@@ -100,22 +100,20 @@ def plan_calls(plan: RunPlan | None, experiment: Experiment, study: Study, card:
         for dataset in DATASETS
         if dataset in experiment.datasets
     }
-    ledgers = [ledger.totals() for ledger in (workspace.answers, workspace.votes)] if workspace else []
+    ledgers = [ledger.totals() for ledger in (plan.workspace.answers, plan.workspace.votes)] if plan else []
     forecasts = [
         forecast(entry, count, experience(totals[entry.id] for totals in ledgers if entry.id in totals))
         for entry, count in new
     ]
     judge = load_protocol().judge(study.panel)
-    if judge is None:
-        return CallPlan(calls, uncertain_datasets, forecasts, None, steered_counts, pairs, local)
-    labels = _count_labels(workspace, lineage, experiment, judge)
-    if labels.new:
+    labels = _count_labels(plan, experiment, judge) if judge else None
+    if judge and labels and labels.new:
         cost = forecast(judge, labels.new, Experience(prompt_tokens=LABEL_TOKENS))
         forecasts.append(replace(cost, participant="confabulation labels"))
     return CallPlan(calls, uncertain_datasets, forecasts, labels, steered_counts, pairs, local)
 
 
-def _count_steered(workspace: Workspace | None, experiment: Experiment, study: Study) -> dict[str, tuple[Count, Count]]:
+def _count_steered(plan: RunPlan | None, experiment: Experiment, study: Study) -> dict[str, tuple[Count, Count]]:
     """Count the calls for steered models' answers and the panel's votes, by model."""
     settings, counts = experiment.mechanism, dict[str, tuple[Count, Count]]()
     if settings is None or settings.steering is None:
@@ -127,16 +125,18 @@ def _count_steered(workspace: Workspace | None, experiment: Experiment, study: S
         datasets = [name for name in experiment.datasets if name in DATASETS]
         for regime, side_counts in count_answers(settings, model, datasets, Counter(taxonomies)).items():
             n_answers, ballots = side_counts.total(), seats * sum(len(tasks_for(s)) * n for s, n in side_counts.items())
-            folder, settled_counts = SteeredEvaluation(model, regime, 1).key, [0, 0]
-            if workspace is not None:
-                settled_counts = [len(ledger.read(folder).settled) for ledger in (workspace.answers, workspace.votes)]
-            answers.add(n_answers, min(settled_counts[0], n_answers))
-            votes.add(ballots, min(settled_counts[1], ballots))
+            folder, ledgers = (
+                SteeredEvaluation(model, regime, 1).key,
+                (plan.workspace.answers, plan.workspace.votes) if plan else (),
+            )
+            settled = [len(ledger.read(folder).settled) for ledger in ledgers] or [0, 0]
+            answers.add(n_answers, min(settled[0], n_answers))
+            votes.add(ballots, min(settled[1], ballots))
     return counts
 
 
 def _local_costs(
-    workspace: Workspace | None,
+    plan: RunPlan | None,
     experiment: Experiment,
     study: Study,
     card: str,
@@ -154,11 +154,10 @@ def _local_costs(
         work = [(entry, Work("answers", calls[model][0].new, tokens), entry.local_params())] if model in calls else []
         if settings and model in settings.models:
             inside_entry, params = mechanism_entry(entry, settings), entry.inside_params()
-            if workspace is None or not any(s["model"] == model for s in workspace.tables.partitions(HIDDEN_STATES)):
-                work += [
-                    (inside_entry, passes, params)
-                    for passes in mechanism_passes(settings, experiment.datasets, taxonomies)
-                ]
+            parts = plan.workspace.tables.partitions(HIDDEN_STATES) if plan else []
+            if not any(part["model"] == model for part in parts):
+                passes_of_all = mechanism_passes(settings, experiment.datasets, taxonomies)
+                work += [(inside_entry, passes, params) for passes in passes_of_all]
             if settings.steering and model in steered:
                 max_tokens = min(entry.expected_completion_tokens, settings.steering.max_new_tokens)
                 work.append((inside_entry, Work("steered answers", steered[model][0].new, max_tokens), params))
@@ -168,9 +167,7 @@ def _local_costs(
                 yield cost_of(media, media.media, passes, CARDS[card], quantised=params.quantisation == "nf4")
 
 
-def _count_labels(
-    workspace: Workspace | None, lineage: Lineage | None, experiment: Experiment, judge: JudgeEntry
-) -> Count:
+def _count_labels(plan: RunPlan | None, experiment: Experiment, judge: JudgeEntry) -> Count:
     """Count confabulation labels, a full sample for models without verdicts."""
     protocol, cell_keys = load_protocol(), {cell.key for cell in experiment.cells()}
     labels = Count()
@@ -178,12 +175,12 @@ def _count_labels(
         cells = [cell for cell in protocol.cells(model) if cell.key in cell_keys]
         if not cells:
             continue
-        if workspace is None or lineage is None or not _is_judged(lineage, cells):
+        if plan is None or not _is_judged(plan.lineage, cells):
             labels.add(protocol.n, 0)
             continue
-        samples = sample_failures(workspace, judge, model).values()
+        samples = sample_failures(plan.workspace, judge, model).values()
         keys = {failure.request.key for failures in samples for failure in failures}
-        labels.add(len(keys), len(workspace.votes.read(cells[0].evaluation.key, keys).settled))
+        labels.add(len(keys), len(plan.workspace.votes.read(cells[0].evaluation.key, keys).settled))
     return labels
 
 
@@ -194,40 +191,38 @@ def _is_judged(lineage: Lineage, cells: Sequence[Cell]) -> bool:
 
 
 def _count_calls(
-    workspace: Workspace | None, lineage: Lineage | None, experiment: Experiment, study: Study
+    plan: RunPlan | None, experiment: Experiment, study: Study
 ) -> tuple[dict[str, tuple[Count, Count]], list[str]]:
-    plan = {model: (Count(), Count()) for model in experiment.models}
+    counts = {model: (Count(), Count()) for model in experiment.models}
     panel = load_panel(study.panel)
     scenes = Counter(name for scenario in load_scenarios(study).values() for name in all_datasets_of(scenario.category))
-    current = {dataset for dataset in experiment.datasets if lineage and _has_current_items(lineage, dataset)}
-    items = {
-        dataset: _items(workspace, lineage, dataset, scenes[dataset], is_current=dataset in current)
-        for dataset in experiment.datasets
-    }
+    current = {dataset for dataset in experiment.datasets if plan and _has_current_items(plan.lineage, dataset)}
+    items = {d: _items(plan, d, scenes[d], is_current=d in current) for d in experiment.datasets}
     for cell in experiment.cells():
-        answers, votes = plan[cell.evaluation.model]
+        answers, votes = counts[cell.evaluation.model]
         cell_items, unknown_items = items[cell.dataset]
         answers.add(unknown_items.total(), 0)
         votes.add(len(panel) * sum(len(tasks_for(side)) * n for side, n in unknown_items.items()), 0)
-        if workspace is None or lineage is None:
+        if plan is None:
             continue
         # A fresh cell of current items is complete: skip building its keys and reading its ledger.
-        fresh_answers, cast = (_count_fresh_rows(lineage, table, cell) for table in (RESPONSES, VOTES))
+        fresh_answers, cast = (_count_fresh_rows(plan.lineage, table, cell) for table in (RESPONSES, VOTES))
         if fresh_answers is not None and cast is not None and cell.dataset in current:
             answers.add(fresh_answers, fresh_answers)
             votes.add(cast, cast)
         else:
-            _count_cell(workspace, panel, cell, cell_items, answers, votes)
-    return plan, sorted(dataset for dataset, (_, unknown_items) in items.items() if unknown_items)
+            _count_cell(plan.workspace, panel, cell, cell_items, answers, votes)
+    return counts, sorted(dataset for dataset, (_, unknown_items) in items.items() if unknown_items)
 
 
 def _items(
-    workspace: Workspace | None, lineage: Lineage | None, dataset: str, scenes: int, *, is_current: bool
+    plan: RunPlan | None, dataset: str, scenes: int, *, is_current: bool
 ) -> tuple[list[dict[str, Any]], Counter[str]]:
     """Return a dataset's items in the next run, and counts by side of unknown ones."""
     unknown_items = Counter(dict.fromkeys(sides_of(dataset), scenes))
-    if workspace is None or lineage is None or not _is_there(lineage, ("items", dataset)):
+    if plan is None or not _is_there(plan.lineage, ("items", dataset)):
         return [], unknown_items
+    workspace, lineage = plan.workspace, plan.lineage
     if is_current:
         return asked_items(workspace, dataset), Counter()
     for stage, key in _input_versions(lineage, dataset):

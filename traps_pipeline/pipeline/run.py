@@ -7,7 +7,6 @@ import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 
@@ -21,20 +20,11 @@ from traps_pipeline.base.files import remedy, write_text
 from traps_pipeline.base.paths import require_history_path
 from traps_pipeline.models.traffic import remembering_stops
 from traps_pipeline.pipeline.history import History
-from traps_pipeline.pipeline.run_plan import RunPlan
+from traps_pipeline.pipeline.run_plan import RunPlan, RunReport
 from traps_pipeline.pipeline.runs import HOST_TAG, PID_TAG, Runs, this_host
 from traps_pipeline.pipeline.step import EXPERIMENT_TAG, MAKE_TAG, STALE_OR_MISSING
 from traps_pipeline.storage.several_hosts import several_hosts
 from traps_pipeline.storage.workspace import Workspace
-
-
-@dataclass
-class MaterializationResult:
-    """The problems of `materialize_stale`, whether a budget ended it, and its seconds."""
-
-    problems: list[str] = field(default_factory=list)
-    over_budget: bool = False
-    seconds: float = 0.0
 
 
 @contextmanager
@@ -122,20 +112,20 @@ def _is_alive(pid: int) -> bool:
     return True
 
 
-def materialize_stale(instance: dg.DagsterInstance, runs: Runs, plan: RunPlan) -> MaterializationResult:
+def materialize_stale(instance: dg.DagsterInstance, runs: Runs, plan: RunPlan) -> RunReport:
     """Materialize what a plan finds missing or stale; its problems include failed checks of earlier runs.
 
     KeyboardInterrupt propagates.
     """
-    outcome, started_at, history = MaterializationResult(), time.monotonic(), History(instance, plan.graph)
+    report, started_at, history = RunReport(), time.monotonic(), History(instance, plan.graph)
     tags = {MAKE_TAG: STALE_OR_MISSING} | ({EXPERIMENT_TAG: plan.experiment} if plan.experiment else {})
     with remembering_stops():
         for block in plan.blocks():
             pending, keys = plan.pending(block, cache(history.recorded))
             for range_outcome in runs.make(pending, runs.ranges(pending, keys), tags):
-                outcome.problems += range_outcome.problems
-                outcome.over_budget |= range_outcome.over_budget
+                report.problems += range_outcome.problems
+                report.over_budget |= range_outcome.over_budget
             plan.renew(pending)
-    outcome.problems = [*dict.fromkeys([*outcome.problems, *plan.failed_checks()])]
-    outcome.seconds = time.monotonic() - started_at
-    return outcome
+    report.problems = [*dict.fromkeys([*report.problems, *plan.failed_checks()])]
+    report.seconds, report.tallies = time.monotonic() - started_at, progress.current().totals
+    return report

@@ -11,11 +11,12 @@ import json
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.progress import Tally
 from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.pipeline.graph import Stage, name_of, the_graph
 from traps_pipeline.pipeline.lineage import Lineage
@@ -55,6 +56,25 @@ class StageStatus:
             general_reasons = [reason.replace(f"/{key} ", " ") for reason in reasons]
             groups.setdefault("; ".join(general_reasons), []).append(key)
         return groups | ({"not made yet": [*self.missing]} if self.missing else {})
+
+
+@dataclass
+class RunReport:
+    """A run's problems in sentences, whether a budget ended it, and its tallies."""
+
+    problems: list[str] = field(default_factory=list)
+    over_budget: bool = False
+    seconds: float = 0.0
+    tallies: Mapping[str, Tally] = field(default_factory=dict)
+
+    def tally(self, stage: str) -> Tally:
+        """Return the work of one stage."""
+        return self.tallies.get(stage, Tally())
+
+    @property
+    def frames(self) -> int:
+        """Number of rendered frames."""
+        return sum(tally.frames for tally in self.tallies.values())
 
 
 class RunPlan:
