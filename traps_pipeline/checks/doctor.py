@@ -128,21 +128,18 @@ def examine_files(place: Place) -> Iterator[Finding]:
         ("states", sorted(file for kind in STATES for file in (workspace.root / "states").rglob(kind)), damage),
         ("history", sorted(workspace.dagster_home.rglob("*.db")), _history_damage),
     ):
-        messages = [message for path in files if (message := _damage(path, damage_of))]
-        summary = "; ".join(messages[:MAX_FILES]) + (
-            f"; and {len(messages) - MAX_FILES} more" if len(messages) > MAX_FILES else ""
-        )
-        yield Finding(not messages, topic, summary or f"{count_noun(len(files), 'file')} read, as written")
+        yield _finding(topic, partial(_read_all, files, damage_of))
     message = [*workspace.answers.damage(), *workspace.votes.damage()]
     yield Finding(not message, "ledger", "; ".join(message[:MAX_FILES]) or "all rows are what was written")
     yield Finding(True, "unfinished", _remove_unfinished(workspace.root))
 
 
-def _damage(path: Path, damage_of: Callable[[Path], str]) -> str:
-    try:
-        return damage_of(path)
-    except OSError as error:
-        return f"{path}: cannot be read ({error.strerror}); run this as the study's owner"
+def _read_all(files: Sequence[Path], damage_of: Callable[[Path], str]) -> str:
+    """Read files and return their number. Raises TrapsError that names damaged ones, OSError for an unreadable one."""
+    if messages := [message for path in files if (message := damage_of(path))]:
+        rest = f"; and {len(messages) - MAX_FILES} more" if len(messages) > MAX_FILES else ""
+        raise TrapsError("; ".join(messages[:MAX_FILES]) + rest)
+    return f"{count_noun(len(files), 'file')} read, as written"
 
 
 def examine_unused(place: Place, *, is_removed: bool) -> Finding:

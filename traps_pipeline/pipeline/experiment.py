@@ -15,7 +15,8 @@ from traps_pipeline.base.yamlfile import name_file_in_errors, parse_yaml_model, 
 from traps_pipeline.models.judges import require_panel
 from traps_pipeline.models.registry import LOCAL, get_model, local_models
 from traps_pipeline.models.user_registry import UserRegistry, add_entries
-from traps_pipeline.protocol.cells import Cell, Evaluation
+from traps_pipeline.pipeline.wanted import evaluations_of
+from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.protocol.datasets import DATASETS, SCHEMAS, UNPAIRED
 from traps_pipeline.protocol.regimes import BY_NAME, PAPER_REGIMES, REGIMES
 from traps_pipeline.storage.study import Asked, MechanismSettings, Settings, Study
@@ -147,14 +148,7 @@ class Experiment(Settings):
 
     def cells(self) -> list[Cell]:
         """Return cells by model, up to its runs. Raises TrapsError for an unknown model."""
-        cells = []
-        for model in self.models:
-            available = get_model(model).runs
-            for regime in self.regimes:
-                for run in self.runs:
-                    if run <= available:
-                        cells += [Cell(dataset, Evaluation(model, regime, run)) for dataset in self.datasets]
-        return cells
+        return [Cell(dataset, evaluation) for evaluation in evaluations_of(self.asked) for dataset in self.datasets]
 
 
 def load_experiment(name: str) -> Experiment:

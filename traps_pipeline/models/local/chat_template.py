@@ -18,7 +18,7 @@ from typing import Any
 
 from traps_pipeline.base.errors import TrapsError
 
-MAX_S, MAX_BYTES, MAX_CHARACTERS = 10, 2**30, 1_000_000  # CPU seconds and memory of a prompt, and its length
+MAX_S, MAX_BYTES, MAX_CHARACTERS = 10, 2**30, 1_000_000  # CPU seconds, memory and length of a prompt
 _TOO_MUCH = f"it takes more than {MAX_S} s, {MAX_BYTES / 1e9:.0f} GB or {MAX_CHARACTERS:,} characters"
 _lock, _renderer = Lock(), list[Connection]()  # to the process, while there is one
 
@@ -29,13 +29,15 @@ def render(checkpoint: str, template: str, turns: Sequence[Mapping[str, Any]], v
     with _lock:
         try:
             if not _renderer:
-                _renderer.append(_start())
+                ours, theirs = get_context("spawn").Pipe()
+                get_context("spawn").Process(target=_serve, args=(theirs,), daemon=True).start()
+                theirs.close()
+                _renderer.append(ours)
             _renderer[0].send_bytes(json.dumps(request).encode())
             text, failure = json.loads(_renderer[0].recv_bytes())
         except (EOFError, OSError):  # the kernel has ended the process
             text, failure = "", _TOO_MUCH
-        if failure and _renderer:
-            _renderer.pop().close()
+            _renderer.clear()
     if failure:
         raise TrapsError(
             f"{checkpoint}: its chat template fails ({failure}); give the checkpoint another template, or "
@@ -44,28 +46,22 @@ def render(checkpoint: str, template: str, turns: Sequence[Mapping[str, Any]], v
     return text
 
 
-def _start() -> Connection:
-    context = get_context("spawn")
-    ours, theirs = context.Pipe()
-    context.Process(target=_serve, args=(theirs,), daemon=True, name="chat template").start()
-    theirs.close()
-    return ours
-
-
 def _serve(connection: Connection) -> None:
     """Answer each request by a text and a failure, of which one is empty, until the other side has gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the other side
     from transformers.utils.chat_template_utils import render_jinja_template
 
     pages = Path("/proc/self/statm")
-    size = int(pages.read_text().split()[0]) * resource.getpagesize() if pages.exists() else 0
-    _limit(resource.RLIMIT_AS, size + MAX_BYTES)
+    if pages.exists():  # elsewhere only the time is bounded
+        size = int(pages.read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (size + MAX_BYTES, resource.getrlimit(resource.RLIMIT_AS)[1]))
+    hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
     while True:
         try:
             request = json.loads(connection.recv_bytes())
         except EOFError:
             return
-        _limit(resource.RLIMIT_CPU, int(time.process_time()) + MAX_S + 1)
+        resource.setrlimit(resource.RLIMIT_CPU, (int(time.process_time()) + MAX_S + 1, hard))
         try:
             (text,), _ = render_jinja_template(**request)
             reply = (text, "") if len(text) <= MAX_CHARACTERS else ("", _TOO_MUCH)
@@ -74,8 +70,3 @@ def _serve(connection: Connection) -> None:
         except Exception as error:  # noqa: BLE001 - whatever a template raises becomes its failure
             reply = "", f"{type(error).__name__}: {str(error)[:200]}"
         connection.send_bytes(json.dumps(reply).encode())
-
-
-def _limit(kind: int, most: int) -> None:
-    hard = resource.getrlimit(kind)[1]
-    resource.setrlimit(kind, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
