@@ -1,5 +1,5 @@
 # What maintainers do: measurements, locks, releases, other libraries. Included by the Makefile, whose variables it uses.
-.PHONY: coverage bench bench-cluster test-newest test-cluster test-cluster-gate test-cluster-kills lock explorer-check explorer-vendor wheel sbom release-check environments
+.PHONY: coverage bench bench-cluster test-newest test-cluster test-cluster-gate test-cluster-kills lock explorer-check explorer-vendor wheel sbom release release-check environments
 
 # Of the versions that pyproject.toml admits, those that pip finds today. torch stays the one of `make setup`.
 test-newest: VENV := .workspaces/newest
@@ -62,12 +62,11 @@ wheel: setup-core ## dist/*.whl: the same bytes whoever builds it from the same 
 sbom: setup ## dist/sbom.json: what the lock installs, as CycloneDX
 	$(BIN)/python tools/sbom.py dist/sbom.json
 
-release-check: setup-core ## whether this checkout is TAG=v0.3.0, is in the changelog, and has no placeholder left
-	@wrong() { echo "$$1"; failed=1; }; failed=; version=v$$($(BIN)/python -m hatchling version); \
-	test "$$version" = "$(TAG)" || wrong "this checkout is $$version and not $(TAG): check the tag out, with no changed file"; \
-	grep -q '^## $(TAG:v%=%) ' CHANGELOG.md || wrong "CHANGELOG.md has no section $(TAG:v%=%)"; \
-	! grep -nE 'OWNER|host\.invalid|SECURITY-ADDRESS' pyproject.toml SECURITY.md .github/CODEOWNERS || wrong "put your own in the place of these placeholders"; \
-	test -z "$$failed"
+release: setup-core ## cut VERSION=0.4.0: date the changelog, commit, tag, build wheel and bill of materials; pushes nothing
+	$(BIN)/python -m tools.release --cut "$(VERSION)"
+
+release-check: setup-core ## whether this checkout is TAG=v0.4.0, is in the changelog, and has no placeholder left
+	$(BIN)/python -m tools.release --check "$(TAG)"
 
 # Libraries and harnesses that others use, each in an environment of its own: tests/release is tried with them.
 ENVIRONMENTS := $(patsubst tests/release/%.txt,.workspaces/environments/%/.installed,$(wildcard tests/release/*.txt))

@@ -39,12 +39,12 @@ def ours(url: str, connections: int, answers: int) -> dict[str, float]:
     from traps_pipeline.cluster.postgres import open_ledger
     from traps_pipeline.ledger.ledger import Ledger
     from traps_pipeline.ledger.sqlite import SqliteDatabase
-    from traps_pipeline.models.api import ApiBackend, load_litellm
-    from traps_pipeline.models.ask import Call, Work, run_work
-    from traps_pipeline.models.budget import Budget
-    from traps_pipeline.models.participants import Participants
-    from traps_pipeline.models.registry import Account, Entry, Limits
+    from traps_pipeline.models.asking.ask import Call, Work, run_work
+    from traps_pipeline.models.asking.participants import Participants
+    from traps_pipeline.models.money.budget import Budget
+    from traps_pipeline.models.registry.entries import Account, Entry, Limits
     from traps_pipeline.models.request import Request
+    from traps_pipeline.models.wire.api import ApiBackend, load_litellm
     from traps_pipeline.protocol.cells import Cell, Evaluation
     from traps_pipeline.protocol.datasets import DATASETS
     from traps_pipeline.protocol.regimes import REGIMES
@@ -77,7 +77,7 @@ def ours(url: str, connections: int, answers: int) -> dict[str, float]:
 
 def bare(url: str, connections: int, answers: int) -> dict[str, float]:
     """Return the least that a script would do: acompletion under a semaphore, answers kept in a list."""
-    from traps_pipeline.models.api import load_litellm
+    from traps_pipeline.models.wire.api import load_litellm
 
     litellm = load_litellm()
 

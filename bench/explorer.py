@@ -29,7 +29,7 @@ from traps_pipeline.benchmark.items import build_items
 from traps_pipeline.benchmark.specs import build_specs
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.judging.verdicts import ITEM_COLUMNS, RESPONSE_COLUMNS, decide
-from traps_pipeline.models.answer_rows import RESPONSES
+from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import CATEGORIES, DATASETS
 from traps_pipeline.protocol.regimes import REGIMES

@@ -31,7 +31,7 @@ from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.models.local import adapter
 from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
 from traps_pipeline.models.local.tiny import build_tiny
-from traps_pipeline.models.registry import LOCAL, ModelEntry, load_models
+from traps_pipeline.models.registry.entries import LOCAL, ModelEntry, load_models
 from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH
 from traps_pipeline.storage.media import MediaSpec, pick
 

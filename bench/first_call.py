@@ -43,7 +43,7 @@ class Remote(Checkout):
 def ledger_rows(rows: int) -> Iterator[tuple[str, list[Any]]]:
     """Yield a ledger as a study leaves it, in parts of an evaluation each, its key before them: the evaluation that
     will be asked has rows of other keys too."""
-    from traps_pipeline.models.participants import ledger_row
+    from traps_pipeline.models.asking.participants import ledger_row
     from traps_pipeline.models.request import Outcome, Request
     from traps_pipeline.pipeline.wanted import StudyPartitions
     from traps_pipeline.protocol.cells import Evaluation

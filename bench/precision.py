@@ -18,8 +18,8 @@ from bench.quick import parse
 from traps_pipeline.base.terminal import text_table
 from traps_pipeline.base.yamlfile import read_yaml
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.models.reference import STRATEGIES
-from traps_pipeline.models.registry import get_model
+from traps_pipeline.models.baselines.reference import STRATEGIES
+from traps_pipeline.models.registry.entries import get_model
 from traps_pipeline.models.request import Request
 from traps_pipeline.pipeline.experiment import LITE_FILE, load_experiment
 from traps_pipeline.protocol.datasets import DATASETS, SIDES, datasets_of_category

@@ -5,8 +5,8 @@ when, how much moves and when it rests), a regression reads the words of a quest
 so that no picture is drawn: a reader of pixels knows them less well. Where a rule does not abstain it answers like an
 oracle, so that each figure bounds what it can earn. `or` and `and` join the two decisions, `sum` adds their evidence;
 `joint` is no such rule: one classifier that reads both. Each is fitted on other scenarios, or on other families, than
-it is asked about. The first four are the cues of `models.shortcut_rules`, one line each, with nothing to fit. All
-figures are the project's own (`scoring`).
+it is asked about. The first four are the cues of `models.baselines.shortcut_rules`, one line each, with nothing to
+fit. All figures are the project's own (`scoring`).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from bench.shortcuts import first_of_each
 from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.filmed_arms import arm_of
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.models.shortcut_rules import CUT_FRAMES, has_no_choices
+from traps_pipeline.models.baselines.shortcut_rules import CUT_FRAMES, has_no_choices
 from traps_pipeline.protocol.datasets import CROSSED, DATASETS, INFERENCE_ARMS, TWIN
 from traps_pipeline.scenes.picture.camera import Camera, Occluder
 from traps_pipeline.scenes.variants.arms import SHOWN_AGAIN_S

@@ -33,8 +33,8 @@ from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.models.local.adapter import GeneratedAnswer, LocalModel, load_local_model
 from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.models.local.vision_cache import ClipMemory
-from traps_pipeline.models.prompts import system_prompt, vqa_prompt
-from traps_pipeline.models.registry import LOCAL, ModelEntry, get_model
+from traps_pipeline.models.registry.entries import LOCAL, ModelEntry, get_model
+from traps_pipeline.models.registry.prompts import system_prompt, vqa_prompt
 from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH
 from traps_pipeline.storage.media import MediaSpec, pick, resize
 

@@ -50,12 +50,12 @@ def main() -> None:
     from traps_pipeline.base.digests import file_digest
     from traps_pipeline.ledger.ledger import Ledger
     from traps_pipeline.ledger.sqlite import SqliteDatabase
-    from traps_pipeline.models.api import ApiBackend, load_litellm
-    from traps_pipeline.models.ask import Call, Work, run_work
-    from traps_pipeline.models.budget import Budget
-    from traps_pipeline.models.participants import Participants
-    from traps_pipeline.models.registry import Account, ModelEntry
+    from traps_pipeline.models.asking.ask import Call, Work, run_work
+    from traps_pipeline.models.asking.participants import Participants
+    from traps_pipeline.models.money.budget import Budget
+    from traps_pipeline.models.registry.entries import Account, ModelEntry
     from traps_pipeline.models.request import Request
+    from traps_pipeline.models.wire.api import ApiBackend, load_litellm
     from traps_pipeline.protocol.cells import Cell, Evaluation
     from traps_pipeline.storage.media import MediaSpec, MediaStore
     from traps_pipeline.storage.study import Study

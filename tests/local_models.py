@@ -11,7 +11,7 @@ import numpy as np
 
 from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
 from traps_pipeline.models.local.tiny import FAMILIES, Family, build_tiny
-from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.models.registry.entries import ModelEntry
 from traps_pipeline.storage.media import MediaSpec, sample
 from traps_pipeline.video.encode import encode
 

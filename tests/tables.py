@@ -3,7 +3,7 @@
 from traps_pipeline.judging import judging_rows as judging
 from traps_pipeline.mechanism import control_rows
 from traps_pipeline.mechanism import mechanism_rows as mechanism
-from traps_pipeline.models import answer_rows as models
+from traps_pipeline.models.asking import answer_rows as models
 from traps_pipeline.people import human_label_rows
 from traps_pipeline.people import human_score_rows as scores_of_people
 from traps_pipeline.scoring import score_rows as scoring

@@ -38,6 +38,7 @@ RUN_AS = {
     "traps study import-votes": ("integration/test_batches.py", 'f"import-{what}"'),
     "inspect eval": ("release/test_pocket_harness.py", '"-m", "inspect_ai", "eval"'),
     "make docs": ("test_docs_site.py", '"make", "-C", checkout'),
+    "make release": ("test_habits.py", '"release", "VERSION=9.0.0"'),
     "make release-check": ("test_habits.py", '"release-check"'),
     "make sbom": ("base/test_extras.py", '"tools/sbom.py"'),
     "make ui": ("integration/test_ui.py", '"ui",'),

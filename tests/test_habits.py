@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import yaml
 
 from tests.conftest import ROOT
 from tools.lock import outdated
+from tools.release import PLACEHOLDERS, TO_FILL
 
 WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
 MAKEFILES = [ROOT / "Makefile", ROOT / "maintainers.mk"]
@@ -56,18 +58,56 @@ def test_checks_run_on_every_python_that_the_package_admits_and_every_shard_at_n
     assert shards == [f"{k}/{len(shards)}" for k in range(1, len(shards) + 1)]
 
 
-def test_a_tag_that_is_another_version_and_a_placeholder_that_is_left_stop_a_release() -> None:
-    def check(tag: str) -> list[str]:
-        command = ["make", "-o", "setup-core", f"BIN={Path(sys.executable).parent}", "release-check", f"TAG={tag}"]
-        finished = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-        return [] if finished.returncode == 0 else finished.stdout.splitlines()
+def make(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run make of a checkout with this environment's Python, without setting it up."""
+    command = ["make", "--no-print-directory", "-o", "setup-core", f"BIN={Path(sys.executable).parent}", *arguments]
+    environment = os.environ | {"PYTHONPATH": str(folder)}
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
 
+
+def test_a_tag_that_is_another_version_and_a_placeholder_that_is_left_stop_a_release() -> None:
     command = [sys.executable, "-m", "hatchling", "version"]
     version = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
-    another = check("v0.0.1")
-    assert f"v{version}" in another[0] and "v0.0.1" in another[0] and "CHANGELOG.md" in another[1]
-    assert "CODEOWNERS" in "".join(another)  # this checkout still has placeholders
-    assert another[0] not in check(f"v{version}") and "CODEOWNERS" in "".join(check(f"v{version}"))
+    another = make(ROOT, "release-check", "TAG=v0.0.1")
+    assert another.returncode != 0
+    checkout, changelog, *placeholders = [line for line in another.stderr.splitlines() if not line.startswith("make")]
+    assert f"v{version}" in checkout and "v0.0.1" in checkout and "CHANGELOG.md" in changelog
+    assert {line.partition(":")[0] for line in placeholders} == {"pyproject.toml", "SECURITY.md", ".github/CODEOWNERS"}
+    assert checkout not in make(ROOT, "release-check", f"TAG=v{version}").stderr
+
+
+@pytest.mark.slow
+def test_one_command_cuts_a_version_and_leaves_nothing_where_it_cannot(tmp_path: Path) -> None:
+    checkout = tmp_path / "checkout"
+    git = ["git", "-c", "user.name=t", "-c", "user.email=t@example.org", "-C", str(checkout)]
+    subprocess.run(["git", "clone", "--quiet", str(ROOT), str(checkout)], check=True)
+
+    def asked(*command: str) -> str:
+        return subprocess.run([*git, *command], check=True, capture_output=True, text=True).stdout
+
+    for key, value in {"user.name": "t", "user.email": "t@example.org"}.items():
+        asked("config", key, value)
+    head = asked("rev-parse", "HEAD")
+    refused = make(checkout, "release", "VERSION=9.0.0")
+    assert refused.returncode != 0 and "OWNER" in refused.stderr and "host.invalid" in refused.stderr
+    for name in TO_FILL:
+        text = (checkout / name).read_text()
+        (checkout / name).write_text(PLACEHOLDERS.sub("example", text))
+    dirty = make(checkout, "release", "VERSION=9.0.0")
+    assert dirty.returncode != 0 and "SECURITY.md" in dirty.stderr and "host.invalid" not in dirty.stderr
+    assert (asked("rev-parse", "HEAD"), asked("tag", "--list", "v9*")) == (head, "")
+    asked("commit", "--quiet", "--all", "--message", "Name the publisher")
+    assert "no version" in make(checkout, "release", "VERSION=9.0.x").stderr
+    cut = make(checkout, "release", "VERSION=9.0.0")
+    assert cut.returncode == 0, cut.stderr
+    assert [path.name for path in sorted((checkout / "dist").iterdir())] == [
+        "sbom.json",
+        "traps_pipeline-9.0.0-py3-none-any.whl",
+    ]
+    assert make(checkout, "release-check", "TAG=v9.0.0").returncode == 0
+    assert re.search(r"^## 9\.0\.0 - \d{4}-\d\d-\d\d$", (checkout / "CHANGELOG.md").read_text(), re.MULTILINE)
+    again = make(checkout, "release", "VERSION=8.9.0")
+    assert again.returncode != 0 and "v9.0.0" in again.stderr and "Unreleased" in again.stderr
 
 
 def test_the_lock_meets_the_project_and_one_that_does_not_is_named(tmp_path: Path) -> None:

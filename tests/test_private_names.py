@@ -28,10 +28,14 @@ PRIVATE = {
     "self._initialized_dbs": ("dagster", "pipeline/event_storage.py", "files of events that have their tables"),
     "events._base_dir": ("dagster", "pipeline/event_storage.py", "where the events are"),
     "runs._conn_string": ("dagster", "pipeline/event_storage.py", "where the runs are"),
-    "litellm._internal_context": ("litellm", "models/api.py", "calls are not logged twice"),
-    "litellm.integrations.custom_logger": ("litellm", "models/api.py", "calls are not priced twice"),
-    "litellm.llms.custom_httpx.http_handler": ("litellm", "models/api.py", "calls leave through models/wire.py"),
-    "response._hidden_params": ("litellm", "models/api.py", "a price there keeps litellm from looking for one"),
+    "litellm._internal_context": ("litellm", "models/wire/api.py", "calls are not logged twice"),
+    "litellm.integrations.custom_logger": ("litellm", "models/wire/api.py", "calls are not priced twice"),
+    "litellm.llms.custom_httpx.http_handler": (
+        "litellm",
+        "models/wire/api.py",
+        "calls leave through models/wire/httpx_transport.py",
+    ),
+    "response._hidden_params": ("litellm", "models/wire/api.py", "a price there keeps litellm from looking for one"),
     "module._forward_hooks": ("torch", "mechanism/adapter_checks.py", "whether steering leaves hooks behind"),
 }
 

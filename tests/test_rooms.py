@@ -29,6 +29,8 @@ SCENES = (
     "physics", "picture", "parts", "families", "family_registry", "observe", "worlds", "certification", "draw",
     "variants",
 )  # fmt: skip
+# For models: a call, how answers are read, what is declared, what is paid, how calls are sent and asked.
+MODELS = ("request", "framing", "reading", "baselines", "registry", "local", "money", "wire", "asking")
 
 
 @cache
@@ -94,9 +96,10 @@ def test_no_room_imports_one_above_it() -> None:
     assert upwards(PACKAGE.name, ROOMS) == []
 
 
-def test_no_folder_of_the_scenes_imports_one_above_it() -> None:
-    assert {module.split(".")[2] for module in files() if module.startswith("traps_pipeline.scenes.")} == {*SCENES}
-    assert upwards("traps_pipeline.scenes", SCENES) == []
+@pytest.mark.parametrize(("room", "order"), [("scenes", SCENES), ("models", MODELS)])
+def test_no_folder_of_a_room_imports_one_above_it(room: str, order: Sequence[str]) -> None:
+    assert {module.split(".")[2] for module in files() if module.startswith(f"{PACKAGE.name}.{room}.")} == {*order}
+    assert upwards(f"{PACKAGE.name}.{room}", order) == []
 
 
 def test_no_files_import_each_other_in_a_circle() -> None:

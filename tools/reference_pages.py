@@ -17,9 +17,9 @@ ROOT = Path(__file__).resolve().parents[1]
 YAML_FILES = {
     "An experiment": ("pipeline.experiment", "Experiment"),
     "study.yaml": ("storage.study", "Study"),
-    "A model": ("models.registry", "ModelEntry"),
-    "A judge": ("models.judges", "JudgeEntry"),
-    "An account": ("models.registry", "Account"),
+    "A model": ("models.registry.entries", "ModelEntry"),
+    "A judge": ("models.registry.judges", "JudgeEntry"),
+    "An account": ("models.registry.entries", "Account"),
     "A correction": ("benchmark.corrections", "Correction"),
 }
 WORDS = {str: "text", int: "whole number", float: "number", bool: "true or false", Any: "any value", NoneType: "null"}

@@ -32,7 +32,7 @@ from traps_pipeline.mechanism.probes import Fit, fit_probe
 from traps_pipeline.mechanism.probing import ProbeRun
 from traps_pipeline.mechanism.stages import saved_directions
 from traps_pipeline.mechanism.stored_states import StoredStates
-from traps_pipeline.models.registry import get_model
+from traps_pipeline.models.registry.entries import get_model
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.storage.study import ProbeSettings

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from tests.build.ledger import local
-from traps_pipeline.models.ask import Call, SettledCell, Work, run_work
-from traps_pipeline.models.budget import Budget
-from traps_pipeline.models.participants import Participants
-from traps_pipeline.models.registry import Entry, Limits
+from traps_pipeline.models.asking.ask import Call, SettledCell, Work, run_work
+from traps_pipeline.models.asking.participants import Participants
+from traps_pipeline.models.money.budget import Budget
+from traps_pipeline.models.registry.entries import Entry, Limits
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.study import Study

@@ -7,9 +7,9 @@ import datetime
 import json
 from typing import Any
 
-from traps_pipeline.models.budget import Budget
-from traps_pipeline.models.participants import CallContext
-from traps_pipeline.models.registry import Account, Entry, Limits, Prices
+from traps_pipeline.models.asking.participants import CallContext
+from traps_pipeline.models.money.budget import Budget
+from traps_pipeline.models.registry.entries import Account, Entry, Limits, Prices
 from traps_pipeline.models.request import Request
 
 PARAMS = {"temperature": 0.8, "top_p": 0.95, "max_tokens": 8000}

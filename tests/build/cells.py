@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import datetime
 
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
-from traps_pipeline.models.answer_rows import RESPONSES
+from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.benchmark_tables import ITEMS
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from traps_pipeline.models import user_registry
+from traps_pipeline.models.registry import user_registry
 
 
 @pytest.fixture(autouse=True)

@@ -14,7 +14,7 @@ from traps_pipeline.ledger.ledger import Ledger
 from traps_pipeline.ledger.money import Money
 from traps_pipeline.ledger.rows import Totals
 from traps_pipeline.ledger.sqlite import SqliteDatabase
-from traps_pipeline.models.budget import Budget
+from traps_pipeline.models.money.budget import Budget
 
 KEPT: list[Any] = []  # databases of budgets, open until the process ends
 

@@ -12,7 +12,7 @@ from tests.mechanism.study import PAIRS, make_study, register, tiny_entry
 from traps_pipeline.mechanism import stages
 from traps_pipeline.mechanism.mechanism_rows import DIRECTIONS, HIDDEN_STATES, PROBE_ITEMS
 from traps_pipeline.mechanism.probe_items import probe_items
-from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.models.registry.entries import ModelEntry
 from traps_pipeline.protocol.cells import Extraction, StatesCell
 from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS, TIME_SWAPPED
 from traps_pipeline.storage.workspace import Workspace

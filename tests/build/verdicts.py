@@ -9,7 +9,7 @@ import pandas as pd
 
 from tests.build.cells import row
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
-from traps_pipeline.models.judges import panel_id
+from traps_pipeline.models.registry.judges import panel_id
 from traps_pipeline.protocol.datasets import ARMS, sides_of
 from traps_pipeline.scoring.metrics import cell_metrics
 from traps_pipeline.scoring.score_rows import METRICS

@@ -18,9 +18,9 @@ from traps_pipeline.benchmark.records import load_release, load_released, releas
 from traps_pipeline.exchange.answer_exchange import checked_answers
 from traps_pipeline.judging.confabulation_protocol import load_protocol
 from traps_pipeline.judging.robustness import load_attacks
-from traps_pipeline.models.account_budget import AccountBudget
-from traps_pipeline.models.judges import load_judges, load_panel
-from traps_pipeline.models.registry import load_accounts, load_models
+from traps_pipeline.models.money.account_budget import AccountBudget
+from traps_pipeline.models.registry.entries import load_accounts, load_models
+from traps_pipeline.models.registry.judges import load_judges, load_panel
 from traps_pipeline.models.request import Request
 from traps_pipeline.people.judge_validation import LABEL_COLUMNS, read_labels
 from traps_pipeline.pipeline.experiment import load_experiment

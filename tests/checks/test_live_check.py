@@ -13,11 +13,12 @@ from tests.providers.server import Provider
 from tests.providers.servers import closed_port
 from traps_pipeline.base import progress
 from traps_pipeline.checks.live_check import LiveResult, check_live, findings, nobody_at
-from traps_pipeline.models import api, registry
-from traps_pipeline.models.dialects import shape_of
-from traps_pipeline.models.judges import JudgeEntry
-from traps_pipeline.models.registry import PROTOCOL, Account, Entry, ModelEntry, Prices
+from traps_pipeline.models.registry import entries as registry
+from traps_pipeline.models.registry.entries import PROTOCOL, Account, Entry, ModelEntry, Prices
+from traps_pipeline.models.registry.judges import JudgeEntry
 from traps_pipeline.models.request import Outcome
+from traps_pipeline.models.wire import api
+from traps_pipeline.models.wire.dialects import shape_of
 
 pytestmark = pytest.mark.slow
 NAME = "seer"

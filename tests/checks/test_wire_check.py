@@ -18,9 +18,9 @@ from traps_pipeline.checks.loopback import PLACEHOLDER_KEY, render
 from traps_pipeline.checks.wire_body import ClipPart, WireBody, read_body
 from traps_pipeline.checks.wire_check import check_named, examine, requests_of
 from traps_pipeline.cli import main
-from traps_pipeline.models import api
-from traps_pipeline.models.registry import ModelEntry, get_model, load_models
-from traps_pipeline.models.schemas import answer_object
+from traps_pipeline.models.registry.entries import ModelEntry, get_model, load_models
+from traps_pipeline.models.registry.schemas import answer_object
+from traps_pipeline.models.wire import api
 from traps_pipeline.protocol.regimes import FIELDS, fields_of
 from traps_pipeline.storage.media import Media, MediaSpec, data_uris, payload
 

@@ -26,7 +26,7 @@ from traps_pipeline.cluster.history import HISTORY, LOGS, dagster_yaml
 from traps_pipeline.cluster.node import code_here, require_same_code
 from traps_pipeline.cluster.ray_runs import RESOURCES_TAG, STUDY_TAG, RayRuns, own_tags
 from traps_pipeline.cluster.sensors import REQUEST_TAG, start_requested_runs, submit
-from traps_pipeline.models.answer_rows import RESPONSES
+from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.pipeline.graph import the_graph
 from traps_pipeline.pipeline.run import dagster_history
 from traps_pipeline.pipeline.runs import is_broken_off, range_tags

@@ -23,9 +23,9 @@ from traps_pipeline.checks.live_check import requests_of
 from traps_pipeline.checks.wire_body import Api
 from traps_pipeline.exchange import provider_batch
 from traps_pipeline.exchange.provider_batch import export_batches, failures, is_batch, outcomes_of, read_batch
-from traps_pipeline.models import api
-from traps_pipeline.models.registry import PROTOCOL, Account, Entry, ModelEntry, Prices
+from traps_pipeline.models.registry.entries import PROTOCOL, Account, Entry, ModelEntry, Prices
 from traps_pipeline.models.request import Outcome, Request
+from traps_pipeline.models.wire import api
 
 PRICES = Prices(input=1, output=10, as_of=datetime.date(2026, 11, 1))
 Entries = Callable[[str], Entry]

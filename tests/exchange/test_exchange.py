@@ -12,7 +12,7 @@ from tests.build.errors import raises
 from tests.judging.conftest import item_row
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.exchange.answer_exchange import _ERROR_TEXT, Answer, ImportResult, checked_answers, import_answers
-from traps_pipeline.models.answers import wanted_questions
+from traps_pipeline.models.asking.answers import wanted_questions
 from traps_pipeline.models.request import Request
 from traps_pipeline.pipeline.experiment import Experiment
 from traps_pipeline.storage.benchmark_tables import ITEMS, ItemRow

@@ -12,7 +12,7 @@ import pytest
 
 from tests.conftest import Checkout
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.models.answer_rows import RESPONSES
+from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.report.leaderboard_page import leaderboard_text
 from traps_pipeline.scoring.score_rows import GRADED_CUTS, HYPOTHESES, LEADERBOARD, ROBUST
 from traps_pipeline.storage.benchmark_tables import ARMS, ITEMS

@@ -15,7 +15,7 @@ import pytest
 from tests.conftest import KEY, SECRET, SMALL, Checkout, copy_of, forget_answers
 from tests.providers.server import Provider
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
-from traps_pipeline.models.answer_rows import RESPONSES
+from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.tables import Table
 

@@ -11,7 +11,7 @@ import pytest
 from tests.conftest import EXPERIMENT, Checkout
 from tests.tables import TABLES
 from traps_pipeline.benchmark.records import load_release
-from traps_pipeline.models.answer_rows import RESPONSES
+from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.scoring.score_rows import METRICS
 from traps_pipeline.storage.benchmark_tables import ITEMS, SCENE_SPECS, VIDEOS
 from traps_pipeline.storage.workspace import Workspace

@@ -22,7 +22,7 @@ from tests.build.cells import row, write_cell
 from tests.conftest import Checkout
 from tests.pages import patient, until, watched
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
-from traps_pipeline.models.answer_rows import RESPONSES
+from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.report.explorer.site import write_site
 from traps_pipeline.report.leaderboard_page import leaderboards
 from traps_pipeline.report.published_results import PublishedResults

@@ -14,7 +14,7 @@ import yaml
 from tests.conftest import EXPERIMENT, Checkout, Finished, forget_answers
 from traps_pipeline.definitions import defs
 from traps_pipeline.judging.judging_rows import VERDICTS
-from traps_pipeline.models.answer_rows import RESPONSES
+from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.pipeline.graph import the_graph
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.pipeline.run import dagster_history

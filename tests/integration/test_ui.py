@@ -23,7 +23,7 @@ from tests.conftest import CLIP_CACHE, EXPERIMENT, SMALL, Checkout, make_checkou
 from tests.pages import a_browser, patient
 from tests.providers.server import Provider
 from tests.providers.servers import closed_port
-from traps_pipeline.models.answer_rows import RESPONSES
+from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.pipeline.automation import INTERVAL_S
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.tables import Table

@@ -14,13 +14,14 @@ import pytest
 from tests.conftest import KEY
 from tests.providers.server import Provider
 from traps_pipeline.judging.judging_rows import VOTES
-from traps_pipeline.models import api, participants
-from traps_pipeline.models.answer_rows import RESPONSES, ResponseRow
-from traps_pipeline.models.answers import answer_request, response_row
-from traps_pipeline.models.judges import JudgeEntry
-from traps_pipeline.models.participants import ledger_row
-from traps_pipeline.models.registry import Account, Limits, Prices, get_model
+from traps_pipeline.models.asking import participants
+from traps_pipeline.models.asking.answer_rows import RESPONSES, ResponseRow
+from traps_pipeline.models.asking.answers import answer_request, response_row
+from traps_pipeline.models.asking.participants import ledger_row
+from traps_pipeline.models.registry.entries import Account, Limits, Prices, get_model
+from traps_pipeline.models.registry.judges import JudgeEntry
 from traps_pipeline.models.request import Outcome
+from traps_pipeline.models.wire import api
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.protocol.datasets import is_ill_posed, taxonomy_of
 from traps_pipeline.storage.benchmark_tables import ITEMS, ItemRow

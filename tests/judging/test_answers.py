@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from traps_pipeline.models.judged_answers import is_correct, normalise
+from traps_pipeline.models.reading.judged_answers import is_correct, normalise
 
 SIDES = ["left", "right", "elsewhere"]
 BINS = {"left bin": "left", "red bin": "left", "right bin": "right", "blue bin": "right"}

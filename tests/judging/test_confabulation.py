@@ -30,8 +30,8 @@ from traps_pipeline.judging.confabulation import (
 from traps_pipeline.judging.confabulation_protocol import PROTOCOL_FILE, VOID_KINDS, Protocol, load_protocol
 from traps_pipeline.judging.judging_rows import CONFABULATION, VERDICTS, VerdictRow
 from traps_pipeline.judging.panel import parse_judgement
-from traps_pipeline.models.judges import JudgeEntry
-from traps_pipeline.models.prompts import prompt
+from traps_pipeline.models.registry.judges import JudgeEntry
+from traps_pipeline.models.registry.prompts import prompt
 from traps_pipeline.pipeline.experiment import load_experiment
 from traps_pipeline.pipeline.forecast_plan import CallPlan, plan_calls
 from traps_pipeline.protocol.cells import Cell, Evaluation

@@ -12,8 +12,8 @@ import pytest
 from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.panel import Vote, parse_vote, render, tasks_for, vote_request
-from traps_pipeline.models.judges import is_judged_by_rules, load_panel
-from traps_pipeline.models.prompts import prompt
+from traps_pipeline.models.registry.judges import is_judged_by_rules, load_panel
+from traps_pipeline.models.registry.prompts import prompt
 from traps_pipeline.protocol.cells import Cell, Evaluation
 
 ITEM: dict[str, Any] = {
@@ -237,7 +237,7 @@ def test_judges_that_ask_no_language_model_sit_in_panels_named_after_rules_and_n
     if is_allowed:
         assert load_panel(name, path)
     else:
-        with raises(TrapsError, "models.judges.load_panel", "judges.yaml", repr(name), "'rules-..'"):
+        with raises(TrapsError, "models.registry.judges.load_panel", "judges.yaml", repr(name), "'rules-..'"):
             load_panel(name, path)
 
 

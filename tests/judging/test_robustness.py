@@ -15,7 +15,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cli import main
 from traps_pipeline.judging.judging_rows import JUDGE_ROBUSTNESS
 from traps_pipeline.judging.robustness import ATTACKS_FILE, TASKS, check_panel, load_attacks, result, summary
-from traps_pipeline.models.judges import JudgeEntry, load_panel
+from traps_pipeline.models.registry.judges import JudgeEntry, load_panel
 from traps_pipeline.protocol.ratings import PANEL
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace

@@ -9,9 +9,9 @@ import pytest
 
 from traps_pipeline.judging.panel import Vote, parse_vote, render
 from traps_pipeline.judging.rules import ABSTENTION, RuleJudge, Statement, read_statement
-from traps_pipeline.models.judged_answers import UNREAD
-from traps_pipeline.models.judges import Task
-from traps_pipeline.models.reference import phrase
+from traps_pipeline.models.baselines.reference import phrase
+from traps_pipeline.models.reading.judged_answers import UNREAD
+from traps_pipeline.models.registry.judges import Task
 from traps_pipeline.models.request import Request
 from traps_pipeline.protocol.regimes import FIELDS, REGIMES
 

@@ -19,7 +19,7 @@ from traps_pipeline.judging import panel as judging
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.judging.panel import collect_votes
 from traps_pipeline.judging.verdicts import decide, decide_cells
-from traps_pipeline.models.judges import JudgeEntry
+from traps_pipeline.models.registry.judges import JudgeEntry
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.scoring.metrics import cell_metrics
 from traps_pipeline.storage.benchmark_tables import ITEMS

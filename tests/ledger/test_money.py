@@ -14,14 +14,14 @@ from tests.ledger.conftest import Place, begin, line_of
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.ledger.ledger import Ledger
 from traps_pipeline.ledger.money import Money, Releasable
-from traps_pipeline.models.budget import Budget, BudgetReached
+from traps_pipeline.models.money.budget import Budget, BudgetReached
 
 WORST = 0.05
 # Asks as a run does, 24 calls at a time that cost 0 to 5 cents of 5, until there is no room.
 SPEND = """
 import asyncio
 from traps_pipeline.ledger.money import Money
-from traps_pipeline.models.budget import Budget, BudgetReached
+from traps_pipeline.models.money.budget import Budget, BudgetReached
 name, cap, pause = sys.argv[1:]
 async def run():
     numbers = iter(range(100_000))
@@ -124,7 +124,7 @@ def test_a_models_own_cap_stops_it_and_not_the_others(ledger: Ledger) -> None:
     async def reserve() -> None:
         with ledger.database.writing():
             budget = Budget(10.0, {"m": 0.10}, Money(ledger.database))
-            with raises(BudgetReached, "models.budget.Budget.reserve", " m ", "$0.06", "$0.10"):
+            with raises(BudgetReached, "models.money.budget.Budget.reserve", " m ", "$0.06", "$0.10"):
                 await budget.reserve("m", 0.06)
             assert await budget.reserve("other", 0.06) is not None
 
@@ -162,7 +162,7 @@ def test_a_cost_above_the_worst_case_is_spent_and_asked_for_no_more(ledger: Ledg
             await budget.settle(reservation, 2.0)
             async with ledger.writing("m", print) as writer:
                 await writer.write(paid("k", 2.0), {}, [reservation.id])
-            with raises(BudgetReached, "models.budget.Budget.reserve", "$2.00", "$1.00"):
+            with raises(BudgetReached, "models.money.budget.Budget.reserve", "$2.00", "$1.00"):
                 await budget.reserve("m", 0.1)
             return budget.spent_usd
 

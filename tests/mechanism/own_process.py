@@ -22,7 +22,7 @@ from traps_pipeline.mechanism.mechanism_rows import STEERING
 from traps_pipeline.mechanism.patching_effects import RecordedPass, record
 from traps_pipeline.mechanism.steered_backend import SteeredBackend
 from traps_pipeline.mechanism.steering import collect_steered
-from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.models.registry.entries import ModelEntry
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.protocol.cells import Extraction, SteeringCell
 from traps_pipeline.storage.workspace import Workspace

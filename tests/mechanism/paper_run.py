@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from traps_pipeline.models.local.tiny import Family, build_tiny
-from traps_pipeline.models.prompts import PROMPTS
+from traps_pipeline.models.registry.prompts import PROMPTS
 from traps_pipeline.pipeline.experiment import EXPERIMENTS
 
 if TYPE_CHECKING:

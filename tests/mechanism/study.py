@@ -12,9 +12,9 @@ import pytest
 
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.judging.judging_rows import VERDICTS
-from traps_pipeline.models import registry
 from traps_pipeline.models.local.tiny import build_tiny
-from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.models.registry import entries as registry
+from traps_pipeline.models.registry.entries import ModelEntry
 from traps_pipeline.protocol.datasets import DATASETS, SIDES, is_ill_posed, taxonomy_of
 from traps_pipeline.storage.benchmark_tables import ITEMS, SCENE_SPECS, VIDEOS, SceneSpecRow
 from traps_pipeline.storage.study import MechanismSettings, Study

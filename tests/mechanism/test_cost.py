@@ -6,7 +6,7 @@ import pytest
 
 from traps_pipeline.cli import main
 from traps_pipeline.mechanism.cost import CARDS, Card, Work, cost_of, mechanism_passes
-from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.models.registry.entries import ModelEntry
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.storage.media import MediaSpec
 from traps_pipeline.storage.study import MechanismSettings

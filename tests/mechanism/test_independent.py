@@ -26,7 +26,7 @@ from traps_pipeline.mechanism.steered_backend import SteeredBackend
 from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.tiny import build_tiny
-from traps_pipeline.models.registry import ModelEntry, get_model
+from traps_pipeline.models.registry.entries import ModelEntry, get_model
 from traps_pipeline.models.request import Request
 from traps_pipeline.storage.media import Frames, MediaSpec, sample
 from traps_pipeline.storage.store import FolderStore

@@ -30,8 +30,8 @@ from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS, PROBES
 from traps_pipeline.mechanism.probes import scenario_folds
 from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.models.local.adapter import load_local_model
-from traps_pipeline.models.prompts import vqa_prompt
-from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.models.registry.entries import ModelEntry
+from traps_pipeline.models.registry.prompts import vqa_prompt
 from traps_pipeline.storage.media import sample
 from traps_pipeline.storage.workspace import Workspace
 

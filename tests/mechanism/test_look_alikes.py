@@ -33,11 +33,11 @@ from traps_pipeline.mechanism.sentences import mean_log_probabilities, sentence_
 from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.mechanism.transfer_paths import LOOK_ALIKES
 from traps_pipeline.mechanism.untrained import untrained_states
-from traps_pipeline.models.answer_rows import RESPONSES
+from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.local.library import load_transformers
-from traps_pipeline.models.prompts import system_prompt, vqa_prompt
-from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.models.registry.entries import ModelEntry
+from traps_pipeline.models.registry.prompts import system_prompt, vqa_prompt
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.storage.benchmark_tables import ITEMS

@@ -31,7 +31,7 @@ from traps_pipeline.mechanism.patching_effects import (
 )
 from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
 from traps_pipeline.models.local.tiny import build_tiny
-from traps_pipeline.models.registry import get_model
+from traps_pipeline.models.registry.entries import get_model
 from traps_pipeline.storage.media import MediaSpec, sample
 
 pytestmark = pytest.mark.slow

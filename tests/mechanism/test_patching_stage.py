@@ -30,8 +30,8 @@ from traps_pipeline.mechanism.patching_stage import (
 from traps_pipeline.mechanism.probe_items import probe_items
 from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
 from traps_pipeline.models.local.spans import changed_tokens, spans
-from traps_pipeline.models.prompts import vqa_prompt
-from traps_pipeline.models.registry import ModelEntry, get_model
+from traps_pipeline.models.registry.entries import ModelEntry, get_model
+from traps_pipeline.models.registry.prompts import vqa_prompt
 from traps_pipeline.protocol.cells import Extraction
 from traps_pipeline.protocol.datasets import SIDES
 from traps_pipeline.storage.benchmark_tables import ITEMS

@@ -44,7 +44,7 @@ from traps_pipeline.mechanism.steering import (
     strengths,
 )
 from traps_pipeline.mechanism.stored_states import StoredStates
-from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.models.registry.entries import ModelEntry
 from traps_pipeline.models.request import WITH_TEXT
 from traps_pipeline.pipeline.graph import the_graph
 from traps_pipeline.pipeline.lineage import Lineage
@@ -296,7 +296,7 @@ def test_no_answer_is_steered_along_a_direction_that_comes_from_its_scenario(ste
 
 def test_a_steered_answer_is_the_models_own_under_the_hook(steered: Workspace, entry: ModelEntry) -> None:
     from traps_pipeline.models.local.adapter import load_local_model
-    from traps_pipeline.models.prompts import system_prompt
+    from traps_pipeline.models.registry.prompts import system_prompt
     from traps_pipeline.storage.media import sample
 
     model, items = load_local_model(entry), steered.tables.read(ITEMS, {"dataset": "chaotic"}).set_index("item_id")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from traps_pipeline.models.api import load_litellm
+from traps_pipeline.models.wire.api import load_litellm
 
 
 @pytest.fixture(scope="session")

@@ -13,10 +13,10 @@ import pytest
 from tests.build.errors import raises
 from tests.build.ledger import paid, write
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.models.account_budget import AccountBudget
-from traps_pipeline.models.budget import Budget, BudgetReached
-from traps_pipeline.models.registry import get_model
-from traps_pipeline.models.spending import open_budget
+from traps_pipeline.models.money.account_budget import AccountBudget
+from traps_pipeline.models.money.budget import Budget, BudgetReached
+from traps_pipeline.models.money.spending import open_budget
+from traps_pipeline.models.registry.entries import get_model
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 
@@ -24,7 +24,7 @@ from traps_pipeline.storage.workspace import Workspace
 SPENDER = """
 import sys
 from pathlib import Path
-from traps_pipeline.models.account_budget import AccountBudget
+from traps_pipeline.models.money.account_budget import AccountBudget
 budget, calls = AccountBudget("openai", Path(sys.argv[1]), sys.argv[2]), 0
 while budget.reserve(0.10):
     calls += 1
@@ -76,7 +76,7 @@ def test_a_damaged_file_stops_paid_calls_and_a_lost_one_is_filled_again(folder: 
     path = folder / "spent.json"
     path.write_bytes(path.read_bytes().replace(b"1.0", b"0.1"))
     for spend in (lambda: budget.reserve(0.1), lambda: AccountBudget("openai", folder, "b")):
-        with raises(TrapsError, "models.account_budget.AccountBudget._read", str(path)):
+        with raises(TrapsError, "models.money.account_budget.AccountBudget._read", str(path)):
             spend()
     path.unlink()
     budget.begin(known_usd=1.0)
@@ -98,7 +98,7 @@ def test_a_second_study_stops_where_the_first_has_spent_the_accounts_money(tmp_p
         with open_budget(study(tmp_path / "two", folder), [entry]) as two:  # at the same time
             asyncio.run(pay(two, 5))
             names = "openai", " 2 ", "$9.00", "$10.00", str(folder / "budget.yaml")
-            with raises(BudgetReached, "models.budget.Budget.reserve", *names):
+            with raises(BudgetReached, "models.money.budget.Budget.reserve", *names):
                 asyncio.run(pay(two, 2))
             asyncio.run(two.reserve("gemini-2.5-pro", 2))  # another account
 
@@ -116,9 +116,12 @@ def test_an_account_without_a_file_or_a_name_is_refused(tmp_path: Path) -> None:
     entry = get_model("gpt-5-mini")
     nobody = Workspace.create(tmp_path / "a", Study(budget_usd=5, account_budgets={"opnai": "x"}))
     names = "study.yaml", "account_budgets", "opnai"
-    with raises(TrapsError, "models.spending._check_names", *names), open_budget(nobody, [entry]):
+    with raises(TrapsError, "models.money.spending._check_names", *names), open_budget(nobody, [entry]):
         pass
     missing = study(tmp_path / "b", tmp_path / "nowhere")
     names = str(tmp_path / "nowhere" / "budget.yaml"), "`usd: 100`", "study.yaml"
-    with raises(TrapsError, "models.account_budget.AccountBudget.__init__", *names), open_budget(missing, [entry]):
+    with (
+        raises(TrapsError, "models.money.account_budget.AccountBudget.__init__", *names),
+        open_budget(missing, [entry]),
+    ):
         pass

@@ -19,9 +19,9 @@ import pytest
 from tests.conftest import KEY, ROOT, SECRET
 from tests.providers.server import Provider, answer_to
 from traps_pipeline.base import progress
-from traps_pipeline.models.api import ApiBackend
-from traps_pipeline.models.registry import Account, Entry, Limits, Prices
+from traps_pipeline.models.registry.entries import Account, Entry, Limits, Prices
 from traps_pipeline.models.request import Outcome, Request, TransientError
+from traps_pipeline.models.wire.api import ApiBackend
 
 pytestmark = pytest.mark.slow  # asks a server
 FINISHES = {"openai/m": "stop", "gemini/gemini-2.5-pro": "STOP", "openai/responses/m": "completed"}
@@ -85,7 +85,7 @@ IN_A_LOOP = """
 import asyncio, sys
 from types import SimpleNamespace
 import tests.models.test_api as test
-from traps_pipeline.models.registry import Limits
+from traps_pipeline.models.registry.entries import Limits
 from traps_pipeline.models.request import Request
 
 async def ask():  # the first backend is made, and the client library imported, while the loop runs
@@ -175,7 +175,7 @@ def test_a_env_file_above_the_checkout_sets_no_proxy_and_no_key(tmp_path: Path) 
     script = """
 import os
 before = {**os.environ}
-from traps_pipeline.models.api import load_litellm
+from traps_pipeline.models.wire.api import load_litellm
 load_litellm()
 print(sorted(name for name in os.environ.keys() - before.keys() if not name.startswith("LITELLM_")))
 import dotenv

@@ -17,10 +17,10 @@ from tests.build.asking import CELL, LEFT, ONE, QUICK, TEN, Answering, ask, kept
 from tests.build.errors import raises
 from tests.build.ledger import local
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.models import participants
-from traps_pipeline.models.answers import answer_request
-from traps_pipeline.models.ask import STOP_SIGNALS, run_work, settle
-from traps_pipeline.models.registry import Limits, get_model
+from traps_pipeline.models.asking import participants
+from traps_pipeline.models.asking.answers import answer_request
+from traps_pipeline.models.asking.ask import STOP_SIGNALS, run_work, settle
+from traps_pipeline.models.registry.entries import Limits, get_model
 from traps_pipeline.models.request import Outcome, Request, TransientError
 from traps_pipeline.protocol.cells import Evaluation
 from traps_pipeline.storage.study import Study
@@ -91,7 +91,7 @@ def test_waits_grow_with_each_retry_and_are_drawn_below_their_bound(
 def test_a_model_that_fails_does_not_stop_another(tmp_path: Path) -> None:
     broken = Answering(lambda *_: ValueError("no such parameter: temprature"))
     job, done = work(tmp_path, {"m": broken, "n": Answering()}, ONE), []
-    with raises(ValueError, "models.participants._send"):
+    with raises(ValueError, "models.asking.participants._send"):
         done.extend(finished["cell"] for finished in run_work(job, [CELL, of_model("n")]))
     assert done == [of_model("n")]
 
@@ -101,7 +101,7 @@ def test_several_models_that_fail_are_named_together(tmp_path: Path) -> None:
         return TrapsError(f"{asked.participant}: no key; set one")
 
     backends = {"m": Answering(broken), "n": Answering(broken), "o": Answering()}
-    with raises(TrapsError, "models.ask._raise_together", "m: no key", "n: no key"):
+    with raises(TrapsError, "models.asking.ask._raise_together", "m: no key", "n: no key"):
         list(run_work(work(tmp_path, backends, ONE), [of_model(name) for name in backends]))
     assert backends["o"].calls == ["item-1"]
 
@@ -117,7 +117,7 @@ def test_closing_the_work_early_records_the_calls_in_flight(tmp_path: Path) -> N
 def test_calls_in_flight_are_recorded_when_another_call_of_the_cell_fails(tmp_path: Path) -> None:
     cannot = ValueError("cannot be sent")
     backend = Answering(lambda asked, _: cannot if asked.about["item_id"] == "item-1" else LEFT, after_s=0.05)
-    with raises(ValueError, "models.participants._send"):
+    with raises(ValueError, "models.asking.participants._send"):
         ask(tmp_path, backend, TEN)
     assert backend.calls == ["item-0", "item-1", "item-2", "item-3"]  # four at once, none begun afterwards
     assert len(kept(tmp_path)) == 3
@@ -161,7 +161,7 @@ INTERRUPTED = """
 import asyncio, sys
 from pathlib import Path
 from tests.build.asking import CELL, LEFT, request, work
-from traps_pipeline.models import ask
+from traps_pipeline.models.asking import ask
 class Slow:
     asked = 0
     async def ask(self, request):

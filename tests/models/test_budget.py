@@ -18,12 +18,12 @@ from tests.build.ledger import budget as budget_of
 from tests.build.ledger import budget_in, local
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.ledger.money import Money, Releasable
-from traps_pipeline.models.ask import Call, Work, run_work
-from traps_pipeline.models.budget import Budget, BudgetReached, check_money, most_tokens, worst_case_usd
-from traps_pipeline.models.participants import Participants
-from traps_pipeline.models.registry import Account, Entry, Limits, Prices
+from traps_pipeline.models.asking.ask import Call, Work, run_work
+from traps_pipeline.models.asking.participants import Participants
+from traps_pipeline.models.money.budget import Budget, BudgetReached, check_money, most_tokens, worst_case_usd
+from traps_pipeline.models.money.spending import open_budget
+from traps_pipeline.models.registry.entries import Account, Entry, Limits, Prices
 from traps_pipeline.models.request import Outcome, Request, TransientError
-from traps_pipeline.models.spending import open_budget
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
@@ -88,10 +88,10 @@ def test_an_unknown_cost_counts_as_the_worst() -> None:
 
 
 def test_paid_calls_want_a_budget_and_unknown_prices_a_word() -> None:
-    with raises(TrapsError, "models.budget.check_money", "--budget-usd", "budget_usd"):
+    with raises(TrapsError, "models.money.budget.check_money", "--budget-usd", "budget_usd"):
         check_money(Study(), PRICED)
     check_money(Study(budget_usd=1), PRICED)
-    with raises(TrapsError, "models.budget.check_money", "--allow-unknown-prices", "allow_unknown_prices"):
+    with raises(TrapsError, "models.money.budget.check_money", "--allow-unknown-prices", "allow_unknown_prices"):
         check_money(Study(budget_usd=1), entry(None))
     check_money(Study(allow_unknown_prices=True), entry(None))
     check_money(Study(), entry(Prices(input=0, output=0, as_of=datetime.date(2026, 11, 1))))
@@ -151,7 +151,7 @@ def test_a_call_that_may_be_billed_counts_as_its_worst_case(
 
 def test_a_cap_for_nobody_is_refused(tmp_path: Path) -> None:
     workspace = Workspace.create(tmp_path, Study(budget_usd=5, model_budgets_usd={"gpt-5-mini": 1, "gpt-6": 1}))
-    by, names = "models.spending._check_names", ("study.yaml", "model_budgets_usd", "gpt-6")
+    by, names = "models.money.spending._check_names", ("study.yaml", "model_budgets_usd", "gpt-6")
     with raises(TrapsError, by, *names) as caught, open_budget(workspace, [PRICED]):
         pass
     assert "gpt-5-mini" not in str(caught.value)

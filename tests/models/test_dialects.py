@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from tests.build.errors import raises
-from traps_pipeline.models.dialects import OddShapeError, Reply, parse_body, read_reply, shape_of
+from traps_pipeline.models.wire.dialects import OddShapeError, Reply, parse_body, read_reply, shape_of
 
 LEFT = "The ball rolls to the left."
 ROUTES = {
@@ -107,7 +107,7 @@ def test_an_incomplete_response_says_why() -> None:
 @pytest.mark.parametrize("dialect", ["chat", "anthropic", "gemini"])
 @pytest.mark.parametrize("finish", [None, "", 7, ["stop"]])
 def test_an_answer_that_does_not_say_why_it_ended_is_no_complete_answer(dialect: str, finish: Any) -> None:
-    with raises(OddShapeError, "models.dialects.read_reply"):
+    with raises(OddShapeError, "models.wire.dialects.read_reply"):
         read(dialect, MAKERS[dialect](finish))
 
 
@@ -179,7 +179,7 @@ def test_a_response_is_read_as_one_where_the_route_says_chat() -> None:
     ],
 )
 def test_an_object_of_an_odd_shape_is_named_in_one_sentence(content: bytes, names: list[str]) -> None:
-    with raises(OddShapeError, "models.dialects.read_reply", *names) as raised:
+    with raises(OddShapeError, "models.wire.dialects.read_reply", *names) as raised:
         read_reply(parse_body(content), "openai/m")
     assert "\n" not in str(raised.value)
 
@@ -189,7 +189,7 @@ def test_what_is_no_object_is_told_apart() -> None:
     shapes = {text: shape_of(text) for text in ("", page, stream, cut)}
     assert len({*shapes.values()}) == 4 and "`base_url`" in shapes[page] and "/v1" in shapes[page]
     for content, shape in (shapes | {"[" * 100_000: shapes[cut], "[1]": " list "}).items():
-        with raises(OddShapeError, "models.dialects.parse_body", shape):
+        with raises(OddShapeError, "models.wire.dialects.parse_body", shape):
             parse_body(content.encode())
 
 

@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 
 from traps_pipeline.ledger.rows import Totals
-from traps_pipeline.models import forecast as forecasts
-from traps_pipeline.models.forecast import Experience, experience, forecast
-from traps_pipeline.models.media_tokens import anthropic_frame, expected_clip_tokens, gemini_frame, openai_frame
-from traps_pipeline.models.registry import NETWORK, Account, ModelEntry, get_model, load_models
+from traps_pipeline.models.money import forecast as forecasts
+from traps_pipeline.models.money.forecast import Experience, experience, forecast
+from traps_pipeline.models.money.media_tokens import anthropic_frame, expected_clip_tokens, gemini_frame, openai_frame
+from traps_pipeline.models.registry.entries import NETWORK, Account, ModelEntry, get_model, load_models
 
 
 def model(**changes: Any) -> ModelEntry:

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.build.asking import TEN, Answering, ask, kept
-from traps_pipeline.models import ask as asking
+from traps_pipeline.models.asking import ask as asking
 from traps_pipeline.models.request import Outcome, Request
 
 OnDisk = Callable[[], list[str]]

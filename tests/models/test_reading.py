@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from tests.build.errors import raises
-from traps_pipeline.models.reading import Reading, read_answer
-from traps_pipeline.models.thinking import COMMON_MARKS, declaration_line, marks_of, strip_fence, strip_tokens
+from traps_pipeline.models.reading.interpret import Reading, read_answer
+from traps_pipeline.models.reading.thinking import COMMON_MARKS, declaration_line, marks_of, strip_fence, strip_tokens
 
 THINK = ("<think>", "</think>")
 
@@ -137,7 +137,7 @@ def test_what_gpt_oss_writes_around_its_messages_is_no_answer() -> None:
 
 @pytest.mark.parametrize("declared", ["<ponder>", ["<a>"], ["<a>", "<a>"], ["<a>", ""], "", []])
 def test_marks_are_both_declared_or_the_usual_ones(declared: Any) -> None:
-    with raises(ValueError, "models.thinking.marks_of", "<think>"):
+    with raises(ValueError, "models.reading.thinking.marks_of", "<think>"):
         marks_of(declared)
     assert marks_of(["<ponder>", "</ponder>"]) == ("<ponder>", "</ponder>")
 

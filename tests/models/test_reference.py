@@ -10,8 +10,14 @@ from typing import Any
 
 import pytest
 
-from traps_pipeline.models.reference import ABSTENTION, STRATEGIES, ReferenceBackend, believed_probabilities, uniform
-from traps_pipeline.models.registry import get_model
+from traps_pipeline.models.baselines.reference import (
+    ABSTENTION,
+    STRATEGIES,
+    ReferenceBackend,
+    believed_probabilities,
+    uniform,
+)
+from traps_pipeline.models.registry.entries import get_model
 from traps_pipeline.models.request import Request, TransientError
 from traps_pipeline.protocol.regimes import FIELDS
 

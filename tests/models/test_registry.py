@@ -8,8 +8,8 @@ import pytest
 
 from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.models.judges import load_panel
-from traps_pipeline.models.registry import get_model, load_models
+from traps_pipeline.models.registry.entries import get_model, load_models
+from traps_pipeline.models.registry.judges import load_panel
 from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.cells import Evaluation
 from traps_pipeline.protocol.regimes import REGIMES
@@ -55,7 +55,7 @@ def test_a_wrong_entry_is_named_with_its_field(tmp_path: Path, wrong: str, names
 
 
 def test_the_second_entry_of_a_name_is_named(tmp_path: Path) -> None:
-    with raises(TrapsError, "models.registry._add", "models.yaml: ", " 3: ", "'a'"):
+    with raises(TrapsError, "models.registry.entries._add", "models.yaml: ", " 3: ", "'a'"):
         load_models(registry(tmp_path, entry("a"), entry("b"), entry("a")))
 
 
@@ -64,12 +64,12 @@ def test_a_file_without_models_says_what_it_must_hold(tmp_path: Path) -> None:
     for text in ("", "[]", "judges: []", "models: 3"):
         path.write_text(text)
         load_models.cache_clear()
-        with raises(TrapsError, "models.registry.read_entries", "models.yaml", "models"):
+        with raises(TrapsError, "models.registry.entries.read_entries", "models.yaml", "models"):
             load_models(path)
 
 
 def test_an_unknown_model_is_answered_with_the_known_ones() -> None:
-    with raises(TrapsError, "models.registry.get_model", "gpt-6", "gpt-5-nr"):
+    with raises(TrapsError, "models.registry.entries.get_model", "gpt-6", "gpt-5-nr"):
         get_model("gpt-6")
 
 

@@ -14,10 +14,9 @@ from tests.build.ledger import write
 from tests.conftest import ROOT, Checkout
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.ledger.money import Money, Releasable
-from traps_pipeline.models.account_budget import AccountBudget
-from traps_pipeline.models.budget import BudgetReached
-from traps_pipeline.models.release import releasable, release
-from traps_pipeline.models.spending import open_budget
+from traps_pipeline.models.money.account_budget import AccountBudget
+from traps_pipeline.models.money.budget import BudgetReached
+from traps_pipeline.models.money.spending import open_budget, releasable, release_money
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 
@@ -55,9 +54,9 @@ def room_for(workspace: Workspace, dollars: float) -> bool:
 def test_what_was_in_flight_or_failed_is_released_with_its_reason_and_the_study_goes_on(blocked: Workspace) -> None:
     assert not room_for(blocked, 0.5)
     assert releasable(blocked) == {"m": Releasable(in_flight=1.0, failed=3.0)}
-    assert release(blocked, "m", None, "the process was killed before it connected") == 1.0
+    assert release_money(blocked, "m", None, "the process was killed before it connected") == 1.0
     assert room_for(blocked, 0.9) and not room_for(blocked, 1.1)
-    assert release(blocked, "m", 2.5, "a dead proxy") == 2.5
+    assert release_money(blocked, "m", 2.5, "a dead proxy") == 2.5
     assert releasable(blocked) == {"m": Releasable(in_flight=0.0, failed=0.5)}
     assert room_for(blocked, 3.4) and not room_for(blocked, 3.6)
     with blocked.ledger.writing():
@@ -72,9 +71,9 @@ def test_what_was_in_flight_or_failed_is_released_with_its_reason_and_the_study_
 @pytest.mark.parametrize("usd", [4.1, 0.0, -1.0, float("nan"), float("inf")])
 def test_no_more_is_released_than_is_booked_for_calls_that_may_never_have_left(blocked: Workspace, usd: float) -> None:
     with raises(TrapsError, "ledger.money.Money.release", "m: $", "$1.0000", "$3.0000", "--usd"):
-        release(blocked, "m", usd, "why")
+        release_money(blocked, "m", usd, "why")
     with raises(TrapsError, "ledger.money.Money.release", "nobody: $0.0000"):
-        release(blocked, "nobody", None, "why")
+        release_money(blocked, "nobody", None, "why")
     assert not room_for(blocked, 0.5)
 
 
@@ -83,7 +82,7 @@ def test_an_account_that_several_studies_share_gets_the_money_back_too(blocked: 
     (tmp_path / "openai" / "budget.yaml").write_text("usd: 100\n")
     blocked = blocked.allow(account_budgets={"openai": str(tmp_path / "openai")})
     in_flight(blocked, "gpt-5-mini")
-    assert release(blocked, "gpt-5-mini", None, "killed") == 1.0
+    assert release_money(blocked, "gpt-5-mini", None, "killed") == 1.0
     assert AccountBudget("openai", tmp_path / "openai", "x").spent_usd == {blocked.study.name: 0.0}
 
 

@@ -19,12 +19,12 @@ from tests.conftest import KEY, SECRET
 from tests.providers.server import Provider
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.models.api import ApiBackend
-from traps_pipeline.models.ask import Call, Work, run_work
-from traps_pipeline.models.budget import BudgetReached
-from traps_pipeline.models.participants import OVERRUN, Participants, attempt
-from traps_pipeline.models.registry import Account, Entry
+from traps_pipeline.models.asking.ask import Call, Work, run_work
+from traps_pipeline.models.asking.participants import OVERRUN, Participants, attempt
+from traps_pipeline.models.money.budget import BudgetReached
+from traps_pipeline.models.registry.entries import Account, Entry
 from traps_pipeline.models.request import Outcome, Request
+from traps_pipeline.models.wire.api import ApiBackend
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.study import Study
 
@@ -248,7 +248,7 @@ def work(provider: Provider, entry: Entry, cap_usd: float, items: int, folder: P
 
 def test_three_answers_out_of_order_in_a_row_stop_a_model_and_are_kept_aside(odd: Provider, tmp_path: Path) -> None:
     odd.configure(raw_by_model={"m": {"content": f"\x1b[2J<h1>{SECRET}</h1>" + "x" * 9000}})
-    with raises(TrapsError, "models.ask._raise_together", "3 "):
+    with raises(TrapsError, "models.asking.ask._raise_together", "3 "):
         list(work(odd, entry_of("m", concurrency=1), 100.0, 20, tmp_path))
     assert odd.stats()["requests"] == 6
     raws = [beside["raw"] for _, beside in local(tmp_path).rows("m__standard__run1")]

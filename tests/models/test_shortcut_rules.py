@@ -12,12 +12,12 @@ import pytest
 
 from tests.scenes.released import load
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.models.answers import _secret
-from traps_pipeline.models.backends import make_backend
-from traps_pipeline.models.reference import ABSTENTION
-from traps_pipeline.models.registry import get_model
+from traps_pipeline.models.asking.answers import _secret
+from traps_pipeline.models.asking.backends import make_backend
+from traps_pipeline.models.baselines.reference import ABSTENTION
+from traps_pipeline.models.baselines.shortcut_rules import CUES, CUT_FRAMES, OCCLUDER_PX, RULES, has_no_choices
+from traps_pipeline.models.registry.entries import get_model
 from traps_pipeline.models.request import Request
-from traps_pipeline.models.shortcut_rules import CUES, CUT_FRAMES, OCCLUDER_PX, RULES, has_no_choices
 from traps_pipeline.scenes.parts.look import MATERIALS, OCCLUDERS, Look
 from traps_pipeline.scenes.parts.vision import largest_board
 from traps_pipeline.scenes.physics.kit import COLOURS
@@ -98,7 +98,7 @@ def test_without_its_cue_a_rule_says_what_the_observer_sees_and_else_the_commone
     media = clip(tmp_path, "clip.mp4")
     assert said("any", media, CHOICES, commonest_answer="maybe").endswith("The answer is: maybe.")
     monkeypatch.setattr(
-        "traps_pipeline.models.shortcut_rules.observer_answer", lambda digest, clip, question, frames: "yes"
+        "traps_pipeline.models.baselines.shortcut_rules.observer_answer", lambda digest, clip, question, frames: "yes"
     )
     assert said("any", media, CHOICES, commonest_answer="maybe").endswith("The answer is: yes.")
 

@@ -10,14 +10,14 @@ import time
 import pytest
 
 from tests.build.errors import raises
-from traps_pipeline.models.request import Outcome
-from traps_pipeline.models.traffic import (
+from traps_pipeline.models.asking.traffic import (
     CircuitBreaker,
     ConnectionLimit,
     ParticipantStopped,
     RateLimiter,
     remembering_stops,
 )
+from traps_pipeline.models.request import Outcome
 
 ANSWER, ERROR = Outcome("answer", "left"), Outcome("error", error="timeout")
 
@@ -107,13 +107,13 @@ def test_twenty_refusals_of_one_kind_in_a_row_stop_a_model_and_nineteen_do_not()
     breaker.watch(Outcome("refused", finish_reason="content_filter"))  # another kind
     for _ in range(19):
         breaker.watch(refusal)
-    with raises(ParticipantStopped, "models.traffic.CircuitBreaker._stop"):
+    with raises(ParticipantStopped, "models.asking.traffic.CircuitBreaker._stop"):
         breaker.watch(refusal)
 
 
 def test_a_call_that_the_provider_refuses_as_it_is_counts_as_a_refusal() -> None:
     breaker = CircuitBreaker("m")
-    with raises(ParticipantStopped, "models.traffic.CircuitBreaker._stop", " 20 ", "(http_401)"):
+    with raises(ParticipantStopped, "models.asking.traffic.CircuitBreaker._stop", " 20 ", "(http_401)"):
         for _ in range(20):
             breaker.watch(Outcome("error", error="http_401"))
 
@@ -139,7 +139,7 @@ def test_more_than_ten_errors_in_a_hundred_calls_stop_a_model() -> None:
     breaker = CircuitBreaker("m")
     for n in range(100):
         breaker.watch(ERROR if n % 10 == 0 else ANSWER)  # ten: at the limit
-    with raises(ParticipantStopped, "models.traffic.CircuitBreaker._stop", " 11 ", " 100 "):
+    with raises(ParticipantStopped, "models.asking.traffic.CircuitBreaker._stop", " 11 ", " 100 "):
         for n in range(1, 12):
             breaker.watch(ERROR if n % 2 else ANSWER)
 
@@ -149,7 +149,7 @@ def test_connections_that_a_shell_does_not_allow_are_refused_before_anything_is_
     asking = """
 import resource
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.models.participants import allow_connections
+from traps_pipeline.models.asking.participants import allow_connections
 resource.setrlimit(resource.RLIMIT_NOFILE, (180, 400))
 allow_connections(100)
 print(resource.getrlimit(resource.RLIMIT_NOFILE))
@@ -179,5 +179,7 @@ def test_five_calls_in_a_row_that_never_left_over_twelve_seconds_stop_a_model_an
     for _ in range(5):
         breaker.no_connection()
     now[0] += 12
-    with raises(ParticipantStopped, "models.traffic.CircuitBreaker._stop", "http://127.0.0.1:8000/v1", "no such name"):
+    with raises(
+        ParticipantStopped, "models.asking.traffic.CircuitBreaker._stop", "http://127.0.0.1:8000/v1", "no such name"
+    ):
         breaker.no_connection("no such name")

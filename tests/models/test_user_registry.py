@@ -9,9 +9,8 @@ import pytest
 from tests.build.entries import nobodys_own
 from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.models import user_registry
-from traps_pipeline.models.judges import load_panel, panel_id, thinking_of
-from traps_pipeline.models.registry import account_of, get_model, load_models
+from traps_pipeline.models.registry.entries import account_of, get_model, load_models, user_registry
+from traps_pipeline.models.registry.judges import load_panel, panel_id, thinking_of
 from traps_pipeline.pipeline.experiment import load_experiment
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import VARIABLE, Workspace
@@ -97,7 +96,7 @@ def test_the_workspace_keeps_what_an_experiment_brought(tmp_path: Path, monkeypa
     load_experiment(written(tmp_path, MINE))
     user_registry.save_entries(Workspace(tmp_path, Study(name="lab")))
     user_registry.add_entries(user_registry.UserRegistry(), Path("none"))
-    with raises(TrapsError, "models.registry.get_model", "my-model"):
+    with raises(TrapsError, "models.registry.entries.get_model", "my-model"):
         get_model("my-model")
     monkeypatch.setenv(VARIABLE, str(tmp_path))
     user_registry.clear_caches()

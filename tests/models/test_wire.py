@@ -21,12 +21,12 @@ from tests.conftest import KEY, SECRET
 from tests.providers.servers import answering, closed_port, self_signed, silent
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.models.api import ApiBackend
-from traps_pipeline.models.budget import Budget, worst_case_usd
-from traps_pipeline.models.participants import Participants, attempt
-from traps_pipeline.models.registry import Account
+from traps_pipeline.models.asking.participants import Participants, attempt
+from traps_pipeline.models.money.budget import Budget, worst_case_usd
+from traps_pipeline.models.registry.entries import Account
 from traps_pipeline.models.request import Outcome, TransientError
-from traps_pipeline.models.wire import get
+from traps_pipeline.models.wire.api import ApiBackend
+from traps_pipeline.models.wire.httpx_transport import get
 from traps_pipeline.storage.study import Study
 
 pytestmark = pytest.mark.promise  # the client library alone takes seconds to import

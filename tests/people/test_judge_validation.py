@@ -18,7 +18,7 @@ from tests.conftest import ROOT, Checkout
 from tests.judging.conftest import answered_study
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.judging_rows import CONFABULATION, JUDGE_VALIDATION
-from traps_pipeline.models.answer_rows import RESPONSES
+from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.people.judge_validation import (
     HumanLabels,
     annotation_sheet,

@@ -24,7 +24,7 @@ _DECIDED_BY: dict[str, tuple[str, ...]] = {
     "videos": ("scenes/picture", "scenes/worlds/clips.py", "benchmark/videos.py", "video"),
     "arms": ("scenes/variants", "benchmark/filmed_arms.py"),
     "items": ("benchmark/items.py",),
-    "responses": ("models/answers.py", "models/framing.py", "models/reading.py", "models/request.py"),
+    "responses": ("models/asking/answers.py", "models/framing.py", "models/reading/interpret.py", "models/request.py"),
     "votes": ("judging/panel.py", "judging/rules.py"),
     "verdicts": ("judging/verdicts.py",),
     "confabulation": ("judging/confabulation.py", "judging/confabulation_protocol.py"),

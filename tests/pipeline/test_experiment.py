@@ -89,7 +89,7 @@ def test_an_unknown_model_or_experiment_is_answered_with_the_known_ones(tmp_path
 
 def test_no_panel_judges_unless_the_experiment_the_command_or_the_study_names_it(tmp_path: Path) -> None:
     silent = load_experiment(experiment(tmp_path, ""))
-    with raises(TrapsError, "models.judges.load_panel", "--panel"):
+    with raises(TrapsError, "models.registry.judges.load_panel", "--panel"):
         silent.judged(None, None)
     assert silent.judged(None, "rules").panel == "rules"
     assert silent.judged(Study(panel="paper"), None).panel == "paper"
@@ -103,7 +103,7 @@ def test_rules_judge_reference_models_and_others_only_where_somebody_says_so(tmp
     path = tmp_path / "my.yaml"
     path.write_text("name: my\nmodels: [oracle, gpt-5-high]\npanel: rules\n")
     mine = load_experiment(str(path))
-    with raises(TrapsError, "models.judges.require_panel", "gpt-5-high", "--judged-by-rules"):
+    with raises(TrapsError, "models.registry.judges.require_panel", "gpt-5-high", "--judged-by-rules"):
         mine.judged(None, None)
     assert mine.judged(None, None, judged_by_rules=True).judged_by_rules
     assert mine.judged(Study(panel="rules", judged_by_rules=True), None).panel == "rules"

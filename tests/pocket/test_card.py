@@ -17,7 +17,7 @@ from tools.pocket.seeds import Figure, read_seeds, write_seeds
 from tools.pocket.words import PROMPTS
 from traps_pipeline.mechanism.control_rows import PATCHING
 from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES
-from traps_pipeline.models.local.checkpoint import folder_digest
+from traps_pipeline.models.registry.checkpoint import folder_digest
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 

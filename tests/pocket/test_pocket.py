@@ -23,8 +23,8 @@ from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cli import main
 from traps_pipeline.judging.rules import ABSTENTION, Statement, read_statement
-from traps_pipeline.models.judged_answers import normalise
-from traps_pipeline.models.prompts import system_prompt
+from traps_pipeline.models.reading.judged_answers import normalise
+from traps_pipeline.models.registry.prompts import system_prompt
 from traps_pipeline.storage.media import sample
 
 pytestmark = pytest.mark.slow

@@ -19,8 +19,8 @@ from tests.conftest import EXPERIMENT, Checkout, once
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.held_out import opaque
 from traps_pipeline.exchange.answer_exchange import AnswerContext, import_answers
-from traps_pipeline.models.answer_rows import RESPONSES
-from traps_pipeline.models.prompts import system_prompt
+from traps_pipeline.models.asking.answer_rows import RESPONSES
+from traps_pipeline.models.registry.prompts import system_prompt
 from traps_pipeline.pipeline.experiment import load_experiment
 from traps_pipeline.release.harness.scoring import figures, judge
 from traps_pipeline.release.harness.write import MEDIA_SETTINGS, media_settings, rewritten_source, write_harness

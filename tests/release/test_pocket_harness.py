@@ -15,7 +15,7 @@ from tests.conftest import ROOT, Checkout
 from tests.release.environments import python_of, run_in
 from tests.serving import transformers_serve
 from traps_pipeline.exchange.harness_logs import reader_of
-from traps_pipeline.models.answer_rows import RESPONSES
+from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.release.harness.scoring import RUN_FIGURES
 from traps_pipeline.release.harness.write import media_settings, write_harness
 from traps_pipeline.storage.workspace import Workspace

@@ -18,7 +18,7 @@ from tests.build.errors import raises
 from tests.conftest import Checkout
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.verdicts import decide
-from traps_pipeline.models.judges import BY_RULES, RULES_VERSION
+from traps_pipeline.models.registry.judges import BY_RULES, RULES_VERSION
 from traps_pipeline.release.content import content_of
 from traps_pipeline.release.folder import Options, write_release
 from traps_pipeline.release.released_rows import SUBMITTED

@@ -18,8 +18,8 @@ from tests.remedies.remedied import remedied
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cluster.bucket import Bucket
 from traps_pipeline.cluster.ray_runs import require_cluster
-from traps_pipeline.models.registry import get_model
-from traps_pipeline.models.spending import open_budget
+from traps_pipeline.models.money.spending import open_budget
+from traps_pipeline.models.registry.entries import get_model
 from traps_pipeline.pipeline.run import dagster_history
 from traps_pipeline.storage.place import place_of
 from traps_pipeline.storage.study import Study
@@ -92,7 +92,9 @@ def test_a_budget_of_an_account_in_a_folder_that_all_hosts_see_is_spent_from(add
         with open_budget(Workspace.open(address), [entry]) as budget:
             asyncio.run(budget.reserve(entry.id, 2.0))
 
-    remedied(pay, "models.spending.account_budgets", lambda: workspace.allow(account_budgets={"openai": str(shared)}))
+    remedied(
+        pay, "models.money.spending.account_budgets", lambda: workspace.allow(account_budgets={"openai": str(shared)})
+    )
 
 
 # --- runs on other hosts ----------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from tests.judging.conftest import judge_at
 from tests.providers.server import Provider
 from tests.remedies.remedied import remedied
 from traps_pipeline.judging.robustness import check_panel, load_attacks
-from traps_pipeline.models.judges import JudgeEntry
+from traps_pipeline.models.registry.judges import JudgeEntry
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 

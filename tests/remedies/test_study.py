@@ -16,7 +16,7 @@ from traps_pipeline.benchmark.items import build_items
 from traps_pipeline.checks.canary import canary_items
 from traps_pipeline.exchange import answer_exchange
 from traps_pipeline.exchange.answer_exchange import export_requests
-from traps_pipeline.models.answers import wanted_questions
+from traps_pipeline.models.asking.answers import wanted_questions
 from traps_pipeline.pipeline.experiment import Experiment, load_experiment
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.pipeline.stages import judging_stages, scoring_stages
@@ -42,7 +42,7 @@ def test_once_a_study_was_run_all_that_wanted_its_tables_has_them(small: Checkou
     experiment = load_experiment(str(study.root / EXPERIMENT))
     again: list[Callable[[], Any]] = [
         refused(lambda: build_items(workspace, "occlusion"), "benchmark.items.build_items"),
-        refused(lambda: wanted_questions(workspace, CELL), "models.answers.wanted_questions"),
+        refused(lambda: wanted_questions(workspace, CELL), "models.asking.answers.wanted_questions"),
         refused(lambda: scoring_stages.metrics.make(workspace, "occlusion"), "pipeline.stages.scoring_stages"),
         refused(lambda: scoring_stages._metrics_and_verdicts(workspace, "contrasts"), "pipeline.stages.scoring_stages"),
         refused(lambda: scoring_stages.robust.make(workspace, None), "pipeline.stages.scoring_stages"),

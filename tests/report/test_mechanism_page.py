@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from tests.conftest import ROOT
-from traps_pipeline.models.registry import ModelEntry, load_accounts
+from traps_pipeline.models.registry.entries import ModelEntry, load_accounts
 from traps_pipeline.pipeline.graph import the_graph
 from traps_pipeline.pipeline.stages.mechanism_stages import GROUP
 from traps_pipeline.report.catalogue import TABLE_REPORTS

@@ -14,7 +14,7 @@ import pandas as pd
 import pytest
 
 from tests.build.boards import PECS_OF, board_of, board_row, leaderboard_section, tables
-from traps_pipeline.models.judges import BY_RULES
+from traps_pipeline.models.registry.judges import BY_RULES
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import PAPER_REGIMES
 from traps_pipeline.report.cards import EXPLORER, Card, data_address, explorer_address

@@ -10,7 +10,7 @@ import pytest
 
 from tests.scenes.released import load
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.models.shortcut_rules import CUT_FRAMES
+from traps_pipeline.models.baselines.shortcut_rules import CUT_FRAMES
 from traps_pipeline.scenes.certification.certificates import PACE, pair_of, stored_evidence
 from traps_pipeline.scenes.physics.kit import Physics
 from traps_pipeline.scenes.worlds.outcome import compile_scene, simulated

@@ -13,8 +13,8 @@ import pytest
 
 from tests.build.cells import row
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
-from traps_pipeline.models.answer_rows import RESPONSES
-from traps_pipeline.models.prompts import prompt
+from traps_pipeline.models.asking.answer_rows import RESPONSES
+from traps_pipeline.models.registry.prompts import prompt
 from traps_pipeline.protocol.regimes import ANSWER_FROM, WRONG_COSTS
 from traps_pipeline.scoring.graded import GradedItem, answer_points, brier, graded, wrong_rows
 

@@ -21,7 +21,7 @@ from tests.build.errors import raises
 from tests.build.frames import frames
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.models.registry import load_models
+from traps_pipeline.models.registry.entries import load_models
 from traps_pipeline.storage import media
 from traps_pipeline.storage.media import MediaSpec, MediaStore, data_uris, payload, pick, profile_digest, sample
 from traps_pipeline.video.encode import DamagedClip, decode, decode_sampled, encode

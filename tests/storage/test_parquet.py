@@ -14,7 +14,7 @@ import pytest
 from tests.build.errors import raises
 from tests.build.video_rows import PARTITION, clip
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.models.answer_rows import RESPONSES, ResponseRow
+from traps_pipeline.models.asking.answer_rows import RESPONSES, ResponseRow
 from traps_pipeline.storage.benchmark_tables import VIDEOS, VideoRow
 from traps_pipeline.storage.parquet import State, TableStore, write_sealed
 

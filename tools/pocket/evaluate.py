@@ -14,9 +14,9 @@ from tools.pocket.data import SceneRecord, read_shards
 from tools.pocket.recipe import GAP, Recipe
 from tools.pocket.seeds import SeedRow
 from traps_pipeline.judging.rules import ABSTENTION, read_statement
-from traps_pipeline.models.judged_answers import is_correct
-from traps_pipeline.models.prompts import system_prompt
-from traps_pipeline.models.registry import ModelEntry, get_model
+from traps_pipeline.models.reading.judged_answers import is_correct
+from traps_pipeline.models.registry.entries import ModelEntry, get_model
+from traps_pipeline.models.registry.prompts import system_prompt
 from traps_pipeline.protocol.regimes import PAPER_REGIMES
 from traps_pipeline.scoring.metrics import wilson
 from traps_pipeline.storage.media import sample

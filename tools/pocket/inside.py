@@ -9,7 +9,7 @@ from tools.pocket.recipe import SHIPPED
 from tools.pocket.seeds import Figure
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES
-from traps_pipeline.models.local.checkpoint import as_folder, folder_digest
+from traps_pipeline.models.registry.checkpoint import as_folder, folder_digest
 from traps_pipeline.storage.workspace import Workspace
 
 FACTS = "training.json"  # beside the folder of the weights

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from traps_pipeline.models.prompts import prompt, system_prompt
+from traps_pipeline.models.registry.prompts import prompt, system_prompt
 
 PROMPTS = ("standard", "guided", "json", "vqa_standard", "vqa_guided")
 _COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")

@@ -18,12 +18,12 @@ from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.terminal import text_table
 from traps_pipeline.judging.rules import read_statement
-from traps_pipeline.models.answers import answer_request
-from traps_pipeline.models.ask import Call, SettledCell, collect
-from traps_pipeline.models.judged_answers import UNREAD
-from traps_pipeline.models.participants import Row, call_time_columns
-from traps_pipeline.models.reading import read_answer
-from traps_pipeline.models.registry import NETWORK, ModelEntry, get_model
+from traps_pipeline.models.asking.answers import answer_request
+from traps_pipeline.models.asking.ask import Call, SettledCell, collect
+from traps_pipeline.models.asking.participants import Row, call_time_columns
+from traps_pipeline.models.reading.interpret import read_answer
+from traps_pipeline.models.reading.judged_answers import UNREAD
+from traps_pipeline.models.registry.entries import NETWORK, ModelEntry, get_model
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.storage import columns as shared

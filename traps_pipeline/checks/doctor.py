@@ -63,7 +63,7 @@ def examine_local(models: Sequence[str] = ()) -> Iterator[Finding]:
     from traps_pipeline.models.local import selfcheck
     from traps_pipeline.models.local.adapter import load_local_model
     from traps_pipeline.models.local.tiny import FAMILIES
-    from traps_pipeline.models.registry import LOCAL, get_model, local_models
+    from traps_pipeline.models.registry.entries import LOCAL, get_model, local_models
 
     entries = [get_model(model) for model in models]
     for entry in entries:
@@ -228,7 +228,7 @@ def _checkout() -> str:
     from traps_pipeline.base.paths import require_root
     from traps_pipeline.benchmark.corrections import read_corrections
     from traps_pipeline.benchmark.records import load_release, load_released
-    from traps_pipeline.models.registry import load_models
+    from traps_pipeline.models.registry.entries import load_models
 
     root, release = require_root(), load_release()
     counts = ", ".join(
@@ -259,8 +259,8 @@ def _workspace(place: Place) -> str:
 
 def _keys() -> str:
     """Return missing keys and who needs them. Raises TrapsError for an unusable key."""
-    from traps_pipeline.models.judges import load_judges
-    from traps_pipeline.models.registry import load_accounts, load_models, missing_keys
+    from traps_pipeline.models.registry.entries import load_accounts, load_models, missing_keys
+    from traps_pipeline.models.registry.judges import load_judges
 
     entries = [*load_models().values(), *load_judges().values()]
     for key in sorted({account.key for account in load_accounts().values() if account.key}):

@@ -25,13 +25,14 @@ from traps_pipeline.base.redaction import redact
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.checks.wire_check import SyntheticClip, model_name, question
 from traps_pipeline.judging.panel import parse_vote, vote_request
-from traps_pipeline.models.ask import Call, SettledCell, collect
-from traps_pipeline.models.backends import make_backend
-from traps_pipeline.models.budget import check_money
-from traps_pipeline.models.judges import JudgeEntry, Task
-from traps_pipeline.models.participants import Row
-from traps_pipeline.models.reading import degenerate, read_answer
-from traps_pipeline.models.registry import NETWORK, Account, Entry, ModelEntry, account_of
+from traps_pipeline.models.asking.ask import Call, SettledCell, collect
+from traps_pipeline.models.asking.backends import make_backend
+from traps_pipeline.models.asking.participants import Row
+from traps_pipeline.models.money.budget import check_money
+from traps_pipeline.models.reading.interpret import degenerate, read_answer
+from traps_pipeline.models.reading.thinking import declaration_line, split_thinking, undeclared_mark
+from traps_pipeline.models.registry.entries import NETWORK, Account, Entry, ModelEntry, account_of
+from traps_pipeline.models.registry.judges import JudgeEntry, Task
 from traps_pipeline.models.request import (
     MALFORMED,
     RATE_LIMITED,
@@ -41,7 +42,6 @@ from traps_pipeline.models.request import (
     Request,
     TransientError,
 )
-from traps_pipeline.models.thinking import declaration_line, split_thinking, undeclared_mark
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.workspace import Workspace
 
@@ -127,7 +127,7 @@ class ServerCheck:
 
 def check_server(entry: Entry, account: Account) -> ServerCheck:
     """Check the key, the address, and the server's own list of models if it has one."""
-    from traps_pipeline.models.wire import get
+    from traps_pipeline.models.wire.httpx_transport import get
 
     try:
         check_network()

@@ -13,10 +13,10 @@ from urllib.parse import urlsplit
 
 from traps_pipeline.base.progress import Progress, use_progress
 from traps_pipeline.checks.wire_body import WireBody
-from traps_pipeline.models.api import ApiBackend
-from traps_pipeline.models.registry import Account, Entry, load_accounts
+from traps_pipeline.models.registry.entries import Account, Entry, load_accounts
 from traps_pipeline.models.request import Outcome, Request, TransientError
-from traps_pipeline.models.transport import record_exchange
+from traps_pipeline.models.wire.api import ApiBackend
+from traps_pipeline.models.wire.exchange import record_exchange
 
 PLACEHOLDER_KEY = "placeholder-of-a-key"
 

@@ -35,9 +35,9 @@ from traps_pipeline.checks.wire_body import (
 from traps_pipeline.judging.confabulation import label_request
 from traps_pipeline.judging.confabulation_protocol import load_protocol
 from traps_pipeline.judging.panel import tasks_for, vote_request
-from traps_pipeline.models.judges import JudgeEntry, load_judges
-from traps_pipeline.models.prompts import system_prompt
-from traps_pipeline.models.registry import NETWORK, Entry, ModelEntry, effective_params, load_models
+from traps_pipeline.models.registry.entries import NETWORK, Entry, ModelEntry, effective_params, load_models
+from traps_pipeline.models.registry.judges import JudgeEntry, load_judges
+from traps_pipeline.models.registry.prompts import system_prompt
 from traps_pipeline.models.request import Request
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.regimes import BY_NAME, REGIMES

@@ -263,7 +263,7 @@ def open_workspace(arguments: argparse.Namespace) -> Workspace:
 
 def enter_workspace(workspace: Workspace) -> Workspace:
     """Set the workspace in the environment, for keys and child processes; return it."""
-    from traps_pipeline.models.user_registry import clear_caches
+    from traps_pipeline.models.registry.user_registry import clear_caches
     from traps_pipeline.storage.workspace import VARIABLE
 
     os.environ[VARIABLE] = str(workspace.place)

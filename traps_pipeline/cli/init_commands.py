@@ -49,7 +49,7 @@ def create(
     the existing study differs from the one that the experiment needs, or keeps its ledger elsewhere.
     """
     from traps_pipeline.benchmark.corrections import load_scenarios
-    from traps_pipeline.models.user_registry import save_entries
+    from traps_pipeline.models.registry.user_registry import save_entries
     from traps_pipeline.storage.workspace import Workspace
 
     place, is_judged_by_rules, money = place_of(arguments), arguments.judged_by_rules, dict(money or {})
@@ -92,8 +92,8 @@ def create(
 
 def _check_participant(name: str) -> None:
     """Raise TrapsError with the known names if no model or judge has this name."""
-    from traps_pipeline.models.judges import load_judges
-    from traps_pipeline.models.registry import get_model
+    from traps_pipeline.models.registry.entries import get_model
+    from traps_pipeline.models.registry.judges import load_judges
 
     if name not in load_judges():
         get_model(name)

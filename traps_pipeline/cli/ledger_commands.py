@@ -35,11 +35,11 @@ def add(commands: Commands) -> None:
 def release(arguments: argparse.Namespace) -> int:
     """See `traps study release-money --help`."""
     from traps_pipeline.base.terminal import text_table
-    from traps_pipeline.models import release as releasing
+    from traps_pipeline.models.money.spending import releasable, release_money
 
     workspace = open_workspace(arguments)
     if arguments.participant is None:
-        rooms = releasing.releasable(workspace)
+        rooms = releasable(workspace)
         if arguments.json:
             print_json(rooms)
             return OK
@@ -48,7 +48,7 @@ def release(arguments: argparse.Namespace) -> int:
         return OK
     if not (arguments.why or "").strip() or (arguments.usd is None and not arguments.all_in_flight):
         raise TrapsError(f"{arguments.participant}: give --usd X or --all-in-flight, and the reason with --why")
-    usd = releasing.release(workspace, arguments.participant, arguments.usd, arguments.why.strip())
+    usd = release_money(workspace, arguments.participant, arguments.usd, arguments.why.strip())
     print(f"${usd:.4f} of {arguments.participant} are released; the same command of `traps run` goes on")
     return OK
 

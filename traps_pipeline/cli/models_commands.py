@@ -63,7 +63,7 @@ def _chosen_names(arguments: argparse.Namespace) -> list[str]:
 
     The workspace's own entries are known too. Raises TrapsError for a panel that cannot vote, named or not.
     """
-    from traps_pipeline.models.judges import load_panel, load_panels
+    from traps_pipeline.models.registry.judges import load_panel, load_panels
     from traps_pipeline.pipeline.experiment import load_experiment
     from traps_pipeline.storage.workspace import Workspace
 
@@ -87,7 +87,7 @@ def _chosen_names(arguments: argparse.Namespace) -> list[str]:
 def _check_live(names: list[str], *, is_json: bool) -> int:
     from traps_pipeline.checks.live_check import check_live
     from traps_pipeline.checks.wire_check import participants
-    from traps_pipeline.models.registry import NETWORK
+    from traps_pipeline.models.registry.entries import NETWORK
 
     entry_of = participants()
     if unknown := [name for name in names if name not in entry_of]:
@@ -106,7 +106,7 @@ def _check_live(names: list[str], *, is_json: bool) -> int:
 def test_panel(arguments: argparse.Namespace) -> int:
     """See `traps models test-panel --help`."""
     from traps_pipeline.judging.robustness import check_panel, load_attacks, summary
-    from traps_pipeline.models.judges import load_panel
+    from traps_pipeline.models.registry.judges import load_panel
 
     workspace = open_workspace(arguments)
     name = arguments.panel or workspace.study.panel

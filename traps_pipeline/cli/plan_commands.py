@@ -24,7 +24,7 @@ from traps_pipeline.cli.command import (
 
 if TYPE_CHECKING:
     from traps_pipeline.mechanism.cost import Cost
-    from traps_pipeline.models.forecast import Forecast
+    from traps_pipeline.models.money.forecast import Forecast
 
 
 def add(commands: Commands) -> None:

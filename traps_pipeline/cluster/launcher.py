@@ -15,7 +15,7 @@ from ray.job_submission import JobSubmissionClient  # pyright: ignore[reportMiss
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cluster.ray_runs import RESOURCES_TAG, STUDY_TAG, own_tags
-from traps_pipeline.models.answer_rows import RESPONSES
+from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.pipeline.graph import Stage, the_graph
 from traps_pipeline.pipeline.runs import keys_of
 from traps_pipeline.storage.workspace import RAY, RUN_CPUS, RUN_GPUS, Workspace

@@ -26,8 +26,8 @@ from traps_pipeline.base.wording import count_noun
 from traps_pipeline.cluster.node import CODE, REFUSED_TAG, code_here
 from traps_pipeline.cluster.postgres import PATIENCE_S
 from traps_pipeline.cluster.sensors import REQUEST_TAG, submit
-from traps_pipeline.models.answer_rows import RESPONSES
-from traps_pipeline.models.registry import LOCAL, get_model
+from traps_pipeline.models.asking.answer_rows import RESPONSES
+from traps_pipeline.models.registry.entries import LOCAL, get_model
 from traps_pipeline.pipeline.graph import Stage, the_graph
 from traps_pipeline.pipeline.metadata import tally_of
 from traps_pipeline.pipeline.ranges import Range, cut, shared_out

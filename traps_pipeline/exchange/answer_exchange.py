@@ -28,12 +28,12 @@ from traps_pipeline.exchange.provider_batch import export_batches, failures, is_
 from traps_pipeline.judging.panel import wanted_ballots
 from traps_pipeline.ledger.ledger import Ledger
 from traps_pipeline.ledger.rows import MAX_TOKENS, Stored
-from traps_pipeline.models.answer_rows import RESPONSES
-from traps_pipeline.models.answers import prepare_media, wanted_questions
-from traps_pipeline.models.endings import ending_of
-from traps_pipeline.models.judges import load_judges, load_panel
-from traps_pipeline.models.participants import ledger_row
-from traps_pipeline.models.registry import Entry, ModelEntry, account_of, get_model, load_models
+from traps_pipeline.models.asking.answer_rows import RESPONSES
+from traps_pipeline.models.asking.answers import prepare_media, wanted_questions
+from traps_pipeline.models.asking.participants import ledger_row
+from traps_pipeline.models.reading.endings import ending_of
+from traps_pipeline.models.registry.entries import Entry, ModelEntry, account_of, get_model, load_models
+from traps_pipeline.models.registry.judges import load_judges, load_panel
 from traps_pipeline.models.request import UNFINISHED, WITH_TEXT, Outcome, OutcomeKind, Request
 from traps_pipeline.pipeline.experiment import Experiment
 from traps_pipeline.protocol.cells import Cell, Evaluation

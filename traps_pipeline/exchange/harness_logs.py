@@ -18,9 +18,9 @@ from typing import Any
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.yamlfile import read_lines
-from traps_pipeline.models.endings import ending_of
+from traps_pipeline.models.reading.endings import ending_of
 from traps_pipeline.models.request import UNFINISHED, WITH_TEXT
-from traps_pipeline.models.usage import Sizes, read_usage
+from traps_pipeline.models.wire.usage import Sizes, read_usage
 
 MAX_SAMPLE_BYTES, MAX_LOG_BYTES, MAX_SAMPLES = 2**28, 2 * 2**30, 1_000_000
 # Outcome by finish reason in a log; an error is asked again.

@@ -23,7 +23,7 @@ from traps_pipeline.checks.loopback import render, replay
 from traps_pipeline.checks.wire_body import Api, WireBody
 from traps_pipeline.exchange.media_references import FOLDER as MEDIA
 from traps_pipeline.exchange.media_references import MediaReferences
-from traps_pipeline.models.registry import Entry
+from traps_pipeline.models.registry.entries import Entry
 from traps_pipeline.models.request import Outcome, Request
 
 FOLDER = "batches"

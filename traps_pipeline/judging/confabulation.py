@@ -27,11 +27,11 @@ from traps_pipeline.judging.confabulation_protocol import (
 )
 from traps_pipeline.judging.judging_rows import CONFABULATION, VERDICTS, ConfabulationRow
 from traps_pipeline.judging.panel import Flag, ask_judges, judge_request, parse_judgement, quote, vote_subject
-from traps_pipeline.models.answer_rows import RESPONSES
-from traps_pipeline.models.ask import Call, SettledCell
-from traps_pipeline.models.judges import JudgeEntry, thinking_of
-from traps_pipeline.models.participants import Row, call_time_columns
-from traps_pipeline.models.prompts import prompt
+from traps_pipeline.models.asking.answer_rows import RESPONSES
+from traps_pipeline.models.asking.ask import Call, SettledCell
+from traps_pipeline.models.asking.participants import Row, call_time_columns
+from traps_pipeline.models.registry.judges import JudgeEntry, thinking_of
+from traps_pipeline.models.registry.prompts import prompt
 from traps_pipeline.models.request import Request
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.protocol.datasets import is_ill_posed

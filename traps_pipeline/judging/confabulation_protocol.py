@@ -16,10 +16,10 @@ from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.yamlfile import name_file_in_errors, parse_yaml_model, read_yaml
-from traps_pipeline.models.judges import JudgeEntry, load_judges
-from traps_pipeline.models.prompts import prompt
-from traps_pipeline.models.registry import NETWORK, get_model
-from traps_pipeline.models.schemas import structured_output
+from traps_pipeline.models.registry.entries import NETWORK, get_model
+from traps_pipeline.models.registry.judges import JudgeEntry, load_judges
+from traps_pipeline.models.registry.prompts import prompt
+from traps_pipeline.models.registry.schemas import structured_output
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.ratings import AXES

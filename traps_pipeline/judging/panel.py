@@ -29,12 +29,15 @@ from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.yamlfile import explain
 from traps_pipeline.judging.judging_rows import VoteRow
-from traps_pipeline.models.answer_rows import RESPONSES
-from traps_pipeline.models.answers import answer_request, asked_items
-from traps_pipeline.models.ask import AnyCall, AnyCell, Call, Finished, SettledCell, collect
-from traps_pipeline.models.backends import make_backend
-from traps_pipeline.models.judged_answers import UNREAD, is_correct, leading_object, read_flag, read_object
-from traps_pipeline.models.judges import (
+from traps_pipeline.models.asking.answer_rows import RESPONSES
+from traps_pipeline.models.asking.answers import answer_request, asked_items
+from traps_pipeline.models.asking.ask import AnyCall, AnyCell, Call, Finished, SettledCell, collect
+from traps_pipeline.models.asking.backends import make_backend
+from traps_pipeline.models.asking.participants import Row, call_time_columns
+from traps_pipeline.models.reading.judged_answers import UNREAD, is_correct, leading_object, read_flag, read_object
+from traps_pipeline.models.reading.thinking import Marks, split_thinking, strip_tokens
+from traps_pipeline.models.registry.entries import NETWORK, Entry, get_model
+from traps_pipeline.models.registry.judges import (
     Judge,
     JudgeEntry,
     Task,
@@ -45,10 +48,7 @@ from traps_pipeline.models.judges import (
     vote_prompt,
     vote_schema,
 )
-from traps_pipeline.models.participants import Row, call_time_columns
-from traps_pipeline.models.registry import NETWORK, Entry, get_model
 from traps_pipeline.models.request import JUDGED, WITH_TEXT, Backend, Request
-from traps_pipeline.models.thinking import Marks, split_thinking, strip_tokens
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.tables import Table

@@ -23,8 +23,8 @@ from traps_pipeline.base.wording import count_noun
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml
 from traps_pipeline.judging.judging_rows import JUDGE_ROBUSTNESS
 from traps_pipeline.judging.panel import Ballot, Vote, ask_judges, tasks_for, vote_requests
-from traps_pipeline.models.ask import SettledCell
-from traps_pipeline.models.judges import JudgeEntry, Task
+from traps_pipeline.models.asking.ask import SettledCell
+from traps_pipeline.models.registry.judges import JudgeEntry, Task
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.ratings import INVALID, NO, PANEL, YES, majority
 from traps_pipeline.storage.workspace import Workspace

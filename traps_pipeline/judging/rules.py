@@ -12,9 +12,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from traps_pipeline.models.judged_answers import NUMBER_WORDS, UNREAD, normalise, read_flag, read_object
+from traps_pipeline.models.reading.judged_answers import NUMBER_WORDS, UNREAD, normalise, read_flag, read_object
+from traps_pipeline.models.reading.thinking import strip_fence
 from traps_pipeline.models.request import Outcome, Request
-from traps_pipeline.models.thinking import strip_fence
 
 # Answers that commit under any question: labels of pairs and of answerable questions, and other guesses of the
 # pocket model.

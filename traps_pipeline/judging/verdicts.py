@@ -11,9 +11,9 @@ import pyarrow as pa
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
-from traps_pipeline.models.answer_rows import RESPONSES
-from traps_pipeline.models.judged_answers import UNREAD
-from traps_pipeline.models.judges import PANEL_SIZES, panel_id
+from traps_pipeline.models.asking.answer_rows import RESPONSES
+from traps_pipeline.models.reading.judged_answers import UNREAD
+from traps_pipeline.models.registry.judges import PANEL_SIZES, panel_id
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.protocol.ratings import (

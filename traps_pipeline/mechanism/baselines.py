@@ -24,7 +24,7 @@ from traps_pipeline.mechanism.probes import Fit, fit_probe
 from traps_pipeline.mechanism.probing import ProbeRun, Row
 from traps_pipeline.mechanism.stages import confabulations
 from traps_pipeline.mechanism.stored_states import StoredStates
-from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.models.registry.entries import ModelEntry
 from traps_pipeline.storage.media import MediaSpec, sample
 from traps_pipeline.storage.tables import records
 from traps_pipeline.storage.workspace import Workspace

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from traps_pipeline.models.local.checkpoint import NF4_BYTES
 from traps_pipeline.models.local.vision_cache import MAX_BYTES
-from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.models.registry.checkpoint import NF4_BYTES
+from traps_pipeline.models.registry.entries import ModelEntry
 from traps_pipeline.protocol.datasets import DATASETS, PROBED_ARMS, SIDES, sides_of, taxonomy_of
 from traps_pipeline.storage.media import MediaSpec
 from traps_pipeline.storage.study import MechanismSettings

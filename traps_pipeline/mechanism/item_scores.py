@@ -16,7 +16,7 @@ from traps_pipeline.mechanism.control_rows import ItemScoreRow
 from traps_pipeline.mechanism.gate import MID, OTHER_DATASETS, decide, sources_of_gate
 from traps_pipeline.mechanism.gating import chosen_layers, gate_items, gate_table, outcomes_of, read_states
 from traps_pipeline.mechanism.stored_states import StoredStates
-from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.models.registry.entries import ModelEntry
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.storage.workspace import Workspace

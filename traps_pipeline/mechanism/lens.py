@@ -17,7 +17,7 @@ from traps_pipeline.mechanism.control_rows import LensRow
 from traps_pipeline.mechanism.margin import first_token_margins
 from traps_pipeline.mechanism.probes import auroc, auroc_interval
 from traps_pipeline.mechanism.stored_states import StoredStates
-from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.models.registry.entries import ModelEntry
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.bootstrap import scenario_weights
 from traps_pipeline.storage.workspace import Workspace

@@ -14,7 +14,7 @@ from traps_pipeline.mechanism.gating import chosen_layers, gate_items, gate_tabl
 from traps_pipeline.mechanism.probes import Scorer
 from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.models.local.capture import OF_PARTS, Pooling
-from traps_pipeline.models.registry import get_model
+from traps_pipeline.models.registry.entries import get_model
 from traps_pipeline.protocol.cells import Extraction
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.storage.workspace import Workspace

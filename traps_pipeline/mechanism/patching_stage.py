@@ -38,8 +38,8 @@ from traps_pipeline.mechanism.patching_effects import (
 )
 from traps_pipeline.mechanism.probing_versions import extraction_version
 from traps_pipeline.models.local.spans import changed_tokens, spans
-from traps_pipeline.models.prompts import states_prompt
-from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.models.registry.entries import ModelEntry
+from traps_pipeline.models.registry.prompts import states_prompt
 from traps_pipeline.protocol.cells import Extraction
 from traps_pipeline.protocol.datasets import SIDES
 from traps_pipeline.scoring.bootstrap import (

@@ -10,8 +10,8 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.mechanism_rows import DIRECTIONS
 from traps_pipeline.mechanism.transfer_paths import CURVES
 from traps_pipeline.models.local.capture import OF_PAIRS
-from traps_pipeline.models.prompts import states_prompt, system_prompt
-from traps_pipeline.models.registry import ModelEntry, effective_params, get_model
+from traps_pipeline.models.registry.entries import ModelEntry, effective_params, get_model
+from traps_pipeline.models.registry.prompts import states_prompt, system_prompt
 from traps_pipeline.protocol.cells import Extraction, StatesCell
 from traps_pipeline.storage.benchmark_tables import VIDEOS
 from traps_pipeline.storage.media import profile_digest

@@ -16,9 +16,9 @@ from traps_pipeline.mechanism.control_rows import SentenceRow
 from traps_pipeline.mechanism.margin import head_logits
 from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS
 from traps_pipeline.mechanism.stages import probed_item
-from traps_pipeline.models.answer_rows import RESPONSES
-from traps_pipeline.models.prompts import system_prompt
-from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.models.asking.answer_rows import RESPONSES
+from traps_pipeline.models.registry.entries import ModelEntry
+from traps_pipeline.models.registry.prompts import system_prompt
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.storage.workspace import Workspace

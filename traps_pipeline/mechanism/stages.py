@@ -34,8 +34,8 @@ from traps_pipeline.mechanism.probing import Confabulated, NothingConfabulated, 
 from traps_pipeline.mechanism.probing_versions import mechanism_entry, states_folder
 from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.mechanism.transfer_paths import CURVES
-from traps_pipeline.models.prompts import states_prompt
-from traps_pipeline.models.registry import LOCAL, ModelEntry, get_model
+from traps_pipeline.models.registry.entries import LOCAL, ModelEntry, get_model
+from traps_pipeline.models.registry.prompts import states_prompt
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction, StatesCell
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.storage.media import MediaSpec

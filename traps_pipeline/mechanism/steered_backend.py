@@ -14,7 +14,7 @@ import numpy as np
 
 from traps_pipeline.mechanism.shared_answers import SharedAnswers
 from traps_pipeline.models.local.backend import LocalBackend, outcome
-from traps_pipeline.models.registry import Entry
+from traps_pipeline.models.registry.entries import Entry
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.storage.media import sample
 

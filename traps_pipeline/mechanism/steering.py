@@ -28,12 +28,12 @@ from traps_pipeline.mechanism.probing_versions import loaded_params
 from traps_pipeline.mechanism.shared_answers import SharedAnswers, is_written, make_meanwhile
 from traps_pipeline.mechanism.steered_backend import SteeredBackend
 from traps_pipeline.mechanism.transfer_paths import sources_of
-from traps_pipeline.models.answers import Question
-from traps_pipeline.models.ask import SettledCell, collect
-from traps_pipeline.models.judges import JudgeEntry, load_panel
-from traps_pipeline.models.participants import Row, call_time_columns
-from traps_pipeline.models.prompts import system_prompt
-from traps_pipeline.models.registry import Entry, ModelEntry
+from traps_pipeline.models.asking.answers import Question
+from traps_pipeline.models.asking.ask import SettledCell, collect
+from traps_pipeline.models.asking.participants import Row, call_time_columns
+from traps_pipeline.models.registry.entries import Entry, ModelEntry
+from traps_pipeline.models.registry.judges import JudgeEntry, load_panel
+from traps_pipeline.models.registry.prompts import system_prompt
 from traps_pipeline.models.request import Request
 from traps_pipeline.protocol.cells import SteeringCell
 from traps_pipeline.protocol.datasets import SIDES, taxonomy_of

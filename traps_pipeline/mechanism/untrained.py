@@ -16,8 +16,8 @@ from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.model import LocalModel
-from traps_pipeline.models.prompts import states_prompt
-from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.models.registry.entries import ModelEntry
+from traps_pipeline.models.registry.prompts import states_prompt
 from traps_pipeline.storage.workspace import Workspace
 
 

@@ -1,1 +1,1 @@
-"""Ask models and judges: registry, requests, backends, and how calls are recorded."""
+"""Ask models and judges: from below, a call, its text, the registry, money, the wire, and asking."""

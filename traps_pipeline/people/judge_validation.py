@@ -24,7 +24,7 @@ from traps_pipeline.judging.agreement import cohen_kappa
 from traps_pipeline.judging.confabulation import draw_sample, sample_id
 from traps_pipeline.judging.confabulation_protocol import TRACE_AND_OUTPUT, VOID_KINDS, load_protocol
 from traps_pipeline.judging.judging_rows import CONFABULATION, JUDGE_VALIDATION
-from traps_pipeline.models.answer_rows import RESPONSES
+from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.ratings import AXES
 from traps_pipeline.storage.benchmark_tables import ITEMS

@@ -21,8 +21,8 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml
 from traps_pipeline.judging.confabulation_protocol import load_protocol
 from traps_pipeline.judging.judging_rows import CONFABULATION, VERDICTS
-from traps_pipeline.models.answer_rows import RESPONSES
-from traps_pipeline.models.judges import panel_id
+from traps_pipeline.models.asking.answer_rows import RESPONSES
+from traps_pipeline.models.registry.judges import panel_id
 from traps_pipeline.people.human_label_rows import PROTOCOL_FILE
 from traps_pipeline.people.judge_validation import sheet_rows
 from traps_pipeline.protocol.datasets import DATASETS

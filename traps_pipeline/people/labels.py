@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field, StrictBool, ValidationError, 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.yamlfile import explain
 from traps_pipeline.judging.agreement import krippendorff_alpha
-from traps_pipeline.models.judged_answers import is_correct
+from traps_pipeline.models.reading.judged_answers import is_correct
 from traps_pipeline.people.human_label_rows import HUMAN_AGREEMENT, HUMAN_LABELS, LABELS_FILE
 from traps_pipeline.people.label_units import ABOUT_ANSWERS, TASKS, TaskName, strata, units
 from traps_pipeline.protocol.datasets import DATASETS

@@ -20,9 +20,9 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.corrections import corrected_scenarios
 from traps_pipeline.benchmark.records import load_released, released_lines
 from traps_pipeline.judging.confabulation_protocol import load_protocol
-from traps_pipeline.models.judges import load_judges, load_panel
-from traps_pipeline.models.prompts import prompt, system_prompt, vqa_prompt
-from traps_pipeline.models.registry import load_accounts, load_models
+from traps_pipeline.models.registry.entries import load_accounts, load_models
+from traps_pipeline.models.registry.judges import load_judges, load_panel
+from traps_pipeline.models.registry.prompts import prompt, system_prompt, vqa_prompt
 from traps_pipeline.pipeline.assets import WorkspaceResource
 from traps_pipeline.pipeline.graph import JOB_GROUPS, Stage, name_of, the_graph
 from traps_pipeline.pipeline.history import History

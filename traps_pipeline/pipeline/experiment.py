@@ -12,9 +12,9 @@ from traps_pipeline.base.names import Name
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.base.yamlfile import name_file_in_errors, parse_yaml_model, read_yaml
-from traps_pipeline.models.judges import require_panel
-from traps_pipeline.models.registry import LOCAL, get_model, local_models
-from traps_pipeline.models.user_registry import UserRegistry, add_entries
+from traps_pipeline.models.registry.entries import LOCAL, get_model, local_models
+from traps_pipeline.models.registry.judges import require_panel
+from traps_pipeline.models.registry.user_registry import UserRegistry, add_entries
 from traps_pipeline.pipeline.wanted import evaluations_of
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.protocol.datasets import DATASETS, SCHEMAS, UNPAIRED

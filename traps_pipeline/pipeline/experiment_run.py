@@ -7,9 +7,9 @@ from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.extras import require
-from traps_pipeline.models.backends import require_libraries
-from traps_pipeline.models.judges import JudgeEntry
-from traps_pipeline.models.registry import NETWORK, Entry
+from traps_pipeline.models.asking.backends import require_libraries
+from traps_pipeline.models.registry.entries import NETWORK, Entry
+from traps_pipeline.models.registry.judges import JudgeEntry
 from traps_pipeline.pipeline.experiment import Experiment
 from traps_pipeline.pipeline.run_plan import RunPlan, RunReport, stages_until
 from traps_pipeline.storage.workspace import Workspace

@@ -17,11 +17,11 @@ from traps_pipeline.mechanism.cost import CARDS, Cost, Work, cost_of, mechanism_
 from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES
 from traps_pipeline.mechanism.probing_versions import mechanism_entry
 from traps_pipeline.mechanism.steering import count_answers
-from traps_pipeline.models.answer_rows import RESPONSES
-from traps_pipeline.models.answers import answer_request, asked_items, is_prepared, response_row
-from traps_pipeline.models.forecast import Experience, Forecast, experience, forecast, minutes_of
-from traps_pipeline.models.judges import JudgeEntry, load_panel
-from traps_pipeline.models.registry import LOCAL, NETWORK, Entry, get_model
+from traps_pipeline.models.asking.answer_rows import RESPONSES
+from traps_pipeline.models.asking.answers import answer_request, asked_items, is_prepared, response_row
+from traps_pipeline.models.money.forecast import Experience, Forecast, experience, forecast, minutes_of
+from traps_pipeline.models.registry.entries import LOCAL, NETWORK, Entry, get_model
+from traps_pipeline.models.registry.judges import JudgeEntry, load_panel
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.pipeline.experiment import Experiment
 from traps_pipeline.pipeline.graph import Node

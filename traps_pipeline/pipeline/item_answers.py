@@ -10,9 +10,9 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.base.wording import count_noun
 from traps_pipeline.judging.judging_rows import VOTES
-from traps_pipeline.models.answer_rows import RESPONSES
-from traps_pipeline.models.answers import answer_request, with_posteriors
-from traps_pipeline.models.registry import load_models
+from traps_pipeline.models.asking.answer_rows import RESPONSES
+from traps_pipeline.models.asking.answers import answer_request, with_posteriors
+from traps_pipeline.models.registry.entries import load_models
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.storage.benchmark_tables import ITEMS

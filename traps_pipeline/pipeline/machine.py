@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 from traps_pipeline.base.files import check_disk
 from traps_pipeline.base.network import check_network
-from traps_pipeline.models.answer_rows import RESPONSES
-from traps_pipeline.models.judges import load_panel
-from traps_pipeline.models.registry import LOCAL, NETWORK, Entry, get_model
+from traps_pipeline.models.asking.answer_rows import RESPONSES
+from traps_pipeline.models.registry.entries import LOCAL, NETWORK, Entry, get_model
+from traps_pipeline.models.registry.judges import load_panel
 from traps_pipeline.pipeline.graph import Stage
 from traps_pipeline.pipeline.run_plan import Parts, RunPlan
 from traps_pipeline.protocol.cells import Cell

@@ -9,7 +9,7 @@ from typing import Any
 import dagster as dg
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.models.budget import BudgetReached
+from traps_pipeline.models.money.budget import BudgetReached
 from traps_pipeline.pipeline.graph import Graph, Node, Stage, name_of
 from traps_pipeline.pipeline.history import History
 from traps_pipeline.pipeline.lineage import Lineage, failed_calls

@@ -18,7 +18,7 @@ from traps_pipeline.base.databases import database_error, reason_and_remedy
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import remedy, write_text
 from traps_pipeline.base.paths import require_history_path
-from traps_pipeline.models.traffic import remembering_stops
+from traps_pipeline.models.asking.traffic import remembering_stops
 from traps_pipeline.pipeline.history import History
 from traps_pipeline.pipeline.run_plan import RunPlan, RunReport
 from traps_pipeline.pipeline.runs import HOST_TAG, PID_TAG, Runs, this_host

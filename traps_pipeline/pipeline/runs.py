@@ -19,7 +19,7 @@ import dagster as dg
 from sqlalchemy.exc import SQLAlchemyError
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.models.budget import BudgetReached
+from traps_pipeline.models.money.budget import BudgetReached
 from traps_pipeline.pipeline.graph import Stage
 from traps_pipeline.pipeline.ranges import Range, batches
 from traps_pipeline.pipeline.translation import asset_key

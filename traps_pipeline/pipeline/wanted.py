@@ -11,7 +11,7 @@ from functools import cached_property
 from itertools import product
 
 from traps_pipeline.benchmark.corrections import categories_of, load_scenarios
-from traps_pipeline.models.registry import get_model, load_models, local_models
+from traps_pipeline.models.registry.entries import get_model, load_models, local_models
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction, StatesCell, SteeringCell
 from traps_pipeline.protocol.datasets import (
     ALL_CATEGORIES,

@@ -15,7 +15,7 @@ from traps_pipeline.benchmark.held_out import opaque
 from traps_pipeline.benchmark.records import Release, load_release
 from traps_pipeline.benchmark.specs import spec_of
 from traps_pipeline.judging.panel import tasks_for
-from traps_pipeline.models.prompts import prompt, system_prompt
+from traps_pipeline.models.registry.prompts import prompt, system_prompt
 from traps_pipeline.pipeline.experiment import LITE_FILE
 from traps_pipeline.protocol.datasets import ARMS, DATASETS
 from traps_pipeline.protocol.regimes import PAPER_REGIMES

@@ -19,8 +19,8 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes, write_text
 from traps_pipeline.base.wording import count_noun
 from traps_pipeline.benchmark.records import Release, load_release
-from traps_pipeline.models.answer_rows import RESPONSES
-from traps_pipeline.models.registry import is_reference
+from traps_pipeline.models.asking.answer_rows import RESPONSES
+from traps_pipeline.models.registry.entries import is_reference
 from traps_pipeline.protocol.metric_words import METRIC_WORDS
 from traps_pipeline.release.submission import table_bytes
 from traps_pipeline.scoring.bootstrap import RESAMPLES

@@ -25,11 +25,11 @@ from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.yamlfile import explain
 from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.judging.judging_rows import VOTES
-from traps_pipeline.models.answer_rows import RESPONSES
-from traps_pipeline.models.judges import RULES_VERSION, load_panel, panel_id
-from traps_pipeline.models.prompts import prompt_version
-from traps_pipeline.models.reading import READING
-from traps_pipeline.models.thinking import Marks
+from traps_pipeline.models.asking.answer_rows import RESPONSES
+from traps_pipeline.models.reading.interpret import READING
+from traps_pipeline.models.reading.thinking import Marks
+from traps_pipeline.models.registry.judges import RULES_VERSION, load_panel, panel_id
+from traps_pipeline.models.registry.prompts import prompt_version
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.score_rows import LEADERBOARD, METRICS
 from traps_pipeline.storage.benchmark_tables import ITEMS, current_rows

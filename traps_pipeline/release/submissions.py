@@ -14,7 +14,7 @@ from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes, write_text
 from traps_pipeline.base.wording import count_noun
-from traps_pipeline.models.judges import id_of_judges
+from traps_pipeline.models.registry.judges import id_of_judges
 from traps_pipeline.release.released_rows import SUBMITTED
 from traps_pipeline.release.submission import Submission, read_submission, table_bytes
 from traps_pipeline.release.verification import Verification, verify

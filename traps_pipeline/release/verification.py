@@ -24,12 +24,12 @@ from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.judging.panel import parse_vote, tasks_for, vote_request
 from traps_pipeline.judging.rules import RuleJudge
 from traps_pipeline.judging.verdicts import decide
-from traps_pipeline.models.answer_rows import RESPONSES
-from traps_pipeline.models.judged_answers import is_correct
-from traps_pipeline.models.judges import RULE, RULES_VERSION, id_of_judges
-from traps_pipeline.models.prompts import prompt_version
-from traps_pipeline.models.reading import degenerate
-from traps_pipeline.models.registry import is_reference
+from traps_pipeline.models.asking.answer_rows import RESPONSES
+from traps_pipeline.models.reading.interpret import degenerate
+from traps_pipeline.models.reading.judged_answers import is_correct
+from traps_pipeline.models.registry.entries import is_reference
+from traps_pipeline.models.registry.judges import RULE, RULES_VERSION, id_of_judges
+from traps_pipeline.models.registry.prompts import prompt_version
 from traps_pipeline.models.request import JUDGED, Outcome, Request
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import DATASETS

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from traps_pipeline.models.judges import BY_RULES
+from traps_pipeline.models.registry.judges import BY_RULES
 
 if TYPE_CHECKING:
     import pandas as pd

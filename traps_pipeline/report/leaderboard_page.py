@@ -12,7 +12,7 @@ from typing import Any
 import pandas as pd
 
 from traps_pipeline.base.terminal import TextTable
-from traps_pipeline.models.judges import BY_RULES, ONE_JUDGE, is_judged_by_rules
+from traps_pipeline.models.registry.judges import BY_RULES, ONE_JUDGE, is_judged_by_rules
 from traps_pipeline.protocol.datasets import ARMS, DATASETS
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.report.tables.table_columns import (

@@ -9,7 +9,7 @@ import pandas as pd
 
 from traps_pipeline.base.wording import count_noun
 from traps_pipeline.mechanism.mechanism_rows import COSINES, STEERING_EFFECTS
-from traps_pipeline.models.judges import panel_id
+from traps_pipeline.models.registry.judges import panel_id
 from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 from traps_pipeline.report.leaderboard_page import judged_by
 from traps_pipeline.report.result_frames import (

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from traps_pipeline.models.registry import load_models
+from traps_pipeline.models.registry.entries import load_models
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, STANDARD
 from traps_pipeline.scoring.epochs import require_one_epoch

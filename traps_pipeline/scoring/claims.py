@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from traps_pipeline.models.registry import load_models
+from traps_pipeline.models.registry.entries import load_models
 from traps_pipeline.protocol.regimes import GUIDED, PAPER_REGIMES
 from traps_pipeline.scoring.analyses import (
     hidden_against_others,

@@ -17,7 +17,7 @@ from typing import Any, cast
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.models.judged_answers import is_correct, read_object, to_label
+from traps_pipeline.models.reading.judged_answers import is_correct, read_object, to_label
 from traps_pipeline.protocol.regimes import ANSWER_FROM, BY_NAME, WRONG_COSTS, fields_of
 from traps_pipeline.scoring.bootstrap import RESAMPLES, SEED, Resampling, draw_scenarios, ends_of_mean, with_interval
 from traps_pipeline.scoring.metrics import joined_epochs, joined_versions

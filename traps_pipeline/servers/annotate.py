@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.webguard import TOKEN_OWNER
 from traps_pipeline.base.yamlfile import explain
-from traps_pipeline.models.answer_rows import RESPONSES
+from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.people.judge_validation import sheet_rows
 from traps_pipeline.people.label_units import TASKS, TaskName, annotation_protocol, queue_of, require_task, sample
 from traps_pipeline.people.labels import LABELS

@@ -13,9 +13,9 @@ from traps_pipeline.base.wording import count_noun
 from traps_pipeline.benchmark.corrections import Correction
 from traps_pipeline.benchmark.specs import wording_of
 from traps_pipeline.judging.panel import tasks_for
-from traps_pipeline.models.forecast import Experience, forecast
-from traps_pipeline.models.judges import load_panel
-from traps_pipeline.models.registry import NETWORK, load_models
+from traps_pipeline.models.money.forecast import Experience, forecast
+from traps_pipeline.models.registry.entries import NETWORK, load_models
+from traps_pipeline.models.registry.judges import load_panel
 from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.protocol.datasets import DATASETS, SIDES, is_ill_posed, taxonomy_of

@@ -21,7 +21,7 @@ from traps_pipeline.base.yamlfile import explain
 from traps_pipeline.benchmark.corrections import WORDS, Correction, load_scenarios, read_corrections
 from traps_pipeline.benchmark.decisions import DecidedMeanwhile, decide, decisions_on, is_reviewed, undo
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.models.answer_rows import RESPONSES
+from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.pipeline.experiment import EXPERIMENTS
 from traps_pipeline.report.explorer.scenario_words import answer_of_control, certificate_phrases, intervention
 from traps_pipeline.servers.correction_cost import CorrectionEffect, correction_effect

@@ -35,14 +35,14 @@ from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.mechanism.probing_versions import loaded_params
 from traps_pipeline.models.local import adapter
 from traps_pipeline.models.local.adapter import Sampling, load_local_model
-from traps_pipeline.models.local.checkpoint import weight_bytes
 from traps_pipeline.models.local.decoding import decode
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.prompt_batches import batches
 from traps_pipeline.models.local.sampling import SeededNucleus
-from traps_pipeline.models.local.settings import MechanismSpec
 from traps_pipeline.models.local.tiny import build_tiny, make_tokenizer
-from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.models.registry.checkpoint import weight_bytes
+from traps_pipeline.models.registry.entries import ModelEntry
+from traps_pipeline.models.registry.local_settings import MechanismSpec
 
 pytestmark = pytest.mark.slow
 
@@ -242,10 +242,10 @@ def altered(tmp_path: Path, family: Family = "qwen3-vl") -> Path:
 def test_weights_that_are_not_here_say_how_to_get_them(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
     download = "`hf download nobody/nothing --revision abc`"
-    with raises(TrapsError, "models.local.checkpoint.find_checkpoint", download, "`checkpoint:`"):
+    with raises(TrapsError, "models.registry.checkpoint.find_checkpoint", download, "`checkpoint:`"):
         load_local_model(entry("qwen3-vl", "nobody/nothing", revision="abc"))
     gone = tmp_path / "nowhere" / "config.json"
-    with raises(TrapsError, "models.local.checkpoint._require_whole", str(gone), "save_pretrained"):
+    with raises(TrapsError, "models.registry.checkpoint._require_whole", str(gone), "save_pretrained"):
         load_local_model(entry("qwen3-vl", gone.parent))
 
 
@@ -254,7 +254,7 @@ def test_a_shard_that_is_missing_is_named(tmp_path: Path) -> None:
     (folder / "model.safetensors").unlink()
     index = {"weight_map": {"a": "model-1-of-2.safetensors", "b": "model-2-of-2.safetensors"}}
     (folder / "model.safetensors.index.json").write_text(json.dumps(index))
-    with raises(TrapsError, "models.local.checkpoint._require_whole", str(folder / "model-1-of-2.safetensors")):
+    with raises(TrapsError, "models.registry.checkpoint._require_whole", str(folder / "model-1-of-2.safetensors")):
         load_local_model(entry("qwen3-vl", folder))
 
 
@@ -276,8 +276,8 @@ def test_a_checkpoint_of_another_kind_is_refused(tmp_path: Path) -> None:
 
 def test_too_little_memory_says_how_much_is_needed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     folder = build_tiny("llava-next-video", tmp_path / "big", seed=5)
-    monkeypatch.setattr("traps_pipeline.models.local.checkpoint.free_bytes", lambda device: 1000.0)
-    with raises(TrapsError, "models.local.checkpoint.require_memory", str(folder), "0.0 GB", "float32", "cpu"):
+    monkeypatch.setattr("traps_pipeline.models.registry.checkpoint.free_bytes", lambda device: 1000.0)
+    with raises(TrapsError, "models.registry.checkpoint.require_memory", str(folder), "0.0 GB", "float32", "cpu"):
         load_local_model(entry("llava-next-video", folder))
 
 
@@ -389,6 +389,6 @@ def test_code_in_a_checkpoint_never_runs_and_nobody_is_asked(
         said |= {"tokenizer_class": "Evil", "processor_class": "Evil", "video_processor_type": "Evil"}
         path.write_text(json.dumps(said))
     monkeypatch.setattr("builtins.input", lambda question="": asked.append(question) or "y")
-    with raises(TrapsError, "models.local.checkpoint.require_no_code", str(folder), *named):
+    with raises(TrapsError, "models.registry.checkpoint.require_no_code", str(folder), *named):
         load_local_model(entry("qwen3-vl", folder))
     assert asked == [] and not canary.exists()

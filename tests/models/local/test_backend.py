@@ -25,12 +25,12 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cli import main
 from traps_pipeline.mechanism.adapter_checks import CHECKS
 from traps_pipeline.mechanism.probing_versions import loaded_params
-from traps_pipeline.models import registry
-from traps_pipeline.models.backends import make_backend
+from traps_pipeline.models.asking.backends import make_backend
 from traps_pipeline.models.local.adapter import LocalModel, load_local_model
 from traps_pipeline.models.local.backend import LocalBackend, outcome, seeds, worker
 from traps_pipeline.models.local.tiny import build_tiny
-from traps_pipeline.models.registry import Limits, ModelEntry, effective_params, load_models
+from traps_pipeline.models.registry import entries as registry
+from traps_pipeline.models.registry.entries import Limits, ModelEntry, effective_params, load_models
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.storage.media import MediaStore, sample
 
@@ -163,16 +163,16 @@ def test_another_commit_of_a_hub_id_without_a_revision_is_another_call(
 def test_another_registry_is_named_by_a_variable(tmp_path: Path) -> None:
     shipped = registry.MODELS_FILE.read_text()
     (tmp_path / "mine.yaml").write_text(shipped.replace("assets/pocket/weights", str(checkpoint("llava-next-video"))))
-    ask = "from traps_pipeline.models.registry import get_model; print(get_model('pocket').params['checkpoint'])"
+    ask = "from traps_pipeline.models.registry import entries; print(entries.get_model('pocket').params['checkpoint'])"
     mine = os.environ | {registry.MODELS_VARIABLE: str(tmp_path / "mine.yaml")}
     done = subprocess.run([sys.executable, "-c", ask], env=mine, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == str(checkpoint("llava-next-video"))
 
 
 def test_missing_weights_are_told_before_anything_is_asked(tmp_path: Path) -> None:
-    with raises(TrapsError, "models.local.checkpoint.find_checkpoint", "`hf download nobody/nothing`"):
+    with raises(TrapsError, "models.registry.checkpoint.find_checkpoint", "`hf download nobody/nothing`"):
         make_backend(entry("qwen3-vl", "nobody/nothing"))
-    with raises(TrapsError, "models.local.checkpoint._require_whole", str(tmp_path / "gone" / "config.json")):
+    with raises(TrapsError, "models.registry.checkpoint._require_whole", str(tmp_path / "gone" / "config.json")):
         request(entry("qwen3-vl", tmp_path / "gone"), MediaStore(tmp_path), QUESTIONS[0])
 
 

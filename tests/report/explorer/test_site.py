@@ -18,7 +18,7 @@ from tests.build.cells import CELL, HOSTILE, row, write_cell
 from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
-from traps_pipeline.models.answer_rows import RESPONSES
+from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.report.explorer import answer_shards
 from traps_pipeline.report.explorer.answer_shards import NO, NONE, StudyAnswers, study_answers

@@ -21,7 +21,11 @@ from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.extras import require
 from traps_pipeline.base.wording import count_noun
-from traps_pipeline.models.local.checkpoint import (
+from traps_pipeline.models.local.library import load_transformers
+from traps_pipeline.models.local.model import GeneratedAnswer, LocalModel, States
+from traps_pipeline.models.local.prompt_batches import Prompt
+from traps_pipeline.models.local.sampling import Sampling
+from traps_pipeline.models.registry.checkpoint import (
     Checkpoint,
     find_checkpoint,
     free_bytes,
@@ -29,12 +33,8 @@ from traps_pipeline.models.local.checkpoint import (
     require_no_code,
     weight_bytes,
 )
-from traps_pipeline.models.local.library import load_transformers
-from traps_pipeline.models.local.model import GeneratedAnswer, LocalModel, States
-from traps_pipeline.models.local.prompt_batches import Prompt
-from traps_pipeline.models.local.sampling import Sampling
-from traps_pipeline.models.local.settings import SPREAD, LocalParams
-from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.models.registry.entries import ModelEntry
+from traps_pipeline.models.registry.local_settings import SPREAD, LocalParams
 
 __all__ = ["GeneratedAnswer", "LocalModel", "Prompt", "Sampling", "States", "load_local_model", "require_device"]
 

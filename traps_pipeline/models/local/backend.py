@@ -14,10 +14,10 @@ from threading import Event
 
 from traps_pipeline.base.cores import cores
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.models.first_token import stored_alternatives
 from traps_pipeline.models.framing import media_for_dataset
-from traps_pipeline.models.local.checkpoint import find_checkpoint
-from traps_pipeline.models.registry import Entry, ModelEntry
+from traps_pipeline.models.reading.first_token import stored_alternatives
+from traps_pipeline.models.registry.checkpoint import find_checkpoint
+from traps_pipeline.models.registry.entries import Entry, ModelEntry
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.protocol.datasets import dataset_of
 from traps_pipeline.storage.media import Frames, MediaSpec, sample

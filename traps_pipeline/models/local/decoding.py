@@ -6,11 +6,11 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any, Protocol
 
-from traps_pipeline.models.first_token import MAX_ALTERNATIVES
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.prompt_batches import Prompt, collate
 from traps_pipeline.models.local.sampling import Sampling, SeededNucleus
 from traps_pipeline.models.local.shared_prompts import sharing_prompts
+from traps_pipeline.models.reading.first_token import MAX_ALTERNATIVES
 
 if TYPE_CHECKING:
     from torch import Tensor

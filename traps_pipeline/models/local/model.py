@@ -16,13 +16,13 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.wording import count_noun
 from traps_pipeline.models.local import chat_template
 from traps_pipeline.models.local.capture import Pooling, capture_states
-from traps_pipeline.models.local.checkpoint import Checkpoint, free_bytes
 from traps_pipeline.models.local.decoding import Steers, decode, steering_context
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.prompt_batches import Prompt, batches
 from traps_pipeline.models.local.sampling import Sampling
-from traps_pipeline.models.local.settings import SPREAD, LocalParams
 from traps_pipeline.models.local.vision_cache import ClipMemory
+from traps_pipeline.models.registry.checkpoint import Checkpoint, free_bytes
+from traps_pipeline.models.registry.local_settings import SPREAD, LocalParams
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -9,12 +9,12 @@ import numpy as np
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.extras import install_line, missing
 from traps_pipeline.models.local.adapter import LocalModel, load_local_model
-from traps_pipeline.models.local.checkpoint import download_command, find_checkpoint
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.prompt_batches import Prompt
-from traps_pipeline.models.local.settings import Quantisation
 from traps_pipeline.models.local.tiny import Family, build_tiny
-from traps_pipeline.models.registry import LOCAL, ModelEntry, load_models
+from traps_pipeline.models.registry.checkpoint import download_command, find_checkpoint
+from traps_pipeline.models.registry.entries import LOCAL, ModelEntry, load_models
+from traps_pipeline.models.registry.local_settings import Quantisation
 from traps_pipeline.storage.media import MediaSpec, sample
 from traps_pipeline.video.encode import encode
 

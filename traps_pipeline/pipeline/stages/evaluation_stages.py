@@ -8,11 +8,11 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.explorer_link import EXPLORER, answers_view
 from traps_pipeline.base.wording import count_noun, in_percent
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES, VoteRow
-from traps_pipeline.models.answer_rows import RESPONSES, ResponseRow
-from traps_pipeline.models.judges import panel_version
-from traps_pipeline.models.prompts import prompt_version
-from traps_pipeline.models.reading import READING
-from traps_pipeline.models.registry import answering_version
+from traps_pipeline.models.asking.answer_rows import RESPONSES, ResponseRow
+from traps_pipeline.models.reading.interpret import READING
+from traps_pipeline.models.registry.entries import answering_version
+from traps_pipeline.models.registry.judges import panel_version
+from traps_pipeline.models.registry.prompts import prompt_version
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.pipeline.graph import Check
 from traps_pipeline.pipeline.previews import Records, StudyFile
@@ -87,7 +87,7 @@ def responses(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str |
     """Return a model's answers under a regime in a run, one row per item.
 
     Answers in the ledger are reused."""
-    from traps_pipeline.models.answers import collect_answers
+    from traps_pipeline.models.asking.answers import collect_answers
 
     return _with_items(workspace, collect_answers(workspace, [Cell.parse(key) for key in keys]))
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from traps_pipeline.mechanism import control_rows as tables
 from traps_pipeline.mechanism.mechanism_rows import STEERING_EFFECTS
 from traps_pipeline.mechanism.probing_versions import patching_version, sentence_version
-from traps_pipeline.models.registry import ModelEntry, local_models
+from traps_pipeline.models.registry.entries import ModelEntry, local_models
 from traps_pipeline.pipeline.partitioning import EVERY, SAME
 from traps_pipeline.pipeline.schemes import CELL, EXTRACTION, by_extraction, these_keys
 from traps_pipeline.pipeline.stage import of, source, stage

@@ -7,7 +7,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.wording import count_noun, in_percent
 from traps_pipeline.judging.confabulation_protocol import load_protocol, protocol_digest
 from traps_pipeline.judging.judging_rows import AGREEMENT, CONFABULATION, JUDGE_BIAS, JUDGE_VALIDATION, VERDICTS, VOTES
-from traps_pipeline.models.judges import load_panel, panel_id
+from traps_pipeline.models.registry.judges import load_panel, panel_id
 from traps_pipeline.pipeline.graph import Check
 from traps_pipeline.pipeline.schemes import CELL, these_keys
 from traps_pipeline.pipeline.stage import of, source, stage

@@ -22,7 +22,7 @@ from traps_pipeline.mechanism.mechanism_rows import (
     SteeringShareRow,
 )
 from traps_pipeline.mechanism.mechanism_rows import STEERING as STEERING_TABLE
-from traps_pipeline.models.registry import local_models
+from traps_pipeline.models.registry.entries import local_models
 from traps_pipeline.pipeline import schemes
 from traps_pipeline.pipeline.graph import Check, RunResources
 from traps_pipeline.pipeline.partitioning import EVERY

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.judging.judging_rows import VERDICTS
-from traps_pipeline.models.judges import panel_id
+from traps_pipeline.models.registry.judges import panel_id
 from traps_pipeline.people.human_label_rows import HUMAN_AGREEMENT, HUMAN_LABELS, PROTOCOL_FILE, labels_version
 from traps_pipeline.people.human_score_rows import CORRECTED, HUMAN_ROW, PANEL_ERRORS
 from traps_pipeline.pipeline.stage import of, source, stage

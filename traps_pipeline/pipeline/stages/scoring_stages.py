@@ -215,7 +215,7 @@ def graded(workspace: Workspace, _: None) -> "pd.DataFrame":
 
     The table is empty if no graded cut was run.
     """
-    from traps_pipeline.models.answer_rows import RESPONSES
+    from traps_pipeline.models.asking.answer_rows import RESPONSES
     from traps_pipeline.scoring.graded import GradedItem
     from traps_pipeline.scoring.graded import graded as against_posterior
     from traps_pipeline.storage.posteriors import posteriors

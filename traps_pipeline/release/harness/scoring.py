@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from traps_pipeline.judging.rules import read_statement
-from traps_pipeline.models.judged_answers import UNREAD, is_correct
-from traps_pipeline.models.reading import read_answer
+from traps_pipeline.models.reading.interpret import read_answer
+from traps_pipeline.models.reading.judged_answers import UNREAD, is_correct
 from traps_pipeline.models.request import JUDGED
 
 DATASETS = (

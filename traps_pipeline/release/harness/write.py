@@ -14,8 +14,8 @@ from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes, write_text
 from traps_pipeline.base.yamlfile import read_lines
-from traps_pipeline.models.judges import RULES_PANEL, panel_id
-from traps_pipeline.models.registry import PROTOCOL
+from traps_pipeline.models.registry.entries import PROTOCOL
+from traps_pipeline.models.registry.judges import RULES_PANEL, panel_id
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.metric_words import METRIC_WORDS
 from traps_pipeline.protocol.regimes import PAPER_REGIMES
@@ -30,8 +30,8 @@ _CODE = Path(__file__).parents[2]
 # Modules that are copied under their own names. They import each other and the standard library.
 _COPIED = (
     *("base/digests.py", "base/redaction.py", "protocol/regimes.py"),
-    *("models/request.py", "models/endings.py", "models/thinking.py", "models/reading.py"),
-    *("models/judged_answers.py", "judging/rules.py", "release/harness/scoring.py"),
+    *("models/request.py", "models/reading/endings.py", "models/reading/thinking.py", "models/reading/interpret.py"),
+    *("models/reading/judged_answers.py", "judging/rules.py", "release/harness/scoring.py"),
     *("release/harness/harness_items.py", "release/harness/inspect_task.py"),
 )
 _IMPORT = re.compile(r"(?m)^( *)from traps_pipeline\.([\w.]+) import ")

@@ -17,8 +17,8 @@ import pyarrow.compute
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
-from traps_pipeline.models.answer_rows import RESPONSES
-from traps_pipeline.models.judged_answers import UNREAD
+from traps_pipeline.models.asking.answer_rows import RESPONSES
+from traps_pipeline.models.reading.judged_answers import UNREAD
 from traps_pipeline.protocol.cells import Evaluation
 from traps_pipeline.protocol.datasets import DATASETS, SIDES, UNPAIRED
 from traps_pipeline.protocol.regimes import REGIMES

@@ -185,7 +185,7 @@ def _contents(
 
 def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_clips: bool) -> dict[str, Any]:
     """Return the data that every page of the explorer needs, and the leaderboard."""
-    from traps_pipeline.models.registry import load_models
+    from traps_pipeline.models.registry.entries import load_models
 
     board, robust = workspace.tables.read_all(LEADERBOARD), workspace.tables.read_all(ROBUST)
     human_row = workspace.tables.read_all(HUMAN_ROW)

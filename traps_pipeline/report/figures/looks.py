@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.models.registry import load_models
+from traps_pipeline.models.registry.entries import load_models
 from traps_pipeline.report.writing import COLOURS, GRID, MARKERS, SOFT
 
 if TYPE_CHECKING:

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from traps_pipeline.base.wording import count_noun
-from traps_pipeline.models.judges import load_judges
-from traps_pipeline.models.registry import Entry, ModelEntry, load_models
+from traps_pipeline.models.registry.entries import Entry, ModelEntry, load_models
+from traps_pipeline.models.registry.judges import load_judges
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.table_columns import MODEL, frame
 from traps_pipeline.report.writing import Column, PrintedTable

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.models.registry import load_models
+from traps_pipeline.models.registry.entries import load_models
 from traps_pipeline.protocol.datasets import DATASETS, SHORT
 from traps_pipeline.protocol.metric_words import METRIC_WORDS
 from traps_pipeline.protocol.regimes import REGIMES

@@ -19,10 +19,10 @@ from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.redaction import hide
 from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.base.yamlfile import explain, parse_yaml_model, read_yaml
-from traps_pipeline.models import user_registry
-from traps_pipeline.models.local.settings import DEVICE, LocalParams, MechanismSpec, NetworkSize
-from traps_pipeline.models.schemas import answer_object
-from traps_pipeline.models.thinking import Marks, marks_of
+from traps_pipeline.models.reading.thinking import Marks, marks_of
+from traps_pipeline.models.registry import user_registry
+from traps_pipeline.models.registry.local_settings import DEVICE, LocalParams, MechanismSpec, NetworkSize
+from traps_pipeline.models.registry.schemas import answer_object
 from traps_pipeline.protocol.cells import Evaluation
 from traps_pipeline.protocol.regimes import fields_of
 from traps_pipeline.storage.media import MediaSpec, profile_digest
@@ -216,8 +216,8 @@ class ModelEntry(Entry):
 
     @model_validator(mode="after")
     def _backend_has_what_it_needs(self) -> ModelEntry:
-        from traps_pipeline.models.reference import STRATEGIES
-        from traps_pipeline.models.shortcut_rules import RULES
+        from traps_pipeline.models.baselines.reference import STRATEGIES
+        from traps_pipeline.models.baselines.shortcut_rules import RULES
 
         if self.backend == "reference" and self.params.get("strategy") not in STRATEGIES:
             known_strategies = ", ".join(STRATEGIES)
@@ -346,7 +346,7 @@ def effective_params(entry: ModelEntry, regime: str, dataset: str = "") -> dict[
     the digest of its weights (`declared_digest`).
     """
     if entry.backend == LOCAL:
-        from traps_pipeline.models.local.checkpoint import declared_digest
+        from traps_pipeline.models.registry.checkpoint import declared_digest
 
         content = declared_digest(entry.local_params())
         return entry.params | ({"checkpoint_digest": content} if content else {})

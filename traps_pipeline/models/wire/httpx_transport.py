@@ -23,7 +23,7 @@ from yarl import URL
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.network import TLS_VARIABLES, certificate_problem, proxy_of
-from traps_pipeline.models.transport import Exchange, record_exchange
+from traps_pipeline.models.wire.exchange import Exchange, record_exchange
 
 MAX_BYTES = 16 * 2**20  # maximum bytes of an answer; 8,000 tokens with reasoning take less than a hundredth of it
 CONNECT_S = 60.0  # time-out of a connection with its TLS handshake

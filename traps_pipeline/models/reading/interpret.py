@@ -13,9 +13,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from traps_pipeline.models.endings import ending_of
-from traps_pipeline.models.request import JUDGED, UNFINISHED, WITH_TEXT
-from traps_pipeline.models.thinking import (
+from traps_pipeline.models.reading.endings import ending_of
+from traps_pipeline.models.reading.thinking import (
     Marks,
     declaration_line,
     split_thinking,
@@ -23,6 +22,7 @@ from traps_pipeline.models.thinking import (
     strip_tokens,
     undeclared_mark,
 )
+from traps_pipeline.models.request import JUDGED, UNFINISHED, WITH_TEXT
 from traps_pipeline.protocol.regimes import fields_of
 
 READING = "4"  # version of this module's rules; raising it makes the answers' tables stale

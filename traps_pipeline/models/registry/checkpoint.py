@@ -15,7 +15,7 @@ from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.extras import require
 from traps_pipeline.base.paths import ROOT
-from traps_pipeline.models.local.settings import SPREAD, Dtype, LocalParams, Quantisation
+from traps_pipeline.models.registry.local_settings import SPREAD, Dtype, LocalParams, Quantisation
 
 _FILES = (".json", ".jinja", ".model", ".safetensors", ".txt")  # files of a folder that decide the model's output
 _HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")

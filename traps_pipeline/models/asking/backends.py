@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.extras import require
-from traps_pipeline.models.registry import LOCAL, NETWORK, Entry, ModelEntry
+from traps_pipeline.models.registry.entries import LOCAL, NETWORK, Entry, ModelEntry
 from traps_pipeline.models.request import Backend
 
 
@@ -26,19 +26,19 @@ def make_backend(entry: Entry) -> Backend:
     require_libraries(entry)
     match entry.backend:
         case "reference":
-            from traps_pipeline.models.reference import ReferenceBackend
+            from traps_pipeline.models.baselines.reference import ReferenceBackend
 
             return ReferenceBackend()
         case "observer":
-            from traps_pipeline.models.observer import ObserverBackend
+            from traps_pipeline.models.baselines.observer import ObserverBackend
 
             return ObserverBackend()
         case "rule":
-            from traps_pipeline.models.shortcut_rules import RuleBackend
+            from traps_pipeline.models.baselines.shortcut_rules import RuleBackend
 
             return RuleBackend()
         case "api":
-            from traps_pipeline.models.api import ApiBackend
+            from traps_pipeline.models.wire.api import ApiBackend
 
             return ApiBackend(entry)
         case "local":

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from traps_pipeline.base.terminal import plain
-from traps_pipeline.models import first_token
-from traps_pipeline.models.endings import Ending, ending_of
+from traps_pipeline.models.reading import first_token
+from traps_pipeline.models.reading.endings import Ending, ending_of
 
 Dialect = Literal["chat", "responses", "anthropic", "gemini"]
 Json = Mapping[str, Any]

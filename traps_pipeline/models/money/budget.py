@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.ledger.money import CapExhausted, Money
-from traps_pipeline.models.account_budget import AccountBudget
-from traps_pipeline.models.registry import NETWORK, Entry, ModelEntry
+from traps_pipeline.models.money.account_budget import AccountBudget
+from traps_pipeline.models.registry.entries import NETWORK, Entry, ModelEntry
 from traps_pipeline.models.request import Request
 from traps_pipeline.storage.study import Study
 

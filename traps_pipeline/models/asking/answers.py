@@ -12,13 +12,13 @@ from typing import Any
 from traps_pipeline.base import progress
 from traps_pipeline.base.cores import cores
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.models.answer_rows import ResponseRow
-from traps_pipeline.models.ask import Call, SettledCell, collect
+from traps_pipeline.models.asking.answer_rows import ResponseRow
+from traps_pipeline.models.asking.ask import Call, SettledCell, collect
+from traps_pipeline.models.asking.participants import Row, call_time_columns
 from traps_pipeline.models.framing import media_for_dataset
-from traps_pipeline.models.participants import Row, call_time_columns
-from traps_pipeline.models.prompts import system_prompt
-from traps_pipeline.models.reading import read_answer
-from traps_pipeline.models.registry import ModelEntry, effective_params, get_model
+from traps_pipeline.models.reading.interpret import read_answer
+from traps_pipeline.models.registry.entries import ModelEntry, effective_params, get_model
+from traps_pipeline.models.registry.prompts import system_prompt
 from traps_pipeline.models.request import Request
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import GRADED, dataset_of

@@ -5,8 +5,8 @@ from __future__ import annotations
 from functools import lru_cache
 from pathlib import Path
 
+from traps_pipeline.models.baselines.reference import phrase
 from traps_pipeline.models.framing import observer_frames
-from traps_pipeline.models.reference import phrase
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.protocol.datasets import dataset_of
 from traps_pipeline.video.policies import FramePolicy

@@ -14,7 +14,7 @@ from statistics import NormalDist
 from typing import Any
 
 from traps_pipeline.base.digests import digest
-from traps_pipeline.models.first_token import stored_alternatives
+from traps_pipeline.models.reading.first_token import stored_alternatives
 from traps_pipeline.models.request import Outcome, Request, TransientError
 from traps_pipeline.protocol.datasets import dataset_of
 from traps_pipeline.protocol.regimes import fields_of

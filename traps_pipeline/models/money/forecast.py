@@ -9,9 +9,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from traps_pipeline.ledger.rows import AVERAGED_COLUMNS, Totals
-from traps_pipeline.models.budget import BYTES_A_TOKEN, OVERHEAD_TOKENS
-from traps_pipeline.models.media_tokens import expected_clip_tokens
-from traps_pipeline.models.registry import Entry, ModelEntry, load_accounts
+from traps_pipeline.models.money.budget import BYTES_A_TOKEN, OVERHEAD_TOKENS
+from traps_pipeline.models.money.media_tokens import expected_clip_tokens
+from traps_pipeline.models.registry.entries import Entry, ModelEntry, load_accounts
 
 TYPICAL_TEXT_BYTES = 1500  # system prompt, question and, for a judge, the answer
 # Of an entry without `expected_latency_s`: seconds to the first token of an answer, and completion tokens a second.

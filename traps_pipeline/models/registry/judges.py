@@ -15,19 +15,19 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.base.yamlfile import read_mapping
-from traps_pipeline.models import user_registry
-from traps_pipeline.models.prompts import prompt
-from traps_pipeline.models.registry import (
+from traps_pipeline.models.reading.thinking import Marks
+from traps_pipeline.models.registry.entries import (
     JUDGE_PROTOCOL,
     Entry,
     Limits,
     Protocol,
     is_reference,
     read_entries,
+    user_registry,
     with_own,
 )
-from traps_pipeline.models.schemas import structured_output
-from traps_pipeline.models.thinking import Marks
+from traps_pipeline.models.registry.prompts import prompt
+from traps_pipeline.models.registry.schemas import structured_output
 
 JUDGES_FILE = ASSETS / "judges.yaml"
 PANEL_SIZES = (1, 3)

@@ -11,9 +11,9 @@ from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
 
+from traps_pipeline.models.baselines.observer import observer_answer
+from traps_pipeline.models.baselines.reference import phrase
 from traps_pipeline.models.framing import observer_frames
-from traps_pipeline.models.observer import observer_answer
-from traps_pipeline.models.reference import phrase
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.protocol.datasets import dataset_of
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
-from traps_pipeline.models.thinking import strip_fence
+from traps_pipeline.models.reading.thinking import strip_fence
 
 UNREAD = "unread"  # a rule judge's vote, and an answer's outcome, if no rule can read the text
 NUMERIC_TOLERANCE = 0.5

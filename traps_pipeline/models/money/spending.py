@@ -1,17 +1,24 @@
-"""Yield the budget of a run: the remaining money of its study and accounts."""
+"""Yield the budget of a run, and release money reserved for unsent calls.
+
+A call in flight when its process died, and a failed one that may be billed, count as their worst case until released. A
+person who has checked the provider's bill releases them; the ledger records who, when and why.
+"""
 
 from __future__ import annotations
 
+import getpass
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.ledger.money import Money
-from traps_pipeline.models.account_budget import AccountBudget
-from traps_pipeline.models.budget import Budget
-from traps_pipeline.models.judges import load_judges
-from traps_pipeline.models.registry import Entry, load_accounts, load_models
+from traps_pipeline.ledger.money import Money, Releasable
+from traps_pipeline.models.money.account_budget import AccountBudget
+from traps_pipeline.models.money.budget import Budget
+from traps_pipeline.models.registry.entries import Entry, load_accounts, load_models
+from traps_pipeline.models.registry.judges import load_judges
 from traps_pipeline.storage.workspace import Workspace
 
 
@@ -56,6 +63,26 @@ def account_budgets(workspace: Workspace, spent: Mapping[str, float]) -> dict[st
     return budgets
 
 
+def releasable(workspace: Workspace) -> dict[str, Releasable]:
+    """Return the releasable dollars by participant. Raises TrapsError."""
+    with workspace.ledger.writing():
+        return Money(workspace.ledger).releasable()
+
+
+def release_money(workspace: Workspace, participant: str, usd: float | None, why: str) -> float:
+    """Release a participant's dollars (None: all in flight); return the amount.
+
+    Raises TrapsError if less is reserved for calls that may never have been sent.
+    """
+    with workspace.ledger.writing():
+        money = Money(workspace.ledger)
+        account = account_budgets(workspace, money.spent()).get(participant)
+        dollars = money.release(participant, usd, why, _person(), datetime.now(UTC).isoformat())
+        if account is not None:
+            account.correct(-dollars)
+        return dollars
+
+
 def _check_names(workspace: Workspace) -> None:
     """Raise TrapsError for a cap of a participant that is not in the study."""
     if unknown := workspace.study.account_budgets.keys() - load_accounts().keys():
@@ -68,3 +95,11 @@ def _check_names(workspace: Workspace) -> None:
             f"{workspace.root / 'study.yaml'}: model_budgets_usd names {', '.join(sorted(unknown))}, neither a model "
             "of assets/models.yaml nor a judge of assets/judges.yaml; correct the name, or remove its line"
         )
+
+
+def _person() -> str:
+    """Return the user's name, if the user id has one (in a container it may not)."""
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):
+        return str(os.getuid())

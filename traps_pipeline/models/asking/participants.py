@@ -1,6 +1,6 @@
 """Send one call to a participant: pace, retries, reservation and ledger row.
 
-This is the one place that sends calls; `models/ask.py` decides which.
+This is the one place that sends calls; `models/asking/ask.py` decides which.
 """
 
 from __future__ import annotations
@@ -20,8 +20,16 @@ from typing import Any
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.ledger.rows import SIDE_TEXTS
-from traps_pipeline.models.budget import Budget, BudgetReached, Reservation, check_money, most_tokens, worst_case_usd
-from traps_pipeline.models.registry import NETWORK, Account, Entry, load_accounts
+from traps_pipeline.models.asking.traffic import CircuitBreaker, ConnectionLimit, RateLimiter
+from traps_pipeline.models.money.budget import (
+    Budget,
+    BudgetReached,
+    Reservation,
+    check_money,
+    most_tokens,
+    worst_case_usd,
+)
+from traps_pipeline.models.registry.entries import NETWORK, Account, Entry, load_accounts
 from traps_pipeline.models.request import (
     MALFORMED,
     RATE_LIMITED,
@@ -31,8 +39,7 @@ from traps_pipeline.models.request import (
     Request,
     TransientError,
 )
-from traps_pipeline.models.traffic import CircuitBreaker, ConnectionLimit, RateLimiter
-from traps_pipeline.models.transport import record_exchange
+from traps_pipeline.models.wire.exchange import record_exchange
 from traps_pipeline.storage.study import Study
 
 Row = Mapping[str, Any]

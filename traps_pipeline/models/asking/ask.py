@@ -21,12 +21,12 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.progress import Tally
 from traps_pipeline.ledger.ledger import SYNC_S, Ledger, LockGivenUp, Writer
 from traps_pipeline.ledger.rows import settles
-from traps_pipeline.models.backends import make_backend
-from traps_pipeline.models.budget import Budget, BudgetReached
-from traps_pipeline.models.participants import CallContext, Participant, Participants, Row, attempt, ledger_row
-from traps_pipeline.models.registry import Entry
+from traps_pipeline.models.asking.backends import make_backend
+from traps_pipeline.models.asking.participants import CallContext, Participant, Participants, Row, attempt, ledger_row
+from traps_pipeline.models.money.budget import Budget, BudgetReached
+from traps_pipeline.models.money.spending import open_budget, share_accounts
+from traps_pipeline.models.registry.entries import Entry
 from traps_pipeline.models.request import Backend, Request
-from traps_pipeline.models.spending import open_budget, share_accounts
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace

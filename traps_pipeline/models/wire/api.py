@@ -20,12 +20,10 @@ from traps_pipeline.base.extras import require
 from traps_pipeline.base.redaction import redact
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.wording import count_noun
-from traps_pipeline.models.budget import worst_case_usd
-from traps_pipeline.models.dialects import OddShapeError, Reply, parse_body, read_reply
-from traps_pipeline.models.endings import Ending
-from traps_pipeline.models.first_token import stored_alternatives
-from traps_pipeline.models.provider_errors import ProviderError, read_error, retry_after_s
-from traps_pipeline.models.registry import Account, Entry, load_accounts
+from traps_pipeline.models.money.budget import worst_case_usd
+from traps_pipeline.models.reading.endings import Ending
+from traps_pipeline.models.reading.first_token import stored_alternatives
+from traps_pipeline.models.registry.entries import Account, Entry, load_accounts
 from traps_pipeline.models.request import (
     MALFORMED,
     RATE_LIMITED,
@@ -37,8 +35,10 @@ from traps_pipeline.models.request import (
     Request,
     TransientError,
 )
-from traps_pipeline.models.transport import Exchange, record_exchange
-from traps_pipeline.models.usage import Sizes, Usage, read_usage
+from traps_pipeline.models.wire.dialects import OddShapeError, Reply, parse_body, read_reply
+from traps_pipeline.models.wire.exchange import Exchange, record_exchange
+from traps_pipeline.models.wire.provider_errors import ProviderError, read_error, retry_after_s
+from traps_pipeline.models.wire.usage import Sizes, Usage, read_usage
 from traps_pipeline.storage.media import Media, data_uris
 
 UNKNOWN_ERROR = 500  # default status of an error object in a 200
@@ -67,7 +67,7 @@ TRANSIENT_STATUSES = {408: "timeout", 409: "conflict", 429: RATE_LIMITED}
 def load_litellm() -> Any:
     """Return litellm, set to send and fetch nothing itself. Raises TrapsError."""
     require("api")
-    from traps_pipeline.models.wire import use_in
+    from traps_pipeline.models.wire.httpx_transport import use_in
 
     os.environ["LITELLM_MODE"] = "PRODUCTION"  # otherwise it loads a .env file from any folder above
     os.environ["LITELLM_LOCAL_MODEL_COST_MAP"] = "True"
@@ -232,7 +232,7 @@ class ApiBackend:
 
     def _failure(self, error: Exception, exchange: Exchange) -> Outcome:
         """Return a failure as an outcome, without its text, or raise it as TransientError."""
-        from traps_pipeline.models.wire import cause_of
+        from traps_pipeline.models.wire.httpx_transport import cause_of
 
         if exchange.is_unsent:
             reason = redact(plain(exchange.problem or cause_of(error)))

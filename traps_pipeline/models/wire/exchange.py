@@ -1,7 +1,7 @@
 """Record one attempt on the wire.
 
-The transport (`models/wire.py`) writes it below the client libraries, which turn malformed answers into errors that
-look unbilled.
+The transport (`models/wire/httpx_transport.py`) writes it below the client libraries, which turn malformed answers into
+errors that look unbilled.
 """
 
 from __future__ import annotations

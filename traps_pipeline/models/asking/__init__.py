@@ -1,0 +1,1 @@
+"""Ask models and judges for the calls that the ledger lacks."""

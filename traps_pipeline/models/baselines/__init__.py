@@ -1,0 +1,1 @@
+"""Answer without a model: reference strategies, the observer, one-cue rules."""

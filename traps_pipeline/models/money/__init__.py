@@ -1,0 +1,1 @@
+"""Forecast what calls cost, reserve it, and cap spending."""

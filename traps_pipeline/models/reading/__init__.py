@@ -1,0 +1,1 @@
+"""Read an answer's text: its end, thinking, object and value."""

@@ -1,0 +1,1 @@
+"""Declare models, judges, panels, accounts and prompts."""

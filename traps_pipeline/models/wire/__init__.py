@@ -1,0 +1,1 @@
+"""Send one call to a provider, and read its bytes."""
