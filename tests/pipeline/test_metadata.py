@@ -52,11 +52,11 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_files_are_named_from_the_study_the_checkout_and_the_home_on(place: Path) -> None:
     named = {
-        "why": f"{place}/tables/votes.parquet and {ROOT}/assets/x.yaml",
+        "why": f"{place}/tables/votes.parquet and {ROOT}/assets/models.yaml",
         "more": [f"{place}: full, {place.parent}/a"],
     }
     assert visible_metadata(named) == {
-        "why": "tables/votes.parquet and assets/x.yaml",
+        "why": "tables/votes.parquet and assets/models.yaml",
         "more": ["mine: full, ~/studies/a"],
     }
 

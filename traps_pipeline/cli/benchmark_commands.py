@@ -63,11 +63,7 @@ def add(commands: Commands) -> None:
         help="things like the named ones that cross before each scene (default: none)",
     )
     parser.add_argument(
-        "--speed",
-        type=float,
-        choices=SPEEDS,
-        default=1.0,
-        help="how many times as fast all happens (default: 1.0)",
+        "--speed", type=float, choices=SPEEDS, default=1.0, help="how many times as fast all happens (default: 1.0)"
     )
     parser.add_argument("--longer", action="store_true", help="longer rows, more lanes, greater counts")
     parser.add_argument("--workers", type=integer(1, 1024), help="processes (default: one per core)")

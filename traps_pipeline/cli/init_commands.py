@@ -49,6 +49,8 @@ def create(
     the existing study differs from the one that the experiment needs, or keeps its ledger elsewhere.
     """
     from traps_pipeline.benchmark.corrections import load_scenarios
+    from traps_pipeline.models.registry.entries import get_model
+    from traps_pipeline.models.registry.judges import load_judges
     from traps_pipeline.models.registry.user_registry import save_entries
     from traps_pipeline.storage.workspace import Workspace
 
@@ -62,7 +64,8 @@ def create(
     if "model_budgets_usd" in money:
         money["model_budgets_usd"] = (experiment.model_budgets_usd or caps) | money["model_budgets_usd"]
     for name in {**(experiment.model_budgets_usd or {}), **money.get("model_budgets_usd", {})}:
-        _check_participant(name)
+        if name not in load_judges():
+            get_model(name)  # refuses a name that is none
     workspace = Workspace.create(place, experiment.study.model_copy(update={"database": database}))
     if database is not None and workspace.study.database != database:
         raise TrapsError(
@@ -88,12 +91,3 @@ def create(
         with dagster_history(workspace):  # open it once here, so that several processes can use it afterwards
             pass
     return workspace
-
-
-def _check_participant(name: str) -> None:
-    """Raise TrapsError with the known names if no model or judge has this name."""
-    from traps_pipeline.models.registry.entries import get_model
-    from traps_pipeline.models.registry.judges import load_judges
-
-    if name not in load_judges():
-        get_model(name)

@@ -57,8 +57,8 @@ def plan(arguments: argparse.Namespace) -> int:
     plan_counts = plan_calls(run_plan, experiment, study, arguments.card)
     stages = [status for status in run_plan.statuses() if status.to_make] if run_plan else []
     if arguments.json:
-        place_or_none = str(place) if workspace else None
-        print_json({"experiment": experiment.name, "workspace": place_or_none, "plan": plan_counts, "stages": stages})
+        head = {"experiment": experiment.name, "workspace": str(place) if workspace else None}
+        print_json(head | {"plan": plan_counts, "stages": stages})
         return OK
     total = (Count(), Count())
     location = place if workspace else "a new workspace"

@@ -142,11 +142,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     print(printed_board(workspace))
     print(f"report {workspace.reports / 'report.html'}\nexplorer {workspace.reports / 'index.html'}")
-    print(
-        wrap_text(
-            "next: open one of them; traps why ITEM examines an item's answers; traps site writes a folder to send"
-        )
-    )
+    hint = "open one of them; traps why ITEM examines an item's answers; traps site writes a folder to send"
+    print(wrap_text(f"next: {hint}"))
     return OK
 
 
@@ -159,13 +156,11 @@ def _print_work(report: RunReport, *, is_inside: bool) -> None:
     print(f"{count_noun(report.frames, 'frame')} rendered, {clock(report.seconds)} min")
     if is_inside:
         states, steering_tally, judged = map(report.tally, ("hidden_states", "steering", "steering_votes"))
-        steered_answers = (
+        steered = (
             f"{count_noun(steering_tally.asked, 'steered answer')} asked ({steering_tally.cached} from the ledger)"
         )
-        print(
-            f"inside models: {count_noun(states.asked, 'item')} extracted, {steered_answers}, "
-            f"{count_noun(judged.asked, 'vote')} on them"
-        )
+        votes = f"{count_noun(judged.asked, 'vote')} on them"
+        print(f"inside models: {count_noun(states.asked, 'item')} extracted, {steered}, {votes}")
 
 
 def _print_problems(problems: Sequence[str], *, as_json: bool) -> None:

@@ -54,14 +54,12 @@ def visible_metadata(value: Any) -> Any:
     """Return a metadata value, mapping or list whose texts are for Dagster's pages."""
     if isinstance(value, str):
         return page_text(value)
-    if isinstance(value, Markdown):
-        return dg.MetadataValue.md(visible(value.text))
+    if isinstance(value, Markdown | dg.MarkdownMetadataValue):
+        return dg.MetadataValue.md(page_text((value.text if isinstance(value, Markdown) else value.md_str) or ""))
     if isinstance(value, Records):
         return dg.MetadataValue.table([dg.TableRecord(visible_metadata(row)) for row in value.rows])
     if isinstance(value, StudyFile):
         return dg.MetadataValue.url(value.url)
-    if isinstance(value, dg.MarkdownMetadataValue):
-        return dg.MetadataValue.md(visible(value.md_str or ""))
     if isinstance(value, dg.TableMetadataValue):
         records = [dg.TableRecord(visible_metadata(record.data)) for record in value.records]
         return dg.MetadataValue.table(records, value.schema)

@@ -183,7 +183,9 @@ class RunPlan:
         """Record versions and the history's state after a run without problems."""
         if (history := _history_state(self.workspace)) is None:
             return
-        versions, previous_note = self._versions(), _read_note(self.workspace)
+        nodes = [(name, key) for name, keys in self.parts.items() for key in keys]
+        versions = {name_of(node): self.lineage.version(*node) for node in nodes}
+        previous_note = _read_note(self.workspace)
         if previous_note.get("history") == history:  # keep versions of other stages or experiments
             versions = previous_note["versions"] | versions
         note = json.dumps({"history": history, "versions": versions})
@@ -201,9 +203,6 @@ class RunPlan:
             for name, keys in self.parts.items()
             for key in keys
         )
-
-    def _versions(self) -> dict[str, str | None]:
-        return {name_of((n, key)): self.lineage.version(n, key) for n, keys in self.parts.items() for key in keys}
 
 
 def stages_until(until: str | None) -> set[str] | None:

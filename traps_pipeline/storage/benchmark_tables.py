@@ -124,8 +124,7 @@ class ItemRow:
     answer_type: AnswerType
     ground_truth: Annotated[str | None, "null on void"]
     control_answer: Annotated[
-        str,
-        "the pair's control answer: groups both sides by label; no model or judge sees it on a void",
+        str, "the pair's control answer: groups both sides by label; no model or judge sees it on a void"
     ]
     commonest_answer: Annotated[str, "the commonest control answer of the sub-scenario: what `prior` says"]
     clip: shared.ClipPath
@@ -138,10 +137,7 @@ ITEMS = Table("items", ItemRow, partition_by=("dataset",), key=("item_id",))
 
 
 def current_rows(
-    workspace: "Workspace",
-    table: Table,
-    columns: Sequence[str] | None = None,
-    dataset: str | Sequence[str] = DATASETS,
+    workspace: "Workspace", table: Table, columns: Sequence[str] | None = None, dataset: str | Sequence[str] = DATASETS
 ) -> "pd.DataFrame":
     """Return a table's rows whose items are still in the benchmark.
 

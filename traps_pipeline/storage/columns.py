@@ -36,8 +36,7 @@ AnswerEpochs = Annotated[str, "campaigns of the answers, joined by +"]
 AskedAt = Annotated[datetime, "when it was asked"]
 Wilson = Annotated[float | None, "95 % Wilson interval"]
 BenchmarkVersion = Annotated[
-    str,
-    "of the part of the benchmark that this row is from: release, or release+digest once corrected",
+    str, "of the part of the benchmark that this row is from: release, or release+digest once corrected"
 ]
 
 

@@ -87,9 +87,7 @@ class SteeringSettings(Settings):
         default=(0.5, 1, 2, 4), description="further doses, in units of the distance between the sides' means there"
     )
     cap: float = Field(
-        default=2.0,
-        gt=0,
-        description="longest dose in gaps, in mean lengths of control states; no longer one is given",
+        default=2.0, gt=0, description="longest dose in gaps, in mean lengths of control states; no longer one is given"
     )
     signs: tuple[Literal["plus", "minus"], ...] = Field(
         default=("plus", "minus"), description="policies beside the paper's, which knows each item's side"
