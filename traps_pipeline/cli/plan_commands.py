@@ -55,7 +55,9 @@ def plan(arguments: argparse.Namespace) -> int:
         raise TrapsError(f"--card {arguments.card}: name one of {', '.join(CARDS)}")
     run_plan = RunPlan(workspace, experiment.name) if workspace else None
     plan_counts = plan_calls(run_plan, experiment, study, arguments.card)
-    stages = [status for status in run_plan.statuses() if status.to_make] if run_plan else []
+    # An experiment that the study does not hold in this form wants other partitions, which a run would add.
+    is_held = workspace is not None and workspace.study.experiments.get(experiment.name) == experiment.asked
+    stages = [status for status in run_plan.statuses() if status.to_make] if run_plan and is_held else []
     if arguments.json:
         head = {"experiment": experiment.name, "workspace": str(place) if workspace else None}
         print_json(head | {"plan": plan_counts, "stages": stages})
