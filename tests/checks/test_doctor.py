@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sqlite3
+import sys
 import time
 from contextlib import closing
 from pathlib import Path
@@ -14,6 +15,7 @@ import pyarrow as pa
 import pytest
 
 from tests.build.ledger import answer, write
+from tests.conftest import Checkout
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.cli import main
 from traps_pipeline.scoring.score_rows import LEADERBOARD
@@ -85,3 +87,33 @@ def test_a_damaged_note_file_and_history_are_named_and_what_killed_runs_left_is_
         code, told = verified()
         assert code == 1 and told.count("FAIL") == 1 and str(path.with_suffix("")) in told, told
         path.write_bytes(written)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root becomes another user")
+@pytest.mark.parametrize("is_log_left", [False, True])
+def test_a_user_who_may_only_read_verifies_a_study(study: Checkout, is_log_left: bool) -> None:
+    """A killed process leaves SQLite's log beside a file of the history or the ledger."""
+    old = study.workspace / "reports" / ".page.html.old.part"
+    old.write_bytes(b"<html>")
+    os.utime(old, (time.time() - 2 * 24 * 3600,) * 2)
+    databases = [study.workspace / "ledger" / "ledger.sqlite", *study.workspace.rglob("index.db")]
+    held = [sqlite3.connect(path) for path in databases if is_log_left]
+    for connection in held:
+        connection.execute("pragma journal_mode=wal")
+        connection.execute("pragma user_version=7")
+    before = {path: path.stat().st_mtime_ns for path in study.workspace.rglob("*")}
+    for folder in (study.workspace, *study.workspace.parents):
+        folder.chmod(folder.stat().st_mode | 0o055)
+    nobody = ["setpriv", "--reuid", "65534", "--regid", "65534", "--clear-groups"]
+    verify = [sys.executable, "-m", "traps_pipeline.cli", "doctor", "--verify", "--json"]
+    told = study.run(*nobody, *verify, "--workspace", study.workspace)
+    assert told.code == 0, told.out + told.err
+    assert {path: path.stat().st_mtime_ns for path in study.workspace.rglob("*")} == before
+    [leaderboard] = (study.workspace / "tables" / "leaderboard").glob("*.parquet")
+    leaderboard.chmod(0o600)
+    told = study.run(*nobody, *verify, "--workspace", study.workspace)
+    failing = [finding for finding in json.loads(told.out) if not finding["ok"]]
+    assert [finding["what"] for finding in failing] == ["tables"] and str(leaderboard) in failing[0]["detail"]
+    for connection in held:
+        connection.close()

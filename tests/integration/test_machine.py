@@ -55,6 +55,27 @@ def test_opengl_that_does_not_draw_ends_a_run_before_its_first_table_unless_the_
     study.traps("run", experiment, "--until", "responses").ok()
 
 
+@pytest.mark.parametrize("budget", ["much", "-1", "nobody=3"])
+def test_a_budget_that_is_none_is_refused_before_anything_is_written(tmp_path: Path, budget: str) -> None:
+    experiment, study = tmp_path / "tiny.yaml", Checkout(ROOT, tmp_path / "study")
+    experiment.write_text(yaml.safe_dump(EXPERIMENT))
+    assert study.traps("run", experiment, f"--budget-usd={budget}").code == 1
+    assert not study.workspace.exists()
+    experiment.write_text(yaml.safe_dump(EXPERIMENT | {"model_budgets_usd": {"nobody": 3}}))
+    for command in ("init", "run"):
+        assert study.traps(command, experiment).code == 1
+    assert not study.workspace.exists()
+
+
+def test_budgets_of_the_command_are_kept_beside_those_of_the_experiment(tmp_path: Path) -> None:
+    experiment, study = tmp_path / "tiny.yaml", Checkout(ROOT, tmp_path / "study")
+    experiment.write_text(yaml.safe_dump(EXPERIMENT | {"model_budgets_usd": {"oracle": 3}}))
+    budgets = ("--budget-usd", "20.50", "--budget-usd", "random-50=2")
+    assert study.traps("run", experiment, *budgets, "--until", "scene_specs").code == 0
+    kept = yaml.safe_load((study.workspace / "study.yaml").read_text())
+    assert (kept["budget_usd"], kept["model_budgets_usd"]) == (20.5, {"oracle": 3.0, "random-50": 2.0})
+
+
 def test_a_run_for_which_nothing_matches_says_so_and_fails(tmp_path: Path) -> None:
     study = Checkout(ROOT, tmp_path / "study")
     for name, changes in {
@@ -69,7 +90,7 @@ def test_a_run_for_which_nothing_matches_says_so_and_fails(tmp_path: Path) -> No
         assert study.traps("init", tmp_path / f"{name}.yaml", "--workspace", tmp_path / place).code == 0
     for name, place in (("no-such-run", "study"), ("no-such-arm", "other")):
         ran = study.traps("run", tmp_path / f"{name}.yaml", "--workspace", tmp_path / place)
-        assert (ran.code, ran.raised) == (1, "pipeline.selection.require_work") and name in ran.err
+        assert (ran.code, ran.raised) == (1, "pipeline.run_plan.RunPlan.require_work") and name in ran.err
 
     materialize = ("asset", "materialize", "-m", "traps_pipeline.definitions", "--select", "responses")
     wanted, unwanted = "occlusion|oracle__standard__run1", "chaotic|oracle__standard__run1"

@@ -19,6 +19,7 @@ from traps_pipeline.pipeline.graph import the_graph
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.pipeline.run import dagster_history
 from traps_pipeline.pipeline.runs import HOST_TAG, PID_TAG, this_host
+from traps_pipeline.pipeline.stage import SHARED_IN_RUN
 from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.storage.benchmark_tables import ITEMS
@@ -38,6 +39,25 @@ key = dg.AssetCheckKey(dg.AssetKey("votes"), "current")
 with dg.DagsterInstance.get() as history:
     state = history.event_log_storage.get_asset_check_state([(key, partitions_of(CELL))])[key]
 print(json.dumps({name.value: subset.size for name, subset in state.subsets.items() if subset.size}))
+"""
+
+
+# What Dagster's own resolver says of each partition of each asset.
+RESOLVED = """
+import json
+import dagster as dg
+from dagster._core.definitions.data_version import CachingStaleStatusResolver
+from dagster._core.loader import LoadingContextForTest
+from traps_pipeline.definitions import defs
+graph = defs.resolve_asset_graph()
+with dg.DagsterInstance.get() as history:
+    resolver = CachingStaleStatusResolver(history, graph, LoadingContextForTest(history))
+    nodes = list[tuple[dg.AssetKey, str | None]]()
+    for key in graph.materializable_asset_keys:
+        partitions = graph.get(key).partitions_def
+        nodes += [(key, name) for name in (partitions.get_partition_keys() if partitions else [None])]
+    states = {f"{key.path[-1]}/{partition}": resolver.get_status(key, partition).value for key, partition in nodes}
+print(json.dumps(states))
 """
 
 
@@ -136,6 +156,14 @@ def test_a_run_that_lives_elsewhere_is_left_alone(study: Checkout, monkeypatch: 
     }
 
 
+def test_dagster_itself_calls_every_partition_of_a_new_study_fresh(small: Checkout) -> None:
+    states: dict[str, str] = json.loads(small.python("-c", RESOLVED).ok().out)
+    assert {name.partition("/")[0] for name in states} == {
+        stage.name for stage in the_graph().stages if stage.wanted(StudyPartitions(Workspace.open(small.workspace)))
+    }
+    assert {name for name, state in states.items() if state != "FRESH"} == set()
+
+
 @pytest.mark.promise
 def test_a_failing_step_exits_with_one_and_names_the_file(own_study: Checkout) -> None:
     path = own_study.root / "scene_specs" / "released" / "domino_chain.jsonl"
@@ -145,7 +173,7 @@ def test_a_failing_step_exits_with_one_and_names_the_file(own_study: Checkout) -
     path.write_text("\n".join([json.dumps(record), *lines[1:]]) + "\n")
     finished = materialize(own_study, "scene_specs", "--partition", "dominoes")
     assert finished.code == 1
-    assert f"{path}:1" in finished.out + finished.err
+    assert f"{path.relative_to(own_study.root)}:1" in finished.out + finished.err
 
 
 def test_the_code_location_validates_and_imports_nothing_heavy(study: Checkout) -> None:
@@ -155,3 +183,9 @@ def test_the_code_location_validates_and_imports_nothing_heavy(study: Checkout) 
     assert finished.out.strip() == "[]", finished.err
     valid = study.dagster("definitions", "validate", "-m", "traps_pipeline.definitions").ok()
     assert "BetaWarning" not in valid.err
+
+
+def test_a_run_keeps_nothing_in_memory_for_a_stage_that_does_not_follow(study: Checkout) -> None:
+    shutil.rmtree(study.workspace / "tables" / "contrasts")
+    assert study.traps("run", EXPERIMENT, "--until", "contrasts").code == 0
+    assert (study.workspace / "tables" / "contrasts").exists() and not SHARED_IN_RUN

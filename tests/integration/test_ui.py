@@ -18,8 +18,10 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, expect
 
+from tests.build.network import entry, experiment
 from tests.conftest import CLIP_CACHE, EXPERIMENT, SMALL, Checkout, make_checkout
 from tests.pages import a_browser, patient
+from tests.providers.server import Provider
 from tests.providers.servers import closed_port
 from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.pipeline.automation import INTERVAL_S
@@ -192,3 +194,67 @@ with dg.DagsterInstance.get() as history:
 
 def failures(study: Checkout, table: Table) -> str:
     return study.python("-c", FAILURES, table.name).out
+
+
+# As Dagster's pages send them.
+TERMINATE = """mutation Terminate($runIds: [String!]!, $terminatePolicy: TerminateRunPolicy) {
+  terminateRuns(runIds: $runIds, terminatePolicy: $terminatePolicy) {
+    ... on TerminateRunsResult { terminateRunResults { __typename } }
+  }
+}"""
+LAUNCH = """mutation LaunchPipelineExecution($executionParams: ExecutionParams!) {
+  launchPipelineExecution(executionParams: $executionParams) { __typename }
+}"""
+RUNS = "query { runsOrError { ... on Runs { results { runId status pipelineName } } } }"
+LOCATION = {"repositoryLocationName": "traps_pipeline.definitions", "repositoryName": "__repository__"}
+
+
+def graphql(server: str, query: str, **variables: object) -> dict:
+    headers = {"Authorization": f"Bearer {TOKEN}", "Content-Type": "application/json"}
+    body = json.dumps({"query": query, "variables": variables}).encode()
+    with urllib.request.urlopen(urllib.request.Request(f"{server}/graphql", body, headers), timeout=120) as response:
+        return json.load(response)["data"]
+
+
+def runs_by_job(server: str) -> dict[str, list[tuple[str, str]]]:
+    """Id and status of all runs, by job."""
+    found: dict[str, list[tuple[str, str]]] = {}
+    for run in graphql(server, RUNS)["runsOrError"]["results"]:
+        found.setdefault(run["pipelineName"], []).append((run["runId"], run["status"]))
+    return found
+
+
+@pytest.mark.parametrize("policy", ["SAFE_TERMINATE", "MARK_AS_CANCELED_IMMEDIATELY"])
+@pytest.mark.parametrize("is_job", [False, True], ids=["traps run", "job"])
+def test_terminating_a_run_in_the_pages_sends_no_further_request_and_starts_no_further_run(
+    unasked: Checkout, provider: Provider, is_job: bool, policy: str
+) -> None:
+    provider.configure(latency_s=8.0)
+    model = entry("image-model", "images").replace("limits: {", "limits: {concurrency: 8, ")
+    path = experiment(unasked, provider, [model])
+    unasked.traps("run", path, "--no-preflight", "--until", "items", "--budget-usd", "100").ok()
+    with serving(unasked) as server:
+        earlier = {run for runs in runs_by_job(server).values() for run, _ in runs}
+
+        def started(job: str) -> dict[str, str]:
+            return {run: status for run, status in runs_by_job(server).get(job, []) if run not in earlier}
+
+        command = None
+        if is_job:
+            selector = LOCATION | {"pipelineName": "everything"}
+            graphql(server, LAUNCH, executionParams={"mode": "default", "selector": selector, "runConfigData": {}})
+        else:
+            command = unasked.start(sys.executable, "-m", "traps_pipeline.cli", "run", path, "--no-preflight")
+        wait_until(lambda: provider.stats()["in_flight"] == 8, RUN_SECONDS, "the first requests are sent")
+        [nested] = started("__ASSET_JOB")
+        sent = provider.stats()["requests"]
+        # Dagster's server may answer that it failed, having started no process for the run: it marks it all the same.
+        graphql(server, TERMINATE, runIds=[nested], terminatePolicy=policy)
+        if command is not None:
+            out, err = command.communicate(timeout=RUN_SECONDS)
+            assert command.returncode == 130, out + err
+        else:
+            ended = ["CANCELED"]
+            wait_until(lambda: [*started("everything").values()] == ended, RUN_SECONDS, "the job is canceled, too")
+        assert started("__ASSET_JOB") == {nested: "CANCELED"}
+        assert provider.stats()["requests"] == sent

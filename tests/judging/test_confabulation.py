@@ -33,7 +33,7 @@ from traps_pipeline.judging.panel import parse_judgement
 from traps_pipeline.models.registry.judges import JudgeEntry
 from traps_pipeline.models.registry.prompts import prompt
 from traps_pipeline.pipeline.experiment import load_experiment
-from traps_pipeline.pipeline.forecast_plan import Plan, make_plan
+from traps_pipeline.pipeline.forecast_plan import CallPlan, plan_calls
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.ratings import AXES
@@ -297,9 +297,9 @@ def test_a_wrong_protocol_is_named(tmp_path: Path, old: str, new: str, field: st
         load_protocol(path)
 
 
-def plan_of(name: str) -> Plan:
+def plan_of(name: str) -> CallPlan:
     experiment = load_experiment(name)
-    return make_plan(None, experiment, experiment.study)
+    return plan_calls(None, experiment, experiment.study)
 
 
 def test_the_plan_counts_a_sample_of_each_model_and_none_where_there_is_no_judge() -> None:

@@ -17,8 +17,8 @@ from traps_pipeline.pipeline.graph import the_graph
 from traps_pipeline.pipeline.history import History
 from traps_pipeline.pipeline.lineage import OTHER_COLUMNS, Lineage, Status
 from traps_pipeline.pipeline.partition_checks import CURRENT, evaluations
+from traps_pipeline.pipeline.run_plan import RunPlan, StageStatus
 from traps_pipeline.pipeline.schemes import CELL as CELLS
-from traps_pipeline.pipeline.study_status import StageStatus, stage_statuses
 from traps_pipeline.pipeline.translation import partitions_of
 from traps_pipeline.scoring.score_rows import METRICS
 from traps_pipeline.storage import columns as shared
@@ -63,8 +63,9 @@ class OlderRow:
 
 
 @pytest.fixture
-def study(tmp_path: Path) -> Workspace:
+def study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Workspace:
     """A study whose metrics are made from one cell."""
+    monkeypatch.setenv("TRAPS_WORKSPACE", str(tmp_path / "study"))
     asked = Asked(models=["prior", "oracle"], regimes=["json"], runs=[1], datasets=["chaotic"])
     workspace = Workspace.create(tmp_path / "study", Study(scenarios=["plinko-0001"], experiments={"one": asked}))
     decide(workspace, CELL, abstained=True)
@@ -95,7 +96,7 @@ def test_a_table_that_is_gone_makes_metrics_stale(study: Workspace) -> None:
 def test_a_table_of_a_version_with_other_columns_is_to_be_made_again_and_not_told_as_lost(study: Workspace) -> None:
     study.tables.write(Table("metrics", OlderRow, ("dataset",), ("dataset",)), {"dataset": "chaotic"}, [], {})
     assert status(study) == Status("missing", (OTHER_COLUMNS,))
-    (told,) = (one for one in stage_statuses(study, Lineage(study), None) if one.stage == "metrics")
+    (told,) = (one for one in RunPlan(study).statuses() if one.stage == "metrics")
     assert told.by_reason() == {OTHER_COLUMNS: ["chaotic"]}
 
 
@@ -133,13 +134,54 @@ def test_damage_and_a_loss_are_reported_again_after_a_restart_of_the_daemon(stud
         for last in (False, False, True):  # a new process has reported nothing yet
             if last:
                 path.unlink()
-            report_unseen(instance, study, Lineage(study), {})
+            report_unseen(instance, RunPlan(study), {})
         key = dg.AssetCheckKey(dg.AssetKey("verdicts"), CURRENT)
         stored = instance.event_log_storage.get_asset_check_execution_history(key, limit=9)
     found = [each.event.dagster_event.asset_check_evaluation_data for each in stored]  # pyright: ignore
     assert [each.partition for each in found] == [None, None, cell]
     assert all(each.metadata["partition"].value == cell for each in found)
-    assert [str(path) in each.metadata["not current"].value for each in found] == [False, True, True]  # newest first
+    told = [str(each.metadata["not current"].value) for each in found]
+    assert [study.relative(path) in line for line in told] == [False, True, True]  # newest first
+    assert not [line for line in told if str(tmp_path) in line]
+
+
+@pytest.mark.slow
+def test_a_stale_cell_is_told_in_one_line_until_it_is_made_again(study: Workspace, tmp_path: Path) -> None:
+    graph, reported = the_graph(), dict[str, str]()
+    key = dg.AssetCheckKey(dg.AssetKey("metrics"), CURRENT)
+    with dg.DagsterInstance.local_temp(str(tmp_path)) as instance:
+        instance.report_runless_asset_event(History(instance, graph).event(graph["metrics"], "chaotic", "1", {}, {}))
+        decide(study, CELL, abstained=False)
+        decide(study, CELL | {"model": "oracle"}, abstained=True)
+        report_unseen(instance, RunPlan(study), reported)
+        assert [*reported] == ["metrics/chaotic"] and len(reported["metrics/chaotic"].splitlines()) == 1
+        assert "(and 1 more)" in reported["metrics/chaotic"]
+        score(study, graph["metrics"].code)
+        report_unseen(instance, RunPlan(study), reported)
+        stored = instance.event_log_storage.get_asset_check_execution_history(key, limit=9)
+    results = [each.event.dagster_event.asset_check_evaluation_data for each in stored]  # pyright: ignore
+    assert [(each.partition, each.passed) for each in results] == [(None, True), ("chaotic", False)] and not reported
+
+
+@pytest.mark.slow
+def test_the_sensor_and_the_status_name_the_same_partitions(
+    study: Workspace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DAGSTER_HOME", str(tmp_path / "history"))
+    sensor = sensors()[0]
+
+    def told() -> str:
+        with dg.DagsterInstance.local_temp(str(tmp_path)) as instance:
+            skipped = sensor(dg.build_sensor_context(instance))
+        assert isinstance(skipped, dg.SkipReason)
+        return str(skipped.skip_message)
+
+    def outdated() -> list[str]:
+        return [f"{status.stage}/{key}" for status in RunPlan(study).statuses() for key in status.stale]
+
+    assert not outdated() and "metrics/chaotic" not in told()
+    decide(study, CELL, abstained=False)  # the items are missing, so that nothing can be made of it
+    assert outdated() == ["metrics/chaotic"] and "metrics/chaotic" in told()
 
 
 @pytest.mark.slow
@@ -152,9 +194,9 @@ def test_a_loss_is_told_each_time_that_it_happens_and_taken_back_once_it_is_repa
         for _ in range(2):
             path.unlink()
             for _ in range(2):
-                report_unseen(instance, study, Lineage(study), reported)
+                report_unseen(instance, RunPlan(study), reported)
             score(study, graph["metrics"].code)
-            report_unseen(instance, study, Lineage(study), reported)
+            report_unseen(instance, RunPlan(study), reported)
         key = dg.AssetCheckKey(dg.AssetKey("metrics"), CURRENT)
         stored = instance.event_log_storage.get_asset_check_execution_history(key, limit=9)
     passed = [each.event.dagster_event.asset_check_evaluation_data.passed for each in stored]  # pyright: ignore

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import dagster as dg
 import pandas as pd
 import pytest
 
 from tests.build.cells import row
+from tests.conftest import ROOT
 from tests.mechanism.study import filled
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.progress import Tally
 from traps_pipeline.mechanism.control_rows import GATE
 from traps_pipeline.pipeline.graph import the_graph
-from traps_pipeline.pipeline.metadata import preview, tally_metadata, tally_of
+from traps_pipeline.pipeline.metadata import errors_for_pages, preview, tally_metadata, tally_of, visible_metadata
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.parquet import StageOutput
 
@@ -36,3 +40,41 @@ def test_work_is_numbers_that_dagster_plots_and_that_are_read_back() -> None:
     assert event.metadata == {n: dg.MetadataValue.int(v) for n, v in (("asked", 0), ("known", 4), ("failed", 0))}
     assert tally_of(event.metadata) == Tally(cached=4)
     assert tally_metadata(the_graph()["videos"], Tally(frames=9)) == {"frames": 9}
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A study's folder, in the folder of a user."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("TRAPS_WORKSPACE", str(tmp_path / "studies" / "mine"))
+    return tmp_path / "studies" / "mine"
+
+
+def test_files_are_named_from_the_study_the_checkout_and_the_home_on(place: Path) -> None:
+    named = {
+        "why": f"{place}/tables/votes.parquet and {ROOT}/assets/models.yaml",
+        "more": [f"{place}: full, {place.parent}/a"],
+    }
+    assert visible_metadata(named) == {
+        "why": "tables/votes.parquet and assets/models.yaml",
+        "more": ["mine: full, ~/studies/a"],
+    }
+
+
+def test_an_error_and_its_causes_show_no_folder_of_the_host(place: Path) -> None:
+    def fail() -> None:
+        with errors_for_pages():
+            try:
+                (place / "study.yaml").read_bytes()
+            except FileNotFoundError as error:
+                raise TrapsError(f"{place}/study.yaml: is gone") from error
+
+    with pytest.raises(TrapsError) as raised:
+        fail()
+    assert str(raised.value) == "study.yaml: is gone"
+    assert str(place) not in str(raised.value.__cause__) and "study.yaml" in str(raised.value.__cause__)
+
+
+def test_a_user_whose_home_is_the_root_sees_texts_as_they_are(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/")
+    assert visible_metadata("https://a.org/b and /etc/x") == "https://a.org/b and /etc/x"

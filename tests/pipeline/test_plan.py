@@ -96,3 +96,17 @@ def test_a_scene_that_must_be_drawn_anew_counts_as_new_and_no_other_does(study: 
     assert asked(study)[0] == 4 * 6
     correct_one_void(study)  # with the other scene simulated once, the plan is exact
     assert announced(study)[0] == 3 * 2
+
+
+@pytest.mark.parametrize("table", ["scene_specs", "videos", "items", "responses", "votes", "verdicts", "leaderboard"])
+def test_a_damaged_table_is_one_to_make_and_its_calls_are_those_of_the_next_run(study: Checkout, table: str) -> None:
+    path = sorted((study.workspace / "tables" / table).rglob("*.parquet"))[0]
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    plan = json.loads(study.traps("plan", EXPERIMENT, "--json").ok().out)
+    assert table in {status["stage"] for status in plan["stages"]}
+    calls = [count for counts in plan["plan"]["calls"].values() for count in counts]
+    # What the ledger holds is known; of items that are to be made the plan cannot know that, and says so.
+    assert bool(sum(map(new, calls))) == bool(plan["plan"]["uncertain"])
+    assert asked(study) == (0, 0)

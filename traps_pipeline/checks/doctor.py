@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 import sys
 import time
@@ -121,14 +122,18 @@ def examine_files(place: Place) -> Iterator[Finding]:
         ("states", sorted(file for kind in STATES for file in (workspace.root / "states").rglob(kind)), damage),
         ("history", sorted(workspace.dagster_home.rglob("*.db")), _history_damage),
     ):
-        messages = [message for path in files if (message := damage_of(path))]
-        summary = "; ".join(messages[:MAX_FILES]) + (
-            f"; and {len(messages) - MAX_FILES} more" if len(messages) > MAX_FILES else ""
-        )
-        yield Finding(not messages, topic, summary or f"{count_noun(len(files), 'file')} read, as written")
+        yield _finding(topic, partial(_read_all, files, damage_of))
     message = [*dict.fromkeys((*workspace.answers.damage(), *workspace.votes.damage(), *_lost_rows(workspace)))]
     yield Finding(not message, "ledger", "; ".join(message[:MAX_FILES]) or "all rows are what was written")
     yield Finding(True, "unfinished", _remove_unfinished(workspace.root))
+
+
+def _read_all(files: Sequence[Path], damage_of: Callable[[Path], str]) -> str:
+    """Read files and return their number. Raises TrapsError that names damaged ones, OSError for an unreadable one."""
+    if messages := [message for path in files if (message := damage_of(path))]:
+        rest = f"; and {len(messages) - MAX_FILES} more" if len(messages) > MAX_FILES else ""
+        raise TrapsError("; ".join(messages[:MAX_FILES]) + rest)
+    return f"{count_noun(len(files), 'file')} read, as written"
 
 
 def examine_unused(place: Place, *, is_removed: bool) -> Finding:
@@ -206,8 +211,10 @@ def _media_damage(note: Path) -> str:
 
 def _history_damage(path: Path) -> str:
     """Return why a history is damaged; the next command puts it aside, losing nothing."""
+    # SQLite keeps notes beside a file of this kind, which a user who may only read cannot let it write.
+    mode = "mode=ro" if os.access(path.parent, os.W_OK) else "immutable=1"
     try:
-        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as connection:
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?{mode}", uri=True)) as connection:
             (result,) = connection.execute("pragma quick_check(1)").fetchone()
     except sqlite3.DatabaseError as error:
         result = str(error)
@@ -217,14 +224,15 @@ def _history_damage(path: Path) -> str:
 def _remove_unfinished(root: Path) -> str:
     """Remove killed runs' unfinished files, but no young ones a run may be writing."""
     old = [path for path in root.rglob(f".*{PART}") if time.time() - path.stat().st_mtime > UNFINISHED_AFTER_S]
-    size = sum(path.stat().st_size for path in old)
+    if not old:
+        return "no killed run left a file"
+    size, effect = sum(path.stat().st_size for path in old), "removed"
     for path in old:
-        path.unlink(missing_ok=True)
-    return (
-        f"{count_noun(len(old), 'file')} of killed runs removed ({size / 1e6:.1f} MB)"
-        if old
-        else "no killed run left a file"
-    )
+        try:
+            path.unlink(missing_ok=True)
+        except OSError:
+            effect = "left, which only the study's owner can remove"
+    return f"{count_noun(len(old), 'file')} of killed runs {effect} ({size / 1e6:.1f} MB)"
 
 
 def _finding(topic: str, look: Callable[[], str]) -> Finding:

@@ -69,6 +69,7 @@ def main(argv: Sequence[str] | None = None, parser: argparse.ArgumentParser | No
     gc.set_threshold(1_000_000, 20, 20)  # no collections while a command imports, which saves half a second
     atexit.register(gc.freeze)  # the interpreter's last collections would visit every object, which takes a second
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # looking for some reads every installed distribution
+    _open_closed_streams()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a path or a word that this terminal cannot show
@@ -113,8 +114,17 @@ def _run(argv: Sequence[str] | None, parser: argparse.ArgumentParser) -> int:
         return INTERRUPTED
     finally:
         for stream in (sys.stdout, sys.stderr):
-            if stream is not None:  # pyright: ignore[reportUnnecessaryComparison] - None where it was closed (`>&-`)
-                stream.flush()
+            stream.flush()
+
+
+def _open_closed_streams() -> None:
+    """Open what the shell closed (`>&-`) on the null device: a ledger must never get the number of an output."""
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(descriptor)
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(number, "w" if number else "r", closefd=False))
 
 
 @contextmanager

@@ -163,11 +163,7 @@ class Commands:
             else ""
         )
         parser = self._parsers[group].add_parser(
-            name,
-            help=text,
-            description=text,
-            epilog=example_line + codes,
-            formatter_class=LineHelpFormatter,
+            name, help=text, description=text, epilog=example_line + codes, formatter_class=LineHelpFormatter
         )
         self.by_name[path] = parser
         parser.set_defaults(command=run, parser=parser)

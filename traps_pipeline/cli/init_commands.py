@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cli.command import OK, Commands, add_experiment, add_panel, enter_workspace, experiment_of, place_of
@@ -34,20 +35,36 @@ def init(arguments: argparse.Namespace) -> int:
     return OK
 
 
-def create(arguments: argparse.Namespace, experiment: Experiment, database: str | None = None) -> Workspace:
+def create(
+    arguments: argparse.Namespace,
+    experiment: Experiment,
+    database: str | None = None,
+    money: Mapping[str, Any] | None = None,
+) -> Workspace:
     """Return the workspace with the experiment in its study, created if missing.
 
-    database: the environment variable with the address of the study's database, if one is requested. Raises TrapsError
-    if the existing study differs from the one that the experiment needs, or keeps its ledger elsewhere.
+    database: the environment variable with the address of the study's database, if one is requested. money: fields of
+    the study to change, such as budgets. Raises TrapsError, before anything is written, for a budget of nobody; and if
+    the existing study differs from the one that the experiment needs, or keeps its ledger elsewhere.
     """
     from traps_pipeline.benchmark.corrections import load_scenarios
+    from traps_pipeline.models.registry.entries import get_model
+    from traps_pipeline.models.registry.judges import load_judges
     from traps_pipeline.models.registry.user_registry import save_entries
     from traps_pipeline.storage.workspace import Workspace
 
-    place, is_judged_by_rules = place_of(arguments), arguments.judged_by_rules
-    if not Workspace.is_there(place):  # refuse before a folder is created
+    place, is_judged_by_rules, money = place_of(arguments), arguments.judged_by_rules, dict(money or {})
+    if Workspace.is_there(place):
+        caps = enter_workspace(Workspace.open(place)).study.model_budgets_usd  # and its own models are known now
+    else:  # refuse before a folder is created
         experiment.judged(None, arguments.panel, judged_by_rules=is_judged_by_rules)
         load_scenarios(experiment.study)
+        caps = {}
+    if "model_budgets_usd" in money:
+        money["model_budgets_usd"] = (experiment.model_budgets_usd or caps) | money["model_budgets_usd"]
+    for name in {**(experiment.model_budgets_usd or {}), **money.get("model_budgets_usd", {})}:
+        if name not in load_judges():
+            get_model(name)  # refuses a name that is none
     workspace = Workspace.create(place, experiment.study.model_copy(update={"database": database}))
     if database is not None and workspace.study.database != database:
         raise TrapsError(
@@ -63,8 +80,8 @@ def create(arguments: argparse.Namespace, experiment: Experiment, database: str 
     if experiment.mechanism is not None and workspace.study.mechanism is None:
         workspace = workspace.allow(mechanism=experiment.mechanism)
     experiments = workspace.study.experiments | {experiment.name: experiment.asked}
-    if experiments != workspace.study.experiments:
-        workspace = workspace.allow(experiments=experiments)
+    if experiments != workspace.study.experiments or money:
+        workspace = workspace.allow(experiments=experiments, **money)
     enter_workspace(workspace)
     save_entries(workspace)
     if not (workspace.dagster_home / "dagster.yaml").exists():

@@ -40,7 +40,8 @@ def add(commands: Commands) -> None:
 
 def plan(arguments: argparse.Namespace) -> int:
     from traps_pipeline.mechanism.cost import CARDS
-    from traps_pipeline.pipeline.forecast_plan import Count, make_plan
+    from traps_pipeline.pipeline.forecast_plan import Count, plan_calls
+    from traps_pipeline.pipeline.run_plan import RunPlan
     from traps_pipeline.storage.workspace import Workspace
 
     experiment, place = experiment_of(arguments), place_of(arguments)
@@ -51,9 +52,14 @@ def plan(arguments: argparse.Namespace) -> int:
     )
     if arguments.card not in CARDS:
         raise TrapsError(f"--card {arguments.card}: name one of {', '.join(CARDS)}")
-    plan_counts = make_plan(workspace, experiment, study, arguments.card)
+    run_plan = RunPlan(workspace, experiment.name) if workspace else None
+    plan_counts = plan_calls(run_plan, experiment, study, arguments.card)
+    # An experiment that the study does not hold in this form wants other partitions, which a run would add.
+    is_held = workspace is not None and workspace.study.experiments.get(experiment.name) == experiment.asked
+    stages = [status for status in run_plan.statuses() if status.to_make] if run_plan and is_held else []
     if arguments.json:
-        print_json({"experiment": experiment.name, "workspace": str(place) if workspace else None, "plan": plan_counts})
+        head = {"experiment": experiment.name, "workspace": str(place) if workspace else None}
+        print_json(head | {"plan": plan_counts, "stages": stages})
         return OK
     total = (Count(), Count())
     location = place if workspace else "a new workspace"
@@ -75,6 +81,9 @@ def plan(arguments: argparse.Namespace) -> int:
     if plan_counts.local:
         _print_local(plan_counts.local, arguments.card)
     _print_precision(plan_counts.pairs, len(plan_counts.calls))
+    if stages:
+        order = ", ".join(f"{status.stage} {status.to_make:,}" for status in stages)
+        print(wrap_text(f"\npartitions to make, in this order: {order}; `traps status` says why"))
     if plan_counts.uncertain:
         text = (
             f"This is an upper bound: items of {', '.join(plan_counts.uncertain)} are still to be made, so all of "

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from dagster import DagsterInstance
 
     from traps_pipeline.pipeline.experiment import Experiment
-    from traps_pipeline.pipeline.experiment_run import RunReport
+    from traps_pipeline.pipeline.run_plan import RunReport
     from traps_pipeline.pipeline.runs import Runs
     from traps_pipeline.storage.workspace import Workspace
 
@@ -98,7 +98,7 @@ def run(arguments: argparse.Namespace) -> int:
     from traps_pipeline.cli.printed_progress import make_progress
 
     experiment = experiment_of(arguments)
-    workspace = _allow(create(arguments, experiment), experiment, arguments)
+    workspace = create(arguments, experiment, money=_money(experiment, arguments))
     stream = sys.stderr if arguments.json else sys.stdout
     title = f"{experiment.name}: {experiment.description}" if experiment.description else experiment.name
     print(f"{wrap_text(title, stream)}\nworkspace {workspace.place}", file=stream, flush=True)
@@ -141,11 +141,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     print(printed_board(workspace))
     print(f"report {workspace.reports / 'report.html'}\nexplorer {workspace.reports / 'index.html'}")
-    print(
-        wrap_text(
-            "next: open one of them; traps why ITEM examines an item's answers; traps site writes a folder to send"
-        )
-    )
+    hint = "open one of them; traps why ITEM examines an item's answers; traps site writes a folder to send"
+    print(wrap_text(f"next: {hint}"))
     return OK
 
 
@@ -158,13 +155,11 @@ def _print_work(report: RunReport, *, is_inside: bool) -> None:
     print(f"{count_noun(report.frames, 'frame')} rendered, {clock(report.seconds)} min")
     if is_inside:
         states, steering_tally, judged = map(report.tally, ("hidden_states", "steering", "steering_votes"))
-        steered_answers = (
+        steered = (
             f"{count_noun(steering_tally.asked, 'steered answer')} asked ({steering_tally.cached} from the ledger)"
         )
-        print(
-            f"inside models: {count_noun(states.asked, 'item')} extracted, {steered_answers}, "
-            f"{count_noun(judged.asked, 'vote')} on them"
-        )
+        votes = f"{count_noun(judged.asked, 'vote')} on them"
+        print(f"inside models: {count_noun(states.asked, 'item')} extracted, {steered}, {votes}")
 
 
 def _print_problems(problems: Sequence[str], *, as_json: bool) -> None:
@@ -195,11 +190,8 @@ def _open_runs(arguments: argparse.Namespace, instance: DagsterInstance, workspa
     yield several_hosts().runs(workspace, instance, arguments)
 
 
-def _allow(workspace: Workspace, experiment: Experiment, arguments: argparse.Namespace) -> Workspace:
-    """Return the workspace with the command's budgets, else the experiment's.
-
-    Raises TrapsError for a wrong one.
-    """
+def _money(experiment: Experiment, arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the budgets of the command, else of the experiment. Raises TrapsError."""
     fields = {name: getattr(experiment, name) for name in MONEY}
     money: dict[str, Any] = {name: value for name, value in fields.items() if value is not None}
     if arguments.allow_unknown_prices:
@@ -212,19 +204,7 @@ def _allow(workspace: Workspace, experiment: Experiment, arguments: argparse.Nam
                 f"--budget-usd {text}: give dollars (20 or 20.50), or MODEL=dollars for one model or judge"
             )
         if name:
-            caps = money.setdefault("model_budgets_usd", dict(workspace.study.model_budgets_usd))
-            caps[name] = dollars
+            money["model_budgets_usd"] = money.get("model_budgets_usd", {}) | {name: dollars}
         else:
             money["budget_usd"] = dollars
-    for name in money.get("model_budgets_usd", {}):
-        _check_participant(name)
-    return workspace.allow(**money) if money else workspace
-
-
-def _check_participant(name: str) -> None:
-    """Raise TrapsError with the known names if no model or judge has this name."""
-    from traps_pipeline.models.registry.entries import get_model
-    from traps_pipeline.models.registry.judges import load_judges
-
-    if name not in load_judges():
-        get_model(name)
+    return money

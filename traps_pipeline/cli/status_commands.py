@@ -49,11 +49,10 @@ def status(arguments: argparse.Namespace) -> int:
             f"{workspace.root}/study.yaml: has no experiment {experiment!r}; traps init {experiment} adds it"
             + did_you_mean(experiment, workspace.study.experiments)
         )
-    from traps_pipeline.pipeline.lineage import Lineage
-    from traps_pipeline.pipeline.study_status import failing_checks, stage_statuses
+    from traps_pipeline.pipeline.run_plan import RunPlan, failing_checks
 
     load_definitions()
-    rows = list(stage_statuses(workspace, Lineage(workspace), experiment))
+    rows = [*RunPlan(workspace, experiment).statuses()]
     checks = [*failing_checks(workspace)]
     command = _command(workspace, arguments, environment)
     if arguments.json:
@@ -64,7 +63,7 @@ def status(arguments: argparse.Namespace) -> int:
     print(f"workspace {workspace.place}")
     for check, stage, partition, reason in checks:
         print(wrap_text(plain(f"check {check} of {stage} {partition} does not pass: {reason}")))
-    total, rows_to_make = sum(row.fresh for row in rows), [row for row in rows if row.stale or row.missing]
+    total, rows_to_make = sum(row.fresh for row in rows), [row for row in rows if row.to_make]
     if not rows_to_make:
         print(f"everything is fresh: {count_noun(total, 'partition')} of {count_noun(len(rows), 'stage')}")
         return OK
@@ -77,7 +76,7 @@ def status(arguments: argparse.Namespace) -> int:
             suffix = f" and {len(keys) - MAX_KEYS} more" if len(keys) > MAX_KEYS else ""
             prefix = "" if keys == [row.stage] else f"{', '.join(keys[:MAX_KEYS])}{suffix}: "
             print(wrap_text(plain(f"    {prefix}{reason[:MAX_REASON]}")))
-    count = sum(len(row.stale) + len(row.missing) for row in rows_to_make)
+    count = sum(row.to_make for row in rows_to_make)
     print(f"not fresh: {count:,} of {count_noun(total + count, 'partition')}; `{command}` makes them again")
     return OK
 
@@ -106,7 +105,7 @@ def _command(workspace: Workspace, arguments: argparse.Namespace, exported: Mapp
 
 
 def why(arguments: argparse.Namespace) -> int:
-    from traps_pipeline.pipeline.stale_reasons import explain, lines_of
+    from traps_pipeline.pipeline.item_answers import explain, lines_of
 
     explanation = explain(open_workspace(arguments), arguments.item)
     if arguments.json:

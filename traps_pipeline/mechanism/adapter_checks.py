@@ -206,9 +206,7 @@ def _check_patching(subject: Subject) -> str:
         "per-layer inputs": bool(target.per_layer),
     }
     path_names = ", ".join(name for name, is_different in side_paths.items() if is_different)
-    return "0 within rounding, and 1" + (
-        f" with {path_names}" if path_names else ""
-    )
+    return "0 within rounding, and 1" + (f" with {path_names}" if path_names else "")
 
 
 # --- faster ways ------------------------------------------------------------------------------------------------------

@@ -9,7 +9,9 @@ from pydantic import PrivateAttr
 from typing_extensions import override
 
 from traps_pipeline.pipeline.graph import Graph, Source, Stage
+from traps_pipeline.pipeline.metadata import errors_for_pages
 from traps_pipeline.pipeline.partition_checks import CURRENT, CURRENT_DOC
+from traps_pipeline.pipeline.stage import SHARED_IN_RUN
 from traps_pipeline.pipeline.step import Event, guard_events, run_step
 from traps_pipeline.pipeline.translation import asset_deps, asset_key, partitions_of
 from traps_pipeline.storage.tables import Table
@@ -39,6 +41,7 @@ class WorkspaceResource(dg.ConfigurableResource):
     @override
     def teardown_after_execution(self, context: dg.InitResourceContext) -> None:
         self._steps.close()
+        SHARED_IN_RUN.clear()
 
     def open(self) -> Workspace:
         """Return the workspace. Raises TrapsError with a remedy where there is none."""
@@ -65,10 +68,11 @@ def _observable(source: Source) -> dg.AssetsDefinition:
         metadata={"owner": OWNERS[0]},
     )
     def observe(workspace: WorkspaceResource) -> dg.DataVersion | dg.DataVersionsByPartition:
-        study_workspace = workspace.open()
-        if source.scheme is None:
-            return dg.DataVersion(source.version(study_workspace, None))
-        return dg.DataVersionsByPartition({key: source.version(study_workspace, key) for key in source.scheme.keys})
+        with errors_for_pages():
+            study, keys = workspace.open(), source.scheme.keys if source.scheme else ()
+            if source.scheme is None:
+                return dg.DataVersion(source.version(study, None))
+            return dg.DataVersionsByPartition({key: source.version(study, key) for key in keys})
 
     return cast(dg.AssetsDefinition, observe)
 
@@ -96,8 +100,9 @@ def _asset(graph: Graph, stage: Stage) -> dg.AssetsDefinition:
         ],
     )
     def asset(context: dg.AssetExecutionContext, workspace: WorkspaceResource) -> Iterator[Event]:
-        events = guard_events(run_step(stage, context, workspace.open()), context)
-        yield from workspace.until_torn_down(events)
+        with errors_for_pages():
+            events = guard_events(run_step(stage, context, workspace.open()), context)
+            yield from workspace.until_torn_down(events)
 
     return asset
 

@@ -8,8 +8,8 @@ correction made while they were off.
 """
 
 import json
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Collection, Sequence
+from functools import cache, partial
 from typing import Any
 
 import dagster as dg
@@ -26,18 +26,16 @@ from traps_pipeline.models.registry.prompts import prompt, system_prompt, vqa_pr
 from traps_pipeline.pipeline.assets import WorkspaceResource
 from traps_pipeline.pipeline.graph import JOB_GROUPS, Stage, name_of, the_graph
 from traps_pipeline.pipeline.history import History
-from traps_pipeline.pipeline.lineage import Lineage
-from traps_pipeline.pipeline.machine import require_machine, wanted_parts
+from traps_pipeline.pipeline.machine import require_machine
+from traps_pipeline.pipeline.metadata import errors_for_pages, visible_metadata
 from traps_pipeline.pipeline.partition_checks import CURRENT
 from traps_pipeline.pipeline.ranges import batches
-from traps_pipeline.pipeline.run import materialize_stale, pending_in
-from traps_pipeline.pipeline.runs import LocalRuns, range_tags
+from traps_pipeline.pipeline.run import materialize_stale
+from traps_pipeline.pipeline.run_plan import RunPlan
+from traps_pipeline.pipeline.runs import LocalRuns, range_tags, report_canceling
 from traps_pipeline.pipeline.schemes import study_here
-from traps_pipeline.pipeline.selection import failed_checks
 from traps_pipeline.pipeline.step import MAKE_TAG, STALE_ONLY, STALE_OR_MISSING
 from traps_pipeline.pipeline.translation import asset_key
-from traps_pipeline.pipeline.wanted import StudyPartitions
-from traps_pipeline.storage.workspace import Workspace
 
 DESCRIPTIONS = {
     "benchmark": "Scenarios, clips and items.",
@@ -54,6 +52,7 @@ UNFINISHED = [
     dg.DagsterRunStatus.STARTED,
 ]
 INTERVAL_S = 30
+MAX_REPORTS, MAX_NAMED = 500, 3  # evaluations of checks in one tick, partitions named in a sentence
 
 
 def reread_sources() -> None:
@@ -80,17 +79,22 @@ def _job(name: str, doc: str, stages: Sequence[Stage]) -> Any:
         return dg.define_asset_job(name, selection=selection, description=doc, tags={MAKE_TAG: STALE_OR_MISSING})
 
     @dg.op(name=f"make_{name}", description=doc)
+    @errors_for_pages()
     def make(context: dg.OpExecutionContext, workspace: WorkspaceResource) -> None:
         reread_sources()
-        study_workspace, names = workspace.open(), [stage.name for stage in stages]
-        require_machine(study_workspace, wanted_parts(study_workspace, names))
+        plan = RunPlan(workspace.open(), stages=[stage.name for stage in stages])
+        require_machine(plan)
         every_asset = context.repository_def.get_implicit_global_asset_job_def()
         runs = LocalRuns(context.instance, every_asset, parent=context.run, log=context.log.info)
-        outcome = materialize_stale(context.instance, runs, study_workspace, names)
+        try:
+            outcome = materialize_stale(context.instance, runs, plan)
+        except KeyboardInterrupt:  # one of its runs was terminated
+            report_canceling(context.instance, context.run_id)
+            raise
         if runs.finished:
             context.add_output_metadata({"runs": dg.MetadataValue.table([dg.TableRecord(r) for r in runs.finished])})
-        if problems := [*dict.fromkeys([*outcome.problems, *failed_checks(study_workspace, None)])]:
-            raise TrapsError("\n".join(problems))
+        if outcome.problems:
+            raise TrapsError("\n".join(outcome.problems))
 
     @dg.job(name=name, description=doc)
     def job() -> None:
@@ -106,29 +110,28 @@ def _stages(costs: bool) -> list[Stage]:
 _GONE = "its file is gone; materialize it again: nothing that the ledger holds is asked"
 
 
-def report_unseen(
-    instance: dg.DagsterInstance, workspace: Workspace, lineage: Lineage, reported: dict[str, str]
-) -> None:
-    """Fail the check `current` for altered, lost or (unpartitioned) stale assets, and pass it once they are well.
+def report_unseen(instance: dg.DagsterInstance, plan: RunPlan, reported: dict[str, str]) -> None:
+    """Fail the check `current` for altered, lost or stale partitions, and pass it once they are well.
 
-    reported: the failures that were reported and last, by partition.
+    reported: the failures that were reported and last, by partition; at most MAX_REPORTS change at once.
     """
-    partitions, history = StudyPartitions(workspace), History(instance, the_graph())
-    for stage in the_graph().stages:
-        recorded_versions = history.recorded(stage.name)
-        for key in stage.wanted(partitions):
-            status = lineage.status(stage.name, key)
-            problems = (
-                [*status.outdated] if stage.scheme is None else [*filter(None, [lineage.damage(stage.name, key)])]
-            )
-            if status.kind == "missing" and key in recorded_versions:
-                problems = [*status.outdated] or [_GONE]
-            name, wrong = name_of((stage.name, key)), "; ".join(problems)
-            if wrong != reported.get(name, ""):
-                reported[name] = wrong
-                _report(instance, stage.name, key, wrong)
-            if not wrong:
-                reported.pop(name, None)
+    history, changes = History(instance, plan.graph), list[tuple[str, str | None, str]]()
+    for stage, keys in plan.parts.items():
+        recorded_versions = history.recorded(stage)
+        for key in keys:
+            status = plan.lineage.status(stage, key)
+            reasons = [*status.outdated]
+            if status.kind == "missing":
+                reasons = (reasons or [_GONE]) if key in recorded_versions else []
+            wrong = reasons[0] + (f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else "") if reasons else ""
+            if wrong != reported.get(name_of((stage, key)), ""):
+                changes.append((stage, key, wrong))
+    for stage, key, wrong in changes[:MAX_REPORTS]:  # a tick has a minute, and the next one goes on
+        name = name_of((stage, key))
+        reported[name] = wrong
+        _report(instance, stage, key, wrong)
+        if not wrong:
+            reported.pop(name)
 
 
 def _report(instance: dg.DagsterInstance, stage: str, key: str | None, wrong: str) -> None:
@@ -138,7 +141,7 @@ def _report(instance: dg.DagsterInstance, stage: str, key: str | None, wrong: st
         asset_key=asset_key(stage),
         check_name=CURRENT,
         passed=not wrong,
-        metadata={**({"not current": wrong} if wrong else {}), "partition": key or "all"},
+        metadata=visible_metadata({**({"not current": wrong} if wrong else {}), "partition": key or "all"}),
         target_materialization_data=History(instance, the_graph()).check_target(stage, key),
     )
     try:
@@ -147,19 +150,17 @@ def _report(instance: dg.DagsterInstance, stage: str, key: str | None, wrong: st
         instance.report_runless_asset_event(evaluation(partition=None))
 
 
-def _requests(
-    instance: dg.DagsterInstance, workspace: Workspace, lineage: Lineage, *, costs: bool
-) -> list[dg.RunRequest]:
+def _requests(instance: dg.DagsterInstance, plan: RunPlan) -> list[dg.RunRequest]:
     """Return runs that rebuild outdated partitions, as far as possible now.
 
     Dependents are requested at a later tick.
     """
-    graph, requests = the_graph(), list[dg.RunRequest]()
-    for block in graph.blocks([stage.name for stage in _stages(costs)]):
-        stages, keys = pending_in(block, lineage, History(instance, graph), StudyPartitions(workspace), existing=True)
+    requests, recorded = list[dg.RunRequest](), cache(History(instance, plan.graph).recorded)
+    for block in plan.blocks():
+        stages, keys = plan.pending(block, recorded, existing=True)
         nodes = [(stage.name, key) for stage in stages for key in keys]
         # Try each outdated partition once per set of inputs: if it stays outdated, it fails for its own reasons.
-        states = [[name_of(node), lineage.made_at(*node), lineage.inputs(*node)] for node in nodes]
+        states = [[name_of(node), plan.lineage.made_at(*node), plan.lineage.inputs(*node)] for node in nodes]
         for batch in batches(block[0].scheme, keys):
             requests.append(
                 dg.RunRequest(
@@ -180,23 +181,32 @@ def _sensor(name: str, doc: str, *, costs: bool) -> dg.SensorDefinition:
         default_status=dg.DefaultSensorStatus.STOPPED if costs else dg.DefaultSensorStatus.RUNNING,
         description=doc,
     )
+    @errors_for_pages()
     def follow(context: dg.SensorEvaluationContext) -> dg.SkipReason | list[dg.RunRequest]:
         reread_sources()
         study_workspace = study_here()
         if study_workspace is None:
             return dg.SkipReason("there is no study; make one with `traps init`, then press Reload definitions")
-        lineage = Lineage(study_workspace)
-        History(context.instance, the_graph()).observe(lineage)
+        plan = RunPlan(study_workspace)
+        History(context.instance, plan.graph).observe(plan.lineage)
         if context.instance.get_runs_count(dg.RunsFilter(statuses=UNFINISHED)):
             return dg.SkipReason("runs are under way")  # they may be mending what would be reported
         reported: dict[str, str] = json.loads(context.cursor or "{}")
-        report_unseen(context.instance, study_workspace, lineage, reported)
+        report_unseen(context.instance, plan, reported)
         context.update_cursor(json.dumps(reported))
-        told = f"; the check `{CURRENT}` fails for {', '.join([*reported][:3])}" if reported else ""
-        requests = _requests(context.instance, study_workspace, lineage, costs=costs)
-        return requests or dg.SkipReason(f"nothing that is there is outdated{told}")
+        plan = plan.part(stage.name for stage in _stages(costs))
+        return _requests(context.instance, plan) or dg.SkipReason(_nothing_to_request(reported))
 
     return follow
+
+
+def _nothing_to_request(reported: Collection[str]) -> str:
+    """Say why no run is requested, as `traps status` would."""
+    if not reported:
+        return "no partition that was made is outdated"
+    rest = f" and {len(reported) - MAX_NAMED} more" if len(reported) > MAX_NAMED else ""
+    names = ", ".join([*reported][:MAX_NAMED]) + rest
+    return f"outdated, but not made without you: {names}; the check `{CURRENT}` fails for each, a job makes it again"
 
 
 def sensors() -> list[dg.SensorDefinition]:

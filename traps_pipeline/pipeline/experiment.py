@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.names import Name
@@ -15,23 +15,23 @@ from traps_pipeline.base.yamlfile import name_file_in_errors, parse_yaml_model, 
 from traps_pipeline.models.registry.entries import LOCAL, get_model, local_models
 from traps_pipeline.models.registry.judges import require_panel
 from traps_pipeline.models.registry.user_registry import UserRegistry, add_entries
-from traps_pipeline.protocol.cells import Cell, Evaluation
+from traps_pipeline.pipeline.wanted import evaluations_of
+from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.protocol.datasets import DATASETS, SCHEMAS, UNPAIRED
 from traps_pipeline.protocol.regimes import BY_NAME, PAPER_REGIMES, REGIMES
-from traps_pipeline.storage.study import Asked, MechanismSettings, Study
+from traps_pipeline.storage.study import Asked, MechanismSettings, Settings, Study
 
 EXPERIMENTS = ASSETS / "experiments"
 LITE = "lite"  # the name of the set of 200 scenarios in LITE_FILE
 LITE_FILE = ASSETS / "lite.yaml"
 
 
-class Experiment(BaseModel):
+class Experiment(Settings):
     """The fields of an experiment's file.
 
     benchmark, scenarios, per_family and panel are copied to the study.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
     name: Name = Field(pattern=r"^[a-z0-9-]+$", description="of the experiment in `study.yaml`")
     description: str = Field(default="", description="one line, printed when it runs")
     benchmark: str = Field(default="released", description="name of the benchmark: released, or a private one")
@@ -74,21 +74,14 @@ class Experiment(BaseModel):
     def _lite(cls, value: Any) -> Any:
         return read_yaml(LITE_FILE)["scenarios"] if value == LITE else value
 
-    @field_validator("datasets")
+    @field_validator("datasets", "regimes")
     @classmethod
-    def _datasets(cls, values: list[str]) -> list[str]:
-        return _known_names(values, (*DATASETS, *UNPAIRED))
-
-    @field_validator("regimes")
-    @classmethod
-    def _regimes(cls, values: list[str]) -> list[str]:
-        return _known_names(values, REGIMES)
-
-    @field_validator("models", "datasets", "regimes", "runs")
-    @classmethod
-    def _require_unique(cls, values: list[Any]) -> list[Any]:
-        if len(set(values)) != len(values):
-            raise ValueError(f"{values} names something twice")
+    def _require_known(cls, values: list[str], info: ValidationInfo) -> list[str]:
+        names = (*DATASETS, *UNPAIRED) if info.field_name == "datasets" else REGIMES
+        unknown = [value for value in values if value not in names]
+        if unknown or not values:
+            suggestion = did_you_mean(unknown[0], names) if unknown else ""
+            raise ValueError(f"{unknown or 'nothing'} given; choose from {', '.join(names)}{suggestion}")
         return values
 
     @model_validator(mode="after")
@@ -100,10 +93,6 @@ class Experiment(BaseModel):
                 f"datasets {', '.join(schemas)} ask for an object of their own, and so does the regime {objects[0]}: "
                 "leave one of them out"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _study_holds_together(self) -> Experiment:
         _ = self.study  # report an invalid study (two subsets, a wrong epoch) as an error of this file
         return self
 
@@ -159,22 +148,7 @@ class Experiment(BaseModel):
 
     def cells(self) -> list[Cell]:
         """Return cells by model, up to its runs. Raises TrapsError for an unknown model."""
-        cells = []
-        for model in self.models:
-            available = get_model(model).runs
-            for regime in self.regimes:
-                for run in self.runs:
-                    if run <= available:
-                        cells += [Cell(dataset, Evaluation(model, regime, run)) for dataset in self.datasets]
-        return cells
-
-
-def _known_names(values: list[str], names: tuple[str, ...]) -> list[str]:
-    unknown = [value for value in values if value not in names]
-    if unknown or not values:
-        suggestion = did_you_mean(unknown[0], names) if unknown else ""
-        raise ValueError(f"{unknown or 'nothing'} given; choose from {', '.join(names)}{suggestion}")
-    return values
+        return [Cell(dataset, evaluation) for evaluation in evaluations_of(self.asked) for dataset in self.datasets]
 
 
 def load_experiment(name: str) -> Experiment:

@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from traps_pipeline.base import progress
 from traps_pipeline.base.extras import require
-from traps_pipeline.base.progress import Tally
 from traps_pipeline.models.asking.backends import require_libraries
-from traps_pipeline.models.registry.entries import LOCAL, NETWORK, Entry, get_model
-from traps_pipeline.models.registry.judges import load_panel
+from traps_pipeline.models.registry.entries import NETWORK, Entry
+from traps_pipeline.models.registry.judges import JudgeEntry
 from traps_pipeline.pipeline.experiment import Experiment
-from traps_pipeline.pipeline.lineage import Lineage
-from traps_pipeline.pipeline.selection import failed_checks, is_nothing_to_do, note_versions, require_work, stages_until
-from traps_pipeline.pipeline.wanted import StudyPartitions
-from traps_pipeline.protocol.cells import Cell
+from traps_pipeline.pipeline.run_plan import RunPlan, RunReport, stages_until
 from traps_pipeline.storage.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -26,25 +20,6 @@ if TYPE_CHECKING:
     from traps_pipeline.pipeline.runs import Runs
 
 OpenRuns = Callable[["DagsterInstance", Workspace], AbstractContextManager["Runs"]]
-
-
-@dataclass
-class RunReport:
-    """A run's problems in sentences, whether a budget ended it, and its tallies."""
-
-    problems: list[str] = field(default_factory=list)
-    over_budget: bool = False
-    seconds: float = 0.0
-    tallies: Mapping[str, Tally] = field(default_factory=dict)
-
-    def tally(self, stage: str) -> Tally:
-        """Return the work of one stage."""
-        return self.tallies.get(stage, Tally())
-
-    @property
-    def frames(self) -> int:
-        """Number of rendered frames."""
-        return sum(tally.frames for tally in self.tallies.values())
 
 
 def run_experiment(
@@ -62,64 +37,40 @@ def run_experiment(
     model and judge, which are tried first unless it is None. open_runs: opens the executor of runs; called, like
     Dagster's history, only if there is something to materialize. Raises TrapsError if a run cannot begin.
     """
-    stages = stages_until(until)
-    require_work(workspace, experiment.name, until)
-    if is_nothing_to_do(workspace, stages, experiment.name):
-        return RunReport(failed_checks(workspace, experiment.name))
-    from traps_pipeline.pipeline.machine import require_machine, wanted_parts
+    plan = RunPlan(workspace, experiment.name, stages_until(until))
+    plan.require_work(until)
+    if plan.is_nothing_to_do():
+        return RunReport(plan.failed_checks())
+    from traps_pipeline.pipeline.machine import pending_entries, require_machine
     from traps_pipeline.pipeline.run import dagster_history, materialize_stale
 
     with dagster_history(workspace) as instance:
-        participants = _pending_participants(workspace, experiment, stages)
-        for entry in (*participants.models, *participants.judges):
+        entries = pending_entries(plan, plan.parts)
+        for entry in entries:
             require_libraries(entry)
-        if experiment.mechanism is not None and "hidden_states" in stages:
+        if experiment.mechanism is not None and "hidden_states" in plan.parts:
             require("local")
         if look_at_machine:
-            require_machine(workspace, wanted_parts(workspace, stages, experiment.name))
+            require_machine(plan)
         if preflight is not None:
-            _preflight(workspace, participants, preflight)
+            _preflight(workspace, entries, preflight)
         with open_runs(instance, workspace) as runs:
-            result = materialize_stale(instance, runs, workspace, stages, experiment=experiment.name)
-    problems = [*dict.fromkeys([*result.problems, *failed_checks(workspace, experiment.name)])]
-    if not problems:
-        note_versions(workspace, stages, experiment.name)
-    return RunReport(problems, result.over_budget, result.seconds, progress.current().totals)
+            report = materialize_stale(instance, runs, plan)
+    if not report.problems:
+        plan.note_made()
+    return report
 
 
-@dataclass(frozen=True)
-class _Participants:
-    """Models and judges with answers missing, whose libraries or keys may be missing."""
-
-    models: list[Entry]
-    judges: list[Entry]
-
-
-def _pending_participants(workspace: Workspace, experiment: Experiment, stages: Collection[str]) -> _Participants:
-    """Return the models and judges whose answers are not all in the ledger."""
-    lineage, cells = Lineage(workspace), StudyPartitions(workspace, experiment.name).cells
-
-    def behind(stage: str) -> Iterator[str]:
-        keys = cells if stage in stages else ()
-        return (key for key in keys if lineage.status(stage, key).kind != "fresh")
-
-    entries = {name: entry for name in experiment.models if (entry := get_model(name)).backend in (LOCAL, NETWORK)}
-    panel = load_panel(workspace.study.panel) if "votes" in stages else ()
-    judges: list[Entry] = [judge for judge in panel if judge.backend == NETWORK]
-    # Whether a cell is behind is looked up for the sake of these alone.
-    names = {Cell.parse(key).evaluation.model for key in behind("responses")} if entries else set[str]()
-    models: list[Entry] = [entry for name, entry in entries.items() if name in names]
-    return _Participants(models, judges if judges and any(behind("votes")) else [])
-
-
-def _preflight(workspace: Workspace, participants: _Participants, say: Callable[[str], None]) -> None:
+def _preflight(workspace: Workspace, entries: Sequence[Entry], say: Callable[[str], None]) -> None:
     """Try networked models and judges first. Raises TrapsError with all problems."""
-    models = [entry for entry in participants.models if entry.backend == NETWORK]
-    if not models and not participants.judges:
+    network = [entry for entry in entries if entry.backend == NETWORK]
+    if not network:
         return
+    judges = [entry for entry in network if isinstance(entry, JudgeEntry)]
+    models = [entry for entry in network if entry not in judges]
     from traps_pipeline.checks.live_check import preflight, require_sound
 
-    checks = preflight(workspace, models, participants.judges)
+    checks = preflight(workspace, models, judges)
     for check in checks:
         if not check.problems:  # they are raised instead
             say(check.line)

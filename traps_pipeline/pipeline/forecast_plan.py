@@ -24,7 +24,9 @@ from traps_pipeline.models.registry.entries import LOCAL, NETWORK, Entry, get_mo
 from traps_pipeline.models.registry.judges import JudgeEntry, load_panel
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.pipeline.experiment import Experiment
+from traps_pipeline.pipeline.graph import Node
 from traps_pipeline.pipeline.lineage import Lineage
+from traps_pipeline.pipeline.run_plan import RunPlan
 from traps_pipeline.protocol.cells import Cell, SteeredEvaluation
 from traps_pipeline.protocol.datasets import DATASETS, UNPAIRED, all_datasets_of, datasets_of_category, sides_of
 from traps_pipeline.storage.benchmark_tables import ITEMS
@@ -53,8 +55,8 @@ class Count:
 
 
 @dataclass(frozen=True)
-class Plan:
-    """The calls of an experiment.
+class CallPlan:
+    """The calls of an experiment, which cost money or time.
 
     calls: answers and votes by model. uncertain: datasets with items that are unknown before a run has made them; their
     calls are counted as new, which is an upper bound. forecasts: tokens, dollars and minutes of the new calls over the
@@ -79,15 +81,15 @@ class Plan:
         return minutes_of(models) + minutes_of(judges)
 
 
-def make_plan(workspace: Workspace | None, experiment: Experiment, study: Study, card: str = "H100") -> Plan:
+def plan_calls(plan: RunPlan | None, experiment: Experiment, study: Study, card: str = "H100") -> CallPlan:
     """Count an experiment's calls and forecast their cost; nothing is sent or written.
 
-    study: the workspace's, or that of a new one, with the panel that judges. card: one of CARDS.
+    plan: of its workspace, None for a new one. study: with the panel that judges. card: one of CARDS.
     """
     panel = load_panel(study.panel)
-    calls, uncertain_datasets = _count_calls(workspace, experiment, study)
-    steered_counts = _count_steered(workspace, experiment, study)
-    local = [*_local_costs(workspace, experiment, study, card, calls, steered_counts)]
+    calls, uncertain_datasets = _count_calls(plan, experiment, study)
+    steered_counts = _count_steered(plan, experiment, study)
+    local = [*_local_costs(plan, experiment, study, card, calls, steered_counts)]
     votes = sum(count.new for _, count in [*calls.values(), *steered_counts.values()])
     new: list[tuple[Entry, int]] = [(get_model(model), answers.new) for model, (answers, _) in calls.items()]
     new += [(judge, votes // len(panel)) for judge in panel]
@@ -98,22 +100,20 @@ def make_plan(workspace: Workspace | None, experiment: Experiment, study: Study,
         for dataset in DATASETS
         if dataset in experiment.datasets
     }
-    ledgers = [ledger.totals() for ledger in (workspace.answers, workspace.votes)] if workspace else []
+    ledgers = [ledger.totals() for ledger in (plan.workspace.answers, plan.workspace.votes)] if plan else []
     forecasts = [
         forecast(entry, count, experience(totals[entry.id] for totals in ledgers if entry.id in totals))
         for entry, count in new
     ]
     judge = load_protocol().judge(study.panel)
-    if judge is None:
-        return Plan(calls, uncertain_datasets, forecasts, None, steered_counts, pairs, local)
-    labels = _count_labels(workspace, experiment, judge)
-    if labels.new:
+    labels = _count_labels(plan, experiment, judge) if judge else None
+    if judge and labels and labels.new:
         cost = forecast(judge, labels.new, Experience(prompt_tokens=LABEL_TOKENS))
         forecasts.append(replace(cost, participant="confabulation labels"))
-    return Plan(calls, uncertain_datasets, forecasts, labels, steered_counts, pairs, local)
+    return CallPlan(calls, uncertain_datasets, forecasts, labels, steered_counts, pairs, local)
 
 
-def _count_steered(workspace: Workspace | None, experiment: Experiment, study: Study) -> dict[str, tuple[Count, Count]]:
+def _count_steered(plan: RunPlan | None, experiment: Experiment, study: Study) -> dict[str, tuple[Count, Count]]:
     """Count the calls for steered models' answers and the panel's votes, by model."""
     settings, counts = experiment.mechanism, dict[str, tuple[Count, Count]]()
     if settings is None or settings.steering is None:
@@ -125,16 +125,18 @@ def _count_steered(workspace: Workspace | None, experiment: Experiment, study: S
         datasets = [name for name in experiment.datasets if name in DATASETS]
         for regime, side_counts in count_answers(settings, model, datasets, Counter(taxonomies)).items():
             n_answers, ballots = side_counts.total(), seats * sum(len(tasks_for(s)) * n for s, n in side_counts.items())
-            folder, settled_counts = SteeredEvaluation(model, regime, 1).key, [0, 0]
-            if workspace is not None:
-                settled_counts = [len(ledger.read(folder).settled) for ledger in (workspace.answers, workspace.votes)]
-            answers.add(n_answers, min(settled_counts[0], n_answers))
-            votes.add(ballots, min(settled_counts[1], ballots))
+            folder, ledgers = (
+                SteeredEvaluation(model, regime, 1).key,
+                (plan.workspace.answers, plan.workspace.votes) if plan else (),
+            )
+            settled = [len(ledger.read(folder).settled) for ledger in ledgers] or [0, 0]
+            answers.add(n_answers, min(settled[0], n_answers))
+            votes.add(ballots, min(settled[1], ballots))
     return counts
 
 
 def _local_costs(
-    workspace: Workspace | None,
+    plan: RunPlan | None,
     experiment: Experiment,
     study: Study,
     card: str,
@@ -152,11 +154,10 @@ def _local_costs(
         work = [(entry, Work("answers", calls[model][0].new, tokens), entry.local_params())] if model in calls else []
         if settings and model in settings.models:
             inside_entry, params = mechanism_entry(entry, settings), entry.inside_params()
-            if workspace is None or not any(s["model"] == model for s in workspace.tables.partitions(HIDDEN_STATES)):
-                work += [
-                    (inside_entry, passes, params)
-                    for passes in mechanism_passes(settings, experiment.datasets, taxonomies)
-                ]
+            parts = plan.workspace.tables.partitions(HIDDEN_STATES) if plan else []
+            if not any(part["model"] == model for part in parts):
+                passes_of_all = mechanism_passes(settings, experiment.datasets, taxonomies)
+                work += [(inside_entry, passes, params) for passes in passes_of_all]
             if settings.steering and model in steered:
                 max_tokens = min(entry.expected_completion_tokens, settings.steering.max_new_tokens)
                 work.append((inside_entry, Work("steered answers", steered[model][0].new, max_tokens), params))
@@ -166,20 +167,20 @@ def _local_costs(
                 yield cost_of(media, media.media, passes, CARDS[card], quantised=params.quantisation == "nf4")
 
 
-def _count_labels(workspace: Workspace | None, experiment: Experiment, judge: JudgeEntry) -> Count:
+def _count_labels(plan: RunPlan | None, experiment: Experiment, judge: JudgeEntry) -> Count:
     """Count confabulation labels, a full sample for models without verdicts."""
     protocol, cell_keys = load_protocol(), {cell.key for cell in experiment.cells()}
-    labels, lineage = Count(), Lineage(workspace) if workspace else None
+    labels = Count()
     for model in protocol.models:
         cells = [cell for cell in protocol.cells(model) if cell.key in cell_keys]
         if not cells:
             continue
-        if workspace is None or lineage is None or not _is_judged(lineage, cells):
+        if plan is None or not _is_judged(plan.lineage, cells):
             labels.add(protocol.n, 0)
             continue
-        samples = sample_failures(workspace, judge, model).values()
+        samples = sample_failures(plan.workspace, judge, model).values()
         keys = {failure.request.key for failures in samples for failure in failures}
-        labels.add(len(keys), len(workspace.votes.read(cells[0].evaluation.key, keys).settled))
+        labels.add(len(keys), len(plan.workspace.votes.read(cells[0].evaluation.key, keys).settled))
     return labels
 
 
@@ -190,47 +191,45 @@ def _is_judged(lineage: Lineage, cells: Sequence[Cell]) -> bool:
 
 
 def _count_calls(
-    workspace: Workspace | None, experiment: Experiment, study: Study
+    plan: RunPlan | None, experiment: Experiment, study: Study
 ) -> tuple[dict[str, tuple[Count, Count]], list[str]]:
-    plan = {model: (Count(), Count()) for model in experiment.models}
-    panel, lineage = load_panel(study.panel), Lineage(workspace) if workspace else None
+    counts = {model: (Count(), Count()) for model in experiment.models}
+    panel = load_panel(study.panel)
     scenes = Counter(name for scenario in load_scenarios(study).values() for name in all_datasets_of(scenario.category))
-    current = {dataset for dataset in experiment.datasets if lineage and _has_current_items(lineage, dataset)}
-    items = {
-        dataset: _items(workspace, lineage, dataset, scenes[dataset], is_current=dataset in current)
-        for dataset in experiment.datasets
-    }
+    current = {dataset for dataset in experiment.datasets if plan and _has_current_items(plan.lineage, dataset)}
+    items = {d: _items(plan, d, scenes[d], is_current=d in current) for d in experiment.datasets}
     for cell in experiment.cells():
-        answers, votes = plan[cell.evaluation.model]
+        answers, votes = counts[cell.evaluation.model]
         cell_items, unknown_items = items[cell.dataset]
         answers.add(unknown_items.total(), 0)
         votes.add(len(panel) * sum(len(tasks_for(side)) * n for side, n in unknown_items.items()), 0)
-        if workspace is None or lineage is None:
+        if plan is None:
             continue
         # A fresh cell of current items is complete: skip building its keys and reading its ledger.
-        fresh_answers, cast = (_count_fresh_rows(workspace, lineage, table, cell) for table in (RESPONSES, VOTES))
+        fresh_answers, cast = (_count_fresh_rows(plan.lineage, table, cell) for table in (RESPONSES, VOTES))
         if fresh_answers is not None and cast is not None and cell.dataset in current:
             answers.add(fresh_answers, fresh_answers)
             votes.add(cast, cast)
         else:
-            _count_cell(workspace, panel, cell, cell_items, answers, votes)
-    return plan, sorted(dataset for dataset, (_, unknown_items) in items.items() if unknown_items)
+            _count_cell(plan.workspace, panel, cell, cell_items, answers, votes)
+    return counts, sorted(dataset for dataset, (_, unknown_items) in items.items() if unknown_items)
 
 
 def _items(
-    workspace: Workspace | None, lineage: Lineage | None, dataset: str, scenes: int, *, is_current: bool
+    plan: RunPlan | None, dataset: str, scenes: int, *, is_current: bool
 ) -> tuple[list[dict[str, Any]], Counter[str]]:
     """Return a dataset's items in the next run, and counts by side of unknown ones."""
     unknown_items = Counter(dict.fromkeys(sides_of(dataset), scenes))
-    if workspace is None or lineage is None or lineage.state("items", dataset) is None:
+    if plan is None or not _is_there(plan.lineage, ("items", dataset)):
         return [], unknown_items
+    workspace, lineage = plan.workspace, plan.lineage
     if is_current:
         return asked_items(workspace, dataset), Counter()
     for stage, key in _input_versions(lineage, dataset):
-        state = lineage.state(stage, key)
-        if lineage.damage(stage, key) or (state and state.code != lineage.graph[stage].code):
+        state, is_lost = lineage.state(stage, key), stage != "items" and lineage.damage(stage, key)
+        if is_lost or (state and state.code != lineage.graph[stage].code):
             return [], unknown_items
-    if dataset in UNPAIRED:  # not every scenario admits all
+    if dataset in UNPAIRED and lineage.state("items", dataset):  # not every scenario admits all
         unknown_items = Counter(workspace.tables.read_all(ITEMS, ["side"], dataset=dataset)["side"])
     items = expected_items(workspace, dataset)
     return items, unknown_items - Counter(item["side"] for item in items)
@@ -267,9 +266,9 @@ def _count_cell(
     votes.add(len(ballots) + n_new, len(workspace.votes.read(folder, ballots).settled))
 
 
-def _count_fresh_rows(workspace: Workspace, lineage: Lineage, table: Table[Any], cell: Cell) -> int | None:
+def _count_fresh_rows(lineage: Lineage, table: Table[Any], cell: Cell) -> int | None:
     """Return the number of rows of a cell's table; None unless it is fresh."""
-    state = workspace.tables.state(table, cell.partition)
+    state = lineage.state(table.name, cell.key)
     return state.rows if state and lineage.status(table.name, cell.key).kind == "fresh" else None
 
 
@@ -278,8 +277,13 @@ def _has_current_items(lineage: Lineage, dataset: str) -> bool:
     return all(lineage.status(*node).kind == "fresh" for node in _input_versions(lineage, dataset))
 
 
-def _input_versions(lineage: Lineage, dataset: str) -> list[tuple[str, str | None]]:
+def _input_versions(lineage: Lineage, dataset: str) -> list[Node]:
     """Return the existing partitions of a dataset's items and of all upstream."""
     parents = lineage.graph.parents("items", dataset).items()
     inputs = [("items", dataset), *((stage, key) for stage, keys in parents for key in keys)]
-    return [node for node in inputs if lineage.state(*node)]
+    return [node for node in inputs if _is_there(lineage, node)]
+
+
+def _is_there(lineage: Lineage, node: Node) -> bool:
+    """Return whether a partition was made, be it damaged since."""
+    return lineage.state(*node) is not None or bool(lineage.damage(*node))

@@ -209,13 +209,7 @@ class Graph:
 
     def above(self, names: Iterable[str]) -> set[str]:
         """Return the stages of these names, and all stages upstream of them."""
-        ancestors, remaining = set[str](), [*names]
-        while remaining:
-            name = remaining.pop()
-            if name not in ancestors and isinstance(self.declared[name], Stage):
-                ancestors.add(name)
-                remaining += self.parents_of[name]
-        return ancestors
+        return {name for name in _reached(names, self.parents_of.__getitem__) if isinstance(self.declared[name], Stage)}
 
     def below(self, name: str) -> set[str]:
         """Return the stages directly downstream of a stage."""
@@ -223,12 +217,7 @@ class Graph:
 
     def all_below(self, name: str) -> set[str]:
         """Return a stage and all stages downstream of it."""
-        found, remaining = set[str](), [name]
-        while remaining:
-            if (name := remaining.pop()) not in found:
-                found.add(name)
-                remaining += self.below(name)
-        return found
+        return _reached([name], self.below)
 
     @cache  # noqa: B019 - a graph lives as long as its process
     def keys(self, name: str) -> list[str | None]:
@@ -252,6 +241,15 @@ class Graph:
         """Return the mapping that selects a partitioned parent's partitions for a stage."""
         scheme, stated_mapping = self.declared[name].scheme, self.parents_of[name][parent].mapping
         return stated_mapping or (SAME if scheme is self.declared[parent].scheme else EVERY)
+
+
+def _reached(names: Iterable[str], neighbours: Callable[[str], Iterable[str]]) -> set[str]:
+    reached, remaining = set[str](), [*names]
+    while remaining:
+        if (name := remaining.pop()) not in reached:
+            reached.add(name)
+            remaining += neighbours(name)
+    return reached
 
 
 def name_of(node: Node) -> str:

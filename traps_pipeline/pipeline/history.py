@@ -11,7 +11,7 @@ from dagster._core.definitions.asset_checks.asset_check_evaluation import (
     AssetCheckEvaluationTargetMaterializationData as CheckTarget,
 )
 
-from traps_pipeline.pipeline.graph import Graph, Node, Stage
+from traps_pipeline.pipeline.graph import Graph, Stage
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.pipeline.metadata import visible_metadata
 from traps_pipeline.pipeline.translation import asset_key
@@ -74,9 +74,8 @@ class History:
             (CheckTarget(storage_id=r.storage_id, run_id=r.run_id, timestamp=r.timestamp) for r in records), None
         )
 
-    def observe(self, lineage: Lineage, sources: Iterable[str] | None = None) -> list[Node]:
-        """Report versions of sources (default: all) that Dagster lacks; return these."""
-        changed_sources = list[Node]()
+    def observe(self, lineage: Lineage, sources: Iterable[str] | None = None) -> None:
+        """Report versions of sources (default: all) that Dagster lacks."""
         for name in self._graph.sources if sources is None else sources:
             now = {key: str(lineage.version(name, key)) for key in self._graph.keys(name)}
             slot = (Path(self._instance.root_directory), name)
@@ -88,9 +87,7 @@ class History:
                     tags = {_VERSION: version, _USER: "true"}
                     event = dg.AssetObservation(asset_key(name), partition=key, tags=tags)
                     self._instance.report_runless_asset_event(event)
-                    changed_sources.append((name, key))
             _OBSERVED[slot] = now
-        return changed_sources
 
     def _fetch(self, name: str) -> Callable[..., dg.EventRecordsResult]:
         source = self._graph.source(name) is not None

@@ -80,7 +80,8 @@ class Lineage:
         self.version, self.state, self.damage = _Once(self._version), _Once(self._state), _Once(self._damage)
         self.status, self._there = _Once(self._status), _Once(lambda name, _: self._keys_there(name))
         self._failed_checks = _Once(lambda name, _: workspace.failed_checks(name))
-        self._wanted = cache(lambda name: {*self.graph[name].wanted(StudyPartitions(workspace))})
+        self.partitions = StudyPartitions(workspace)
+        self._wanted = cache(lambda name: {*self.graph[name].wanted(self.partitions)})
 
     def renew(self, stage: str) -> None:
         """Forget a stage that has been built since, and all stages downstream of it."""

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.files import check_disk
 from traps_pipeline.base.network import check_network
 from traps_pipeline.models.asking.answer_rows import RESPONSES
-from traps_pipeline.models.registry.entries import NETWORK, Entry, get_model
+from traps_pipeline.models.registry.entries import LOCAL, NETWORK, Entry, get_model
 from traps_pipeline.models.registry.judges import load_panel
-from traps_pipeline.pipeline.graph import Stage, the_graph
-from traps_pipeline.pipeline.lineage import Lineage
-from traps_pipeline.pipeline.wanted import StudyPartitions
+from traps_pipeline.pipeline.graph import Stage
+from traps_pipeline.pipeline.run_plan import Parts, RunPlan
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.scenes.picture.trial import check_rendering, opengl_variables
 from traps_pipeline.scenes.worlds.clip_cache import ClipCache
@@ -26,25 +25,16 @@ MIN_GB = 0.1  # less would run out before the first tables are written
 MAX_PARTITIONS = 5  # partitions in a sentence
 CLIPS = "mp4"  # the kind of a stage that renders
 
-Parts = Mapping[str, Sequence[str | None]]  # by stage: the partitions that a run is to make
 
-
-def wanted_parts(workspace: Workspace, stages: Collection[str], experiment: str | None = None) -> Parts:
-    """Return the partitions of these stages that a study, or its experiment, wants."""
-    partitions = StudyPartitions(workspace, experiment)
-    return {stage.name: stage.wanted(partitions) for stage in the_graph().stages if stage.name in stages}
-
-
-def parts_of_run(context: dg.AssetExecutionContext, stage: Stage, partitions: StudyPartitions) -> Parts:
+def parts_of_run(context: dg.AssetExecutionContext, stage: Stage, plan: RunPlan) -> Parts:
     """Return stages of a Dagster run that share a step's partitions, with wanted keys."""
     keys = {str(key) for key in context.partition_keys} if stage.scheme else {None}
     asset_keys = context.run.asset_selection or context.job_def.asset_layer.executable_asset_keys
     names = {key.path[-1] for key in asset_keys}
-    same_partitions = [
-        candidate for candidate in the_graph().stages if candidate.name in names and candidate.scheme is stage.scheme
-    ]
     return {
-        candidate.name: [key for key in candidate.wanted(partitions) if key in keys] for candidate in same_partitions
+        name: [key for key in wanted_keys if key in keys]
+        for name, wanted_keys in plan.parts.items()
+        if name in names and plan.graph[name].scheme is stage.scheme
     }
 
 
@@ -56,38 +46,39 @@ def nothing_to_do_reason(keys: Sequence[str | None], tags: Mapping[str, str], wo
     return f"no partition lies between {first} and {last}; exchange the two"
 
 
-def require_machine(workspace: Workspace, parts: Parts) -> None:
-    """Raise TrapsError unless the machine can build what is still missing.
+def require_machine(plan: RunPlan, parts: Parts | None = None) -> None:
+    """Raise TrapsError unless the machine can build what is still missing of a plan, or of a part of it.
 
     Disk, OpenGL, codecs, proxies and certificates are checked as far as these partitions need them; the error names the
     first that is missing or that a variable breaks. A study whose clips exist needs no OpenGL, and one whose answers
     and votes exist needs no network.
     """
+    workspace, graph, parts = plan.workspace, plan.graph, plan.parts if parts is None else parts
     check_disk(workspace.root, MIN_GB)
-    if any(entry.backend == NETWORK for entry in _asked_entries(workspace, parts)):
+    if any(entry.backend == NETWORK for entry in pending_entries(plan, parts)):
         check_network()
-    graph = the_graph()
     drawing = ((graph[name].shared, key) for name, keys in parts.items() for key in keys if CLIPS in graph[name].kinds)
     if any(build is not None and build.seconds(workspace, key) > 0 for build, key in drawing):
         ClipCache.of_user()
         _check_rendering(*opengl_variables().items())
 
 
-def _asked_entries(workspace: Workspace, parts: Parts) -> Iterator[Entry]:
-    """Yield the models and judges of cells whose answers or votes are missing."""
-    lineage = Lineage(workspace)
+def pending_entries(plan: RunPlan, parts: Parts) -> list[Entry]:
+    """Return the models and judges, but for reference models, of cells whose answers or votes are missing."""
+    pending, panel = dict[tuple[type[Entry], str], Entry](), plan.workspace.study.panel
     for name, keys in parts.items():
-        stage = the_graph()[name]
+        stage = plan.graph[name]
         if stage.cost != "money" or stage.scheme is None:
             continue
         for key in keys:
             if stage.table is RESPONSES:
                 entries: Iterable[Entry] = [get_model(Cell.parse(str(key)).evaluation.model)]
             else:
-                entries = load_panel(workspace.study.panel) if workspace.study.panel else ()
-            network = [entry for entry in entries if entry.backend == NETWORK]
-            if network and lineage.status(name, key).kind != "fresh":
-                yield from network
+                entries = load_panel(panel) if panel else ()
+            asked = {(type(entry), entry.id): entry for entry in entries if entry.backend in (LOCAL, NETWORK)}
+            if asked.keys() - pending.keys() and plan.lineage.status(name, key).kind != "fresh":
+                pending |= asked
+    return [*pending.values()]
 
 
 @cache

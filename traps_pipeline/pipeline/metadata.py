@@ -1,18 +1,22 @@
-"""Translate event metadata; make hidden characters of models' texts visible."""
+"""Translate what Dagster shows: hidden characters become visible, files are named from the study's folder on."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any, cast
 
 import dagster as dg
 
+from traps_pipeline.base.paths import ROOT
 from traps_pipeline.base.progress import Tally
 from traps_pipeline.base.terminal import visible
 from traps_pipeline.pipeline.graph import Stage
 from traps_pipeline.pipeline.previews import Markdown, Records, StudyFile
 from traps_pipeline.storage.parquet import StageOutput
+from traps_pipeline.storage.place import scratch_of
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
@@ -21,18 +25,41 @@ WORDS = {"asked": "asked", "cached": "known", "errors": "failed", "frames": "fra
 RANKED = ("pecs", "conjunction")  # columns by which the rows of a table are better or worse
 
 
+def page_text(text: str) -> str:
+    """Return a text for Dagster's pages: nothing hidden, and no folder of this host above study and checkout."""
+    place = Workspace.default_place()
+    root = scratch_of(place) if isinstance(place, str) else place
+    for folder, prefix in ((root, ""), (ROOT, ""), (Path.home(), "~/")):
+        if folder != folder.parent:  # the home of a container's user may be /
+            text = text.replace(f"{folder}/", prefix).replace(str(folder), folder.name)
+    return visible(text)
+
+
+@contextmanager
+def errors_for_pages() -> Iterator[None]:
+    """Let errors of the block, and what caused them, say what they say by `page_text`."""
+    try:
+        yield
+    except Exception as error:
+        link: BaseException | None = error
+        while link is not None:
+            link.args = tuple(page_text(arg) if isinstance(arg, str) else arg for arg in link.args)
+            if isinstance(link, OSError) and isinstance(link.filename, str):
+                link.filename = page_text(link.filename)
+            link = link.__cause__ or link.__context__
+        raise
+
+
 def visible_metadata(value: Any) -> Any:
-    """Return a metadata value, mapping or list with hidden characters visible."""
+    """Return a metadata value, mapping or list whose texts are for Dagster's pages."""
     if isinstance(value, str):
-        return visible(value)
-    if isinstance(value, Markdown):
-        return dg.MetadataValue.md(visible(value.text))
+        return page_text(value)
+    if isinstance(value, Markdown | dg.MarkdownMetadataValue):
+        return dg.MetadataValue.md(page_text((value.text if isinstance(value, Markdown) else value.md_str) or ""))
     if isinstance(value, Records):
         return dg.MetadataValue.table([dg.TableRecord(visible_metadata(row)) for row in value.rows])
     if isinstance(value, StudyFile):
         return dg.MetadataValue.url(value.url)
-    if isinstance(value, dg.MarkdownMetadataValue):
-        return dg.MetadataValue.md(visible(value.md_str or ""))
     if isinstance(value, dg.TableMetadataValue):
         records = [dg.TableRecord(visible_metadata(record.data)) for record in value.records]
         return dg.MetadataValue.table(records, value.schema)

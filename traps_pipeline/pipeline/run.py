@@ -5,9 +5,9 @@ from __future__ import annotations
 import fcntl
 import os
 import time
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 import dagster as dg
@@ -19,23 +19,12 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import remedy, write_text
 from traps_pipeline.base.paths import require_history_path
 from traps_pipeline.models.asking.traffic import remembering_stops
-from traps_pipeline.pipeline.graph import Stage, the_graph
 from traps_pipeline.pipeline.history import History
-from traps_pipeline.pipeline.lineage import Lineage
+from traps_pipeline.pipeline.run_plan import RunPlan, RunReport
 from traps_pipeline.pipeline.runs import HOST_TAG, PID_TAG, Runs, this_host
-from traps_pipeline.pipeline.step import EXPERIMENT_TAG, MAKE_TAG, STALE_OR_MISSING, to_make
-from traps_pipeline.pipeline.wanted import StudyPartitions
+from traps_pipeline.pipeline.step import EXPERIMENT_TAG, MAKE_TAG, STALE_OR_MISSING
 from traps_pipeline.storage.several_hosts import several_hosts
 from traps_pipeline.storage.workspace import Workspace
-
-
-@dataclass
-class MaterializationResult:
-    """The problems of `materialize_stale`, whether a budget ended it, and its seconds."""
-
-    problems: list[str] = field(default_factory=list)
-    over_budget: bool = False
-    seconds: float = 0.0
 
 
 @contextmanager
@@ -123,48 +112,20 @@ def _is_alive(pid: int) -> bool:
     return True
 
 
-def pending_in(
-    block: Sequence[Stage], lineage: Lineage, history: History, partitions: StudyPartitions, *, existing: bool = False
-) -> tuple[list[Stage], list[str | None]]:
-    """Return the block's pending stages, their dependents in it, and the pending keys.
-
-    existing: only partitions that exist, are stale, and wait for nothing upstream.
-    """
-    pending: dict[str, list[str | None]] = {}
-    for stage in block:
-        recorded_versions = history.recorded(stage.name)
-        wanted_keys = stage.wanted(partitions)
-        keys = [k for k in wanted_keys if to_make(lineage, recorded_versions, stage.name, k, existing=existing)]
-        keys = [k for k in keys if not (existing and lineage.waits(stage.name, k))]
-        if keys or lineage.graph.parents_of[stage.name].keys() & pending.keys():
-            pending[stage.name] = keys
-    wanted_keys = lineage.graph.keys(block[0].name)
-    return [lineage.graph[name] for name in pending], [
-        k for k in wanted_keys if any(k in keys for keys in pending.values())
-    ]
-
-
-def materialize_stale(
-    instance: dg.DagsterInstance,
-    runs: Runs,
-    workspace: Workspace,
-    stages: Collection[str],
-    *,
-    experiment: str | None = None,
-) -> MaterializationResult:
-    """Materialize missing or stale partitions of these stages, or of one experiment.
+def materialize_stale(instance: dg.DagsterInstance, runs: Runs, plan: RunPlan) -> RunReport:
+    """Materialize what a plan finds missing or stale; its problems include failed checks of earlier runs.
 
     KeyboardInterrupt propagates.
     """
-    outcome, started_at, graph = MaterializationResult(), time.monotonic(), the_graph()
-    history, partitions = History(instance, graph), StudyPartitions(workspace, experiment)
-    tags = {MAKE_TAG: STALE_OR_MISSING} | ({EXPERIMENT_TAG: experiment} if experiment else {})
+    report, started_at, history = RunReport(), time.monotonic(), History(instance, plan.graph)
+    tags = {MAKE_TAG: STALE_OR_MISSING} | ({EXPERIMENT_TAG: plan.experiment} if plan.experiment else {})
     with remembering_stops():
-        for block in graph.blocks([name for name in stages if graph[name].wanted(partitions)]):
-            pending, keys = pending_in(block, Lineage(workspace), history, partitions)
+        for block in plan.blocks():
+            pending, keys = plan.pending(block, cache(history.recorded))
             for range_outcome in runs.make(pending, runs.ranges(pending, keys), tags):
-                outcome.problems += range_outcome.problems
-                outcome.over_budget |= range_outcome.over_budget
-    outcome.problems = [*dict.fromkeys(outcome.problems)]
-    outcome.seconds = time.monotonic() - started_at
-    return outcome
+                report.problems += range_outcome.problems
+                report.over_budget |= range_outcome.over_budget
+            plan.renew(pending)
+    report.problems = [*dict.fromkeys([*report.problems, *plan.failed_checks()])]
+    report.seconds, report.tallies = time.monotonic() - started_at, progress.current().totals
+    return report

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import socket
+import threading
 import uuid
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import dagster as dg
+from sqlalchemy.exc import SQLAlchemyError
 from typing_extensions import override
 
 from traps_pipeline.base.errors import TrapsError
@@ -27,6 +31,8 @@ _RANGE = "dagster/asset_partition_range_start", "dagster/asset_partition_range_e
 # Errors whose message is for people; the last one's class is imported only if SQLite holds the history.
 _SENTENCES = (TrapsError.__name__, BudgetReached.__name__, "HistoryUnwritable")
 _INTERRUPTS = ("DagsterExecutionInterruptedError", "KeyboardInterrupt")
+_LOOK_S = 1.0  # between two looks whether a run was terminated in Dagster's pages
+_stopped_here = set[str]()  # runs that a signal to this process stops already
 _QUIET = {"loggers": {"console": {"config": {"log_level": "CRITICAL"}}}}
 
 
@@ -73,35 +79,63 @@ class LocalRuns(Runs):
     @override
     def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterator[RunOutcome]:
         for number, keys in enumerate(ranges, start=1):
-            self._stop_with_parent()
             run_id, names = str(uuid.uuid4()), ", ".join(stage.name for stage in stages)
+            self._stop_if_terminated()
             words = "" if keys[0] is None else keys[0] if keys[0] == keys[1] else f"{keys[0]} to {keys[1]}"
             self._log(f"run {run_id} ({number} of {len(ranges)}): {names} {words}")
             outcome = self._execute(stages, keys, tags, run_id)
             result = "; ".join(outcome.problems) or "made"
             self._log(f"run {run_id}: {result}")
             self.finished.append({"run": run_id, "assets": names, "partitions": words, "result": result})
+            self._stop_if_terminated(run_id)  # a library may have swallowed the signal
             yield outcome
-        self._stop_with_parent()
 
-    def _stop_with_parent(self) -> None:
-        """Raise KeyboardInterrupt if the parent was terminated, also where a library has swallowed the signal."""
-        parent = self._instance.get_run_by_id(self._parent.run_id) if self._parent else None
-        if parent and parent.status in (dg.DagsterRunStatus.CANCELING, dg.DagsterRunStatus.CANCELED):
+    def _stop_if_terminated(self, *run_ids: str) -> None:
+        if any(map(self._is_terminated, (*run_ids, *([self._parent.run_id] if self._parent else [])))):
             raise KeyboardInterrupt
+
+    def _is_terminated(self, run_id: str) -> bool:
+        run = self._instance.get_run_by_id(run_id)
+        return run is not None and run.status in (dg.DagsterRunStatus.CANCELING, dg.DagsterRunStatus.CANCELED)
+
+    @contextmanager
+    def _following(self, run_id: str) -> Iterator[None]:
+        """Interrupt this process if the run is terminated in Dagster's pages.
+
+        Dagster's launcher started no process for it, so that "Terminate" can only mark it as canceling. A parent that
+        Dagster has launched gets a signal from it.
+        """
+        is_over = threading.Event()
+
+        def look() -> None:
+            while not is_over.wait(_LOOK_S):
+                with suppress(SQLAlchemyError):  # a busy history is looked at again
+                    if run_id not in _stopped_here and self._is_terminated(run_id):
+                        # To the main thread itself: it may wait in a call that a signal to another one does not end.
+                        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+                        return
+
+        thread = threading.Thread(target=look, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            is_over.set()
+            thread.join()
 
     def _execute(self, stages: Sequence[Stage], keys: Range, tags: Mapping[str, str], run_id: str) -> RunOutcome:
         key = keys[0] if keys[0] == keys[1] else None
         try:
-            result = self._job.execute_in_process(
-                instance=self._instance,
-                asset_selection=[asset_key(stage.name) for stage in stages],
-                partition_key=key,
-                tags={**self._tags, **tags, **range_tags(keys)},
-                raise_on_error=False,
-                run_config=_QUIET,
-                run_id=run_id,
-            )
+            with self._following(run_id):
+                result = self._job.execute_in_process(
+                    instance=self._instance,
+                    asset_selection=[asset_key(stage.name) for stage in stages],
+                    partition_key=key,
+                    tags={**self._tags, **tags, **range_tags(keys)},
+                    raise_on_error=False,
+                    run_config=_QUIET,
+                    run_id=run_id,
+                )
         except dg.DagsterExecutionInterruptedError:
             raise KeyboardInterrupt from None
         failures = [event for event in result.all_events if event.is_step_failure]
@@ -112,6 +146,14 @@ class LocalRuns(Runs):
             names = ", ".join(stage.name for stage in stages)
             outcome.problems.append(f"{names} {key or ''}: the run failed; see its log in Dagster")
         return outcome
+
+
+def report_canceling(instance: dg.DagsterInstance, run_id: str) -> None:
+    """Tell Dagster that a signal stops a run of this process, which it would call a failure otherwise."""
+    _stopped_here.add(run_id)
+    run = instance.get_run_by_id(run_id)
+    if run is not None and run.status == dg.DagsterRunStatus.STARTED:
+        instance.report_run_canceling(run, "Stopped by a signal.")
 
 
 def range_tags(keys: Range, *, always: bool = False) -> dict[str, str]:

@@ -37,6 +37,8 @@ _FOLLOWED = {"report": ("protocol", "report")} | dict.fromkeys(
     ("scoring", "judging", "people"), ("protocol", "judging", "scoring", "people")
 )
 
+SHARED_IN_RUN: dict[str, Any] = {}  # what stages of one Dagster run share; empty after its end
+
 
 @cache
 def code_of(group: str) -> str:
@@ -98,11 +100,8 @@ def stage(
             output = function(workspace, key)
             return output if isinstance(output, StageOutput) or isinstance(table, str) else _with_preview(table, output)
 
-        upstream = [
-            upstream_or_parent if isinstance(upstream_or_parent, Parent) else of(upstream_or_parent)
-            for upstream_or_parent in parents
-        ]
-        upstream_or_parent = Stage(
+        upstream = [parent if isinstance(parent, Parent) else of(parent) for parent in parents]
+        declaration = Stage(
             name=table if isinstance(table, str) else table.name,
             table=None if isinstance(table, str) else table,
             make=function if side_by_side else make,
@@ -120,8 +119,8 @@ def stage(
             shared=shared,
             side_by_side=side_by_side,
         )
-        _declare(upstream_or_parent)
-        return upstream_or_parent
+        _declare(declaration)
+        return declaration
 
     return declare
 

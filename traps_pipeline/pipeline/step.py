@@ -12,6 +12,7 @@ gets a `MaterializeResult`.
 import hashlib
 import os
 from collections.abc import Generator, Iterator, Mapping
+from functools import cache
 from typing import Any, cast
 
 import dagster as dg
@@ -22,12 +23,13 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.redaction import redact_exception
 from traps_pipeline.pipeline.graph import Stage, the_graph
 from traps_pipeline.pipeline.history import History
-from traps_pipeline.pipeline.lineage import Lineage, write_report_state
+from traps_pipeline.pipeline.lineage import write_report_state
 from traps_pipeline.pipeline.machine import nothing_to_do_reason, parts_of_run, require_machine
 from traps_pipeline.pipeline.making import PartitionMaker
-from traps_pipeline.pipeline.metadata import partition_metadata, tally_metadata, visible_metadata
+from traps_pipeline.pipeline.metadata import page_text, partition_metadata, tally_metadata, visible_metadata
 from traps_pipeline.pipeline.partition_checks import StageChecks, raise_for_run
-from traps_pipeline.pipeline.wanted import StudyPartitions
+from traps_pipeline.pipeline.run_plan import RunPlan
+from traps_pipeline.pipeline.runs import report_canceling
 from traps_pipeline.storage.parquet import StageOutput, State
 from traps_pipeline.storage.workspace import Workspace
 
@@ -40,7 +42,7 @@ RESUMED_ELSEWHERE = 5  # the exit code of a process whose run another process ha
 Event = dg.AssetMaterialization | dg.AssetCheckEvaluation | dg.MaterializeResult | dg.Output
 Events = Generator[Event, None, None]
 _ATTEMPTS: dict[str, int] = {}  # by run: how often it had been resumed when this process started on it
-_LINEAGE: dict[str, Lineage] = {}  # by run: its snapshot of the study; only of the run in progress
+_PLANS: dict[str, RunPlan] = {}  # by run: its snapshot of the study; only of the run in progress
 
 
 def run_step(stage: Stage, context: dg.AssetExecutionContext, workspace: Workspace) -> Events:
@@ -62,7 +64,10 @@ def run_step(stage: Stage, context: dg.AssetExecutionContext, workspace: Workspa
         if stage.scheme is None:
             yield from step.checks.of_made(key, failures)
             metadata = visible_metadata(metadata)
-            made_result = dg.MaterializeResult(metadata=metadata, data_version=dg.DataVersion(version))
+            # Dagster's own provenance is older: it reads the inputs' versions before the step can report them.
+            made_result = dg.MaterializeResult(
+                metadata=metadata, data_version=dg.DataVersion(version), tags=step.provenance
+            )
         else:
             yield step.history.event(stage, key, version, step.provenance, metadata)
             yield from step.checks.of_made(key, failures)
@@ -75,16 +80,16 @@ def run_step(stage: Stage, context: dg.AssetExecutionContext, workspace: Workspa
         raise_for_run(context, step.graph, stage.name)
 
 
-def _lineage_of(run_id: str, workspace: Workspace) -> Lineage:
-    """Return the snapshot that a run's steps share; a new one for each step if other hosts build beside them.
+def _plan_of(run: dg.DagsterRun, workspace: Workspace) -> RunPlan:
+    """Return the plan, with its snapshot, that a run's steps share; one for each step if other hosts build, too.
 
     If another process builds a partition between two steps, the later step records its older version, so that the next
     run makes the result once more.
     """
-    if run_id not in _LINEAGE or workspace.is_shared:
-        _LINEAGE.clear()
-        _LINEAGE[run_id] = Lineage(workspace, thorough=True)
-    return _LINEAGE[run_id]
+    if run.run_id not in _PLANS or workspace.is_shared:
+        _PLANS.clear()
+        _PLANS[run.run_id] = RunPlan(workspace, run.tags.get(EXPERIMENT_TAG), thorough=True)
+    return _PLANS[run.run_id]
 
 
 class _Step:
@@ -95,16 +100,16 @@ class _Step:
         self.tags = context.run.tags
         if context.run.run_id not in _ATTEMPTS:
             _ATTEMPTS[context.run.run_id] = context.instance.count_resume_run_attempts(context.run.run_id)
-        partitions = StudyPartitions(workspace, self.tags.get(EXPERIMENT_TAG))
-        require_machine(workspace, parts_of_run(context, stage, partitions))
-        self.history, self.lineage = History(context.instance, self.graph), _lineage_of(context.run.run_id, workspace)
+        self.plan = _plan_of(context.run, workspace)
+        require_machine(self.plan, parts_of_run(context, stage, self.plan))
+        self.history, self.lineage = History(context.instance, self.graph), self.plan.lineage
         self.history.observe(self.lineage, [p for p in stage.parents if self.graph.source(p)])
-        self.provenance = self.history.provenance(stage) if stage.scheme else {}
+        self.provenance = self.history.provenance(stage)
         self.checks = StageChecks(workspace, self.history, self.graph, stage)
         self._maker = PartitionMaker(workspace, stage, self.history)
         self._inputs: dict[str | None, Mapping[str, str]] = {}  # recorded before anything is read
         keys: list[str | None] = [None] if stage.scheme is None else [str(key) for key in context.partition_keys]
-        wanted_keys = {*stage.wanted(partitions)}
+        wanted_keys = {*self.plan.parts[stage.name]}
         self._wanted, self._unwanted = [k for k in keys if k in wanted_keys], [k for k in keys if k not in wanted_keys]
 
     def tell_unwanted(self) -> Iterator[dg.AssetMaterialization]:
@@ -122,11 +127,8 @@ class _Step:
         """Return the wanted keys, or those among them that the run's tag selects."""
         if MAKE_TAG not in self.tags:
             return self._wanted
-        recorded_versions, existing = self.history.recorded(self.stage.name), self.tags[MAKE_TAG] == STALE_ONLY
-        name, lineage = self.stage.name, self.lineage
-        keys = [k for k in self._wanted if to_make(lineage, recorded_versions, name, k, existing=existing)]
-        # A partition that waits for an upstream one would be built twice.
-        return [k for k in keys if not (existing and lineage.waits(name, k))]
+        recorded, existing = cache(self.history.recorded), self.tags[MAKE_TAG] == STALE_ONLY
+        return [k for k in self._wanted if self.plan.is_pending(self.stage.name, k, recorded, existing=existing)]
 
     def admit(self, key: str | None) -> None:
         """Record the inputs of a partition that can be built, or the reason why it cannot."""
@@ -196,13 +198,10 @@ class _Step:
 
 
 def guard_events(events: Events, context: dg.AssetExecutionContext) -> Events:
-    """Forward a step's events; log progress, and keep keys out of stored tracebacks.
-
-    A run stopped by a signal is canceled; Dagster, which did not stop it itself, would call it a failure.
-    """
+    """Forward a step's events; log progress, and keep keys out of stored tracebacks."""
     report = progress.current()
     try:
-        with report.heard_by(context.log.info):
+        with report.heard_by(lambda line: context.log.info(page_text(line))):
             yield from events
             report.end_stage()
     except Exception as error:
@@ -210,9 +209,7 @@ def guard_events(events: Events, context: dg.AssetExecutionContext) -> Events:
             raise
         raise without_keys from None
     except (KeyboardInterrupt, dg.DagsterExecutionInterruptedError):
-        run = context.instance.get_run_by_id(context.run.run_id)
-        if run is not None and run.status == dg.DagsterRunStatus.STARTED:
-            context.instance.report_run_canceling(run, "Stopped by a signal.")
+        report_canceling(context.instance, context.run.run_id)
         raise
 
 
@@ -223,17 +220,3 @@ def end_if_resumed(instance: dg.DagsterInstance, run_id: str, attempts: int) -> 
     """
     if instance.count_resume_run_attempts(run_id) > attempts:
         os._exit(RESUMED_ELSEWHERE)
-
-
-def to_make(
-    lineage: Lineage, recorded: Mapping[str | None, str | None], name: str, key: str | None, *, existing: bool = False
-) -> bool:
-    """Return whether a partition is missing, stale, or unknown to Dagster.
-
-    A crash between a table and its event leaves a table that Dagster does not know, which is built once more. existing:
-    only partitions that exist and whose inputs have changed.
-    """
-    status = lineage.status(name, key)
-    if existing:
-        return status.kind == "stale" and bool(status.outdated)
-    return status.kind != "fresh" or recorded.get(key) != lineage.version(name, key)

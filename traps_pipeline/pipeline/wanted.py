@@ -46,6 +46,11 @@ class StudyPartitions:
         else:
             self._asked = [e for name, e in workspace.study.experiments.items() if experiment in (None, name)]
 
+    def of(self, experiment: str | None) -> StudyPartitions:
+        """Return the keys of one experiment of the study; None: of all."""
+        is_all = experiment is None or self._workspace is None or [*self._workspace.study.experiments] == [experiment]
+        return self if is_all else StudyPartitions(self._workspace, experiment)
+
     @cached_property
     def categories(self) -> list[str]:
         """Categories with scenarios, or with a table made before all were discarded."""
@@ -81,7 +86,7 @@ class StudyPartitions:
     @cached_property
     def evaluations(self) -> list[Evaluation]:
         """Every requested model, regime and run, in the registry's order."""
-        asked_evaluations = {e for experiment in self._asked for e in _evaluations(experiment)}
+        asked_evaluations = {e for experiment in self._asked for e in evaluations_of(experiment)}
         place = {model: number for number, model in enumerate(load_models())}
         return sorted(asked_evaluations, key=lambda e: (place[e.model], REGIMES.index(e.regime), e.run))
 
@@ -92,7 +97,7 @@ class StudyPartitions:
             Cell(dataset, evaluation).key
             for experiment in self._asked
             for dataset in self._datasets([experiment])
-            for evaluation in _evaluations(experiment)
+            for evaluation in evaluations_of(experiment)
         }
         all_cells = (Cell(dataset, evaluation).key for dataset, evaluation in product(self.datasets, self.evaluations))
         return [key for key in all_cells if key in asked_cells]
@@ -186,7 +191,7 @@ class StudyPartitions:
         return [SteeringCell.parse(f"{dataset}|{run}").key for dataset, run in product(datasets, self.steered)]
 
 
-def _evaluations(experiment: Asked) -> list[Evaluation]:
+def evaluations_of(experiment: Asked) -> list[Evaluation]:
     """Return evaluations of named runs (default: all) that a model's run count allows."""
     evaluations = []
     for model in experiment.models:

@@ -8,8 +8,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
-from urllib.parse import urlencode
 
+from traps_pipeline.base.explorer_link import EXPLORER, answers_view
 from traps_pipeline.base.sheets import csv_bytes
 from traps_pipeline.report.catalogue import FigureReport, TableReport
 from traps_pipeline.report.pair_pictures import Picture
@@ -31,7 +31,6 @@ from traps_pipeline.storage.workspace import Workspace
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-EXPLORER = "index.html"  # path beside the report page
 MEDIA = {"svg": "image/svg+xml", "webp": "image/webp", "csv": "text/csv", "tex": "application/x-tex"}
 Address = Callable[[SourceItems], str]
 
@@ -83,8 +82,7 @@ class Sources:
 @lru_cache(4096)  # cells of one row share it, and so do tables
 def explorer_address(behind: SourceItems) -> str:
     """Return the address of the explorer's view of the answers behind a number."""
-    query = {name: value for name, value in vars(behind).items() if value}
-    return f"{EXPLORER}#/answers" + (f"?{urlencode(query)}" if query else "")
+    return f"{EXPLORER}#{answers_view(**vars(behind))}"
 
 
 def table_card(report: TableReport, sources: Sources, address: Address | None = explorer_address) -> Card:

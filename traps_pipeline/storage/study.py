@@ -15,13 +15,26 @@ FORMAT = 1  # version of a workspace's format
 Regime = Annotated[str, Field(pattern=f"^({'|'.join(VQA_PROMPTS)})$")]
 
 
+class Settings(BaseModel):
+    """What people write into a file: no unknown field, and no list that names something twice."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    @field_validator("*")
+    @classmethod
+    def _require_unique(cls, value: Any) -> Any:
+        members = [*map(repr, value)] if isinstance(value, list | tuple) else []
+        if twice := sorted({member for member in members if members.count(member) > 1}):
+            raise ValueError(f"{', '.join(twice[:5])} is named twice; leave one out")
+        return value
+
+
 # --- what is asked inside local models --------------------------------------------------------------------------------
 
 
-class Layers(BaseModel):
+class Layers(Settings):
     """A model's layers as in hidden_states: 0 = embeddings, l = output of block l."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
     steering: int = Field(ge=1, description="block whose output is steered")
     centroid: int = Field(ge=0, description="of the nearest centroid")
     sweep: tuple[Annotated[int, Field(ge=1)], ...] = Field(default=(), description="further layers for the sweep")
@@ -30,10 +43,9 @@ class Layers(BaseModel):
     )
 
 
-class ProbeSettings(BaseModel):
+class ProbeSettings(Settings):
     """How probes are fitted and resampled (docs/spec.md 7)."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
     folds: int = Field(default=5, ge=2, description="scenarios of a fold are held out together")
     shuffles: int = Field(default=20, ge=20, description="with fewer the mean says little")
     resamples: int = Field(default=1000, ge=100, description="of intervals")
@@ -42,23 +54,21 @@ class ProbeSettings(BaseModel):
     )
 
 
-class NullSettings(BaseModel):
+class NullSettings(Settings):
     """The number of null directions of each kind against which an effect is ranked.
 
     They are steered at the largest dose on the datasets that they come from.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
     kinds: tuple[Literal["isotropic", "covariance", "shuffled"], ...] = Field(
         default=("covariance",), description="how null directions are drawn"
     )
     draws: int = Field(default=20, ge=1, description="19 are the fewest with which p can reach .05")
 
 
-class SteeringSettings(BaseModel):
+class SteeringSettings(Settings):
     """The settings of steering (docs/spec.md 8.2)."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
     alphas: tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...] = Field(
         default=(2, 5, 10), min_length=1, description="doses in units of the unit direction"
     )
@@ -77,9 +87,7 @@ class SteeringSettings(BaseModel):
         default=(0.5, 1, 2, 4), description="further doses, in units of the distance between the sides' means there"
     )
     cap: float = Field(
-        default=2.0,
-        gt=0,
-        description="longest dose in gaps, in mean lengths of control states; no longer one is given",
+        default=2.0, gt=0, description="longest dose in gaps, in mean lengths of control states; no longer one is given"
     )
     signs: tuple[Literal["plus", "minus"], ...] = Field(
         default=("plus", "minus"), description="policies beside the paper's, which knows each item's side"
@@ -99,20 +107,18 @@ class SteeringSettings(BaseModel):
         return values
 
 
-class GateSettings(BaseModel):
+class GateSettings(Settings):
     """The settings of probe-gated abstention (docs/mechanism.md)."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
     false_abs: float = Field(default=0.05, gt=0, lt=1, description="of source controls, that conformal gates promise")
     untrained: bool = Field(
         default=False, description="also a gate on states of the same network with random weights, loaded beside it"
     )
 
 
-class PatchingSettings(BaseModel):
+class PatchingSettings(Settings):
     """The settings of activation patching between controls and voids."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
     pairs: int = Field(default=50, ge=1, description="pairs of each well-posed dataset, the first of a seeded order")
     sites: tuple[Literal["residual", "attention", "mlp"], ...] = Field(
         default=("residual", "attention", "mlp"), min_length=1, description="what is patched in a block"
@@ -126,10 +132,9 @@ class PatchingSettings(BaseModel):
     )
 
 
-class MechanismSettings(BaseModel):
+class MechanismSettings(Settings):
     """The section `mechanism:` of experiments and `study.yaml`: models and layers."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
     models: dict[str, Layers] = Field(min_length=1, description="local models, with the layers to look at")
     prompts: tuple[Regime, ...] = Field(default=VQA_PROMPTS, min_length=1, description="VQA prompts extracted")
     probes: ProbeSettings = Field(default=ProbeSettings(), description="how probes are fitted")
@@ -171,10 +176,9 @@ class MechanismSettings(BaseModel):
 # --- the study --------------------------------------------------------------------------------------------------------
 
 
-class Asked(BaseModel):
+class Asked(Settings):
     """One experiment's scenarios, and whether they get mechanistic analyses."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
     datasets: tuple[str, ...]
     models: tuple[str, ...]
     regimes: tuple[str, ...]
@@ -182,14 +186,13 @@ class Asked(BaseModel):
     mechanism: bool = False
 
 
-class Study(BaseModel):
+class Study(Settings):
     """`study.yaml`: benchmark and subset, panel, budget and experiments.
 
     benchmark, scenarios and per_family are fixed when the workspace is created; panel, epoch and budget may be edited.
     No command and no button asks a model that `experiments` does not name.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
     format: int = Field(default=FORMAT, description="version of the workspace's format")
     name: str = Field(
         default="",

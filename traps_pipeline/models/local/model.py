@@ -14,6 +14,7 @@ import numpy as np
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.wording import count_noun
+from traps_pipeline.models.local import chat_template
 from traps_pipeline.models.local.capture import Pooling, capture_states
 from traps_pipeline.models.local.decoding import Steers, decode, steering_context
 from traps_pipeline.models.local.library import load_transformers
@@ -163,7 +164,10 @@ class LocalModel:
             {"role": "system", "content": [{"type": "text", "text": system}]},
             {"role": "user", "content": content},
         ]
-        text: str = self.processor.apply_chat_template(turns, add_generation_prompt=True, **self.params.template)
+        template, tokens = self.processor.chat_template, self.processor.tokenizer.special_tokens_map
+        template = template["default"] if isinstance(template, dict) else template
+        variables = {name: str(token) for name, token in tokens.items()} | self.params.template
+        text = chat_template.render(self.checkpoint.name, template, turns, variables)
         if text.count(self.processor.video_token) != 1 or text.count(system) != 1 or text.count(user) < 1:
             raise TrapsError(
                 f"{self.checkpoint.name}: its chat template does not keep system prompt, clip and question as they are "

@@ -5,6 +5,7 @@ from functools import partial
 from typing import Any, cast
 
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.explorer_link import EXPLORER, answers_view
 from traps_pipeline.base.wording import count_noun, in_percent
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES, VoteRow
 from traps_pipeline.models.asking.answer_rows import RESPONSES, ResponseRow
@@ -59,17 +60,13 @@ def _with_items(
 
 def _items_shown(workspace: Workspace, cell: Cell, rows: Sequence[ResponseRow | VoteRow]) -> dict[str, Any]:
     """Return metadata: items without an answer, and the explorer's view of all."""
-    from traps_pipeline.report.cards import explorer_address
-    from traps_pipeline.report.writing import SourceItems
-
-    e = cell.evaluation
-    page, _, view = explorer_address(SourceItems(cell.dataset, e.model, e.regime)).partition("#")
+    view = answers_view(dataset=cell.dataset, model=cell.evaluation.model, regime=cell.evaluation.regime)
     columns = ("item_id", "side", "outcome", "error", "attempts")
     unanswered = [row for row in rows if isinstance(row, ResponseRow) and row.outcome not in JUDGED]
     records = [{name: str(getattr(row, name)) for name in columns} for row in unanswered[:ITEMS_SHOWN]]
     table = {"without an answer": Records(records)} if records else {}
     reason = {"one item": f"traps why {rows[0].item_id}"} if rows else {}
-    return {**table, "all items": StudyFile(workspace.relative(workspace.reports / page), view), **reason}
+    return {**table, "all items": StudyFile(workspace.relative(workspace.reports / EXPLORER), view), **reason}
 
 
 def _answers_missing(workspace: Workspace, key: str | None, output: StageOutput) -> str:

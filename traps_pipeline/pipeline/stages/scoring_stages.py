@@ -11,7 +11,7 @@ from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.pipeline.graph import Check
 from traps_pipeline.pipeline.previews import Markdown, rows_shown
 from traps_pipeline.pipeline.schemes import DATASET, by_dataset
-from traps_pipeline.pipeline.stage import is_declared, of, stage
+from traps_pipeline.pipeline.stage import SHARED_IN_RUN, is_declared, of, stage
 from traps_pipeline.pipeline.stages.benchmark_stages import arms, items
 from traps_pipeline.pipeline.stages.evaluation_stages import judges, responses, verdicts, votes
 from traps_pipeline.pipeline.wanted import StudyPartitions
@@ -87,15 +87,12 @@ def _bootstrap_of(judged: "pd.DataFrame") -> "ResampledFigures":
     """Return the bootstrap of verdicts, which one run needs twice: for the contrasts, then for the leaderboard."""
     from traps_pipeline.scoring.bootstrap import resample
 
-    cached_figures = [figures for rows, figures in _RESAMPLED if rows.equals(judged)]
-    _RESAMPLED.clear()  # after the second time the memory is free again
-    if cached_figures:
-        return cached_figures[0]
-    _RESAMPLED.append((judged, resample(judged)))
-    return _RESAMPLED[0][1]
+    rows, figures = SHARED_IN_RUN.pop("bootstrap", (None, None))  # after the second time the memory is free again
+    if rows is None or not rows.equals(judged):
+        figures = resample(judged)
+        SHARED_IN_RUN["bootstrap"] = judged, figures
+    return figures
 
-
-_RESAMPLED: list[tuple["pd.DataFrame", "ResampledFigures"]] = []  # the verdicts and the bootstrap of the last call
 
 # The panel is an input of everything computed from its verdicts, so that a change of panel makes them stale at once,
 # not only after the new votes.
