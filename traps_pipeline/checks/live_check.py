@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -51,6 +51,7 @@ BAD_REQUEST = 400
 COLOURS = {"red": (200, 30, 30), "blue": (30, 30, 200)}
 QUESTION = "The whole picture has one colour and then another: which two colours does the clip show?"
 _FPS, _SIZE, _FRAMES = 10, (120, 160), 50
+_LATE = "timeout"  # the error of a call that may yet be answered
 _NO_SCHEMA = "say `json_schema: false` and `waivers: {json_schema: WHY}`"
 _JUDGED = (("I don't know.", True, False), ("The ball rolls down the ramp. The answer is: left.", False, True))
 _ITEM: Mapping[str, Any] = {
@@ -65,17 +66,22 @@ _ITEM: Mapping[str, Any] = {
 
 @dataclass(frozen=True)
 class LiveResult:
-    """An entry's result: problems, which make its answers worthless, and notes."""
+    """An entry's result: problems, which make its answers worthless, and notes.
+
+    unchecked: what no answer came in time for, so that nothing is known; empty if all that matters was checked.
+    """
 
     entry: Entry
     problems: Sequence[str]
     notes: Sequence[str] = ()
+    unchecked: str = ""
 
     @property
     def line(self) -> str:
         """The result as text, with one line per finding."""
         lines = [*(f"FAIL {problem}" for problem in self.problems), *(f"note {note}" for note in self.notes)]
-        head = f"{'FAIL' if self.problems else 'ok  '} {self.entry.id}"
+        lines += [self.unchecked] if self.unchecked else []
+        head = f"{'FAIL' if self.problems else 'not checked' if self.unchecked else 'ok  '} {self.entry.id}"
         return redact("\n".join([head, *(f"     {line}" for line in lines)]))
 
 
@@ -199,7 +205,7 @@ def findings(
             if outcome.error == RATE_LIMITED and any(response.kind in WITH_TEXT for response in outcomes.values()):
                 notes.append(f"{name}: refused as one call too many; a run waits and asks again")
             else:
-                (notes if outcome.error == "timeout" else problems).append(sentence)
+                (notes if outcome.error == _LATE else problems).append(sentence)
         elif outcome.kind == "malformed":
             form_error = None if outcome.error == MALFORMED else outcome.error
             problems.append(f"{name}: {form_error or 'its answer has no shape of its API; what it is stands above'}")
@@ -214,7 +220,20 @@ def findings(
         problems += [*_wrong_answers(entry, outcomes), *_clip_problems(entry, outcomes, notes)]
     if entry.prices is None:
         notes.append("its price is unknown: no budget bounds it, and a run needs --allow-unknown-prices")
-    return LiveResult(entry, list(dict.fromkeys(problems)), notes)
+    return LiveResult(entry, list(dict.fromkeys(problems)), notes, "" if problems else _unchecked(entry, outcomes))
+
+
+def _unchecked(entry: Entry, outcomes: Mapping[str, Outcome]) -> str:
+    """Return what is not known of an entry without the calls that were not answered in time; empty if all is."""
+    late = {name for name, outcome in outcomes.items() if outcome.error in (_LATE, RATE_LIMITED)}
+    needed = {"whether it sees the clip": {"clip"}}
+    if isinstance(entry, JudgeEntry):
+        tasks = {name.rpartition(" ")[0] for name in outcomes}
+        needed = {f"its vote on {task}": {name for name in outcomes if name.startswith(task)} for task in tasks}
+    elif "no clip" in late and not _names_colours(outcomes["clip"]):
+        needed = {"whether it sees the clip": {"no clip"}}
+    unknown = [subject for subject, names in needed.items() if names and names <= late]
+    return f"not checked: {' and '.join(unknown)}, since no answer came in time" if unknown else ""
 
 
 def _failure(entry: Entry, account: Account, name: str, error: str) -> str:
@@ -287,12 +306,16 @@ def _wrong_answers(entry: ModelEntry, outcomes: Mapping[str, Outcome]) -> list[s
     return messages
 
 
+def _names_colours(outcome: Outcome) -> bool:
+    return all(re.search(rf"\b{colour}\b", (outcome.text or "").lower()) for colour in COLOURS)
+
+
 def _clip_problems(entry: ModelEntry, outcomes: Mapping[str, Outcome], notes: list[str]) -> list[str]:
     """Return whether the clip arrives, from the answer's colours or counted tokens."""
     clip, blank = outcomes.get("clip"), outcomes.get("no clip")
     if clip is None or blank is None or clip.kind not in WITH_TEXT:
         return []
-    names_both_colours = all(re.search(rf"\b{colour}\b", (clip.text or "").lower()) for colour in COLOURS)
+    names_both_colours = _names_colours(clip)
     frame_count = None
     if clip.prompt_tokens is not None and blank.prompt_tokens is not None:
         frame_count = clip.prompt_tokens - blank.prompt_tokens
@@ -301,9 +324,9 @@ def _clip_problems(entry: ModelEntry, outcomes: Mapping[str, Outcome], notes: li
             f"it does not see the clip: {clip.prompt_tokens} prompt tokens with it and {blank.prompt_tokens} without; "
             f"is this a model that sees, and is `{entry.media.profile if entry.media else ''}` what its server takes?"
         ]
-    if not names_both_colours and frame_count is None:
+    if not names_both_colours and frame_count is None and blank.error not in (_LATE, RATE_LIMITED):
         return ["it does not see the clip: it names no colour of one that is red and then blue, nor counts its tokens"]
-    if not names_both_colours:
+    if not names_both_colours and frame_count is not None:
         notes.append(f"it counts {frame_count} tokens for the clip, and does not name its colours (red, then blue)")
     return []
 
@@ -384,9 +407,17 @@ def _outcome(row: Row) -> Outcome:
     return Outcome(row["outcome"], **{name: row.get(name) for name in names})
 
 
-def require_sound(results: Sequence[LiveResult]) -> None:
-    """Raise TrapsError naming all problems of all entries, if there are any."""
+def require_sound(results: Sequence[LiveResult], goes_on: Callable[[str], bool]) -> None:
+    """Raise TrapsError naming all problems of all entries, or what was not checked.
+
+    goes_on: returns whether to run without knowing what a sentence says was not checked.
+    """
     messages = [f"{result.entry.id}: {problem}" for result in results for problem in result.problems]
+    advice = "nothing was rendered and nothing was judged; --no-preflight runs all the same"
+    if not messages:
+        messages = [f"{result.entry.id}: {result.unchecked}" for result in results if result.unchecked]
+        advice = "nothing was rendered and nothing was judged; --unchecked runs all the same"
+        if messages and goes_on("\n".join(messages)):
+            return
     if messages:
-        advice = "nothing was rendered and nothing was judged; --no-preflight runs all the same"
         raise TrapsError("\n".join([*messages, advice]))

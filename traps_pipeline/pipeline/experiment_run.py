@@ -53,14 +53,16 @@ def run_experiment(
     *,
     until: str | None,
     preflight: Callable[[str], None] | None,
+    goes_on: Callable[[str], bool],
     look_at_machine: bool,
     open_runs: OpenRuns,
 ) -> RunReport:
     """Materialize missing or stale partitions, reporting to `progress.current()`.
 
     until: comma-separated stages; only these and their upstream are materialized. preflight: receives a line about each
-    model and judge, which are tried first unless it is None. open_runs: opens the executor of runs; called, like
-    Dagster's history, only if there is something to materialize. Raises TrapsError if a run cannot begin.
+    model and judge, which are tried first unless it is None. goes_on: see `require_sound`. open_runs: opens the
+    executor of runs; called, like Dagster's history, only if there is something to materialize. Raises TrapsError if a
+    run cannot begin.
     """
     stages = stages_until(until)
     require_work(workspace, experiment.name, until)
@@ -78,7 +80,7 @@ def run_experiment(
         if look_at_machine:
             require_machine(workspace, wanted_parts(workspace, stages, experiment.name))
         if preflight is not None:
-            _preflight(workspace, participants, preflight)
+            _preflight(workspace, participants, preflight, goes_on)
         with open_runs(instance, workspace) as runs:
             result = materialize_stale(instance, runs, workspace, stages, experiment=experiment.name)
     problems = [*dict.fromkeys([*result.problems, *failed_checks(workspace, experiment.name)])]
@@ -112,7 +114,9 @@ def _pending_participants(workspace: Workspace, experiment: Experiment, stages: 
     return _Participants(models, judges if judges and any(behind("votes")) else [])
 
 
-def _preflight(workspace: Workspace, participants: _Participants, say: Callable[[str], None]) -> None:
+def _preflight(
+    workspace: Workspace, participants: _Participants, say: Callable[[str], None], goes_on: Callable[[str], bool]
+) -> None:
     """Try networked models and judges first. Raises TrapsError with all problems."""
     models = [entry for entry in participants.models if entry.backend == NETWORK]
     if not models and not participants.judges:
@@ -123,4 +127,4 @@ def _preflight(workspace: Workspace, participants: _Participants, say: Callable[
     for check in checks:
         if not check.problems:  # they are raised instead
             say(check.line)
-    require_sound(checks)
+    require_sound(checks, goes_on)
