@@ -20,6 +20,7 @@ _END = re.compile(rb"\r?\n\r?\n")
 _STATUS = re.compile(rb"(?:HTTP|ICY)(?:/(\d)(?:\.(\d))?)? {1,8}(\d{3})(?!\d)", re.I)
 _NAME = re.compile(rb"[!#$%&'*+.^_`|~0-9A-Za-z-]{1,200}")
 _LENGTH = re.compile(rb"\+?(\d{1,15})(?: ?, ?\+?(?:\d{1,15}))*")
+_NEEDED = re.compile(rb"content|limit|retry|date|location|connection", re.I)  # kept where there are too many
 _FRAMING = (b"content-length", b"transfer-encoding")
 
 
@@ -88,7 +89,8 @@ def rewrite_head(head: bytes) -> tuple[bytes, int | None]:
             fields.append((name, value))
     minor = b"0" if status[1] == b"1" and status[2] == b"0" else b"1"
     framing, length = _framing([(name.lower(), value) for name, value in fields], int(status[3]))
-    kept = [(name, value) for name, value in fields if name.lower() not in _FRAMING][:MAX_FIELDS] + framing
+    others = [(name, value) for name, value in fields if name.lower() not in _FRAMING]
+    kept = sorted(others, key=lambda field: _NEEDED.search(field[0]) is None)[:MAX_FIELDS] + framing
     reason = re.sub(rb"[\r\0]", b" ", lines[0][status.end() :]).strip()[:200]
     rewritten = b"HTTP/1.%s %s %s\r\n" % (minor, status[3], reason) + b"".join(b"%s: %s\r\n" % field for field in kept)
     return rewritten + b"\r\n", length

@@ -62,7 +62,7 @@ _MEANINGS: Mapping[Meaning, tuple[str, ...]] = {
         *("1113", "1304", "1308", "1309", "1310"),
     ),
 }
-_MEANING_OF = {word: meaning for meaning, words in _MEANINGS.items() for word in words}
+_MEANING_OF: Mapping[str, Meaning] = {word: meaning for meaning, words in _MEANINGS.items() for word in words}
 _FILTER_WORDS = re.compile(
     r"content_?filter|content_policy|responsible_?ai_?policy|moderation|safety_violation|data_?inspection_?failed|^1301$",
     re.I,
@@ -151,8 +151,8 @@ def _read(error: Json, codes: Mapping[str, Meaning]) -> ProviderError | None:
     message = text if isinstance(text, str) else json.dumps(text)
     if all(word.lower() in _FINE for word in words) and (words or not message):
         return None
-    meanings: list[Meaning] = [int(word) for word in words if re.fullmatch(r"[45]\d\d", word)]
-    meanings += [m for word in words if (m := codes.get(word) or _MEANING_OF.get(word.lower()))]
+    known = [codes.get(word) or _MEANING_OF.get(word.lower()) for word in words]
+    meanings = [*(int(word) for word in words if re.fullmatch(r"[45]\d\d", word)), *known]
     return ProviderError(
         message,
         words,
