@@ -489,6 +489,22 @@ def test_words_in_the_character_set_of_their_label_are_read() -> None:
     assert outcome and outcome.text == "caf\u00e9"
 
 
+def test_a_head_that_comes_byte_by_byte_is_read(environment: pytest.MonkeyPatch) -> None:
+    async def drip(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.readuntil(b"\r\n\r\n")
+        for byte in READ["length twice"]:
+            writer.write(bytes([byte]))
+            await writer.drain()
+        writer.close()
+
+    async def run() -> Outcome | None:
+        async with await asyncio.start_server(drip, "127.0.0.1", 0) as server:
+            return await asking(f"http://127.0.0.1:{server.sockets[0].getsockname()[1]}/v1", budget_of(10.0))
+
+    outcome = asyncio.run(run())
+    assert outcome and outcome.text == "The answer is: left."
+
+
 UNREADABLE = {
     "no chunks where chunks are said": CHUNKED + WHOLE,
     "chunk of another size": CHUNKED + b"5\r\n" + WHOLE + b"\r\n0\r\n\r\n",

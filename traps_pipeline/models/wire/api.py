@@ -200,7 +200,7 @@ class ApiBackend:
 
     def _outcome(self, reply: Reply, request: Request) -> Outcome:
         """Return the outcome of an answer: visible text, thinking, and usage."""
-        usage = read_usage(reply.usage, _sizes(request, reply.text))
+        usage = read_usage(reply.usage, _sizes(request, reply.text or reply.reasoning))
         believed_usage = usage if usage and usage.believed else None
         kind = _kind(reply)
         return Outcome(
@@ -278,9 +278,9 @@ class ApiBackend:
         """Return the beginning of an answer without an error object, for people."""
         text = redact((exchange.content or b"").decode("utf-8", "replace"))  # before it is cut
         if 300 <= (exchange.status or 0) < 400:
-            target = redact(next((v for name, v in exchange.headers.items() if name.lower() == "location"), "nowhere"))
+            target = redact(exchange.headers.get("location", "nowhere"))
             return f"HTTP {exchange.status} to {target}: no redirect is followed, name the right address as `base_url`"
-        kind = exchange.headers.get("Content-Type", "no content type").partition(";")[0]
+        kind = exchange.headers.get("content-type", "no content type").partition(";")[0]
         quotation = f", beginning {text[:60]!r}" if text.strip() else ""
         return f"HTTP {exchange.status}, {kind}, {len(exchange.content or b'')} bytes{quotation}"
 

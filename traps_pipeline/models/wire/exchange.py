@@ -20,9 +20,9 @@ class Exchange:
     """One attempt as seen on the wire.
 
     sent: whether bytes of the request were handed to a connected server; None if unknown (a backend without a network).
-    status, headers: of the answer. content: its decoded body, None if it was not read to its end. proxy: the variable
-    that named the proxy. problem: why nothing was sent, or why no answer came; is_unreadable: whether one came that
-    breaks the rules of HTTP.
+    status, headers (by name in lower case): of the answer. content: its decoded body, None if it was not read to its
+    end. proxy: the variable that named the proxy. problem: why nothing was sent, or why no answer came; is_unreadable:
+    whether one came that breaks the rules of HTTP.
     """
 
     sent: bool | None = None

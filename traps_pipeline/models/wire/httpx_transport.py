@@ -78,7 +78,8 @@ class Wire(httpx.AsyncBaseTransport):
             exchange.sent = False
             try:
                 response = await self._send(request, exchange)
-                exchange.status, exchange.headers = response.status, dict(response.headers)
+                exchange.status = response.status
+                exchange.headers = {name.lower(): value for name, value in response.headers.items()}
                 exchange.content = await _read(response)
             except Exception as error:
                 exchange.problem = _explain(error, request.url, exchange)

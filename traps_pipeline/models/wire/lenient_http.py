@@ -47,13 +47,12 @@ class LenientHandler(ResponseHandler):
             super().data_received(data)
             return
         if self._head is not None:
-            self._head += data
-            start = len(self._head) - len(self._head.lstrip(b"\r\n"))
-            end = _END.search(self._head, start)
+            self._head += data if self._head else data.lstrip(b"\r\n")
+            end = _END.search(self._head, max(0, len(self._head) - len(data) - 3))  # what came before holds no end
             if end is None and len(self._head) < MAX_HEAD:
                 self._reschedule_timeout()
                 return
-            head = bytes(self._head[start : end.end() if end else None])
+            head = bytes(self._head[: end.end() if end else None])
             data, self._left = rewrite_head(head)
             super().data_received(data)
             data = bytes(self._head[end.end() :]) if end else b""
