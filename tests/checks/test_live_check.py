@@ -17,7 +17,8 @@ from tests.providers.servers import closed_port
 from tests.terminals import run_in_terminal
 from traps_pipeline.base import progress
 from traps_pipeline.checks import live_check
-from traps_pipeline.checks.live_check import LiveResult, check_live, findings, nobody_at
+from traps_pipeline.checks.live_check import LiveResult, check_live, findings
+from traps_pipeline.checks.server_check import nobody_at
 from traps_pipeline.models.registry import entries as registry
 from traps_pipeline.models.registry.entries import PROTOCOL, Account, Entry, ModelEntry, Prices
 from traps_pipeline.models.registry.judges import JudgeEntry

@@ -10,19 +10,17 @@ from __future__ import annotations
 import asyncio
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache
 from typing import Any
-from urllib.parse import urlsplit
 
 import numpy as np
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.network import check_network, is_loopback
 from traps_pipeline.base.redaction import redact
 from traps_pipeline.base.terminal import plain
+from traps_pipeline.checks.server_check import BAD_REQUEST, ServerCheck, check_server, nobody_at, wrong_key
 from traps_pipeline.checks.wire_check import SyntheticClip, model_name, question
 from traps_pipeline.judging.panel import parse_vote, vote_request
 from traps_pipeline.models.asking.ask import Call, SettledCell, collect
@@ -46,8 +44,7 @@ from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.workspace import Workspace
 
 CELL = Cell("occlusion", Evaluation("preflight", "standard", 1))  # a name in the ledger, not a model
-TIMEOUT_S, REACH_S = 25.0, 5.0  # time-outs of a call and of earlier checks
-BAD_REQUEST = 400
+TIMEOUT_S = 25.0  # of a call
 COLOURS = {"red": (200, 30, 30), "blue": (30, 30, 200)}
 QUESTION = "The whole picture has one colour and then another: which two colours does the clip show?"
 _FPS, _SIZE, _FRAMES = 10, (120, 160), 50
@@ -117,72 +114,6 @@ def requests_of(entry: Entry) -> dict[str, Request]:
 # --- what is wrong ----------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class ServerCheck:
-    """Findings before any call.
-
-    problem: why asking is useless; unlisted: the server's own list of models lacks the name; refused: the list, which
-    needs only a key, is refused. Neither is certain: some servers list what was downloaded, or examples, and a litellm
-    proxy without a database answers 400 to a wrong key.
-    """
-
-    problem: str = ""
-    unlisted: str = ""
-    refused: str = ""
-
-
-def check_server(entry: Entry, account: Account) -> ServerCheck:
-    """Check the key, the address, and the server's own list of models if it has one."""
-    from traps_pipeline.models.wire.httpx_transport import get
-
-    try:
-        check_network()
-        secret = account.secret()
-    except TrapsError as error:
-        return ServerCheck(str(error))
-    if account.base_url is None:
-        return ServerCheck()
-    headers = {"Authorization": f"Bearer {secret}"} if secret else {}
-    try:
-        answer = get(f"{account.base_url.rstrip('/')}/models", headers, REACH_S)
-    except TrapsError as error:
-        return ServerCheck(nobody_at(account.base_url, plain(str(error))))
-    if answer.status_code in (401, 403):
-        return ServerCheck(_wrong_key(account))
-    if answer.status_code == BAD_REQUEST and account.key:
-        list_problem = f"{account.base_url} refuses even its list of models (HTTP 400), which wants nothing but a key"
-        return ServerCheck(refused=f"{list_problem}: is the one in {account.key} right?")
-    served_names = [str(model["id"]) for model in _served_models(answer) if isinstance(model, dict) and "id" in model]
-    if served_names and model_name(entry) not in served_names:
-        name_problem = (
-            f"{account.base_url} serves no {model_name(entry)!r}; it lists {plain(', '.join(served_names[:8]))[:200]}"
-        )
-        return ServerCheck(unlisted=name_problem)
-    return ServerCheck()
-
-
-def nobody_at(address: str, why: str = "the cause stands above") -> str:
-    """Return the error message for an address at which no server listens."""
-    is_here = is_loopback(urlsplit(address).hostname or "")
-    remedy = "start the server there" if is_here else "look at this machine's network, proxy variables and NO_PROXY"
-    return f"nothing answers at {address} ({why}): {remedy}, or mend its `base_url`"
-
-
-def _wrong_key(account: Account) -> str:
-    location = f" at {account.base_url}" if account.base_url else ""
-    if account.key:
-        return f"the key in {account.key} is not accepted{location}: export the right one"
-    return f"a key is wanted{location}: name its variable as `key`"
-
-
-def _served_models(answer: Any) -> list[Any]:
-    if answer.status_code == 200:
-        with suppress(ValueError, AttributeError):
-            model_list = answer.json().get("data")
-            return model_list if isinstance(model_list, list) else []
-    return []
-
-
 def findings(
     entry: Entry, account: Account, outcomes: Mapping[str, Outcome], reached: ServerCheck | None = None
 ) -> LiveResult:
@@ -242,7 +173,7 @@ def _failure(entry: Entry, account: Account, name: str, error: str) -> str:
         case "unreachable" | "connection":
             return nobody_at(location)
         case "http_401" | "http_403":
-            return _wrong_key(account)
+            return wrong_key(account)
         case "http_403_denied":
             return f"{name}: {location} refuses the call (HTTP 403), and not for its key; what it said stands above"
         case "http_404":

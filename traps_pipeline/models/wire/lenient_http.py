@@ -35,40 +35,44 @@ class LenientConnector(aiohttp.TCPConnector):
 class LenientHandler(ResponseHandler):
     """Reads the answers of one connection, each with its head rewritten."""
 
+    is_asked = False  # whether a request was sent; what comes before is kept
+
     def set_response_params(self, **settings: Any) -> None:
         """Expect the answer to a request that was just sent."""
-        self._head: bytearray | None = bytearray()
+        self.is_asked, self._head = True, bytearray()
+        self._is_head, self._body = True, aiohttp.EMPTY_PAYLOAD
         self._left: int | None = None  # bytes of the body to come; None if chunks or the end of the connection say it
         super().set_response_params(**settings)
 
+    def feed_data(self, data: tuple[Any, aiohttp.StreamReader], size: int = 0) -> None:
+        """Hand on an answer, and remember the reader of its body."""
+        self._body = data[1]
+        super().feed_data(data, size)
+
     def data_received(self, data: bytes) -> None:
         """Hand on what belongs to the answer."""
-        if self._parser is None or not data:  # kept until a request is sent; or a call that goes on unpacking
-            super().data_received(data)
-            return
-        if self._head is not None:
+        if self.is_asked and data and self._is_head:
             self._head += data if self._head else data.lstrip(b"\r\n")
             end = _END.search(self._head, max(0, len(self._head) - len(data) - 3))  # what came before holds no end
             if end is None and len(self._head) < MAX_HEAD:
-                self._reschedule_timeout()
                 return
-            head = bytes(self._head[: end.end() if end else None])
-            data, self._left = rewrite_head(head)
-            super().data_received(data)
-            data = bytes(self._head[end.end() :]) if end else b""
-            is_interim = re.match(rb"HTTP/\d\.\d 1(?!01)", head) is not None
-            self._head = bytearray() if is_interim else None
-            if data and self._parser is not None:
+            head, data = bytes(self._head[: end and end.end()]), bytes(self._head[end.end() :]) if end else b""
+            self._is_head, self._head = re.match(rb"HTTP/\d\.\d 1(?!01)", head) is not None, bytearray()
+            rewritten, self._left = rewrite_head(head)
+            super().data_received(rewritten)
+            if data:
                 self.data_received(data)
             return
-        if self._left is not None:
-            if len(data) > self._left:  # nothing was asked for beside this answer
-                data, self._should_close = data[: self._left], True
+        if self.is_asked and data and self._left is not None:
+            if len(data) > self._left:
+                self.force_close()  # nothing was asked for beside this answer
+            data = data[: self._left]
             self._left -= len(data)
-        if data:
-            super().data_received(data)
-        if self._exception is not None and self._payload is not None and self._payload.exception() is None:
-            self._payload.set_exception(self._exception)  # wakes the reader of a body that breaks HTTP's rules
+            if not data:
+                return
+        super().data_received(data)
+        if (error := self.exception()) is not None and self._body.exception() is None:
+            self._body.set_exception(error)  # wakes the reader of a body that breaks HTTP's rules
 
 
 def rewrite_head(head: bytes) -> tuple[bytes, int | None]:
