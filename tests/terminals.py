@@ -82,10 +82,19 @@ def read_all(end: int, wait_s: float = 0.2) -> bytes:
 
 
 def run_in_terminal(
-    command: Sequence[str], columns: int, rows: int, folder: Path, environment: Mapping[str, str], limit_s: float = 600
+    command: Sequence[str],
+    columns: int,
+    rows: int,
+    folder: Path,
+    environment: Mapping[str, str],
+    limit_s: float = 600,
+    typed: Mapping[str, str] | None = None,
 ) -> tuple[int, Screen]:
-    """Run a command in a terminal of this size; return its exit code and what it showed."""
-    screen = Screen(columns)
+    """Run a command in a terminal of this size; return its exit code and what it showed.
+
+    typed: by a prompt, what a person types once it is shown.
+    """
+    screen, answers = Screen(columns), dict(typed or {})
     variables = {**environment, "TERM": "xterm-256color"}
     with terminal(columns, rows) as (ours, theirs):
         process = subprocess.Popen(
@@ -95,6 +104,8 @@ def run_in_terminal(
         while time.monotonic() < until:
             if select.select([ours], [], [], 0.2)[0]:
                 screen.feed(os.read(ours, 1 << 16))
+                for prompt in [prompt for prompt in answers if prompt in screen.text]:
+                    os.write(ours, answers.pop(prompt).encode())
             elif process.poll() is not None:
                 return process.returncode, screen
         process.kill()

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import datetime
+import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import pytest
 
-from tests.conftest import KEY
+from tests.build.network import ITEMS, experiment
+from tests.build.network import entry as network_entry
+from tests.conftest import KEY, Checkout
 from tests.providers.server import Provider
 from tests.providers.servers import closed_port
+from tests.terminals import run_in_terminal
 from traps_pipeline.base import progress
-from traps_pipeline.checks.live_check import LiveResult, check_live, findings, nobody_at
+from traps_pipeline.checks import live_check
+from traps_pipeline.checks.live_check import LiveResult, check_live, findings
+from traps_pipeline.checks.server_check import nobody_at
 from traps_pipeline.models.registry import entries as registry
 from traps_pipeline.models.registry.accounts import Account, Prices
 from traps_pipeline.models.registry.entries import PROTOCOL, Entry, ModelEntry
@@ -189,3 +195,69 @@ def test_a_judge_votes_rightly_on_plain_answers_or_is_named(check: Check, provid
     provider.configure(scripts={NAME: {"answer is: left": yes}})
     abstention, correctness = check(JudgeEntry).problems
     assert " abstention " in abstention and plain in abstention and " correctness " in correctness
+
+
+def test_what_was_not_answered_in_time_is_not_checked_and_no_model_that_drops_its_pictures_is_sound(
+    check: Check, provider: Provider, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    provider.configure(blind=[NAME])
+    (problem,) = check().problems
+    assert " blue" in problem
+    provider.configure(blind=[NAME], latency_s=1.5)
+    monkeypatch.setattr(live_check, "TIMEOUT_S", 0.5)
+    live, votes = check(), check(JudgeEntry)
+    assert (
+        live.unchecked
+        and live.line.startswith(f"not checked {NAME}")
+        and calls_of(live.notes)[:2] == ["clip", "no clip"]
+    )
+    assert votes.unchecked and "abstention" in votes.unchecked and "correctness" in votes.unchecked
+
+
+def test_a_clip_alone_that_is_late_or_one_call_too_many_leaves_the_model_unchecked(check: Check) -> None:
+    entry, account, seen = check().entry, Account(key=KEY), Outcome("answer", text="The answer is: red and blue.")
+    unseen = Outcome("answer", text="The answer is: green.")
+    for error in ("timeout", "rate_limited"):
+        late = Outcome("error", error=error)
+        assert findings(entry, account, {"clip": late, "no clip": seen}).unchecked
+        assert findings(entry, account, {"clip": unseen, "no clip": late}).unchecked
+        assert not findings(entry, account, {"clip": seen, "no clip": late}).unchecked
+    assert findings(entry, account, {"clip": unseen, "no clip": unseen}).problems
+
+
+def test_a_run_stops_at_a_model_that_is_not_checked_unless_it_is_told_to_go_on(
+    unasked: Checkout, provider: Provider, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(live_check, "TIMEOUT_S", 1.0)
+    provider.configure(latency_s=1.5)
+    path = experiment(unasked, provider, [network_entry(NAME, "images")], regimes=["standard"], budget_usd=50.0)
+    checked = unasked.traps("models", "check", path, "--live")
+    assert checked.code == 1 and f"not checked {NAME}" in checked.out
+    stopped = unasked.traps("run", path, "--until", "responses")
+    assert (stopped.code, stopped.raised) == (1, "checks.live_check.require_sound")
+    assert f"{NAME}: not checked" in stopped.err and "--unchecked" in stopped.err and not unasked.ledger_rows("answers")
+    unasked.traps("run", path, "--until", "responses", "--unchecked").ok()
+    assert len(unasked.ledger_rows("answers")) == ITEMS
+
+
+@pytest.mark.parametrize(("typed", "code"), [("n\n", 1), ("y\n", 0)])
+def test_a_run_in_a_terminal_asks_before_it_goes_on_unchecked(
+    unasked: Checkout, provider: Provider, typed: str, code: int
+) -> None:
+    provider.configure(latency_s=1.5)
+    path = experiment(unasked, provider, [network_entry(NAME, "images")], regimes=["standard"], budget_usd=50.0)
+    script = (
+        "from traps_pipeline.checks import live_check; live_check.TIMEOUT_S = 1.0; from traps_pipeline.cli import main"
+    )
+    command = [
+        sys.executable,
+        "-c",
+        f"import sys; {script}; sys.exit(main())",
+        "run",
+        str(path),
+        "--until",
+        "responses",
+    ]
+    ended, screen = run_in_terminal(command, 100, 40, unasked.root, unasked.environment, typed={"[y/N]": typed})
+    assert (ended, "[y/N]" in screen.text) == (code, True), screen.text
+    assert len(unasked.ledger_rows("answers")) == (0 if code else ITEMS)

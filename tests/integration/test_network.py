@@ -11,6 +11,7 @@ import time
 from collections import Counter
 from pathlib import Path
 
+import pyarrow.parquet as pq
 import pytest
 
 from tests.build.network import ITEMS, ask, entry, experiment, responses, settled
@@ -71,6 +72,29 @@ def test_a_fifth_of_all_calls_fails_and_every_item_ends_rightly_without_a_trace_
     assert len(written) > 100
     assert not [file for file in written if SECRET.encode() in file.read_bytes()]
     assert SECRET not in finished.out + finished.err
+
+
+def test_a_filter_in_unknown_words_is_settled_in_one_run_and_the_study_is_whole(
+    unasked: Checkout, provider: Provider
+) -> None:
+    path = experiment(unasked, provider, [entry("image-model", "images")], regimes=["standard"])
+    files = [*(unasked.workspace / "tables" / "items").rglob("*.parquet")]
+    questions = [{*row.values()} for file in files for row in pq.read_table(file, columns=["question"]).to_pylist()]
+    (filtered,) = questions[0]
+    n_filtered, n_cells = questions.count({filtered}), 2
+    provider.configure(filtered=[filtered])
+    unasked.traps("run", path, "--no-preflight", "--budget-usd", "50").ok()
+    rows = responses(unasked)
+    assert len(rows) == ITEMS and Counter((row["outcome"], row["error"]) for row in rows) == {
+        ("answer", None): ITEMS - n_filtered,
+        ("refused", "http_400"): n_filtered,
+    }
+    requests = provider.stats()["requests"]
+    assert ITEMS + n_filtered < requests <= ITEMS + n_filtered + n_cells  # each again, and a control in each such cell
+    unasked.traps("run", path, "--no-preflight").ok()
+    assert provider.stats()["requests"] == requests
+    (row,) = pq.read_table(next((unasked.workspace / "tables" / "leaderboard").rglob("*.parquet"))).to_pylist()[:1]
+    assert row["n_errors"] == 0
 
 
 @pytest.mark.promise

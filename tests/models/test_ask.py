@@ -19,7 +19,8 @@ from tests.build.ledger import local
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.asking import participants
 from traps_pipeline.models.asking.answers import answer_request
-from traps_pipeline.models.asking.ask import STOP_SIGNALS, run_work, settle
+from traps_pipeline.models.asking.ask import run_work, settle
+from traps_pipeline.models.asking.draining import STOP_SIGNALS
 from traps_pipeline.models.registry.accounts import Limits
 from traps_pipeline.models.registry.entries import get_model
 from traps_pipeline.models.request import Outcome, Request, TransientError
@@ -204,7 +205,9 @@ def test_a_stop_waits_for_the_calls_in_flight_and_goes_on_later(tmp_path: Path, 
 @pytest.mark.slow
 def test_what_ends_a_process_by_force_later_gets_a_grace_and_ctrl_c_none(tmp_path: Path) -> None:
     script = INTERRUPTED.replace("asyncio.sleep(0.3)", "asyncio.sleep(0.3 if Slow.asked < 6 else 60)")
-    script = script.replace("class Slow:", "ask.GRACE_S = 1.0\nclass Slow:")
+    script = script.replace(
+        "class Slow:", "from traps_pipeline.models.asking import draining\ndraining.GRACE_S = 1.0\nclass Slow:"
+    )
     run = interrupted(script, tmp_path)
     run.send_signal(signal.SIGTERM)
     out, err = run.communicate(timeout=180)
@@ -310,3 +313,60 @@ def test_a_variation_of_the_asking_changes_the_request_and_a_dataset_of_the_pair
     item = ITEM | {"item_id": "schema_abstain:s-1:control"}
     told = answer_request(workspace, silent, item, Evaluation("gemini-2.5-flash", "standard", 1))
     assert "response_format" not in told.params and told.system == abstain.system
+
+
+HTTP_400 = Outcome("error", error="http_400", cost_usd=0.0)
+
+
+def outcomes(rows: list[Any]) -> list[tuple[str, str | None]]:
+    return [(row["outcome"], row["error"]) for row in rows]
+
+
+def test_calls_refused_twice_while_their_model_answers_are_refusals_and_not_asked_again(tmp_path: Path) -> None:
+    backend = Answering(lambda wanted, _: HTTP_400 if wanted.about["item_id"] in ("item-3", "item-9") else LEFT)
+    first = ask(tmp_path, backend, TEN)
+    assert outcomes(first["rows"]) == [("refused", "http_400") if n in (3, 9) else ("answer", None) for n in range(10)]
+    assert first["tally"].errors == 0 and len(backend.calls) == 10 + 2 + 1  # both again, and one that was answered
+    second = ask(tmp_path, backend, TEN)
+    assert second["rows"] == first["rows"] and len(backend.calls) == 13 and kept(tmp_path).count("item-3") == 1
+
+
+@pytest.mark.parametrize(
+    ("says", "calls"),
+    [
+        (lambda *_: HTTP_400, 4),  # nothing is answered
+        (lambda wanted, call: HTTP_400 if wanted.about["item_id"] == "item-0" or call > 1 else LEFT, 6),  # nor now
+        (lambda wanted, _: replace(HTTP_400, error="http_402") if wanted.about["item_id"] == "item-0" else LEFT, 4),
+        (
+            lambda wanted, call: (
+                replace(HTTP_400, error=f"http_{421 + call}") if wanted.about["item_id"] == "item-0" else LEFT
+            ),
+            5,
+        ),
+    ],
+    ids=["all", "until the control", "credit", "another error"],
+)
+def test_a_failure_that_may_be_the_accounts_stays_a_failure(tmp_path: Path, says: Any, calls: int) -> None:
+    backend = Answering(says)
+    finished = ask(tmp_path, backend, TEN[:4])
+    assert finished["rows"][0]["outcome"] == "error" and finished["tally"].errors >= 1
+    assert len(backend.calls) == calls
+
+
+def test_a_call_that_is_answered_the_second_time_is_an_answer(tmp_path: Path) -> None:
+    backend = Answering(lambda wanted, call: HTTP_400 if wanted.about["item_id"] == "item-0" and call == 1 else LEFT)
+    finished = ask(tmp_path, backend, TEN[:4])
+    assert outcomes(finished["rows"]) == [("answer", None)] * 4 and len(backend.calls) == 5
+
+
+def test_calls_of_another_form_prove_nothing(tmp_path: Path) -> None:
+    wanted = [request(0, params={"schema": True}), *TEN[1:4]]
+    finished = ask(tmp_path, Answering(lambda one, _: HTTP_400 if one.params else LEFT), wanted)
+    assert outcomes(finished["rows"])[0] == ("error", "http_400")
+
+
+def test_many_refusals_in_a_row_at_their_second_asking_stop_no_model(tmp_path: Path) -> None:
+    wanted = [request(n) for n in range(60)]
+    backend = Answering(lambda one, _: HTTP_400 if int(str(one.about["item_id"])[5:]) % 2 else LEFT)
+    finished = ask(tmp_path, backend, wanted)
+    assert sum(row["outcome"] == "refused" for row in finished["rows"]) == 30 and len(backend.calls) == 60 + 30 + 1

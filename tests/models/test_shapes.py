@@ -69,11 +69,9 @@ ODD = {
     "message-null": body(choices=[CHOICE | {"message": None}]),
     "content-number": message(content=5),
     "content-list": message(content=["left"]),
-    "body-list": f"[{body()}]",
     "body-empty": "",
     "cut": body()[:90],
     "two-bodies": body() + body(),
-    "event-stream": f"data: {body()}\n\ndata: [DONE]\n\n",
     "page": "<!doctype html><h1>It works</h1>",
     "no-utf8": "\udcff\udcfe" + body(),
     "deep": "[" * 100_000,
@@ -82,9 +80,54 @@ ODD = {
     "error-in-choice": body(choices=[CHOICE | {"error": {"message": "upstream failed", "code": 502}}]),
     "cost-by-name": body(usage={"cost_usd": -1000}),
 }
-STATUSES = {f"status-{status}": status for status in (500, 502, 504, 520, 522, 524, 599, 408, 302, 307, 204)}
+STATUSES = {f"status-{status}": status for status in (500, 502, 504, 520, 522, 524, 599, 408, 204)}
 UNBILLED = {f"status-{status}": status for status in (400, 401, 403, 404, 409, 422, 429, 503)}
+REDIRECTS = {f"status-{status}": status for status in (301, 302, 304, 307)}
 EXPLAINED = {f"explained-{status}": status for status in (500, 502, 520)}  # with an error object of the provider's
+USED_UP = {"message": "You exceeded your current quota", "type": "insufficient_quota", "code": "insufficient_quota"}
+MINIMAX = {"choices": None, "usage": {"total_tokens": 0}}
+ANSWERS = {  # by status and body, what a provider's own way to fail becomes, and how often it is asked
+    "minimax limit": (
+        200,
+        MINIMAX | {"base_resp": {"status_code": 1002, "status_msg": "rate limit"}},
+        "rate_limited",
+        2,
+    ),
+    "minimax credit": (200, MINIMAX | {"base_resp": {"status_code": 1008, "status_msg": "balance"}}, "http_402", 1),
+    "minimax filter": (200, MINIMAX | {"base_resp": {"status_code": 1026, "status_msg": "x"}}, "content_policy", 1),
+    "openai quota": (429, {"error": USED_UP}, "http_402", 1),
+    "moonshot quota": (429, {"error": {"type": "exceeded_current_quota_error", "message": "x"}}, "http_402", 1),
+    "zhipu arrears": (429, {"error": {"code": "1113", "message": "x"}}, "http_402", 1),
+    "dashscope quota a minute": (
+        429,
+        {"error": USED_UP | {"message": "You exceeded your current quota: https://help/error-code#token-limit"}},
+        "rate_limited",
+        2,
+    ),
+    "dashscope arrears": (400, {"code": "Arrearage", "message": "x", "request_id": "r"}, "http_402", 1),
+    "dashscope filter": (400, {"error": {"code": "data_inspection_failed", "message": "x"}}, "content_policy", 1),
+    "deepseek filter": (
+        400,
+        {"error": {"code": "invalid_request_error", "message": "Content Exists Risk"}},
+        "content_policy",
+        1,
+    ),
+    "deepseek filter, older": (400, {"detail": "Content Exists Risk"}, "content_policy", 1),
+    "zhipu filter": (400, {"error": {"code": "1301", "message": "x"}}, "content_policy", 1),
+    "mistral": (200, {"object": "error", "message": "slow", "type": "rate_limit_error"}, "rate_limited", 2),
+    "baidu": (200, {"error_code": 429, "error_msg": "slow"}, "rate_limited", 2),
+    "cloudflare": (200, {"success": False, "errors": [{"code": 429, "message": "slow"}]}, "rate_limited", 2),
+    "stream of one error": (200, [{"error": {"code": 429, "message": "slow"}}], "rate_limited", 2),
+}
+NO_ERRORS: list[dict[str, Any]] = [
+    {"error": {"code": 0, "message": ""}},
+    {"error": {"code": "0", "message": "success"}},
+    {"error": {}},
+    {"error": {"code": None, "message": None}},
+    {"base_resp": {"status_code": 0, "status_msg": ""}},
+    {"code": 0, "message": "Success"},
+    {"errors": []},
+]
 REFUSED_IN_200 = {  # by what a provider says in a 200, and what it amounts to
     "number": ({"code": 429, "message": "slow down"}, "rate_limited"),
     "word": ({"code": "rate_limit_exceeded", "message": "slow down"}, "rate_limited"),
@@ -103,9 +146,9 @@ def odd(shared_provider: Provider, monkeypatch: pytest.MonkeyPatch) -> Provider:
     """The server with every odd shape, each the only answer of a model of its own; it keeps its own bill."""
     monkeypatch.setenv(KEY, SECRET)
     raw: dict[str, Any] = {name: {"content": content} for name, content in ODD.items()}
-    raw["event-stream"]["type"] = "text/event-stream"
     raw["in-200-flat"] = {"content": json.dumps(FLAT_IN_200), "billed": False}
     raw |= {name: {"content": body(), "status": status} for name, status in (STATUSES | UNBILLED).items()}
+    raw |= {name: {"content": body(), "status": status, "billed": False} for name, status in REDIRECTS.items()}
     explained = {"content": FAILED, "billed": False}
     raw |= {name: explained | {"status": status} for name, status in EXPLAINED.items()}
     for name, (error, _) in REFUSED_IN_200.items():
@@ -143,7 +186,7 @@ def test_what_a_provider_bills_for_an_odd_answer_is_booked(odd: Provider, shape:
     assert outcome.text in (None, ANSWER)
 
 
-@pytest.mark.parametrize("shape", [*UNBILLED, *EXPLAINED])
+@pytest.mark.parametrize("shape", [*UNBILLED, *REDIRECTS, *EXPLAINED])
 def test_a_call_that_a_provider_did_not_take_or_reports_as_failed_costs_nothing(odd: Provider, shape: str) -> None:
     outcome, booked_usd = booked_for(odd, shape)
     assert outcome and booked_usd == odd.stats()["billed_usd"] == 0.0
@@ -165,6 +208,40 @@ def test_an_error_object_that_is_the_whole_body_is_no_answer_out_of_order(odd: P
     odd.configure(raw_by_model=beside)
     outcome, _ = booked_for(odd, "good")
     assert outcome and outcome.text == ANSWER
+
+
+@pytest.mark.parametrize("name", ANSWERS)
+def test_an_error_is_found_wherever_its_provider_puts_it_and_costs_nothing(odd: Provider, name: str) -> None:
+    status, content, error, requests = ANSWERS[name]
+    odd.configure(raw_by_model={"m": {"content": json.dumps(content), "status": status, "billed": False}})
+    outcome, booked_usd = booked_for(odd, "m")
+    assert outcome and outcome.error == error and booked_usd == 0.0
+    assert outcome.kind == ("refused" if error == "content_policy" else "error")
+    assert odd.stats()["requests"] == requests
+
+
+@pytest.mark.parametrize("beside", NO_ERRORS, ids=str)
+def test_an_error_object_that_reports_none_beside_an_answer_is_no_failure(
+    odd: Provider, beside: dict[str, Any]
+) -> None:
+    odd.configure(raw_by_model={"m": {"content": body(**beside)}})
+    outcome, booked_usd = booked_for(odd, "m")
+    assert outcome and outcome.text == ANSWER and booked_usd == pytest.approx(20e-6 + 21e-5)
+
+
+@pytest.mark.parametrize(
+    "choice",
+    [
+        {"finish_reason": "content_filter", "message": {"content": None}},
+        {"finish_reason": "stop", "message": {"content": None, "refusal": "No, I cannot help with that."}},
+        {"finish_reason": "stop", "message": {"content": ""}},
+    ],
+)
+def test_a_refusal_before_any_token_costs_its_prompt(odd: Provider, choice: dict[str, Any]) -> None:
+    counts = {"prompt_tokens": 900, "completion_tokens": 0, "total_tokens": 900}
+    for said in (counts, {name: value for name, value in counts.items() if name != "completion_tokens"}):
+        odd.configure(raw_by_model={"m": {"content": body(choices=[CHOICE | choice], usage=said)}})
+        assert booked_for(odd, "m")[1] == pytest.approx(900e-6)
 
 
 def test_an_answer_is_paid_as_its_usage_says(odd: Provider) -> None:
@@ -251,10 +328,28 @@ def test_three_answers_out_of_order_in_a_row_stop_a_model_and_are_kept_aside(odd
     odd.configure(raw_by_model={"m": {"content": f"\x1b[2J<h1>{SECRET}</h1>" + "x" * 9000}})
     with raises(TrapsError, "models.asking.ask._raise_together", "3 "):
         list(work(odd, entry_of("m", concurrency=1), 100.0, 20, tmp_path))
-    assert odd.stats()["requests"] == 6
+    assert odd.stats()["requests"] == 4  # the third in a row is not worth a second try, nor is any later one
     raws = [beside["raw"] for _, beside in local(tmp_path).rows("m__standard__run1")]
     assert raws == ["\x1b[2J<h1>***</h1>" + "x" * (4000 - 16)] * 3
     assert SECRET not in "".join(path.read_bytes().decode("latin-1") for path in tmp_path.rglob("*") if path.is_file())
+
+
+def test_a_redirect_costs_nothing_and_stops_the_model_after_the_first(odd: Provider, tmp_path: Path) -> None:
+    headers = {"Location": "https://elsewhere.invalid/v1"}
+    odd.configure(raw_by_model={"m": {"content": "", "status": 308, "headers": headers, "billed": False}})
+    with raises(TrapsError, "models.asking.ask._raise_together", "http_308", "`base_url`"):
+        list(work(odd, entry_of("m", concurrency=1), 1.0, 20, tmp_path))
+    assert odd.stats()["requests"] == 1
+    assert [row["cost_usd"] for row, _ in local(tmp_path).rows("m__standard__run1")] in ([0.0], [None])
+
+
+def test_whole_answers_that_nobody_can_read_cost_no_more_than_the_calls_in_flight(
+    odd: Provider, tmp_path: Path
+) -> None:
+    odd.configure(raw_by_model={"m": {"content": "no JSON"}})
+    with raises(TrapsError, "models.asking.ask._raise_together"):
+        list(work(odd, entry_of("m", concurrency=24), 100.0, 200, tmp_path))
+    assert odd.stats()["requests"] <= 24 + 2
 
 
 def test_the_cap_holds_against_fuzzed_answers(odd: Provider) -> None:
@@ -288,7 +383,7 @@ def test_keys_do_not_follow_a_redirect_to_another_host(odd: Provider) -> None:
             headers = {"Location": f"{foreign.url}/v1/chat/completions"}
             odd.configure(raw_by_model={"m": {"content": "", "status": status, "headers": headers}})
             outcome, booked_usd = booked_for(odd, "m")
-            assert outcome and (outcome.kind, outcome.error) == ("error", f"http_{status}") and booked_usd > 0
+            assert outcome and (outcome.kind, outcome.error) == ("error", f"http_{status}") and booked_usd == 0
         assert foreign.stats()["requests"] == 0
 
 

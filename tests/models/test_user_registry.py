@@ -148,3 +148,44 @@ def test_an_address_of_a_parameter_would_take_the_key_elsewhere(tmp_path: Path) 
         text = MINE.replace("media: images", f"media: images\n    params: {{{name}: 'http://elsewhere.invalid/v1'}}")
         with raises(TrapsError, "base.yamlfile.parse_yaml_model", name):
             load_experiment(written(tmp_path, text))
+
+
+@pytest.mark.parametrize("name", ["4.10", "4", "true", "null", "''", "[m]"])
+def test_a_served_name_that_yaml_reads_as_something_else_is_refused_and_kept_in_quotes(
+    tmp_path: Path, name: str
+) -> None:
+    with raises(TrapsError, "", "mine.yaml", "served_name", "my-model"):
+        load_experiment(written(tmp_path, MINE.replace("org/Model-7B", name)))
+    quoted = name.strip("'") or "m"
+    load_experiment(written(tmp_path, MINE.replace("org/Model-7B", f'"{quoted}"')))
+    assert get_model("my-model").provider_id == f"openai/{quoted}"
+
+
+def test_an_address_that_is_none_is_refused_lest_the_key_go_to_the_librarys_own(tmp_path: Path) -> None:
+    for address in ("null", "true", "''"):
+        with raises(TrapsError, "", "mine.yaml", "base_url", "my-model"):
+            load_experiment(written(tmp_path, MINE.replace("http://127.0.0.1:8000/v1", address)))
+
+
+@pytest.mark.parametrize(
+    "params",
+    [
+        *("n: 4", "N: 1", "best_of: 2", "candidateCount: 2", "num_return_sequences: 2", "stream: true"),
+        *("stream_options: {include_usage: true}", "model: other", "models: [a, b]", "messages: []", "system: x"),
+        *("input: x", "contents: []", "systemInstruction: x", "generationConfig: {temperature: 0}", "tools: []"),
+        *("tool_choice: none", "response_format: {type: text}", "guided_json: {}", "max_output_tokens: 9"),
+        *("max_new_tokens: 9", "num_retries: 3", "timeout: 5", "mock_response: left", "fallbacks: [x]"),
+        *("extra_body: {n: 4}", "extra_body: {options: {num_predict: 9}}", "extra_body: {temperature: 0}"),
+        *("parameters: {top_p: 1}", "allowed_openai_params: [n]", "enable_search: true"),
+    ],
+)
+def test_a_parameter_that_the_protocol_owns_is_refused_by_its_name(tmp_path: Path, params: str) -> None:
+    text = MINE.replace("media: images", f"media: images\n    params: {{{params}}}")
+    with raises(TrapsError, "base.yamlfile.parse_yaml_model", "mine.yaml", f"params.{params.partition(':')[0]}"):
+        load_experiment(written(tmp_path, text))
+
+
+def test_parameters_of_a_server_that_change_no_protocol_are_sent(tmp_path: Path) -> None:
+    params = "seed: 1, top_k: 20, logprobs: true, extra_body: {chat_template_kwargs: {thinking: false}}"
+    load_experiment(written(tmp_path, MINE.replace("media: images", f"media: images\n    params: {{{params}}}")))
+    assert get_model("my-model").params["extra_body"] == {"chat_template_kwargs": {"thinking": False}}

@@ -94,7 +94,8 @@ class Config:
     served_suffix goes behind the model's name, as real ones answer with a date.
     blind: models that leave images and videos out, as a server of text models may; the others name the colours of a
     clip that they are asked for. served: what the list of models holds, which comes with list_status. unstructured:
-    models that refuse what asks for structured output.
+    models that refuse what asks for structured output. filtered: phrases; a request that holds one is refused in words
+    that no list of content filters has.
     """
 
     latency_s: float = 0.0
@@ -112,6 +113,7 @@ class Config:
     served: Sequence[str] | None = None
     list_status: int = 200
     unstructured: Sequence[str] = ()
+    filtered: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         unknown = ({*self.faults} | {*self.fault_by_model.values()}) - {*FAULTS, None}
@@ -582,6 +584,8 @@ def reply_to(question: Question, fault: str | None, config: Config) -> Reply:
         refused = (400 <= status < 500 and status != 408) or status == 503 or not raw.get("billed", True)
         kind, headers = raw.get("type", "application/json"), raw.get("headers", {})
         return Reply(status, content, kind, headers, config.latency_s, tokens=(0, 0) if refused else most)
+    if any(phrase in question.text for phrase in config.filtered):
+        return json_reply({"error": {"message": "Not at this table, please.", "type": "house_rule", "code": "h7"}}, 400)
     if question.structured and question.model in config.unstructured:
         return json_reply(error_body(question.api, FAILURES["bad_request"]), 400)
     if fault in FAILURES:

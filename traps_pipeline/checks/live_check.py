@@ -9,20 +9,18 @@ from __future__ import annotations
 
 import asyncio
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache
 from typing import Any
-from urllib.parse import urlsplit
 
 import numpy as np
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.network import check_network, is_loopback
 from traps_pipeline.base.redaction import redact
 from traps_pipeline.base.terminal import plain
+from traps_pipeline.checks.server_check import BAD_REQUEST, ServerCheck, check_server, nobody_at, wrong_key
 from traps_pipeline.checks.wire_check import SyntheticClip, model_name, question
 from traps_pipeline.judging.panel import parse_vote, vote_request
 from traps_pipeline.models.asking.ask import Call, SettledCell, collect
@@ -47,11 +45,11 @@ from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.workspace import Workspace
 
 CELL = Cell("occlusion", Evaluation("preflight", "standard", 1))  # a name in the ledger, not a model
-TIMEOUT_S, REACH_S = 25.0, 5.0  # time-outs of a call and of earlier checks
-BAD_REQUEST = 400
+TIMEOUT_S = 25.0  # of a call
 COLOURS = {"red": (200, 30, 30), "blue": (30, 30, 200)}
 QUESTION = "The whole picture has one colour and then another: which two colours does the clip show?"
 _FPS, _SIZE, _FRAMES = 10, (120, 160), 50
+_LATE = "timeout"  # the error of a call that may yet be answered
 _NO_SCHEMA = "say `json_schema: false` and `waivers: {json_schema: WHY}`"
 _JUDGED = (("I don't know.", True, False), ("The ball rolls down the ramp. The answer is: left.", False, True))
 _ITEM: Mapping[str, Any] = {
@@ -66,17 +64,22 @@ _ITEM: Mapping[str, Any] = {
 
 @dataclass(frozen=True)
 class LiveResult:
-    """An entry's result: problems, which make its answers worthless, and notes."""
+    """An entry's result: problems, which make its answers worthless, and notes.
+
+    unchecked: what no answer came in time for, so that nothing is known; empty if all that matters was checked.
+    """
 
     entry: Entry
     problems: Sequence[str]
     notes: Sequence[str] = ()
+    unchecked: str = ""
 
     @property
     def line(self) -> str:
         """The result as text, with one line per finding."""
         lines = [*(f"FAIL {problem}" for problem in self.problems), *(f"note {note}" for note in self.notes)]
-        head = f"{'FAIL' if self.problems else 'ok  '} {self.entry.id}"
+        lines += [self.unchecked] if self.unchecked else []
+        head = f"{'FAIL' if self.problems else 'not checked' if self.unchecked else 'ok  '} {self.entry.id}"
         return redact("\n".join([head, *(f"     {line}" for line in lines)]))
 
 
@@ -112,72 +115,6 @@ def requests_of(entry: Entry) -> dict[str, Request]:
 # --- what is wrong ----------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class ServerCheck:
-    """Findings before any call.
-
-    problem: why asking is useless; unlisted: the server's own list of models lacks the name; refused: the list, which
-    needs only a key, is refused. Neither is certain: some servers list what was downloaded, or examples, and a litellm
-    proxy without a database answers 400 to a wrong key.
-    """
-
-    problem: str = ""
-    unlisted: str = ""
-    refused: str = ""
-
-
-def check_server(entry: Entry, account: Account) -> ServerCheck:
-    """Check the key, the address, and the server's own list of models if it has one."""
-    from traps_pipeline.models.wire.httpx_transport import get
-
-    try:
-        check_network()
-        secret = account.secret()
-    except TrapsError as error:
-        return ServerCheck(str(error))
-    if account.base_url is None:
-        return ServerCheck()
-    headers = {"Authorization": f"Bearer {secret}"} if secret else {}
-    try:
-        answer = get(f"{account.base_url.rstrip('/')}/models", headers, REACH_S)
-    except TrapsError as error:
-        return ServerCheck(nobody_at(account.base_url, plain(str(error))))
-    if answer.status_code in (401, 403):
-        return ServerCheck(_wrong_key(account))
-    if answer.status_code == BAD_REQUEST and account.key:
-        list_problem = f"{account.base_url} refuses even its list of models (HTTP 400), which wants nothing but a key"
-        return ServerCheck(refused=f"{list_problem}: is the one in {account.key} right?")
-    served_names = [str(model["id"]) for model in _served_models(answer) if isinstance(model, dict) and "id" in model]
-    if served_names and model_name(entry) not in served_names:
-        name_problem = (
-            f"{account.base_url} serves no {model_name(entry)!r}; it lists {plain(', '.join(served_names[:8]))[:200]}"
-        )
-        return ServerCheck(unlisted=name_problem)
-    return ServerCheck()
-
-
-def nobody_at(address: str, why: str = "the cause stands above") -> str:
-    """Return the error message for an address at which no server listens."""
-    is_here = is_loopback(urlsplit(address).hostname or "")
-    remedy = "start the server there" if is_here else "look at this machine's network, proxy variables and NO_PROXY"
-    return f"nothing answers at {address} ({why}): {remedy}, or mend its `base_url`"
-
-
-def _wrong_key(account: Account) -> str:
-    location = f" at {account.base_url}" if account.base_url else ""
-    if account.key:
-        return f"the key in {account.key} is not accepted{location}: export the right one"
-    return f"a key is wanted{location}: name its variable as `key`"
-
-
-def _served_models(answer: Any) -> list[Any]:
-    if answer.status_code == 200:
-        with suppress(ValueError, AttributeError):
-            model_list = answer.json().get("data")
-            return model_list if isinstance(model_list, list) else []
-    return []
-
-
 def findings(
     entry: Entry, account: Account, outcomes: Mapping[str, Outcome], reached: ServerCheck | None = None
 ) -> LiveResult:
@@ -200,7 +137,7 @@ def findings(
             if outcome.error == RATE_LIMITED and any(response.kind in WITH_TEXT for response in outcomes.values()):
                 notes.append(f"{name}: refused as one call too many; a run waits and asks again")
             else:
-                (notes if outcome.error == "timeout" else problems).append(sentence)
+                (notes if outcome.error == _LATE else problems).append(sentence)
         elif outcome.kind == "malformed":
             form_error = None if outcome.error == MALFORMED else outcome.error
             problems.append(f"{name}: {form_error or 'its answer has no shape of its API; what it is stands above'}")
@@ -215,7 +152,20 @@ def findings(
         problems += [*_wrong_answers(entry, outcomes), *_clip_problems(entry, outcomes, notes)]
     if entry.prices is None:
         notes.append("its price is unknown: no budget bounds it, and a run needs --allow-unknown-prices")
-    return LiveResult(entry, list(dict.fromkeys(problems)), notes)
+    return LiveResult(entry, list(dict.fromkeys(problems)), notes, "" if problems else _unchecked(entry, outcomes))
+
+
+def _unchecked(entry: Entry, outcomes: Mapping[str, Outcome]) -> str:
+    """Return what is not known of an entry without the calls that were not answered in time; empty if all is."""
+    late = {name for name, outcome in outcomes.items() if outcome.error in (_LATE, RATE_LIMITED)}
+    needed = {"whether it sees the clip": {"clip"}}
+    if isinstance(entry, JudgeEntry):
+        tasks = {name.rpartition(" ")[0] for name in outcomes}
+        needed = {f"its vote on {task}": {name for name in outcomes if name.startswith(task)} for task in tasks}
+    elif "no clip" in late and not _names_colours(outcomes["clip"]):
+        needed = {"whether it sees the clip": {"no clip"}}
+    unknown = [subject for subject, names in needed.items() if names and names <= late]
+    return f"not checked: {' and '.join(unknown)}, since no answer came in time" if unknown else ""
 
 
 def _failure(entry: Entry, account: Account, name: str, error: str) -> str:
@@ -224,7 +174,7 @@ def _failure(entry: Entry, account: Account, name: str, error: str) -> str:
         case "unreachable" | "connection":
             return nobody_at(location)
         case "http_401" | "http_403":
-            return _wrong_key(account)
+            return wrong_key(account)
         case "http_403_denied":
             return f"{name}: {location} refuses the call (HTTP 403), and not for its key; what it said stands above"
         case "http_404":
@@ -288,12 +238,16 @@ def _wrong_answers(entry: ModelEntry, outcomes: Mapping[str, Outcome]) -> list[s
     return messages
 
 
+def _names_colours(outcome: Outcome) -> bool:
+    return all(re.search(rf"\b{colour}\b", (outcome.text or "").lower()) for colour in COLOURS)
+
+
 def _clip_problems(entry: ModelEntry, outcomes: Mapping[str, Outcome], notes: list[str]) -> list[str]:
     """Return whether the clip arrives, from the answer's colours or counted tokens."""
     clip, blank = outcomes.get("clip"), outcomes.get("no clip")
     if clip is None or blank is None or clip.kind not in WITH_TEXT:
         return []
-    names_both_colours = all(re.search(rf"\b{colour}\b", (clip.text or "").lower()) for colour in COLOURS)
+    names_both_colours = _names_colours(clip)
     frame_count = None
     if clip.prompt_tokens is not None and blank.prompt_tokens is not None:
         frame_count = clip.prompt_tokens - blank.prompt_tokens
@@ -302,9 +256,9 @@ def _clip_problems(entry: ModelEntry, outcomes: Mapping[str, Outcome], notes: li
             f"it does not see the clip: {clip.prompt_tokens} prompt tokens with it and {blank.prompt_tokens} without; "
             f"is this a model that sees, and is `{entry.media.profile if entry.media else ''}` what its server takes?"
         ]
-    if not names_both_colours and frame_count is None:
+    if not names_both_colours and frame_count is None and blank.error not in (_LATE, RATE_LIMITED):
         return ["it does not see the clip: it names no colour of one that is red and then blue, nor counts its tokens"]
-    if not names_both_colours:
+    if not names_both_colours and frame_count is not None:
         notes.append(f"it counts {frame_count} tokens for the clip, and does not name its colours (red, then blue)")
     return []
 
@@ -385,9 +339,17 @@ def _outcome(row: Row) -> Outcome:
     return Outcome(row["outcome"], **{name: row.get(name) for name in names})
 
 
-def require_sound(results: Sequence[LiveResult]) -> None:
-    """Raise TrapsError naming all problems of all entries, if there are any."""
+def require_sound(results: Sequence[LiveResult], goes_on: Callable[[str], bool]) -> None:
+    """Raise TrapsError naming all problems of all entries, or what was not checked.
+
+    goes_on: returns whether to run without knowing what a sentence says was not checked.
+    """
     messages = [f"{result.entry.id}: {problem}" for result in results for problem in result.problems]
+    advice = "nothing was rendered and nothing was judged; --no-preflight runs all the same"
+    if not messages:
+        messages = [f"{result.entry.id}: {result.unchecked}" for result in results if result.unchecked]
+        advice = "nothing was rendered and nothing was judged; --unchecked runs all the same"
+        if messages and goes_on("\n".join(messages)):
+            return
     if messages:
-        advice = "nothing was rendered and nothing was judged; --no-preflight runs all the same"
         raise TrapsError("\n".join([*messages, advice]))

@@ -99,7 +99,7 @@ def _check_live(names: list[str], *, is_json: bool) -> int:
         print_json(checks)
     for entry_check in () if is_json else checks:
         print(entry_check.line, flush=True)
-    return FAILED if any(entry_check.problems for entry_check in checks) else OK
+    return FAILED if any(entry_check.problems or entry_check.unchecked for entry_check in checks) else OK
 
 
 def test_panel(arguments: argparse.Namespace) -> int:

@@ -61,6 +61,11 @@ def add(commands: Commands) -> None:
         "--no-preflight", action="store_true", help="ask at once, without first trying every model and judge"
     )
     parser.add_argument(
+        "--unchecked",
+        action="store_true",
+        help="go on with what did not answer in time to be checked (default: ask on a terminal, else stop)",
+    )
+    parser.add_argument(
         "--until", metavar="STAGES", help="make only these stages (separated by commas) and the stages they need"
     )
     parser.add_argument(
@@ -111,6 +116,7 @@ def run(arguments: argparse.Namespace) -> int:
             experiment,
             until=arguments.until,
             preflight=None if arguments.no_preflight else progress.tell,
+            goes_on=partial(_goes_on, arguments),
             look_at_machine=not arguments.cluster,  # on a cluster, each host checks itself
             open_runs=partial(_open_runs, arguments),
         )
@@ -144,6 +150,14 @@ def run(arguments: argparse.Namespace) -> int:
     hint = "open one of them; traps why ITEM examines an item's answers; traps site writes a folder to send"
     print(wrap_text(f"next: {hint}"))
     return OK
+
+
+def _goes_on(arguments: argparse.Namespace, unchecked: str) -> bool:
+    """Return whether to go on without knowing what a sentence says was not checked."""
+    if arguments.unchecked or not (sys.stdin.isatty() and sys.stderr.isatty()):
+        return arguments.unchecked
+    print(f"{unchecked}\ngo on all the same? [y/N] ", end="", file=sys.stderr, flush=True)
+    return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
 def _print_work(report: RunReport, *, is_inside: bool) -> None:

@@ -28,14 +28,16 @@ def run_experiment(
     *,
     until: str | None,
     preflight: Callable[[str], None] | None,
+    goes_on: Callable[[str], bool],
     look_at_machine: bool,
     open_runs: OpenRuns,
 ) -> RunReport:
     """Materialize missing or stale partitions, reporting to `progress.current()`.
 
     until: comma-separated stages; only these and their upstream are materialized. preflight: receives a line about each
-    model and judge, which are tried first unless it is None. open_runs: opens the executor of runs; called, like
-    Dagster's history, only if there is something to materialize. Raises TrapsError if a run cannot begin.
+    model and judge, which are tried first unless it is None. goes_on: see `require_sound`. open_runs: opens the
+    executor of runs; called, like Dagster's history, only if there is something to materialize. Raises TrapsError if a
+    run cannot begin.
     """
     plan = RunPlan(workspace, experiment.name, stages_until(until))
     plan.require_work(until)
@@ -53,7 +55,7 @@ def run_experiment(
         if look_at_machine:
             require_machine(plan)
         if preflight is not None:
-            _preflight(workspace, entries, preflight)
+            _preflight(workspace, entries, preflight, goes_on)
         with open_runs(instance, workspace) as runs:
             report = materialize_stale(instance, runs, plan)
     if not report.problems:
@@ -61,7 +63,9 @@ def run_experiment(
     return report
 
 
-def _preflight(workspace: Workspace, entries: Sequence[Entry], say: Callable[[str], None]) -> None:
+def _preflight(
+    workspace: Workspace, entries: Sequence[Entry], say: Callable[[str], None], goes_on: Callable[[str], bool]
+) -> None:
     """Try networked models and judges first. Raises TrapsError with all problems."""
     network = [entry for entry in entries if entry.backend == NETWORK]
     if not network:
@@ -74,4 +78,4 @@ def _preflight(workspace: Workspace, entries: Sequence[Entry], say: Callable[[st
     for check in checks:
         if not check.problems:  # they are raised instead
             say(check.line)
-    require_sound(checks)
+    require_sound(checks, goes_on)

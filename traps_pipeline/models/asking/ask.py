@@ -7,12 +7,9 @@ correction are the same operation (docs/models.md, "Ledger").
 from __future__ import annotations
 
 import asyncio
-import os
-import signal
-import threading
 from collections import Counter, deque
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -22,19 +19,16 @@ from traps_pipeline.base.progress import Tally
 from traps_pipeline.ledger.ledger import SYNC_S, Ledger, LockGivenUp, Writer
 from traps_pipeline.ledger.rows import settles
 from traps_pipeline.models.asking.backends import make_backend
+from traps_pipeline.models.asking.draining import drain_on_interrupt
 from traps_pipeline.models.asking.participants import CallContext, Participant, Participants, Row, attempt, ledger_row
+from traps_pipeline.models.asking.refusals import CONTROL, RefusedCalls, control_outcome, refusal, refused_calls
 from traps_pipeline.models.money.budget import Budget, BudgetReached
 from traps_pipeline.models.money.spending import open_budget, share_accounts
 from traps_pipeline.models.registry.entries import Entry
-from traps_pipeline.models.request import Backend, Request
+from traps_pipeline.models.request import Backend, Outcome, Request
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
-
-STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-GRACE_S = 30.0  # grace period of calls in flight after SIGTERM or SIGHUP
-END_S = 1.5  # grace period after the second signal
-INTERRUPTED = 130  # the exit code of a stopped run
 
 
 @dataclass(frozen=True)
@@ -112,12 +106,16 @@ def collect(
 
 @dataclass
 class _Asking:
-    """Workers over the missing requests of one evaluation."""
+    """Workers over the missing requests of one evaluation.
+
+    again: what to record of a call that is repeated to tell refusals from failures; nothing stops its model.
+    """
 
     work: Work[Any, Any, Any]
     writer: Writer
     missing: Sequence[Request]
     stop: asyncio.Event
+    again: Callable[[Outcome], Outcome] | None = None
     rows: dict[str, Row] = field(default_factory=dict)
     problems: list[Exception] = field(default_factory=list)
 
@@ -137,12 +135,18 @@ class _Asking:
         attempt_result = await attempt(participant, request, context)
         if attempt_result is None:
             return False
-        row, side_texts = ledger_row(request, *attempt_result, self.work.epoch)
-        await self.writer.write(row, side_texts, [reservation.id for reservation in context.paid_by])
-        self.rows[request.key] = _Held(row)
+        outcome = attempt_result[0] if self.again is None else self.again(attempt_result[0])
+        row = await self.write(request, outcome, *attempt_result[1:], [each.id for each in context.paid_by])
         progress.current().called(name, not settles(row), row["latency_s"], row["cost_usd"] or 0.0)
-        participant.breaker.watch(attempt_result[0])
+        if self.again is None:
+            participant.breaker.watch(outcome)
         return True
+
+    async def write(self, request: Request, outcome: Outcome, attempts: int, seconds: float, paid_by: list[str]) -> Row:
+        row, side_texts = ledger_row(request, outcome, attempts, seconds, self.work.epoch)
+        await self.writer.write(row, side_texts, paid_by)
+        self.rows[request.key] = _Held(row)
+        return row
 
     def halted(self) -> bool:
         """Return whether to stop sending calls."""
@@ -244,10 +248,27 @@ async def _settle_cell(
     rows |= asker.rows
     if stop.is_set() or len(rows) < len(requests):
         return None
+    for refused in refused_calls(requests.values(), rows):
+        rows |= await _settle_refusals(asker, refused, rows)
+    if stop.is_set():
+        return None
     await its.writer.sync()
     errors = sum(not settles(row) for row in rows.values())
     tally = Tally(asked=len(missing), cached=len(requests) - len(missing), errors=errors)
     return SettledCell(cell, calls, {key: rows[key] for key in requests}, tally)
+
+
+async def _settle_refusals(asker: _Asking, calls: RefusedCalls, rows: Mapping[str, Row]) -> dict[str, Row]:
+    """Ask refused calls again, then one that was answered; return the new rows of the former."""
+    again = replace(asker, missing=calls.refused, again=lambda outcome: outcome, rows={})
+    await again.run()
+    refused = [call for call in calls.refused if again.rows.get(call.key, {}).get("error") == rows[call.key]["error"]]
+    control = replace(asker, missing=[calls.control] if refused else [], again=control_outcome, rows={})
+    await control.run()
+    if any(row["error"] == CONTROL for row in control.rows.values()):
+        for call in refused:
+            await again.write(call, refusal(row := again.rows[call.key]), row["attempts"], row["latency_s"], [])
+    return again.rows
 
 
 async def settle(
@@ -308,7 +329,7 @@ def run_work(work: Work[AnyCell, AnyCall, Finished], cells: Sequence[AnyCell]) -
         while True:
             try:
                 # Dagster sets a handler of its own around each step of this generator, so ours is set for each too.
-                with _drain_on_interrupt(loop, stop):
+                with drain_on_interrupt(loop, stop):
                     settled_cell = loop.run_until_complete(anext(results))
             except StopAsyncIteration:
                 break
@@ -324,7 +345,7 @@ def run_work(work: Work[AnyCell, AnyCall, Finished], cells: Sequence[AnyCell]) -
         interrupted = stop.is_set()
         stop.set()
         try:
-            with _drain_on_interrupt(loop, stop):
+            with drain_on_interrupt(loop, stop):
                 loop.run_until_complete(_exhaust(results))
         except asyncio.CancelledError:
             raise KeyboardInterrupt from None
@@ -350,51 +371,3 @@ def _raise_together(stage: str, problems: Sequence[Exception]) -> None:
     if problems:
         causes = "; ".join(sorted({f"{type(problem).__name__}: {problem}" for problem in problems}))
         raise ExceptionGroup(f"{stage}: {causes}", problems)
-
-
-class _drain_on_interrupt:  # noqa: N801 - reads as a verb where it is used
-    """A guard that routes stop signals to the stop event while a loop works.
-
-    A person who presses Ctrl-C can press it again; a sender of SIGTERM or SIGHUP will kill the process some time later,
-    so calls in flight get GRACE_S to finish. A call given up stays reserved with its worst case.
-    """
-
-    def __init__(self, loop: asyncio.AbstractEventLoop, stop: asyncio.Event) -> None:
-        self._loop, self._stop = loop, stop
-        self._main = threading.current_thread() is threading.main_thread()
-        self._former: dict[signal.Signals, Any] = {}
-
-    def __enter__(self) -> None:
-        for signal_number in STOP_SIGNALS if self._main else ():
-            handler = signal.getsignal(signal_number)
-            if (
-                signal_number is signal.SIGINT or handler is not signal.SIG_IGN
-            ):  # `nohup` lets a run outlive its terminal
-                self._former[signal_number] = handler
-                signal.signal(signal_number, lambda number, _: self._interrupt(signal.Signals(number)))
-
-    def _interrupt(self, by: signal.Signals) -> None:
-        if self._stop.is_set():
-            # Calls cancelled now are in the ledger or stay reserved: do not report how they end.
-            self._loop.set_exception_handler(lambda *_: None)
-            self._loop.call_soon_threadsafe(self._cancel)
-            end = threading.Timer(END_S, os._exit, (INTERRUPTED,))  # whatever still holds the process then
-            end.daemon = True
-            end.start()
-            return
-        self._stop.set()
-        wait_text, advice = "", "Ctrl-C again stops at once"
-        if by is not signal.SIGINT:
-            wait_text, advice = f" {GRACE_S:.0f} s at most", f"{by.name} again stops at once"
-            self._loop.call_soon_threadsafe(self._loop.call_later, GRACE_S, self._cancel)
-        self._loop.call_soon_threadsafe(lambda: None)  # wakes the loop from its select
-        progress.current().note(f"{by.name}: stopping: waiting{wait_text} for the calls in flight ({advice})")
-
-    def _cancel(self) -> None:
-        for task in asyncio.all_tasks(self._loop):
-            task.cancel()
-
-    def __exit__(self, *_: object) -> None:
-        for signal_number, handler in self._former.items():
-            signal.signal(signal_number, handler or signal.SIG_DFL)
-        self._former.clear()

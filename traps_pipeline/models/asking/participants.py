@@ -161,6 +161,7 @@ async def attempt(
             else:
                 participant.gate.answered()
                 participant.breaker.connected()
+                participant.breaker.answered()
                 if lost_usd:
                     outcome = replace(outcome, cost_usd=(outcome.cost_usd or 0.0) + lost_usd)
                 return outcome, number, time.monotonic() - started_at
@@ -170,10 +171,12 @@ async def attempt(
             participant.breaker.no_connection(failure.why)
         elif failure.kind != UNREACHABLE:
             participant.breaker.connected()
+        is_hopeless = False
         if failure.billed:
             lost_usd += _believed_cost(failure.cost_usd, worst_case_usd(participant.entry, request))
+            is_hopeless = lost_usd > 0 and not participant.breaker.is_worth_another_try(failure.kind)
         n_malformed += failure.kind == MALFORMED
-        if number > limits.retries or n_malformed == MALFORMED_TRIES:
+        if number > limits.retries or n_malformed == MALFORMED_TRIES or is_hopeless:
             return _final_failure(failure.kind, number, seconds, lost_usd, failure.raw)
         progress.current().retried(participant.entry.id)
         longest = min(limits.backoff_s * 2 ** (number - 1), MAX_BACKOFF_S)

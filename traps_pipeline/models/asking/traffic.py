@@ -10,11 +10,12 @@ from contextlib import asynccontextmanager, contextmanager
 from typing import NoReturn
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.models.request import Outcome
+from traps_pipeline.models.request import MALFORMED, Outcome
 
 SAME_REFUSALS = 20
 UNMADE_IN_A_ROW, UNMADE_S = 5, 12.0  # calls that were never sent, and seconds since the first of them
 MALFORMED_IN_A_ROW = 3
+LOST_IN_A_ROW = 60  # attempts that were paid for and brought no answer
 ERROR_WINDOW, ERROR_SHARE = 100, 0.10
 LOOK_S = 0.2  # how often a waiting call checks whether it is still wanted
 BURST_S = 2.0  # burst size, in seconds of the rate
@@ -139,6 +140,7 @@ class CircuitBreaker:
         self._unmade, self._unmade_since = 0, 0.0  # consecutive unsent calls, and when the first was tried
         self._refusal, self._in_a_row = "", 0
         self._malformed = 0  # consecutive
+        self._lost = dict.fromkeys((MALFORMED, ""), 0)  # consecutive attempts without an answer: malformed, of any kind
         self._window: deque[bool] = deque(maxlen=ERROR_WINDOW)
 
     def check(self) -> None:
@@ -162,11 +164,21 @@ class CircuitBreaker:
         """Record that a call was sent."""
         self._unmade, self._unmade_since = 0, 0.0
 
+    def is_worth_another_try(self, kind: str) -> bool:
+        """Count a paid attempt without an answer; return whether to try its call again."""
+        self._lost[""] += 1
+        self._lost[MALFORMED] = self._lost[MALFORMED] + 1 if kind == MALFORMED else 0
+        return self._lost[MALFORMED] < MALFORMED_IN_A_ROW and self._lost[""] < LOST_IN_A_ROW
+
+    def answered(self) -> None:
+        """Record that an attempt brought an answer."""
+        self._lost = dict.fromkeys(self._lost, 0)
+
     def watch(self, outcome: Outcome) -> None:
         """Raise ParticipantStopped after repeated failures.
 
-        These are 20 consecutive refusals of the same kind, three consecutive malformed answers, or more than 10
-        failures in the last 100 calls.
+        These are a redirect, 20 consecutive refusals of the same kind, three consecutive malformed answers, 60
+        consecutive attempts that were paid for and lost, or more than 10 failures in the last 100 calls.
         """
         refusal = _refusal(outcome)
         self._in_a_row = self._in_a_row + 1 if refusal and refusal == self._refusal else int(bool(refusal))
@@ -174,7 +186,11 @@ class CircuitBreaker:
         self._malformed = self._malformed + 1 if outcome.kind == "malformed" else 0
         self._window.append(outcome.kind in ("error", "malformed"))
         errors = sum(self._window)
-        if self._in_a_row >= SAME_REFUSALS:
+        if refusal.startswith("http_3"):
+            reason = f"its address redirects each call ({refusal}), which is not followed: mend its `base_url`"
+        elif self._lost[""] >= LOST_IN_A_ROW:
+            reason = f"{self._lost['']} attempts in a row that may be billed brought no answer (last: {outcome.error})"
+        elif self._in_a_row >= SAME_REFUSALS:
             reason = f"{self._in_a_row} refusals in a row ({refusal})"
         elif self._malformed >= MALFORMED_IN_A_ROW:
             reason = f"{self._malformed} answers in a row are out of order (they lie in the ledger, beside its rows)"

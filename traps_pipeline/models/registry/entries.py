@@ -22,6 +22,7 @@ from traps_pipeline.models.reading.thinking import Marks, marks_of
 from traps_pipeline.models.registry import user_registry
 from traps_pipeline.models.registry.accounts import Account, Groups, Limits, Prices
 from traps_pipeline.models.registry.local_settings import DEVICE, LocalParams, MechanismSpec, NetworkSize
+from traps_pipeline.models.registry.owned_parameters import check_owned_parameters
 from traps_pipeline.models.registry.schemas import answer_object
 from traps_pipeline.protocol.cells import Evaluation
 from traps_pipeline.protocol.regimes import fields_of
@@ -100,6 +101,7 @@ class Entry(BaseModel):
         if self.provider_id is None or "/" not in self.provider_id:
             raise ValueError(f"provider_id is {self.provider_id!r}; it is route/model, e.g. openai/gpt-5")
         check_parameters(self.params)
+        check_owned_parameters(self.params)
         self._check_waivers(self.protocol())
         if self.prices and (self.prices.input or self.prices.output) and not self.max_tokens:
             raise ValueError("params.max_tokens is not sent: without it no budget can bound what a call costs")

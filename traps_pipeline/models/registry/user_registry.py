@@ -46,6 +46,12 @@ class UserRegistry(BaseModel):
     def _have_ids(cls, values: list[dict[str, Any]]) -> list[dict[str, Any]]:
         if not all(isinstance(value.get("id"), str) for value in values):
             raise ValueError("each entry has an `id`, a word in lower case with hyphens")
+        for value in values:
+            for name in SHORT_FIELDS[:2]:
+                if name in value and not (isinstance(value[name], str) and value[name].strip()):
+                    raise ValueError(
+                        f"{value['id']}: {name} is no text in YAML but {value[name]!r}: write the name in quotes"
+                    )
         return values
 
     def __or__(self, newer: UserRegistry) -> UserRegistry:

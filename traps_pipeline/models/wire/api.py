@@ -44,6 +44,7 @@ from traps_pipeline.storage.media import Media, data_uris
 
 UNKNOWN_ERROR = 500  # default status of an error object in a 200
 REFUSED_CONTENT = "content_policy"  # the error of a call stopped by a provider's content filter
+USED_UP = "http_402"  # the error of a call without credit or quota, whatever its status
 DENIED = "http_403_denied"  # the error of a 403 that is not about the key
 MAX_KEPT = 4000  # characters of a malformed answer
 # Message for people, by kind of failure.
@@ -58,6 +59,7 @@ _HAPPENED = {
     "connection": "the connection broke",
     "ended": "its answer broke off",
     "usage": "its count of tokens is not believed",
+    USED_UP: "its credit or quota is used up",
     "http_401": "it does not accept the key",
     "http_404": "it knows no such model or address",
 }
@@ -168,11 +170,11 @@ class ApiBackend:
                 await self._litellm.acompletion(messages=prompt, **request.params, **self._fixed)
             except Exception as error:  # noqa: BLE001 - litellm's, the SDKs' and httpx's errors
                 if not exchange.is_answered or exchange.content is None:
-                    return self._failure(error, exchange)
+                    return self._failure(error, request, exchange)
             if exchange.status is None:  # a bug of ours, or of a new version of the client library
                 exchange.sent = None
             elif (provider_error := read_error(exchange.content)) is not None:
-                return self._provider_outcome(provider_error, exchange)
+                return self._provider_outcome(provider_error, request, exchange)
             return self._read(request, exchange)  # whatever exception the library raises for it
 
     def _read(self, request: Request, exchange: Exchange) -> Outcome:
@@ -199,9 +201,7 @@ class ApiBackend:
 
     def _outcome(self, reply: Reply, request: Request) -> Outcome:
         """Return the outcome of an answer: visible text, thinking, and usage."""
-        prompt_bytes = len((request.system + request.user).encode("utf-8", "replace"))
-        frames = request.sent.n_frames if request.sent else 0
-        usage = read_usage(reply.usage, Sizes(prompt_bytes, frames, len((reply.text or reply.refusal).encode())))
+        usage = read_usage(reply.usage, _sizes(request, reply.text or reply.reasoning))
         believed_usage = usage if usage and usage.believed else None
         kind = _kind(reply)
         return Outcome(
@@ -231,7 +231,7 @@ class ApiBackend:
             self._tell("usage", f"contradicts itself; the most that it says is booked, {counts}")
         return cost if usage.believed else max(cost, worst_usd)
 
-    def _failure(self, error: Exception, exchange: Exchange) -> Outcome:
+    def _failure(self, error: Exception, request: Request, exchange: Exchange) -> Outcome:
         """Return a failure as an outcome, without its text, or raise it as TransientError."""
         from traps_pipeline.models.wire.httpx_transport import cause_of
 
@@ -241,12 +241,14 @@ class ApiBackend:
             raise TransientError(UNREACHABLE, billed=False, why=reason) from None
         provider_error = read_error(exchange.content)
         if provider_error is not None or (exchange.status is not None and not exchange.is_answered):
-            return self._provider_outcome(provider_error, exchange)
+            return self._provider_outcome(provider_error, request, exchange)
+        if exchange.is_unreadable:
+            raise self._malformed_error(str(exchange.problem)) from None
         kind = "timeout" if isinstance(error, self._litellm.Timeout) else "connection"
         self._tell(kind, exchange.problem or cause_of(error), passes=True)
         raise TransientError(kind) from None
 
-    def _provider_outcome(self, error: ProviderError | None, exchange: Exchange) -> Outcome:
+    def _provider_outcome(self, error: ProviderError | None, request: Request, exchange: Exchange) -> Outcome:
         """Return a provider's error as an outcome, or raise it as TransientError.
 
         The status is the one on the wire, or the one in the error object if that came with a 200. error: None if the
@@ -257,22 +259,29 @@ class ApiBackend:
         assert status is not None
         is_explained = error is not None and not error.is_beside_answer
         is_billed = exchange.is_billable(status, is_explained=is_explained)
+        wait_s = retry_after_s(exchange.headers, provider_error)
+        if provider_error.is_used_up and wait_s is None:
+            status = int(USED_UP.removeprefix("http_"))
         origin = " (an error object in an HTTP 200)" if exchange.is_answered else ""
         origin += f" (through the proxy of {exchange.proxy})" if exchange.proxy else ""
         if provider_error.is_filtered and status not in TRANSIENT_STATUSES:
             self._tell(REFUSED_CONTENT, f"{provider_error}{origin}")
-            return Outcome("refused", error=REFUSED_CONTENT, cost_usd=None if is_billed else 0.0)
+            usage = read_usage(provider_error.usage, _sizes(request, ""))
+            return Outcome("refused", error=REFUSED_CONTENT, cost_usd=self._cost(usage, request) if is_billed else 0.0)
         kind = failure_kind(status, provider_error)
         is_final = kind.startswith("http_")
         self._tell(kind, f"{provider_error}{origin}", passes=not is_final)
         if is_final:
             return Outcome("error", error=kind, cost_usd=None if is_billed else 0.0)
-        raise TransientError(kind, retry_after_s(exchange.headers, provider_error), billed=is_billed) from None
+        raise TransientError(kind, wait_s, billed=is_billed) from None
 
     def _quote_beginning(self, exchange: Exchange) -> str:
         """Return the beginning of an answer without an error object, for people."""
         text = redact((exchange.content or b"").decode("utf-8", "replace"))  # before it is cut
-        kind = exchange.headers.get("Content-Type", "no content type").partition(";")[0]
+        if 300 <= (exchange.status or 0) < 400:
+            target = redact(exchange.headers.get("location", "nowhere"))
+            return f"HTTP {exchange.status} to {target}: no redirect is followed, name the right address as `base_url`"
+        kind = exchange.headers.get("content-type", "no content type").partition(";")[0]
         quotation = f", beginning {text[:60]!r}" if text.strip() else ""
         return f"HTTP {exchange.status}, {kind}, {len(exchange.content or b'')} bytes{quotation}"
 
@@ -299,6 +308,12 @@ def failure_kind(status: int, reported: ProviderError) -> str:
     if status >= 500:
         return "server_error"
     return DENIED if status == 403 and not reported.is_about_key else f"http_{status}"
+
+
+def _sizes(request: Request, text: str) -> Sizes:
+    """Return our measure of a call whose answer has this text."""
+    prompt_bytes = len((request.system + request.user).encode("utf-8", "replace"))
+    return Sizes(prompt_bytes, request.sent.n_frames if request.sent else 0, len(text.encode()))
 
 
 def _kind(reply: Reply) -> OutcomeKind:

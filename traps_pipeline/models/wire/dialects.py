@@ -17,6 +17,7 @@ from traps_pipeline.models.reading.endings import Ending, ending_of
 
 Dialect = Literal["chat", "responses", "anthropic", "gemini"]
 Json = Mapping[str, Any]
+ANSWER_FIELDS = ("choices", "content", "candidates", "output")  # fields that hold an answer, of all dialects
 MAX_WORD = 200  # characters of a provider's short fields: served model, finish reason
 _NAMES: Mapping[Dialect, str] = {
     "chat": "OpenAI's chat API",
@@ -70,15 +71,54 @@ def dialect_of(provider_id: str) -> Dialect:
 
 
 def parse_body(content: bytes) -> Json:
-    """Return the JSON object in a body. Raises OddShapeError for anything else."""
-    text = content.decode("utf-8-sig", "replace")
+    """Return the JSON object in a body, or the one that the parts of a stream make.
+
+    Line breaks in texts, zero bytes around it, and UTF-16 are read as browsers read them. Raises OddShapeError for
+    anything else.
+    """
+    text = content.decode(json.detect_encoding(content), "replace").strip("\0\ufeff \t\r\n")
     try:
-        body = json.loads(text)
+        body = json.loads(text, strict=False)
     except (ValueError, RecursionError):
-        raise OddShapeError(f"it sent {shape_of(text)}") from None
+        body = _events(text)
+        if (joined := _join(body)) is None:
+            raise OddShapeError(f"it sent {shape_of(text)}") from None
+        return joined
+    if isinstance(body, list):  # Gemini's streams
+        body = _join(body) or body
     if not isinstance(body, dict):
         raise OddShapeError(f"it sent a JSON {type(body).__name__} and no object")
     return body
+
+
+def _events(text: str) -> list[Any]:
+    """Return the JSON values of a stream of events or lines; empty if it is none."""
+    lines = (line.removeprefix("data:").strip() for line in text.splitlines())
+    try:
+        return [json.loads(line, strict=False) for line in lines if line[:1] == "{"]
+    except (ValueError, RecursionError):
+        return []
+
+
+def _join(parts: list[Any]) -> Json | None:
+    """Return the answer that the parts of a stream make; None if they make none."""
+    bodies = [part for part in parts if isinstance(part, dict)]
+    whole = [body["response"] for body in bodies if isinstance(body.get("response"), dict)]  # OpenAI's Responses API
+    whole += [body for body in bodies if body.get("error") or (len(bodies) == 1 and any(map(body.get, ANSWER_FIELDS)))]
+    choices = [choice for body in bodies for choice in _listed(body, "choices") if choice.get("index", 0) == 0]
+    deltas = [delta for choice in choices if isinstance(delta := choice.get("delta"), dict)]
+    if whole or not deltas:
+        return whole[-1] if whole else None
+    names = ("content", "refusal", "reasoning_content", "reasoning")
+    message = {name: "".join(text for delta in deltas if isinstance(text := delta.get(name), str)) for name in names}
+    finish = next((choice["finish_reason"] for choice in choices if choice.get("finish_reason")), None)
+    usage = next((body["usage"] for body in reversed(bodies) if body.get("usage")), None)
+    return {**bodies[-1], "choices": [{"message": message, "finish_reason": finish}], "usage": usage}
+
+
+def _listed(body: Json, name: str) -> list[dict[str, Any]]:
+    values = body.get(name)
+    return [value for value in values if isinstance(value, dict)] if isinstance(values, list) else []
 
 
 def shape_of(text: str) -> str:

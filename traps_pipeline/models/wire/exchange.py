@@ -20,8 +20,9 @@ class Exchange:
     """One attempt as seen on the wire.
 
     sent: whether bytes of the request were handed to a connected server; None if unknown (a backend without a network).
-    status, headers: of the answer. content: its decoded body, None if it was not read to its end. proxy: the variable
-    that named the proxy. problem: why nothing was sent, or why no answer came.
+    status, headers (by name in lower case): of the answer. content: its decoded body, None if it was not read to its
+    end. proxy: the variable that named the proxy. problem: why nothing was sent, or why no answer came; is_unreadable:
+    whether one came that breaks the rules of HTTP.
     """
 
     sent: bool | None = None
@@ -30,6 +31,7 @@ class Exchange:
     content: bytes | None = None
     proxy: str | None = None
     problem: str | None = None
+    is_unreadable: bool = False
 
     @property
     def is_unsent(self) -> bool:
@@ -51,7 +53,7 @@ class Exchange:
             return False
         if status in _GIVEN_UP:
             return True
-        return not (400 <= status < 500 or status in _NOT_TAKEN or (is_explained and status >= 500))
+        return not (300 <= status < 500 or status in _NOT_TAKEN or (is_explained and status >= 500))
 
 
 CURRENT_EXCHANGE: ContextVar[Exchange | None] = ContextVar("watched", default=None)

@@ -13,6 +13,7 @@ import ssl
 import zlib
 from collections.abc import Mapping
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import aiohttp
@@ -24,10 +25,12 @@ from yarl import URL
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.network import TLS_VARIABLES, certificate_problem, proxy_of
 from traps_pipeline.models.wire.exchange import Exchange, record_exchange
+from traps_pipeline.models.wire.lenient_http import LenientConnector
 
 MAX_BYTES = 16 * 2**20  # maximum bytes of an answer; 8,000 tokens with reasoning take less than a hundredth of it
 CONNECT_S = 60.0  # time-out of a connection with its TLS handshake
 KEEPALIVE_S, NAMES_KEPT_S = 120.0, 300  # an idle connection; an address of a name
+_GZIP = b"\x1f\x8b"
 _ASKED_ANEW = ("content-encoding", "content-length", "transfer-encoding", "location")
 
 
@@ -54,12 +57,13 @@ class _Body(aiohttp.BytesPayload):
 class Wire(httpx.AsyncBaseTransport):
     """A transport that sends requests with aiohttp, one session per event loop.
 
-    tls: a context, or False to trust every certificate; None: the certificates that SSL_CERT_FILE or certifi names.
+    is_verified: whether certificates must be signed by an authority of SSL_CERT_FILE, SSL_CERT_DIR or certifi.
     """
 
-    def __init__(self, tls: ssl.SSLContext | bool | None = None) -> None:
-        self._tls = tls
-        self._certificates: list[str | None] = []  # the environment's settings when the session was created
+    def __init__(self, *, is_verified: bool = True) -> None:
+        self._is_verified = is_verified
+        self._tls: ssl.SSLContext | bool = is_verified
+        self._certificates: list[tuple[str | None, int | None]] = []  # of which `_tls` was made
         self._sessions: dict[asyncio.AbstractEventLoop, aiohttp.ClientSession] = {}
 
     async def handle_async_request(self, request: httpx.Request) -> httpx.Response:
@@ -74,10 +78,12 @@ class Wire(httpx.AsyncBaseTransport):
             exchange.sent = False
             try:
                 response = await self._send(request, exchange)
-                exchange.status, exchange.headers = response.status, dict(response.headers)
+                exchange.status = response.status
+                exchange.headers = {name.lower(): value for name, value in response.headers.items()}
                 exchange.content = await _read(response)
             except Exception as error:
                 exchange.problem = _explain(error, request.url, exchange)
+                exchange.is_unreadable = bool(exchange.sent) and _is_unreadable(error)
                 kind = httpx.ReadTimeout if isinstance(error, TimeoutError) and exchange.sent else httpx.NetworkError
                 raise kind(exchange.problem) from error
         headers = [(name, value) for name, value in response.headers.items() if name.lower() not in _ASKED_ANEW]
@@ -93,11 +99,8 @@ class Wire(httpx.AsyncBaseTransport):
             exchange.proxy = proxy.variable
             if proxy.problem:
                 raise TrapsError(proxy.problem)
-        tls_files = [os.environ.get(name) for name in TLS_VARIABLES]
-        if request.url.scheme == "https" and self._tls is not False and self._certificates != tls_files:
-            if problem := certificate_problem(TLS_VARIABLES):
-                raise TrapsError(problem)
-            self._tls, self._certificates = self._tls or httpx.create_ssl_context(), tls_files
+        if request.url.scheme == "https" and self._is_verified:
+            self._renew_tls()
         return await self._session().request(
             request.method,
             URL(url, encoded=True),
@@ -108,15 +111,22 @@ class Wire(httpx.AsyncBaseTransport):
                 total=None, sock_connect=min(times.get("connect") or CONNECT_S, CONNECT_S), sock_read=times.get("read")
             ),
             proxy=proxy and proxy.url,
-            ssl=True if self._tls is None else self._tls,
+            ssl=self._tls,
         )
+
+    def _renew_tls(self) -> None:
+        """Read the certificates anew if a variable, or a file that one names, has changed."""
+        certificates = [(place := os.environ.get(name), _changed_at(place)) for name in TLS_VARIABLES]
+        if certificates != self._certificates:
+            if problem := certificate_problem(TLS_VARIABLES):
+                raise TrapsError(problem)
+            self._tls, self._certificates = httpx.create_ssl_context(), certificates
 
     def _session(self) -> aiohttp.ClientSession:
         loop = asyncio.get_running_loop()
-        for session in [closed_loop for closed_loop in self._sessions if closed_loop.is_closed()]:
-            _dispose(self._sessions.pop(session))
+        self._dispose_closed()
         if loop not in self._sessions:
-            connector = aiohttp.TCPConnector(limit=0, keepalive_timeout=KEEPALIVE_S, ttl_dns_cache=NAMES_KEPT_S)
+            connector = LenientConnector(limit=0, keepalive_timeout=KEEPALIVE_S, ttl_dns_cache=NAMES_KEPT_S)
             cookies = aiohttp.DummyCookieJar()
             self._sessions[loop] = aiohttp.ClientSession(
                 connector=connector, cookie_jar=cookies, auto_decompress=False, trust_env=False
@@ -128,13 +138,22 @@ class Wire(httpx.AsyncBaseTransport):
         own_session = self._sessions.pop(asyncio.get_running_loop(), None)
         if own_session is not None:
             await own_session.close()
-        for session in [self._sessions.pop(loop) for loop in list(self._sessions) if loop.is_closed()]:
-            _dispose(session)
+        self._dispose_closed()
+
+    def _dispose_closed(self) -> None:
+        for closed_loop in [loop for loop in self._sessions if loop.is_closed()]:
+            _dispose(self._sessions.pop(closed_loop))
 
     def __del__(self) -> None:
-        for loop, session in self._sessions.items():
-            if loop.is_closed():
-                _dispose(session)
+        self._dispose_closed()
+
+
+def _changed_at(place: str | None) -> int | None:
+    """Return when a file or folder was changed, in nanoseconds; None if it is not there."""
+    try:
+        return Path(place).stat().st_mtime_ns if place else None
+    except OSError:
+        return None
 
 
 def _dispose(session: aiohttp.ClientSession) -> None:
@@ -151,25 +170,41 @@ async def _read(response: aiohttp.ClientResponse) -> bytes:
             if size > MAX_BYTES:
                 raise ValueError(f"the answer is larger than {MAX_BYTES} bytes")
             chunks.append(chunk)
-    return _decompress(b"".join(chunks), response.headers.get("content-encoding", "identity"))
+    content = _decompress(b"".join(chunks), response.headers.get("content-encoding", "").lower())
+    try:
+        content.decode()
+    except UnicodeDecodeError:
+        with suppress(LookupError, UnicodeDecodeError, RuntimeError):  # an unknown character set, or not its bytes
+            content = content.decode(response.get_encoding()).encode() if response.charset else content
+    return content
 
 
-def _decompress(content: bytes, encoding: str) -> bytes:
-    """Decompress a body; raise ValueError if truncated, too large or unknown."""
-    if encoding.lower() == "identity":
+def _decompress(content: bytes, label: str) -> bytes:
+    """Decompress a body by what it is, whatever its label; raise ValueError if truncated or too large."""
+    is_gzip, is_text = content.startswith(_GZIP), content.lstrip()[:1] in (b"{", b"[", b"")
+    if not is_gzip and ("deflate" not in label or is_text):
         return content
-    if encoding.lower() not in ("gzip", "x-gzip", "deflate"):
-        raise ValueError(f"the answer is encoded as {encoding[:40]!r}, which was not asked for")
+    has_header = content[0] & 15 == 8 and int.from_bytes(content[:2], "big") % 31 == 0  # some send "deflate" without
     plain_bytes = b""
-    while content:  # gzip may have several members
-        unpacking = zlib.decompressobj(15 if encoding.lower() == "deflate" else 47)
+    while True:  # gzip may have several members
+        unpacking = zlib.decompressobj(31 if is_gzip else 15 if has_header else -15)
         plain_bytes += unpacking.decompress(content, MAX_BYTES + 1 - len(plain_bytes))
         if len(plain_bytes) > MAX_BYTES:
             raise ValueError(f"the answer is larger than {MAX_BYTES} bytes")
         if not unpacking.eof:
             raise ValueError("the compressed answer breaks off")
         content = unpacking.unused_data.lstrip(b"\0")
-    return plain_bytes
+        if not content.startswith(_GZIP):
+            return plain_bytes
+
+
+def _is_unreadable(error: BaseException | None) -> bool:
+    """Return whether an answer came that breaks HTTP's rules, and no connection that broke."""
+    while error is not None:
+        if isinstance(error, HttpProcessingError | ValueError | zlib.error):
+            return "Not enough data" not in str(error)
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def _explain(error: BaseException, url: httpx.URL, exchange: Exchange) -> str:
@@ -213,8 +248,8 @@ def use_in(handler: Any) -> None:
     transport.
     """
 
-    def create(ssl_context: ssl.SSLContext | None = None, ssl_verify: bool | None = None, **_: Any) -> Wire:
-        return Wire(ssl_context if ssl_context is not None else False if ssl_verify is False else None)
+    def create(ssl_verify: bool | None = None, **_: Any) -> Wire:
+        return Wire(is_verified=ssl_verify is not False)  # litellm's own context is never renewed
 
     handler.create_async_transport = staticmethod(create)
 

@@ -60,7 +60,7 @@ class Sizes:
     def contradict(self, usage: Usage) -> bool:
         """Return whether a usage is below the minimum for these sizes."""
         min_tokens = self.prompt_bytes // BYTES_A_TOKEN + self.frames * TOKENS_A_FRAME
-        return usage.prompt < min_tokens or usage.completion < max(1, -(-self.text_bytes // BYTES_A_TOKEN))
+        return usage.prompt < min_tokens or usage.completion < -(-self.text_bytes // BYTES_A_TOKEN)
 
 
 def read_usage(fields: Mapping[str, Any], sizes: Sizes) -> Usage | None:
@@ -96,6 +96,8 @@ def _complete_usage(
         counts = {name: value for name, value in counts.items() if not (name in apart and value is None)}
     elif counts.get(str(total), 0) is None:
         del counts[str(total)]
+    if completion not in counts and counts.get(str(total)) == counts[prompt]:
+        counts[completion] = 0  # refused before anything was generated
     if completion not in counts or not all(map(_is_count, counts.values())):
         return None
     read_tokens = counts[prompt] + sum(counts.get(name, 0) for name, is_of_answer in apart.items() if not is_of_answer)
