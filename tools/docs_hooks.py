@@ -17,6 +17,8 @@ from typing import Any
 
 from mkdocs.structure.files import File, Files
 
+from tools.markdown import prose
+
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "traps_pipeline"
 NOTEBOOK, NOTEBOOK_PAGE = ROOT / "docs" / "inside.ipynb", "inside.md"
@@ -38,8 +40,8 @@ def on_files(files: Files, config: Any) -> Files:
         if not path.is_relative_to(ROOT / "docs"):  # mkdocs finds these itself
             files.append(File.generated(config, _place(path), content=path.read_bytes()))
     files.append(File.generated(config, NOTEBOOK_PAGE, content=notebook_page()))
-    for name, text in reference().items():
-        files.append(File.generated(config, f"reference/{name}.md", content=text))
+    for place, content in reference().items():
+        files.append(File.generated(config, place, content=content))
     return files
 
 
@@ -75,10 +77,10 @@ def _place(path: Path) -> str:
 
 
 def _source(place: str) -> Path | None:
-    """Return the file of the repository behind a page of the site; None for a page of the reference."""
+    """Return the file of the repository behind a page of the site; None for a generated page."""
     if place == "index.md":
         return ROOT / "README.md"
-    if place.startswith("reference/"):
+    if place.startswith(("reference/", "families/")):
         return None
     return ROOT / place.removeprefix(f"{OUTSIDE}/") if place.startswith(f"{OUTSIDE}/") else ROOT / "docs" / place
 
@@ -100,13 +102,15 @@ def notebook_page() -> str:
 # --- the reference ----------------------------------------------------------------------------------------------------
 
 
-def reference() -> dict[str, str]:
-    """Return the text of each page by its name: the public Python module, tables, and YAML fields."""
+def reference() -> dict[str, str | bytes]:
+    """Return each page by its place: Python, tables, YAML fields, certificates, and families with pictures."""
+    from tools.family_pages import family_pages
     from tools.reference_pages import certificates_page, tables_page, yaml_page
 
     head = "# Python\n\nFor everyone who opens a study in a [notebook](../inside.md): the module whose names stay."
     python = f"{head}\n\n{_module(PACKAGE / 'inside.py')}"
-    return {"python": python, "tables": tables_page(), "yaml": yaml_page(), "certificates": certificates_page()}
+    pages = {"python": python, "tables": tables_page(), "yaml": yaml_page(), "certificates": certificates_page()}
+    return {f"reference/{name}.md": page for name, page in pages.items()} | family_pages()
 
 
 def _module(path: Path) -> str:
@@ -115,7 +119,7 @@ def _module(path: Path) -> str:
     name = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
     members = "\n".join(_members(tree, ""))
     about = ast.get_docstring(tree)
-    return f"## {name}\n\n{_prose(about)}\n\n{members}" if members else ""
+    return f"## {name}\n\n{prose(about)}\n\n{members}" if members else ""
 
 
 def _members(tree: ast.Module | ast.ClassDef, owner: str) -> Iterator[str]:
@@ -126,7 +130,7 @@ def _members(tree: ast.Module | ast.ClassDef, owner: str) -> Iterator[str]:
         if about is None:
             continue
         head = f"{'####' if owner else '###'} `{owner}{node.name}`"
-        yield f"{head}\n\n```python\n{_signature(node)}\n```\n\n{_prose(about)}\n"
+        yield f"{head}\n\n```python\n{_signature(node)}\n```\n\n{prose(about)}\n"
         if isinstance(node, ast.ClassDef):
             yield from _members(node, f"{node.name}.")
 
@@ -139,15 +143,3 @@ def _signature(node: ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) -> s
     kind = "async def" if isinstance(node, ast.AsyncFunctionDef) else "def"
     returns = f" -> {ast.unparse(node.returns)}" if node.returns else ""
     return f"{kind} {node.name}({ast.unparse(node.args)}){returns}"
-
-
-def _prose(text: str | None) -> str:
-    """Return a docstring as Markdown: paragraphs as they are, indented parts as code."""
-    paragraphs = (text or "").split("\n\n")
-    return "\n\n".join(one if one.startswith("    ") else _escaped(one) for one in paragraphs)
-
-
-def _escaped(text: str) -> str:
-    """Return prose that Markdown takes for nothing else; code in backticks stays code."""
-    parts = re.split(r"(`[^`]*`)", text)
-    return "".join(part if part.startswith("`") else re.sub(r"([*_<>\[\]#|])", r"\\\1", part) for part in parts)

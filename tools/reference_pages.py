@@ -12,6 +12,8 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
+from tools.markdown import markdown_table
+
 ROOT = Path(__file__).resolve().parents[1]
 # Each file that people write, with the class that checks it.
 YAML_FILES = {
@@ -67,7 +69,7 @@ def _table(name: str, table: Any) -> str:
         )
         for column in table.columns
     ]
-    columns = _markdown(("column", "type", "meaning"), rows)
+    columns = markdown_table(("column", "type", "meaning"), rows)
     return f"## {name}\n\n{table.row[:1].upper()}{table.row[1:]}.{by}\n\n{columns}\n"
 
 
@@ -89,7 +91,7 @@ def yaml_page() -> str:
             (f"`{name}`", _type(field.annotation), _default(field), field.description or "")
             for name, field in fields.items()
         ]
-        parts.append(f"## {title}\n\n{doc}\n\n{_markdown(('field', 'type', 'default', 'meaning'), rows)}\n")
+        parts.append(f"## {title}\n\n{doc}\n\n{markdown_table(('field', 'type', 'default', 'meaning'), rows)}\n")
     return "\n".join(parts)
 
 
@@ -126,8 +128,3 @@ def _default(field: FieldInfo) -> str:
     if isinstance(value, BaseModel):
         return "its own defaults"
     return f"`{json.dumps(value, default=str)}`"
-
-
-def _markdown(headings: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
-    lines = [headings, tuple("---" for _ in headings), *rows]
-    return "\n".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |" for line in lines)

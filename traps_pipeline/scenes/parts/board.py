@@ -32,6 +32,7 @@ def peg_rows(least: int, most: int) -> Group:
     """Return the fields `rows`, `peg_gap_m`, `row_shifts_m` of staggered rows of pegs."""
 
     def draw(rng: np.random.Generator, so_far: Drawn) -> tuple[int, float, tuple[float, ...]]:
+        """Draw the number of rows, the gap, and shifts: half a gap in every other row."""
         rows, gap = int(rng.integers(least, most + 1)), uniform(rng, 0.126, 0.140)
         skew = uniform(rng, -0.15, 0.15) if rng.random() < 0.5 else 0.0
         shifts = tuple(round(gap * (i % 2 / 2 + i * skew + float(rng.normal(0, 0.04))), 4) for i in range(rows))
@@ -42,7 +43,8 @@ def peg_rows(least: int, most: int) -> Group:
 
 def camera_elevation(low: float, high: float) -> Any:
     """Return the elevation of a camera off the normal of a board with a `tilt_deg`."""
-    return drawn_by(lambda rng, so_far: uniform(rng, low, high) + so_far["tilt_deg"] - 90)
+    about = f"tilt_deg - 90 + ({low} to {high})"
+    return drawn_by(lambda rng, so_far: uniform(rng, low, high) + so_far["tilt_deg"] - 90, about=about)
 
 
 # --- the board --------------------------------------------------------------------------------------------------------

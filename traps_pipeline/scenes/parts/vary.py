@@ -44,7 +44,7 @@ def drawn_by(draw: Draw, **metadata: Any) -> Any:
 
     `so_far` holds the fields above by name. `draw` may put further values into it for fields below: those are not
     stored with the parameters. metadata: for `check`, the bounds (`range`) or the possible values (`values`); `longer`,
-    those of a draw that asks for longer rows, or true if `draw` itself heeds `is_longer(so_far)`.
+    those of longer rows, or true if `draw` itself heeds `is_longer(so_far)`; `about`, in words how it draws.
     """
     return field(metadata={_HOW: draw, **metadata})
 
@@ -76,17 +76,18 @@ def one_of(*values: Any, longer: tuple[Any, ...] = ()) -> Any:
 
 def chance(share: float) -> Any:
     """Return a boolean field that is true with this probability."""
-    return drawn_by(lambda rng, so_far: bool(rng.random() < share))
+    return drawn_by(lambda rng, so_far: bool(rng.random() < share), about=f"true in {share:.0%} of draws")
 
 
 def facing(low: float, high: float) -> Any:
     """Return a field: a camera's azimuth, turned towards where things come from. Needs a field `direction` above it."""
-    return drawn_by(lambda rng, so_far: 90 - so_far["direction"] * uniform(rng, low, high))
+    about = f"90 - direction * ({low} to {high})"
+    return drawn_by(lambda rng, so_far: 90 - so_far["direction"] * uniform(rng, low, high), about=about)
 
 
 def in_front(low: float, high: float) -> Any:
     """Return a field: a camera's azimuth (degrees) off the front, for any direction."""
-    return drawn_by(lambda rng, so_far: 90 + uniform(rng, low, high))
+    return drawn_by(lambda rng, so_far: 90 + uniform(rng, low, high), about=f"90 + ({low} to {high})")
 
 
 # --- fields that are drawn together -----------------------------------------------------------------------------------
@@ -101,6 +102,7 @@ class Group:
 
     draw: Callable[[np.random.Generator, Drawn, int], Sequence[Any]]
     values: tuple[Any, ...] | None = None  # all that it draws from, where that can be said
+    about: str | None = None  # how it draws, in words
 
     def __call__(self, count: Count | None = None) -> Any:
         """Return a field with a value of the group, or a tuple of `count` of them."""
@@ -131,7 +133,7 @@ def shuffled(*values: Any, without: str | None = None) -> Group:
 
 def together(draw: Callable[[np.random.Generator, Drawn], Sequence[Any]]) -> Group:
     """Return a group of fields whose values `draw(rng, so_far)` gives in order."""
-    return Group(lambda rng, so_far, count: draw(rng, so_far))
+    return Group(lambda rng, so_far, count: draw(rng, so_far), about=draw.__doc__)
 
 
 # --- the hidden element -----------------------------------------------------------------------------------------------
