@@ -16,13 +16,14 @@ import pytest
 
 from tests.build.errors import raises
 from tests.conftest import Checkout
+from traps_pipeline.base.archives import pack as zipped
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.verdicts import decide
 from traps_pipeline.models.registry.judges import BY_RULES, RULES_VERSION
 from traps_pipeline.release.content import content_of
 from traps_pipeline.release.folder import Options, write_release
 from traps_pipeline.release.released_rows import SUBMITTED
-from traps_pipeline.release.submission import ABOUT, TABLES, _zip, pack, read_submission, table_bytes
+from traps_pipeline.release.submission import ABOUT, TABLES, pack, read_submission, table_bytes
 from traps_pipeline.release.submissions import gather, write_board
 from traps_pipeline.release.verification import verify
 from traps_pipeline.scoring.score_rows import LEADERBOARD
@@ -63,7 +64,7 @@ def forged(
     content = {name: table_bytes(TABLES[name], frame) for name, frame in frames.items()}
     digests = {name: hashlib.sha256(data).hexdigest() for name, data in content.items()}
     said = json.loads(submission.about.model_dump_json()) | {"files": digests} | about
-    target.write_bytes(_zip({ABOUT: json.dumps(said).encode(), **content}))
+    target.write_bytes(zipped({ABOUT: json.dumps(said).encode(), **content}))
     return target
 
 
@@ -100,7 +101,7 @@ def test_a_table_that_is_not_the_packed_one_is_named(packed: Path, tmp_path: Pat
     about = json.loads(submission.about.model_dump_json())
     about["files"]["votes.parquet"] = "0" * 64
     content = {name: table_bytes(TABLES[name], frame) for name, frame in submission.tables.items()}
-    (tmp_path / "f.zip").write_bytes(_zip({ABOUT: json.dumps(about).encode(), **content}))
+    (tmp_path / "f.zip").write_bytes(zipped({ABOUT: json.dumps(about).encode(), **content}))
     (problem,) = problems(tmp_path / "f.zip")
     assert "votes.parquet" in problem
 
@@ -205,11 +206,11 @@ def test_compressed_members_other_columns_and_other_files_are_refused(packed: Pa
     table = pq.read_table(io.BytesIO(content["votes.parquet"])).drop_columns(["rationale"])
     made = io.BytesIO()
     pq.write_table(table, made)
-    path.write_bytes(_zip(content | {"votes.parquet": made.getvalue()}))
+    path.write_bytes(zipped(content | {"votes.parquet": made.getvalue()}))
     with raises(TrapsError, "release.submission._frame", "votes.parquet") as refused:
         read_submission(path)
     assert refused.value.__cause__ is None  # it could be read
-    path.write_bytes(_zip(content | {"votes.parquet": b"\x80\x04K\x01."}))  # a pickle is no table
+    path.write_bytes(zipped(content | {"votes.parquet": b"\x80\x04K\x01."}))  # a pickle is no table
     with raises(TrapsError, "release.submission._frame", "votes.parquet") as refused:
         read_submission(path)
     assert refused.value.__cause__ is not None
