@@ -140,10 +140,9 @@ def verify(arguments: argparse.Namespace) -> int:
 
 def verify_file(path: Path, release: Path | None, *, is_json: bool) -> int:
     """Return the report of `traps publish verify` on a submission."""
-    from traps_pipeline.release.submission import read_submission
-    from traps_pipeline.release.verification import verify
+    from traps_pipeline.release import verification as checks
 
-    verification = verify(read_submission(path), release)
+    _, verification = checks.verify_file(path, None if release is None else checks.released_items(release))
     if is_json:
         print_json(
             {"problems": verification.problems, "checked": verification.checked, "not_checked": verification.unchecked}

@@ -34,7 +34,7 @@ from traps_pipeline.models.registry.prompts import prompt_version
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.score_rows import LEADERBOARD, METRICS
 from traps_pipeline.storage.benchmark_tables import ITEMS, current_rows
-from traps_pipeline.storage.tables import Table
+from traps_pipeline.storage.tables import Table, records
 from traps_pipeline.storage.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -210,13 +210,14 @@ def _frame(path: Path, file: str, content: bytes) -> pd.DataFrame:
         schema = table.arrow_schema()
         if parquet.schema_arrow.names != schema.names or parquet.schema_arrow.types != schema.types:
             raise TrapsError(f"{path}: {file} has other columns than this version's; pack it again, or verify it there")
-        data = parquet.read()
+        data = parquet.read().replace_schema_metadata(None)  # what pandas would make of a stranger's is not wanted
+        frame = data.to_pandas(ignore_metadata=True)
     except (pa.ArrowException, OSError, ValueError) as error:
         raise TrapsError(f"{path}: {file} is no readable table ({plain(error)[:200]}); pack it again") from error
     for column in schema:
         if not column.nullable and data[column.name].null_count:
             raise TrapsError(f"{path}: {file}: column {column.name} has missing values")
-    keys = data.select(list(table.key)).to_pandas()
+    keys = frame[list(table.key)]
     if keys.duplicated().any():
-        raise TrapsError(f"{path}: {file}: {dict(keys.loc[keys.duplicated()].iloc[0])} stands there twice")
-    return data.to_pandas()
+        raise TrapsError(f"{path}: {file}: {records(keys.loc[keys.duplicated()])[0]} stands there twice")
+    return frame
