@@ -94,7 +94,7 @@ def test_a_study_packed_twice_is_the_same_file_and_holds_against_its_release(
     finished = small.traps("publish", "verify", again, "--release", release)
     *told, last = finished.out.splitlines()
     assert finished.code == 0 and last.startswith(f"{again}: ")
-    assert len(told) == 1 + 2  # what was checked, and two things that nobody can check
+    assert len(told) == 1 + 3  # what was checked, and three things that nobody can check
     # 12 scenarios x 2 datasets x 2 sides; 3 models x 2 regimes; three judges on two tasks of a control, one of a void
     rows = {name: len(frame) for name, frame in read_submission(again).tables.items()}
     assert (rows["items.parquet"], rows["responses.parquet"], rows["votes.parquet"]) == (48, 288, 144 * 9)

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.paths import OWN_SPECS, SCENE_SPECS
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.wording import count_noun
 from traps_pipeline.cli.command import FAILED, OK, Commands, integer, open_workspace, print_json
@@ -96,6 +97,8 @@ def release(arguments: argparse.Namespace) -> int:
     print(f"{count_noun(output.files, 'file')} in {target}: {count_noun(output.clips, 'clip')}; {rows}")
     if output.answers:
         print(f"which item is which, for you alone: {output.answers}")
+        if SCENE_SPECS == OWN_SPECS:
+            print("these scenarios are published: frames tell their answers; draw your own with traps benchmark sample")
     if arguments.sign:
         print(f"signature: {sign(target, arguments.sign)}")
     print(f"next: read {target / CARD}; traps publish verify {target}")

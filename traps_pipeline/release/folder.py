@@ -15,6 +15,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import replace_folder, write_bytes, write_text
 from traps_pipeline.base.paths import ASSETS, ROOT
 from traps_pipeline.benchmark.held_out import drawn_items, held_out_key, mark_held_out, opaque, refuse_held_out
+from traps_pipeline.protocol.datasets import CROSSED
 from traps_pipeline.release import content as rows_of
 from traps_pipeline.release.card import card, dictionary
 from traps_pipeline.release.checksums import CHECKSUMS, write_checksums
@@ -137,6 +138,8 @@ def _open_release(folder: _Folder, content: Content) -> None:
 
 def _held_out_release(folder: _Folder, content: Content, key_file: Path) -> Path:
     """Write one item of each scenario with a clip of its own, and the answers beside the key."""
+    if CROSSED in content.versions:
+        raise TrapsError(f"--arms {CROSSED}: it asks questions of other scenarios, which tells sides; leave it out")
     key = held_out_key(key_file, make=True)
     items = drawn_items(content.items, key)
     mark_held_out(content.study, items)
