@@ -21,7 +21,8 @@ from tests.conftest import Checkout, copy_of
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.held_out import MARKER, drawn_items, held_out_key
-from traps_pipeline.protocol.datasets import CROSSED
+from traps_pipeline.benchmark.items import build_items
+from traps_pipeline.protocol.datasets import CROSSED, DATASETS
 from traps_pipeline.release.content import Content, content_of
 from traps_pipeline.release.folder import Options, write_release
 from traps_pipeline.storage.benchmark_tables import VIDEOS
@@ -192,6 +193,15 @@ def test_the_attacks_succeed_on_a_release_of_whole_pairs(content: Content) -> No
         for row in content.items
     ]
     assert counted(whole) == 1.0 and learned([whole]) > 0.9
+
+
+def test_a_study_made_after_the_release_asks_the_released_items_alone(
+    releases: list[tuple[Path, Path]], study: Checkout
+) -> None:
+    _, key = releases[-1]
+    released = {row["item_id"] for row in rows(key.with_name(f"{key.name}.items.jsonl"))}
+    built = [row.item_id for dataset in DATASETS for row in build_items(Workspace.open(study.workspace), dataset)]
+    assert sorted(built) == sorted(released) and len(built) == 32
 
 
 # --- the guard --------------------------------------------------------------------------------------------------------

@@ -12,15 +12,17 @@ import re
 import secrets
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import OWN_SPECS, SCENE_SPECS
+from traps_pipeline.storage.benchmark_tables import ItemRow
 
 KEY_BYTES = 32
 MARKER = "held-out.json"  # the released items, in the study's folder and in that of a private benchmark
 Row = Mapping[str, Any]
+Asked = TypeVar("Asked", bound=ItemRow)
 
 
 def opaque(key: bytes, item_id: str) -> str:
@@ -74,6 +76,12 @@ def held_out_items(study: Path) -> dict[str, str]:
         if path.is_file():
             items |= {item_id.split(":")[1]: item_id for item_id in json.loads(path.read_text(encoding="utf-8"))}
     return items
+
+
+def released_only(study: Path, rows: Iterable[Asked]) -> list[Asked]:
+    """Return ITEMS rows without those of held-out scenarios that were not released: nobody is asked them."""
+    items = held_out_items(study)
+    return [row for row in rows if items.get(row.scenario_id, row.item_id) == row.item_id]
 
 
 def mark_held_out(study: Path, drawn: Iterable[Row]) -> None:

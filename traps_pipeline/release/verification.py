@@ -298,19 +298,22 @@ def _expected_of_rules(row: Row, item: Row, again: Outcome) -> dict[str, Any]:
 
 def _expected_of_judge(row: Row, item: Row, seat: SubmittedJudge) -> dict[str, Any]:
     """Return the columns of a language model's vote that its other columns decide."""
-    decision, expected = _decision_column(row), dict[str, Any]()
+    is_correctness = row["task"] == "correctness"
     if not row["valid"]:
-        expected = dict.fromkeys(
-            ("abstained", "correct", "judge_correct", "extracted_value", "confidence", "rationale")
-        )
-    elif decision == "correct":
-        labels, aliases = list(item["labels"]), json.loads(item["aliases"])
-        own = is_correct(row["extracted_value"], item["ground_truth"], item["answer_type"], labels, aliases)
-        expected = {"invalid_reason": None, "abstained": None, "correct": own}
+        null = ["abstained", "correct", "judge_correct", "extracted_value", "confidence", "rationale"]
     else:
-        expected = {"invalid_reason": None, "correct": None, "judge_correct": None, "extracted_value": None}
-    if not row["valid"] or decision == "correct" or not seat.premise:
-        expected["rejects_premise"] = None
+        null = [
+            "invalid_reason",
+            *(["abstained"] if is_correctness else ["correct", "judge_correct", "extracted_value"]),
+        ]
+    if not row["valid"] or is_correctness or not seat.premise:
+        null.append("rejects_premise")
+    expected: dict[str, Any] = dict.fromkeys(null)
+    if row["valid"] and is_correctness:
+        labels, aliases = list(item["labels"]), json.loads(item["aliases"])
+        expected["correct"] = is_correct(
+            row["extracted_value"], item["ground_truth"], item["answer_type"], labels, aliases
+        )
     return expected
 
 

@@ -173,9 +173,7 @@ def legend(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> dict[str,
     """Return the entries of LEGEND for the board's columns and marks."""
     optional_terms = {column.heading: field for column, field in OPTIONAL.items()}
     optional_terms |= {INCOMPLETE_MARK: "incomplete", BROKEN_MARK: "is_broken"}
-    unused_terms = {
-        term for term, field in optional_terms.items() if not (pd.to_numeric(board.loc[:, field]) > 0).any()
-    }
+    unused_terms = {term for term, field in optional_terms.items() if not (board.loc[:, field].astype(float) > 0).any()}
     unused_terms |= {*ROBUST_TERMS} if robust is None or robust.empty else set()
     return {term: meaning for term, meaning in LEGEND.items() if term not in unused_terms}
 
