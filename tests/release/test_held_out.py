@@ -172,7 +172,7 @@ def learned(sets: Sequence[Sequence[Published]]) -> float:
     features = np.concatenate([structure(items) for items in sets])
     is_void = np.array([one.is_void for items in sets for one in items])
     groups = [one.scenario for items in sets for one in items]
-    trees = ExtraTreesClassifier(200, min_samples_leaf=2, class_weight="balanced", random_state=0)
+    trees = ExtraTreesClassifier(200, min_samples_leaf=2, random_state=0).set_params(class_weight="balanced")
     predicted = cross_val_predict(trees, features, is_void, groups=groups, cv=GroupKFold(8))
     return float(balanced_accuracy_score(is_void, predicted))
 
