@@ -14,7 +14,7 @@ import pytest
 from tests.build.errors import raises
 from tests.conftest import ROOT
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.files import remedy, replace_file, write_bytes, write_text
+from traps_pipeline.base.files import remedy, replace_file, replace_folder, write_bytes, write_text
 
 
 @pytest.fixture
@@ -96,3 +96,52 @@ def test_a_missing_file_that_the_block_reads_is_not_taken_for_one_that_cannot_be
         part.write_bytes((file.parent / "no-such-clip.mp4").read_bytes())
     assert file.read_text() == "former"
     assert alone(file)
+
+
+def test_a_private_file_is_the_owners_alone_from_its_first_byte(file: Path) -> None:
+    with replace_file(file, private=True) as part:
+        assert part.stat().st_mode & 0o777 == 0o600 and part.stat().st_size == 0
+        part.write_text("secret")
+    assert file.stat().st_mode & 0o777 == 0o600
+
+
+def names_in(folder: Path) -> dict[str, str]:
+    return {path.relative_to(folder).as_posix(): path.read_text() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_folder_is_replaced_whole_and_keeps_hidden_entries(tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    for content in ("first", "second"):
+        with replace_folder(folder) as part:
+            (part / content).write_text(content)
+            (folder / ".git").mkdir(exist_ok=True) if folder.exists() else None
+    (folder / ".git" / "config").write_text("kept")
+    with pytest.raises(KeyboardInterrupt), replace_folder(folder) as part:
+        (part / "third").write_text("third")
+        raise KeyboardInterrupt
+    with replace_folder(folder) as part:
+        (part / "fourth").write_text("fourth")
+    assert names_in(tmp_path) == {"out/fourth": "fourth", "out/.git/config": "kept"}
+
+
+@pytest.mark.parametrize("is_new_in_place", [False, True])
+def test_a_kill_between_two_renames_loses_nothing(tmp_path: Path, is_new_in_place: bool) -> None:
+    folder = tmp_path / "out"
+    with replace_folder(folder) as part:
+        (part / "old").write_text("old")
+        (part / ".git").write_text("kept")
+    folder.rename(tmp_path / ".out.former.part")  # as a kill leaves them
+    (folder if is_new_in_place else tmp_path / ".out.new.part").mkdir()
+    with pytest.raises(ZeroDivisionError), replace_folder(folder):
+        assert names_in(folder) == ({".git": "kept"} if is_new_in_place else {"old": "old", ".git": "kept"})
+        raise ZeroDivisionError
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_folder_that_cannot_be_made_is_told_in_a_sentence(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with (
+        raises(TrapsError, "base.files.replace_folder", str(tmp_path / "file" / "out")),
+        replace_folder(tmp_path / "file" / "out"),
+    ):
+        pass

@@ -299,7 +299,8 @@ def answer_to(question: str) -> str:
 def text_for(question: Question) -> str:
     """The text of a good answer: a judge's JSON, the benchmark's JSON or a sentence."""
     if '{"abstained"' in question.system:
-        return json.dumps(_abstention(question.text))
+        asked = {"rejects_premise": False} if '"rejects_premise"' in question.system else {}
+        return json.dumps(_abstention(question.text) | asked)
     if '{"correct"' in question.system:
         return json.dumps(_correctness(question.text))
     answer = " and then ".join(question.colours) or answer_to(question.text)

@@ -10,15 +10,12 @@ from typing import Any
 
 import pytest
 
-from tests.build.errors import raises
 from tests.conftest import Checkout
 from tests.release.environments import run_in
 from traps_pipeline.base.digests import file_digest
-from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.benchmark.held_out import held_out_key
 from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.release.checksums import altered_files
-from traps_pipeline.release.content import content_of, item_rows
+from traps_pipeline.release.content import content_of
 from traps_pipeline.release.folder import Options, identity_texts, write_release
 from traps_pipeline.release.released_rows import OPEN
 from traps_pipeline.storage.benchmark_tables import ITEMS
@@ -127,32 +124,6 @@ def test_for_double_blind_review_nothing_names_its_authors(workspace: Workspace,
     assert [word for word in words for text in texts if word in text] == []
 
 
-def test_a_held_out_set_tells_no_side_no_pair_and_no_answer(workspace: Workspace, tmp_path: Path) -> None:
-    content, key = content_of(workspace), tmp_path / "key"
-    written = write_release(content, tmp_path / "held", Options(held_out=key))
-    texts = "".join(c.decode() for name, c in files(tmp_path / "held").items() if name.endswith((".jsonl", "SUMS")))
-    told = {name for row in item_rows(content) for name in (row.item_id, row.pair_id, row.scenario_id)}
-    assert [name for name in told if name in texts] == []
-    assert {*rows(tmp_path / "held" / "clips" / "metadata.jsonl")[0]} == {
-        "item", "question", "file_name", "media_digest", "canary",
-    }  # fmt: skip
-    assert written.answers is not None
-    which = {row["item"]: row["item_id"] for row in rows(written.answers)}
-    digests = {row["item_id"]: row["media_digest"] for row in content.items}
-    for row in rows(tmp_path / "held" / "clips" / "metadata.jsonl"):
-        assert digests[which[row["item"]]] == row["media_digest"]
-    before = files(tmp_path / "held")
-    write_release(content, tmp_path / "held", Options(held_out=key))
-    assert files(tmp_path / "held") == before
-    inside = tmp_path / "held" / "key"
-    with raises(TrapsError, "release.folder.write_release", str(inside)):
-        write_release(content, tmp_path / "held", Options(held_out=inside))
-    assert files(tmp_path / "held") == before
-    (tmp_path / "other").write_text("no key")
-    with raises(TrapsError, "benchmark.held_out.held_out_key", str(tmp_path / "other"), "64"):
-        held_out_key(tmp_path / "other")
-
-
 def test_a_clip_that_is_not_its_items_is_named_and_nothing_is_written(demo_study: Checkout, tmp_path: Path) -> None:
     clip = next((demo_study.workspace / "clips" / "plinko-0001").glob("void*.mp4"))
     clip.write_bytes(b"other")
@@ -212,7 +183,6 @@ def test_mlcroissant_validates_its_description_and_reads_every_record(released: 
 SIGN = """
 import sys
 from pathlib import Path
-from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.release.signing import check_signature, sign
 folder, private, public, other = map(Path, sys.argv[1:])
 for refused in (lambda: sign(folder, public), lambda: check_signature(folder, public)):

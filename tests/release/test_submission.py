@@ -8,6 +8,7 @@ import json
 import re
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
@@ -15,18 +16,22 @@ import pyarrow.parquet as pq
 import pytest
 
 from tests.build.errors import raises
-from tests.conftest import Checkout
+from tests.conftest import SMALL, Checkout
+from tests.providers.server import Provider
+from traps_pipeline.base.archives import pack as zipped
+from traps_pipeline.base.archives import unpack
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.verdicts import decide
 from traps_pipeline.models.registry.judges import BY_RULES, RULES_VERSION
 from traps_pipeline.release.content import content_of
 from traps_pipeline.release.folder import Options, write_release
 from traps_pipeline.release.released_rows import SUBMITTED
-from traps_pipeline.release.submission import ABOUT, TABLES, _zip, pack, read_submission, table_bytes
+from traps_pipeline.release.submission import ABOUT, TABLES, pack, read_submission, table_bytes
 from traps_pipeline.release.submissions import gather, write_board
-from traps_pipeline.release.verification import verify
+from traps_pipeline.release.verification import NOT_RECOMPUTED, released_items, verify, verify_file
 from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.scoring.scores import score
+from traps_pipeline.storage.tables import records
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
@@ -63,7 +68,7 @@ def forged(
     content = {name: table_bytes(TABLES[name], frame) for name, frame in frames.items()}
     digests = {name: hashlib.sha256(data).hexdigest() for name, data in content.items()}
     said = json.loads(submission.about.model_dump_json()) | {"files": digests} | about
-    target.write_bytes(_zip({ABOUT: json.dumps(said).encode(), **content}))
+    target.write_bytes(zipped({ABOUT: json.dumps(said).encode(), **content}))
     return target
 
 
@@ -76,7 +81,7 @@ def put(frames: Frames, name: str, column: str, value: object, **where: object) 
 
 
 def problems(path: Path, release: Path | None = None) -> list[str]:
-    return verify(read_submission(path), release).problems
+    return verify(read_submission(path), release and released_items(release)).problems
 
 
 @pytest.mark.promise
@@ -89,7 +94,7 @@ def test_a_study_packed_twice_is_the_same_file_and_holds_against_its_release(
     finished = small.traps("publish", "verify", again, "--release", release)
     *told, last = finished.out.splitlines()
     assert finished.code == 0 and last.startswith(f"{again}: ")
-    assert len(told) == 1 + 2  # what was checked, and two things that nobody can check
+    assert len(told) == 1 + 3  # what was checked, and three things that nobody can check
     # 12 scenarios x 2 datasets x 2 sides; 3 models x 2 regimes; three judges on two tasks of a control, one of a void
     rows = {name: len(frame) for name, frame in read_submission(again).tables.items()}
     assert (rows["items.parquet"], rows["responses.parquet"], rows["votes.parquet"]) == (48, 288, 144 * 9)
@@ -100,7 +105,7 @@ def test_a_table_that_is_not_the_packed_one_is_named(packed: Path, tmp_path: Pat
     about = json.loads(submission.about.model_dump_json())
     about["files"]["votes.parquet"] = "0" * 64
     content = {name: table_bytes(TABLES[name], frame) for name, frame in submission.tables.items()}
-    (tmp_path / "f.zip").write_bytes(_zip({ABOUT: json.dumps(about).encode(), **content}))
+    (tmp_path / "f.zip").write_bytes(zipped({ABOUT: json.dumps(about).encode(), **content}))
     (problem,) = problems(tmp_path / "f.zip")
     assert "votes.parquet" in problem
 
@@ -205,11 +210,11 @@ def test_compressed_members_other_columns_and_other_files_are_refused(packed: Pa
     table = pq.read_table(io.BytesIO(content["votes.parquet"])).drop_columns(["rationale"])
     made = io.BytesIO()
     pq.write_table(table, made)
-    path.write_bytes(_zip(content | {"votes.parquet": made.getvalue()}))
+    path.write_bytes(zipped(content | {"votes.parquet": made.getvalue()}))
     with raises(TrapsError, "release.submission._frame", "votes.parquet") as refused:
         read_submission(path)
     assert refused.value.__cause__ is None  # it could be read
-    path.write_bytes(_zip(content | {"votes.parquet": b"\x80\x04K\x01."}))  # a pickle is no table
+    path.write_bytes(zipped(content | {"votes.parquet": b"\x80\x04K\x01."}))  # a pickle is no table
     with raises(TrapsError, "release.submission._frame", "votes.parquet") as refused:
         read_submission(path)
     assert refused.value.__cause__ is not None
@@ -238,8 +243,10 @@ def test_submissions_of_the_same_items_and_panel_are_ranked_together(
     assert {*rows["submission"].to_pylist()} == {"small", "other"}
     page = (tmp_path / "board" / "index.html").read_text()
     assert "oracle@other" in page and page.count('class="chapter"') == 1 and BY_RULES[1:] not in page
-    with raises(TrapsError, "release.submissions.gather", "'small'"):
-        gather([packed, packed])
+    again = gather([packed, other, packed])
+    assert [entry.name for entry in again.accepted] == ["small", "other"]
+    (refused,) = again.refused
+    assert str(packed) in refused.problems[0] and "'small'" in refused.problems[0] and "--name" in refused.problems[0]
 
 
 def test_other_items_or_another_panel_are_never_ranked_together(packed: Path, tmp_path: Path) -> None:
@@ -284,3 +291,119 @@ def test_a_forged_submission_is_not_ranked_and_its_reason_is_on_the_page(
         assert [name for name in ("pecs", "1.0", "0.0") if name not in told] == [], text
     with raises(TrapsError, "release.submissions.gather", "forged.zip", "pecs"):
         gather([path])
+
+
+# --- a stranger's tables ----------------------------------------------------------------------------------------------
+
+
+def odd_value(value: object) -> object:
+    """A value of the same kind that a column does not hold."""
+    if isinstance(value, bool):
+        return not value
+    if isinstance(value, str):
+        return "elsewhere"
+    return value + 7 if isinstance(value, int | float) else pd.Timestamp("2001-01-01", tz="UTC")
+
+
+@pytest.mark.parametrize("name", ["items", "responses", "votes", "metrics", "leaderboard"])
+def test_every_column_of_a_table_is_recomputed_or_named_as_not_recomputed(packed: Path, name: str) -> None:
+    submission, table = read_submission(packed), TABLES[f"{name}.parquet"]
+    rows, unseen = records(submission.table(table)), list[str]()
+    for column in set(table.names) - {"labels", "created_at"}:
+        at = next((k for k, row in enumerate(rows) if row[column] is not None), None)
+        if at is None:
+            value: object = True if column == "rejects_premise" else "elsewhere" if column == "error" else 7
+            at = 0
+        else:
+            value = odd_value(rows[at][column])
+        changed = [row | {column: value} if k == at else row for k, row in enumerate(rows)]
+        frame = pd.DataFrame(changed, columns=pd.Index(table.names))
+        tables = {**submission.tables, f"{name}.parquet": frame}
+        problems = verify(replace(submission, tables=tables)).problems
+        assert not [problem for problem in problems if "np." in problem]
+        if not problems:
+            unseen.append(column)
+    assert {*unseen} == {*NOT_RECOMPUTED.get(name, ())} - {"created_at"}
+
+
+def test_rejections_that_the_rules_do_not_see_are_named_though_all_numbers_were_made_anew(
+    packed: Path, tmp_path: Path
+) -> None:
+    def edit(frames: Frames) -> None:
+        votes = frames["votes.parquet"]
+        is_void = votes["item_id"].str.endswith(":void") & votes["task"].eq("abstention")
+        votes.loc[is_void & votes["model"].eq("oracle"), "rejects_premise"] = True
+
+    found = problems(forged(packed, tmp_path / "f.zip", edit, rescore=True))
+    assert found and all("rejects_premise is True" in one for one in found[:-1])
+
+
+def hostile_metadata(packed: Path, target: Path, name: str) -> Path:
+    """A submission whose tables tell pandas to take an attribute of theirs for the index."""
+    submission, content = read_submission(packed), dict[str, bytes]()
+    for file in TABLES:
+        table = pq.read_table(io.BytesIO(unpack(packed.read_bytes())[file]))
+        told = {"index_columns": ["__class__"], "columns": [{"name": "item_id", "metadata": {"x": 1}}]}
+        stream = io.BytesIO()
+        pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(told)}), stream)
+        content[file] = stream.getvalue()
+    digests = {file: hashlib.sha256(data).hexdigest() for file, data in content.items()}
+    said = json.loads(submission.about.model_dump_json()) | {"files": digests, "name": name}
+    target.write_bytes(zipped({ABOUT: json.dumps(said).encode(), **content}))
+    return target
+
+
+def test_an_odd_submission_is_left_out_with_a_sentence_and_all_others_are_ranked(packed: Path, tmp_path: Path) -> None:
+    def foreign(frames: Frames) -> None:
+        put(frames, "responses", "dataset", "elsewhere", model="prior")
+
+    def no_number(frames: Frames) -> None:
+        frames["items.parquet"]["labels"] = [[] for _ in range(len(frames["items.parquet"]))]
+
+    odd = [
+        forged(packed, tmp_path / f"{k}.zip", change, name=f"odd-{k}") for k, change in enumerate((foreign, no_number))
+    ]
+    odd.append(tmp_path / "cut.zip")
+    odd[-1].write_bytes(packed.read_bytes()[:-400])
+    odd.append(tmp_path / "gone.zip")
+    told = hostile_metadata(packed, tmp_path / "metadata.zip", "told")
+    board = gather([*odd, packed, told])
+    assert [entry.name for entry in board.accepted] == ["small", "told"]
+    assert [entry.name for entry in board.refused] == [path.name for path in odd]
+    assert all(entry.problems and "Traceback" not in entry.problems[0] for entry in board.refused)
+    assert all(str(path) in entry.problems[0] for path, entry in zip(odd[2:], board.refused[2:], strict=True))
+    write_board(board, tmp_path / "board")
+    page = (tmp_path / "board" / "index.html").read_text()
+    assert all(name in page for name in ("0.zip", "1.zip", "cut.zip", "gone.zip", "oracle@small", "oracle@told"))
+
+
+def test_whatever_a_check_raises_refuses_its_file_in_a_sentence(
+    packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def surprise(*_: object) -> object:
+        raise RecursionError("deep")
+
+    monkeypatch.setattr("traps_pipeline.release.verification.decide", surprise)
+    with raises(TrapsError, "release.verification.verify_file", str(packed), "RecursionError"):
+        verify_file(packed)
+
+
+@pytest.mark.parametrize("premise", [False, True])
+def test_a_submission_judged_by_language_models_is_ranked_with_and_without_their_view_of_the_premise(
+    packed: Path, unasked: Checkout, provider: Provider, tmp_path: Path, premise: bool
+) -> None:
+    of_judge = f'base_url: "{provider.url}/v1", premise: {str(premise).lower()}'
+    judges = "".join(f"  - {{id: judge-{k}, {of_judge}}}\n" for k in "abc")
+    path, scenarios = tmp_path / "judged.yaml", SMALL.read_text()
+    path.write_text(
+        f"name: judged\nmodels: [oracle, prior]\nregimes: [standard]\njudges:\n{judges}"
+        f"panels: {{three: [judge-a, judge-b, judge-c]}}\n{scenarios[scenarios.index('scenarios:') :]}"
+    )
+    unasked.traps("run", path, "--panel", "three", "--no-preflight", "--until", "leaderboard").ok()
+    mine = tmp_path / "mine.zip"
+    unasked.traps("publish", "submit", mine, "--name", "mine").ok()
+    assert read_submission(mine).tables["leaderboard.parquet"]["n_rejects"].isna().all() != premise
+    finished = unasked.traps("publish", "leaderboard", packed, mine, "--out", tmp_path / "board")
+    assert finished.code == 0, finished.err
+    page = (tmp_path / "board" / "index.html").read_text()
+    assert page.count('class="chapter"') == 2 and "panel three@" in page and "panel rules@" in page

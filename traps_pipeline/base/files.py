@@ -38,13 +38,14 @@ def remedy(error: OSError) -> str:
 
 
 @contextmanager
-def replace_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
+def replace_file(path: Path, *, durable: bool = False, private: bool = False) -> Iterator[Path]:
     """Yield a temporary path beside `path`, which replaces `path` after the block.
 
     Until then, and after an error, Ctrl-C or a kill, `path` keeps its former content. An unfinished file is removed;
     only a kill leaves one, hidden and named `*.part`, which nothing reads. Missing folders are created.
 
     durable: sync the content to disk before it gets its name, so that a power cut leaves no torn file under that name.
+    private: let the owner alone read it, from its first byte.
     Raises TrapsError that names `path` when it cannot be written; an OSError about another file, which the block reads,
     passes unchanged.
     """
@@ -53,6 +54,8 @@ def replace_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
+            if private:
+                part.touch(0o600, exist_ok=False)
             yield part
             if durable:
                 with part.open("rb") as stream:
@@ -125,15 +128,55 @@ def require_in_place(descriptor: int, path: Path) -> None:
         )
 
 
-def write_bytes(path: Path, content: bytes, *, durable: bool = False) -> None:
+def write_bytes(path: Path, content: bytes, *, durable: bool = False, private: bool = False) -> None:
     """Write a file atomically, as `replace_file` does."""
-    with replace_file(path, durable=durable) as part:
+    with replace_file(path, durable=durable, private=private) as part:
         part.write_bytes(content)
 
 
-def write_text(path: Path, text: str) -> None:
+def write_text(path: Path, text: str, *, private: bool = False) -> None:
     """Write UTF-8 text atomically, as `replace_file` does."""
-    write_bytes(path, text.encode())
+    write_bytes(path, text.encode(), private=private)
+
+
+@contextmanager
+def replace_folder(path: Path) -> Iterator[Path]:
+    """Yield an empty folder beside `path`, which replaces `path` and its files after the block.
+
+    Until then, and after an error, Ctrl-C or a kill, `path` keeps its former content. Hidden entries of `path`, such as
+    `.git`, stay. What a kill leaves is hidden, and the next call for `path` clears it. Raises TrapsError.
+    """
+    part, former = (path.with_name(f".{path.name}.{name}{PART}") for name in ("new", "former"))
+    try:
+        _finish_replacement(path, former)
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir(parents=True)
+        try:
+            yield part
+            if path.exists():
+                path.rename(former)
+            part.rename(path)
+            _finish_replacement(path, former)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+    except OSError as error:
+        if error.filename is not None and not str(error.filename).startswith((str(path), str(part), str(former))):
+            raise
+        raise TrapsError(
+            f"{path}: cannot be written ({error.strerror or error}); {remedy(error)} and run the same command again"
+        ) from error
+
+
+def _finish_replacement(path: Path, former: Path) -> None:
+    """Take a folder's former content back if nothing has replaced it, else delete it but for hidden entries."""
+    if not former.is_dir():
+        return
+    if not path.exists():
+        former.rename(path)
+        return
+    for entry in former.glob(".*"):
+        entry.rename(path / entry.name)
+    shutil.rmtree(former)
 
 
 def is_same_file(first: Path, second: Path) -> bool:

@@ -10,6 +10,7 @@ from typing import Any
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.benchmark.held_out import released_only
 from traps_pipeline.benchmark.specs import expected_specs, released_in_study
 from traps_pipeline.benchmark.versions import item_content, spec_record, version_of
 from traps_pipeline.protocol.datasets import (
@@ -57,8 +58,10 @@ def build_items(workspace: Workspace, dataset: str) -> list[ItemRow]:
     )
     commonest = commonest_answers(specs)
     if dataset in UNPAIRED:
-        return _arm_items(workspace, dataset, {spec["scenario_id"]: spec for spec in specs}, commonest, version)
-    return [_item(dataset, spec, side, clips, commonest, version) for spec in specs for side in SIDES]
+        rows = _arm_items(workspace, dataset, {spec["scenario_id"]: spec for spec in specs}, commonest, version)
+    else:
+        rows = [_item(dataset, spec, side, clips, commonest, version) for spec in specs for side in SIDES]
+    return released_only(workspace.root, rows)
 
 
 def expected_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
@@ -81,7 +84,8 @@ def expected_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
     }
     complete_specs = [spec for spec in specs if all((spec["scenario_id"], side) in clips for side in SIDES)]
     commonest = commonest_answers(specs)
-    return [asdict(_item(dataset, spec, side, clips, commonest, "")) for spec in complete_specs for side in SIDES]
+    rows = [_item(dataset, spec, side, clips, commonest, "") for spec in complete_specs for side in SIDES]
+    return [asdict(row) for row in released_only(workspace.root, rows)]
 
 
 def _arm_items(

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.paths import OWN_SPECS, SCENE_SPECS
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.wording import count_noun
 from traps_pipeline.cli.command import FAILED, OK, Commands, integer, open_workspace, print_json
@@ -95,6 +96,8 @@ def release(arguments: argparse.Namespace) -> int:
     print(f"{count_noun(output.files, 'file')} in {target}: {count_noun(output.clips, 'clip')}; {rows}")
     if output.answers:
         print(f"which item is which, for you alone: {output.answers}")
+        if SCENE_SPECS == OWN_SPECS:
+            print("these scenarios are published: frames tell their answers; draw your own with traps benchmark sample")
     if arguments.sign:
         print(f"signature: {sign(target, arguments.sign)}")
     print(f"next: read {target / CARD}; traps publish verify {target}")
@@ -138,10 +141,9 @@ def verify(arguments: argparse.Namespace) -> int:
 
 def verify_file(path: Path, release: Path | None, *, is_json: bool) -> int:
     """Return the report of `traps publish verify` on a submission."""
-    from traps_pipeline.release.submission import read_submission
-    from traps_pipeline.release.verification import verify
+    from traps_pipeline.release import verification as checks
 
-    verification = verify(read_submission(path), release)
+    _, verification = checks.verify_file(path, None if release is None else checks.released_items(release))
     if is_json:
         print_json(
             {"problems": verification.problems, "checked": verification.checked, "not_checked": verification.unchecked}

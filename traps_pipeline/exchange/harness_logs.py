@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from traps_pipeline.base.archives import BadArchive, reading_archive
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.yamlfile import read_lines
@@ -26,7 +27,6 @@ MAX_SAMPLE_BYTES, MAX_LOG_BYTES, MAX_SAMPLES = 2**28, 2 * 2**30, 1_000_000
 # Outcome by finish reason in a log; an error is asked again.
 OUTCOMES = {"complete": "answer", "truncated": "truncated", "refused": "refused", "transient": "error"}
 _ZSTD, _LOCAL_HEADER = 93, struct.Struct("<4s5H3I2H")
-_NO_ZIP = (zipfile.BadZipFile, zlib.error, ValueError, RuntimeError, EOFError, NotImplementedError, struct.error)
 LOG = ".eval"  # suffix of inspect_ai's own log format
 Reader = Callable[[Path], Iterator["LoggedAnswer"]]
 
@@ -85,7 +85,7 @@ def _json_log(path: Path) -> Iterator[LoggedAnswer]:
 def _eval_log(path: Path) -> Iterator[LoggedAnswer]:
     """Yield answers of a zipped log, with one JSON file (deflate, zstd) per sample."""
     try:
-        with zipfile.ZipFile(path) as archive, path.open("rb") as raw:
+        with reading_archive(), zipfile.ZipFile(path) as archive, path.open("rb") as raw:
             entries = [entry for entry in archive.infolist() if entry.filename.startswith("samples/")]
             if len(entries) > MAX_SAMPLES:
                 raise TrapsError(f"{path}: has more than {MAX_SAMPLES} samples")
@@ -96,7 +96,7 @@ def _eval_log(path: Path) -> Iterator[LoggedAnswer]:
                 yield _sample(f"{path}: {entry.filename}", json.loads(content))
     except OSError as error:
         raise TrapsError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except (*_NO_ZIP, RecursionError) as error:
+    except BadArchive as error:
         raise TrapsError(
             f"{path}: is no log that can be read ({plain(error)[:200]}); convert it: inspect log convert --to json"
         ) from error

@@ -6,9 +6,7 @@ the asset's state, together with digests of its inputs.
 
 from __future__ import annotations
 
-import io
 import json
-import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -17,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from traps_pipeline.base import progress
+from traps_pipeline.base.archives import pack, unpack
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.files import write_bytes
 from traps_pipeline.base.paths import user_cache
@@ -26,7 +25,6 @@ from traps_pipeline.storage.workspace import Workspace
 Digests = tuple[str, str]  # of the versions of what a piece reads, and of what it shows of it
 NOTES = "inputs.json"  # archive member with the digests of each piece
 _DRAWN_BY = ("matplotlib", "pandas", "jinja2")  # libraries whose versions decide what a piece looks like
-_DATE = (1980, 1, 1, 0, 0, 0)  # date of every member, so that equal pieces give equal bytes
 
 
 @dataclass(frozen=True)
@@ -111,21 +109,14 @@ class _SharedPieces:
 
 
 def _archive(inputs: Mapping[str, Digests], contents: Mapping[str, bytes]) -> bytes:
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, content in {NOTES: json.dumps(inputs).encode(), **contents}.items():
-            archive.writestr(zipfile.ZipInfo(name, _DATE), content, zipfile.ZIP_DEFLATED, compresslevel=1)
-    return stream.getvalue()
+    return pack({NOTES: json.dumps(inputs).encode(), **contents}, level=1)
 
 
 def _read(data: bytes) -> dict[str, tuple[Digests, bytes]]:
     """Return the digests and content of each piece; empty if the archive is damaged, or of an earlier version."""
     try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            inputs = {
-                name: (str(versions), str(inputs_digest))
-                for name, (versions, inputs_digest) in json.loads(archive.read(NOTES)).items()
-            }
-            return {name: (digests, archive.read(name)) for name, digests in inputs.items()}  # checks each CRC
-    except (zipfile.BadZipFile, ValueError, KeyError, TypeError):
+        members = unpack(data)
+        inputs = json.loads(members[NOTES]).items()
+        return {name: ((str(versions), str(inputs)), members[name]) for name, (versions, inputs) in inputs}
+    except (ValueError, KeyError, TypeError, AttributeError):
         return {}

@@ -102,8 +102,7 @@ def commit(benchmark: Path, commitment: Path, reveal: Path) -> Commitment:
         specs={id_: _seal_spec(secret, spec) for id_, spec in sorted(specs.items())},
         made_with=_arithmetic(),
     )
-    write_text(reveal, secret.model_dump_json(indent=1) + "\n")
-    reveal.chmod(0o600)
+    write_text(reveal, secret.model_dump_json(indent=1) + "\n", private=True)
     write_text(commitment, published.model_dump_json(indent=1) + "\n")
     return published
 

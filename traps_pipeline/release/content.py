@@ -19,6 +19,7 @@ from traps_pipeline.models.registry.prompts import prompt, system_prompt
 from traps_pipeline.pipeline.experiment import LITE_FILE
 from traps_pipeline.protocol.datasets import ARMS, DATASETS
 from traps_pipeline.protocol.regimes import PAPER_REGIMES
+from traps_pipeline.release.held_out_clips import clip_name
 from traps_pipeline.release.released_rows import (
     CertificateRow,
     HeldOutItemRow,
@@ -45,8 +46,9 @@ Rows = Sequence[Mapping[str, Any]]
 
 @dataclass(frozen=True)
 class Content:
-    """A release's content: ITEMS and SCENE_SPECS rows, clips by path, benchmark."""
+    """A release's content: the study's folder, ITEMS and SCENE_SPECS rows, clips by path, benchmark."""
 
+    study: Path
     items: Rows
     specs: Rows
     clips: Mapping[str, Path]
@@ -75,7 +77,7 @@ def content_of(workspace: Workspace, arms: Sequence[str] = ()) -> Content:
         path = clips[row["clip"]]
         if not path.is_file() or file_digest(path) != row["media_digest"]:
             raise TrapsError(f"{path}: is missing or not the clip of its item; materialize videos again")
-    return Content(items, specs, clips, load_release())
+    return Content(workspace.root, items, specs, clips, load_release())
 
 
 def _records(workspace: Workspace, table: Any, datasets: Sequence[str] | None = None) -> list[dict[str, Any]]:
@@ -146,24 +148,22 @@ def item_rows(content: Content) -> list[ReleasedItemRow]:
     ]
 
 
-def held_out_rows(content: Content, key: bytes) -> list[HeldOutItemRow]:
-    """Return one row per item, sorted by opaque name; no field reveals the answer."""
+def held_out_rows(items: Rows, digests: Mapping[str, str], key: bytes, canary: str) -> list[HeldOutItemRow]:
+    """Return one row per item, sorted by opaque name; no field reveals the answer.
+
+    digests: of each item's own clip.
+    """
     rows = [
         HeldOutItemRow(
             item=opaque(key, row["item_id"]),
             question=row["question"],
-            file_name=held_out_clip(row["media_digest"]).removeprefix(_CLIPS),
-            media_digest=row["media_digest"],
-            canary=content.release.canary,
+            file_name=f"items/{clip_name(digests[row['item_id']])}",
+            media_digest=digests[row["item_id"]],
+            canary=canary,
         )
-        for row in content.items
+        for row in items
     ]
     return sorted(rows, key=lambda row: row.item)
-
-
-def held_out_clip(media_digest: str) -> str:
-    """Return a clip's path without answers: its name is its content's digest."""
-    return f"{_CLIPS}{media_digest[:2]}/{media_digest[:32]}.mp4"
 
 
 def scenario_rows(content: Content) -> list[ScenarioRow]:

@@ -12,14 +12,16 @@ from typing import Any
 import yaml
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.files import write_bytes, write_text
+from traps_pipeline.base.files import replace_folder, write_bytes, write_text
 from traps_pipeline.base.paths import ASSETS, ROOT
-from traps_pipeline.benchmark.held_out import held_out_key, opaque
+from traps_pipeline.benchmark.held_out import drawn_items, held_out_key, mark_held_out, opaque, refuse_held_out
+from traps_pipeline.protocol.datasets import CROSSED
 from traps_pipeline.release import content as rows_of
 from traps_pipeline.release.card import card, dictionary
-from traps_pipeline.release.checksums import CHECKSUMS, SIGNATURE, write_checksums
+from traps_pipeline.release.checksums import CHECKSUMS, write_checksums
 from traps_pipeline.release.content import CLIPS, Content
 from traps_pipeline.release.croissant import croissant
+from traps_pipeline.release.held_out_clips import date_equally, write_held_out_clips
 from traps_pipeline.release.released_rows import (
     CERTIFICATES,
     HELD_OUT,
@@ -93,57 +95,59 @@ class _Folder:
 
 def write_release(content: Content, target: Path, options: Options) -> ReleaseSummary:
     """Write the folder; it may replace only a former release. Raises TrapsError."""
-    if target.exists() and any(target.iterdir()) and not (target / CHECKSUMS).is_file():
-        raise TrapsError(
-            f"{target}: holds other files, or what a stopped release left; give an empty or a new folder, or delete it"
-        )
     if options.held_out is not None and options.held_out.is_relative_to(target):  # before removing a former release
         raise TrapsError(f"{options.held_out}: lies in the folder that is published; keep the key elsewhere")
-    _clear(target)
-    folder = _Folder(target, anonymize if options.anonymous else str)
-    answers = None
+    _require_own(target)
     if options.held_out is None:
-        _open_tables(folder, content)
-        clips = dict(content.clips)
-    else:
-        answers = _write_held_out_tables(folder, content, options.held_out)
-        clips = {rows_of.held_out_clip(row["media_digest"]): content.clips[row["clip"]] for row in content.items}
-    folder.table(PROMPTS, rows_of.prompt_rows(content.release.canary))
-    for name, source in sorted(clips.items()):
-        write_bytes(target / name, source.read_bytes())
-    _pages(folder, content, options)
-    files = write_checksums(target, content.release.canary) + 1
-    return ReleaseSummary(files, len(clips), folder.rows, answers)
+        refuse_held_out(content.study, "an open release")
+    with replace_folder(target) as part:
+        folder = _Folder(part, anonymize if options.anonymous else str)
+        answers = _open_release(folder, content) if options.held_out is None else None
+        if options.held_out is not None:
+            answers = _held_out_release(folder, content, options.held_out)
+        folder.table(PROMPTS, rows_of.prompt_rows(content.release.canary))
+        _pages(folder, content, options)
+        files = write_checksums(part, content.release.canary) + 1
+        if options.held_out is not None:
+            date_equally(part)
+    return ReleaseSummary(files, len([*target.glob(f"{CLIPS}/*/*.mp4")]), folder.rows, answers)
 
 
-def _clear(target: Path) -> None:
-    """Remove all files of a former release, as its checksums name them."""
+def _require_own(target: Path) -> None:
+    """Raise TrapsError unless a folder is missing, empty, or a former release that may be replaced."""
     from traps_pipeline.release.checksums import read_checksums, released_files
 
     if not (target / CHECKSUMS).is_file():
+        if target.exists() and any(target.iterdir()):
+            raise TrapsError(f"{target}: holds other files than a release; give an empty or a new folder")
         return
     foreign_files = sorted({*released_files(target)} - {*read_checksums(target)})
     if foreign_files:
         raise TrapsError(f"{target / foreign_files[0]}: is no file of the release there; move it away")
-    for name in (*released_files(target), CHECKSUMS, SIGNATURE):
-        (target / name).unlink(missing_ok=True)
 
 
-def _open_tables(folder: _Folder, content: Content) -> None:
+def _open_release(folder: _Folder, content: Content) -> None:
     folder.table(PAIRS, rows_of.pair_rows(content))
     folder.table(RELEASED_ITEMS, rows_of.item_rows(content))
     folder.table(SCENARIOS, rows_of.scenario_rows(content))
     folder.table(CERTIFICATES, rows_of.certificate_rows(content))
     folder.table(SPLITS, rows_of.split_rows(content))
+    for name, source in sorted(content.clips.items()):
+        write_bytes(folder.root / name, source.read_bytes())
 
 
-def _write_held_out_tables(folder: _Folder, content: Content, key_file: Path) -> Path:
-    """Write the items without their answers, and the answers beside the key."""
+def _held_out_release(folder: _Folder, content: Content, key_file: Path) -> Path:
+    """Write one item of each scenario with a clip of its own, and the answers beside the key."""
+    if CROSSED in content.versions:
+        raise TrapsError(f"--arms {CROSSED}: it asks questions of other scenarios, which tells sides; leave it out")
     key = held_out_key(key_file, make=True)
-    folder.table(HELD_OUT_ITEMS, rows_of.held_out_rows(content, key))
-    names = sorted((opaque(key, row["item_id"]), row["item_id"]) for row in content.items)
+    items = drawn_items(content.items, key)
+    mark_held_out(content.study, items)
+    digests = write_held_out_clips(items, content.clips, key, folder.root / CLIPS / "items")
+    folder.table(HELD_OUT_ITEMS, rows_of.held_out_rows(items, digests, key, content.release.canary))
+    names = sorted((opaque(key, row["item_id"]), row["item_id"]) for row in items)
     answers = key_file.with_name(f"{key_file.name}.items.jsonl")
-    write_text(answers, "".join(json.dumps({"item": name, "item_id": id_}) + "\n" for name, id_ in names))
+    write_text(answers, "".join(json.dumps({"item": n, "item_id": id_}) + "\n" for n, id_ in names), private=True)
     return answers
 
 

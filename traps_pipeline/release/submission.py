@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import io
 import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -18,11 +17,14 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from traps_pipeline.base.archives import BadArchive, reading_archive
+from traps_pipeline.base.archives import pack as pack_archive
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
 from traps_pipeline.base.names import Name
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.yamlfile import explain
+from traps_pipeline.benchmark.held_out import refuse_held_out
 from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.models.asking.answer_rows import RESPONSES
@@ -33,7 +35,7 @@ from traps_pipeline.models.registry.prompts import prompt_version
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.score_rows import LEADERBOARD, METRICS
 from traps_pipeline.storage.benchmark_tables import ITEMS, current_rows
-from traps_pipeline.storage.tables import Table
+from traps_pipeline.storage.tables import Table, records
 from traps_pipeline.storage.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -43,8 +45,6 @@ ABOUT = "submission.json"
 TABLES: Mapping[str, Table[Any]] = {f"{t.name}.parquet": t for t in (ITEMS, RESPONSES, VOTES, METRICS, LEADERBOARD)}
 MAX_FILE_BYTES, MAX_TABLE_BYTES, MAX_ROWS = 2 * 2**30, 4 * 2**30, 20_000_000
 MAX_ABOUT_BYTES = 2**20
-_DATE = (1980, 1, 1, 0, 0, 0)
-_NO_ZIP = (zipfile.BadZipFile, zlib.error, ValueError, RuntimeError, EOFError, OverflowError, NotImplementedError)
 
 
 class _Strict(BaseModel):
@@ -106,6 +106,7 @@ def pack(workspace: Workspace, target: Path, name: str) -> About:
 
     Raises TrapsError if it is not judged or scored yet.
     """
+    refuse_held_out(workspace.root, "a submission")
     study = workspace.study
     frames = {
         "items.parquet": workspace.tables.read_all(ITEMS, dataset=DATASETS),
@@ -137,7 +138,7 @@ def pack(workspace: Workspace, target: Path, name: str) -> About:
         )
     except ValidationError as error:
         raise TrapsError(f"--name {name!r:.100}: {explain(error)}; use lower-case letters, digits, - and .") from error
-    write_bytes(target, _zip({ABOUT: description.model_dump_json(indent=1).encode() + b"\n", **content}))
+    write_bytes(target, pack_archive({ABOUT: description.model_dump_json(indent=1).encode() + b"\n", **content}))
     return description
 
 
@@ -153,16 +154,6 @@ def table_bytes(table: Table[Any], frame: pd.DataFrame) -> bytes:
     return buffer.getvalue()
 
 
-def _zip(content: Mapping[str, bytes]) -> bytes:
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
-        for name, data in content.items():
-            entry = zipfile.ZipInfo(name, date_time=_DATE)
-            entry.create_system, entry.external_attr = 3, 0o644 << 16
-            archive.writestr(entry, data, zipfile.ZIP_STORED)
-    return buffer.getvalue()
-
-
 # --- reading ----------------------------------------------------------------------------------------------------------
 
 
@@ -172,13 +163,13 @@ def read_submission(path: Path) -> Submission:
         size = path.stat().st_size
         if size > MAX_FILE_BYTES:
             raise TrapsError(f"{path}: has {size} bytes, at most {MAX_FILE_BYTES} are read; submit models one by one")
-        with zipfile.ZipFile(path) as archive:
+        with reading_archive(), zipfile.ZipFile(path) as archive:
             content = _members(path, archive)
     except OSError as error:
         raise TrapsError(
             f"{path}: cannot be read ({error.strerror}); name a file that `traps publish submit` wrote"
         ) from error
-    except _NO_ZIP as error:
+    except BadArchive as error:
         raise TrapsError(f"{path}: is no submission ({plain(error)[:200]}); get it again") from error
     try:
         description = About.model_validate_json(content[ABOUT])
@@ -221,13 +212,14 @@ def _frame(path: Path, file: str, content: bytes) -> pd.DataFrame:
         schema = table.arrow_schema()
         if parquet.schema_arrow.names != schema.names or parquet.schema_arrow.types != schema.types:
             raise TrapsError(f"{path}: {file} has other columns than this version's; pack it again, or verify it there")
-        data = parquet.read()
+        data = parquet.read().replace_schema_metadata(None)  # what pandas would make of a stranger's is not wanted
+        frame = data.to_pandas(ignore_metadata=True)
     except (pa.ArrowException, OSError, ValueError) as error:
         raise TrapsError(f"{path}: {file} is no readable table ({plain(error)[:200]}); pack it again") from error
     for column in schema:
         if not column.nullable and data[column.name].null_count:
             raise TrapsError(f"{path}: {file}: column {column.name} has missing values")
-    keys = data.select(list(table.key)).to_pandas()
+    keys = frame[list(table.key)]
     if keys.duplicated().any():
-        raise TrapsError(f"{path}: {file}: {dict(keys.loc[keys.duplicated()].iloc[0])} stands there twice")
-    return data.to_pandas()
+        raise TrapsError(f"{path}: {file}: {records(keys.loc[keys.duplicated()])[0]} stands there twice")
+    return frame

@@ -16,8 +16,8 @@ from traps_pipeline.base.files import write_bytes, write_text
 from traps_pipeline.base.wording import count_noun
 from traps_pipeline.models.registry.judges import id_of_judges
 from traps_pipeline.release.released_rows import SUBMITTED
-from traps_pipeline.release.submission import Submission, read_submission, table_bytes
-from traps_pipeline.release.verification import Verification, verify
+from traps_pipeline.release.submission import Submission, table_bytes
+from traps_pipeline.release.verification import Verification, released_items, verify_file
 from traps_pipeline.report.leaderboard_page import leaderboards, legend
 from traps_pipeline.report.writing import environment, table_html
 from traps_pipeline.scoring.scores import score
@@ -82,27 +82,26 @@ class Board:
 
 
 def gather(paths: Iterable[Path], release: Path | None = None, say: Callable[[str], None] = lambda line: None) -> Board:
-    """Verify and rank submissions. Raises TrapsError for equal names, or none valid."""
-    board = Board()
+    """Verify and rank submissions; one that is refused, for whatever is in it, stops no other.
+
+    Of submissions of one name the first keeps it. Raises TrapsError if none is valid, and for an altered release.
+    """
+    board, released = Board(), None if release is None else released_items(release)
     for path in paths:
         try:
-            submission = read_submission(path)
+            submission, verification = verify_file(path, released)
+            problems = verification.problems
+            if not problems and submission.about.name in {entry.name for entry in board.accepted}:
+                raise TrapsError(
+                    f"{path}: another submission is called {submission.about.name!r}; pack it with another --name"
+                )
+            if not problems:
+                board.accepted.append(AcceptedSubmission(submission, verification))
         except TrapsError as error:
-            board.refused.append(RefusedSubmission(path.name, [str(error)]))
-            say(f"{path}: refused")
-            continue
-        verification = verify(submission, release)
-        if verification.problems:
-            board.refused.append(RefusedSubmission(path.name, verification.problems))
-        else:
-            board.accepted.append(AcceptedSubmission(submission, verification))
-        say(f"{path}: {'refused' if verification.problems else 'verified'}")
-    names = Counter(entry.name for entry in board.accepted)
-    repeated_names = [name for name, n in names.items() if n > 1]
-    if repeated_names:
-        raise TrapsError(
-            f"two submissions are called {repeated_names[0]!r}; pack one of them again with another --name"
-        )
+            problems = [str(error)]
+        if problems:
+            board.refused.append(RefusedSubmission(path.name, problems))
+        say(f"{path}: {'refused' if problems else 'verified'}")
     if not board.accepted:
         reason = "; ".join(f"{entry.name}: {entry.problems[0]}" for entry in board.refused[:3])
         raise TrapsError(f"no submission holds, so there is nothing to rank ({reason})")
@@ -119,7 +118,8 @@ def _group(key: tuple[str, str], members: Sequence[AcceptedSubmission]) -> Ranke
     parts, submissions = list[pd.DataFrame](), dict[str, str]()
     for member in members:
         verdicts = _verdicts(member)
-        names = {m: m if owners[m] == 1 else f"{m}@{member.name}" for m in verdicts["model"].unique()}
+        # A model that is itself called `model@submission` gets another suffix, so that no two rows share a name.
+        names = {m: m if owners[m] == 1 and "@" not in m else f"{m}@{member.name}" for m in verdicts["model"].unique()}
         submissions |= dict.fromkeys(names.values(), member.name)
         parts.append(verdicts.assign(model=[names[model] for model in verdicts["model"]]))
     verdicts = pd.concat(parts, ignore_index=True)

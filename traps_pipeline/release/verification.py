@@ -1,7 +1,7 @@
 """Verify a submission: recast votes, recompute numbers, compare with a release.
 
 Votes are recast if that needs no key. Items, prompts and media are compared with the release's. The result names what
-cannot be checked.
+cannot be checked, among it every column of NOT_RECOMPUTED.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from __future__ import annotations
 import asyncio
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,14 +18,15 @@ from typing import Any
 import pandas as pd
 
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.yamlfile import read_lines
-from traps_pipeline.benchmark.items import item_hash
+from traps_pipeline.benchmark.items import commonest_answers, item_hash
 from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.judging.panel import parse_vote, tasks_for, vote_request
 from traps_pipeline.judging.rules import RuleJudge
 from traps_pipeline.judging.verdicts import decide
 from traps_pipeline.models.asking.answer_rows import RESPONSES
-from traps_pipeline.models.reading.interpret import degenerate
+from traps_pipeline.models.reading.interpret import degenerate, read_answer
 from traps_pipeline.models.reading.judged_answers import is_correct
 from traps_pipeline.models.registry.entries import is_reference
 from traps_pipeline.models.registry.judges import RULE, RULES_VERSION, id_of_judges
@@ -34,7 +35,7 @@ from traps_pipeline.models.request import JUDGED, Outcome, Request
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import REGIMES
-from traps_pipeline.release.submission import Submission
+from traps_pipeline.release.submission import Submission, SubmittedJudge, read_submission
 from traps_pipeline.scoring.score_rows import LEADERBOARD, METRICS
 from traps_pipeline.scoring.scores import Scores, score
 from traps_pipeline.storage.benchmark_tables import ITEMS
@@ -43,6 +44,19 @@ from traps_pipeline.storage.tables import Table, records
 MAX_SENTENCES = 10  # sentences per kind; further ones are counted
 CLOSE = 1e-9  # tolerance: linear algebra of another machine may differ in the last digits
 _ITEM_COLUMNS = ("side", "pair_id", "dataset", "benchmark_version")  # columns that an answer has from its item
+_OF_VOTE = ("side", "dataset", "benchmark_version")  # columns that a vote has from its item
+# Columns that no number of a table gives; all others are compared with what the submission itself makes of them.
+NOT_RECOMPUTED: Mapping[str, tuple[str, ...]] = {
+    ITEMS.name: ("clip",),
+    RESPONSES.name: (
+        *("reasoning", "first_token", "finish_reason", "error", "served_model", "client", "prompt_tokens"),
+        *("completion_tokens", "reasoning_tokens", "cost_usd", "latency_s", "attempts", "request_key", "created_at"),
+    ),
+    VOTES.name: ("epoch", "created_at"),
+}
+# Of a language model's votes, besides; what it says of the value is compared with the value.
+_SAID_BY_JUDGES = ("judge_correct", "confidence", "rationale")
+Released = Mapping[str, tuple[str, str]]  # digests of item and clip by item
 Row = Mapping[str, Any]
 
 
@@ -69,11 +83,20 @@ class Verification:
             self.problems.append(f"... and {len(problems) - MAX_SENTENCES} more of this kind")
 
 
-def verify(submission: Submission, release: Path | None = None) -> Verification:
-    """Verify a submission, against a released folder if given.
+def verify_file(path: Path, released: Released | None = None) -> tuple[Submission, Verification]:
+    """Read and verify a submission. Raises TrapsError that names the file, whatever is in it."""
+    try:
+        submission = read_submission(path)
+        return submission, verify(submission, released)
+    except TrapsError:
+        raise
+    except Exception as error:
+        reason = plain(f"{type(error).__name__}: {error}")[:200]
+        raise TrapsError(f"{path}: holds what no check can read ({reason}); pack it again") from error
 
-    Raises TrapsError for an unreadable release.
-    """
+
+def verify(submission: Submission, released: Released | None = None) -> Verification:
+    """Verify a submission, against `released_items` of a folder if given."""
     verification = Verification()
     items = {row["item_id"]: row for row in records(submission.table(ITEMS))}
     answers, votes = records(submission.table(RESPONSES)), records(submission.table(VOTES))
@@ -85,21 +108,26 @@ def verify(submission: Submission, release: Path | None = None) -> Verification:
     is_judged_by_rules = all(seat.backend == RULE for seat in submission.about.judges)
     verification.look("votes", _wrong_votes(submission, votes, answers, items))
     _numbers(verification, submission)
-    if release is None:
+    if released is None:
         verification.unchecked.append("items and clips against a release: name its folder with --release")
     else:
-        verification.look("items and clips against the release", _foreign_items(items, release))
+        verification.look("items and clips against the release", _foreign_items(items, released))
     verification.unchecked.append("that the answers are the model's: only who asked it knows")
     verification.unchecked.append("that the clips named by digest are those that the model was sent")
+    columns = [f"{table} {', '.join(names)}" for table, names in NOT_RECOMPUTED.items()]
     if not is_judged_by_rules:
         verification.unchecked.append("that the judges cast these votes: asking language models again needs their keys")
+        columns.append(f"votes of language models {', '.join(_SAID_BY_JUDGES)}")
+    verification.unchecked.append(f"columns that no number is made of: {'; '.join(columns)}")
     return verification
 
 
 # --- items and prompts ------------------------------------------------------------------------------------------------
 
 
-def _wrong_items(items: Any) -> Iterator[str]:
+def _wrong_items(items: Collection[Row]) -> Iterator[str]:
+    answers = {(row["sub_scenario"], row["scenario_id"]): row["control_answer"] for row in items}
+    commonest = commonest_answers([{"sub_scenario": k[0], "ground_truth": answers[k]} for k in sorted(answers)])
     for row in items:
         try:
             is_same = item_hash(row) == row["item_hash"]
@@ -109,6 +137,8 @@ def _wrong_items(items: Any) -> Iterator[str]:
             yield f"item {row['item_id']}: is not what its digest says"
         elif row["dataset"] not in DATASETS:
             yield f"item {row['item_id']}: is none of the pairs'"
+        elif row["commonest_answer"] != commonest[row["sub_scenario"]]:
+            yield f"item {row['item_id']}: its commonest answer is not that of its sub-scenario"
 
 
 def _wrong_prompts(submission: Submission) -> Iterator[str]:
@@ -121,7 +151,7 @@ def _wrong_prompts(submission: Submission) -> Iterator[str]:
         yield f"regime {str(regime)[:40]!r}: was asked with a prompt that is not named"
 
 
-def released_items(release: Path) -> dict[str, tuple[str, str]]:
+def released_items(release: Path) -> Released:
     """Return digests of item and clip by item. Raises TrapsError, also if altered."""
     from traps_pipeline.release.checksums import altered_files
     from traps_pipeline.release.content import CLIPS
@@ -140,8 +170,7 @@ def released_items(release: Path) -> dict[str, tuple[str, str]]:
     return items
 
 
-def _foreign_items(items: Mapping[str, Row], release: Path) -> Iterator[str]:
-    released_digests = released_items(release)
+def _foreign_items(items: Mapping[str, Row], released_digests: Released) -> Iterator[str]:
     for id_, row in items.items():
         if id_ not in released_digests:
             yield f"item {id_}: is not in the release"
@@ -176,11 +205,13 @@ def _wrong_answers(answers: Sequence[Row], items: Mapping[str, Row]) -> Iterator
             yield f"answer of {_row_name(row)}: outcome {row['outcome']!r} does not go with its text"
         elif row["outcome"] in JUDGED and (reason := degenerate(text)):
             yield f"answer of {_row_name(row)}: {reason}, so it is none"
+        elif row["outcome"] in JUDGED and row["is_json"] != read_answer(row, None, row["regime"]).is_json:
+            yield f"answer of {_row_name(row)}: is_json is {row['is_json']}, which its text is not"
     expected = dict[str, set[str]]()
     for id_, item in items.items():
         expected.setdefault(item["dataset"], set()).add(id_)
     for (dataset, model, regime, run), ids in items_of.items():
-        for id_ in sorted(expected[dataset] - ids):
+        for id_ in sorted(expected.get(dataset, set()) - ids):
             yield f"answer of {model} ({regime}, run {run}) on {id_}: is missing"
 
 
@@ -215,12 +246,17 @@ def _wrong_votes(
             yield f"vote of {row['judge']!r:.60} on {row['task']!r:.40} of {_row_name(row)}: there is nothing to judge"
             continue
         cast.setdefault(key, set()).add((row["task"], row["judge"]))
+        if any(row[name] != item[name] for name in _OF_VOTE):
+            name = f"vote of {row['judge']} on {row['task']} of {_row_name(row)}"
+            yield f"{name}: its side, dataset or version is not its item's"
+            continue
         cell = Cell(row["dataset"], Evaluation(row["model"], row["regime"], row["run"]))
         request = vote_request(seat, row["task"], cell, item, answer["text"])
         if request.key != row["vote_key"]:
             yield f"answer of {_row_name(row)}: is not the text, or not to the question, that {seat.id} judged"
             continue
-        problem = _vote_difference(row, item, _recast(str(row["task"]), request.user) if seat.backend == RULE else None)
+        recast = _recast(str(row["task"]), request.user) if seat.backend == RULE else None
+        problem = _vote_difference(row, item, seat, recast)
         if problem:
             yield f"vote of {seat.id} on {row['task']} of {_row_name(row)}: {problem}"
     for key, row in texts.items():
@@ -236,40 +272,49 @@ def _recast(task: str, user: str) -> Outcome:
     return asyncio.run(RuleJudge().ask(Request("rules", RULE, {}, "", user, {"task": task})))
 
 
-def _vote_difference(row: Row, item: Row, again: Outcome | None) -> str:
+def _vote_difference(row: Row, item: Row, seat: SubmittedJudge, again: Outcome | None) -> str:
     """Return how a vote differs from the correct one; wrong kinds decide nothing."""
     try:
-        return _difference(row, item, again)
+        expected = _expected_of_rules(row, item, again) if again is not None else _expected_of_judge(row, item, seat)
     except (ValueError, TypeError, AttributeError) as error:
         return f"cannot be decided by its item ({error})"
-
-
-def _difference(row: Row, item: Row, again: Outcome | None) -> str:
-    """Return how a vote differs from the correct one, in words; empty if it does not."""
-    decision = "abstained" if row["task"] == "abstention" else "correct"
-    if again is not None:
-        vote = parse_vote(row["task"], {"outcome": again.kind, "text": again.text}, item)
-        expected = {decision: vote.decision}
-        expected |= {name: getattr(vote, name) for name in ("extracted_value", "valid", "invalid_reason")}
-        wrong_columns = [name for name, value in expected.items() if row[name] != value]
-        return (
-            f"{wrong_columns[0]} is {row[wrong_columns[0]]!r:.40}, its rules say {expected[wrong_columns[0]]!r:.40}"
-            if wrong_columns
-            else ""
-        )
-    if not row["valid"]:
-        return "is invalid and decides nothing, yet has a decision" if row[decision] is not None else ""
-    if row[decision] is None:
+    wrong_columns = [name for name, value in expected.items() if row[name] != value]
+    decision = _decision_column(row)
+    if again is None and row["valid"] and row[decision] is None:
         return "is valid and has no decision"
-    if decision == "correct":
+    maker = "its extracted value gives" if again is None and decision in wrong_columns else "its judge gives"
+    return "".join(f"{n} is {row[n]!r:.40}, {maker} {expected[n]!r:.40}" for n in wrong_columns[:1])
+
+
+def _decision_column(row: Row) -> str:
+    return "abstained" if row["task"] == "abstention" else "correct"
+
+
+def _expected_of_rules(row: Row, item: Row, again: Outcome) -> dict[str, Any]:
+    """Return every column of a rule judge's vote that its answer decides."""
+    vote = asdict(parse_vote(row["task"], {"outcome": again.kind, "text": again.text}, item))
+    return {"abstained": None, "correct": None, _decision_column(row): vote.pop("decision")} | vote
+
+
+def _expected_of_judge(row: Row, item: Row, seat: SubmittedJudge) -> dict[str, Any]:
+    """Return the columns of a language model's vote that its other columns decide."""
+    is_correctness = row["task"] == "correctness"
+    if not row["valid"]:
+        null = ["abstained", "correct", "judge_correct", "extracted_value", "confidence", "rationale"]
+    else:
+        null = [
+            "invalid_reason",
+            *(["abstained"] if is_correctness else ["correct", "judge_correct", "extracted_value"]),
+        ]
+    if not row["valid"] or is_correctness or not seat.premise:
+        null.append("rejects_premise")
+    expected: dict[str, Any] = dict.fromkeys(null)
+    if row["valid"] and is_correctness:
         labels, aliases = list(item["labels"]), json.loads(item["aliases"])
-        own_decision = is_correct(row["extracted_value"], item["ground_truth"], item["answer_type"], labels, aliases)
-        return (
-            ""
-            if own_decision == row["correct"]
-            else f"correct is {row['correct']}, its extracted value gives {own_decision}"
+        expected["correct"] = is_correct(
+            row["extracted_value"], item["ground_truth"], item["answer_type"], labels, aliases
         )
-    return ""
+    return expected
 
 
 # --- numbers ----------------------------------------------------------------------------------------------------------

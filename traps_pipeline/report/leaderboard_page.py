@@ -63,6 +63,7 @@ OPTIONAL = {
     Column("broken", "Broken %", "percent"): "broken",
     Column("bounds", BOUNDS, "range"): "n_missing",
 }
+_SUMMED = ("n_pairs", "n_missing", *(column.field for column in OPTIONAL if column.unit == "count"))
 Robust = Mapping[tuple[str, str], Mapping[str, Any]]  # ROBUST rows by model and regime
 ROBUST_COLUMNS = [
     Column(field, heading, "range", group=not place) for place, (field, heading, *_) in enumerate(ROBUST_FIGURES)
@@ -150,7 +151,7 @@ def legend(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> dict[str,
     """Return the entries of LEGEND for the board's columns and marks."""
     optional_terms = {column.heading: field for column, field in OPTIONAL.items()}
     optional_terms |= {INCOMPLETE_MARK: "incomplete", BROKEN_MARK: "is_broken"}
-    unused_terms = {term for term, field in optional_terms.items() if not (board.loc[:, field] > 0).any()}
+    unused_terms = {term for term, field in optional_terms.items() if not (board.loc[:, field].astype(float) > 0).any()}
     if robust is None or robust.empty:
         unused_terms |= {heading for _, heading, *_ in ROBUST_FIGURES}
     return {term: meaning for term, meaning in LEGEND.items() if term not in unused_terms}
@@ -262,8 +263,7 @@ def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.Dat
         main_row = dataset_rows.get(dataset)
         counted_rows = list(dataset_rows.values()) if main_row is None else [main_row]
         entry: dict[str, Any] = {name: counted_rows[0][name] for name in ("model", "regime")} | (main_row or {})
-        summed_columns = ("n_pairs", "n_missing", *(count.name for count in _COUNTS))
-        entry |= {n: sum(row[n] for row in counted_rows) for n in summed_columns}
+        entry |= {name: _total(row[name] for row in counted_rows) for name in _SUMMED}
         entry["mark"] = _mark(main_row) if main_row else ""
         entry["n_mark"] = INCOMPLETE_MARK if any(row["incomplete"] for row in counted_rows) else ""
         entry["model_mark"] = BROKEN_MARK if any(row["is_broken"] for row in counted_rows) else ""
@@ -286,6 +286,12 @@ def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.Dat
         *(f"{name}_mark" for name in others),
     ]
     return pd.DataFrame(sorted(rows, key=_rank), columns=pd.Index([*columns, *marks]))
+
+
+def _total(counts: Iterable[Any]) -> float:
+    """Return the sum of the known counts; NaN if none is known, as rejections to a panel that is not asked."""
+    known_counts = [count for count in counts if not pd.isna(count)]
+    return sum(known_counts) if known_counts else float("nan")
 
 
 def _mark(row: Mapping[str, Any]) -> str:

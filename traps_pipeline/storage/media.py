@@ -9,11 +9,8 @@ from __future__ import annotations
 import base64
 import fcntl
 import hashlib
-import io
 import json
 import os
-import struct
-import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -24,6 +21,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from traps_pipeline.base.archives import BadArchive, pack, unpack
 from traps_pipeline.base.bounded_cache import BoundedCache
 from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
@@ -40,8 +38,6 @@ CACHE_BYTES = 256 * 2**20
 _REVISION = 1  # raise it when picking, resizing or the container changes, so that all media are prepared anew
 _SUFFIX: dict[Profile, str] = {"video": ".mp4", "images": ".zip"}
 _MIME: dict[Profile, str] = {"video": "video/mp4", "images": "image/jpeg"}
-# What zipfile raises on an archive with altered bytes.
-_NO_ZIP = (zipfile.BadZipFile, ValueError, RuntimeError, EOFError, OverflowError, struct.error)
 
 
 class MediaSpec(BaseModel):
@@ -249,10 +245,10 @@ def payload(media: Media) -> list[bytes]:
         raise TrapsError("media.profile frames is not sent as bytes; use video or images for a model behind an API")
     try:
         data = media.path.read_bytes()
-        parts = _unzip(data) if media.profile == "images" else [data]
+        parts = [*unpack(data).values()] if media.profile == "images" else [data]
     except OSError as error:
         raise _damaged_clip(media.path, error.strerror or str(error)) from error
-    except _NO_ZIP as error:
+    except BadArchive as error:
         raise _damaged_clip(media.path, str(error)) from error
     if len(data) != media.size_bytes or _sha256(parts) != media.sha256:
         raise _damaged_clip(media.path, f"{len(data)} of {media.size_bytes} bytes; truncated or altered")
@@ -288,7 +284,7 @@ def _make(clip: Path, clip_digest: str, spec: MediaSpec, note: Path) -> Media:
         sha256, size = file_digest(path), path.stat().st_size
     else:
         jpegs = [_jpeg(frame) for frame in frames.frames]
-        data = _zip(jpegs)
+        data = pack({f"{i:02d}.jpg": jpeg for i, jpeg in enumerate(jpegs)})
         write_bytes(path, data)
         sha256, size = _sha256(jpegs), len(data)
     times = tuple(frames.times_s.tolist())
@@ -332,25 +328,6 @@ def _jpeg(frame: np.ndarray) -> bytes:
     import cv2
 
     return cv2.imencode(".jpg", frame[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
-
-
-def _zip(jpegs: Sequence[bytes]) -> bytes:
-    """Return an uncompressed zip of 00.jpg, 01.jpg, ..., the same bytes everywhere."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
-        for i, jpeg in enumerate(jpegs):
-            entry = zipfile.ZipInfo(f"{i:02d}.jpg", date_time=(1980, 1, 1, 0, 0, 0))
-            entry.create_system = 3
-            archive.writestr(entry, jpeg, zipfile.ZIP_STORED)
-    return buffer.getvalue()
-
-
-def _unzip(data: bytes) -> list[bytes]:
-    """Return the entries of a zip in order, or raise one of `_NO_ZIP`."""
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
-            raise zipfile.BadZipFile("an entry is compressed")
-        return [archive.read(entry) for entry in archive.infolist()]
 
 
 @contextmanager

@@ -202,8 +202,12 @@ def arms(workspace: Workspace, category: str) -> StageOutput:
 
 
 def _odd_pairs(workspace: Workspace, key: str | None, output: StageOutput) -> dict[str, list[str]]:
-    sides: dict[str, list[str]] = {}
+    from traps_pipeline.benchmark.held_out import held_out_items
+
+    sides, alone = dict[str, list[str]](), held_out_items(workspace.root)
     for row in output.rows(ITEMS):
+        if row.scenario_id in alone:
+            continue
         sides.setdefault(row.pair_id, []).append(row.side)
     return {pair: pair_sides for pair, pair_sides in sides.items() if tuple(sorted(pair_sides)) != sides_of(str(key))}
 
