@@ -59,7 +59,7 @@ class Entry(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
     plugins: ClassVar[Group] = "models"  # the group in which packages add backends to these
-    own_backends: ClassVar[tuple[str, ...]] = BACKENDS
+    own_backends: ClassVar[tuple[str, ...]] = ()  # any, where there are none
     id: Name = Field(description="its name in every table")
     backend: str
     params: dict[str, Any] = Field(default_factory=dict, description="what is sent, and part of the ledger key")
@@ -79,7 +79,7 @@ class Entry(BaseModel):
     @field_validator("backend")
     @classmethod
     def _backend_is_known(cls, value: str) -> str:
-        return require_known(value, cls.plugins, cls.own_backends)
+        return require_known(value, cls.plugins, cls.own_backends) if cls.own_backends else value
 
     @field_validator("thinking", mode="before")
     @classmethod
@@ -142,6 +142,7 @@ class Entry(BaseModel):
 class ModelEntry(Entry):
     """One model of the registry, with the settings that decide its answers."""
 
+    own_backends: ClassVar[tuple[str, ...]] = BACKENDS
     backend: str = Field(
         description="what answers: reference, observer, rule, api (a server), local (a checkpoint), or a package's name"
     )
