@@ -43,7 +43,7 @@ _ANNOUNCED = re.compile(r"(?:(?:the|my) )?(?:(?:correct|final|right) )?answer(?:
 _EXPLAINS = re.compile(
     r"(?:here(?:'s|’s| is) why|this is because|because|explanation|reasoning|reason)\b", re.IGNORECASE
 )
-_SENTENCE_END = re.compile(r"(?<=[.!?])\s+|\s*\n\s*")
+_SENTENCE_END = re.compile(r"(?<=[.!?])\s+|(?<!\s)\s*\n\s*")
 _MARKUP = re.compile(r"[*_`\"“”]")
 _STRANGE = re.compile(r"^!|[^\w\s.,;:!'’()–—−+=-]", re.ASCII)  # not in a statement, nor is a question mark
 _CONTRACTIONS = {"can't": "cannot", "can not": "cannot", "n't": " not", "i'm": "i am", "it's": "it is"}
@@ -155,6 +155,7 @@ def _in_words(text: str, question: str, *, any_label: bool = False) -> Statement
 
 def _is_offered(question: str, words: str) -> bool:
     """Return whether these words are exactly one of the choices in a question."""
+    # own text: questions of the benchmark's records
     texts = (question, re.sub(r"\s*\([^)]*\)", "", question)) if " or " in question and words.count(" ") < 5 else ()
     lists = [_words(re.sub(r"[,:;?]| -- ", " or ", text)) for text in texts]
     return any(len(re.findall(rf"\b{re.escape(words)} or\b", parts)) == 1 for parts in lists)

@@ -26,15 +26,15 @@ from traps_pipeline.models.request import JUDGED, UNFINISHED, WITH_TEXT
 from traps_pipeline.protocol.regimes import fields_of
 
 READING = "4"  # version of this module's rules; raising it makes the answers' tables stale
-# An announced final answer that ends before the text does: one at the cut may be incomplete.
-_STATED = re.compile(
-    r"(?:^|[.!?:\n]|\b(?:the|my|final|correct|best)\s)[\W_]*answer[\W_]*?(?:\bis\b\s*:?|[:=])[\s*_\"'`]*"
-    r"\w[^\n]*?(?:\n|[.!?][\"'`)*_\]]*(?:\s|(?<!\d.)$))",
-    re.IGNORECASE,
-)
+# An announced final answer: what stands before it, its first character, and an end after that one.
+_MAX_BEFORE = 60  # characters
+# own text: _MAX_BEFORE characters of one
+_BEFORE = re.compile(r"(?:^|[.!?:\n]|\b(?:the|my|final|correct|best)\s)[\W_]*\Z", re.IGNORECASE)
+_STATED = re.compile(r"answer[\W_]*?(?:\bis\b(?:\s*:)?|[:=])[\s*_\"'`]*(?=\w)", re.IGNORECASE)
+_END = re.compile(r"\n|[.!?][\"'`)*_\]]*(?:\s|(?<!\d.)$)")
 _OBJECT = re.compile(r'\{\s*"')
 _DECODER = json.JSONDecoder(strict=False)
-_WORD = re.compile(r"\w+")
+_WORD, _SPACE = re.compile(r"\w+"), re.compile(r"\s*")
 _LONGEST_UNIT, _MIN_REPEATS, _MIN_SHARE = 40, 6, 0.5  # words, times, of the text's words
 _MIN_WORDS, _FEW_CHARACTERS = 12, 30
 _MAX_REASON = 60  # characters of a finish reason in a sentence
@@ -104,7 +104,19 @@ def _has_final_answer(text: str) -> bool:
     """
     brace = _OBJECT.search(text)
     start = brace.start() if brace else len(text)
-    return bool(_STATED.search(text[:start])) or "final_answer" in _complete_fields(text[start:])
+    return _states_answer(text[:start]) or "final_answer" in _complete_fields(text[start:])
+
+
+def _states_answer(text: str) -> bool:
+    """Return whether a text announces an answer that ends before the text does.
+
+    One at the cut may be incomplete. Where none ends after one announcement, none does after a later one.
+    """
+    for stated in _STATED.finditer(text):
+        start = max(0, stated.start() - _MAX_BEFORE)
+        if _BEFORE.search(f"{'x' if start else ''}{text[start : stated.start()]}"):
+            return _END.search(text, stated.end() + 1) is not None
+    return False
 
 
 def _complete_fields(text: str) -> dict[str, Any]:
@@ -126,7 +138,7 @@ def _complete_fields(text: str) -> dict[str, Any]:
 
 def _skip(text: str, place: int, sign: str = "") -> int:
     """Return the place after white space (and a sign). Raises ValueError."""
-    place = len(text) - len(text[place:].lstrip())
+    place = _SPACE.match(text, place).end()  # pyright: ignore[reportOptionalMemberAccess] - it matches everywhere
     if not text.startswith(sign, place):
         raise ValueError(f"{sign!r} is not there")
     return place if not sign else _skip(text, place + len(sign))

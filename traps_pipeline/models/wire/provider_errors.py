@@ -36,7 +36,7 @@ _FILTERED = re.compile(
     r"content_filter|content_policy|responsible_?ai_?policy|moderation|safety_violation|data_?inspection_?failed", re.I
 )
 _ABOUT_KEY = re.compile(r"\b(api[ _-]?keys?|keys?|tokens?|auth\w*|unauth\w*|credentials?|permissions?|access)\b", re.I)
-_AMOUNT = re.compile(r"(\d+(?:\.\d+)?)(ms|h|m|s)")
+_AMOUNT = re.compile(r"(\d{1,15}(?:\.\d{1,15})?)(ms|h|m|s)")
 _UNIT_S = {"h": 3600.0, "m": 60.0, "s": 1.0, "ms": 0.001}
 
 
