@@ -12,6 +12,7 @@ import pytest
 from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.panel import Vote, parse_vote, render, tasks_for, vote_request
+from traps_pipeline.models.reading.judged_answers import UNREAD
 from traps_pipeline.models.registry.judges import is_judged_by_rules, load_panel
 from traps_pipeline.models.registry.prompts import prompt
 from traps_pipeline.protocol.cells import Cell, Evaluation
@@ -173,11 +174,27 @@ def test_correctness_is_decided_from_the_extracted_value(value: str, claim: str,
     assert (cast.valid, cast.decision, cast.judge_correct) == (True, right, claim == "true")
 
 
-def test_a_truth_value_is_no_extracted_value() -> None:
-    text = '{"correct": true, "extracted_value": true, "reasoning": "r"}'
-    cast = vote("correctness", text, ground_truth="1", answer_type="numeric", labels=["1", "3"])
-    assert (cast.valid, cast.decision) == (False, None)
-    assert cast.invalid_reason is not None and "extracted_value" in cast.invalid_reason
+@pytest.mark.parametrize(
+    ("value", "said", "right"),
+    [
+        ("false", "false", True),
+        ("true", "true", False),
+        ('["no"]', "no", True),
+        ('{"value": false, "note": null}', "false, ", True),
+        ('[["no"], []]', "no", True),
+        ("[]", None, False),
+        ("null", None, False),
+        ("0", "0", False),
+        ('["yes", "no"]', "yes, no", None),
+        ('"yes or no"', "yes or no", None),
+    ],
+)
+def test_a_value_of_any_json_type_keeps_its_vote(value: str, said: str | None, right: bool | None) -> None:
+    text = f'{{"correct": true, "extracted_value": {value}, "reasoning": "r"}}'
+    cast = vote("correctness", text, ground_truth="no", answer_type="binary", labels=["yes", "no"], aliases="{}")
+    assert (cast.valid, cast.decision, cast.judge_correct) == (right is not None, right, True)
+    assert cast.invalid_reason == (UNREAD if right is None else None)
+    assert cast.extracted_value == (said and said.removesuffix(", "))
 
 
 def panels(tmp_path: Path, text: str) -> Path:
