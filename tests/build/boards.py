@@ -28,6 +28,7 @@ def board_row(model, regime="standard", dataset="overall", shares=(0.5, 0.1, 0.6
         **{f"{name}_std": 0.01 for name in figures},
         **dict.fromkeys(("n_refused", "n_empty", "n_truncated", "n_unfinished", "n_degenerate", "n_unread"), 0),
         **dict.fromkeys(("n_not_json", "n_errors", "n_rejects", "n_rejects_answered"), 0),
+        "n_overruled": None,
         **{"answered": 1.0, "incomplete": False, "broken": 0.0, "is_broken": False, "panel": "three@1"},
         **{f"{name}_ci_{end}": float(value) for name, value in figures.items() for end in ("low", "high")},
         **{"rank": 1, "rank_low": 1, "rank_high": 2, "naive": acc * abs_rec},

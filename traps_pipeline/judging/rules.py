@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from traps_pipeline.models.reading.judged_answers import UNREAD, normalise, read_flag, read_object, words_of
+from traps_pipeline.models.reading.judged_answers import MAX_SHOWN, UNREAD, normalise, read_flag, read_object, words_of
 from traps_pipeline.models.reading.thinking import strip_fence
 from traps_pipeline.models.request import Outcome, Request
 
@@ -94,7 +94,9 @@ def _vote(statement: Statement, truth: str | None) -> dict[str, object]:
 
 
 def read_statement(text: str, question: str = "") -> Statement | None:
-    """Return an answer's meaning; None if of unknown form or self-contradictory."""
+    """Return an answer's meaning; None if of unknown form, self-contradictory, or too long to be shown whole."""
+    if len(text) > MAX_SHOWN:
+        return None
     answer = read_object(text)
     return _in_text(strip_fence(text), question) if answer is None else _in_object(answer, question)
 

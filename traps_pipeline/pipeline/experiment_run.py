@@ -15,7 +15,14 @@ from traps_pipeline.models.registry.entries import LOCAL, NETWORK, Entry, get_mo
 from traps_pipeline.models.registry.judges import load_panel
 from traps_pipeline.pipeline.experiment import Experiment
 from traps_pipeline.pipeline.lineage import Lineage
-from traps_pipeline.pipeline.selection import failed_checks, is_nothing_to_do, note_versions, require_work, stages_until
+from traps_pipeline.pipeline.selection import (
+    failed_checks,
+    is_made,
+    is_nothing_to_do,
+    note_versions,
+    require_work,
+    stages_until,
+)
 from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.storage.workspace import Workspace
@@ -30,9 +37,15 @@ OpenRuns = Callable[["DagsterInstance", Workspace], AbstractContextManager["Runs
 
 @dataclass
 class RunReport:
-    """A run's problems in sentences, whether a budget ended it, and its tallies."""
+    """A run's problems in sentences, whether a budget ended it, and its tallies.
+
+    is_made: whether every table is made, so that the same command would do nothing; has_board: whether the leaderboard
+    is.
+    """
 
     problems: list[str] = field(default_factory=list)
+    is_made: bool = True
+    has_board: bool = True
     over_budget: bool = False
     seconds: float = 0.0
     tallies: Mapping[str, Tally] = field(default_factory=dict)
@@ -84,7 +97,9 @@ def run_experiment(
     problems = [*dict.fromkeys([*result.problems, *failed_checks(workspace, experiment.name)])]
     if not problems:
         note_versions(workspace, stages, experiment.name)
-    return RunReport(problems, result.over_budget, result.seconds, progress.current().totals)
+    made = not problems or is_made(workspace, stages, experiment.name)
+    has_board = made or is_made(workspace, ["leaderboard", "report_page"], experiment.name)
+    return RunReport(problems, made, has_board, result.over_budget, result.seconds, progress.current().totals)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -94,10 +94,17 @@ def is_nothing_to_do(workspace: Workspace, stages: Collection[str], experiment: 
     note = _read_note(workspace)
     if not note or note.get("history") != _history_state(workspace):
         return False
-    lineage, partitions, noted_versions = Lineage(workspace), StudyPartitions(workspace, experiment), note["versions"]
+    return is_made(workspace, stages, experiment, note["versions"])
+
+
+def is_made(
+    workspace: Workspace, stages: Collection[str], experiment: str | None, noted: Mapping[str, Any] | None = None
+) -> bool:
+    """Return whether all wanted partitions are fresh, and of the noted versions if these are given."""
+    lineage, partitions = Lineage(workspace), StudyPartitions(workspace, experiment)
     return all(
-        noted_versions.get(name_of((name, key))) == lineage.version(name, key) is not None
-        and lineage.status(name, key).kind == "fresh"
+        lineage.status(name, key).kind == "fresh"
+        and (noted is None or noted.get(name_of((name, key))) == lineage.version(name, key) is not None)
         for name in stages
         for key in lineage.graph[name].wanted(partitions)
     )

@@ -35,6 +35,8 @@ from traps_pipeline.report.terms import (
     ENOUGH,
     INCOMPLETE_MARK,
     MISSING_MARK,
+    OVERRULED_ABOVE,
+    OVERRULED_MARK,
     ROBUST_TERMS,
     TITLES,
 )
@@ -66,6 +68,7 @@ OPTIONAL = {
     Column("broken", "Broken %", "percent"): "broken",
     Column("n_not_json", "Not JSON", "count"): "n_not_json",
     Column("n_rejects", "Rejects premise", "count"): "n_rejects",
+    Column("n_overruled", "Overruled", "count", mark="overruled_mark"): "n_overruled",
     Column("bounds", BOUNDS, "range"): "n_missing",
 }
 Robust = Mapping[tuple[str, str], Mapping[str, Any]]  # ROBUST rows by model and regime
@@ -103,6 +106,8 @@ LEGEND = {
     "are judged as they stand",
     "Rejects premise": "void items over all runs whose answer says that something which the question takes for granted "
     "is not so, in the panel's view; counted apart from abstention, which decides AbsRec",
+    "Overruled": "control items over all runs on which code reads another value out of a judge's vote than the judge's "
+    f"own word on it says; {OVERRULED_MARK} on more than 1 % of the controls",
     BOUNDS: "PECS of all items if every missing decision were the worst for the model (a control wrong and abstained "
     "on, a void not abstained on), and if every one were the best; computed per run, then averaged",
     **ROBUST_TERMS,
@@ -227,7 +232,7 @@ def _leaderboard(
     columns += [
         column for column in (EPOCH, Column("benchmark_version", "Version")) if rows.loc[:, column.field].nunique() > 1
     ]
-    marks = [*rows["n_mark"], *rows["missing_mark"], *rows["model_mark"]]
+    marks = [mark for name in ("n_mark", "missing_mark", "model_mark", "overruled_mark") for mark in rows[name]]
     notes = [*meanings(marks), *_notes_on_arms(beside)]
     if brief:
         columns = [replace(c, spread="") for c in columns if c.field not in ("n_runs", "epoch", "benchmark_version")]
@@ -286,6 +291,9 @@ def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.Dat
         entry |= {
             n: sum(row[n] for row in counted_rows) for n in (*summed_columns, "n_unread", "n_not_json", "n_rejects")
         }
+        entry["n_overruled"] = sum(int(row["n_overruled"]) for row in counted_rows if pd.notna(row["n_overruled"]))
+        n_controls = sum(row["n_pairs"] * row["n_runs"] for row in counted_rows)
+        entry["overruled_mark"] = OVERRULED_MARK if entry["n_overruled"] > OVERRULED_ABOVE * n_controls else ""
         entry["mark"] = _mark(main_row) if main_row else ""
         entry["n_mark"] = INCOMPLETE_MARK if any(row["incomplete"] for row in counted_rows) else ""
         entry["model_mark"] = BROKEN_MARK if any(row["is_broken"] for row in counted_rows) else ""
@@ -302,6 +310,7 @@ def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.Dat
         "n_mark",
         "model_mark",
         "missing_mark",
+        "overruled_mark",
         "ci",
         "bounds",
         *others,

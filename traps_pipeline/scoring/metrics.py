@@ -22,10 +22,8 @@ BOUNDS = ["pecs_low", "pecs_high"]
 BROKEN_COUNTS = {f"n_{name}": (name,) for name in ("empty", "truncated", "unfinished", "degenerate", "unread")}
 OUTCOMES = {"n_answered": JUDGED, "n_refused": ("refused",), **BROKEN_COUNTS, "n_errors": ("error", "malformed")}
 COUNT_COLUMNS = [*OUTCOMES, "n_not_json"]
-REJECTION_COLUMNS = [
-    "n_rejects",
-    "n_rejects_answered",
-]  # counts of decisions that not every panel is asked for: null otherwise
+# Counts of decisions that not every panel is asked for: null otherwise.
+REJECTION_COLUMNS = ["n_rejects", "n_rejects_answered", "n_overruled"]
 # For each decision, how often it was yes (numerator) and how often it was made (denominator, `_of`); every figure is
 # computed from these six counts.
 COUNTS = ["correct", "correct_of", "false_abs", "false_abs_of", "abs_rec", "abs_rec_of"]
@@ -124,7 +122,8 @@ def _with_scopes(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]
     is_not_json = verdicts["is_json"].eq(False).astype("int64")
     rejects_premise = verdicts["rejects_premise"].astype("boolean").where(~is_control)
     is_answered = rejects_premise & ~verdicts["abstained"].astype("boolean").fillna(False)
-    rejections = {"n_rejects": rejects_premise.astype("Int64"), "n_rejects_answered": is_answered.astype("Int64")}
+    optional = (rejects_premise, is_answered, verdicts["overruled"].astype("boolean"))
+    rejections = {name: f.astype("Int64") for name, f in zip(REJECTION_COLUMNS, optional, strict=True)}
     flags = counts.assign(complete=is_complete, **outcomes, n_not_json=is_not_json, **rejections)
     items = pd.concat([verdicts[[*CELL, "pair_id", "epoch", "panel", "benchmark_version"]], flags], axis=1)
     scopes = [pd.Series("all", index=items.index)]

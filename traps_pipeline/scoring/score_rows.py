@@ -43,6 +43,9 @@ class MetricsRow(shared.CellRow):
     n_not_json: Annotated[int, "items of the JSON regime answered with a text that is not the object asked for"]
     n_rejects: Annotated[int | None, "voids whose answer rejects the question's premise; null if judges are not asked"]
     n_rejects_answered: Annotated[int | None, "of these, answers that do not abstain, such as a true zero"]
+    n_overruled: Annotated[
+        int | None, "controls on which code decides some judge's vote on correctness unlike the judge"
+    ]
     n_errors: Annotated[int, "items whose call failed"]
     n_answered: Annotated[int, "items with an answer"]
     acc: Annotated[float | None, "share of decided controls answered correctly"]
@@ -152,6 +155,7 @@ class LeaderboardRow:
     n_not_json: Annotated[int, "items of the JSON regime whose text is not the object asked for, over runs"]
     n_rejects: Annotated[int | None, "voids whose answer rejects the question's premise, over runs"]
     n_rejects_answered: Annotated[int | None, "of these, answers that do not abstain, over runs"]
+    n_overruled: Annotated[int | None, "controls on which code decides some judge's vote unlike the judge, over runs"]
     n_errors: Annotated[int, "items whose call failed, over runs"]
     answered: Annotated[float, "share of items (2 a pair and run) with an answer"]
     incomplete: Annotated[bool, "whether answered is below 0.99; for overall, in any of its datasets"]

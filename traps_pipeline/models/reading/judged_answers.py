@@ -11,6 +11,7 @@ from typing import Any
 from traps_pipeline.models.reading.thinking import strip_fence
 
 UNREAD = "unread"  # a rule judge's vote, and an answer's outcome, if no rule can read the text
+MAX_SHOWN = 40_000  # characters of an answer that a judge is shown, more than 8,000 tokens of prose
 NUMERIC_TOLERANCE = 0.5
 _WORDS = ("zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
 _ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth")
