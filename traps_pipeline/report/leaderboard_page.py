@@ -291,9 +291,10 @@ def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.Dat
         entry |= {
             n: sum(row[n] for row in counted_rows) for n in (*summed_columns, "n_unread", "n_not_json", "n_rejects")
         }
-        entry["n_overruled"] = sum(int(row["n_overruled"]) for row in counted_rows if pd.notna(row["n_overruled"]))
+        overruled = [row["n_overruled"] for row in counted_rows if pd.notna(row["n_overruled"])]
         n_controls = sum(row["n_pairs"] * row["n_runs"] for row in counted_rows)
-        entry["overruled_mark"] = OVERRULED_MARK if entry["n_overruled"] > OVERRULED_ABOVE * n_controls else ""
+        entry["n_overruled"] = sum(overruled) if overruled else None
+        entry["overruled_mark"] = OVERRULED_MARK if sum(overruled) > OVERRULED_ABOVE * n_controls else ""
         entry["mark"] = _mark(main_row) if main_row else ""
         entry["n_mark"] = INCOMPLETE_MARK if any(row["incomplete"] for row in counted_rows) else ""
         entry["model_mark"] = BROKEN_MARK if any(row["is_broken"] for row in counted_rows) else ""
