@@ -27,7 +27,9 @@ def board_row(model, regime="standard", dataset="overall", shares=(0.5, 0.1, 0.6
         **figures,
         **{f"{name}_std": 0.01 for name in figures},
         **dict.fromkeys(COUNT_WORDS, 0),
-        **dict.fromkeys(("n_rejects", "n_rejects_answered")),  # null, as of every panel that is not asked
+        **dict.fromkeys(
+            ("n_rejects", "n_rejects_answered", "n_overruled")
+        ),  # null, as of every panel that is not asked
         **{"answered": 1.0, "incomplete": False, "broken": 0.0, "is_broken": False, "panel": "three@1"},
         **{f"{name}_ci_{end}": value for name, value in figures.items() for end in ("low", "high")},
         **{"rank": 1, "rank_low": 1, "rank_high": 2, "naive": float(acc * abs_rec)},

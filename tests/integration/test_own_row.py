@@ -97,3 +97,22 @@ def test_whatever_is_wrong_with_a_model_is_named_before_anything_is_rendered_or_
     assert "--no-preflight" in advice
     assert not list((study.workspace / "clips").rglob("*.mp4")) and not study.ledger_rows("answers")
     assert {row["components"]["about"]["check"] for row in study.ledger_rows("votes")} == {"clip", "no clip", "schema"}
+
+
+@pytest.mark.parametrize("panel", ["rules", "three"])
+def test_a_run_that_made_its_tables_prints_them_whatever_the_votes_are(
+    unasked: Checkout, provider: Provider, panel: str
+) -> None:
+    prose, endless = {"": "I think that it may fall, or so."}, {"": "The answer is: left." * 55_000}
+    provider.configure(scripts={"org/Seer-7B": prose, "dots": endless, "judge-c": {"": "I say no JSON."}})
+    path = experiment(unasked, provider.url, panel)
+    options = ["--panel", panel, *(["--judged-by-rules"] if panel == "rules" else [])]
+    for _ in range(2):
+        finished = unasked.traps("run", path, *options, "--no-preflight")
+        assert "\nreport " in finished.out and "\nexplorer " in finished.out and "seer" in finished.out
+        assert "run the same command" not in finished.out + finished.err
+        assert finished.code == (0 if panel == "rules" else 1)  # unread answers are counted; broken votes are told
+        assert ("few_invalid_votes" in finished.err) == (panel == "three")
+    rows = board(unasked)
+    assert rows["seer"]["n_unread"] == (12 if panel == "rules" else 0)
+    assert rows["dots"]["n_unfinished"] == rows["dots"]["n_missing"] == 12  # 1.1 MB in 8,000 tokens

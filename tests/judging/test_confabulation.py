@@ -57,7 +57,7 @@ def decide(workspace: Workspace, at: Cell, failures: set[int], numbers: range) -
         row = dict.fromkeys(VERDICTS.names, "x") | at.partition
         row |= {"item_id": f"{at.dataset}:s-{number:04d}:void", "side": "void", "abstained": abstained, "correct": None}
         row |= {"n_valid": 3, "n_valid_correctness": 0, "unanimous": True, "undecided": abstained is None}
-        row |= {"is_json": None, "rejects_premise": None}
+        row |= {"is_json": None, "rejects_premise": None, "overruled": None}
         rows.append(VerdictRow(**row))
     workspace.tables.write(VERDICTS, at.partition, rows, {})
 

@@ -16,6 +16,7 @@ from traps_pipeline.models.request import Request
 from traps_pipeline.protocol.regimes import FIELDS, REGIMES
 
 QUESTION = "Where did the ball end up -- left bin, right bin, or somewhere else?"
+RACE = "Which ball comes out of the tunnel first, purple, green or orange?"
 BINS = "Does the ball end up in the left bin (red) or the right bin (blue)?"
 ITEM = {
     "ground_truth": "left",
@@ -136,6 +137,18 @@ def test_any_other_text_is_unread_and_decides_nothing(answer: str) -> None:
         ("Three.", "How many fall?", "three"),
         ("-2.5", "How many fall?", "-2.5"),
         ("Yes", "Does it fall?", "yes"),
+        ("Purple ball.", RACE, "purple ball"),
+        ("The green ball.", RACE, "green ball"),
+        ("the orange one", RACE, "orange one"),
+        ("orange light", RACE, None),  # no noun of the question
+        ("purple or green", RACE, None),
+        ("No ball.", RACE, None),
+        ("Bucket 3.", "In which bucket, 1, 2 or 3, does it land?", "bucket 3"),
+        ("3 balls", "How many of the balls fall: 2 or 3?", "3 balls"),
+        ("2 or 3", "How many of the balls fall: 2 or 3?", None),
+        ("left side", "Left or right?", "left side"),
+        ("left or right", "Which end is lower, left or right, or is the beam level?", None),
+        ("yes or no", "Does it fall, yes or no?", None),
     ],
 )
 def test_a_choice_is_a_known_value_or_one_that_the_question_names(

@@ -83,6 +83,28 @@ def test_a_rejected_premise_is_decided_by_the_majority_and_counted_beside_absten
     assert pd.isna(cell["n_rejects"])  # nobody was asked
 
 
+@pytest.mark.parametrize(
+    ("words", "panel", "overruled"),
+    [
+        ("yyy", "three@1", False),
+        ("yyn", "three@1", True),
+        ("y--", "three@1", False),  # two judges say nothing
+        ("---", "three@1", None),
+        ("nnn", "rules@1", None),  # rules have no word of their own
+    ],
+)
+def test_a_verdict_says_where_code_decides_unlike_a_judges_own_word(
+    words: str, panel: str, overruled: bool | None
+) -> None:
+    votes = control_votes("nnn", "yyy").assign(panel=panel)
+    own = [None if word == "-" else word == "y" for word in words]
+    votes["judge_correct"] = [None] * 3 + own  # the first three votes are on abstention
+    (row,) = decide(*undone("control"), votes).to_dict("records")
+    assert (None if pd.isna(row["overruled"]) else row["overruled"]) == overruled
+    (cell,) = cell_metrics(pd.DataFrame([row]), {}).to_dict("records")
+    assert (None if pd.isna(cell["n_overruled"]) else cell["n_overruled"]) == overruled
+
+
 def test_an_answer_that_nobody_judges_has_no_verdict_and_is_not_undecided() -> None:
     items, responses = undone("void", "refused")
     (row,) = decide(items, responses, vote_rows(["yyy"])[:0]).to_dict("records")

@@ -194,3 +194,31 @@ def test_a_text_is_the_object_that_its_dataset_asks_for_or_it_is_not(
     row = {"outcome": "answer", "text": text}
     found = read_answer(row, None, "standard", dataset=dataset)
     assert (found.outcome, found.text, found.is_json) == ("answer", text, is_json)
+
+
+def test_a_text_that_is_longer_than_its_tokens_can_be_is_no_answer() -> None:
+    row = {"outcome": "answer", "text": "The answer is: left." + "".join(f" w{n:03}" for n in range(1_000))}
+    assert read_answer(row, None, "standard", max_tokens=40).outcome == "answer"  # 5,020 characters of at most 5,120
+    assert read_answer(row, None, "standard").outcome == "answer"  # no limit is known
+    found = read_answer(row, None, "standard", max_tokens=39)
+    assert (found.outcome, found.text) == ("unfinished", None)
+    assert found.why and "5,020 characters" in found.why
+
+
+@pytest.mark.parametrize(
+    ("text", "outcome", "fragment"),
+    [
+        ("The bucket in the bottom left-hand corner of", "truncated", "The bucket in the bottom left-hand corner of"),
+        ("<think>I look.</think>The bucket in", "truncated", "The bucket in"),
+        ("<think>I look at the", "truncated", None),  # the trace has it
+        ("left " * 2_000, "answer", ("left " * 2_000)[:4_000]),
+        (".....", "answer", "....."),
+        ("The answer is: left. And", "truncated", None),  # an answer
+    ],
+)
+def test_the_beginning_of_a_text_that_is_no_answer_is_kept_beside_it(
+    text: str, outcome: str, fragment: str | None
+) -> None:
+    found = read(text, outcome, thinks=True)
+    assert found.fragment == fragment
+    assert found.text is None or found.outcome == "answer"

@@ -25,7 +25,7 @@ _DECIDED_BY: dict[str, tuple[str, ...]] = {
     "arms": ("scenes/variants", "benchmark/filmed_arms.py"),
     "items": ("benchmark/items.py",),
     "responses": ("models/asking/answers.py", "models/framing.py", "models/reading/interpret.py", "models/request.py"),
-    "votes": ("judging/panel.py", "judging/rules.py"),
+    "votes": ("judging/panel.py", "judging/rules.py", "models/reading/judged_answers.py"),
     "verdicts": ("judging/verdicts.py",),
     "confabulation": ("judging/confabulation.py", "judging/confabulation_protocol.py"),
     "hidden_states": ("mechanism/hidden_states.py", "models/local/capture.py"),

@@ -120,6 +120,18 @@ def test_text_markdown_and_html_show_the_same_counts_and_bounds_and_mark_an_inco
     assert "‡" not in own["occlusion"] and "[0.249, 0.251]" in own["occlusion"]
 
 
+@pytest.mark.parametrize(("overruled", "shown"), [(None, None), (0, None), (10, "10"), (11, "11 ¶")])
+def test_votes_that_code_decides_unlike_their_judges_are_counted_and_marked_above_1_percent_of_the_controls(
+    overruled, shown
+):
+    nobody = board_row("rules", n_overruled=None)
+    for rows in tables(
+        board_of(board_row("m", n_pairs=500, n_runs=2, n_overruled=overruled), nobody)
+    ):  # 1,000 controls
+        by_model = {row["Model"]: row.get("Overruled") for row in rows}
+        assert by_model == {"m": shown, "rules": None if shown is None else "–"}
+
+
 def test_marks_and_columns_are_away_where_nothing_calls_for_them():
     for board in (board_of(board_row("m")), board_of(board_row("m", n_errors=1, n_missing=0))):
         for shown in (leaderboard_text(board), leaderboard_markdown(board), report_html(board)):

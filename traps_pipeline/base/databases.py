@@ -23,7 +23,7 @@ def reason_and_remedy(error: BaseException) -> tuple[str, str, bool]:
     """Return why a database is unusable, a remedy, and whether it is unwritable."""
     words = plain(" ".join(str(getattr(error, "orig", None) or error).split()))[:MAX_WORDS]
     for pattern, reason, remedy in _UNWRITABLE:
-        if re.search(pattern, words, re.IGNORECASE):
+        if re.search(pattern, words, re.IGNORECASE):  # own text: at most MAX_WORDS of it
             return reason, remedy, True
     if is_damaged(error):
         return "it is damaged, or no database", "move that file away, or restore a copy of it", False

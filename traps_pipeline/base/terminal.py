@@ -37,7 +37,8 @@ def visible(text: str) -> str:
 
 
 def _number(match: re.Match[str]) -> str:
-    previous_character, next_character = match.string[: match.start()][-1:], match.string[match.end() :][:1]
+    start, end = match.span()
+    previous_character, next_character = match.string[max(0, start - 1) : start], match.string[end : end + 1]
     is_emoji = unicodedata.category(previous_character or " ") in ("So", "Sk") or previous_character == _EMOJI_STYLE
     if match[0] == _EMOJI_STYLE and (is_emoji or previous_character in "0123456789#*") and previous_character:
         return match[0]

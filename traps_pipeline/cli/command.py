@@ -100,6 +100,7 @@ class Parser(argparse.ArgumentParser):
 
     @override
     def error(self, message: str) -> NoReturn:
+        # own text: what the user typed
         match = re.match(r"(?:argument (.+?): )?invalid choice: '(.*)' \(choose from (.+)\)$", message, re.DOTALL)
         if match and match[1] in (None, METAVAR):
             choices, last = re.findall(r"[\w-]+", match[3]), {path.split()[-1]: path for path in self.commands}

@@ -6,7 +6,7 @@ import argparse
 import re
 import shlex
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -133,22 +133,20 @@ def run(arguments: argparse.Namespace) -> int:
 
         board = workspace.tables.read_all(LEADERBOARD)
         print_json({"workspace": str(workspace.place), "run": report, "leaderboard": board})
+    if not arguments.json and arguments.until is None and report.has_board:
+        from traps_pipeline.report.printed_board import printed_board
+
+        print(printed_board(workspace))
+        print(f"report {workspace.reports / 'report.html'}\nexplorer {workspace.reports / 'index.html'}")
+        advice = "open one of them; traps why ITEM examines an item's answers; traps site writes a folder to send"
+        print(wrap_text(f"next: {advice}"))
     if report.problems:
-        _print_problems(report.problems, as_json=arguments.progress == "json")
+        _print_problems(report, as_json=arguments.progress == "json")
         return OVER_BUDGET if report.over_budget else FAILED
-    if arguments.json:
-        return OK
-    if arguments.until is not None:
+    if not arguments.json and arguments.until is not None:
         workspace_option = [] if arguments.workspace is None else ["--workspace", arguments.workspace]
         command = shlex.join(["traps", "run", arguments.experiment, *workspace_option])
         print(wrap_text(f"next: `{command}` for the stages after {arguments.until}"))
-        return OK
-    from traps_pipeline.report.printed_board import printed_board
-
-    print(printed_board(workspace))
-    print(f"report {workspace.reports / 'report.html'}\nexplorer {workspace.reports / 'index.html'}")
-    hint = "open one of them; traps why ITEM examines an item's answers; traps site writes a folder to send"
-    print(wrap_text(f"next: {hint}"))
     return OK
 
 
@@ -176,15 +174,16 @@ def _print_work(report: RunReport, *, is_inside: bool) -> None:
         print(f"inside models: {count_noun(states.asked, 'item')} extracted, {steered}, {votes}")
 
 
-def _print_problems(problems: Sequence[str], *, as_json: bool) -> None:
+def _print_problems(report: RunReport, *, as_json: bool) -> None:
     """Print each cause once, last the one behind most problems, to fix first."""
     print_line = partial(print_failure, as_json=as_json)
     problems_by_cause = dict[str, list[str]]()
-    for problem in problems:
+    for problem in report.problems:
         problems_by_cause.setdefault(problem.partition(": ")[2] or problem, []).append(problem)
     for first, *repeats in problems_by_cause.values():
         print_line(f"{first}{f' (and {len(repeats)} more)' if repeats else ''}")
-    print_line(f"{count_noun(len(problems), 'problem')}; finished work is kept: run the same command to continue")
+    advice = "every table is made" if report.is_made else "finished work is kept: run the same command to continue"
+    print_line(f"{count_noun(len(report.problems), 'problem')}; {advice}")
     cause, cause_problems = max(problems_by_cause.items(), key=lambda pair: len(pair[1]))
     if len(cause_problems) > 1:
         print_line(f"{len(cause_problems)} of them have one cause: {cause}")

@@ -42,7 +42,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 REQUESTS, MEDIA = "requests.jsonl", "media"
 # Beginnings of texts that a harness stores as the answer of a failed call.
-_ERROR_TEXT = re.compile(
+_ERROR_TEXT = re.compile(  # own text: MAX_LOOKED_AT characters of one
     r"\W*(?:(?:\w+\.)*(?:\w*error|\w*exception)\b\s*(?:code)?\s*[:(\[\d-]|traceback \(most recent|an error occurred"
     r"|(?:\w+\.)+exceptions?\.\w+\b"
     r"|(?:http|status|code)\W*[45]\d\d\b|[45]\d\d (?:client|server) error|too many requests|rate limit"

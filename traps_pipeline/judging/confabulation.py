@@ -40,6 +40,8 @@ from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
+MAX_TRACE = 400_000  # characters of a trace that the judge is shown
+
 # --- the sample -------------------------------------------------------------------------------------------------------
 
 
@@ -106,7 +108,7 @@ def _void_failures(workspace: Workspace, cell: Cell) -> list[dict[str, Any]]:
 
 def render(question: str, kind: str, answer: str, trace: str | None) -> str:
     """Return the user message to the judge."""
-    parts = [quote("reasoning trace", "TRACE", trace)] if trace else ["No reasoning trace is given."]
+    parts = [quote("reasoning trace", "TRACE", trace, MAX_TRACE)] if trace else ["No reasoning trace is given."]
     lines = [f"Question: {question}", f"Why it could not be answered: {VOID_KINDS[kind]}."]
     return "\n\n".join([*lines, *parts, quote("response", "RESPONSE", answer)])
 

@@ -9,7 +9,7 @@ from traps_pipeline.storage.tables import Table
 Task = Annotated[str, "abstention or correctness"]
 Decision = Annotated[str, "void_abstention, control_abstention or correctness"]
 Valid = Annotated[bool, "whether the judge's JSON meets the schema"]
-InvalidReason = Annotated[str | None, "why not; unread where the rules know no form of the answer"]
+InvalidReason = Annotated[str | None, "why not; unread where no rule reads the answer, or its value names two choices"]
 VoteEpochs = Annotated[str, "campaigns of the votes, joined by +"]
 
 
@@ -27,7 +27,7 @@ class VoteRow(shared.CellRow):
     abstained: Annotated[bool | None, "abstention task"]
     rejects_premise: Annotated[bool | None, "abstention task, of judges with `premise: true`"]
     correct: Annotated[bool | None, "correctness task, decided by code from extracted_value"]
-    judge_correct: Annotated[bool | None, "the judge's own claim, recorded and not used"]
+    judge_correct: Annotated[bool | None, "the judge's own claim; verdicts count where code decides otherwise"]
     extracted_value: Annotated[str | None, "correctness task"]
     confidence: Annotated[str | None, "high, medium or low (abstention task)"]
     rationale: Annotated[str | None, "one sentence"]
@@ -61,6 +61,10 @@ class VerdictRow(shared.CellRow):
     abstained: Annotated[bool | None, "majority; null if missing or undecided"]
     rejects_premise: Annotated[bool | None, "majority; null if missing, undecided, or if judges are not asked for it"]
     correct: Annotated[bool | None, "majority on a control; null on a void, and if missing or undecided"]
+    overruled: Annotated[
+        bool | None,
+        "whether code decides some vote on correctness unlike its judge; null if no language model casts one",
+    ]
     n_valid: Annotated[int, "valid abstention votes"]
     n_valid_correctness: Annotated[int, "valid correctness votes (0 on void)"]
     unanimous: Annotated[bool, "all votes of all tasks valid and agreed"]

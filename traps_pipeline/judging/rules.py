@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from traps_pipeline.models.reading.judged_answers import NUMBER_WORDS, UNREAD, normalise, read_flag, read_object
+from traps_pipeline.models.reading.judged_answers import MAX_SHOWN, UNREAD, normalise, read_flag, read_object, words_of
 from traps_pipeline.models.reading.thinking import strip_fence
 from traps_pipeline.models.request import Outcome, Request
 
@@ -25,7 +25,7 @@ _LABEL = re.compile(
 _GUESS = re.compile(
     "front|back|same|different|round|square|before|after|hollow|solid|man|woman|child|wood|metal|plastic|ball|wall|floor"
 )
-# Sentences that decline, in the form of `_words`.
+# Sentences that decline, in the form of `words_of`.
 _TO, _IT = "(?:know|tell|say|determine|answer)", "(?:it|this|that|which 1|answer|outcome|result|(?:this )?question)"
 _FROM_VIDEO = "(?: (?:from|based on|in) (?:this )?(?:video|clip|footage|frames))?"
 _DECLINES = re.compile(
@@ -43,10 +43,9 @@ _ANNOUNCED = re.compile(r"(?:(?:the|my) )?(?:(?:correct|final|right) )?answer(?:
 _EXPLAINS = re.compile(
     r"(?:here(?:'s|’s| is) why|this is because|because|explanation|reasoning|reason)\b", re.IGNORECASE
 )
-_SENTENCE_END = re.compile(r"(?<=[.!?])\s+|\s*\n\s*")
+_SENTENCE_END = re.compile(r"(?<=[.!?])\s+|(?<!\s)\s*\n\s*")
 _MARKUP = re.compile(r"[*_`\"“”]")
 _STRANGE = re.compile(r"^!|[^\w\s.,;:!'’()–—−+=-]", re.ASCII)  # not in a statement, nor is a question mark
-_CONTRACTIONS = {"can't": "cannot", "can not": "cannot", "n't": " not", "i'm": "i am", "it's": "it is"}
 _RESPONSE = re.compile(r"^(RESPONSE-[0-9a-f]{12})\n(.*)\n\1\Z", re.DOTALL | re.MULTILINE)
 _TRUTH = re.compile(r"^Ground truth: (.*)$", re.MULTILINE)
 _QUESTION = re.compile(r"\AQuestion: (.*)$", re.MULTILINE)
@@ -95,7 +94,9 @@ def _vote(statement: Statement, truth: str | None) -> dict[str, object]:
 
 
 def read_statement(text: str, question: str = "") -> Statement | None:
-    """Return an answer's meaning; None if of unknown form or self-contradictory."""
+    """Return an answer's meaning; None if of unknown form, self-contradictory, or too long to be shown whole."""
+    if len(text) > MAX_SHOWN:
+        return None
     answer = read_object(text)
     return _in_text(strip_fence(text), question) if answer is None else _in_object(answer, question)
 
@@ -121,7 +122,7 @@ def _in_text(text: str, question: str) -> Statement | None:
     of the question may stand before a sentence that declines.
     """
     sentences = [part for part in _SENTENCE_END.split(_MARKUP.sub("", text).strip()) if part]
-    wording, last = f" {_words(question)} ", len(sentences) - 1
+    wording, last = f" {words_of(question)} ", len(sentences) - 1
     statements = dict[int, Statement | None]()
     for place, sentence in enumerate(sentences):
         if announcement := _ANNOUNCED.fullmatch(sentence):
@@ -130,7 +131,7 @@ def _in_text(text: str, question: str) -> Statement | None:
         elif last == 0:
             statements[place] = _in_words(sentence, question)
         elif _in_words(sentence, question) == ABSTENTION:
-            earlier_words = _words(" ".join(sentences[:last])).split() if place == last else []
+            earlier_words = words_of(" ".join(sentences[:last])).split() if place == last else []
             choices = [
                 w for w in earlier_words if _LABEL.fullmatch(w) or f" {w} or " in wording or f" or {w} " in wording
             ]
@@ -142,27 +143,38 @@ def _in_text(text: str, question: str) -> Statement | None:
 
 def _in_words(text: str, question: str, *, any_label: bool = False) -> Statement | None:
     """Read an exact abstention or choice (with `any_label`, any other words too)."""
-    words = _words(text)
+    words = words_of(text)
     if not words or _STRANGE.search(text):
         return None
     if _DECLINES.fullmatch(words):
         return ABSTENTION
-    if (absence_match := _ABSENT.fullmatch(words)) and f" {absence_match[1]} " in f" {_words(question)} ":
+    if (absence_match := _ABSENT.fullmatch(words)) and f" {absence_match[1]} " in f" {words_of(question)} ":
         return Statement(None, rejects=True)
-    is_choice = any_label or _LABEL.fullmatch(words) or _GUESS.fullmatch(words) or _is_offered(question, words)
-    return Statement(normalise(text)) if is_choice else None
+    return Statement(normalise(text)) if any_label or _is_choice(words, question) else None
 
 
-def _is_offered(question: str, words: str) -> bool:
-    """Return whether these words are exactly one of the choices in a question."""
-    texts = (question, re.sub(r"\s*\([^)]*\)", "", question)) if " or " in question and words.count(" ") < 5 else ()
-    lists = [_words(re.sub(r"[,:;?]| -- ", " or ", text)) for text in texts]
+def _is_choice(words: str, question: str) -> bool:
+    """Return whether these words are a choice, alone or with a noun that the question names."""
+    if _GUESS.fullmatch(words) or _is_value(words, question):
+        return True
+    asked, (first, _, after), (before, _, last) = (
+        words_of(question).split(),
+        words.partition(" "),
+        words.rpartition(" "),
+    )
+    nouns = {*asked, *(word.removesuffix("s") for word in asked), *(f"{word}s" for word in asked), "side"}
+    return any(
+        noun in nouns and choice not in ("yes", "no") and _is_value(choice, question)
+        for choice, noun in ((before, last), (after, first))
+    ) or (last == "1" and not before[-1:].isdigit() and _is_value(before, question))  # "the green one"
+
+
+def _is_value(words: str, question: str) -> bool:
+    """Return whether these words are exactly a label, or one of the choices in a question."""
+    if _LABEL.fullmatch(words):
+        return True
+    is_asked = " or " in question and words.count(" ") < 5 and " or " not in f" {words} "
+    # own text: questions of the benchmark's records
+    texts = (question, re.sub(r"\s*\([^)]*\)", "", question)) if is_asked and words else ()
+    lists = [words_of(re.sub(r"[,:;?]| -- ", " or ", text)) for text in texts]
     return any(len(re.findall(rf"\b{re.escape(words)} or\b", parts)) == 1 for parts in lists)
-
-
-def _words(text: str) -> str:
-    """Return the words of a text without contractions, and with numbers in digits."""
-    text = text.lower().replace("’", "'")
-    for contraction, full in _CONTRACTIONS.items():
-        text = text.replace(contraction, full)
-    return " ".join(NUMBER_WORDS.get(word, word) for word in normalise(text).split())

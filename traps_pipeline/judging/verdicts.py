@@ -13,7 +13,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.models.reading.judged_answers import UNREAD
-from traps_pipeline.models.registry.judges import PANEL_SIZES, panel_id
+from traps_pipeline.models.registry.judges import PANEL_SIZES, is_of_rules, panel_id
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.protocol.ratings import (
@@ -49,7 +49,7 @@ def decide_cells(workspace: Workspace, cells: Sequence[Cell]) -> dict[Cell, pd.D
 
 def _decide_group(workspace: Workspace, cells: Sequence[Cell]) -> dict[Cell, pd.DataFrame | TrapsError]:
     tables, result_by_cell = workspace.tables, dict[Cell, pd.DataFrame | TrapsError]()
-    vote_columns = [*VOTE_COLUMNS, "invalid_reason", "rejects_premise", "panel"]
+    vote_columns = [*VOTE_COLUMNS, "invalid_reason", "rejects_premise", "judge_correct", "panel"]
     votes = {cell: tables.arrow(VOTES, cell.partition, vote_columns) for cell in cells}
 
     def alike(cell: Cell) -> tuple[str, list[str]]:
@@ -94,6 +94,7 @@ def decide(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) ->
     is_undecided = (abstained == INVALID) | (is_control & (correct == INVALID))
     rows["abstained"], rows["correct"] = vote_decisions(abstained), vote_decisions(correct)
     rows["rejects_premise"] = _rejects_premise(rows, votes, len(cast.judges))
+    rows["overruled"] = _overruled(rows, votes)
     rows["n_valid"] = (abstention != INVALID).sum(axis=1)
     rows["n_valid_correctness"] = (correctness != INVALID).sum(axis=1)
     rows["unanimous"] = judged & _unanimous(abstention) & (~is_control | _unanimous(correctness))
@@ -115,6 +116,19 @@ def _rejects_premise(rows: pd.DataFrame, votes: pd.DataFrame, n_judges: int) -> 
     counts = rows[ANSWER].merge(yes.reset_index(), on=ANSWER, how="left").fillna(0)
     n_rejecting, n_accepting = counts["sum"].to_numpy(), (counts["size"] - counts["sum"]).to_numpy()
     return pd.arrays.BooleanArray(n_rejecting > n_judges / 2, np.maximum(n_rejecting, n_accepting) <= n_judges / 2)
+
+
+def _overruled(rows: pd.DataFrame, votes: pd.DataFrame) -> pd.Series:
+    """Return whether code differs from some judge's own word on correctness, (rows,), null without such a word.
+
+    Rules have no word of their own.
+    """
+    rules = [panel for panel in votes["panel"].unique() if is_of_rules(panel.partition("@")[0])]
+    has_word = votes["judge_correct"].notna() & votes["correct"].notna() & ~votes["panel"].isin(rules)
+    words = votes.loc[has_word, [*ANSWER, "judge_correct", "correct"]]
+    flags = words[ANSWER].assign(overruled=words["judge_correct"].astype(bool) != words["correct"].astype(bool))
+    flags = flags.groupby(ANSWER, as_index=False)["overruled"].any()
+    return rows[ANSWER].merge(flags, on=ANSWER, how="left")["overruled"].astype("boolean")
 
 
 def _unanimous(values: np.ndarray) -> np.ndarray:

@@ -60,6 +60,10 @@ def run_experiment(
             report = materialize_stale(instance, runs, plan)
     if not report.problems:
         plan.note_made()
+        return report
+    after = RunPlan(workspace, experiment.name, plan.parts)
+    report.is_made = after.is_made()
+    report.has_board = after.part(["leaderboard", "report_page"]).is_made()
     return report
 
 

@@ -20,7 +20,7 @@ from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
 # Without the times of calls, for which pyarrow would import pandas.
-_OF_ANSWER = ("item_id", "text", "error", "outcome")
+_OF_ANSWER = ("item_id", "text", "fragment", "error", "outcome")
 _OF_VOTE = ("item_id", "task", "abstained", "correct", "valid", "judge", "rationale", "invalid_reason")
 
 
@@ -72,6 +72,7 @@ def lines_of(explanation: Mapping[str, Any]) -> Iterator[str]:
         yield f"{evaluation['evaluation']}: {evaluation['state']}"
         for answer in evaluation["answers"]:
             yield f"    {answer['outcome']}: {_short(answer['text']) if answer['text'] else answer['error'] or ''}"
+            yield from [f"        it began: {_short(answer['fragment'])}"] if answer["fragment"] else []
         for vote in evaluation["votes"]:
             decision = vote["abstained"] if vote["task"] == "abstention" else vote["correct"]
             word = "invalid" if not vote["valid"] else "yes" if decision else "no"

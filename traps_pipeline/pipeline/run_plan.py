@@ -60,9 +60,15 @@ class StageStatus:
 
 @dataclass
 class RunReport:
-    """A run's problems in sentences, whether a budget ended it, and its tallies."""
+    """A run's problems in sentences, whether a budget ended it, and its tallies.
+
+    is_made: whether every table is made, so that the same command would do nothing; has_board: whether the leaderboard
+    is.
+    """
 
     problems: list[str] = field(default_factory=list)
+    is_made: bool = True
+    has_board: bool = True
     over_budget: bool = False
     seconds: float = 0.0
     tallies: Mapping[str, Tally] = field(default_factory=dict)
@@ -196,9 +202,12 @@ class RunPlan:
         note = _read_note(self.workspace)
         if not note or note.get("history") != _history_state(self.workspace):
             return False
-        noted_versions = note["versions"]
+        return self.is_made(note["versions"])
+
+    def is_made(self, noted: Mapping[str, Any] | None = None) -> bool:
+        """Return whether all wanted partitions are fresh, and of the noted versions if these are given."""
         return all(
-            noted_versions.get(name_of((name, key))) == self.lineage.version(name, key) is not None
+            (noted is None or noted.get(name_of((name, key))) == self.lineage.version(name, key) is not None)
             and self.lineage.status(name, key).kind == "fresh"
             for name, keys in self.parts.items()
             for key in keys

@@ -139,6 +139,12 @@ COUNT_WORDS: Mapping[str, Count] = {
         Count(
             "n_rejects_answered", "", "of these, answers that do not abstain, such as a true zero", is_of_decisions=True
         ),
+        Count(
+            "n_overruled", "Overruled",
+            "control items on which code reads another value out of a judge's vote than the judge's own word on it "
+            "says; marked above 1 % of the controls; null if no language model judged",
+            is_of_decisions=True,
+        ),
     )
 }  # fmt: skip
 BROKEN_COUNTS = tuple(count.name for count in COUNT_WORDS.values() if count.is_broken)

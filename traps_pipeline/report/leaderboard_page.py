@@ -36,6 +36,8 @@ from traps_pipeline.report.terms import (
     ENOUGH,
     INCOMPLETE_MARK,
     MISSING_MARK,
+    OVERRULED_ABOVE,
+    OVERRULED_MARK,
     ROBUST_FIGURES,
     TITLES,
 )
@@ -59,7 +61,10 @@ BOUNDS = "If missing: worst, best"
 _COUNTS = [count for count in COUNT_WORDS.values() if count.heading]
 # Columns shown only if their count, or that of another field, is not 0, because the table is already wide.
 OPTIONAL = {
-    **{Column(count.name, count.heading, "count"): count.name for count in _COUNTS},
+    **{
+        Column(c.name, c.heading, "count", mark="overruled_mark" if c.name == "n_overruled" else ""): c.name
+        for c in _COUNTS
+    },
     Column("broken", "Broken %", "percent"): "broken",
     Column("bounds", BOUNDS, "range"): "n_missing",
 }
@@ -207,7 +212,7 @@ def _leaderboard(
     columns += [
         column for column in (EPOCH, Column("benchmark_version", "Version")) if rows.loc[:, column.field].nunique() > 1
     ]
-    marks = [*rows["n_mark"], *rows["missing_mark"], *rows["model_mark"]]
+    marks = [mark for name in ("n_mark", "missing_mark", "model_mark", "overruled_mark") for mark in rows[name]]
     notes = [*meanings(marks), *_notes_on_arms(beside)]
     if brief:
         columns = [replace(c, spread="") for c in columns if c.field not in ("n_runs", "epoch", "benchmark_version")]
@@ -264,6 +269,9 @@ def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.Dat
         counted_rows = list(dataset_rows.values()) if main_row is None else [main_row]
         entry: dict[str, Any] = {name: counted_rows[0][name] for name in ("model", "regime")} | (main_row or {})
         entry |= {name: _total(row[name] for row in counted_rows) for name in _SUMMED}
+        n_controls = sum(row["n_pairs"] * row["n_runs"] for row in counted_rows)
+        is_marked = (entry["n_overruled"] or 0) > OVERRULED_ABOVE * n_controls
+        entry["overruled_mark"] = OVERRULED_MARK if is_marked else ""
         entry["mark"] = _mark(main_row) if main_row else ""
         entry["n_mark"] = INCOMPLETE_MARK if any(row["incomplete"] for row in counted_rows) else ""
         entry["model_mark"] = BROKEN_MARK if any(row["is_broken"] for row in counted_rows) else ""
@@ -280,6 +288,7 @@ def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.Dat
         "n_mark",
         "model_mark",
         "missing_mark",
+        "overruled_mark",
         "ci",
         "bounds",
         *others,

@@ -40,6 +40,7 @@ ENOUGH = f"{100 * INCOMPLETE_BELOW:g} %"
 MISSING_MARK = "†"
 INCOMPLETE_MARK = "‡"
 BROKEN_MARK = "§"
+OVERRULED_MARK, OVERRULED_ABOVE = "¶", 0.01
 BROKEN_TEXTS = (
     f"more than {100 * BROKEN_ABOVE:g} % of the texts are empty, degenerate, unread, unfinished or cut off before an "
     "answer"
@@ -48,6 +49,7 @@ MARKS = {
     MISSING_MARK: "some items have no answer or no majority; shares are over the other items",
     INCOMPLETE_MARK: f"incomplete: fewer than {ENOUGH} of items answered",
     BROKEN_MARK: f"broken: {BROKEN_TEXTS}",
+    OVERRULED_MARK: "code decides otherwise than some judge's own word on more than 1 % of the controls",
 }
 # Terms of mechanistic tables and figures; a page without these does not explain them.
 INSIDE_TERMS = {

@@ -24,7 +24,7 @@ from traps_pipeline.scoring.published import published, published_cells, publish
 
 AGREES, ROUNDING, DECLARED, DIFFERS = "agrees", "within rounding", "declared", "differs"
 Verdict = Literal["agrees", "within rounding", "declared", "differs"]
-_NUMBER = re.compile(r"(?<![\w.-])\d+(?:\.\d+)?(?![\w-]*[a-z])")
+_NUMBER = re.compile(r"(?<![\w.-])\d+(?:\.\d+)?(?![\w-]*[a-z])")  # own text: the paper's statements
 _SLACK = 1e-9
 _AGREEING = (AGREES, ROUNDING)
 
@@ -138,6 +138,7 @@ def _differences(printed: str, recomputed: str) -> str:
 
 def _trim_zeros(words: str) -> str:
     """Return the words with trailing zeros of four-decimal numbers removed."""
+    # own text: the paper's statements
     return re.sub(r"(\d\.\d*?[1-9])0+(?!\d)|(\d+)\.0+(?!\d)", r"\1\2", words) if re.search(r"\.\d{4}", words) else words
 
 

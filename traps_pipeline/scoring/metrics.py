@@ -121,7 +121,8 @@ def _with_scopes(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]
     is_not_json = verdicts["is_json"].eq(False).astype("int64")
     rejects_premise = verdicts["rejects_premise"].astype("boolean").where(~is_control)
     is_answered = rejects_premise & ~verdicts["abstained"].astype("boolean").fillna(False)
-    rejections = {"n_rejects": rejects_premise.astype("Int64"), "n_rejects_answered": is_answered.astype("Int64")}
+    optional = (rejects_premise, is_answered, verdicts["overruled"].astype("boolean"))
+    rejections = {name: f.astype("Int64") for name, f in zip(REJECTION_COLUMNS, optional, strict=True)}
     flags = counts.assign(complete=is_complete, **outcomes, n_not_json=is_not_json, **rejections)
     items = pd.concat([verdicts[[*CELL, "pair_id", "epoch", "panel", "benchmark_version"]], flags], axis=1)
     scopes = [pd.Series("all", index=items.index)]

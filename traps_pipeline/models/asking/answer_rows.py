@@ -16,6 +16,7 @@ class ResponseRow(shared.CellRow):
     side: shared.Side
     outcome: shared.AnswerOutcome
     text: Annotated[str | None, "the visible answer; null unless outcome is answer"]
+    fragment: Annotated[str | None, "the beginning of a text that is no answer: cut off, degenerate; never judged"]
     reasoning: Annotated[str | None, "the trace, where the provider returns it"]
     is_json: Annotated[bool | None, "JSON regime: whether the text is the object that the prompt asks for"]
     first_token: Annotated[str | None, "regime logprobs: JSON object, token to log-probability, likeliest first"]

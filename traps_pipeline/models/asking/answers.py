@@ -144,8 +144,8 @@ def _secret(entry: ModelEntry, item: Mapping[str, Any]) -> dict[str, Any]:
 
 def response_row(cell: Cell, item: Mapping[str, Any], row: Row, reasoning: str | None) -> ResponseRow:
     """Return one row of the responses table."""
-    thinking = get_model(cell.evaluation.model).thinking
-    reading = read_answer(row, reasoning, cell.evaluation.regime, thinking=thinking, dataset=cell.dataset)
+    entry, regime, dataset = get_model(cell.evaluation.model), cell.evaluation.regime, cell.dataset
+    reading = read_answer(row, reasoning, regime, thinking=entry.thinking, dataset=dataset, max_tokens=entry.max_tokens)
     row_fields = ("finish_reason", "served_model", "client", "prompt_tokens", "completion_tokens")
     row_fields += ("reasoning_tokens", "cost_usd", "latency_s", "attempts")
     return ResponseRow(
@@ -155,6 +155,7 @@ def response_row(cell: Cell, item: Mapping[str, Any], row: Row, reasoning: str |
         **call_time_columns(row),
         outcome=reading.outcome,
         text=reading.text,
+        fragment=reading.fragment,
         reasoning=reading.reasoning,
         is_json=reading.is_json,
         first_token=row.get("first_token"),

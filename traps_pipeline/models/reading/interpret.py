@@ -25,19 +25,20 @@ from traps_pipeline.models.reading.thinking import (
 from traps_pipeline.models.request import JUDGED, UNFINISHED, WITH_TEXT
 from traps_pipeline.protocol.regimes import fields_of
 
-READING = "4"  # version of this module's rules; raising it makes the answers' tables stale
-# An announced final answer that ends before the text does: one at the cut may be incomplete.
-_STATED = re.compile(
-    r"(?:^|[.!?:\n]|\b(?:the|my|final|correct|best)\s)[\W_]*answer[\W_]*?(?:\bis\b\s*:?|[:=])[\s*_\"'`]*"
-    r"\w[^\n]*?(?:\n|[.!?][\"'`)*_\]]*(?:\s|(?<!\d.)$))",
-    re.IGNORECASE,
-)
+READING = "5"  # version of this module's rules; raising it makes the answers' tables stale
+# An announced final answer: what stands before it, its first character, and an end after that one.
+_MAX_BEFORE = 60  # characters
+# own text: _MAX_BEFORE characters of one
+_BEFORE = re.compile(r"(?:^|[.!?:\n]|\b(?:the|my|final|correct|best)\s)[\W_]*\Z", re.IGNORECASE)
+_STATED = re.compile(r"answer[\W_]*?(?:\bis\b(?:\s*:)?|[:=])[\s*_\"'`]*(?=\w)", re.IGNORECASE)
+_END = re.compile(r"\n|[.!?][\"'`)*_\]]*(?:\s|(?<!\d.)$)")
 _OBJECT = re.compile(r'\{\s*"')
 _DECODER = json.JSONDecoder(strict=False)
-_WORD = re.compile(r"\w+")
+_WORD, _SPACE = re.compile(r"\w+"), re.compile(r"\s*")
 _LONGEST_UNIT, _MIN_REPEATS, _MIN_SHARE = 40, 6, 0.5  # words, times, of the text's words
 _MIN_WORDS, _FEW_CHARACTERS = 12, 30
-_MAX_REASON = 60  # characters of a finish reason in a sentence
+_MAX_REASON, _MAX_FRAGMENT = 60, 4_000  # characters of a finish reason in a sentence, and of a text that is no answer
+_TOKEN_CHARACTERS = 128  # of the longest token in any usual vocabulary
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class Reading:
 
     outcome: as in the ledger, or `degenerate`; text: for judges, None if they are shown nothing; reasoning: the trace;
     is_json: whether the text is the requested object, if one was requested; why: what is wrong with a text that is no
-    answer.
+    answer; fragment: that text's beginning.
     """
 
     outcome: str
@@ -54,29 +55,40 @@ class Reading:
     reasoning: str | None
     is_json: bool | None = None
     why: str | None = None
+    fragment: str | None = None
 
 
 def read_answer(
-    row: Mapping[str, Any], reasoning: str | None, regime: str, *, thinking: Marks | None = None, dataset: str = ""
+    row: Mapping[str, Any],
+    reasoning: str | None,
+    regime: str,
+    *,
+    thinking: Marks | None = None,
+    dataset: str = "",
+    max_tokens: int = 0,
 ) -> Reading:
     """Return the interpretation of an answer's ledger row.
 
     thinking: the marks, declared by the model's entry, around thinking in the visible text, which is split off.
-    dataset: of the item; it may ask for another object than the regime.
+    dataset: of the item; it may ask for another object than the regime. max_tokens: the request's limit; a longer text
+    is not the model's alone, and no answer. 0 if there is none.
     """
     fields = fields_of(regime, dataset)
     outcome, text = str(row["outcome"]), row["text"]
+    fragment = text[:_MAX_FRAGMENT] if isinstance(text, str) else None
     if outcome == UNFINISHED:  # this version may know the reason
         finish_reason = row.get("finish_reason")
         outcome = {"complete": JUDGED[0], "truncated": "truncated"}.get(ending_of(finish_reason), UNFINISHED)
         if outcome == UNFINISHED:
-            return Reading(
-                outcome, None, reasoning, why=f"ended for the unknown reason {str(finish_reason)[:_MAX_REASON]!r}"
-            )
+            why = f"ended for the unknown reason {str(finish_reason)[:_MAX_REASON]!r}"
+            return Reading(outcome, None, reasoning, why=why, fragment=fragment)
     if outcome == "empty" and ending_of(row.get("finish_reason")) == "truncated":
         return Reading("truncated", None, reasoning, False if fields else None, "cut off before its answer began")
     if outcome not in WITH_TEXT or not isinstance(text, str):
         return Reading(outcome, text, reasoning)
+    if max_tokens and len(text) > _TOKEN_CHARACTERS * max_tokens:
+        why = f"is longer than its {max_tokens:,} tokens can be: {len(text):,} characters"
+        return Reading(UNFINISHED, None, reasoning, False if fields else None, why, fragment)
     text, is_cut_off = strip_tokens(text), outcome == "truncated"
     if thinking:
         split = split_thinking(text, thinking)
@@ -86,14 +98,15 @@ def read_answer(
             return Reading("truncated", None, reasoning, False if fields else None, "cut off inside its thinking")
         if not text:
             return Reading("empty", None, reasoning, False if fields else None, "only thinks")
-    is_json = _is_json(text, fields) if fields else None
+    is_json, fragment = _is_json(text, fields) if fields else None, text[:_MAX_FRAGMENT]
     if mark := undeclared_mark(text):
         reason = f"thinks between marks in its text; say `{declaration_line(mark)}` in its entry"
-        return Reading("degenerate", None, reasoning, is_json, reason)
+        return Reading("degenerate", None, reasoning, is_json, reason, fragment)
     if reason := degenerate(text):
-        return Reading("degenerate", None, reasoning, is_json, reason)
+        return Reading("degenerate", None, reasoning, is_json, reason, fragment)
     if is_cut_off and not _has_final_answer(text):
-        return Reading("truncated", None, reasoning, is_json, "cut off at the limit of tokens before a final answer")
+        why = "cut off at the limit of tokens before a final answer"
+        return Reading("truncated", None, reasoning, is_json, why, fragment)
     return Reading(JUDGED[0], text, reasoning, is_json)
 
 
@@ -104,7 +117,19 @@ def _has_final_answer(text: str) -> bool:
     """
     brace = _OBJECT.search(text)
     start = brace.start() if brace else len(text)
-    return bool(_STATED.search(text[:start])) or "final_answer" in _complete_fields(text[start:])
+    return _states_answer(text[:start]) or "final_answer" in _complete_fields(text[start:])
+
+
+def _states_answer(text: str) -> bool:
+    """Return whether a text announces an answer that ends before the text does.
+
+    One at the cut may be incomplete. Where none ends after one announcement, none does after a later one.
+    """
+    for stated in _STATED.finditer(text):
+        start = max(0, stated.start() - _MAX_BEFORE)
+        if _BEFORE.search(f"{'x' if start else ''}{text[start : stated.start()]}"):
+            return _END.search(text, stated.end() + 1) is not None
+    return False
 
 
 def _complete_fields(text: str) -> dict[str, Any]:
@@ -126,7 +151,7 @@ def _complete_fields(text: str) -> dict[str, Any]:
 
 def _skip(text: str, place: int, sign: str = "") -> int:
     """Return the place after white space (and a sign). Raises ValueError."""
-    place = len(text) - len(text[place:].lstrip())
+    place = _SPACE.match(text, place).end()  # pyright: ignore[reportOptionalMemberAccess] - it matches everywhere
     if not text.startswith(sign, place):
         raise ValueError(f"{sign!r} is not there")
     return place if not sign else _skip(text, place + len(sign))

@@ -11,9 +11,16 @@ from typing import Any
 from traps_pipeline.models.reading.thinking import strip_fence
 
 UNREAD = "unread"  # a rule judge's vote, and an answer's outcome, if no rule can read the text
+MAX_SHOWN = 40_000  # characters of an answer that a judge is shown, more than 8,000 tokens of prose
 NUMERIC_TOLERANCE = 0.5
 _WORDS = ("zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
+_ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth")
 NUMBER_WORDS = {word: str(n) for n, word in enumerate(_WORDS)}
+_ORDINAL_WORDS = {word: str(n) for n, word in enumerate(_ORDINALS, 1)}
+_CONTRACTIONS = {"can't": "cannot", "can not": "cannot", "n't": " not", "i'm": "i am", "it's": "it is"}
+_DENIALS = {"not", "never", "neither", "nor", "without", "except", "cannot"}
+_SAYS_YES = dict.fromkeys([("true",), ("does",), ("do",), ("is",), ("will",)], "yes") | {("false",): "no"}
+_PRONOUN = re.compile(r"\b((?:the|this|that)\s+\w+\s+)ones?\b", re.IGNORECASE)  # "the middle one" is no number
 _FENCE = re.compile(r"(?:```|~~~)?\s*(?:json)?", re.IGNORECASE)
 _NUMBER = re.compile(r"(?:(?<![\w.])-)?(?:\d+(?:\.\d+)?|\.\d+)")
 _THOUSANDS = re.compile(r"(?<=\d),(?=\d{3}(?!\d))")
@@ -21,7 +28,6 @@ _THOUSANDS = re.compile(r"(?<=\d),(?=\d{3}(?!\d))")
 _PUNCTUATION = re.compile(r"(?<=\d)[.\-](?=\d)|(?<![\w.])-(?=\.?\d)|(?<![\w.])\.(?=\d)|([^\w\s])")
 
 
-@lru_cache(4096)  # every vote on correctness normalises all labels and aliases of its item again
 def normalise(text: str) -> str:
     """Return the text in lower case, without articles and non-numeric punctuation."""
     text = _THOUSANDS.sub("", re.sub("[–—−]", "-", text.lower()))
@@ -67,28 +73,71 @@ def read_flag(value: object) -> object:
     return {"true": True, "false": False}.get(value.strip().lower(), value) if isinstance(value, str) else value
 
 
-def to_number(text: str) -> float | None:
-    """Return the only number in a text, in digits or words; None if none or several."""
-    words = [NUMBER_WORDS.get(word, word) for word in normalise(text).split()]
-    numbers = _NUMBER.findall(" ".join(words))
-    return float(numbers[0]) if len(numbers) == 1 else None
+def words_of(text: str) -> str:
+    """Return a text's normal form without contractions, and with numbers in digits."""
+    text = text.lower().replace("’", "'")
+    for contraction, full in _CONTRACTIONS.items():
+        text = text.replace(contraction, full)
+    return " ".join(NUMBER_WORDS.get(word, word) for word in normalise(text).split())
+
+
+def named_choices(text: str, answer_type: str, labels: Sequence[str], aliases: Mapping[str, str]) -> set[str]:
+    """Return the choices that a value names: one is its choice; of several none can be read.
+
+    The longest names count, wherever they stand; a numeric value also names each number in it, and "2 of 3" names 2
+    alone. Where a word outside of a name denies something, or a number counts from the right, every choice is returned.
+    """
+    names, longest = _names(tuple(labels), tuple(aliases.items()))
+    text = _PRONOUN.sub(lambda match: match[0] if tuple(_value_words(match[0])) in names else match[1], text)
+    words, is_binary, named = _value_words(text), {*labels} == {"yes", "no"}, set[str]()
+    if exact := names.get(tuple(words)) or (is_binary and _SAYS_YES.get(tuple(words))):
+        return {exact}
+    if is_binary and words[-1:] == ["not"]:  # "no, it does not"
+        words, named = words[:-2], {"no"}
+    is_denied, place = False, 0
+    while place < len(words):
+        word, ends = words[place], range(min(place + longest, len(words)), place, -1)
+        end = next((end for end in ends if tuple(words[place:end]) in names), place)
+        if named and words[place - 1] == "of" and word[0].isdigit():
+            end = place + 1
+        elif end > place:
+            named.add(names[tuple(words[place:end])])
+        elif answer_type == "numeric":
+            numbers = [f"{float(number):g}" for number in _NUMBER.findall(_ORDINAL_WORDS.get(word, word))]
+            named |= {names.get((number,), number) for number in numbers}
+        elif all((part,) in names for part in word.split("-")):
+            named |= {names[part,] for part in word.split("-")}
+        is_other_end = answer_type == "numeric" and words[max(0, place - 1) : place + 1] == ["from", "right"]
+        is_denial = word in _DENIALS or is_other_end or (word == "no" and answer_type != "numeric")
+        is_denied |= is_denial and end == place and named != {"no"}  # "no, it does not fall"
+        place = max(end, place + 1)
+    return {*labels} if is_denied and (named or is_binary) else named
+
+
+@lru_cache(1024)  # every vote on an item needs them
+def _names(labels: tuple[str, ...], aliases: tuple[tuple[str, str], ...]) -> tuple[dict[tuple[str, ...], str], int]:
+    """Return the label of each name, by the name's words, and the words of the longest."""
+    names = {tuple(_value_words(name)): label for name, label in (*aliases, *zip(labels, labels, strict=True)) if name}
+    return names, max(map(len, names), default=0)
+
+
+def _value_words(text: str) -> list[str]:
+    return [word for word in words_of(text).split() if word not in ("it", "they")]
 
 
 def to_label(text: str, labels: Sequence[str], aliases: Mapping[str, str]) -> str | None:
-    """Return the label that a value names, exactly or by an alias; else None."""
-    table = {normalise(label): label for label in labels}
-    table |= {normalise(alias): label for alias, label in aliases.items()}
-    return table.get(normalise(text))
+    """Return the only label that a value names; else None."""
+    named = named_choices(text, "", labels, aliases)
+    return named.pop() if len(named) == 1 else None
 
 
 def is_correct(
     extracted: str | None, ground_truth: str, answer_type: str, labels: Sequence[str], aliases: Mapping[str, str]
-) -> bool:
-    """Return whether a value is within 0.5 of the truth, or names its label or alias."""
-    if extracted is None:
-        return False
-    if answer_type == "numeric":
-        label = to_label(extracted, labels, aliases)
-        number = to_number(label if label is not None else extracted)
-        return number is not None and abs(number - float(ground_truth)) <= NUMERIC_TOLERANCE
-    return to_label(extracted, labels, aliases) == ground_truth
+) -> bool | None:
+    """Return whether the choice that a value names is the truth, or within 0.5 of it; None if it names several."""
+    named = [] if extracted is None else [*named_choices(extracted, answer_type, labels, aliases)]
+    if len(named) > 1:
+        return None
+    if not named or answer_type != "numeric":
+        return named == [ground_truth]
+    return abs(float(named[0]) - float(ground_truth)) <= NUMERIC_TOLERANCE

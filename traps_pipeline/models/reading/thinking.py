@@ -57,19 +57,18 @@ def split_thinking(text: str, marks: Marks | None) -> ThinkingSplit:
     if marks is None:
         return ThinkingSplit("", text, is_open=False)
     opening_mark, closing_mark = (re.escape(mark) for mark in marks)
-    thinking, answer, is_open = "", "", False
+    thinking, answer, is_open = list[str](), list[str](), False
     for piece in re.split(rf"({opening_mark}|{closing_mark})", text, flags=re.IGNORECASE):
         if piece.lower() == marks[0].lower():
             is_open = True
         elif piece.lower() == marks[1].lower():
             if not is_open:
-                thinking, answer = f"{thinking}\n{answer}", ""
+                thinking += ["\n", *answer]
+                answer = []
             is_open = False
-        elif is_open:
-            thinking += piece
         else:
-            answer += piece
-    return ThinkingSplit(_TURN.sub("", thinking).strip(), _TURN.sub("", answer).strip(), is_open)
+            (thinking if is_open else answer).append(piece)
+    return ThinkingSplit(*(_TURN.sub("", "".join(parts)).strip() for parts in (thinking, answer)), is_open)
 
 
 def strip_tokens(text: str) -> str:

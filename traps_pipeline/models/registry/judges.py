@@ -35,7 +35,7 @@ from traps_pipeline.models.registry.schemas import structured_output
 JUDGES_FILE = ASSETS / "judges.yaml"
 PANEL_SIZES = (1, 3)
 RULE = "rule"  # the backend of the rule judges
-RULES_VERSION = 6  # version of judging/rules.py; raise it to make rule judges vote again
+RULES_VERSION = 7  # version of judging/rules.py; raise it to make rule judges vote again
 RULES_PANEL = "rules"  # panels of this name, or `rules-..`, seat judges that ask no language model, and no others do
 ONE_JUDGE = ".1"  # suffix of the id of a panel of one judge
 BY_RULES = "judged by rules, not comparable"

@@ -10,6 +10,7 @@ from traps_pipeline.base.wording import count_noun, in_percent
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES, VoteRow
 from traps_pipeline.models.asking.answer_rows import RESPONSES, ResponseRow
 from traps_pipeline.models.reading.interpret import READING
+from traps_pipeline.models.reading.judged_answers import UNREAD
 from traps_pipeline.models.registry.entries import answering_version
 from traps_pipeline.models.registry.judges import panel_version
 from traps_pipeline.models.registry.prompts import prompt_version
@@ -94,7 +95,7 @@ def responses(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str |
 
 def _excess_of_invalid(workspace: Workspace, key: str | None, output: StageOutput) -> str:
     cast_votes = output.rows(VOTES)
-    invalid = sum(not vote.valid for vote in cast_votes)
+    invalid = sum(not vote.valid and vote.invalid_reason != UNREAD for vote in cast_votes)  # unread is counted apart
     is_too_many = invalid > MAX_INVALID_SHARE * len(cast_votes)
     return f"invalid: {invalid:,} of {count_noun(len(cast_votes), 'vote')}" if is_too_many else ""
 
@@ -102,12 +103,12 @@ def _excess_of_invalid(workspace: Workspace, key: str | None, output: StageOutpu
 @_stage(
     VOTES,
     parents=[of(items, by_dataset), responses, judges],
-    code="3",
+    code="4",
     cost="money",
     checks=[
         Check(
             "few_invalid_votes",
-            f"At most {in_percent(MAX_INVALID_SHARE)} of a cell's votes break the judges' schema or are unread.",
+            f"At most {in_percent(MAX_INVALID_SHARE)} of a cell's votes break the judges' schema.",
             _excess_of_invalid,
             blocks=False,
         )
@@ -132,7 +133,7 @@ def _verdicts_missing(workspace: Workspace, key: str | None, output: StageOutput
 @_stage(
     VERDICTS,
     parents=[of(items, by_dataset), responses, votes, judges],
-    code="3",
+    code="4",
     checks=[Check("one_verdict_an_item", "Every answered item has exactly one verdict.", _verdicts_missing)],
     side_by_side=True,
 )

@@ -33,7 +33,7 @@ pc: Any = pyarrow.compute  # it creates its functions on import, invisible to ty
 NO, YES, NONE = 0, 1, 2  # values of a decision; NONE: not judged, or without a majority
 SHARD_ROWS = 1200  # answers: four pairs of the paper's 138 evaluations, which are read in a tenth of a second
 _EVALUATION = ("model", "regime", "run")
-_TEXTS = ("text", "reasoning", "finish_reason", "error", "served_model", "cost_usd")
+_TEXTS = ("text", "fragment", "reasoning", "finish_reason", "error", "served_model", "cost_usd")
 _VOTES = ("task", "judge", "valid", "invalid_reason", "abstained", "correct")
 _VOTE_TEXTS = ("extracted_value", "confidence", "rationale")
 

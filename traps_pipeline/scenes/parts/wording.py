@@ -28,7 +28,7 @@ def _pattern(template: str) -> re.Pattern[str]:
         else:
             pattern += f"(?P={part})" if part in slots else f"(?P<{part}>.+?)"
             slots.add(part)
-    return re.compile(pattern)
+    return re.compile(pattern)  # own text: questions of the benchmark's records
 
 
 def match_slots(templates: Sequence[str], question: str) -> dict[str, str] | None:
@@ -102,6 +102,7 @@ BEYOND_VIDEO: Mapping[str, tuple[str, tuple[str, ...]]] = {
 def beyond_video(question: str) -> str | None:
     """Return the property asked for that no video shows; None if there is none."""
     text = question.lower()
+    # own text: questions of the benchmark's records
     return next((name for name, (words, _) in BEYOND_VIDEO.items() if re.search(words, text)), None)
 
 
@@ -178,7 +179,7 @@ def false_premises(question: str, inventory: Inventory, *, near: bool = False) -
     for thing in (*ABSENT_OBJECTS, "arrow", "stripe"):
         if re.search(rf"\b{thing}(s|es)?\b", text) and thing not in inventory.objects:
             premises.append(f"there is no {thing}")
-    quality = re.search(NO_QUALITY_OF_A_COLOUR, text)
+    quality = re.search(NO_QUALITY_OF_A_COLOUR, text)  # own text: a record's question
     if quality:
         premises.append(f"a colour has no {quality.group(1)}")
     for colour in sorted(_COLOUR_WORDS):
@@ -200,6 +201,7 @@ def none_as_answer(question: str) -> str | None:
     "How many windmills does the ball touch?" has one (zero), "What colour is the windmill?" has none.
     """
     text = question.lower()
+    # own text: questions of the benchmark's records
     return next((answer for words, answer in _TRULY_NONE if re.search(words, text)), None)
 
 

@@ -317,7 +317,7 @@ def crossed(partner: SceneSpec | None) -> Arm:
 
 def _presumed(spec: SceneSpec) -> str:
     """Return the question without its choices, which it does not presume."""
-    text = re.sub(r"\([^)]*\)", "", spec.question.lower())
+    text = re.sub(r"\([^)]*\)", "", spec.question.lower())  # own text: a record's question
     matches = [re.search(rf"\b{re.escape(label.lower())}\b", text) for label in spec.labels]
     spans = [match.span() for match in matches if match]
     return text[: min(spans)[0]] + text[max(end for _, end in spans) :] if spans else text

@@ -164,6 +164,7 @@ function answerLine(found, row, terms) {
 function excerpt(read, terms) {
   const places = [
     ["", read.text],
+    ["it began: ", read.fragment],
     ["reasoning: ", read.reasoning],
     ...read.votes.map((vote) => [`${vote.judge}: `, vote.rationale]),
   ];
@@ -215,7 +216,7 @@ async function searchTexts(route, found, rows, words, status, list) {
 }
 
 function mentions({ texts, votes }, at, terms) {
-  const own = [texts.text[at], texts.reasoning[at]];
+  const own = [texts.text[at], texts.fragment[at], texts.reasoning[at]];
   for (let k = lowerBound(votes.answer, at); k < votes.length && votes.answer[k] === at; k++) own.push(votes.rationale[k]);
   return holdsAll(own, terms);
 }

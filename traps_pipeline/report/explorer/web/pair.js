@@ -203,9 +203,11 @@ async function answerPanel(found, pair, sides, evaluation) {
 function answerParts(read, outcome) {
   return [
     read.text === null
-      ? notice(`no text: ${outcome}${read.error ? ` (${read.error})` : ""}`)
+      ? notice(`no answer: ${outcome}${read.error ? ` (${read.error})` : ""}`)
       : untrusted(read.text, { tag: "div", class: "text" }),
-    outcome === "truncated" ? h("p", { class: "note" }, "truncated: it reached its limit of tokens") : null,
+    read.fragment
+      ? [h("p", { class: "note" }, "it began:"), untrusted(read.fragment, { tag: "div", class: "text soft" })]
+      : null,
     read.reasoning
       ? h(
           "details",
