@@ -112,7 +112,7 @@ def expressions() -> tuple[Expression, ...]:
             flags = sum(
                 int(eval(compile(ast.Expression(one), place, "eval"), {"re": re}))
                 for one in known_flags
-                if ast.unparse(one).startswith("re.")
+                if isinstance(one, ast.Attribute | ast.BinOp) and ast.unparse(one).startswith("re.")
             )
             used = methods.get(names.get(node, ""), {"search"}) if node.func.attr == "compile" else {node.func.attr}
             found += [Expression(place, value, flags, method) for method in sorted(used - {"compile"})]

@@ -26,10 +26,8 @@ def board_row(model, regime="standard", dataset="overall", shares=(0.5, 0.1, 0.6
         **{"model": model, "regime": regime, "dataset": dataset, "n_runs": 3, "n_pairs": 1404, "n_missing": 0},
         **figures,
         **{f"{name}_std": 0.01 for name in figures},
-        **dict.fromkeys(COUNT_WORDS, 0),
-        **dict.fromkeys(
-            ("n_rejects", "n_rejects_answered", "n_overruled")
-        ),  # null, as of every panel that is not asked
+        # Counts of decisions are null, as of every panel that is not asked.
+        **{name: None if count.is_of_decisions else 0 for name, count in COUNT_WORDS.items()},
         **{"answered": 1.0, "incomplete": False, "broken": 0.0, "is_broken": False, "panel": "three@1"},
         **{f"{name}_ci_{end}": value for name, value in figures.items() for end in ("low", "high")},
         **{"rank": 1, "rank_low": 1, "rank_high": 2, "naive": float(acc * abs_rec)},

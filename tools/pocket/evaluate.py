@@ -128,8 +128,8 @@ def _is_right(one: Asked, answer: str) -> bool:
     statement = read_statement(answer, one.question)
     value = statement.value if statement else None
     if one.kind == "answerable":
-        return is_correct(value, one.truth, "label", [one.truth], {})
-    return is_correct(value, one.truth, one.scene.answer_type, one.scene.labels, one.scene.aliases)
+        return is_correct(value, one.truth, "label", [one.truth], {}) is True
+    return is_correct(value, one.truth, one.scene.answer_type, one.scene.labels, one.scene.aliases) is True
 
 
 def _commonest(asked: Sequence[Asked]) -> dict[str, str]:

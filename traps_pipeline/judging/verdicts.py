@@ -128,7 +128,8 @@ def _overruled(rows: pd.DataFrame, votes: pd.DataFrame) -> pd.Series:
     words = votes.loc[has_word, [*ANSWER, "judge_correct", "correct"]]
     flags = words[ANSWER].assign(overruled=words["judge_correct"].astype(bool) != words["correct"].astype(bool))
     flags = flags.groupby(ANSWER, as_index=False)["overruled"].any()
-    return rows[ANSWER].merge(flags, on=ANSWER, how="left")["overruled"].astype("boolean")
+    joined = pd.DataFrame(rows[ANSWER]).merge(flags, on=ANSWER, how="left")
+    return pd.Series(joined["overruled"]).astype("boolean")
 
 
 def _unanimous(values: np.ndarray) -> np.ndarray:

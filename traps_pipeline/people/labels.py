@@ -123,7 +123,8 @@ def _with_answers(workspace: Workspace, rows: pd.DataFrame) -> pd.DataFrame:
     def right(row: Mapping[Any, Any]) -> bool:
         item = items[row["item_id"]]
         aliases = json.loads(item["aliases"])
-        return is_correct(row["answer"], item["ground_truth"], item["answer_type"], list(item["labels"]), aliases)
+        read = is_correct(row["answer"], item["ground_truth"], item["answer_type"], list(item["labels"]), aliases)
+        return read is True
 
     answers = []
     for row in rows.to_dict("records"):

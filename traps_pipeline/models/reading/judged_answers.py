@@ -19,7 +19,9 @@ NUMBER_WORDS = {word: str(n) for n, word in enumerate(_WORDS)}
 _ORDINAL_WORDS = {word: str(n) for n, word in enumerate(_ORDINALS, 1)}
 _CONTRACTIONS = {"can't": "cannot", "can not": "cannot", "n't": " not", "i'm": "i am", "it's": "it is"}
 _DENIALS = {"not", "never", "neither", "nor", "without", "except", "cannot"}
-_SAYS_YES = dict.fromkeys([("true",), ("does",), ("do",), ("is",), ("will",)], "yes") | {("false",): "no"}
+_SAYS_YES: Mapping[tuple[str, ...], str] = dict.fromkeys([("true",), ("does",), ("do",), ("is",), ("will",)], "yes") | {
+    ("false",): "no"
+}
 _PRONOUN = re.compile(r"\b((?:the|this|that)\s+\w+\s+)ones?\b", re.IGNORECASE)  # "the middle one" is no number
 _FENCE = re.compile(r"(?:```|~~~)?\s*(?:json)?", re.IGNORECASE)
 _NUMBER = re.compile(r"(?:(?<![\w.])-)?(?:\d+(?:\.\d+)?|\.\d+)")
