@@ -39,8 +39,7 @@ OpenRuns = Callable[["DagsterInstance", Workspace], AbstractContextManager["Runs
 class RunReport:
     """A run's problems in sentences, whether a budget ended it, and its tallies.
 
-    is_made: whether every table is made, so that the same command would do nothing; has_board: whether the leaderboard
-    is.
+    is_made: whether the same command would do nothing. has_board: whether the leaderboard is made.
     """
 
     problems: list[str] = field(default_factory=list)
