@@ -187,8 +187,7 @@ class ObjectStore(Store):
     @override
     def below(self, folder: Path, pattern: str = "**/*") -> list[Path]:
         start = f"{self._name(folder)}/"
-        # `**/` is any number of folders, and `*` is within one name, as in `pathlib`.
-        # own text: names of a study's files
+        # `**/` is any number of folders, `*` is within one name, as in `pathlib`. # own text: names of a study's files
         matches = re.compile(re.escape(pattern).replace(r"\*\*/", "(?:[^/]+/)*").replace(r"\*", "[^/]*")).fullmatch
         inside = (name.removeprefix(start) for name in self.names.below(self._name(folder)))
         return [folder / name for name in inside if matches(name) and not is_hidden(Path(name))]

@@ -118,7 +118,7 @@ def _rejects_premise(rows: pd.DataFrame, votes: pd.DataFrame, n_judges: int) -> 
     return pd.arrays.BooleanArray(n_rejecting > n_judges / 2, np.maximum(n_rejecting, n_accepting) <= n_judges / 2)
 
 
-def _overruled(rows: pd.DataFrame, votes: pd.DataFrame) -> pd.Series:
+def _overruled(rows: pd.DataFrame, votes: pd.DataFrame) -> pd.arrays.BooleanArray:
     """Return whether code differs from some judge's own word on correctness, (rows,), null without such a word.
 
     Rules have no word of their own.
@@ -128,8 +128,8 @@ def _overruled(rows: pd.DataFrame, votes: pd.DataFrame) -> pd.Series:
     words = votes.loc[has_word, [*ANSWER, "judge_correct", "correct"]]
     flags = words[ANSWER].assign(overruled=words["judge_correct"].astype(bool) != words["correct"].astype(bool))
     flags = flags.groupby(ANSWER, as_index=False)["overruled"].any()
-    joined = pd.DataFrame(rows[ANSWER]).merge(flags, on=ANSWER, how="left")
-    return pd.Series(joined["overruled"]).astype("boolean")
+    found = rows[ANSWER].merge(flags, on=ANSWER, how="left")["overruled"]
+    return pd.arrays.BooleanArray(found.eq(True).to_numpy(bool), found.isna().to_numpy(bool))
 
 
 def _unanimous(values: np.ndarray) -> np.ndarray:

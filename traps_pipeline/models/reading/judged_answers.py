@@ -19,9 +19,7 @@ NUMBER_WORDS = {word: str(n) for n, word in enumerate(_WORDS)}
 _ORDINAL_WORDS = {word: str(n) for n, word in enumerate(_ORDINALS, 1)}
 _CONTRACTIONS = {"can't": "cannot", "can not": "cannot", "n't": " not", "i'm": "i am", "it's": "it is"}
 _DENIALS = {"not", "never", "neither", "nor", "without", "except", "cannot"}
-_SAYS_YES: Mapping[tuple[str, ...], str] = dict.fromkeys([("true",), ("does",), ("do",), ("is",), ("will",)], "yes") | {
-    ("false",): "no"
-}
+_SAYS_YES = dict.fromkeys(("true", "does", "do", "is", "will"), "yes") | {"false": "no"}
 _PRONOUN = re.compile(r"\b((?:the|this|that)\s+\w+\s+)ones?\b", re.IGNORECASE)  # "the middle one" is no number
 _FENCE = re.compile(r"(?:```|~~~)?\s*(?:json)?", re.IGNORECASE)
 _NUMBER = re.compile(r"(?:(?<![\w.])-)?(?:\d+(?:\.\d+)?|\.\d+)")
@@ -92,7 +90,7 @@ def named_choices(text: str, answer_type: str, labels: Sequence[str], aliases: M
     names, longest = _names(tuple(labels), tuple(aliases.items()))
     text = _PRONOUN.sub(lambda match: match[0] if tuple(_value_words(match[0])) in names else match[1], text)
     words, is_binary, named = _value_words(text), {*labels} == {"yes", "no"}, set[str]()
-    if exact := names.get(tuple(words)) or (is_binary and _SAYS_YES.get(tuple(words))):
+    if exact := names.get(tuple(words)) or (is_binary and _SAYS_YES.get(" ".join(words))):
         return {exact}
     if is_binary and words[-1:] == ["not"]:  # "no, it does not"
         words, named = words[:-2], {"no"}

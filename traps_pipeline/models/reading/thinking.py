@@ -68,8 +68,8 @@ def split_thinking(text: str, marks: Marks | None) -> ThinkingSplit:
             is_open = False
         else:
             (thinking if is_open else answer).append(piece)
-    visible = (_TURN.sub("", "".join(parts)).strip() for parts in (thinking, answer))
-    return ThinkingSplit(next(visible), next(visible), is_open)
+    thinking_text, answer_text = (_TURN.sub("", "".join(parts)).strip() for parts in (thinking, answer))
+    return ThinkingSplit(thinking_text, answer_text, is_open)
 
 
 def strip_tokens(text: str) -> str:
