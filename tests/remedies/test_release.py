@@ -14,7 +14,7 @@ from traps_pipeline.release.content import content_of
 from traps_pipeline.release.folder import Options, write_release
 from traps_pipeline.release.results import Attribution, write_results
 from traps_pipeline.release.submission import pack, read_submission
-from traps_pipeline.release.verification import verify
+from traps_pipeline.release.verification import released_items, verify
 from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.workspace import Workspace
 
@@ -44,8 +44,8 @@ def test_a_release_is_written_to_another_folder_or_once_what_is_not_of_it_is_mov
 
     folder.mkdir()
     letter.write_text("mine")
-    remedied(write, "release.folder.write_release", again=lambda: write(tmp_path / "new"))
-    remedied(write, "release.folder.write_release", lambda: shutil.rmtree(folder))
+    remedied(write, "release.folder._require_own", again=lambda: write(tmp_path / "new"))
+    remedied(write, "release.folder._require_own", lambda: shutil.rmtree(folder))
     assert (folder / CHECKSUMS).is_file()
     letter.write_text("mine")
     remedied(write, "release.folder", lambda: letter.rename(tmp_path / "letter.txt"))
@@ -85,7 +85,7 @@ def test_a_submission_is_packed_under_a_name_read_and_held_against_its_release(
         "release.submission.read_submission",
         again=lambda: read_submission(path),
     )
-    alone, held = verify(submission).unchecked, verify(submission, release).unchecked
+    alone, held = verify(submission).unchecked, verify(submission, released_items(release)).unchecked
     (told,) = {*alone} - {*held}
     assert "--release" in told
     remedied(

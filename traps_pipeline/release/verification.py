@@ -49,7 +49,7 @@ _OF_VOTE = ("side", "dataset", "benchmark_version")  # columns that a vote has f
 NOT_RECOMPUTED: Mapping[str, tuple[str, ...]] = {
     ITEMS.name: ("clip",),
     RESPONSES.name: (
-        *("reasoning", "first_token", "finish_reason", "error", "served_model", "client", "prompt_tokens"),
+        *("reasoning", "first_token", "finish_reason", "fragment", "error", "served_model", "client", "prompt_tokens"),
         *("completion_tokens", "reasoning_tokens", "cost_usd", "latency_s", "attempts", "request_key", "created_at"),
     ),
     VOTES.name: ("epoch", "created_at"),
