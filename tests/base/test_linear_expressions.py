@@ -108,6 +108,7 @@ def expressions() -> tuple[Expression, ...]:
             place = f"{path.relative_to(PACKAGE)}:{node.lineno}"
             assert not isinstance(node.args[0], ast.Name) or node.args[0].id in vars(module), f"{place}: not to be read"
             value = eval(compile(ast.Expression(node.args[0]), place, "eval"), {}, namespace)
+            value = value.decode("latin-1") if isinstance(value, bytes) else value  # a byte is as good as a character
             known_flags = [*node.args[1:], *(keyword.value for keyword in node.keywords)]
             flags = sum(
                 int(eval(compile(ast.Expression(one), place, "eval"), {"re": re}))
