@@ -36,7 +36,7 @@ KEY, DATABASE = "BENCH_KEY", "BENCH_DATABASE"
 
 def ours(url: str, connections: int, answers: int) -> dict[str, float]:
     """Return requests through `ask`: backend, retries, pace, budget and the ledger, on disk or in a database."""
-    from traps_pipeline.cluster.postgres import open_ledger
+    from traps_cluster.postgres import open_ledger
     from traps_pipeline.ledger.ledger import Ledger
     from traps_pipeline.ledger.sqlite import SqliteDatabase
     from traps_pipeline.models.asking.ask import Call, Work, run_work

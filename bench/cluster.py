@@ -33,7 +33,7 @@ from bench.cluster_study import NODES, Study
 from bench.cpu_share import is_there, of_cores
 from tests.objectstore import S3
 from tests.postgres import Postgres
-from traps_pipeline.cluster.history import export
+from traps_cluster.history import export
 
 ROOT = Path(__file__).resolve().parents[1]
 # One run for each node, which goes through all categories and shares their clips with the other.

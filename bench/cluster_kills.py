@@ -33,9 +33,9 @@ from bench.cluster_watch import Opened, Orphans, Proxy, executing
 from tests.objectstore import S3
 from tests.postgres import Postgres
 from tests.providers.server import Provider
+from traps_cluster.bucket import object_name
+from traps_cluster.objects import ObjectStore
 from traps_pipeline.cli.command import OVER_BUDGET
-from traps_pipeline.cluster.bucket import object_name
-from traps_pipeline.cluster.objects import ObjectStore
 from traps_pipeline.ledger.money import Money
 
 MODELS, CONNECTIONS = ("seer-a", "seer-b"), 2

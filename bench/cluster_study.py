@@ -29,9 +29,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from traps_cluster.history import export
+from traps_cluster.ray_runs import require_cluster
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cluster.history import export
-from traps_pipeline.cluster.ray_runs import require_cluster
 from traps_pipeline.pipeline.run import dagster_history
 from traps_pipeline.storage.place import name_of
 from traps_pipeline.storage.workspace import Workspace
@@ -275,7 +275,7 @@ def main() -> None:
 # The database may hold the history of other studies, too. A run that a page launched has no tag of ours while it waits.
 RUNS = """
 from dagster import DagsterEventType as T, DagsterInstance
-from traps_pipeline.cluster.history import export
+from traps_cluster.history import export
 from traps_pipeline.storage.workspace import Workspace
 workspace = Workspace.open()
 export(workspace)

@@ -111,7 +111,7 @@ def main() -> None:
     with ExitStack() as opened:
         if arguments.database:
             from tests.postgres import Postgres
-            from traps_pipeline.cluster.postgres import PostgresDatabase
+            from traps_cluster.postgres import PostgresDatabase
 
             server = opened.enter_context(Postgres.running(durable=True))
             one, two = (PostgresDatabase(server.address(), "BENCH", study) for study in ("one", "two"))

@@ -154,7 +154,7 @@ class Checkout:
 
 def make_checkout(root: Path) -> Path:
     """Copy what the package needs to run, with what Python has compiled: the commands of tests need not do it again."""
-    for name in ("traps_pipeline", "assets", "scene_specs"):
+    for name in ("traps_pipeline", "traps_cluster", "assets", "scene_specs"):
         shutil.copytree(ROOT / name, root / name)
     for name in ("LICENSE-DATA", "CITATION.cff"):
         shutil.copy(ROOT / name, root / name)
@@ -336,7 +336,7 @@ def postgres() -> Iterator[Postgres]:
     if programs() is None:
         pytest.skip(LACKING)
     pytest.importorskip("psycopg", reason="psycopg is not installed; `pip install -e '.[dev]'` brings it")
-    from traps_pipeline.cluster.postgres import GRACE_S
+    from traps_cluster.postgres import GRACE_S
 
     with Postgres.running() as server:
         time.sleep(GRACE_S)  # until then a lock is kept for sessions that had it before the server was started

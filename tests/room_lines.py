@@ -48,7 +48,7 @@ def read_budgets(table: Path = TABLE) -> dict[str, Budget]:
 
 def excesses(counts: Mapping[str, int], budgets: Mapping[str, Budget]) -> Iterator[str]:
     """Yield a sentence for each rule that the rooms or their budgets break."""
-    for room in sorted({*counts} ^ {*budgets}):
+    for room in sorted({*counts} ^ {room for room, budget in budgets.items() if budget.lines}):
         yield f"{room}: {'has no budget' if room in counts else 'is no room'}"
     for room, budget in budgets.items():
         if (lines := counts.get(room, 0)) > budget.lines:

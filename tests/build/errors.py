@@ -10,7 +10,7 @@ import pytest
 from pydantic import ValidationError
 
 PACKAGE = "traps_pipeline."
-OURS = (PACKAGE, "tools.")
+OURS = (PACKAGE, "traps_cluster.", "tools.")
 
 
 def raised_in(error: BaseException) -> str:

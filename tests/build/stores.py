@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from traps_pipeline.cluster.objects import Bucket, ObjectStore
-from traps_pipeline.cluster.postgres import PostgresDatabase
+from traps_cluster.objects import Bucket, ObjectStore
+from traps_cluster.postgres import PostgresDatabase
 from traps_pipeline.storage.store import FolderStore, Store
 
 

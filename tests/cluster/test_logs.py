@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from tests.objectstore import S3
-from traps_pipeline.cluster import history
-from traps_pipeline.cluster.bucket import Bucket
-from traps_pipeline.cluster.history import fetch, upload, uploading
+from traps_cluster import history
+from traps_cluster.bucket import Bucket
+from traps_cluster.history import fetch, upload, uploading
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 

@@ -20,10 +20,10 @@ from dagster._core.launcher import LaunchRunContext
 from dagster._utils.error import serializable_error_info_from_exc_info
 
 from tests.remedies.remedied import remedied
+from traps_cluster.history import dagster_yaml
+from traps_cluster.ray_runs import RESOURCES_TAG, STUDY_TAG, RayRuns
+from traps_cluster.sensors import fail_lost_runs
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cluster.history import dagster_yaml
-from traps_pipeline.cluster.ray_runs import RESOURCES_TAG, STUDY_TAG, RayRuns
-from traps_pipeline.cluster.sensors import fail_lost_runs
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import RAY, Workspace
 
@@ -95,7 +95,7 @@ def test_a_run_that_waits_for_a_host_goes_on_waiting_and_one_that_waits_for_noth
         def launch() -> None:
             launcher.launch_run(LaunchRunContext(waiting, workspace=None))
 
-        remedied(launch, "cluster.launcher", cluster.start_head)
+        remedied(launch, "traps_cluster.launcher", cluster.start_head)
         from ray.job_submission import JobSubmissionClient  # pyright: ignore[reportMissingImports]
 
         client = JobSubmissionClient(launcher.address)

@@ -13,8 +13,8 @@ import pytest
 
 from tests.conftest import ROOT
 from tests.postgres import Postgres
-from traps_pipeline.cluster.history import HISTORY, LOGS
-from traps_pipeline.cluster.node import CODE, REFUSED_TAG, code_here
+from traps_cluster.history import HISTORY, LOGS
+from traps_cluster.node import CODE, REFUSED_TAG, code_here
 from traps_pipeline.pipeline.run import dagster_history
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import RAY, VARIABLE, Workspace
@@ -39,7 +39,7 @@ def workspace(tmp_path: Path, postgres: Postgres, monkeypatch: pytest.MonkeyPatc
 
 def node(run_id: str, **exported: str) -> subprocess.CompletedProcess[str]:
     """What Ray starts, with a command of Dagster's that only prints."""
-    command = [sys.executable, "-P", "-m", "traps_pipeline.cluster.node", run_id, "--version"]
+    command = [sys.executable, "-P", "-m", "traps_cluster.node", run_id, "--version"]
     environment = os.environ | {"PYTHONPATH": str(ROOT), **exported}
     return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
 

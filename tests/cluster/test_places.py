@@ -53,6 +53,8 @@ def test_a_database_that_cannot_be_used_leaves_no_study(
     folder: Path, postgres: Postgres, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("LAB_DATABASE", postgres.address(password="wrong"))
-    with raises(TrapsError, "cluster.postgres.PostgresDatabase", "LAB_DATABASE: ", "password authentication failed"):
+    with raises(
+        TrapsError, "traps_cluster.postgres.PostgresDatabase", "LAB_DATABASE: ", "password authentication failed"
+    ):
         command("init", "demo", "--workspace", folder, "--database", "LAB_DATABASE")
     assert not Workspace.is_there(folder)

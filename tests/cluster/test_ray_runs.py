@@ -19,13 +19,13 @@ from dagster._daemon.monitoring.run_monitoring import RESUME_RUN_LOG_MESSAGE
 
 from tests.build.errors import raises
 from tests.postgres import Postgres
+from traps_cluster.history import HISTORY, LOGS, dagster_yaml
+from traps_cluster.node import code_here, require_same_code
+from traps_cluster.ray_runs import RESOURCES_TAG, STUDY_TAG, RayRuns, own_tags
+from traps_cluster.sensors import REQUEST_TAG, start_requested_runs, submit
 from traps_pipeline.base.cores import cores
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.progress import Progress, use_progress
-from traps_pipeline.cluster.history import HISTORY, LOGS, dagster_yaml
-from traps_pipeline.cluster.node import code_here, require_same_code
-from traps_pipeline.cluster.ray_runs import RESOURCES_TAG, STUDY_TAG, RayRuns, own_tags
-from traps_pipeline.cluster.sensors import REQUEST_TAG, start_requested_runs, submit
 from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.pipeline.graph import the_graph
 from traps_pipeline.pipeline.run import dagster_history
@@ -102,7 +102,7 @@ def test_a_host_with_other_code_refuses_a_run_and_names_both() -> None:
     theirs |= {"files of assets": "0123", "numpy": "1.0", "numba": "9"}
     del theirs["mujoco"]  # which it does not have: what only one of them has is not compared
     names = (socket.gethostname(), "lab", "files of assets", "0123", f"numpy {version('numpy')}", " 1.0 ")
-    with raises(TrapsError, "cluster.node.require_same_code", *names) as refused:
+    with raises(TrapsError, "traps_cluster.node.require_same_code", *names) as refused:
         require_same_code(json.dumps(theirs), "lab")
     assert not [name for name in ("numba", "mujoco") if name in str(refused.value)]
 
@@ -117,10 +117,10 @@ def test_dagsters_settings_hold_no_address_of_the_database(remote: Workspace) ->
 
 @pytest.mark.slow
 def test_the_command_line_of_a_run_survives_a_shell() -> None:
-    launcher = pytest.importorskip("traps_pipeline.cluster.launcher", reason="the extra `cluster` is not installed")
+    launcher = pytest.importorskip("traps_cluster.launcher", reason="the extra `cluster` is not installed")
     run = """{"config_yaml": "'variable: X'", "a": 1}"""
     command = launcher.node_command(f"/venv/bin/dagster api execute_run '{run}'", "r1")
-    node = ["python", "-P", "-m", "traps_pipeline.cluster.node", "r1"]
+    node = ["python", "-P", "-m", "traps_cluster.node", "r1"]
     assert shlex.split(command) == [*node, "api", "execute_run", run]
 
 
@@ -128,7 +128,7 @@ def test_the_command_line_of_a_run_survives_a_shell() -> None:
 def test_a_run_that_dagsters_pages_launch_takes_and_says_what_one_of_the_command_line_does(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    launcher = pytest.importorskip("traps_pipeline.cluster.launcher", reason="the extra `cluster` is not installed")
+    launcher = pytest.importorskip("traps_cluster.launcher", reason="the extra `cluster` is not installed")
     monkeypatch.setenv("TRAPS_WORKSPACE", str(Workspace.create(tmp_path / "study", Study(name="lab")).root))
     monkeypatch.setenv("TRAPS_RUN_CPUS", "4")
     monkeypatch.setenv("TRAPS_RUN_GPUS", "1")

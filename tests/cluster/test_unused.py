@@ -13,10 +13,10 @@ import pytest
 from tests.objectstore import S3
 from tests.postgres import Postgres
 from tests.remedies.remedied import command, remedied
-from traps_pipeline.cluster import objects
-from traps_pipeline.cluster.bucket import Bucket, object_name
-from traps_pipeline.cluster.objects import ObjectStore
-from traps_pipeline.cluster.postgres import PostgresDatabase
+from traps_cluster import objects
+from traps_cluster.bucket import Bucket, object_name
+from traps_cluster.objects import ObjectStore
+from traps_cluster.postgres import PostgresDatabase
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import DATABASE, Workspace
 
@@ -139,7 +139,7 @@ def test_a_database_that_names_nothing_of_the_store_is_refused(
     other = opened_store(postgres, tmp_path / "other", study, f"{study}-other")
     found = remedied(
         lambda: other.unused(grace_days=0),
-        "cluster.objects.ObjectStore.unused",
+        "traps_cluster.objects.ObjectStore.unused",
         again=lambda: host("one").unused(grace_days=0),
     )
     assert found == [] and names(store) == {object_name(digest(NEW))}

@@ -17,8 +17,8 @@ from bench.equality import main as compare
 from tests.conftest import ROOT, SMALL, Checkout, Finished
 from tests.objectstore import S3
 from tests.postgres import Postgres
-from traps_pipeline.cluster.bucket import object_name
-from traps_pipeline.cluster.objects import ObjectStore
+from traps_cluster.bucket import object_name
+from traps_cluster.objects import ObjectStore
 from traps_pipeline.storage.workspace import DATABASE, Workspace
 
 pytestmark = pytest.mark.slow

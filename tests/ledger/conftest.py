@@ -14,7 +14,7 @@ import pytest
 
 from tests.conftest import ROOT
 from tests.postgres import Postgres
-from traps_pipeline.cluster.postgres import PostgresDatabase
+from traps_cluster.postgres import PostgresDatabase
 from traps_pipeline.ledger.ledger import Ledger
 from traps_pipeline.ledger.sqlite import SqliteDatabase
 

@@ -21,8 +21,8 @@ from tests.build.ledger import answer, paid, write
 from tests.conftest import ROOT
 from tests.ledger.conftest import VARIABLE, WRITE_ONE, begin, in_database, line_of, opened
 from tests.postgres import Postgres
+from traps_cluster.postgres import PostgresDatabase, open_ledger
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cluster.postgres import PostgresDatabase, open_ledger
 from traps_pipeline.ledger.ledger import Ledger
 
 pytestmark = pytest.mark.slow
@@ -47,7 +47,7 @@ except TrapsError as error:
     print(raised_in(error), error, flush=True)
 """
 # What tells a process that another one has begun to ask the same calls.
-TAKEN_OVER = ("cluster.postgres.PostgresDatabase._require", "ledger.ledger.Writer.check")
+TAKEN_OVER = ("traps_cluster.postgres.PostgresDatabase._require", "ledger.ledger.Writer.check")
 
 
 def test_a_writer_that_slept_while_another_took_over_pays_nothing_and_stores_nothing(
@@ -154,7 +154,7 @@ def test_while_the_server_is_away_no_call_is_sent_and_then_the_run_ends_with_the
                 await writer.require()
 
         address = f"127.0.0.1:{server.port}/postgres"
-        with raises(TrapsError, "cluster.postgres.PostgresDatabase._patient", VARIABLE, address):
+        with raises(TrapsError, "traps_cluster.postgres.PostgresDatabase._patient", VARIABLE, address):
             asyncio.run(scenario())
 
 
@@ -171,7 +171,7 @@ def test_an_address_that_leads_nowhere_names_variable_host_study_and_remedy(
     postgres: Postgres, address: str, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(VARIABLE, address.format(port=postgres.port))
-    by = "cluster.postgres.PostgresDatabase"
+    by = "traps_cluster.postgres.PostgresDatabase"
     with raises(TrapsError, by, VARIABLE, said, "my-study", socket.gethostname()) as raised:
         open_ledger(VARIABLE, "my-study")
     told = str(raised.value)
@@ -182,12 +182,12 @@ def test_an_address_that_leads_nowhere_names_variable_host_study_and_remedy(
 def test_a_variable_that_is_not_set_and_a_package_that_is_not_there_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(VARIABLE, raising=False)
     names = (VARIABLE, socket.gethostname(), "my-study", f"export {VARIABLE}=postgresql://")
-    with raises(TrapsError, "cluster.postgres.open_ledger", *names):
+    with raises(TrapsError, "traps_cluster.postgres.open_ledger", *names):
         open_ledger(VARIABLE, "my-study")
     code = f"""
 import os, sys
 sys.modules["psycopg"] = None
-from traps_pipeline.cluster.postgres import open_ledger
+from traps_cluster.postgres import open_ledger
 os.environ["{VARIABLE}"] = "postgresql://traps@127.0.0.1/postgres"
 open_ledger("{VARIABLE}", "my-study")
 """

@@ -15,9 +15,9 @@ from tests.build.errors import raises
 from tests.objectstore import S3
 from tests.postgres import Postgres
 from tests.remedies.remedied import remedied
+from traps_cluster.bucket import Bucket
+from traps_cluster.ray_runs import require_cluster
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cluster.bucket import Bucket
-from traps_pipeline.cluster.ray_runs import require_cluster
 from traps_pipeline.models.money.spending import open_budget
 from traps_pipeline.models.registry.entries import get_model
 from traps_pipeline.pipeline.run import dagster_history
@@ -44,12 +44,12 @@ def test_a_bucket_that_is_made_and_a_key_that_is_exported_are_used(
 ) -> None:
     s3.empty()
     content = b"frames"
-    remedied(lambda: Bucket(address).put("a", content), "cluster.bucket", s3.make_bucket)
+    remedied(lambda: Bucket(address).put("a", content), "traps_cluster.bucket", s3.make_bucket)
     assert Bucket(address).get("a") == content
     monkeypatch.setenv("AWS_ENDPOINT", "http://127.0.0.1:1")
     found = remedied(
         lambda: Bucket(address).get("a"),
-        "cluster.bucket",
+        "traps_cluster.bucket",
         lambda: monkeypatch.setenv("AWS_ENDPOINT", s3.environment["AWS_ENDPOINT"]),
     )
     assert found == content
@@ -77,7 +77,7 @@ def test_a_store_of_google_or_azure_without_its_key_is_refused_with_the_variable
     for name, value in exported.items():
         monkeypatch.setenv(name, value)
     assert place_of(f"{address}/") == address
-    with raises(TrapsError, "cluster.bucket.Bucket._used", f"{address}: ", f"({variable}"):
+    with raises(TrapsError, "traps_cluster.bucket.Bucket._used", f"{address}: ", f"({variable}"):
         Bucket(address).get("a")
 
 
@@ -104,7 +104,7 @@ def test_a_budget_of_an_account_in_a_folder_that_all_hosts_see_is_spent_from(add
 def test_runs_want_the_extra_the_address_and_the_head(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in PACKAGES:
         pytest.importorskip(name, reason="the extra `cluster` is not installed")
-    workspace, by = Workspace.create(address, Study()), "cluster.ray_runs.require_cluster"
+    workspace, by = Workspace.create(address, Study()), "traps_cluster.ray_runs.require_cluster"
     monkeypatch.setenv("TRAPS_WORKSPACE", address)
 
     def required() -> None:

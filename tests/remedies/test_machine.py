@@ -15,7 +15,7 @@ from tests.build.ledger import answer, local, paid, write
 from tests.ledger.conftest import VARIABLE
 from tests.postgres import Postgres
 from tests.remedies.remedied import command, refused, remedied
-from traps_pipeline.cluster.postgres import PostgresDatabase
+from traps_cluster.postgres import PostgresDatabase
 from traps_pipeline.ledger.money import Money
 from traps_pipeline.pipeline.run import dagster_history
 from traps_pipeline.report.explorer import site
@@ -114,5 +114,5 @@ def test_a_host_whose_clock_is_an_hour_off_works_once_it_is_set(postgres: Postgr
         with psycopg.connect(late, autocommit=True) as connection:
             connection.execute("drop function altered.clock_timestamp()")
 
-    session = remedied(lambda: PostgresDatabase(late, VARIABLE, "clocks"), "cluster.postgres", set_clock)
+    session = remedied(lambda: PostgresDatabase(late, VARIABLE, "clocks"), "traps_cluster.postgres", set_clock)
     assert session.exists()

@@ -18,9 +18,9 @@ from tests.build.video_rows import clip
 from tests.conftest import ROOT
 from tests.objectstore import S3
 from tests.postgres import Postgres
+from traps_cluster.bucket import object_name
+from traps_cluster.objects import OBJECTS, ObjectStore
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cluster.bucket import object_name
-from traps_pipeline.cluster.objects import OBJECTS, ObjectStore
 from traps_pipeline.storage.benchmark_tables import VIDEOS
 from traps_pipeline.storage.leases import hold_lease, leased_ranges
 from traps_pipeline.storage.parquet import TableStore
@@ -224,7 +224,7 @@ def test_an_object_that_was_altered_is_named_and_nothing_is_read_from_it(bucket_
         one.bucket.put(object_name(row.digest), altered)
         other.look()
         there = other.root / "tables/t/part.parquet"
-        with raises(TrapsError, "cluster.objects.ObjectStore.here", "tables/t/part.parquet"):
+        with raises(TrapsError, "traps_cluster.objects.ObjectStore.here", "tables/t/part.parquet"):
             other.here(there)
         assert not other.has(there)
         one.look()
@@ -257,7 +257,7 @@ def test_a_bucket_that_is_gone_is_no_reason_to_forget_its_files(bucket_hosts: Ho
     try:
         other.look()
         for look in (lambda: other.here(other.root / "clips/a.mp4"), lambda: other.sizes([other.root / "clips/a.mp4"])):
-            with raises(TrapsError, "cluster.bucket.Bucket._used", "s3://lab/study-", socket.gethostname()):
+            with raises(TrapsError, "traps_cluster.bucket.Bucket._used", "s3://lab/study-", socket.gethostname()):
                 look()
         assert other.has(other.root / "clips/a.mp4") and one.has(path)
     finally:

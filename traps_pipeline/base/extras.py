@@ -26,7 +26,7 @@ EXTRAS: Mapping[ExtraName, Extra] = {
     "local": Extra("a model on this machine", ("torch", "torchvision", "transformers", "safetensors")),
     "nf4": Extra("quantisation nf4", ("bitsandbytes", "accelerate")),
     "sign": Extra("a signature", ("model_signing",)),
-    "cluster": Extra("a study that hosts share", ("psycopg", "obstore")),
+    "cluster": Extra("a study that hosts share", ("traps_cluster", "psycopg", "obstore")),
     "ui": Extra("Dagster's web server", ("dagster_webserver",)),
     "web": Extra("a page that listens", ("fastapi", "uvicorn")),
 }
@@ -34,7 +34,8 @@ EXTRAS: Mapping[ExtraName, Extra] = {
 
 def install_line(name: ExtraName) -> str:
     """Return the command that installs an extra."""
-    return f"python -m pip install 'traps-pipeline[{name}]'" if IS_INSTALLED else "make setup"
+    package = "traps-cluster" if name == "cluster" else f"traps-pipeline[{name}]"
+    return f"python -m pip install '{package}'" if IS_INSTALLED else "make setup"
 
 
 def missing(name: ExtraName, *modules: str) -> list[str]:

@@ -1,6 +1,6 @@
-"""Reach the room `traps_pipeline.cluster`, which only several hosts need.
+"""Reach the package `traps_cluster`, which only several hosts need.
 
-It is imported by name, and only if a study has a database that hosts share. No other room imports it.
+It is imported by name, and only if a study has a database that hosts share. Nothing else here imports it.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
+from traps_pipeline.base.extras import require
+
 if TYPE_CHECKING:
     import dagster as dg
 
@@ -18,11 +20,11 @@ if TYPE_CHECKING:
     from traps_pipeline.storage.store import Store
     from traps_pipeline.storage.study import Study
 
-_ROOM = "traps_pipeline.cluster.entry"
+_PACKAGE = "traps_cluster.entry"
 
 
 class SeveralHosts(Protocol):
-    """The interface of `traps_pipeline.cluster`; `workspace` is always a `Workspace`."""
+    """The interface of `traps_cluster`; `workspace` is always a `Workspace`."""
 
     def open_store(self, place: Place, root: Path, study: Study | None = None) -> Store | None:
         """Open a study with a database, in a shared folder or an object store.
@@ -54,5 +56,6 @@ class SeveralHosts(Protocol):
 
 
 def several_hosts() -> SeveralHosts:
-    """Return the module for several hosts."""
-    return cast(SeveralHosts, import_module(_ROOM))
+    """Return the module for several hosts. Raises TrapsError if its package is not installed."""
+    require("cluster", "traps_cluster")
+    return cast(SeveralHosts, import_module(_PACKAGE))

@@ -20,11 +20,11 @@ from sqlalchemy import URL
 from sqlalchemy.dialects import plugins
 from sqlalchemy.engine import CreateEnginePlugin
 
+from traps_cluster.bucket import Bucket
+from traps_cluster.postgres import KEEPALIVE
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
 from traps_pipeline.base.keys import check_key
-from traps_pipeline.cluster.bucket import Bucket
-from traps_pipeline.cluster.postgres import KEEPALIVE
 from traps_pipeline.storage.workspace import RAY, Workspace
 
 HISTORY = "TRAPS_HISTORY"  # process variable: the database's address in the form of Dagster's driver; in no file
@@ -45,7 +45,7 @@ def dagster_yaml(workspace: Workspace) -> dict[str, Any]:
         "nux": {"enabled": False},
         "storage": {"postgres": {"postgres_url": {"env": HISTORY}}},
         "run_launcher": {
-            "module": "traps_pipeline.cluster.launcher",
+            "module": "traps_cluster.launcher",
             "class": "ClusterLauncher",
             "config": {"ray": {"address": os.environ[RAY], "num_cpus": 1}},
         },

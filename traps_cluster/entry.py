@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from traps_pipeline.cluster.history import dagster_yaml
-from traps_pipeline.cluster.objects import open_store
-from traps_pipeline.cluster.postgres import open_ledger
+from traps_cluster.history import dagster_yaml
+from traps_cluster.objects import open_store
+from traps_cluster.postgres import open_ledger
 from traps_pipeline.storage.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ __all__ = ["dagster_yaml", "open_ledger", "open_store", "runs", "sensors"]
 
 def runs(workspace: Workspace, instance: dg.DagsterInstance, options: Any) -> Runs:
     """See `SeveralHosts`."""
-    from traps_pipeline.cluster.ray_runs import RayRuns, require_cluster
+    from traps_cluster.ray_runs import RayRuns, require_cluster
 
     require_cluster(workspace, instance)
     runs = RayRuns(instance, workspace, options.runs, options.gpus, options.on_interrupt, options.cpus)
@@ -33,6 +33,6 @@ def runs(workspace: Workspace, instance: dg.DagsterInstance, options: Any) -> Ru
 
 def sensors() -> Sequence[dg.SensorDefinition]:
     """See `SeveralHosts`."""
-    from traps_pipeline.cluster.sensors import end_lost_runs, start_requested_runs
+    from traps_cluster.sensors import end_lost_runs, start_requested_runs
 
     return [start_requested_runs, end_lost_runs]

@@ -1,6 +1,6 @@
 """Execute a run on the node where Ray started it, if the host has the submitter's code.
 
-Command: `python -P -m traps_pipeline.cluster.node RUN_ID api execute_run RUN`. Before Dagster's own command begins,
+Command: `python -P -m traps_cluster.node RUN_ID api execute_run RUN`. Before Dagster's own command begins,
 this process checks that the host has the same code and can open the study. Otherwise the run fails with a sentence that
 names the host, and is not retried.
 """
@@ -19,10 +19,10 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import NoReturn
 
+from traps_cluster.history import export, uploading
 from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import ASSETS, PACKAGE, SCENE_SPECS, SHIPPED
-from traps_pipeline.cluster.history import export, uploading
 from traps_pipeline.storage.workspace import Workspace
 
 REFUSED_TAG = "traps/refused"  # tag of a run that its node refused
@@ -39,7 +39,8 @@ def code_here() -> str:
     versions of Python and of every installed package that `pyproject.toml` names. Builds for other hardware (`+cpu`,
     `+cu128`) count as the same version.
     """
-    folders = {"the package": PACKAGE, "assets": ASSETS, "scene_specs": SCENE_SPECS}
+    own = Path(__file__).parent
+    folders = {"the package": PACKAGE, "traps_cluster": own, "assets": ASSETS, "scene_specs": SCENE_SPECS}
     code = {"python": ".".join(map(str, sys.version_info[:2]))}
     code |= {f"files of {name}": _digest_of(folder) for name, folder in folders.items()}
     requirements = [line for line in requires(DISTRIBUTION) or () if not _NOT_FOR_RUNS.search(line)]

@@ -16,7 +16,7 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.dialects.postgresql import ARRAY, insert
 
-from traps_pipeline.cluster.postgres import PostgresDatabase
+from traps_cluster.postgres import PostgresDatabase
 
 LARGE_FOLDERS = ("clips/", "media/")  # folders whose names are not kept in memory: there may be millions
 FRESH_S = 0.5  # minimum age of the last look before the rows are read again

@@ -19,11 +19,11 @@ from typing import Any
 import yaml
 from typing_extensions import override
 
+from traps_cluster.bucket import Bucket, object_name
+from traps_cluster.object_names import CurrentObject, ObjectNames
+from traps_cluster.postgres import PostgresDatabase, open_ledger
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import is_same_file, link, write_bytes
-from traps_pipeline.cluster.bucket import Bucket, object_name
-from traps_pipeline.cluster.object_names import CurrentObject, ObjectNames
-from traps_pipeline.cluster.postgres import PostgresDatabase, open_ledger
 from traps_pipeline.storage.place import STUDY, Place
 from traps_pipeline.storage.store import GRACE_DAYS, FolderStore, Store, UnusedObject, is_hidden
 from traps_pipeline.storage.study import FORMAT, Study

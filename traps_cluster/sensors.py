@@ -17,9 +17,9 @@ from collections.abc import Mapping, Sequence
 
 import dagster as dg
 
+from traps_cluster.bucket import Bucket
+from traps_cluster.history import fetch, logs_folder
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cluster.bucket import Bucket
-from traps_pipeline.cluster.history import fetch, logs_folder
 from traps_pipeline.pipeline.translation import asset_key
 from traps_pipeline.storage.workspace import Workspace
 

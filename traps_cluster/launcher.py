@@ -13,8 +13,8 @@ import dagster as dg
 from dagster_ray import RayRunLauncher  # pyright: ignore[reportMissingImports] - of the extra `cluster`
 from ray.job_submission import JobSubmissionClient  # pyright: ignore[reportMissingImports]
 
+from traps_cluster.ray_runs import RESOURCES_TAG, STUDY_TAG, own_tags
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cluster.ray_runs import RESOURCES_TAG, STUDY_TAG, own_tags
 from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.pipeline.graph import Stage, the_graph
 from traps_pipeline.pipeline.runs import keys_of
@@ -22,7 +22,7 @@ from traps_pipeline.storage.workspace import RAY, RUN_CPUS, RUN_GPUS, Workspace
 
 
 class ClusterLauncher(RayRunLauncher):
-    """A launcher of runs through `cluster/node.py`, with their stages' resources."""
+    """A launcher of runs through `traps_cluster/node.py`, with their stages' resources."""
 
     @cached_property
     def client(self) -> JobSubmissionClient:
@@ -56,7 +56,7 @@ class ClusterLauncher(RayRunLauncher):
 
 
 class _NodeClient(JobSubmissionClient):
-    """A job client that submits a run through `cluster/node.py`, quoted for a shell.
+    """A job client that submits a run through `traps_cluster/node.py`, quoted for a shell.
 
     dagster-ray 0.4.8 puts the run, as JSON, between single quotes without escaping.
     """
@@ -71,7 +71,7 @@ def node_command(entrypoint: str, run_id: str) -> str:
     """Return a run's command line in the form that dagster-ray expects."""
     command, _, run = entrypoint.partition(" '")
     _, *arguments = command.split()  # without the launching host's `dagster`
-    return shlex.join(["python", "-P", "-m", "traps_pipeline.cluster.node", run_id, *arguments, run.removesuffix("'")])
+    return shlex.join(["python", "-P", "-m", "traps_cluster.node", run_id, *arguments, run.removesuffix("'")])
 
 
 def tags_of_page_run(run: dg.DagsterRun) -> dict[str, str]:

@@ -18,15 +18,15 @@ from typing import Any
 import dagster as dg
 from typing_extensions import override
 
+from traps_cluster.node import CODE, REFUSED_TAG, code_here
+from traps_cluster.postgres import PATIENCE_S
+from traps_cluster.sensors import REQUEST_TAG, submit
 from traps_pipeline.base import progress
 from traps_pipeline.base.cores import CORES
 from traps_pipeline.base.databases import database_error
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.extras import missing
 from traps_pipeline.base.wording import count_noun
-from traps_pipeline.cluster.node import CODE, REFUSED_TAG, code_here
-from traps_pipeline.cluster.postgres import PATIENCE_S
-from traps_pipeline.cluster.sensors import REQUEST_TAG, submit
 from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.models.registry.entries import LOCAL, get_model
 from traps_pipeline.pipeline.graph import Stage, the_graph
