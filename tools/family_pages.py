@@ -52,7 +52,7 @@ Asides, which control and void answer:
 
 ## Parameters
 
-The last two columns: values in released records, and the comment in the code.
+*Released*: the values in released records. *Meaning*: the comment in the code.
 
 {parameters}
 
@@ -92,7 +92,7 @@ def _page(family: Family, specs: Sequence[SceneSpec]) -> str:
         **{"about": prose(_source(family)[0]), "looks": ", ".join(family.looks) or "none"},
         **{"questions": bullets(family.questions), "asides": bullets(_asides(family))},
         parameters=markdown_table(("parameter", "unit", "drawn from", "released", "meaning"), [*_rows(family, specs)]),
-        certificates=markdown_table(("certificate", "promises", "evidence"), [*_certificates(specs)]),
+        certificates=markdown_table(("certificate", "evidence", "promises"), [*_certificates(specs)]),
     )
 
 
@@ -147,9 +147,8 @@ def _drawn(member: Field[Any], node: ast.AnnAssign, worlds: Sequence[Any]) -> st
     if "range" in kept:
         return "{:g} to {:g}".format(*kept["range"])
     if "hidden" in kept:
-        return (
-            _either([*dict.fromkeys(value for world in worlds for value in kept["hidden"](vars(world)))]) + ", hidden"
-        )
+        values = dict.fromkeys(value for world in worlds for value in kept["hidden"](vars(world)))
+        return f"{_either([*values])} (the hidden element)"
     if kept.get("values"):
         return _either(kept["values"]) + (f"; {_either(kept['longer'])} in longer rows" if kept.get("longer") else "")
     if about := kept.get("about") or (how.about if isinstance(how, Group) else how.__doc__):
@@ -174,5 +173,5 @@ def _certificates(specs: Sequence[SceneSpec]) -> Iterator[tuple[str, ...]]:
             if values:
                 ends = [WORST[name](values)] if name in WORST else [min(values), max(values)]
                 span = " to ".join(f"{end:g}" for end in dict.fromkeys(ends))
-                numbers.append(f"`{name}` {span} (median {median(values):g})")
-        yield f"`{certificate.name}`", escaped(certificate.promises), "<br>".join(numbers)
+                numbers.append(f"`{name}` {span} (median {median(values):g})".replace(" ", "&nbsp;"))
+        yield f"`{certificate.name}`", "<br>".join(numbers), escaped(certificate.promises)
