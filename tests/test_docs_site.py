@@ -52,3 +52,4 @@ def test_the_site_is_built_twice_to_the_same_bytes_and_fetches_nothing(checkout:
     assert {f"{path.stem}.html" for path in (ROOT / "docs").glob("*.md")} <= {*pages}
     for name, text in {"python": "traps_pipeline.inside", "tables": "leaderboard", "yaml": "budget_usd"}.items():
         assert text in pages[f"reference/{name}.html"]
+    assert "families/plinko.html" in pages["families.html"] and "plinko.jpg" in pages["families/plinko.html"]

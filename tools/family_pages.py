@@ -34,7 +34,8 @@ HIGH = "ablation_px twin_px top_share unresolved closed_px closed_change_px"
 WORST = dict.fromkeys(LOW.split(), min) | dict.fromkeys(HIGH.split(), max)
 PAGE = """# {name}
 
-Category `{category}` ({taxonomy}), {count} released scenarios, answers of type `{answer}`. [All families](index.md)
+Category `{category}` ({taxonomy}), {count} released scenarios, answers of type `{answer}`.
+[All families](../families.md)
 
 {about}
 
@@ -75,11 +76,11 @@ def family_pages() -> dict[str, str | bytes]:
         released = [(folder, spec) for folder, spec in records if spec.family == family.name]
         pages[f"families/{family.name}.md"] = _page(family, [spec for _, spec in released])
         pages[f"families/{family.name}.jpg"] = pair_picture(*released[0])
-        scene, link = _source(family)[0].splitlines()[0], f"[{family.name}]({family.name}.md)"
+        scene, link = _source(family)[0].splitlines()[0], f"[{family.name}](families/{family.name}.md)"
         rows.append((link, family.category, escaped(scene), family.answer_type, str(len(released))))
     head = "# Families\n\nFor everyone who reads results by family: what each scene shows, and what varies in it.\n\n"
     headings = ("family", "category", "scene", "answer", "released")
-    return pages | {"families/index.md": f"{head}{markdown_table(headings, rows)}\n"}
+    return pages | {"families.md": f"{head}{markdown_table(headings, rows)}\n"}
 
 
 def _page(family: Family, specs: Sequence[SceneSpec]) -> str:
@@ -173,5 +174,7 @@ def _certificates(specs: Sequence[SceneSpec]) -> Iterator[tuple[str, ...]]:
             if values:
                 ends = [WORST[name](values)] if name in WORST else [min(values), max(values)]
                 span = " to ".join(f"{end:g}" for end in dict.fromkeys(ends))
-                numbers.append(f"`{name}` {span} (median {median(values):g})".replace(" ", "&nbsp;"))
+                numbers.append(
+                    f"`{name}` {span} (median {median(values):g})".replace(" ", "&nbsp;").replace("&nbsp;(", " (")
+                )
         yield f"`{certificate.name}`", "<br>".join(numbers), escaped(certificate.promises)
