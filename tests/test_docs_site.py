@@ -53,3 +53,4 @@ def test_the_site_is_built_twice_to_the_same_bytes_and_fetches_nothing(checkout:
     named = {"python": "traps_pipeline.inside", "tables": "leaderboard", "yaml": "budget_usd"}
     for name, text in {**named, "certificates": "does not promise"}.items():
         assert text in pages[f"reference/{name}.html"]
+    assert "families/plinko.html" in pages["families.html"] and "plinko.jpg" in pages["families/plinko.html"]

@@ -80,7 +80,7 @@ def _source(place: str) -> Path | None:
     """Return the file of the repository behind a page of the site; None for a generated page."""
     if place == "index.md":
         return ROOT / "README.md"
-    if place.startswith(("reference/", "families/")):
+    if place.startswith(("reference/", "families")):
         return None
     return ROOT / place.removeprefix(f"{OUTSIDE}/") if place.startswith(f"{OUTSIDE}/") else ROOT / "docs" / place
 

@@ -34,7 +34,8 @@ HIGH = "ablation_px twin_px top_share unresolved closed_px closed_change_px"
 WORST = dict.fromkeys(LOW.split(), min) | dict.fromkeys(HIGH.split(), max)
 PAGE = """# {name}
 
-Category `{category}` ({taxonomy}), {count} released scenarios, answers of type `{answer}`. [All families](index.md)
+Category `{category}` ({taxonomy}), {count} released scenarios, answers of type `{answer}`.
+[All families](../families.md)
 
 {about}
 
@@ -52,7 +53,7 @@ Asides, which control and void answer:
 
 ## Parameters
 
-The last two columns: values in released records, and the comment in the code.
+*Released*: the values in released records. *Meaning*: the comment in the code.
 
 {parameters}
 
@@ -75,11 +76,11 @@ def family_pages() -> dict[str, str | bytes]:
         released = [(folder, spec) for folder, spec in records if spec.family == family.name]
         pages[f"families/{family.name}.md"] = _page(family, [spec for _, spec in released])
         pages[f"families/{family.name}.jpg"] = pair_picture(*released[0])
-        scene, link = _source(family)[0].splitlines()[0], f"[{family.name}]({family.name}.md)"
+        scene, link = _source(family)[0].splitlines()[0], f"[{family.name}](families/{family.name}.md)"
         rows.append((link, family.category, escaped(scene), family.answer_type, str(len(released))))
     head = "# Families\n\nFor everyone who reads results by family: what each scene shows, and what varies in it.\n\n"
     headings = ("family", "category", "scene", "answer", "released")
-    return pages | {"families/index.md": f"{head}{markdown_table(headings, rows)}\n"}
+    return pages | {"families.md": f"{head}{markdown_table(headings, rows)}\n"}
 
 
 def _page(family: Family, specs: Sequence[SceneSpec]) -> str:
@@ -92,7 +93,7 @@ def _page(family: Family, specs: Sequence[SceneSpec]) -> str:
         **{"about": prose(_source(family)[0]), "looks": ", ".join(family.looks) or "none"},
         **{"questions": bullets(family.questions), "asides": bullets(_asides(family))},
         parameters=markdown_table(("parameter", "unit", "drawn from", "released", "meaning"), [*_rows(family, specs)]),
-        certificates=markdown_table(("certificate", "promises", "evidence"), [*_certificates(specs)]),
+        certificates=markdown_table(("certificate", "evidence", "promises"), [*_certificates(specs)]),
     )
 
 
@@ -147,9 +148,8 @@ def _drawn(member: Field[Any], node: ast.AnnAssign, worlds: Sequence[Any]) -> st
     if "range" in kept:
         return "{:g} to {:g}".format(*kept["range"])
     if "hidden" in kept:
-        return (
-            _either([*dict.fromkeys(value for world in worlds for value in kept["hidden"](vars(world)))]) + ", hidden"
-        )
+        values = dict.fromkeys(value for world in worlds for value in kept["hidden"](vars(world)))
+        return f"{_either([*values])} (the hidden element)"
     if kept.get("values"):
         return _either(kept["values"]) + (f"; {_either(kept['longer'])} in longer rows" if kept.get("longer") else "")
     if about := kept.get("about") or (how.about if isinstance(how, Group) else how.__doc__):
@@ -174,5 +174,7 @@ def _certificates(specs: Sequence[SceneSpec]) -> Iterator[tuple[str, ...]]:
             if values:
                 ends = [WORST[name](values)] if name in WORST else [min(values), max(values)]
                 span = " to ".join(f"{end:g}" for end in dict.fromkeys(ends))
-                numbers.append(f"`{name}` {span} (median {median(values):g})")
-        yield f"`{certificate.name}`", escaped(certificate.promises), "<br>".join(numbers)
+                numbers.append(
+                    f"`{name}` {span} (median {median(values):g})".replace(" ", "&nbsp;").replace("&nbsp;(", " (")
+                )
+        yield f"`{certificate.name}`", "<br>".join(numbers), escaped(certificate.promises)

@@ -7,9 +7,15 @@ from collections.abc import Sequence
 
 
 def prose(text: str | None) -> str:
-    """Return a docstring as Markdown: paragraphs as they are, indented parts as code."""
-    paragraphs = (text or "").split("\n\n")
-    return "\n\n".join(one if one.startswith("    ") else escaped(one) for one in paragraphs)
+    """Return a docstring as Markdown: paragraphs as they are, indented parts and examples as code."""
+    text = re.sub(r"^Examples\n-+\n", "Example:\n\n", text or "", flags=re.MULTILINE)
+    return "\n\n".join(map(_paragraph, text.split("\n\n")))
+
+
+def _paragraph(text: str) -> str:
+    if text.startswith(">>> "):
+        return f"```pycon\n{text}\n```"
+    return text if text.startswith("    ") else escaped(text)
 
 
 def escaped(text: str) -> str:

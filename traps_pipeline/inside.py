@@ -51,6 +51,12 @@ class LoadedStates:
 
     X: (n, d) float32. items: n rows with item_id, dataset, scenario_id, side, sub_scenario, void, and for each regime
     with verdicts abstained_REGIME and correct_REGIME (null if there is none).
+
+    Examples
+    --------
+    >>> states = inside.load(".workspaces/mechanism", "pocket", layer=2)
+    >>> states.X.dtype, len(states.X) == len(states.items)
+    (dtype('float32'), True)
     """
 
     X: np.ndarray
@@ -58,11 +64,25 @@ class LoadedStates:
 
     @property
     def void(self) -> np.ndarray:
-        """Whether each item is a void, (n,) bool."""
+        """Whether each item is a void, (n,) bool.
+
+        Examples
+        --------
+        >>> states = inside.load(".workspaces/mechanism", "pocket", layer=2, datasets=["occlusion"])
+        >>> states.void.mean()  # half of a dataset of pairs
+        np.float64(0.5)
+        """
         return self.items["void"].to_numpy(bool)
 
     def where(self, chosen: Any) -> LoadedStates:
-        """Return the items that a mask (n,) or a query on `items` selects."""
+        """Return the items that a mask (n,) or a query on `items` selects.
+
+        Examples
+        --------
+        >>> states = inside.load(".workspaces/mechanism", "pocket", layer=2)
+        >>> states.where("dataset == 'occlusion' and void").void.all()
+        np.True_
+        """
         mask = self.items.eval(chosen) if isinstance(chosen, str) else chosen
         mask = np.asarray(mask, bool)
         return LoadedStates(self.X[mask], self.items.loc[mask].reset_index(drop=True))
@@ -80,6 +100,12 @@ def load(
 
     layer: 0 for embeddings; `normed`: the last one after the final norm. datasets: some of those with states; all by
     default. Raises TrapsError if the study has no such states, model, layer or dataset.
+
+    Examples
+    --------
+    >>> states = inside.load(".workspaces/mechanism", "pocket", layer="normed", datasets=["chaotic"])
+    >>> set(states.items["dataset"])
+    {'chaotic'}
     """
     opened = open_study(workspace)
     states = StoredStates.of(opened, Extraction(get_model(model).id, prompt))
@@ -133,6 +159,12 @@ def protocol(
     own). change: transforms the states of a dataset, (n, d) to (n, k). features: used instead of the study's states;
     datasets without features are left out. Columns: analysis, source, target, value (AUROC), low, high, n_voids,
     n_controls.
+
+    Examples
+    --------
+    >>> rows = inside.protocol(".workspaces/mechanism", "pocket", layer=2, fit=inside.mean_difference)
+    >>> rows.query("target == 'occlusion'")["value"].between(0, 1).all()
+    np.True_
     """
     opened = open_study(workspace)
     states = StoredStates.of(opened, Extraction(get_model(model).id, prompt))
@@ -162,7 +194,14 @@ Change = Callable[["Tensor", "Tensor", float], "Tensor"]  # states (rows, T, d),
 
 
 def add(states: Tensor, unit: Tensor, amount: float) -> Tensor:
-    """Add the amount along the direction at every position."""
+    """Add the amount along the direction at every position.
+
+    Examples
+    --------
+    >>> import torch
+    >>> inside.add(torch.zeros(1, 1, 2), torch.tensor([1.0, 0.0]), 3.0).tolist()
+    [[[3.0, 0.0]]]
+    """
     return states + amount * unit
 
 
@@ -172,6 +211,11 @@ class Direction:
 
     vector: (d,), of any length but 0. layer: 1 to the number of blocks, counted as in hidden_states. gap: the distance
     between the sides' means along it, the unit of doses in gaps.
+
+    Examples
+    --------
+    >>> inside.Direction(np.array([2.0, 0.0]), layer=3).layer
+    3
     """
 
     vector: np.ndarray
@@ -193,6 +237,12 @@ class Direction:
         model: a transformers model, or one of ours. amount: in the model's own unit, or gaps: in class gaps. change:
         maps the states at a site (rows, T, d), the unit direction and the amount to new states; with a cache, T is 1
         after the prompt. Raises TrapsError for a layer or width that the model lacks.
+
+        Examples
+        --------
+        >>> push = inside.direction(".workspaces/mechanism", "pocket", "occlusion", layer=2)
+        >>> with push.apply(network, gaps=-1):  # a transformers model
+        ...     tokens = network.generate(**inputs, max_new_tokens=4)
         """
         import torch
 
@@ -218,7 +268,13 @@ class Direction:
             handle.remove()
 
     def __neg__(self) -> Direction:
-        """Return the reverse direction."""
+        """Return the reverse direction.
+
+        Examples
+        --------
+        >>> (-inside.Direction(np.array([2.0, 1.0]), layer=3)).vector
+        array([-2., -1.])
+        """
         return replace(self, vector=-self.vector)
 
 
@@ -247,6 +303,11 @@ def direction(
     """Return a saved direction: a dataset's void direction, or a draw of a null.
 
     It has the class gap. Raises TrapsError if the study has no such direction.
+
+    Examples
+    --------
+    >>> inside.direction(".workspaces/mechanism", "pocket", "occlusion", layer=2, kind="void").gap > 0
+    True
     """
     directions: Mapping[str, Any] = saved_directions(open_study(workspace), Extraction(get_model(model).id, prompt))
     if dataset not in directions or kind not in directions[dataset].vectors:

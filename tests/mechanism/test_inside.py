@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import ast
+import doctest
+import inspect
+import io
 import json
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -169,3 +174,35 @@ def test_the_protocol_takes_any_probe_and_any_features_of_items(study: Workspace
     assert set(figures["source"]) == set(figures["target"]) == {"chaotic", "chaotic_ill_posed"}
     with raises(TrapsError, "inside.protocol.<locals>.read", "`features`", "2", "chaotic"):
         inside.protocol(study, "tiny", layer=2, features=inside.LoadedStates(some.X[2:], some.items.iloc[2:]))
+
+
+def public_objects() -> dict[str, object]:
+    """What `inside` gives: its own functions and classes, those that it passes on, and their methods."""
+    names = {name: value for name, value in vars(inside).items() if not name.startswith("_")}
+    again = ast.parse(Path(inside.__file__).read_text()).body
+    passed_on = {
+        alias.name for node in again if isinstance(node, ast.ImportFrom) for alias in node.names if alias.asname
+    }
+    own = {name: value for name, value in names.items() if getattr(value, "__module__", "") == inside.__name__}
+    found = {name: value for name, value in (own | {n: names[n] for n in passed_on}).items() if value.__doc__}
+    for owner in (value for value in own.values() if inspect.isclass(value)):
+        methods = {name: value for name, value in vars(owner).items() if not name.startswith("__") or name == "__neg__"}
+        found |= {f"{owner.__name__}.{name}": value for name, value in methods.items() if value.__doc__}
+    return {name: value for name, value in found.items() if callable(value) or isinstance(value, property)}
+
+
+def test_every_public_docstring_has_an_example_that_gives_what_it_says(study: Workspace, entry: ModelEntry) -> None:
+    study.tables.write(PROBES, STANDARD.partition, stages.probe_rows(study, STANDARD), {})
+    model = load_local_model(entry)
+    prompt = model.prompt("Look.", "Which?", np.full((2, 32, 32, 3), 90, np.uint8), [0.0, 1.0])
+    names = {"inside": inside, "np": np, "local_model": model, "prompt": prompt}
+    names |= {"network": model.network, "inputs": prompt.inputs}
+    objects = public_objects()
+    assert {"load", "LoadedStates.where", "Direction.apply", "gate", "erased"} <= {*objects}
+    for name, value in objects.items():
+        text = (inspect.getdoc(value) or "").replace(".workspaces/mechanism", str(study.root)).replace("pocket", "tiny")
+        assert "Examples\n--------\n>>> " in text, name
+        example = doctest.DocTestParser().get_doctest(text, dict(names), name, None, None)
+        report = io.StringIO()
+        failed = doctest.DocTestRunner(verbose=False).run(example, out=report.write).failed
+        assert failed == 0, report.getvalue()

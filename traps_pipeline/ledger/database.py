@@ -1,7 +1,6 @@
 """Share a ledger's database: transactions, named locks, and grouped commits.
 
-Hundreds of calls are in flight at once, and each changes the database twice: before it is sent and when it is answered.
-So changes are queued, and one thread applies all waiting ones in one transaction. A change is done when its future is.
+Changes are queued, and one thread applies all waiting ones in one transaction. A change is done when its future is.
 What differs between databases is in `sqlite.py` and `traps_cluster/postgres.py`.
 """
 

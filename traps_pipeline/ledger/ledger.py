@@ -1,8 +1,4 @@
-"""Append calls to the ledger, so that each is paid for once.
-
-Answers (and votes) are rows, appended as they arrive and before anything counts them as done. An evaluation has one
-writer at a time.
-"""
+"""Append calls to the ledger, so that each is paid for once (docs/design/ledger.md)."""
 
 from __future__ import annotations
 

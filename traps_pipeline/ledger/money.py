@@ -1,7 +1,6 @@
 """Account for dollars spent, reserved by calls in flight, or released by a person.
 
-A call's worst case is reserved before it is sent. The transaction that stores the call's row removes the reservation. A
-reservation of a dead process stays, and counts as spent, until a person releases it.
+The transaction that stores a call's row removes its reservation (docs/design/money.md).
 """
 
 from __future__ import annotations

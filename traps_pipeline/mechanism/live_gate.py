@@ -77,6 +77,12 @@ def gate(
     as the gate stage names them (`occlusion:tunnel`), to hold out: without those of a fold, its decisions about that
     fold equal the stage's. Raises TrapsError for another source or threshold, for a source without both sides in as
     many scenarios as there are folds, and for states that are means over a part of the prompt.
+
+    Examples
+    --------
+    >>> live = inside.gate(".workspaces/mechanism", "pocket", source="one:occlusion", layer=2)
+    >>> live.abstains(local_model, prompt) in (True, False)
+    True
     """
     workspace, extraction = open_study(workspace), Extraction(get_model(model).id, prompt)
     states, settings = StoredStates.of(workspace, extraction), workspace.mechanism

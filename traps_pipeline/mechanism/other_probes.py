@@ -15,6 +15,12 @@ def mean_difference(states: np.ndarray, void: np.ndarray) -> Scorer:
     """Return the probe along the difference of the sides' standardised means.
 
     A score of 0 lies half-way between them.
+
+    Examples
+    --------
+    >>> probe = inside.mean_difference(np.array([[0.0], [1.0]]), np.array([False, True]))
+    >>> probe.scores(np.array([[0.5]])).tolist()
+    [0.0]
     """
     mean, scale = standardiser(np.asarray(states, float))
     standard = (states - mean) / scale
@@ -27,6 +33,13 @@ def from_sklearn(make: Callable[[], Any]) -> Fit:
     """Return a fit function for what `make` returns, a new scikit-learn classifier.
 
     Scores are its decision function, or the log-odds of its probabilities.
+
+    Examples
+    --------
+    >>> from sklearn.svm import LinearSVC
+    >>> probe = inside.from_sklearn(LinearSVC)(np.array([[0.0], [1.0]]), np.array([False, True]))
+    >>> (probe.scores(np.array([[-1.0], [2.0]])) > 0).tolist()
+    [False, True]
     """
 
     def fit(states: np.ndarray, void: np.ndarray) -> Scorer:
@@ -51,6 +64,12 @@ def erased(states: np.ndarray, void: np.ndarray) -> np.ndarray:
 
     Least-squares concept erasure (LEACE, of Belrose et al. 2023) of these very states: the smallest change, in the
     metric of their own covariance, after which both sides have the same mean.
+
+    Examples
+    --------
+    >>> states = np.array([[0.0, 5.0], [2.0, 5.0], [1.0, 7.0], [3.0, 7.0]])  # the first coordinate tells the sides
+    >>> inside.erased(states, np.array([False, True, False, True])).round(6).tolist()
+    [[1.0, 5.0], [1.0, 5.0], [2.0, 7.0], [2.0, 7.0]]
     """
     states = np.asarray(states, float)
     centred, label = states - states.mean(axis=0), void - np.mean(void)

@@ -2,9 +2,8 @@
 
 A job materializes the missing or stale partitions of its stages that the study's experiments want. Dagster cannot run
 assets of different partitions in one job, so a job whose stages have several is one op, which starts a run for each
-block of stages that share their partitions and links them; `report` selects its assets. The sensors target assets: they
-request runs of what exists and is outdated. They read the state of the tables, not events, so that they also follow a
-correction made while they were off.
+block of stages that share their partitions and links them; `report` selects its assets. The sensors request
+runs of what exists and is outdated, by the state of the tables (docs/design/staleness.md).
 """
 
 import json

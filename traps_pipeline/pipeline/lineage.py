@@ -1,9 +1,6 @@
 """Decide what is stale: compare partitions' recorded inputs with the current ones.
 
-The tables' footers hold the truth (`storage.parquet.State`): the versions of the inputs at the time of writing. A
-partition is stale when an input's version has changed. Dagster gets the same versions, so its UI agrees; this module
-also answers where Dagster does not: unpartitioned assets, more than 100 upstream partitions, lost files, altered
-tables, failed calls.
+The tables' footers (`storage.parquet.State`) hold the versions of the inputs (docs/design/staleness.md).
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 `run_step` is the whole protocol, in the only sound order. It records the inputs' versions before it reads anything. It
 skips, with a reason, what cannot be built yet or would be built from something damaged. Each partition is written, read
-back, checked and reported to Dagster as soon as it is done. The step then ends without an error, so that everything
-downstream that does not need the missing partitions is built; the last step of a run raises for all of them (`checks`).
+back, checked and reported to Dagster as soon as it is done. The last step of a run raises for what is missing
+(docs/design/staleness.md).
 A partition of a range gets an `AssetMaterialization` with a data version of its own, since the versions of a
 `MaterializeResult` hold for all partitions of a step (Dagster's issues 21072 and 34013). An asset without partitions
 gets a `MaterializeResult`.

@@ -1,13 +1,8 @@
 """Compute confidence intervals of scores by a Bayesian bootstrap over scenarios.
 
-See docs/scoring.md, "Intervals". A scenario is one draw of the world: its pairs in both datasets of its taxonomy, in
-every run, model and regime, stay together. All cells of a taxonomy share one weight matrix, so two entries' resamples
-are paired, and their difference is a paired difference (`contrasts`).
-
-Every resample is computed twice, since unsampled scenarios may differ from all sampled ones: once with one unseen
-scenario in each share that is the worst for the figure (its lower end), once with one that is the best (its upper end).
-For a share of n answers this is the interval of Clopper and Pearson; for a mean over scenarios it is the bound of
-Gaffke (2005). So an interval keeps a width even if all answers agree, and with a single scenario.
+See docs/scoring.md, "Intervals", and docs/design/intervals.md. All cells of a taxonomy share one weight matrix over
+scenarios. Every resample is computed twice: with one unseen scenario in each share that is the worst for the figure
+(its lower end), and with one that is the best (its upper end).
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Cap spending: the worst case of a call is reserved before it is sent.
 
-The reservation is a row of the ledger's database, and the call's own row replaces it (`ledger/money.py`). So calls in
-flight when a process is killed count as their worst case forever, and all processes of a study share one budget.
+The reservation is a row of the ledger's database (`ledger/money.py`, docs/design/money.md).
 """
 
 from __future__ import annotations

@@ -1,10 +1,7 @@
 """Close controls: an occluder enters once the outcome has settled, and stays.
 
-So the last frame does not tell the answer, and a model must have watched. In an occlusion scene the occluder is that of
-the void: control and void then end in the same frames. In a chaotic scene it stands before the place of all outcomes
-and before whatever moves in either world, so that its place tells nothing of the answer.
-
-Every control closes that can: drawn among them, an occluder at the end would tell something of the side after all.
+In an occlusion scene the occluder is the void's. In a chaotic scene it stands before the place of all outcomes and
+before whatever moves in either world. Every control closes that can (docs/design/twins.md).
 """
 
 from __future__ import annotations

@@ -1,12 +1,7 @@
 """Decide how long a clip is, and when it closes.
 
-An outcome settles neither at a clip's beginning nor at its very end. A scene is simulated for as long as its family
-says. Where the outcome settles early the clip ends earlier, void and control alike, so that its length tells nothing of
-the side. A clip is never longer than its family's: models are shown 25 frames of five a second. So where the outcome
-settles too late the scene is drawn anew.
-
-Of an occlusion pair both worlds count, and which of them is the control makes no difference: neither length nor closing
-tells which world the occluder hides.
+Where the outcome settles early, void and control end earlier; where too late, the scene is drawn anew. Both worlds of
+an occlusion pair count alike (docs/design/twins.md).
 """
 
 from __future__ import annotations
