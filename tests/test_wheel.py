@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.build.packages import install
 from tests.conftest import ROOT, Finished
 from traps_pipeline.base.extras import EXTRAS, ExtraName
 
@@ -112,6 +113,18 @@ def test_the_wheel_holds_the_package_and_its_data_and_nothing_else(wheel: Path) 
     assert {Path(name).suffix for name in rest} == {".typed", ".j2", ".js", ".css", ".sha256"}
     assert re.search(r"^License-Expression: Apache-2.0 AND CC-BY-4.0 AND CC-BY-NC-4.0$", metadata, re.MULTILINE)
     assert "Requires-Python: <3.14,>=3.11" in metadata
+
+
+def test_the_package_for_several_hosts_is_a_wheel_of_its_own_and_its_absence_is_one_sentence(
+    installed: Installed, tmp_path: Path
+) -> None:
+    install(ROOT / "traps_cluster", tmp_path)
+    own = {path.name for path in (ROOT / "traps_cluster").glob("*.py")}
+    assert {path.name for path in (tmp_path / "traps_cluster").glob("*.py")} == own
+    (metadata,) = tmp_path.glob("traps_cluster-*.dist-info/METADATA")
+    assert "Requires-Dist: traps-pipeline[cluster]" in metadata.read_text()
+    refused = installed.traps("init", "demo", "--database", "LAB_DATABASE", "--workspace", "s")
+    assert refused.code != 0 and "traps-cluster" in refused.err and "Traceback" not in refused.err
 
 
 def test_an_installed_wheel_makes_a_leaderboard_in_a_folder_that_is_no_checkout(installed: Installed) -> None:
