@@ -66,6 +66,22 @@ def test_a_controls_two_decisions_are_made_apart(
     assert row["n_valid_correctness"] == 3 - correctness.count("-")
 
 
+@pytest.mark.parametrize(
+    ("abstention", "correctness", "correct"),
+    [("nnn", "---", False), ("nnn", "y--", False), ("nnn", "yy-", True), ("yyy", "---", None), ("---", "---", None)],
+)
+def test_an_answer_that_names_two_choices_is_not_correct_rather_than_missing(
+    abstention: str, correctness: str, correct: bool | None
+) -> None:
+    """A model that hedges where it does not know must not leave the count of controls."""
+    votes = control_votes(abstention, correctness)
+    votes.loc[~votes["valid"].astype(bool), "invalid_reason"] = "unread"
+    verdicts = decide(*undone("control"), votes)
+    (row,), (cell,) = verdicts.to_dict("records"), cell_metrics(verdicts).query("scope == 'all'").to_dict("records")
+    assert (None if pd.isna(row["correct"]) else row["correct"]) is correct
+    assert cell["n_acc"] == (correct is not None)
+
+
 def test_a_rejected_premise_is_decided_by_the_majority_and_counted_beside_abstention() -> None:
     rejecting = {"yyy": True, "yyn": True, "ynn": False, "nnn": False, "yy": True, "yn": None, "y": None, "": None}
     rows = []

@@ -21,6 +21,7 @@ from traps_pipeline.protocol.ratings import (
     ANSWER,
     CORRECTNESS,
     INVALID,
+    NO,
     VOTE_COLUMNS,
     majority,
     ratings,
@@ -91,6 +92,9 @@ def decide(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) ->
     sizes = " or ".join(map(str, PANEL_SIZES))
     _refuse(rows, is_missing, f"item {{}} does not have the votes of {sizes} judges per task", "votes")
     abstained, correct = majority(abstention), majority(correctness)
+    # Most judges see an answer and read several choices in it: a hedge is no gap in the data, and is not right.
+    hedged = is_control & (abstained == NO) & (_unread(rows, votes, "correctness") > len(cast.judges) / 2)
+    correct = np.where(hedged, NO, correct)
     is_undecided = (abstained == INVALID) | (is_control & (correct == INVALID))
     rows["abstained"], rows["correct"] = vote_decisions(abstained), vote_decisions(correct)
     rows["rejects_premise"] = _rejects_premise(rows, votes, len(cast.judges))
@@ -99,12 +103,19 @@ def decide(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) ->
     rows["n_valid_correctness"] = (correctness != INVALID).sum(axis=1)
     rows["unanimous"] = judged & _unanimous(abstention) & (~is_control | _unanimous(correctness))
     rows["undecided"] = judged & is_undecided
-    said_unread = votes["invalid_reason"].eq(UNREAD) & votes["task"].eq("abstention")
-    if said_unread.to_numpy(bool).any():
-        times = rows[ANSWER].merge(votes.loc[said_unread, ANSWER].value_counts().reset_index(name="n"), how="left")["n"]
-        rows.loc[times.eq(len(cast.judges)).to_numpy(), "outcome"] = UNREAD
+    if cast.judges:
+        rows.loc[_unread(rows, votes, "abstention") == len(cast.judges), "outcome"] = UNREAD
     panels = votes.loc[:, [*CELL, "panel"]].drop_duplicates(CELL)
     return rows.merge(panels, on=CELL, how="left").loc[:, VERDICTS.names]
+
+
+def _unread(rows: pd.DataFrame, votes: pd.DataFrame, task: str) -> np.ndarray:
+    """Return how many judges read nothing on a task, (rows,)."""
+    unread = votes.loc[votes["invalid_reason"].eq(UNREAD) & votes["task"].eq(task), ANSWER]
+    if unread.empty:
+        return np.zeros(len(rows))
+    counts = rows[ANSWER].merge(unread.value_counts().reset_index(name="n"), on=ANSWER, how="left")["n"]
+    return counts.fillna(0).to_numpy(float)
 
 
 def _rejects_premise(rows: pd.DataFrame, votes: pd.DataFrame, n_judges: int) -> pd.arrays.BooleanArray:
