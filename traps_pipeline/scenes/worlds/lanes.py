@@ -1,0 +1,419 @@
+"""Film two events of one family side by side, each in a lane of its own.
+
+A lane is a family's own scene on one half of a wide picture. A painted strip lies before it, by which a question names
+it. A bench stands above or below it in the picture, on which doubles of the things that decide slide to rest. Before
+the scene and before the bench is a board each, of the same size in the picture. In a lane that is hidden the scene's
+board stands from the first frame to the last and the bench's comes and goes; in a lane that is seen it is the other way
+round, by the same timetable. So boards, things alike and their motion are the same on both sides, up to what is asked:
+whether the scene was seen, or the bench.
+
+Boards hang on joints, so a clip is a row of poses like any other, and the renderer knows nothing of them. Nothing
+throws a shadow, which would tell what a board hides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from traps_pipeline.scenes.physics.kit import Box, Family, Motion, Physics, Scene, Vec3, add_box, new_spec
+from traps_pipeline.scenes.physics.simulate import replay, swept_points
+from traps_pipeline.scenes.picture.camera import HEIGHT, Camera, Occluder, WideCamera, fit_camera, fit_occluder
+from traps_pipeline.scenes.worlds.outcome import Outcome, Rejected, compile_scene, read_outcome, simulated
+from traps_pipeline.scenes.worlds.shot import box_around
+from traps_pipeline.scenes.worlds.timetable import Timetable
+
+if TYPE_CHECKING:
+    import mujoco
+
+LANES = ("left", "right")  # sides of the picture; names of all that is in a lane begin with it
+SIDES = (-1, 1)  # of the world's middle
+PLACES = ("scene", "bench")  # what a lane's two boards stand before
+GAP_M = 0.14  # between the lanes
+CLEAR_PX = 5.0  # between a lane's scene and its bench, in the picture
+BENCH_M, BENCH_DEPTH_M = 0.04, 0.16  # thickness and depth of a bench
+STRIP_M, STRIP_GAP_M = 0.07, 0.05  # depth of a lane's strip, and what is before and behind it
+DOUBLES = 3  # at most
+DOUBLE_GAP_M = 0.03
+SLIDE_M = (0.05, 0.4)  # how far doubles slide
+AWAY_M = 60.0  # so high hangs a board that is not there
+ROUNDS = 16  # in which camera, boards and benches are fitted to each other
+
+
+@dataclass(frozen=True)
+class Lane:
+    """What is drawn of a lane.
+
+    strip: its colour. bench_above: whether the bench is above the scene in the picture. bench_at: where it is along the
+    scene, -1 to 1. slide_s: time constant of the doubles' slide; slides_to: -1 or 1. timetable: of the board that comes
+    and goes.
+    """
+
+    params: Any
+    strip: str
+    bench_above: bool
+    bench_at: float
+    slide_s: float
+    slides_to: int
+    timetable: Timetable
+
+
+@dataclass(frozen=True, eq=False)
+class Event:
+    """A lane's event by itself, as if there were no other lane."""
+
+    family: Family
+    params: Any
+    physics: Physics
+
+    @cached_property
+    def _compiled(self) -> tuple[mujoco.MjModel, Scene]:
+        return compile_scene(self.family, self.params, self.physics)
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The compiled scene."""
+        return self._compiled[0]
+
+    @property
+    def scene(self) -> Scene:
+        """The built scene."""
+        return self._compiled[1]
+
+    @property
+    def cover(self) -> Box:
+        """What a board must hide. Raises Rejected."""
+        if self.scene.cover is None:
+            raise Rejected(f"{self.family.name}: its scenes have nothing that a board could hide")
+        return self.scene.cover
+
+    @cached_property
+    def motion(self) -> Motion:
+        """Poses of all bodies. Raises Rejected."""
+        return replay(self.model, self._qpos, self.physics)
+
+    @cached_property
+    def _qpos(self) -> np.ndarray:
+        return simulated(self.model, self.scene, self.physics)
+
+    @cached_property
+    def outcome(self) -> Outcome:
+        """The outcome. Raises Rejected."""
+        return read_outcome(self.family, self.motion, self.params)
+
+    @cached_property
+    def points(self) -> np.ndarray:
+        """Corners of all that is ever shown, (N, 3)."""
+        framed = [box.corners() for box in self.scene.framed]
+        return np.concatenate([swept_points(self.model, self._qpos), *geom_corners(self.model).values(), *framed])
+
+
+def geom_corners(model: mujoco.MjModel, qpos: np.ndarray | None = None) -> dict[str, np.ndarray]:
+    """Return box corners (8, 3) of every geom but planes by name, at the start or in a pose."""
+    import mujoco
+
+    data, signs = mujoco.MjData(model), Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)).corners()
+    data.qpos[:] = model.qpos0 if qpos is None else qpos
+    mujoco.mj_kinematics(model, data)
+    corners = {}
+    for geom in np.flatnonzero(model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE):
+        local = model.geom_aabb[geom, :3] + signs * model.geom_aabb[geom, 3:]
+        corners[model.geom(geom).name] = local @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
+    return corners
+
+
+# --- where things stand ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where things of a lane are, in the world.
+
+    shift: of the family's own scene. bench: the middle of the bench's upper face. boards: by `PLACES`.
+    """
+
+    shift: Vec3
+    bench: Vec3
+    bench_half_m: float
+    strip: Box
+    boards: Mapping[str, Occluder]
+
+    @property
+    def corners(self) -> np.ndarray:
+        """Corners of strip and boards, (N, 3)."""
+        return np.concatenate([self.strip.corners(), *(board.corners() for board in self.boards.values())])
+
+
+def fit_lanes(lanes: Sequence[Lane], worlds: Sequence[Sequence[Event]]) -> tuple[Camera, tuple[Layout, ...]]:
+    """Return the nearest camera with both lanes in frame, and where everything stands.
+
+    worlds: of each lane the event and its twin: all is fitted to both.
+    """
+    points = [np.concatenate([event.points for event in events]) for events in worlds]
+    covers = [box_around([event.cover.corners() for event in events]).corners() for events in worlds]
+    view = replace(worlds[0][0].scene.view, azimuth_deg=90.0)
+    down = np.radians(-view.elevation_deg)
+    benches = [_first_bench(lane, shown, down) for lane, shown in zip(lanes, points, strict=True)]
+    half = max(float(np.ptp(shown[:, 0])) for shown in points) / 2 + GAP_M / 2
+    layouts: list[Layout] = []
+    camera = None
+    for _ in range(ROUNDS):
+        shifts = [(side * half - _middle(p[:, 0]), 0.0, 0.0) for side, p in zip(SIDES, points, strict=True)]
+        shown = [p + shift for p, shift in zip(points, shifts, strict=True)]
+        seen = [*shown, *(layout.corners for layout in layouts)]
+        everything = np.concatenate(seen)
+        camera = fit_camera(view, np.concatenate([everything, everything * (-1, 1, 1)]), WideCamera)
+        layouts = []
+        for k, lane in enumerate(lanes):
+            board = fit_occluder(camera, box_around([covers[k] + shifts[k]]))
+            layout = _layout(camera, lane, shown[k], board, shifts[k], benches[k])
+            benches[k] = _moved_apart(camera, lane.bench_above, shown[k], layout, down)
+            layouts.append(layout)
+        reach = max(float(np.abs(layout.corners[:, 0] - side * half).max()) for side, layout in zip(SIDES, layouts, strict=True))
+        half = max(half, reach + GAP_M / 2)
+    assert camera is not None
+    return camera, tuple(layouts)
+
+
+def _middle(values: np.ndarray) -> float:
+    return float(values.min() + values.max()) / 2
+
+
+def _first_bench(lane: Lane, shown: np.ndarray, down: float) -> tuple[float, float]:
+    """Return a bench's depth and height: behind and over all that is shown, or in front of it."""
+    if not lane.bench_above:
+        return float(shown[:, 1].min()) - 0.5, BENCH_M
+    back = float(shown[:, 1].max()) + BENCH_DEPTH_M
+    top = float((shown[:, 2] * np.cos(down) + shown[:, 1] * np.sin(down)).max())
+    return back, max(BENCH_M, (top - back * np.sin(down)) / np.cos(down))
+
+
+def _layout(
+    camera: Camera, lane: Lane, shown: np.ndarray, board: Occluder, shift: Vec3, bench: tuple[float, float]
+) -> Layout:
+    """Return a lane's layout: the bench's board has the size in the picture of the scene's."""
+    y, z = bench
+    front = y - BENCH_DEPTH_M / 2 - board.half[1]
+    place = np.array([board.centre[0], front, z + board.half[2]])
+    scale = camera.metres_a_pixel(place) / camera.metres_a_pixel(np.array(board.centre))
+    across, thick, up = (half * factor for half, factor in zip(board.half, (scale, 1.0, scale), strict=True))
+    low, high = (float(f(shown[:, 0])) for f in (np.min, np.max))
+    slack = max(0.0, (high - low) / 2 - across)
+    x = (low + high) / 2 + lane.bench_at * slack
+    bench_board = Occluder((x, front, z + up), (across, thick, up), board.yaw_deg)
+    near = min(float(shown[:, 1].min()), float(board.corners()[:, 1].min()), y - BENCH_DEPTH_M) - STRIP_GAP_M
+    strip = Box((low, near - STRIP_M, 0.0), (high, near, 0.004))
+    return Layout(shift, (x, y, z), across - 0.05, strip, {"scene": board, "bench": bench_board})
+
+
+def _moved_apart(
+    camera: Camera, above: bool, shown: np.ndarray, layout: Layout, down: float
+) -> tuple[float, float]:
+    """Return a bench's place so that its board and the scene are just apart in the picture."""
+    x, y, z = layout.bench
+    rows = [camera.project(c)[:, 1] for c in (np.concatenate([shown, layout.boards["scene"].corners()]), layout.boards["bench"].corners())]
+    metres = camera.metres_a_pixel(np.array(layout.bench))
+    if above:
+        missing_px = rows[1].max() + CLEAR_PX - rows[0].min()
+        return y, max(BENCH_M, z + missing_px * metres / float(np.cos(down)))
+    missing_px = rows[0].max() + CLEAR_PX - rows[1].min()
+    return y - missing_px * metres / float(np.sin(down)), z
+
+
+# --- the world --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class TwoLanes:
+    """A world of two lanes in its shot. worlds: the event of each lane."""
+
+    lanes: tuple[Lane, Lane]
+    events: tuple[Event, Event]
+    camera: Camera
+    layouts: tuple[Layout, ...]
+
+    @property
+    def physics(self) -> Physics:
+        """Solver settings and timing."""
+        return self.events[0].physics
+
+    def with_event(self, lane: int, event: Event) -> TwoLanes:
+        """Return the world with another event in a lane, such as its twin."""
+        events = tuple(event if k == lane else self.events[k] for k in range(len(self.events)))
+        return replace(self, events=events)
+
+    @cached_property
+    def _built(self) -> tuple[mujoco.MjModel, Scene]:
+        spec = new_spec(self.physics)
+        spec.light("key").castshadow = False
+        velocity: dict[str, Sequence[float]] = {}
+        for name, lane, event, layout in zip(LANES, self.lanes, self.events, self.layouts, strict=True):
+            scene = _lane_scene(event, lane, layout)
+            spec.attach(scene.spec, prefix=f"{name} ", frame=spec.worldbody.add_frame(pos=list(layout.shift)))
+            velocity |= {f"{name} {body}": values for body, values in scene.velocity.items()}
+            _paint(spec, name, lane, layout)
+        for name, layout in zip(LANES, self.layouts, strict=True):  # last: the last columns of a pose are theirs
+            for place in PLACES:
+                _hang(spec, board_of(name, place), layout.boards[place])
+        model = spec.compile()
+        return model, Scene(spec, self.events[0].scene.view, (), (), velocity=velocity)
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The compiled world."""
+        return self._built[0]
+
+    @cached_property
+    def qpos(self) -> np.ndarray:
+        """The trajectory, all boards standing, (F, nq). Raises Rejected."""
+        return simulated(*self._built, self.physics)
+
+    def motion(self, lane: int) -> Motion:
+        """Return the poses of a lane's bodies, as its family knows them."""
+        poses, prefix, shift = self._motion, f"{LANES[lane]} ", np.array(self.layouts[lane].shift)
+        names = {name.removeprefix(prefix): name for name in poses.positions if name.startswith(prefix)}
+        positions = {short: poses.positions[name] - shift for short, name in names.items()}
+        return Motion(poses.times, positions, {short: poses.rotations[name] for short, name in names.items()})
+
+    @cached_property
+    def _motion(self) -> Motion:
+        return replay(self.model, self.qpos, self.physics)
+
+    def outcome(self, lane: int) -> Outcome:
+        """Return a lane's outcome, read by its family."""
+        return read_outcome(self.events[lane].family, self.motion(lane), self.events[lane].params)
+
+    def off_alone_m(self, lane: int) -> float:
+        """Return how far (m) a decisive body is, at most, from where it is without the other lane."""
+        here, alone = self.motion(lane), self.events[lane].motion
+        return max(float(np.abs(here.pos(body) - alone.pos(body)).max()) for body in self.events[lane].scene.decisive)
+
+    def clip(self, hidden: Sequence[bool]) -> np.ndarray:
+        """Return the poses of the clip in which some lanes are hidden, (F, nq)."""
+        qpos = self.qpos.copy()
+        columns = iter(range(qpos.shape[1] - len(LANES) * len(PLACES), qpos.shape[1]))
+        for lane, layout, is_hidden in zip(self.lanes, self.layouts, hidden, strict=True):
+            for place in PLACES:
+                away = lane.timetable.away(len(qpos)) if standing_before(is_hidden) != place else np.zeros(len(qpos))
+                lift = out_of_picture_m(layout.boards[place], self.camera)
+                qpos[:, next(columns)] = np.where(away == 1, AWAY_M, away * lift)
+        return qpos
+
+    def geoms(self, lane: int, *, hidden_element: bool = True) -> tuple[str, ...]:
+        """Return the names of the geoms that decide a lane's outcome."""
+        prefix, scene, model = f"{LANES[lane]} ", self.events[lane].scene, self.model
+        ids = [model.body(prefix + body).id for body in scene.decisive]
+        names = [model.geom(i).name for i in range(model.ngeom) if int(model.geom_bodyid[i]) in ids]
+        return (*names, *(prefix + name for name in scene.hidden if hidden_element))
+
+    def doubles(self, lane: int) -> tuple[str, ...]:
+        """Return the names of the geoms of a lane's doubles."""
+        prefix = f"{LANES[lane]} double "
+        return tuple(name for name in (self.model.geom(i).name for i in range(self.model.ngeom)) if name.startswith(prefix))
+
+
+def standing_before(is_hidden: bool) -> str:
+    """Return before what a lane's still board stands."""
+    return PLACES[0] if is_hidden else PLACES[1]
+
+
+def board_of(lane: str, place: str) -> str:
+    """Return the name of a board, its body and its geom."""
+    return f"board {lane} {place}"
+
+
+def out_of_picture_m(board: Occluder, camera: Camera) -> float:
+    """Return how far a board rises until it is out of the picture (m)."""
+    corners = board.corners()
+    lifts = np.arange(0.0, AWAY_M / 4, 0.02)
+    rows = np.array([camera.project(corners + (0.0, 0.0, lift))[:, 1].max() for lift in lifts])
+    return float(lifts[int((rows < 0).argmax())])
+
+
+# --- parts of a lane --------------------------------------------------------------------------------------------------
+
+
+def _lane_scene(event: Event, lane: Lane, layout: Layout) -> Scene:
+    """Return a family's scene without floor, sky and light of its own, and with its doubles."""
+    import mujoco
+
+    scene = event.family.build(event.params, event.physics)
+    spec = scene.spec
+    for geom in [geom for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]:
+        spec.delete(geom)
+    own = [*spec.lights, *spec.textures, *(material for material in spec.materials if material.name == "floor")]
+    for element in own:
+        spec.delete(element)
+    place = np.subtract(layout.bench, layout.shift)
+    velocity = dict(scene.velocity)
+    velocity |= _add_doubles(event, scene, lane, place, layout.bench_half_m)
+    return replace(scene, velocity=velocity)
+
+
+def _add_doubles(
+    event: Event, scene: Scene, lane: Lane, bench: np.ndarray, half_m: float
+) -> dict[str, tuple[float, ...]]:
+    """Add copies of what decides to the bench; return their first speeds."""
+    import mujoco
+
+    model, data = event.model, mujoco.MjData(event.model)
+    mujoco.mj_kinematics(model, data)
+    corners = geom_corners(model)
+    bodies, spans, used = [], [], 0.0
+    for body in scene.decisive:
+        own = [model.geom(i).name for i in range(model.ngeom) if model.geom_bodyid[i] == model.body(body).id]
+        span = np.concatenate([corners[name] for name in own])
+        if len(bodies) < DOUBLES and (not bodies or used + np.ptp(span[:, 0]) + DOUBLE_GAP_M < 1.4 * half_m):
+            bodies.append(body)
+            spans.append(span - data.body(body).xpos)
+            used += float(np.ptp(span[:, 0])) + DOUBLE_GAP_M
+    slide = min(SLIDE_M[1], 2 * half_m - used)
+    if slide < SLIDE_M[0]:
+        raise Rejected(f"what decides is too wide for a bench of {2 * half_m:.2f} m")
+    x, speeds = bench[0] - used / 2 - lane.slides_to * slide / 2, {}
+    for n, (body, span) in enumerate(zip(bodies, spans, strict=True)):
+        x += DOUBLE_GAP_M / 2
+        at = (x - float(span[:, 0].min()), bench[1] - _middle(span[:, 1]), bench[2] - float(span[:, 2].min()))
+        x += float(np.ptp(span[:, 0])) + DOUBLE_GAP_M / 2
+        name = f"double {n}"
+        copied = scene.spec.worldbody.add_body(name=name, pos=list(at), quat=data.body(body).xquat)
+        axis = np.linalg.inv(data.body(body).xmat.reshape(3, 3)) @ (1.0, 0.0, 0.0)
+        copied.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis.tolist(), damping=[1 / lane.slide_s, 0, 0])
+        copied.mass, copied.inertia, copied.explicitinertial = 1.0, [1.0, 1.0, 1.0], True
+        for i, geom in enumerate(scene.spec.body(body).geoms):
+            _copy_geom(copied, geom, f"{name} {i}")
+        speeds[name] = (lane.slides_to * slide / lane.slide_s,)
+    return speeds
+
+
+def _copy_geom(body: mujoco.MjsBody, geom: mujoco.MjsGeom, name: str) -> None:
+    """Add a copy of a geom without contact or mass."""
+    copied = body.add_geom(name=name, type=geom.type, size=geom.size, pos=geom.pos, quat=geom.quat, rgba=geom.rgba)
+    if not np.isnan(geom.fromto[0]):
+        copied.fromto = geom.fromto
+    copied.meshname, copied.contype, copied.conaffinity, copied.mass = geom.meshname, 0, 0, 0
+
+
+def _paint(spec: mujoco.MjSpec, name: str, lane: Lane, layout: Layout) -> None:
+    """Add a lane's strip and its bench, without contact."""
+    (x, y, z), half = layout.bench, layout.bench_half_m
+    low, high = np.array(layout.strip.low), np.array(layout.strip.high)
+    parts = {
+        "strip": ((low + high) / 2, (high - low) / 2, lane.strip),
+        "bench": (np.array([x, y, z / 2]), np.array([half, BENCH_DEPTH_M / 2, z / 2]), "grey"),
+    }
+    for part, (centre, size, colour) in parts.items():
+        add_box(spec.worldbody, f"{name} {part}", centre.tolist(), size.tolist(), colour, contype=0, conaffinity=0)
+
+
+def _hang(spec: mujoco.MjSpec, name: str, board: Occluder) -> None:
+    """Hang a board on an upright joint; it falls by itself for nothing."""
+    import mujoco
+
+    body = spec.worldbody.add_body(name=name, pos=list(board.centre), gravcomp=1)
+    body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1])
+    add_box(body, name, (0, 0, 0), board.half, "navy", contype=0, conaffinity=0)
