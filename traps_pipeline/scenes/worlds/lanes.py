@@ -36,12 +36,14 @@ PLACES = ("scene", "bench")  # what a lane's two boards stand before
 GAP_M = 0.14  # between the lanes
 CLEAR_PX = 5.0  # between a lane's scene and its bench, in the picture
 BENCH_M, BENCH_DEPTH_M = 0.04, 0.16  # thickness and depth of a bench
-STRIP_M, STRIP_GAP_M = 0.07, 0.05  # depth of a lane's strip, and what is before and behind it
+STRIP_M, STRIP_GAP_M = 0.09, 0.05  # depth of a lane's strip, and what is before and behind it
 DOUBLES = 3  # at most
 DOUBLE_GAP_M = 0.03
 SLIDE_M = (0.05, 0.4)  # how far doubles slide
 AWAY_M = 60.0  # so high hangs a board that is not there
-ROUNDS = 16  # in which camera, boards and benches are fitted to each other
+ROUNDS = 24  # in which camera, boards and benches are fitted to each other
+
+DAMPING = 0.5  # or benches and camera would chase each other
 
 
 @dataclass(frozen=True)
@@ -219,9 +221,9 @@ def _moved_apart(
     metres = camera.metres_a_pixel(np.array(layout.bench))
     if above:
         missing_px = rows[1].max() + CLEAR_PX - rows[0].min()
-        return y, max(BENCH_M, z + missing_px * metres / float(np.cos(down)))
+        return y, max(BENCH_M, z + DAMPING * missing_px * metres / float(np.cos(down)))
     missing_px = rows[0].max() + CLEAR_PX - rows[1].min()
-    return y - missing_px * metres / float(np.sin(down)), z
+    return y - DAMPING * missing_px * metres / float(np.sin(down)), z
 
 
 # --- the world --------------------------------------------------------------------------------------------------------
