@@ -16,7 +16,6 @@ from traps_pipeline.scenes.worlds.lane_records import CLIPS
 from traps_pipeline.scenes.worlds.lanes import AWAY_M, LANES, PLACES, TwoLanes, board_of, geom_corners
 from traps_pipeline.scenes.worlds.outcome import Rejected
 
-OFF_ALONE_M = 0.005  # a lane's outcome is as if there were no other
 OUTCOME_PX = 75.0  # of what decides, in each frame of the window
 DOUBLE_PX = 40.0  # of the doubles, in each frame of the window of a hidden lane
 STRIP_PX = 100.0  # of a lane's strip, in every frame
@@ -31,23 +30,22 @@ def certify_lanes(world: TwoLanes, twins: Sequence[TwoLanes]) -> dict[str, Any]:
 
 
 def _outcomes(world: TwoLanes, twins: Sequence[TwoLanes]) -> dict[str, Any]:
-    settled, off = [], 0.0
+    settled = []
     for k, (lane, event, twin) in enumerate(zip(world.lanes, world.events, twins, strict=True)):
         outcomes = [world.outcome(k), twin.outcome(k)]
         for outcome, alone in zip(outcomes, (event.outcome, twin.events[k].outcome), strict=True):
             if outcome.label is None or outcome.label != alone.label:
-                raise Rejected(f"{LANES[k]}: the outcome is {outcome.label!r} beside the other lane, {alone.label!r} alone")
+                raise Rejected(
+                    f"{LANES[k]}: the outcome is {outcome.label!r} beside the other lane, {alone.label!r} alone"
+                )
             if outcome.margin_m < event.family.min_margin_m:
                 raise Rejected(f"{LANES[k]}: the margin is {outcome.margin_m:.4f} m")
         if outcomes[0].label == outcomes[1].label:
             raise Rejected(f"{LANES[k]}: the twin has the same outcome")
-        off = max(off, world.off_alone_m(k), twin.off_alone_m(k))
         settled.append(max(outcome.commit_frame for outcome in outcomes))
         if not lane.timetable.shows(settled[-1], len(world.qpos), world.physics.fps):
             raise Rejected(f"{LANES[k]}: no window of a second shows the settled outcome")
-    if off > OFF_ALONE_M:
-        raise Rejected(f"a decisive body is {off:.4f} m from where it is without the other lane")
-    return {"settled_frames": settled, "off_alone_m": round(off, 6)}
+    return {"settled_frames": settled}
 
 
 def _passages(world: TwoLanes) -> dict[str, Any]:
@@ -78,11 +76,17 @@ def _seen(world: TwoLanes) -> dict[str, Any]:
     frames = np.arange(0, n_frames, EVERY)
     geoms = [world.geoms(k) for k in range(len(LANES))]
     decisive = [world.geoms(k, hidden_element=False) for k in range(len(LANES))]
-    flags = [[f"{name} {flag_of(mark)}" for mark in event.scene.marks] for name, event in zip(LANES, world.events, strict=True)]
-    strips = [f"{name} strip" for name in LANES]
-    names = list(dict.fromkeys([n for k in range(len(LANES)) for n in (*geoms[k], *world.doubles(k), *flags[k])] + strips))
+    flags = [
+        [f"{name} {flag_of(mark)}" for mark in event.scene.marks]
+        for name, event in zip(LANES, world.events, strict=True)
+    ]
+    strips = [f"{name} lane mark" for name in LANES]
+    names = list(
+        dict.fromkeys([n for k in range(len(LANES)) for n in (*geoms[k], *world.doubles(k), *flags[k])] + strips)
+    )
     with Renderer(world.model, world.camera, supersample=1) as renderer:
         seen = {clip: renderer.visible_pixels(world.clip(CLIPS[clip])[frames], names) for clip in ("neither", "both")}
+
     def px(clip: str, wanted: Sequence[str]) -> np.ndarray:
         return seen[clip][:, [names.index(name) for name in wanted]].sum(axis=1)
 

@@ -108,7 +108,9 @@ def _event(family: Family, physics: Physics, rng: np.random.Generator, like: Any
         elevation = float(np.clip(params.elevation_deg, *ELEVATION_DEG))
         params = replace(params, elevation_deg=elevation if like is None else like.elevation_deg)
         if like is not None:
-            params = replace(params, **{m.name: value for m in fields(like) if _is_colour(value := getattr(like, m.name))})
+            params = replace(
+                params, **{m.name: value for m in fields(like) if _is_colour(value := getattr(like, m.name))}
+            )
         event = Event(family, params, physics)
         twins = [Event(family, twin, physics) for twin in family.twins(params)]
         try:

@@ -130,7 +130,7 @@ def layout_from(record: dict[str, Any]) -> Layout:
     boards = {place: Occluder.from_record(record["boards"][place]) for place in PLACES}
     strip = Box(*(tuple(record["strip"][end]) for end in ("low", "high")))
     shift, bench = (tuple(record[name]) for name in ("shift", "bench"))
-    return Layout(shift, bench, record["bench_half_m"], strip, boards)
+    return Layout(shift, bench, tuple(record["bench_half"]), strip, boards)
 
 
 def layout_record(layout: Layout) -> dict[str, Any]:

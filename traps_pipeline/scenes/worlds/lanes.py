@@ -39,7 +39,10 @@ BENCH_M, BENCH_DEPTH_M = 0.04, 0.16  # thickness and depth of a bench
 STRIP_M, STRIP_GAP_M = 0.09, 0.05  # depth of a lane's strip, and what is before and behind it
 DOUBLES = 3  # at most
 DOUBLE_GAP_M = 0.03
-SLIDE_M = (0.05, 0.4)  # how far doubles slide
+BENCH_EDGE_M = 0.05  # that a board reaches beyond its bench, on each side
+LEG_M = 0.012  # half width of a bench's leg
+BENCH_RGBA = (0.36, 0.33, 0.36, 1.0)  # of no colour that a question names
+SLIDE_M = (0.06, 0.4)  # how far doubles slide
 AWAY_M = 60.0  # so high hangs a board that is not there
 ROUNDS = 24  # in which camera, boards and benches are fitted to each other
 
@@ -62,6 +65,21 @@ class Lane:
     slide_s: float
     slides_to: int
     timetable: Timetable
+
+
+@dataclass(frozen=True)
+class Doubles:
+    """Box corners of bodies from their origin, (N, 3), by name, and the width of all side by side (m)."""
+
+    spans: Mapping[str, np.ndarray]
+    width_m: float
+
+    @property
+    def size_m(self) -> tuple[float, float]:
+        """Depth and height of the largest (m)."""
+        return max(float(np.ptp(s[:, 1])) for s in self.spans.values()), max(
+            float(np.ptp(s[:, 2])) for s in self.spans.values()
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,10 +114,11 @@ class Event:
     @cached_property
     def motion(self) -> Motion:
         """Poses of all bodies. Raises Rejected."""
-        return replay(self.model, self._qpos, self.physics)
+        return replay(self.model, self.qpos, self.physics)
 
     @cached_property
-    def _qpos(self) -> np.ndarray:
+    def qpos(self) -> np.ndarray:
+        """The trajectory, (F, nq). Raises Rejected."""
         return simulated(self.model, self.scene, self.physics)
 
     @cached_property
@@ -111,7 +130,26 @@ class Event:
     def points(self) -> np.ndarray:
         """Corners of all that is ever shown, (N, 3)."""
         framed = [box.corners() for box in self.scene.framed]
-        return np.concatenate([swept_points(self.model, self._qpos), *geom_corners(self.model).values(), *framed])
+        return np.concatenate([swept_points(self.model, self.qpos), *geom_corners(self.model).values(), *framed])
+
+    @cached_property
+    def doubles(self) -> Doubles:
+        """The bodies that have a double on the bench: what decides, as far as there is room."""
+        import mujoco
+
+        model, corners = self.model, geom_corners(self.model)
+        data, room = mujoco.MjData(model), float(np.ptp(self.cover.corners()[:, 0])) / 2
+        mujoco.mj_kinematics(model, data)
+        spans: dict[str, np.ndarray] = {}
+        used = 0.0
+        for body in self.scene.decisive[:DOUBLES]:
+            own = [model.geom(i).name for i in range(model.ngeom) if model.geom_bodyid[i] == model.body(body).id]
+            span = np.concatenate([corners[name] for name in own]) - data.body(body).xpos
+            width = float(np.ptp(span[:, 0])) + DOUBLE_GAP_M
+            if not spans or used + width < room:
+                spans[body] = span
+                used += width
+        return Doubles(spans, used)
 
 
 def geom_corners(model: mujoco.MjModel, qpos: np.ndarray | None = None) -> dict[str, np.ndarray]:
@@ -140,7 +178,7 @@ class Layout:
 
     shift: Vec3
     bench: Vec3
-    bench_half_m: float
+    bench_half: tuple[float, float]  # across and in depth
     strip: Box
     boards: Mapping[str, Occluder]
 
@@ -160,6 +198,8 @@ def fit_lanes(lanes: Sequence[Lane], worlds: Sequence[Sequence[Event]]) -> tuple
     view = replace(worlds[0][0].scene.view, azimuth_deg=90.0)
     down = np.radians(-view.elevation_deg)
     benches = [_first_bench(lane, shown, down) for lane, shown in zip(lanes, points, strict=True)]
+    doubles = [events[0].doubles for events in worlds]
+    bench_depths = [max(BENCH_DEPTH_M, d.size_m[0] + DOUBLE_GAP_M) for d in doubles]
     half = max(float(np.ptp(shown[:, 0])) for shown in points) / 2 + GAP_M / 2
     layouts: list[Layout] = []
     camera = None
@@ -171,14 +211,26 @@ def fit_lanes(lanes: Sequence[Lane], worlds: Sequence[Sequence[Event]]) -> tuple
         camera = fit_camera(view, np.concatenate([everything, everything * (-1, 1, 1)]), WideCamera)
         layouts = []
         for k, lane in enumerate(lanes):
-            board = fit_occluder(camera, box_around([covers[k] + shifts[k]]))
-            layout = _layout(camera, lane, shown[k], board, shifts[k], benches[k])
+            board = _wide_enough(fit_occluder(camera, box_around([covers[k] + shifts[k]])), doubles[k], down)
+            layout = _layout(camera, lane, shown[k], board, shifts[k], benches[k], bench_depths[k])
             benches[k] = _moved_apart(camera, lane.bench_above, shown[k], layout, down)
             layouts.append(layout)
-        reach = max(float(np.abs(layout.corners[:, 0] - side * half).max()) for side, layout in zip(SIDES, layouts, strict=True))
+        reach = max(
+            float(np.abs(layout.corners[:, 0] - side * half).max()) for side, layout in zip(SIDES, layouts, strict=True)
+        )
         half = max(half, reach + GAP_M / 2)
     assert camera is not None
     return camera, tuple(layouts)
+
+
+def _wide_enough(board: Occluder, doubles: Doubles, down: float) -> Occluder:
+    """Return a board that is large enough to hide doubles on a bench as well."""
+    across, thick, up = board.half
+    deep, high = doubles.size_m
+    hides = high + (deep + BENCH_DEPTH_M) * float(np.tan(down))
+    across, grown = max(across, (doubles.width_m + SLIDE_M[0]) / 2 + BENCH_EDGE_M), max(up, hides / 2)
+    x, y, z = board.centre
+    return replace(board, half=(across, thick, grown), centre=(x, y, z + grown - up))
 
 
 def _middle(values: np.ndarray) -> float:
@@ -195,11 +247,11 @@ def _first_bench(lane: Lane, shown: np.ndarray, down: float) -> tuple[float, flo
 
 
 def _layout(
-    camera: Camera, lane: Lane, shown: np.ndarray, board: Occluder, shift: Vec3, bench: tuple[float, float]
+    camera: Camera, lane: Lane, shown: np.ndarray, board: Occluder, shift: Vec3, bench: tuple[float, float], deep: float
 ) -> Layout:
     """Return a lane's layout: the bench's board has the size in the picture of the scene's."""
     y, z = bench
-    front = y - BENCH_DEPTH_M / 2 - board.half[1]
+    front = y - deep / 2 - board.half[1]
     place = np.array([board.centre[0], front, z + board.half[2]])
     scale = camera.metres_a_pixel(place) / camera.metres_a_pixel(np.array(board.centre))
     across, thick, up = (half * factor for half, factor in zip(board.half, (scale, 1.0, scale), strict=True))
@@ -207,17 +259,18 @@ def _layout(
     slack = max(0.0, (high - low) / 2 - across)
     x = (low + high) / 2 + lane.bench_at * slack
     bench_board = Occluder((x, front, z + up), (across, thick, up), board.yaw_deg)
-    near = min(float(shown[:, 1].min()), float(board.corners()[:, 1].min()), y - BENCH_DEPTH_M) - STRIP_GAP_M
+    near = min(float(shown[:, 1].min()), float(board.corners()[:, 1].min()), y - deep) - STRIP_GAP_M
     strip = Box((low, near - STRIP_M, 0.0), (high, near, 0.004))
-    return Layout(shift, (x, y, z), across - 0.05, strip, {"scene": board, "bench": bench_board})
+    return Layout(shift, (x, y, z), (across - BENCH_EDGE_M, deep / 2), strip, {"scene": board, "bench": bench_board})
 
 
-def _moved_apart(
-    camera: Camera, above: bool, shown: np.ndarray, layout: Layout, down: float
-) -> tuple[float, float]:
+def _moved_apart(camera: Camera, above: bool, shown: np.ndarray, layout: Layout, down: float) -> tuple[float, float]:
     """Return a bench's place so that its board and the scene are just apart in the picture."""
     x, y, z = layout.bench
-    rows = [camera.project(c)[:, 1] for c in (np.concatenate([shown, layout.boards["scene"].corners()]), layout.boards["bench"].corners())]
+    rows = [
+        camera.project(c)[:, 1]
+        for c in (np.concatenate([shown, layout.boards["scene"].corners()]), layout.boards["bench"].corners())
+    ]
     metres = camera.metres_a_pixel(np.array(layout.bench))
     if above:
         missing_px = rows[1].max() + CLEAR_PX - rows[0].min()
@@ -249,30 +302,31 @@ class TwoLanes:
         return replace(self, events=events)
 
     @cached_property
-    def _built(self) -> tuple[mujoco.MjModel, Scene]:
+    def model(self) -> mujoco.MjModel:
+        """The compiled world."""
         spec = new_spec(self.physics)
         spec.light("key").castshadow = False
-        velocity: dict[str, Sequence[float]] = {}
         for name, lane, event, layout in zip(LANES, self.lanes, self.events, self.layouts, strict=True):
-            scene = _lane_scene(event, lane, layout)
-            spec.attach(scene.spec, prefix=f"{name} ", frame=spec.worldbody.add_frame(pos=list(layout.shift)))
-            velocity |= {f"{name} {body}": values for body, values in scene.velocity.items()}
-            _paint(spec, name, lane, layout)
+            frame = spec.worldbody.add_frame(pos=list(layout.shift))
+            spec.attach(_lane_spec(event, layout), prefix=f"{name} ", frame=frame)
+            _paint(spec, name, lane.strip, layout)
         for name, layout in zip(LANES, self.layouts, strict=True):  # last: the last columns of a pose are theirs
             for place in PLACES:
                 _hang(spec, board_of(name, place), layout.boards[place])
-        model = spec.compile()
-        return model, Scene(spec, self.events[0].scene.view, (), (), velocity=velocity)
-
-    @property
-    def model(self) -> mujoco.MjModel:
-        """The compiled world."""
-        return self._built[0]
+        return spec.compile()
 
     @cached_property
     def qpos(self) -> np.ndarray:
-        """The trajectory, all boards standing, (F, nq). Raises Rejected."""
-        return simulated(*self._built, self.physics)
+        """The trajectory with all boards standing, (F, nq): each lane's is the family's own, simulated by itself.
+
+        Nothing of one lane can touch the other. Simulated together, the solver would let rounding pass between them,
+        and a twin would not leave the other lane as it is.
+        """
+        parts = []
+        for lane, event, layout in zip(self.lanes, self.events, self.layouts, strict=True):
+            parts += [_shifted(event, layout.shift), _slide(lane, event, layout)]
+        boards = np.zeros((self.physics.n_frames, len(LANES) * len(PLACES)))
+        return np.hstack([*parts, boards]).astype(np.float32)
 
     def motion(self, lane: int) -> Motion:
         """Return the poses of a lane's bodies, as its family knows them."""
@@ -288,11 +342,6 @@ class TwoLanes:
     def outcome(self, lane: int) -> Outcome:
         """Return a lane's outcome, read by its family."""
         return read_outcome(self.events[lane].family, self.motion(lane), self.events[lane].params)
-
-    def off_alone_m(self, lane: int) -> float:
-        """Return how far (m) a decisive body is, at most, from where it is without the other lane."""
-        here, alone = self.motion(lane), self.events[lane].motion
-        return max(float(np.abs(here.pos(body) - alone.pos(body)).max()) for body in self.events[lane].scene.decisive)
 
     def clip(self, hidden: Sequence[bool]) -> np.ndarray:
         """Return the poses of the clip in which some lanes are hidden, (F, nq)."""
@@ -315,7 +364,9 @@ class TwoLanes:
     def doubles(self, lane: int) -> tuple[str, ...]:
         """Return the names of the geoms of a lane's doubles."""
         prefix = f"{LANES[lane]} double "
-        return tuple(name for name in (self.model.geom(i).name for i in range(self.model.ngeom)) if name.startswith(prefix))
+        return tuple(
+            name for name in (self.model.geom(i).name for i in range(self.model.ngeom)) if name.startswith(prefix)
+        )
 
 
 def standing_before(is_hidden: bool) -> str:
@@ -339,57 +390,50 @@ def out_of_picture_m(board: Occluder, camera: Camera) -> float:
 # --- parts of a lane --------------------------------------------------------------------------------------------------
 
 
-def _lane_scene(event: Event, lane: Lane, layout: Layout) -> Scene:
-    """Return a family's scene without floor, sky and light of its own, and with its doubles."""
+def _lane_spec(event: Event, layout: Layout) -> mujoco.MjSpec:
+    """Return a family's scene without floor, sky and light of its own, and with doubles on its bench."""
     import mujoco
 
-    scene = event.family.build(event.params, event.physics)
-    spec = scene.spec
+    spec = event.family.build(event.params, event.physics).spec
     for geom in [geom for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]:
         spec.delete(geom)
     own = [*spec.lights, *spec.textures, *(material for material in spec.materials if material.name == "floor")]
     for element in own:
         spec.delete(element)
-    place = np.subtract(layout.bench, layout.shift)
-    velocity = dict(scene.velocity)
-    velocity |= _add_doubles(event, scene, lane, place, layout.bench_half_m)
-    return replace(scene, velocity=velocity)
+    data = mujoco.MjData(event.model)
+    mujoco.mj_kinematics(event.model, data)
+    x, y, z = np.subtract(layout.bench, layout.shift)
+    x -= event.doubles.width_m / 2
+    for n, (body, span) in enumerate(event.doubles.spans.items()):
+        place = (x + DOUBLE_GAP_M / 2 - span[:, 0].min(), y - _middle(span[:, 1]), z - span[:, 2].min())
+        x += float(np.ptp(span[:, 0])) + DOUBLE_GAP_M
+        copied = spec.worldbody.add_body(
+            name=f"double {n}", pos=[float(at) for at in place], quat=data.body(body).xquat
+        )
+        axis = data.body(body).xmat.reshape(3, 3).T @ (1.0, 0.0, 0.0)
+        copied.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis.tolist())
+        copied.mass, copied.inertia, copied.explicitinertial = 1.0, [1.0, 1.0, 1.0], True
+        for i, geom in enumerate(spec.body(body).geoms):
+            _copy_geom(copied, geom, f"double {n} {i}")
+    return spec
 
 
-def _add_doubles(
-    event: Event, scene: Scene, lane: Lane, bench: np.ndarray, half_m: float
-) -> dict[str, tuple[float, ...]]:
-    """Add copies of what decides to the bench; return their first speeds."""
+def _shifted(event: Event, shift: Vec3) -> np.ndarray:
+    """Return an event's trajectory where its lane is: places of free bodies are those of the world."""
     import mujoco
 
-    model, data = event.model, mujoco.MjData(event.model)
-    mujoco.mj_kinematics(model, data)
-    corners = geom_corners(model)
-    bodies, spans, used = [], [], 0.0
-    for body in scene.decisive:
-        own = [model.geom(i).name for i in range(model.ngeom) if model.geom_bodyid[i] == model.body(body).id]
-        span = np.concatenate([corners[name] for name in own])
-        if len(bodies) < DOUBLES and (not bodies or used + np.ptp(span[:, 0]) + DOUBLE_GAP_M < 1.4 * half_m):
-            bodies.append(body)
-            spans.append(span - data.body(body).xpos)
-            used += float(np.ptp(span[:, 0])) + DOUBLE_GAP_M
-    slide = min(SLIDE_M[1], 2 * half_m - used)
-    if slide < SLIDE_M[0]:
-        raise Rejected(f"what decides is too wide for a bench of {2 * half_m:.2f} m")
-    x, speeds = bench[0] - used / 2 - lane.slides_to * slide / 2, {}
-    for n, (body, span) in enumerate(zip(bodies, spans, strict=True)):
-        x += DOUBLE_GAP_M / 2
-        at = (x - float(span[:, 0].min()), bench[1] - _middle(span[:, 1]), bench[2] - float(span[:, 2].min()))
-        x += float(np.ptp(span[:, 0])) + DOUBLE_GAP_M / 2
-        name = f"double {n}"
-        copied = scene.spec.worldbody.add_body(name=name, pos=list(at), quat=data.body(body).xquat)
-        axis = np.linalg.inv(data.body(body).xmat.reshape(3, 3)) @ (1.0, 0.0, 0.0)
-        copied.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis.tolist(), damping=[1 / lane.slide_s, 0, 0])
-        copied.mass, copied.inertia, copied.explicitinertial = 1.0, [1.0, 1.0, 1.0], True
-        for i, geom in enumerate(scene.spec.body(body).geoms):
-            _copy_geom(copied, geom, f"{name} {i}")
-        speeds[name] = (lane.slides_to * slide / lane.slide_s,)
-    return speeds
+    qpos = event.qpos.astype(float)
+    for joint in np.flatnonzero(event.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
+        address = event.model.jnt_qposadr[joint]
+        qpos[:, address : address + 3] += shift
+    return qpos
+
+
+def _slide(lane: Lane, event: Event, layout: Layout) -> np.ndarray:
+    """Return where the doubles are along their bench, from its middle: they slow down to rest, (F, doubles)."""
+    far = min(SLIDE_M[1], 2 * layout.bench_half[0] - event.doubles.width_m)
+    left = np.exp(-np.arange(event.physics.n_frames) / event.physics.fps / lane.slide_s)
+    return np.repeat((lane.slides_to * far * (0.5 - left))[:, None], len(event.doubles.spans), axis=1)
 
 
 def _copy_geom(body: mujoco.MjsBody, geom: mujoco.MjsGeom, name: str) -> None:
@@ -400,16 +444,21 @@ def _copy_geom(body: mujoco.MjsBody, geom: mujoco.MjsGeom, name: str) -> None:
     copied.meshname, copied.contype, copied.conaffinity, copied.mass = geom.meshname, 0, 0, 0
 
 
-def _paint(spec: mujoco.MjSpec, name: str, lane: Lane, layout: Layout) -> None:
-    """Add a lane's strip and its bench, without contact."""
-    (x, y, z), half = layout.bench, layout.bench_half_m
+def _paint(spec: mujoco.MjSpec, name: str, colour: str, layout: Layout) -> None:
+    """Add a lane's strip and its bench, a plate on two legs, without contact."""
+    (x, y, z), (half, deep) = layout.bench, layout.bench_half
     low, high = np.array(layout.strip.low), np.array(layout.strip.high)
-    parts = {
-        "strip": ((low + high) / 2, (high - low) / 2, lane.strip),
-        "bench": (np.array([x, y, z / 2]), np.array([half, BENCH_DEPTH_M / 2, z / 2]), "grey"),
-    }
-    for part, (centre, size, colour) in parts.items():
-        add_box(spec.worldbody, f"{name} {part}", centre.tolist(), size.tolist(), colour, contype=0, conaffinity=0)
+    parts = [
+        ("mark", (low + high) / 2, (high - low) / 2),
+        ("bench", (x, y, z - BENCH_M / 2), (half, deep, BENCH_M / 2)),
+    ]
+    if z > BENCH_M:
+        legs = ((n, x + side * (half - LEG_M)) for n, side in enumerate(SIDES))
+        parts += [(f"leg {n}", (at, y, (z - BENCH_M) / 2), (LEG_M, LEG_M, (z - BENCH_M) / 2)) for n, at in legs]
+    for part, centre, size in parts:
+        geom = add_box(spec.worldbody, f"{name} lane {part}", centre, size, colour, contype=0, conaffinity=0)
+        if part != "mark":
+            geom.rgba = BENCH_RGBA
 
 
 def _hang(spec: mujoco.MjSpec, name: str, board: Occluder) -> None:
