@@ -11,21 +11,24 @@ from typing import Any
 import numpy as np
 
 from traps_pipeline.scenes.physics.kit import flag_of
+from traps_pipeline.scenes.picture.camera import HEIGHT
 from traps_pipeline.scenes.picture.render import Renderer
 from traps_pipeline.scenes.worlds.lane_records import CLIPS
-from traps_pipeline.scenes.worlds.lanes import AWAY_M, LANES, PLACES, TwoLanes, board_of, geom_corners
+from traps_pipeline.scenes.worlds.lanes import LANES, PLACES, TwoLanes, board_of, geom_corners
 from traps_pipeline.scenes.worlds.outcome import Rejected
 
 OUTCOME_PX = 75.0  # of what decides, in each frame of the window
 DOUBLE_PX = 40.0  # of the doubles, in each frame of the window of a hidden lane
 STRIP_PX = 100.0  # of a lane's strip, in every frame
 FLAG_PX = 25.0  # of each flag, in a hidden lane's first frame without a moving board
+SHARES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)  # of the clip, at which the record keeps what is in view
 EVERY = 2  # frames of which one is drawn
 
 
 def certify_lanes(world: TwoLanes, twins: Sequence[TwoLanes]) -> dict[str, Any]:
     """Return a world's evidence; twins: the worlds with the twin in the left and in the right lane. Raises Rejected."""
-    evidence = {**_outcomes(world, twins), **_passages(world)}
+    evidence = _outcomes(world, twins)
+    _check_places(world)
     return evidence | _seen(world) | _twins(world, twins)
 
 
@@ -48,7 +51,7 @@ def _outcomes(world: TwoLanes, twins: Sequence[TwoLanes]) -> dict[str, Any]:
     return {"settled_frames": settled}
 
 
-def _passages(world: TwoLanes) -> dict[str, Any]:
+def _check_places(world: TwoLanes) -> None:
     """Check that boards pass through nothing, and that each lane stays in its half of the picture."""
     model, camera = world.model, world.camera
     poses = [geom_corners(model, row) for row in world.qpos[::5]]
@@ -60,7 +63,7 @@ def _passages(world: TwoLanes) -> dict[str, Any]:
             is_left = name.removeprefix("board ").startswith(LANES[0])
             if (columns.max() > edge) if is_left else (columns.min() < edge):
                 raise Rejected(f"{name} reaches into the other lane's half of the picture")
-            if columns.min() < 0 or columns.max() > camera.width or rows.max() > 360 or rows.min() < 0:
+            if columns.min() < 0 or columns.max() > camera.width or rows.max() > HEIGHT or rows.min() < 0:
                 raise Rejected(f"{name} is not in the picture")
         for board in names:
             low, high = pose[board].min(axis=0), pose[board].max(axis=0)
@@ -68,7 +71,6 @@ def _passages(world: TwoLanes) -> dict[str, Any]:
                 is_there = (corners.max(axis=0) > low)[:2].all() and (corners.min(axis=0) < high)[:2].all()
                 if name not in names and is_there and corners[:, 2].max() > low[2] + 1e-6:
                     raise Rejected(f"{board} passes through {name}")
-    return {}
 
 
 def _seen(world: TwoLanes) -> dict[str, Any]:
@@ -81,8 +83,11 @@ def _seen(world: TwoLanes) -> dict[str, Any]:
         for name, event in zip(LANES, world.events, strict=True)
     ]
     strips = [f"{name} lane mark" for name in LANES]
+    boards = [[board_of(name, place) for place in PLACES] for name in LANES]
     names = list(
-        dict.fromkeys([n for k in range(len(LANES)) for n in (*geoms[k], *world.doubles(k), *flags[k])] + strips)
+        dict.fromkeys(
+            [n for k in range(len(LANES)) for n in (*geoms[k], *world.doubles(k), *flags[k], *boards[k])] + strips
+        )
     )
     with Renderer(world.model, world.camera, supersample=1) as renderer:
         seen = {clip: renderer.visible_pixels(world.clip(CLIPS[clip])[frames], names) for clip in ("neither", "both")}
@@ -90,7 +95,8 @@ def _seen(world: TwoLanes) -> dict[str, Any]:
     def px(clip: str, wanted: Sequence[str]) -> np.ndarray:
         return seen[clip][:, [names.index(name) for name in wanted]].sum(axis=1)
 
-    evidence: dict[str, Any] = {"outcome_px": [], "double_px": [], "hidden_from": [], "flag_px": []}
+    at = np.rint(np.array(SHARES) * (len(frames) - 1)).astype(int)
+    evidence: dict[str, Any] = {"outcome_px": [], "double_px": [], "hidden_from": [], "flag_px": [], "in_view": []}
     for k, lane in enumerate(world.lanes):
         commit = world.outcome(k).commit_frame
         start, stop = lane.timetable.window(commit, n_frames)
@@ -101,6 +107,15 @@ def _seen(world: TwoLanes) -> dict[str, Any]:
         evidence["hidden_from"].append(int(frames[visible[-1]]) + EVERY if visible.size else 0)
         element = [name for name in geoms[k] if name not in decisive[k]]
         evidence["flag_px"].append([float(px("both", [flag]).max()) for flag in flags[k]])
+        evidence["in_view"].append(
+            {
+                side: {
+                    "alike_px": px(clip, [*decisive[k], *world.doubles(k)])[at].tolist(),
+                    "board_px": px(clip, boards[k])[at].tolist(),
+                }
+                for side, clip in (("seen", "neither"), ("hidden", "both"))
+            }
+        )
         if evidence["outcome_px"][-1] < OUTCOME_PX:
             raise Rejected(f"{LANES[k]}: the outcome has {evidence['outcome_px'][-1]:.0f} pixels in its window")
         if evidence["double_px"][-1] < DOUBLE_PX:

@@ -11,6 +11,7 @@ import numpy as np
 from traps_pipeline.scenes.certification.lane_certificates import certify_lanes
 from traps_pipeline.scenes.draw.resolve import plain
 from traps_pipeline.scenes.family_registry import get_family
+from traps_pipeline.scenes.parts.look import draw_look
 from traps_pipeline.scenes.physics.kit import COLOURS, LOOK_ALIKE, Family, Physics, Wording, params_to_dict, uniform
 from traps_pipeline.scenes.worlds.lane_records import LaneRecord, LaneTwin, TwoEventsSpec, layout_record
 from traps_pipeline.scenes.worlds.lanes import Event, Lane, TwoLanes, fit_lanes
@@ -18,6 +19,7 @@ from traps_pipeline.scenes.worlds.outcome import Rejected
 from traps_pipeline.scenes.worlds.spec import physics_record, trajectory_digest
 from traps_pipeline.scenes.worlds.timetable import draw_timetable
 
+LOOKS = ("pale-floor", "light")  # parts of the look that vary
 STRIPS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
 SETTLES_S = (0.5, 3.6)  # when both worlds of a lane have settled
 ELEVATION_DEG = (-40.0, -22.0)  # of the camera: a bench below the scene needs it to look down
@@ -63,8 +65,10 @@ def _scenario(family: Family, scenario_id: str, rng: np.random.Generator, seed: 
         raise Rejected("the lanes have no question in common")
     strips = _strips(wordings[0], [event.scene.inventory.colours for pair in pairs for event in pair], rng)
     lanes = [_lane(pair, strip, rng) for pair, strip in zip(pairs, strips, strict=True)]
+    look = draw_look(rng, LOOKS)
+    assert look is not None
     camera, layouts = fit_lanes(lanes, pairs)
-    world = TwoLanes((lanes[0], lanes[1]), (pairs[0][0], pairs[1][0]), camera, layouts)
+    world = TwoLanes((lanes[0], lanes[1]), (pairs[0][0], pairs[1][0]), camera, layouts, look)
     twins = [world.with_event(k, pair[1]) for k, pair in enumerate(pairs)]
     evidence = certify_lanes(world, twins)
     records = [
@@ -89,6 +93,7 @@ def _scenario(family: Family, scenario_id: str, rng: np.random.Generator, seed: 
         seed=seed,
         physics=physics_record(physics),
         camera=plain(asdict(camera)),
+        look=plain(asdict(look)),
         lanes=records,
         question=wordings[0].question,
         labels=list(wordings[0].labels),

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from traps_pipeline.base.files import replace_file
 from traps_pipeline.scenes.family_registry import get_family
+from traps_pipeline.scenes.parts.look import Look
 from traps_pipeline.scenes.physics.kit import Box, Physics
 from traps_pipeline.scenes.picture.camera import Occluder, WideCamera
 from traps_pipeline.scenes.worlds.lanes import LANES, PLACES, Event, Lane, Layout, TwoLanes
@@ -21,9 +22,8 @@ from traps_pipeline.scenes.worlds.timetable import Timetable
 
 Hidden = tuple[bool, bool]  # which lanes of a clip are hidden: left, right
 CLIPS: dict[str, Hidden] = {
-    name: hidden
-    for name, hidden in zip(("neither", "right", "left", "both"), product((False, True), repeat=2), strict=True)
-}
+    "neither": (False, False), "right": (False, True), "left": (True, False), "both": (True, True),
+}  # fmt: skip
 
 
 class _Record(BaseModel):
@@ -68,6 +68,7 @@ class TwoEventsSpec(_Record):
     seed: int
     physics: dict[str, Any]
     camera: dict[str, Any]
+    look: dict[str, Any]
     lanes: list[LaneRecord] = Field(min_length=2, max_length=2)
     question: str = Field(min_length=1)
     labels: list[str] = Field(min_length=2)
@@ -93,7 +94,9 @@ class TwoEventsSpec(_Record):
         left, right = (Event(family, family.params_from(values), physics) for values in params)
         first, second = (record.lane for record in self.lanes)
         layouts = tuple(layout_from(record.layout) for record in self.lanes)
-        return TwoLanes((first, second), (left, right), WideCamera.from_record(self.camera), layouts)
+        return TwoLanes(
+            (first, second), (left, right), WideCamera.from_record(self.camera), layouts, Look.from_record(self.look)
+        )
 
     def items(self) -> Iterator[Item]:
         """Yield the eight items, four of which can be answered."""

@@ -20,9 +20,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.scenes.physics.kit import Box, Family, Motion, Physics, Scene, Vec3, add_box, new_spec
+from traps_pipeline.scenes.parts.look import Look, apply_look
+from traps_pipeline.scenes.physics.kit import Box, Family, Motion, Physics, Scene, Vec3, View, add_box, new_spec
 from traps_pipeline.scenes.physics.simulate import replay, swept_points
-from traps_pipeline.scenes.picture.camera import HEIGHT, Camera, Occluder, WideCamera, fit_camera, fit_occluder
+from traps_pipeline.scenes.picture.camera import Camera, Occluder, WideCamera, fit_camera, fit_occluder
 from traps_pipeline.scenes.worlds.outcome import Outcome, Rejected, compile_scene, read_outcome, simulated
 from traps_pipeline.scenes.worlds.shot import box_around
 from traps_pipeline.scenes.worlds.timetable import Timetable
@@ -143,7 +144,8 @@ class Event:
         spans: dict[str, np.ndarray] = {}
         used = 0.0
         for body in self.scene.decisive[:DOUBLES]:
-            own = [model.geom(i).name for i in range(model.ngeom) if model.geom_bodyid[i] == model.body(body).id]
+            names = [model.geom(i).name for i in range(model.ngeom) if model.geom_bodyid[i] == model.body(body).id]
+            own = [name for name in names if name not in self.scene.hidden]  # which no double may show
             span = np.concatenate([corners[name] for name in own]) - data.body(body).xpos
             width = float(np.ptp(span[:, 0])) + DOUBLE_GAP_M
             if not spans or used + width < room:
@@ -166,7 +168,7 @@ def geom_corners(model: mujoco.MjModel, qpos: np.ndarray | None = None) -> dict[
     return corners
 
 
-# --- where things stand ------------------------------------------------------------------------------------------------
+# --- where things stand -----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -198,8 +200,6 @@ def fit_lanes(lanes: Sequence[Lane], worlds: Sequence[Sequence[Event]]) -> tuple
     view = replace(worlds[0][0].scene.view, azimuth_deg=90.0)
     down = np.radians(-view.elevation_deg)
     benches = [_first_bench(lane, shown, down) for lane, shown in zip(lanes, points, strict=True)]
-    doubles = [events[0].doubles for events in worlds]
-    bench_depths = [max(BENCH_DEPTH_M, d.size_m[0] + DOUBLE_GAP_M) for d in doubles]
     half = max(float(np.ptp(shown[:, 0])) for shown in points) / 2 + GAP_M / 2
     layouts: list[Layout] = []
     camera = None
@@ -211,8 +211,8 @@ def fit_lanes(lanes: Sequence[Lane], worlds: Sequence[Sequence[Event]]) -> tuple
         camera = fit_camera(view, np.concatenate([everything, everything * (-1, 1, 1)]), WideCamera)
         layouts = []
         for k, lane in enumerate(lanes):
-            board = _wide_enough(fit_occluder(camera, box_around([covers[k] + shifts[k]])), doubles[k], down)
-            layout = _layout(camera, lane, shown[k], board, shifts[k], benches[k], bench_depths[k])
+            board = fit_occluder(camera, box_around([covers[k] + shifts[k]]))
+            layout = _layout(camera, lanes[k], shown[k], board, shifts[k], benches[k], worlds[k][0].doubles)
             benches[k] = _moved_apart(camera, lane.bench_above, shown[k], layout, down)
             layouts.append(layout)
         reach = max(
@@ -221,16 +221,6 @@ def fit_lanes(lanes: Sequence[Lane], worlds: Sequence[Sequence[Event]]) -> tuple
         half = max(half, reach + GAP_M / 2)
     assert camera is not None
     return camera, tuple(layouts)
-
-
-def _wide_enough(board: Occluder, doubles: Doubles, down: float) -> Occluder:
-    """Return a board that is large enough to hide doubles on a bench as well."""
-    across, thick, up = board.half
-    deep, high = doubles.size_m
-    hides = high + (deep + BENCH_DEPTH_M) * float(np.tan(down))
-    across, grown = max(across, (doubles.width_m + SLIDE_M[0]) / 2 + BENCH_EDGE_M), max(up, hides / 2)
-    x, y, z = board.centre
-    return replace(board, half=(across, thick, grown), centre=(x, y, z + grown - up))
 
 
 def _middle(values: np.ndarray) -> float:
@@ -247,26 +237,38 @@ def _first_bench(lane: Lane, shown: np.ndarray, down: float) -> tuple[float, flo
 
 
 def _layout(
-    camera: Camera, lane: Lane, shown: np.ndarray, board: Occluder, shift: Vec3, bench: tuple[float, float], deep: float
+    camera: Camera,
+    lane: Lane,
+    shown: np.ndarray,
+    board: Occluder,
+    shift: Vec3,
+    bench: tuple[float, float],
+    doubles: Doubles,
 ) -> Layout:
-    """Return a lane's layout: the bench's board has the size in the picture of the scene's."""
+    """Return a lane's layout. Both boards have one size in the picture, so that each hides what is behind either."""
     y, z = bench
+    deep = max(BENCH_DEPTH_M, doubles.size_m[0] + DOUBLE_GAP_M)
     front = y - deep / 2 - board.half[1]
     place = np.array([board.centre[0], front, z + board.half[2]])
     scale = camera.metres_a_pixel(place) / camera.metres_a_pixel(np.array(board.centre))
-    across, thick, up = (half * factor for half, factor in zip(board.half, (scale, 1.0, scale), strict=True))
-    low, high = (float(f(shown[:, 0])) for f in (np.min, np.max))
-    slack = max(0.0, (high - low) / 2 - across)
-    x = (low + high) / 2 + lane.bench_at * slack
-    bench_board = Occluder((x, front, z + up), (across, thick, up), board.yaw_deg)
+    hides = doubles.size_m[1] + deep * float(np.tan(np.radians(-camera.elevation_deg))) + DOUBLE_GAP_M
+    across = max(board.half[0], ((doubles.width_m + SLIDE_M[0]) / 2 + BENCH_EDGE_M) / scale)
+    up = max(board.half[2], hides / 2 / scale)
+    left_m, right_m = (float(end(shown[:, 0])) for end in (np.min, np.max))
+    slack = max(0.0, (right_m - left_m) / 2 - across * scale)
+    x = (left_m + right_m) / 2 + lane.bench_at * slack
+    thick = board.half[1]
+    board = replace(board, half=(across, thick, up), centre=(*board.centre[:2], up))
+    bench_board = Occluder((x, front, z + up * scale), (across * scale, thick, up * scale), board.yaw_deg)
     near = min(float(shown[:, 1].min()), float(board.corners()[:, 1].min()), y - deep) - STRIP_GAP_M
-    strip = Box((low, near - STRIP_M, 0.0), (high, near, 0.004))
-    return Layout(shift, (x, y, z), (across - BENCH_EDGE_M, deep / 2), strip, {"scene": board, "bench": bench_board})
+    strip = Box((left_m, near - STRIP_M, 0.0), (right_m, near, 0.004))
+    half = (across * scale - BENCH_EDGE_M, deep / 2)
+    return Layout(shift, (x, y, z), half, strip, {"scene": board, "bench": bench_board})
 
 
 def _moved_apart(camera: Camera, above: bool, shown: np.ndarray, layout: Layout, down: float) -> tuple[float, float]:
     """Return a bench's place so that its board and the scene are just apart in the picture."""
-    x, y, z = layout.bench
+    _, y, z = layout.bench
     rows = [
         camera.project(c)[:, 1]
         for c in (np.concatenate([shown, layout.boards["scene"].corners()]), layout.boards["bench"].corners())
@@ -290,6 +292,7 @@ class TwoLanes:
     events: tuple[Event, Event]
     camera: Camera
     layouts: tuple[Layout, ...]
+    look: Look  # of floor and light
 
     @property
     def physics(self) -> Physics:
@@ -306,6 +309,7 @@ class TwoLanes:
         """The compiled world."""
         spec = new_spec(self.physics)
         spec.light("key").castshadow = False
+        apply_look(Scene(spec, View(), (), tuple(layout.strip for layout in self.layouts)), self.look)
         for name, lane, event, layout in zip(LANES, self.lanes, self.events, self.layouts, strict=True):
             frame = spec.worldbody.add_frame(pos=list(layout.shift))
             spec.attach(_lane_spec(event, layout), prefix=f"{name} ", frame=frame)
@@ -383,7 +387,7 @@ def out_of_picture_m(board: Occluder, camera: Camera) -> float:
     """Return how far a board rises until it is out of the picture (m)."""
     corners = board.corners()
     lifts = np.arange(0.0, AWAY_M / 4, 0.02)
-    rows = np.array([camera.project(corners + (0.0, 0.0, lift))[:, 1].max() for lift in lifts])
+    rows = np.array([camera.project(corners + np.array([0.0, 0.0, lift]))[:, 1].max() for lift in lifts])
     return float(lifts[int((rows < 0).argmax())])
 
 
@@ -394,7 +398,8 @@ def _lane_spec(event: Event, layout: Layout) -> mujoco.MjSpec:
     """Return a family's scene without floor, sky and light of its own, and with doubles on its bench."""
     import mujoco
 
-    spec = event.family.build(event.params, event.physics).spec
+    scene = event.family.build(event.params, event.physics)
+    spec = scene.spec
     for geom in [geom for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]:
         spec.delete(geom)
     own = [*spec.lights, *spec.textures, *(material for material in spec.materials if material.name == "floor")]
@@ -413,7 +418,7 @@ def _lane_spec(event: Event, layout: Layout) -> mujoco.MjSpec:
         axis = data.body(body).xmat.reshape(3, 3).T @ (1.0, 0.0, 0.0)
         copied.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis.tolist())
         copied.mass, copied.inertia, copied.explicitinertial = 1.0, [1.0, 1.0, 1.0], True
-        for i, geom in enumerate(spec.body(body).geoms):
+        for i, geom in enumerate(geom for geom in spec.body(body).geoms if geom.name not in scene.hidden):
             _copy_geom(copied, geom, f"double {n} {i}")
     return spec
 

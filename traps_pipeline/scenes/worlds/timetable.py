@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -58,7 +59,7 @@ def draw_timetable(rng: np.random.Generator, settled: int, n_frames: int, fps: i
             start = int(rng.integers(MOVES_FRAMES + 1, n_frames - lengths[1] - MOVES_FRAMES))
             spans.append((start, start + lengths[1]))
         spans += [(n_frames - lengths[2], n_frames)] if last else []
-        is_apart = all(b[0] - a[1] >= 2 * MOVES_FRAMES for a, b in zip(spans, spans[1:], strict=False))
+        is_apart = all(b[0] - a[1] >= 2 * MOVES_FRAMES for a, b in pairwise(spans))
         timetable = Timetable(tuple(spans))
         if spans and is_apart and timetable.shows(settled, n_frames, fps):
             return timetable
