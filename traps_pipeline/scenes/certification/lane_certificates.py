@@ -96,7 +96,14 @@ def _seen(world: TwoLanes) -> dict[str, Any]:
         return seen[clip][:, [names.index(name) for name in wanted]].sum(axis=1)
 
     at = np.rint(np.array(SHARES) * (len(frames) - 1)).astype(int)
-    evidence: dict[str, Any] = {"outcome_px": [], "double_px": [], "hidden_from": [], "flag_px": [], "in_view": []}
+    evidence: dict[str, Any] = {
+        "outcome_px": [],
+        "double_px": [],
+        "hidden_from": [],
+        "doubles_hidden_from": [],
+        "flag_px": [],
+        "in_view": [],
+    }
     for k, lane in enumerate(world.lanes):
         commit = world.outcome(k).commit_frame
         start, stop = lane.timetable.window(commit, n_frames)
@@ -122,7 +129,9 @@ def _seen(world: TwoLanes) -> dict[str, Any]:
             raise Rejected(f"{LANES[k]}: the doubles have {evidence['double_px'][-1]:.0f} pixels")
         if evidence["hidden_from"][-1] > commit or px("both", element).any():
             raise Rejected(f"{LANES[k]}: the board does not hide what decides")
-        if px("neither", world.doubles(k)).any():
+        seen_last = np.flatnonzero(px("neither", world.doubles(k)))
+        evidence["doubles_hidden_from"].append(int(frames[seen_last[-1]]) + EVERY if seen_last.size else 0)
+        if evidence["doubles_hidden_from"][-1] > start:
             raise Rejected(f"{LANES[k]}: the board does not hide the doubles")
         if min(evidence["flag_px"][-1], default=FLAG_PX) < FLAG_PX:
             raise Rejected(f"{LANES[k]}: a flag has {min(evidence['flag_px'][-1]):.0f} pixels")

@@ -13,7 +13,7 @@ from traps_pipeline.scenes.draw.resolve import plain
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.parts.look import draw_look
 from traps_pipeline.scenes.physics.kit import COLOURS, LOOK_ALIKE, Family, Physics, Wording, params_to_dict, uniform
-from traps_pipeline.scenes.worlds.lane_records import LaneRecord, LaneTwin, TwoEventsSpec, layout_record
+from traps_pipeline.scenes.worlds.lane_records import DRAWN, LaneRecord, LaneTwin, TwoEventsSpec, layout_record
 from traps_pipeline.scenes.worlds.lanes import Event, Lane, TwoLanes, fit_lanes
 from traps_pipeline.scenes.worlds.outcome import Rejected
 from traps_pipeline.scenes.worlds.spec import physics_record, trajectory_digest
@@ -74,7 +74,7 @@ def _scenario(family: Family, scenario_id: str, rng: np.random.Generator, seed: 
     records = [
         LaneRecord(
             params=plain(params_to_dict(lane.params)),
-            **{name: getattr(lane, name) for name in ("strip", "bench_above", "bench_at", "slide_s", "slides_to")},
+            **{name: getattr(lane, name) for name in DRAWN},
             spans=list(lane.timetable.spans),
             layout=plain(layout_record(layout)),
             ground_truth=world.outcome(k).answer,
@@ -161,8 +161,9 @@ def _lane(pair: tuple[Event, Event], strip: str, rng: np.random.Generator) -> La
         params=event.params,
         strip=strip,
         bench_above=bool(rng.integers(2)),
-        bench_at=uniform(rng, -1, 1),
-        slide_s=uniform(rng, 0.3, 1.0),
-        slides_to=1 if rng.integers(2) else -1,
+        bench_at=uniform(rng, 0, 1),
+        mirrored=bool(rng.integers(2)),
+        rests_at=uniform(rng, 0, 1),
+        sets_out_s=uniform(rng, 0, 2.5),
         timetable=timetable,
     )

@@ -25,6 +25,8 @@ CLIPS: dict[str, Hidden] = {
     "neither": (False, False), "right": (False, True), "left": (True, False), "both": (True, True),
 }  # fmt: skip
 
+DRAWN = ("strip", "bench_above", "bench_at", "mirrored", "rests_at", "sets_out_s")  # of a lane, as records store it
+
 
 class _Record(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -45,8 +47,9 @@ class LaneRecord(_Record):
     strip: str
     bench_above: bool
     bench_at: float
-    slide_s: float
-    slides_to: int
+    mirrored: bool
+    rests_at: float
+    sets_out_s: float
     spans: list[tuple[int, int]]
     layout: dict[str, Any]
     ground_truth: str
@@ -55,7 +58,7 @@ class LaneRecord(_Record):
     @property
     def lane(self) -> Lane:
         """The lane, without the family's parameters read."""
-        fields = {name: getattr(self, name) for name in ("strip", "bench_above", "bench_at", "slide_s", "slides_to")}
+        fields = {name: getattr(self, name) for name in DRAWN}
         return Lane(params=self.params, timetable=Timetable(tuple(self.spans)), **fields)
 
 
@@ -133,12 +136,13 @@ def layout_from(record: dict[str, Any]) -> Layout:
     boards = {place: Occluder.from_record(record["boards"][place]) for place in PLACES}
     strip = Box(*(tuple(record["strip"][end]) for end in ("low", "high")))
     shift, bench = (tuple(record[name]) for name in ("shift", "bench"))
-    return Layout(shift, bench, tuple(record["bench_half"]), strip, boards)
+    paths = tuple(np.array(path) for path in record["paths"])
+    return Layout(shift, bench, tuple(record["bench_half"]), strip, boards, paths)
 
 
 def layout_record(layout: Layout) -> dict[str, Any]:
     """Return a layout as records store it."""
-    return asdict(layout)
+    return {**asdict(layout), "paths": [path.tolist() for path in layout.paths]}
 
 
 def save_lane_trajectories(folder: Path, scenario_id: str, worlds: dict[str, np.ndarray]) -> dict[str, str]:

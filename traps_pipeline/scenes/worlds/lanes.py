@@ -1,11 +1,11 @@
 """Film two events of one family side by side, each in a lane of its own.
 
 A lane is a family's own scene on one half of a wide picture. A painted strip lies before it, by which a question names
-it. A bench stands above or below it in the picture, on which doubles of the things that decide slide to rest. Before
-the scene and before the bench is a board each, of the same size in the picture. In a lane that is hidden the scene's
-board stands from the first frame to the last and the bench's comes and goes; in a lane that is seen it is the other way
-round, by the same timetable. So boards, things alike and their motion are the same on both sides, up to what is asked:
-whether the scene was seen, or the bench.
+it. A bench stands above or below it in the picture, for doubles of the things that decide: these come as the things
+themselves do, until they are behind the board, and then slide to rest. Before the scene and before the bench is a board
+each, of the same size in the picture. In a lane that is hidden the scene's board stands from the first frame to the
+last and the bench's comes and goes; in a lane that is seen it is the other way round, by the same timetable. So boards,
+things alike and their motion are the same on both sides, up to what is asked: whether the scene was seen, or the bench.
 
 Boards hang on joints, so a clip is a row of poses like any other, and the renderer knows nothing of them. Nothing
 throws a shadow, which would tell what a board hides.
@@ -55,16 +55,18 @@ class Lane:
     """What is drawn of a lane.
 
     strip: its colour. bench_above: whether the bench is above the scene in the picture. bench_at: where it is along the
-    scene, -1 to 1. slide_s: time constant of the doubles' slide; slides_to: -1 or 1. timetable: of the board that comes
-    and goes.
+    lane, 0 to 1. mirrored: whether doubles come from the other side than what they are doubles of. rests_at: how far
+    they get, 0 to 1. sets_out_s: when those set out that are behind the board from the start. timetable: of the board
+    that comes and goes.
     """
 
     params: Any
     strip: str
     bench_above: bool
     bench_at: float
-    slide_s: float
-    slides_to: int
+    mirrored: bool
+    rests_at: float
+    sets_out_s: float
     timetable: Timetable
 
 
@@ -146,7 +148,7 @@ class Event:
         for body in self.scene.decisive[:DOUBLES]:
             names = [model.geom(i).name for i in range(model.ngeom) if model.geom_bodyid[i] == model.body(body).id]
             own = [name for name in names if name not in self.scene.hidden]  # which no double may show
-            span = np.concatenate([corners[name] for name in own]) - data.body(body).xpos
+            span = np.concatenate([corners[name] for name in own or names]) - data.body(body).xpos
             width = float(np.ptp(span[:, 0])) + DOUBLE_GAP_M
             if not spans or used + width < room:
                 spans[body] = span
@@ -175,7 +177,8 @@ def geom_corners(model: mujoco.MjModel, qpos: np.ndarray | None = None) -> dict[
 class Layout:
     """Where things of a lane are, in the world.
 
-    shift: of the family's own scene. bench: the middle of the bench's upper face. boards: by `PLACES`.
+    shift: of the family's own scene. bench: the middle of the bench's upper face. boards: by `PLACES`. paths: of each
+    double, how far along and above the bench's middle its own middle and foot are, (F, 2).
     """
 
     shift: Vec3
@@ -183,11 +186,17 @@ class Layout:
     bench_half: tuple[float, float]  # across and in depth
     strip: Box
     boards: Mapping[str, Occluder]
+    paths: tuple[np.ndarray, ...]
 
     @property
     def corners(self) -> np.ndarray:
-        """Corners of strip and boards, (N, 3)."""
-        return np.concatenate([self.strip.corners(), *(board.corners() for board in self.boards.values())])
+        """Corners of strip, bench and boards, and the highest places of doubles, (N, 3)."""
+        x, y, z = self.bench
+        across, deep = self.bench_half
+        high = max(float(path[:, 1].max()) for path in self.paths)
+        bench = Box((x - across, y - deep, z - BENCH_M), (x + across, y + deep, z + high + DOUBLE_GAP_M))
+        boxes = [bench.corners(), self.strip.corners(), *(board.corners() for board in self.boards.values())]
+        return np.concatenate(boxes)
 
 
 def fit_lanes(lanes: Sequence[Lane], worlds: Sequence[Sequence[Event]]) -> tuple[Camera, tuple[Layout, ...]]:
@@ -212,7 +221,7 @@ def fit_lanes(lanes: Sequence[Lane], worlds: Sequence[Sequence[Event]]) -> tuple
         layouts = []
         for k, lane in enumerate(lanes):
             board = fit_occluder(camera, box_around([covers[k] + shifts[k]]))
-            layout = _layout(camera, lanes[k], shown[k], board, shifts[k], benches[k], worlds[k][0].doubles)
+            layout = _layout(camera, lanes[k], shown[k], board, shifts[k], benches[k], worlds[k][0])
             benches[k] = _moved_apart(camera, lane.bench_above, shown[k], layout, down)
             layouts.append(layout)
         reach = max(
@@ -243,10 +252,10 @@ def _layout(
     board: Occluder,
     shift: Vec3,
     bench: tuple[float, float],
-    doubles: Doubles,
+    event: Event,
 ) -> Layout:
     """Return a lane's layout. Both boards have one size in the picture, so that each hides what is behind either."""
-    y, z = bench
+    (y, z), doubles = bench, event.doubles
     deep = max(BENCH_DEPTH_M, doubles.size_m[0] + DOUBLE_GAP_M)
     front = y - deep / 2 - board.half[1]
     place = np.array([board.centre[0], front, z + board.half[2]])
@@ -254,16 +263,71 @@ def _layout(
     hides = doubles.size_m[1] + deep * float(np.tan(np.radians(-camera.elevation_deg))) + DOUBLE_GAP_M
     across = max(board.half[0], ((doubles.width_m + SLIDE_M[0]) / 2 + BENCH_EDGE_M) / scale)
     up = max(board.half[2], hides / 2 / scale)
-    left_m, right_m = (float(end(shown[:, 0])) for end in (np.min, np.max))
-    slack = max(0.0, (right_m - left_m) / 2 - across * scale)
-    x = (left_m + right_m) / 2 + lane.bench_at * slack
     thick = board.half[1]
     board = replace(board, half=(across, thick, up), centre=(*board.centre[:2], up))
-    bench_board = Occluder((x, front, z + up * scale), (across * scale, thick, up * scale), board.yaw_deg)
+    paths = double_paths(lane, event, board, shift, scale)
+    widths = [float(np.ptp(span[:, 0])) / 2 for span in event.doubles.spans.values()]
+    inner = across * scale - BENCH_EDGE_M
+    ends = [(float(p[:, 0].min()) - half, float(p[:, 0].max()) + half) for p, half in zip(paths, widths, strict=True)]
+    low, high = min(-inner, *(end[0] for end in ends)), max(inner, *(end[1] for end in ends))
+    left_m, right_m = (float(end(shown[:, 0])) for end in (np.min, np.max))
+    slack = max(0.0, right_m - left_m - (high - low))
+    x = (left_m + right_m) / 2 + (lane.bench_at - 0.5) * slack  # the middle of the bench
+    at = x - (low + high) / 2  # of its board
+    bench_board = Occluder((at, front, z + up * scale), (across * scale, thick, up * scale), board.yaw_deg)
     near = min(float(shown[:, 1].min()), float(board.corners()[:, 1].min()), y - deep) - STRIP_GAP_M
     strip = Box((left_m, near - STRIP_M, 0.0), (right_m, near, 0.004))
-    half = (across * scale - BENCH_EDGE_M, deep / 2)
-    return Layout(shift, (x, y, z), half, strip, {"scene": board, "bench": bench_board})
+    paths = tuple(np.round(path - ((low + high) / 2, 0.0), 4) for path in paths)
+    boards = {"scene": board, "bench": bench_board}
+    return Layout(shift, (x, y, z), ((high - low) / 2, deep / 2), strip, boards, paths)
+
+
+def double_paths(lane: Lane, event: Event, board: Occluder, shift: Vec3, scale: float) -> tuple[np.ndarray, ...]:
+    """Return where doubles are, along the bench from its board's middle and above it, (F, 2) each.
+
+    A double is before its board as long as what it is a double of, and comes as that does: along, or down from above.
+    Behind the board its path is its own, so that it tells nothing of an outcome.
+    """
+    fps, n_frames, mirror = event.physics.fps, event.physics.n_frames, -1 if lane.mirrored else 1
+    inner, paths, frames = board.half[0] * scale - BENCH_EDGE_M, [], np.arange(n_frames)
+    used = -event.doubles.width_m / 2
+    for n, (body, span) in enumerate(event.doubles.spans.items()):
+        width = float(np.ptp(span[:, 0]))
+        middle = event.motion.pos(body) + np.array(shift) + (_middle(span[:, 0]), 0.0, span[:, 2].min())
+        along = (middle[:, 0] - board.centre[0]) * scale * mirror
+        tall, top = float(np.ptp(span[:, 2])), 2 * board.half[2] * scale
+        above = np.clip(middle[:, 2] * scale, 0.0, top + tall)
+        room = max(0.0, inner - width / 2)
+        over = above + tall > top
+        path = np.zeros((n_frames, 2))
+        if abs(along[0]) > room + DOUBLE_GAP_M:  # it comes along
+            first = int((np.abs(along) <= room).argmax())
+            side = np.sign(along[0])
+            speed = max(abs(along[first] - along[first - 1]), 0.004)
+            far = 2 * room * (0.2 + 0.6 * lane.rests_at) - n * (width + DOUBLE_GAP_M)
+            path[:, 0] = np.where(frames < first, along, along[first] - side * _slowing(frames - first, far, speed))
+        elif over[0]:  # it comes down
+            first = int((~over).argmax())
+            path[:, 0] = along[0]
+            fall = (
+                above[first]
+                - (above[first - 1] - above[first]) * (frames - first)
+                - 4.9 * ((frames - first) / fps) ** 2
+            )
+            path[:, 1] = np.where(frames < first, above, np.maximum(fall, 0.0))
+        else:
+            start = used + DOUBLE_GAP_M / 2 + width / 2
+            far = min(SLIDE_M[1], max(0.0, inner - event.doubles.width_m / 2)) * (0.4 + 0.6 * lane.rests_at)
+            path[:, 0] = mirror * (start - far / 2 + _slowing(frames - round(lane.sets_out_s * fps), far, far / 5))
+        used += width + DOUBLE_GAP_M
+        paths.append(path)
+    return tuple(paths)
+
+
+def _slowing(frames: np.ndarray, far: float, speed: float) -> np.ndarray:
+    """Return how far a thing has come, in frames from when it sets out, that slows down from a speed to rest."""
+    far = max(far, DOUBLE_GAP_M)
+    return far * (1 - np.exp(-np.maximum(frames, 0) * speed / far))
 
 
 def _moved_apart(camera: Camera, above: bool, shown: np.ndarray, layout: Layout, down: float) -> tuple[float, float]:
@@ -327,8 +391,8 @@ class TwoLanes:
         and a twin would not leave the other lane as it is.
         """
         parts = []
-        for lane, event, layout in zip(self.lanes, self.events, self.layouts, strict=True):
-            parts += [_shifted(event, layout.shift), _slide(lane, event, layout)]
+        for event, layout in zip(self.events, self.layouts, strict=True):
+            parts += [_shifted(event, layout.shift), *layout.paths]
         boards = np.zeros((self.physics.n_frames, len(LANES) * len(PLACES)))
         return np.hstack([*parts, boards]).astype(np.float32)
 
@@ -408,15 +472,14 @@ def _lane_spec(event: Event, layout: Layout) -> mujoco.MjSpec:
     data = mujoco.MjData(event.model)
     mujoco.mj_kinematics(event.model, data)
     x, y, z = np.subtract(layout.bench, layout.shift)
-    x -= event.doubles.width_m / 2
     for n, (body, span) in enumerate(event.doubles.spans.items()):
-        place = (x + DOUBLE_GAP_M / 2 - span[:, 0].min(), y - _middle(span[:, 1]), z - span[:, 2].min())
-        x += float(np.ptp(span[:, 0])) + DOUBLE_GAP_M
+        place = (x - _middle(span[:, 0]), y - _middle(span[:, 1]), z - span[:, 2].min())
         copied = spec.worldbody.add_body(
             name=f"double {n}", pos=[float(at) for at in place], quat=data.body(body).xquat
         )
-        axis = data.body(body).xmat.reshape(3, 3).T @ (1.0, 0.0, 0.0)
-        copied.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis.tolist())
+        for axis in ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)):
+            turned = data.body(body).xmat.reshape(3, 3).T @ axis
+            copied.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=turned.tolist())
         copied.mass, copied.inertia, copied.explicitinertial = 1.0, [1.0, 1.0, 1.0], True
         for i, geom in enumerate(geom for geom in spec.body(body).geoms if geom.name not in scene.hidden):
             _copy_geom(copied, geom, f"double {n} {i}")
@@ -432,13 +495,6 @@ def _shifted(event: Event, shift: Vec3) -> np.ndarray:
         address = event.model.jnt_qposadr[joint]
         qpos[:, address : address + 3] += shift
     return qpos
-
-
-def _slide(lane: Lane, event: Event, layout: Layout) -> np.ndarray:
-    """Return where the doubles are along their bench, from its middle: they slow down to rest, (F, doubles)."""
-    far = min(SLIDE_M[1], 2 * layout.bench_half[0] - event.doubles.width_m)
-    left = np.exp(-np.arange(event.physics.n_frames) / event.physics.fps / lane.slide_s)
-    return np.repeat((lane.slides_to * far * (0.5 - left))[:, None], len(event.doubles.spans), axis=1)
 
 
 def _copy_geom(body: mujoco.MjsBody, geom: mujoco.MjsGeom, name: str) -> None:
