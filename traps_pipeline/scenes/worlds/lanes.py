@@ -72,9 +72,10 @@ class Lane:
 
 @dataclass(frozen=True)
 class Doubles:
-    """Box corners of bodies from their origin, (N, 3), by name, and the width of all side by side (m)."""
+    """Box corners of bodies from their origin, (N, 3), by name; the geoms shown; the width side by side (m)."""
 
     spans: Mapping[str, np.ndarray]
+    geoms: frozenset[str]
     width_m: float
 
     @property
@@ -144,16 +145,18 @@ class Event:
         data, room = mujoco.MjData(model), float(np.ptp(self.cover.corners()[:, 0])) / 2
         mujoco.mj_kinematics(model, data)
         spans: dict[str, np.ndarray] = {}
+        geoms: set[str] = set()
         used = 0.0
         for body in self.scene.decisive[:DOUBLES]:
             names = [model.geom(i).name for i in range(model.ngeom) if model.geom_bodyid[i] == model.body(body).id]
-            own = [name for name in names if name not in self.scene.hidden]  # which no double may show
-            span = np.concatenate([corners[name] for name in own or names]) - data.body(body).xpos
+            own = [name for name in names if name not in self.scene.hidden] or names  # a double shows no counterweight
+            span = np.concatenate([corners[name] for name in own]) - data.body(body).xpos
             width = float(np.ptp(span[:, 0])) + DOUBLE_GAP_M
             if not spans or used + width < room:
                 spans[body] = span
+                geoms |= {*own}
                 used += width
-        return Doubles(spans, used)
+        return Doubles(spans, frozenset(geoms), used)
 
 
 def geom_corners(model: mujoco.MjModel, qpos: np.ndarray | None = None) -> dict[str, np.ndarray]:
@@ -462,8 +465,7 @@ def _lane_spec(event: Event, layout: Layout) -> mujoco.MjSpec:
     """Return a family's scene without floor, sky and light of its own, and with doubles on its bench."""
     import mujoco
 
-    scene = event.family.build(event.params, event.physics)
-    spec = scene.spec
+    spec = event.family.build(event.params, event.physics).spec
     for geom in [geom for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]:
         spec.delete(geom)
     own = [*spec.lights, *spec.textures, *(material for material in spec.materials if material.name == "floor")]
@@ -481,7 +483,7 @@ def _lane_spec(event: Event, layout: Layout) -> mujoco.MjSpec:
             turned = data.body(body).xmat.reshape(3, 3).T @ axis
             copied.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=turned.tolist())
         copied.mass, copied.inertia, copied.explicitinertial = 1.0, [1.0, 1.0, 1.0], True
-        for i, geom in enumerate(geom for geom in spec.body(body).geoms if geom.name not in scene.hidden):
+        for i, geom in enumerate(geom for geom in spec.body(body).geoms if geom.name in event.doubles.geoms):
             _copy_geom(copied, geom, f"double {n} {i}")
     return spec
 
