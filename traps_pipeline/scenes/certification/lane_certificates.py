@@ -32,6 +32,27 @@ def certify_lanes(world: TwoLanes, twins: Sequence[TwoLanes]) -> dict[str, Any]:
     return evidence | _seen(world) | _twins(world, twins)
 
 
+def decisive_pixels(world: TwoLanes, lane: int) -> float:
+    """Return the pixels of what decides a lane's outcome at the end, where the lane is seen."""
+    return _pixels(world, "neither", world.geoms(lane, hidden_element=False), lane)
+
+
+def double_pixels(world: TwoLanes, lane: int) -> float:
+    """Return the pixels of a lane's doubles at the end, where the lane is hidden."""
+    return _pixels(world, "both", world.doubles(lane), lane)
+
+
+def _pixels(world: TwoLanes, clip: str, names: Sequence[str], lane: int) -> float:
+    settled = world.outcome(lane).commit_frame
+    start, stop = world.lanes[lane].timetable.window(settled, len(world.qpos))
+    with Renderer(world.model, world.camera, supersample=1) as renderer:
+        return (
+            float(renderer.visible_pixels(world.clip(CLIPS[clip])[stop - 1 : stop], names).sum())
+            if stop > start
+            else 0.0
+        )
+
+
 def _outcomes(world: TwoLanes, twins: Sequence[TwoLanes]) -> dict[str, Any]:
     settled = []
     for k, (lane, event, twin) in enumerate(zip(world.lanes, world.events, twins, strict=True)):

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from traps_pipeline.scenes.certification.lane_certificates import certify_lanes
+from traps_pipeline.scenes.certification.lane_certificates import certify_lanes, decisive_pixels, double_pixels
 from traps_pipeline.scenes.draw.resolve import plain
 from traps_pipeline.scenes.family_registry import get_family
-from traps_pipeline.scenes.parts.look import draw_look
+from traps_pipeline.scenes.parts.look import Look, draw_look
 from traps_pipeline.scenes.physics.kit import COLOURS, LOOK_ALIKE, Family, Physics, Wording, params_to_dict, uniform
 from traps_pipeline.scenes.worlds.lane_records import DRAWN, LaneRecord, LaneTwin, TwoEventsSpec, layout_record
 from traps_pipeline.scenes.worlds.lanes import Event, Lane, TwoLanes, fit_lanes
@@ -23,6 +23,8 @@ LOOKS = ("pale-floor", "light")  # parts of the look that vary
 STRIPS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
 SETTLES_S = (0.5, 3.6)  # when both worlds of a lane have settled
 ELEVATION_DEG = (-40.0, -22.0)  # of the camera: a bench below the scene needs it to look down
+ALIKE = (0.8, 1.25)  # size of doubles, as a share of that at which they have as many pixels as the things
+SIZES = (0.6, 1.2)  # least and most, as a share of the things' own
 EVENTS = 30  # draws of a lane's event before a scenario is given up
 TRIES = 60  # draws of a scenario
 
@@ -67,6 +69,7 @@ def _scenario(family: Family, scenario_id: str, rng: np.random.Generator, seed: 
     lanes = [_lane(pair, strip, rng) for pair, strip in zip(pairs, strips, strict=True)]
     look = draw_look(rng, LOOKS)
     assert look is not None
+    lanes = _alike(lanes, pairs, rng, look)
     camera, layouts = fit_lanes(lanes, pairs)
     world = TwoLanes((lanes[0], lanes[1]), (pairs[0][0], pairs[1][0]), camera, layouts, look)
     twins = [world.with_event(k, pair[1]) for k, pair in enumerate(pairs)]
@@ -103,6 +106,20 @@ def _scenario(family: Family, scenario_id: str, rng: np.random.Generator, seed: 
         evidence=plain(evidence),
     )
     return Drawn(spec, {"qpos": world.qpos, "left": twins[0].qpos, "right": twins[1].qpos})
+
+
+def _alike(lanes: list[Lane], pairs: list[tuple[Event, Event]], rng: np.random.Generator, look: Look) -> list[Lane]:
+    """Return the lanes with doubles of about the size in the picture that the things have in the end.
+
+    The size is that of the mean of both worlds, so that it tells nothing of the outcome.
+    """
+    camera, layouts = fit_lanes(lanes, pairs)
+    events = zip(*pairs, strict=True)
+    worlds = [TwoLanes((lanes[0], lanes[1]), (left, right), camera, layouts, look) for left, right in events]
+    wanted = [np.mean([decisive_pixels(world, k) for world in worlds]) for k in range(len(lanes))]
+    shown = [double_pixels(worlds[0], k) for k in range(len(lanes))]
+    sizes = [float(np.sqrt(w / max(s, 1.0)) * rng.uniform(*ALIKE)) for w, s in zip(wanted, shown, strict=True)]
+    return [replace(lane, size=round(float(np.clip(s, *SIZES)), 3)) for lane, s in zip(lanes, sizes, strict=True)]
 
 
 def _event(family: Family, physics: Physics, rng: np.random.Generator, like: Any) -> tuple[Event, Event]:
@@ -165,5 +182,6 @@ def _lane(pair: tuple[Event, Event], strip: str, rng: np.random.Generator) -> La
         mirrored=bool(rng.integers(2)),
         rests_at=uniform(rng, 0, 1),
         sets_out_s=uniform(rng, 0, 2.5),
+        size=1.0,
         timetable=timetable,
     )

@@ -25,7 +25,15 @@ CLIPS: dict[str, Hidden] = {
     "neither": (False, False), "right": (False, True), "left": (True, False), "both": (True, True),
 }  # fmt: skip
 
-DRAWN = ("strip", "bench_above", "bench_at", "mirrored", "rests_at", "sets_out_s")  # of a lane, as records store it
+DRAWN = (
+    "strip",
+    "bench_above",
+    "bench_at",
+    "mirrored",
+    "rests_at",
+    "sets_out_s",
+    "size",
+)  # of a lane, as records store it
 
 
 class _Record(BaseModel):
@@ -50,6 +58,7 @@ class LaneRecord(_Record):
     mirrored: bool
     rests_at: float
     sets_out_s: float
+    size: float
     spans: list[tuple[int, int]]
     layout: dict[str, Any]
     ground_truth: str

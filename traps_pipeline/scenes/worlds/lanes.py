@@ -56,8 +56,8 @@ class Lane:
 
     strip: its colour. bench_above: whether the bench is above the scene in the picture. bench_at: where it is along the
     lane, 0 to 1. mirrored: whether doubles come from the other side than what they are doubles of. rests_at: how far
-    they get, 0 to 1. sets_out_s: when those set out that are behind the board from the start. timetable: of the board
-    that comes and goes.
+    they get, 0 to 1. sets_out_s: when those set out that are behind the board from the start. size: of doubles, 1 for
+    that of the things themselves. timetable: of the board that comes and goes.
     """
 
     params: Any
@@ -67,6 +67,7 @@ class Lane:
     mirrored: bool
     rests_at: float
     sets_out_s: float
+    size: float
     timetable: Timetable
 
 
@@ -77,6 +78,10 @@ class Doubles:
     spans: Mapping[str, np.ndarray]
     geoms: frozenset[str]
     width_m: float
+
+    def sized(self, size: float) -> Doubles:
+        """Return doubles of another size."""
+        return Doubles({body: size * span for body, span in self.spans.items()}, self.geoms, size * self.width_m)
 
     @property
     def size_m(self) -> tuple[float, float]:
@@ -258,7 +263,7 @@ def _layout(
     event: Event,
 ) -> Layout:
     """Return a lane's layout. Both boards have one size in the picture, so that each hides what is behind either."""
-    (y, z), doubles = bench, event.doubles
+    (y, z), doubles = bench, event.doubles.sized(lane.size)
     deep = max(BENCH_DEPTH_M, doubles.size_m[0] + DOUBLE_GAP_M)
     front = y - deep / 2 - board.half[1]
     place = np.array([board.centre[0], front, z + board.half[2]])
@@ -269,7 +274,7 @@ def _layout(
     thick = board.half[1]
     board = replace(board, half=(across, thick, up), centre=(*board.centre[:2], up))
     paths = double_paths(lane, event, board, shift, scale)
-    widths = [float(np.ptp(span[:, 0])) / 2 for span in event.doubles.spans.values()]
+    widths = [float(np.ptp(span[:, 0])) / 2 for span in doubles.spans.values()]
     inner = across * scale - BENCH_EDGE_M
     ends = [(float(p[:, 0].min()) - half, float(p[:, 0].max()) + half) for p, half in zip(paths, widths, strict=True)]
     low, high = min(-inner, *(end[0] for end in ends)), max(inner, *(end[1] for end in ends))
@@ -293,8 +298,9 @@ def double_paths(lane: Lane, event: Event, board: Occluder, shift: Vec3, scale: 
     """
     fps, n_frames, mirror = event.physics.fps, event.physics.n_frames, -1 if lane.mirrored else 1
     inner, paths, frames = board.half[0] * scale - BENCH_EDGE_M, [], np.arange(n_frames)
-    used = -event.doubles.width_m / 2
-    for n, (body, span) in enumerate(event.doubles.spans.items()):
+    doubles = event.doubles.sized(lane.size)
+    used = -doubles.width_m / 2
+    for n, (body, span) in enumerate(doubles.spans.items()):
         width = float(np.ptp(span[:, 0]))
         middle = event.motion.pos(body) + np.array(shift) + (_middle(span[:, 0]), 0.0, span[:, 2].min())
         along = (middle[:, 0] - board.centre[0]) * scale * mirror
@@ -320,7 +326,7 @@ def double_paths(lane: Lane, event: Event, board: Occluder, shift: Vec3, scale: 
             path[:, 1] = np.where(frames < first, above, np.maximum(fall, 0.0))
         else:
             start = used + DOUBLE_GAP_M / 2 + width / 2
-            far = min(SLIDE_M[1], max(0.0, inner - event.doubles.width_m / 2)) * (0.4 + 0.6 * lane.rests_at)
+            far = min(SLIDE_M[1], max(0.0, inner - doubles.width_m / 2)) * (0.4 + 0.6 * lane.rests_at)
             path[:, 0] = mirror * (start - far / 2 + _slowing(frames - round(lane.sets_out_s * fps), far, far / 5))
         used += width + DOUBLE_GAP_M
         paths.append(path)
@@ -379,7 +385,7 @@ class TwoLanes:
         apply_look(Scene(spec, View(), (), tuple(layout.strip for layout in self.layouts)), self.look)
         for name, lane, event, layout in zip(LANES, self.lanes, self.events, self.layouts, strict=True):
             frame = spec.worldbody.add_frame(pos=list(layout.shift))
-            spec.attach(_lane_spec(event, layout), prefix=f"{name} ", frame=frame)
+            spec.attach(_lane_spec(event, layout, lane.size), prefix=f"{name} ", frame=frame)
             _paint(spec, name, lane.strip, layout)
         for name, layout in zip(LANES, self.layouts, strict=True):  # last: the last columns of a pose are theirs
             for place in PLACES:
@@ -461,7 +467,7 @@ def out_of_picture_m(board: Occluder, camera: Camera) -> float:
 # --- parts of a lane --------------------------------------------------------------------------------------------------
 
 
-def _lane_spec(event: Event, layout: Layout) -> mujoco.MjSpec:
+def _lane_spec(event: Event, layout: Layout, size: float) -> mujoco.MjSpec:
     """Return a family's scene without floor, sky and light of its own, and with doubles on its bench."""
     import mujoco
 
@@ -474,7 +480,7 @@ def _lane_spec(event: Event, layout: Layout) -> mujoco.MjSpec:
     data = mujoco.MjData(event.model)
     mujoco.mj_kinematics(event.model, data)
     x, y, z = np.subtract(layout.bench, layout.shift)
-    for n, (body, span) in enumerate(event.doubles.spans.items()):
+    for n, (body, span) in enumerate(event.doubles.sized(size).spans.items()):
         place = (x - _middle(span[:, 0]), y - _middle(span[:, 1]), z - span[:, 2].min())
         copied = spec.worldbody.add_body(
             name=f"double {n}", pos=[float(at) for at in place], quat=data.body(body).xquat
@@ -484,7 +490,7 @@ def _lane_spec(event: Event, layout: Layout) -> mujoco.MjSpec:
             copied.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=turned.tolist())
         copied.mass, copied.inertia, copied.explicitinertial = 1.0, [1.0, 1.0, 1.0], True
         for i, geom in enumerate(geom for geom in spec.body(body).geoms if geom.name in event.doubles.geoms):
-            _copy_geom(copied, geom, f"double {n} {i}")
+            _copy_geom(copied, geom, f"double {n} {i}", size)
     return spec
 
 
@@ -499,12 +505,15 @@ def _shifted(event: Event, shift: Vec3) -> np.ndarray:
     return qpos
 
 
-def _copy_geom(body: mujoco.MjsBody, geom: mujoco.MjsGeom, name: str) -> None:
-    """Add a copy of a geom without contact or mass."""
-    copied = body.add_geom(name=name, type=geom.type, size=geom.size, pos=geom.pos, quat=geom.quat, rgba=geom.rgba)
+def _copy_geom(body: mujoco.MjsBody, geom: mujoco.MjsGeom, name: str, size: float) -> None:
+    """Add a copy of a geom, of another size, without contact or mass. Raises Rejected for a mesh."""
+    if geom.meshname:
+        raise Rejected("a mesh decides, which has no double of another size")
+    half, place = size * np.array(geom.size), size * np.array(geom.pos)
+    copied = body.add_geom(name=name, type=geom.type, size=half, pos=place, quat=geom.quat, rgba=geom.rgba)
     if not np.isnan(geom.fromto[0]):
-        copied.fromto = geom.fromto
-    copied.meshname, copied.contype, copied.conaffinity, copied.mass = geom.meshname, 0, 0, 0
+        copied.fromto = size * np.array(geom.fromto)
+    copied.contype, copied.conaffinity, copied.mass = 0, 0, 0
 
 
 def _paint(spec: mujoco.MjSpec, name: str, colour: str, layout: Layout) -> None:
