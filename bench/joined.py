@@ -96,7 +96,7 @@ def rows_of(spec: TwoEventsSpec) -> Iterator[dict[str, object]]:
     seen = {key: lane_numbers_of(frames, asked, named) for key, frames in halves.items()}
     for item in spec.items():
         lane, hidden = LANES.index(item.lane), CLIPS[item.clip]
-        own, strip = seen[lane, item.asked_hidden], spec.lanes[lane].strip
+        own, strip = seen[lane, item.asked_hidden], spec.lanes[lane].lane.strip
         frames = np.concatenate([halves[k, hidden[k]] for k in range(2)], axis=2)
         clip = {f"a {k} {name}": value for k in range(2) for name, value in seen[k, hidden[k]].items()}
         colours = {

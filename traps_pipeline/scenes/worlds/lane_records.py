@@ -1,39 +1,26 @@
-"""Define the records of `two_events`: a world of two lanes, its four clips, and the two questions on each."""
+"""Define the records of two events: a world of two lanes, its four clips, and the two questions on each."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import product
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from traps_pipeline.base.files import replace_file
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.parts.look import Look
-from traps_pipeline.scenes.physics.kit import Box, Physics
-from traps_pipeline.scenes.picture.camera import Occluder, WideCamera
-from traps_pipeline.scenes.worlds.lanes import LANES, PLACES, Event, Lane, Layout, TwoLanes
-from traps_pipeline.scenes.worlds.spec import Slug, trajectory_digest
-from traps_pipeline.scenes.worlds.timetable import Timetable
+from traps_pipeline.scenes.physics.kit import Physics
+from traps_pipeline.scenes.picture.camera import WideCamera
+from traps_pipeline.scenes.worlds.lane_event import LaneEvent
+from traps_pipeline.scenes.worlds.lane_layout import Lane, Layout
+from traps_pipeline.scenes.worlds.lanes import LANES, TwoLanes
+from traps_pipeline.scenes.worlds.spec import Slug
 
-Hidden = tuple[bool, bool]  # which lanes of a clip are hidden: left, right
-CLIPS: dict[str, Hidden] = {
-    "neither": (False, False), "right": (False, True), "left": (True, False), "both": (True, True),
+CLIPS: dict[str, tuple[bool, bool]] = {  # by the lanes that are hidden in it: whether the left and the right one is
+    "neither": (False, False), "left": (True, False), "right": (False, True), "both": (True, True),
 }  # fmt: skip
-
-DRAWN = (
-    "strip",
-    "bench_above",
-    "bench_at",
-    "mirrored",
-    "rests_at",
-    "sets_out_s",
-    "size",
-)  # of a lane, as records store it
 
 
 class _Record(BaseModel):
@@ -41,7 +28,7 @@ class _Record(BaseModel):
 
 
 class LaneTwin(_Record):
-    """A lane's other world: what differs, its answer, the digest of the trajectory of both lanes."""
+    """A lane's other world: what differs, its answer, the digest of the trajectory with it."""
 
     params: dict[str, Any]
     ground_truth: str
@@ -49,30 +36,17 @@ class LaneTwin(_Record):
 
 
 class LaneRecord(_Record):
-    """A lane: its event, what is drawn of it (`lanes.Lane`), where it stands (`lanes.Layout`), and its twin."""
+    """A lane: its event, what is drawn of it, where it stands, and its twin."""
 
     params: dict[str, Any]
-    strip: str
-    bench_above: bool
-    bench_at: float
-    mirrored: bool
-    rests_at: float
-    sets_out_s: float
-    size: float
-    spans: list[tuple[int, int]]
-    layout: dict[str, Any]
+    lane: Lane
+    layout: Layout
     ground_truth: str
     twin: LaneTwin
 
-    @property
-    def lane(self) -> Lane:
-        """The lane, without the family's parameters read."""
-        fields = {name: getattr(self, name) for name in DRAWN}
-        return Lane(params=self.params, timetable=Timetable(tuple(self.spans)), **fields)
-
 
 class TwoEventsSpec(_Record):
-    """A scenario of two lanes, resolved. question: the family's own, for both lanes."""
+    """A scenario of two lanes, resolved. question: the family's own, of both lanes."""
 
     scenario_id: str = Field(pattern=Slug, max_length=80)
     category: str
@@ -81,7 +55,7 @@ class TwoEventsSpec(_Record):
     physics: dict[str, Any]
     camera: dict[str, Any]
     look: dict[str, Any]
-    lanes: list[LaneRecord] = Field(min_length=2, max_length=2)
+    lanes: tuple[LaneRecord, LaneRecord]
     question: str = Field(min_length=1)
     labels: list[str] = Field(min_length=2)
     aliases: dict[str, str]
@@ -90,40 +64,37 @@ class TwoEventsSpec(_Record):
     evidence: dict[str, Any]
 
     @model_validator(mode="after")
-    def _labels_agree(self) -> TwoEventsSpec:
-        for lane in self.lanes:
-            for answer in (lane.ground_truth, lane.twin.ground_truth):
-                if answer not in self.labels:
-                    raise ValueError(f"ground_truth {answer!r} is not one of the labels {self.labels}")
-        if self.lanes[0].strip == self.lanes[1].strip:
-            raise ValueError(f"both lanes have a {self.lanes[0].strip} strip, so no question names one")
+    def _answers_and_names_agree(self) -> TwoEventsSpec:
+        for record in self.lanes:
+            answers = {record.ground_truth, record.twin.ground_truth}
+            if len(answers) < 2 or not answers <= {*self.labels}:
+                raise ValueError(f"ground truths {sorted(answers)}: a lane and its twin have two of {self.labels}")
+        if self.lanes[0].lane.strip == self.lanes[1].lane.strip:
+            raise ValueError(f"both lanes have a {self.lanes[0].lane.strip} strip, so no question names one")
         return self
 
     def world(self, twin_in: int | None = None) -> TwoLanes:
         """Return the world, or that with the twin in a lane."""
         family, physics = get_family(self.family), Physics(**self.physics)
         params = [record.twin.params if k == twin_in else record.params for k, record in enumerate(self.lanes)]
-        left, right = (Event(family, family.params_from(values), physics) for values in params)
-        first, second = (record.lane for record in self.lanes)
-        layouts = tuple(layout_from(record.layout) for record in self.lanes)
         return TwoLanes(
-            (first, second), (left, right), WideCamera.from_record(self.camera), layouts, Look.from_record(self.look)
+            [record.lane for record in self.lanes],
+            [LaneEvent(family, family.params_from(values), physics) for values in params],
+            WideCamera.from_record(self.camera),
+            [record.layout for record in self.lanes],
+            Look.from_record(self.look),
         )
 
-    def items(self) -> Iterator[Item]:
+    def items(self) -> Iterator[LaneItem]:
         """Yield the eight items, four of which can be answered."""
-        for (clip, hidden), lane in product(CLIPS.items(), range(len(LANES))):
-            record = self.lanes[lane]
-            answer = None if hidden[lane] else record.ground_truth
-            yield Item(self.scenario_id, clip, LANES[lane], hidden[lane], hidden[1 - lane], self.asked(lane), answer)
-
-    def asked(self, lane: int) -> str:
-        """Return the question about a lane."""
-        return lane_question(self.lanes[lane].strip, self.question)
+        for (clip, hidden), k in product(CLIPS.items(), range(len(LANES))):
+            record = self.lanes[k]
+            answer, text = None if hidden[k] else record.ground_truth, lane_question(record.lane.strip, self.question)
+            yield LaneItem(self.scenario_id, clip, LANES[k], hidden[k], hidden[1 - k], text, answer)
 
 
 @dataclass(frozen=True)
-class Item:
+class LaneItem:
     """A question on a clip. answer: None where it must be abstained on, since the asked lane is hidden."""
 
     scenario_id: str
@@ -138,25 +109,3 @@ class Item:
 def lane_question(strip: str, question: str) -> str:
     """Return a family's question about the lane with a strip."""
     return f"In the lane with the {strip} strip, leaving its bench aside: {question[0].lower()}{question[1:]}"
-
-
-def layout_from(record: dict[str, Any]) -> Layout:
-    """Return the layout of a stored lane."""
-    boards = {place: Occluder.from_record(record["boards"][place]) for place in PLACES}
-    strip = Box(*(tuple(record["strip"][end]) for end in ("low", "high")))
-    shift, bench = (tuple(record[name]) for name in ("shift", "bench"))
-    paths = tuple(np.array(path) for path in record["paths"])
-    return Layout(shift, bench, tuple(record["bench_half"]), strip, boards, paths)
-
-
-def layout_record(layout: Layout) -> dict[str, Any]:
-    """Return a layout as records store it."""
-    return {**asdict(layout), "paths": [path.tolist() for path in layout.paths]}
-
-
-def save_lane_trajectories(folder: Path, scenario_id: str, worlds: dict[str, np.ndarray]) -> dict[str, str]:
-    """Write the trajectories of a scenario's three worlds; return their digests."""
-    arrays = {name: np.ascontiguousarray(qpos, dtype="<f4") for name, qpos in worlds.items()}
-    with replace_file(folder / f"{scenario_id}.npz") as part, part.open("wb") as stream:
-        np.savez_compressed(stream, allow_pickle=False, **arrays)
-    return {name: trajectory_digest(qpos) for name, qpos in arrays.items()}
