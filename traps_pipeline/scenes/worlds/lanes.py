@@ -26,7 +26,7 @@ from traps_pipeline.scenes.physics.simulate import replay
 from traps_pipeline.scenes.picture.camera import Camera, Occluder
 from traps_pipeline.scenes.worlds.lane_event import LaneEvent, middle_of
 from traps_pipeline.scenes.worlds.lane_layout import BENCH_M, Lane, Layout
-from traps_pipeline.scenes.worlds.outcome import Outcome, Rejected, decisive_geoms, read_outcome
+from traps_pipeline.scenes.worlds.outcome import Outcome, decisive_geoms, read_outcome
 
 if TYPE_CHECKING:
     import mujoco
@@ -159,18 +159,18 @@ def _lane_spec(event: LaneEvent, layout: Layout, size: float) -> mujoco.MjSpec:
             double.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=turned.tolist())
         double.mass, double.inertia, double.explicitinertial = 1.0, [1.0, 1.0, 1.0], True
         for name in event.copied_geoms(body):
-            _copy_geom(double, spec.geom(name), f"double {n} {name}", size)
+            _copy_geom(spec, double, spec.geom(name), f"double {n} {name}", size)
     return spec
 
 
-def _copy_geom(body: mujoco.MjsBody, geom: mujoco.MjsGeom, name: str, size: float) -> None:
-    """Add a copy of a geom, of another size, without contact or mass. Raises Rejected for a mesh."""
-    if geom.meshname:
-        raise Rejected("a mesh decides, which has no double of another size")
+def _copy_geom(spec: mujoco.MjSpec, body: mujoco.MjsBody, geom: mujoco.MjsGeom, name: str, size: float) -> None:
+    """Add a copy of a geom, of another size, without contact or mass."""
     half, place = size * np.array(geom.size), size * np.array(geom.pos)
     copied = body.add_geom(name=name, type=geom.type, size=half, pos=place, quat=geom.quat, rgba=geom.rgba)
     if not np.isnan(geom.fromto[0]):
         copied.fromto = size * np.array(geom.fromto)
+    if geom.meshname:
+        copied.meshname = spec.add_mesh(name=name, uservert=size * np.array(spec.mesh(geom.meshname).uservert)).name
     copied.contype, copied.conaffinity, copied.mass = 0, 0, 0
 
 
