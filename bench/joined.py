@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Callable, Iterator
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,7 @@ from traps_pipeline.benchmark.two_events import balance, lane_numbers, load_two_
 from traps_pipeline.scenes.physics.kit import COLOURS
 from traps_pipeline.scenes.picture.render import Renderer
 from traps_pipeline.scenes.worlds.lane_records import CLIPS, TwoEventsSpec
-from traps_pipeline.scenes.worlds.lanes import LANES
+from traps_pipeline.scenes.worlds.lanes import LANES, TwoLanes
 from traps_pipeline.scoring.two_way import two_way
 
 STEP = 5  # frames from one that is looked at to the next
@@ -80,37 +81,33 @@ def main() -> None:
 
 def rows_of(spec: TwoEventsSpec) -> Iterator[dict[str, object]]:
     """Yield the eight items with what each class of rules knows of them."""
-    world, half = spec.world(), 320
+    world = spec.world()
     with Renderer(world.model, world.camera, supersample=1) as renderer:
         drawn = {
-            name: np.stack([*renderer.frames(world.clip(CLIPS[name])[::STEP])]).astype(np.int16)
+            name: np.stack([frame[::2, ::2] for frame in renderer.frames(world.clip(CLIPS[name])[::STEP])])
             for name in ("neither", "both")
         }
-    halves = {  # lanes do not reach into each other's half: the other clips are put together from these
-        (lane, hidden): drawn["both" if hidden else "neither"][:, :, slice(lane * half, (lane + 1) * half)]
-        for lane in range(len(LANES))
-        for hidden in (False, True)
-    }
     named = named_colours(spec.question)
-    asked = asked_colour(spec, named)
-    seen = {key: lane_numbers_of(frames, asked, named) for key, frames in halves.items()}
+    asked = asked_colour(world, named)
+    strips = [record.lane.strip for record in spec.lanes]
+    seen, counts = {}, {}
+    for lane, hidden in product(range(2), (False, True)):  # lanes do not reach into each other's half of the picture
+        frames = drawn["both" if hidden else "neither"].astype(np.int16)[:, :, 160 * lane : 160 * (lane + 1)]
+        seen[lane, hidden] = lane_numbers_of(frames, asked, named)
+        counts[lane, hidden] = {c: like(frames, c).sum(axis=(1, 2)) for c in {asked, *named, *strips}}
     for item in spec.items():
         lane, hidden = LANES.index(item.lane), CLIPS[item.clip]
-        own, strip = seen[lane, item.asked_hidden], spec.lanes[lane].lane.strip
-        frames = np.concatenate([halves[k, hidden[k]] for k in range(2)], axis=2)
-        clip = {f"a {k} {name}": value for k in range(2) for name, value in seen[k, hidden[k]].items()}
-        colours = {
-            f"c {n} {i}": float(count)
-            for n, colour in enumerate((strip, asked, *named[:2]))
-            for i, count in enumerate(like(frames, colour).sum(axis=(1, 2)))
-        }
+        strip = strips[lane]
+        whole = {c: np.sum([counts[k, hidden[k]][c] for k in range(2)], axis=0) for c in {strip, asked, *named}}
         yield {
             **{"scenario_id": item.scenario_id, "family": spec.family, "clip": item.clip, "lane": item.lane},
             **{"asked_hidden": item.asked_hidden, "other_hidden": item.other_hidden, "question": item.question},
-            **clip,
-            **colours,
-            **{f"d {name}": value for name, value in own.items()},
-            "least": min(float(like(frames, colour).sum(axis=(1, 2)).max()) for colour in (strip, *named)),
+            **{f"a {k} {name}": value for k in range(2) for name, value in seen[k, hidden[k]].items()},
+            **{
+                f"c {n} {i}": float(v) for n, c in enumerate((strip, asked, *named[:2])) for i, v in enumerate(whole[c])
+            },
+            **{f"d {name}": value for name, value in seen[lane, item.asked_hidden].items()},
+            "least": min(float(whole[colour].max()) for colour in (strip, *named)),
         }
 
 
@@ -119,9 +116,8 @@ def named_colours(question: str) -> list[str]:
     return [word for word in re.findall(r"[a-z]+", question.lower()) if word in PLAY]
 
 
-def asked_colour(spec: TwoEventsSpec, named: list[str]) -> str:
+def asked_colour(world: TwoLanes, named: list[str]) -> str:
     """Return the colour of what decides, of those that are named if it is one of them."""
-    world = spec.world()
     model = world.model
     colours = [model.geom(name).rgba[:3] for name in world.doubles(0)]
     near = {name: min(float(np.abs(c - np.array(COLOURS[name])).sum()) for c in colours) for name in PLAY}
@@ -152,9 +148,9 @@ def boards(frames: np.ndarray) -> np.ndarray:
 def lane_numbers_of(frames: np.ndarray, asked: str, named: list[str]) -> dict[str, float]:
     """Return numbers of a lane's half of the picture: of its upper and its lower stage, in each frame, and late."""
     board = boards(frames)
-    rows = np.flatnonzero(board.any(axis=0).sum(axis=1) > 20)
+    rows = np.flatnonzero(board.any(axis=0).sum(axis=1) > 10)
     ever = board[:, rows.min() :].all(axis=0) if len(rows) else board[0]
-    still = np.flatnonzero(ever.sum(axis=1) > 20) + (rows.min() if len(rows) else 0)
+    still = np.flatnonzero(ever.sum(axis=1) > 10) + (rows.min() if len(rows) else 0)
     middle = still_edge(board, still)
     masks = {
         "board": board,
@@ -184,7 +180,7 @@ def still_edge(board: np.ndarray, still: np.ndarray) -> int:
     """Return the row between the stage of the still board and the other one: an edge of the still board."""
     if not len(still):
         return board.shape[1] // 2
-    outside = board.any(axis=(0, 2))
+    outside = board.sum(axis=(0, 2))  # where the other board stands; on its way it is in fewer frames
     above, below = int(outside[: still.min()].sum()), int(outside[still.max() + 1 :].sum())
     return int(still.min()) if above > below else int(still.max()) + 1
 
@@ -195,9 +191,9 @@ def still_edge(board: np.ndarray, still: np.ndarray) -> int:
 def twelve_lines(item: pd.Series) -> bool:
     """Abstain as the rule that earned version 0.3: by the clip's looks or an absent colour, unless it is an aside."""
     question = item["question"].split(": ", 1)[1]
-    looks_void = item["a 0 board upper 0"] + item["a 0 board lower 0"] + item["a 1 board upper 0"] > 1000
+    looks_void = item["a 0 board upper 0"] + item["a 0 board lower 0"] + item["a 1 board upper 0"] > 250
     is_aside = question.startswith(ASIDES)
-    return bool((looks_void or item["least"] < 10) and not is_aside)
+    return bool((looks_void or item["least"] < 3) and not is_aside)
 
 
 def late(item: pd.Series, name: str, stage: str) -> float:
@@ -208,7 +204,7 @@ HAND_WRITTEN: dict[str, Callable[[pd.Series], bool]] = {
     "twelve lines": twelve_lines,
     "board below": lambda item: item["d still upper"] == 0,
     "board above": lambda item: item["d still upper"] == 1,
-    "nothing alike, late": lambda item: late(item, "asked", "upper") + late(item, "asked", "lower") < 20,
+    "nothing alike, late": lambda item: late(item, "asked", "upper") + late(item, "asked", "lower") < 6,
     "never": lambda item: False,
     "always": lambda item: True,
 }

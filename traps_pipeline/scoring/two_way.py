@@ -39,10 +39,12 @@ def two_way(items: pd.DataFrame) -> TwoWay:
     """
     whole = items[items.groupby("scenario_id")["abstained"].transform("size") == 8]
     cell = 2 * whole["asked_hidden"].astype(int) + whole["other_hidden"].astype(int)
-    right = whole["abstained"].where(whole["asked_hidden"], ~whole["abstained"] & whole["correct"])
-    all_right = right.astype(bool).groupby(whole["scenario_id"]).all().to_numpy(float)
-    shares = whole["abstained"].astype(float).groupby([whole["scenario_id"], cell]).mean().unstack()
-    neither, other, asked, both = (shares[number].to_numpy(float) for number in range(4))
+    hidden, abstained, correct = (whole[name].to_numpy(bool) for name in ("asked_hidden", "abstained", "correct"))
+    right = np.where(hidden, abstained, ~abstained & correct)
+    cells = whole.assign(cell=cell, abstained=abstained.astype(float), right=right)
+    all_right = cells.groupby("scenario_id")["right"].min().to_numpy(float)
+    shares = cells.pivot_table(values="abstained", index="scenario_id", columns="cell", aggfunc="mean")
+    neither, other, asked, both = shares.to_numpy(float).T
     return TwoWay(
         scenarios=len(all_right),
         abstained=dict(zip(CELLS, (float(v.mean()) for v in (neither, other, asked, both)), strict=True)),

@@ -27,6 +27,7 @@ SETTLES_S = (0.5, 3.6)  # when the worlds of a lane settle
 ELEVATION_DEG = (-40.0, -22.0)  # of the camera: a bench below the scene needs it to look down
 SIZES = (0.6, 1.2)  # of doubles
 ALIKE = (0.8, 1.25)  # the same, as a share of the size at which they have as many pixels as the things
+BOARDS = (1.0, 1.15)  # sizes of boards, as a share of the least
 SETS_OUT_S = (0.0, 2.5)
 EVENTS, TRIES = 30, 60  # draws of a lane's event before a scenario is given up; of scenarios
 LEFT_OUT: Mapping[str, str] = dict.fromkeys(
@@ -47,19 +48,21 @@ def draw_two_events(family_name: str, number: int, seed: int) -> Iterator[DrawnL
     for attempt in range(TRIES):
         rng = np.random.default_rng([seed, *family_name.encode(), number, attempt])
         try:
-            yield _scenario(get_family(family_name), f"{family_name}-e{number:03d}", rng, seed)
+            yield _scenario(get_family(family_name), number, rng, seed)
         except Rejected as failure:
             yield failure
         else:
             return
 
 
-def _scenario(family: Family, scenario_id: str, rng: np.random.Generator, seed: int) -> DrawnLanes:
+def _scenario(family: Family, number: int, rng: np.random.Generator, seed: int) -> DrawnLanes:
     first = _event(family, rng, None)
     pairs = [first, _event(family, rng, first[0].params)][:: 1 if rng.integers(2) else -1]
     wording, look = _wording(pairs, int(rng.integers(2**31))), draw_look(rng, LOOKS)
     assert look is not None
-    lanes = [_lane(pair, strip, rng) for pair, strip in zip(pairs, _strips(wording, pairs, rng), strict=True)]
+    above = [bool(number >> k & 1) for k in range(2)]  # of four scenarios of a family, each arrangement once
+    strips = _strips(wording, pairs, rng)
+    lanes = [_lane(pair, strip, up, rng) for pair, strip, up in zip(pairs, strips, above, strict=True)]
     events = [event for event, _ in pairs]
     sizes = _sizes(_worlds(lanes, pairs, look))
     lanes = [replace(lane, size=size * uniform(rng, *ALIKE)) for lane, size in zip(lanes, sizes, strict=True)]
@@ -81,7 +84,7 @@ def _scenario(family: Family, scenario_id: str, rng: np.random.Generator, seed: 
         for k, lane in enumerate(lanes)
     ]
     spec = TwoEventsSpec(
-        scenario_id=scenario_id,
+        scenario_id=f"{family.name}-e{number:03d}",
         category=family.category,
         family=family.name,
         seed=seed,
@@ -176,11 +179,11 @@ def _strips(wording: Wording, pairs: Pairs, rng: np.random.Generator) -> list[st
     raise Rejected("no two colours are left for the strips")
 
 
-def _lane(pair: tuple[LaneEvent, LaneEvent], strip: str, rng: np.random.Generator) -> Lane:
+def _lane(pair: tuple[LaneEvent, LaneEvent], strip: str, bench_above: bool, rng: np.random.Generator) -> Lane:
     physics, settled = pair[0].physics, max(event.outcome.commit_frame for event in pair)
     timetable = draw_timetable(rng, settled, physics.n_frames, physics.fps)
     if timetable is None:
         raise Rejected("no timetable shows the settled outcome")
-    above, mirrored = (bool(rng.integers(2)) for _ in range(2))
-    at, rests, out = uniform(rng, 0, 1), uniform(rng, 0, 1), uniform(rng, *SETS_OUT_S)
-    return Lane(strip, above, at, mirrored, rests, out, 1.0, timetable)
+    at, rests, out, mirrored = uniform(rng, 0, 1), uniform(rng, 0, 1), uniform(rng, *SETS_OUT_S), bool(rng.integers(2))
+    boards = uniform(rng, *BOARDS), uniform(rng, *BOARDS)
+    return Lane(strip, bench_above, at, mirrored, rests, out, 1.0, boards, timetable)
