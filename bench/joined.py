@@ -1,4 +1,4 @@
-"""What rules earn on two events that follow no event (docs/scoring.md, "Two events").
+"""What rules earn on two events that follow no event.
 
 Where a rule does not abstain it answers like an oracle, so that each figure bounds what it can earn. Frames are drawn
 from the records, half a second apart. Learned rules are boosted trees:
@@ -8,7 +8,7 @@ frame. D: joined by place: of the named lane alone, in its upper and its lower s
 frame: boards, things in the asked one's colour, what moves. D+: also other colours, by which scene and bench could be
 told apart: it finds objects.
 
-    python bench/joined.py FOLDER [--table]
+    python bench/joined.py --records FOLDER
 """
 
 from __future__ import annotations
@@ -26,12 +26,13 @@ from sklearn.feature_extraction.text import CountVectorizer
 from sklearn.model_selection import GroupKFold
 
 from bench.quick import parse
-from traps_pipeline.benchmark.two_events import balance, lane_numbers, load_two_events
+from bench.two_events.balance import balance, lane_numbers, load_two_events
+from bench.two_events.draw import FAMILIES, draw_family
+from bench.two_events.figures import two_way
 from traps_pipeline.scenes.physics.kit import COLOURS
 from traps_pipeline.scenes.picture.render import Renderer
 from traps_pipeline.scenes.worlds.lane_records import CLIPS, TwoEventsSpec
 from traps_pipeline.scenes.worlds.lanes import LANES, TwoLanes
-from traps_pipeline.scoring.two_way import two_way
 
 STEP = 5  # frames from one that is looked at to the next
 PLAY = ("red", "green", "blue", "yellow", "orange", "cyan", "purple", "black", "white")
@@ -45,14 +46,15 @@ LIMITS = {"A clip": (0.05, 0.15), "B words": (0.05, 0.15), "C colours": (0.05, 0
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, help="with the records of two events, as JSON lines")
-    parser.add_argument("--per-family", type=int, help="the first so many records of each family; default: all")
+    parser.add_argument("--records", type=Path, help="folder of records of two events; default: draw --count of each")
+    parser.add_argument("--families", nargs="+", default=FAMILIES, choices=FAMILIES)
+    parser.add_argument("--count", type=int, default=2, help="of each family to draw")
     parser.add_argument("--keep", type=Path, help="file to keep what is seen in frames, or to read it from")
-    arguments = parse(parser, per_family=1)
-    specs = [*load_two_events(arguments.folder).values()]
-    if arguments.per_family:
-        number = pd.Series([spec.family for spec in specs]).groupby(lambda i: specs[i].family).cumcount()
-        specs = [spec for spec, n in zip(specs, number, strict=True) if n < arguments.per_family]
+    arguments = parse(parser, families=["slide", "drop_split", "chain"])
+    if arguments.records:
+        specs = [*load_two_events(arguments.records).values()]
+    else:
+        specs = [spec for family in arguments.families for spec in draw_family(family, arguments.count, seed=2026)]
     print(balance(lane_numbers(specs)).round(3).to_string(index=False))
     kept = arguments.keep
     if kept and kept.exists():

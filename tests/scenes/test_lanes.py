@@ -9,9 +9,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from traps_pipeline.benchmark.two_events import auc, balance, lane_numbers
-from traps_pipeline.scenes.certification.lane_certificates import certify_lanes
-from traps_pipeline.scenes.draw.two_events import LEFT_OUT, DrawnLanes, draw_two_events
+from bench.two_events.balance import auc, balance, lane_numbers
+from bench.two_events.certificates import certify_lanes
+from bench.two_events.draw import LEFT_OUT, DrawnLanes, draw_timetable, draw_two_events
 from traps_pipeline.scenes.family_registry import families
 from traps_pipeline.scenes.picture.render import Renderer
 from traps_pipeline.scenes.worlds.lane_layout import fit_lanes
@@ -19,7 +19,7 @@ from traps_pipeline.scenes.worlds.lane_records import CLIPS, TwoEventsSpec
 from traps_pipeline.scenes.worlds.lanes import TwoLanes
 from traps_pipeline.scenes.worlds.outcome import Rejected
 from traps_pipeline.scenes.worlds.spec import trajectory_digest
-from traps_pipeline.scenes.worlds.timetable import Timetable, draw_timetable
+from traps_pipeline.scenes.worlds.timetable import Timetable
 
 
 @cache

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
@@ -11,9 +10,7 @@ from traps_pipeline.video.policies import fewest_within
 
 MOVES_FRAMES = 4  # that a board takes to come or to go (0.4 s)
 WINDOW_FRAMES = 10  # least time without the board, once the outcome has settled (1 s)
-STANDS_FRAMES = (5, 18)  # how long it stands, at a time
 WINDOW_SHOWN = 2  # frames of the window that each model is shown, at least
-TRIES = 400
 
 
 @dataclass(frozen=True)
@@ -44,23 +41,3 @@ class Timetable:
         """Return whether a window from a frame on is long enough, for each model too."""
         start, stop = self.window(first, n_frames)
         return stop - start >= WINDOW_FRAMES and fewest_within(n_frames, fps, (start, stop)) >= WINDOW_SHOWN
-
-
-def draw_timetable(rng: np.random.Generator, settled: int, n_frames: int, fps: int) -> Timetable | None:
-    """Draw a timetable that shows what has settled by a frame; None if none was found.
-
-    In a half of them each the board stands in the first frame, and in the last; and it comes or goes at least once.
-    """
-    for _ in range(TRIES):
-        first, middle, last = (bool(rng.integers(2)) for _ in range(3))
-        lengths = [int(rng.integers(STANDS_FRAMES[0], STANDS_FRAMES[1] + 1)) for _ in range(3)]
-        spans = [(0, lengths[0])] if first else []
-        if middle:
-            start = int(rng.integers(MOVES_FRAMES + 1, n_frames - lengths[1] - MOVES_FRAMES))
-            spans.append((start, start + lengths[1]))
-        spans += [(n_frames - lengths[2], n_frames)] if last else []
-        is_apart = all(b[0] - a[1] >= 2 * MOVES_FRAMES for a, b in pairwise(spans))
-        timetable = Timetable(tuple(spans))
-        if spans and is_apart and timetable.shows(settled, n_frames, fps):
-            return timetable
-    return None

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import argparse
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from traps_pipeline.scenes.certification.lane_certificates import certify_lanes, pixels_of
+from bench.two_events.certificates import certify_lanes, pixels_of
+from traps_pipeline.protocol.datasets import EXTENSION_CATEGORIES
 from traps_pipeline.scenes.draw.resolve import plain
-from traps_pipeline.scenes.family_registry import get_family
+from traps_pipeline.scenes.family_registry import families, get_family
 from traps_pipeline.scenes.parts.look import Look, draw_look
 from traps_pipeline.scenes.physics.kit import COLOURS, LOOK_ALIKE, Family, Wording, params_to_dict, uniform
 from traps_pipeline.scenes.worlds.lane_event import LaneEvent
@@ -19,7 +24,7 @@ from traps_pipeline.scenes.worlds.lane_records import LaneRecord, LaneTwin, TwoE
 from traps_pipeline.scenes.worlds.lanes import TwoLanes
 from traps_pipeline.scenes.worlds.outcome import Rejected
 from traps_pipeline.scenes.worlds.spec import physics_record, trajectory_digest
-from traps_pipeline.scenes.worlds.timetable import draw_timetable
+from traps_pipeline.scenes.worlds.timetable import MOVES_FRAMES, Timetable
 
 STRIPS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
 LOOKS = ("pale-floor", "light")  # parts of the look that vary
@@ -29,10 +34,19 @@ SIZES = (0.6, 1.2)  # of doubles
 ALIKE = (0.8, 1.25)  # the same, as a share of the size at which they have as many pixels as the things
 BOARDS = (1.0, 1.15)  # sizes of boards, as a share of the least
 SETS_OUT_S = (0.0, 2.5)
+STANDS_FRAMES = (5, 18)  # how long a board stands that comes and goes, at a time
+TIMETABLES = 400  # draws of a timetable before a scenario is given up
 EVENTS, TRIES = 30, 60  # draws of a lane's event before a scenario is given up; of scenarios
 LEFT_OUT: Mapping[str, str] = dict.fromkeys(
     ("hidden_race", "ramp_race"), "it asks which came first, which no settled outcome shows"
 )
+
+
+FAMILIES = [
+    family.name
+    for family in families()
+    if family.taxonomy == "occlusion" and family.category not in EXTENSION_CATEGORIES and family.name not in LEFT_OUT
+]
 
 
 @dataclass(frozen=True)
@@ -187,3 +201,56 @@ def _lane(pair: tuple[LaneEvent, LaneEvent], strip: str, bench_above: bool, rng:
     at, rests, out, mirrored = uniform(rng, 0, 1), uniform(rng, 0, 1), uniform(rng, *SETS_OUT_S), bool(rng.integers(2))
     boards = uniform(rng, *BOARDS), uniform(rng, *BOARDS)
     return Lane(strip, bench_above, at, mirrored, rests, out, 1.0, boards, timetable)
+
+
+def draw_timetable(rng: np.random.Generator, settled: int, n_frames: int, fps: int) -> Timetable | None:
+    """Draw a timetable that shows what has settled by a frame; None if none was found.
+
+    In a half of them each the board stands in the first frame, and in the last; and it comes or goes at least once.
+    """
+    for _ in range(TIMETABLES):
+        first, middle, last = (bool(rng.integers(2)) for _ in range(3))
+        lengths = [int(rng.integers(STANDS_FRAMES[0], STANDS_FRAMES[1] + 1)) for _ in range(3)]
+        spans = [(0, lengths[0])] if first else []
+        if middle:
+            start = int(rng.integers(MOVES_FRAMES + 1, n_frames - lengths[1] - MOVES_FRAMES))
+            spans.append((start, start + lengths[1]))
+        spans += [(n_frames - lengths[2], n_frames)] if last else []
+        is_apart = all(b[0] - a[1] >= 2 * MOVES_FRAMES for a, b in pairwise(spans))
+        timetable = Timetable(tuple(spans))
+        if spans and is_apart and timetable.shows(settled, n_frames, fps):
+            return timetable
+    return None
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("out", type=Path, help="folder for records, a JSON Lines file of each family")
+    parser.add_argument("--families", nargs="+", default=FAMILIES, choices=FAMILIES)
+    parser.add_argument("--count", type=int, default=8, help="scenarios of each family")
+    parser.add_argument("--seed", type=int, default=2026)
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    for family in arguments.families:
+        specs = draw_family(family, arguments.count, arguments.seed)
+        lines = "".join(f"{spec.model_dump_json()}\n" for spec in specs)
+        (arguments.out / f"{family}.jsonl").write_text(lines, encoding="utf-8")
+
+
+def draw_family(family: str, count: int, seed: int) -> list[TwoEventsSpec]:
+    """Draw scenarios of a family; print why draws are rejected."""
+    specs = []
+    for number in range(count):
+        *rejected, last = draw_two_events(family, number, seed)
+        print(
+            family,
+            number,
+            Counter(map(str, rejected if isinstance(last, DrawnLanes) else [*rejected, last])),
+            flush=True,
+        )
+        specs += [last.spec] if isinstance(last, DrawnLanes) else []
+    return specs
+
+
+if __name__ == "__main__":
+    main()

@@ -9,9 +9,9 @@ import numpy as np
 import pandas as pd
 from pydantic import ValidationError
 
+from bench.two_events.certificates import SHARES
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.yamlfile import explain
-from traps_pipeline.scenes.certification.lane_certificates import SHARES
 from traps_pipeline.scenes.physics.kit import Physics
 from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
 

@@ -7,7 +7,7 @@ from itertools import product
 import pandas as pd
 import pytest
 
-from traps_pipeline.scoring.two_way import two_way
+from bench.two_events.figures import two_way
 
 
 def items(rule: str, scenarios: int = 20) -> pd.DataFrame:
