@@ -37,8 +37,8 @@ class Lane:
     strip: its colour. bench_above: whether the bench is above the scene in the picture. bench_at: where it is along the
     lane, 0 to 1. mirrored: whether doubles come from the other side than what they are doubles of. rests_at: how far
     they get, 0 to 1. sets_out_s: when those set out that are behind the board from the start. size: of doubles, 1 for
-    that of the things themselves. boards: of those before scene and bench, 1 for the least. timetable: of the board
-    that comes and goes.
+    that of the things themselves. boards: widths of those before scene and bench, 1 for the least. timetable: of
+    the board that comes and goes.
     """
 
     strip: str
@@ -154,7 +154,7 @@ def _layout(
     x = (left_m + right_m) / 2 + (lane.bench_at - 0.5) * max(0.0, right_m - left_m - (high - low))
     board_x = x - (low + high) / 2
     bench_board = Occluder((board_x, front, z + up * scale), (across * scale, thick, up * scale), board.yaw_deg)
-    board, bench_board = (_larger(each, size) for each, size in zip((board, bench_board), lane.boards, strict=True))
+    board, bench_board = (_wider(each, size) for each, size in zip((board, bench_board), lane.boards, strict=True))
     near = min(float(shown[:, 1].min()), board.centre[1] - thick, y - deep) - STRIP_GAP_M
     strip = Box((left_m, near - STRIP_M, 0.0), (right_m, near, 0.004))
     on_bench = [np.round(path - ((low + high) / 2, 0.0), 4).tolist() for path in paths]
@@ -162,10 +162,10 @@ def _layout(
     return Layout(shift, (x, y, z), ((high - low) / 2, deep / 2), strip, (board, bench_board), rows)
 
 
-def _larger(board: Occluder, size: float) -> Occluder:
-    """Return a board of another size on the same ground."""
-    (x, y, z), (across, thick, up) = board.centre, board.half
-    return replace(board, centre=(x, y, z + (size - 1) * up), half=(size * across, thick, size * up))
+def _wider(board: Occluder, size: float) -> Occluder:
+    """Return a wider board; a higher one would hide the flags of what the question names."""
+    across, thick, up = board.half
+    return replace(board, half=(size * across, thick, up))
 
 
 def _double_paths(
