@@ -74,7 +74,10 @@ def _scenario(family: Family, number: int, rng: np.random.Generator, seed: int) 
     pairs = [first, _event(family, rng, first[0].params)][:: 1 if rng.integers(2) else -1]
     wording, look = _wording(pairs, int(rng.integers(2**31))), draw_look(rng, LOOKS)
     assert look is not None
-    above = [bool(number >> k & 1) for k in range(2)]  # of four scenarios of a family, each arrangement once
+    above = [
+        bool(number & 1),
+        bool((number + 1 ^ number >> 1) & 1),
+    ]  # of four scenarios each arrangement, of two each side
     strips = _strips(wording, pairs, rng)
     lanes = [_lane(pair, strip, up, rng) for pair, strip, up in zip(pairs, strips, above, strict=True)]
     events = [event for event, _ in pairs]

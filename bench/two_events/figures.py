@@ -39,10 +39,10 @@ def two_way(items: pd.DataFrame) -> TwoWay:
     """
     whole = items[items.groupby("scenario_id")["abstained"].transform("size") == 8]
     cell = 2 * whole["asked_hidden"].astype(int) + whole["other_hidden"].astype(int)
-    hidden, abstained, correct = (whole[name].to_numpy(bool) for name in ("asked_hidden", "abstained", "correct"))
+    hidden, abstained, correct = (np.array(whole[name], bool) for name in ("asked_hidden", "abstained", "correct"))
     right = np.where(hidden, abstained, ~abstained & correct)
-    cells = whole.assign(cell=cell, abstained=abstained.astype(float), right=right)
-    all_right = cells.groupby("scenario_id")["right"].min().to_numpy(float)
+    cells = whole.assign(cell=cell, abstained=abstained.astype(float), right=right.astype(float))
+    all_right = cells.pivot_table(values="right", index="scenario_id", aggfunc="min").to_numpy(float)[:, 0]
     shares = cells.pivot_table(values="abstained", index="scenario_id", columns="cell", aggfunc="mean")
     neither, other, asked, both = shares.to_numpy(float).T
     return TwoWay(
