@@ -204,8 +204,8 @@ def late(item: pd.Series, name: str, stage: str) -> float:
 
 HAND_WRITTEN: dict[str, Callable[[pd.Series], bool]] = {
     "twelve lines": twelve_lines,
-    "board below": lambda item: float(item["d still upper"]) == 0,
-    "board above": lambda item: float(item["d still upper"]) == 1,
+    "board below": lambda item: bool(np.equal(item["d still upper"], 0)),
+    "board above": lambda item: bool(np.equal(item["d still upper"], 1)),
     "nothing alike, late": lambda item: late(item, "asked", "upper") + late(item, "asked", "lower") < 6,
     "never": lambda item: False,
     "always": lambda item: True,
