@@ -15,9 +15,10 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -65,7 +66,7 @@ def main() -> None:
             items.to_parquet(kept)
     print(f"\n{len(items)} items of {items['scenario_id'].nunique()} scenarios, {items['family'].nunique()} families")
     for name, rule in HAND_WRITTEN.items():
-        print_figures(name, items, items.apply(rule, axis=1).to_numpy(bool))
+        print_figures(name, items, np.array([rule(item) for item in items.to_dict("records")]))
     for held_out, folds in FOLDS.items():
         print(f"\n{held_out} held out")
         for name, columns in LEARNED.items():
@@ -190,7 +191,7 @@ def still_edge(board: np.ndarray, still: np.ndarray) -> int:
 # --- rules ------------------------------------------------------------------------------------------------------------
 
 
-def twelve_lines(item: pd.Series) -> bool:
+def twelve_lines(item: Mapping[str, Any]) -> bool:
     """Abstain as the rule that earned version 0.3: by the clip's looks or an absent colour, unless it is an aside."""
     question = item["question"].split(": ", 1)[1]
     looks_void = item["a 0 board upper 0"] + item["a 0 board lower 0"] + item["a 1 board upper 0"] > 250
@@ -198,14 +199,14 @@ def twelve_lines(item: pd.Series) -> bool:
     return bool((looks_void or item["least"] < 3) and not is_aside)
 
 
-def late(item: pd.Series, name: str, stage: str) -> float:
+def late(item: Mapping[str, Any], name: str, stage: str) -> float:
     return float(item[f"d {name} {stage} most late"])
 
 
-HAND_WRITTEN: dict[str, Callable[[pd.Series], bool]] = {
+HAND_WRITTEN: dict[str, Callable[[Mapping[str, Any]], bool]] = {
     "twelve lines": twelve_lines,
-    "board below": lambda item: bool(np.equal(item["d still upper"], 0)),
-    "board above": lambda item: bool(np.equal(item["d still upper"], 1)),
+    "board below": lambda item: bool(item["d still upper"] == 0),
+    "board above": lambda item: bool(item["d still upper"] == 1),
     "nothing alike, late": lambda item: late(item, "asked", "upper") + late(item, "asked", "lower") < 6,
     "never": lambda item: False,
     "always": lambda item: True,
