@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from traps_pipeline.scenes.physics.kit import Box, Vec3, View
 
 WIDTH, HEIGHT = 480, 360
+WIDE = 640  # width of a clip of two lanes, in the same height
 FRAME_FILL = 0.92  # share of the half-frame that the fitted points may use
 OCCLUDER_MARGIN = 0.03  # the occluder reaches this much (m) beyond what it must hide, as seen from the camera
 OCCLUDER_GAP = 0.02  # distance (m) between the occluder and the nearest point that it hides
@@ -29,11 +30,12 @@ class Camera:
     fovy_deg: float
     extent: float
     centre: Vec3
+    width: ClassVar[int] = WIDTH  # of its picture (px)
 
-    @staticmethod
-    def from_record(record: Mapping[str, Any]) -> Camera:
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any]) -> Camera:
         """Return the camera of a stored spec."""
-        return Camera(**_tuples(record))
+        return cls(**_tuples(record))
 
     def axes(self) -> np.ndarray:
         """Return unit vectors right, up and forward in the world, rows of (3, 3)."""
@@ -44,15 +46,21 @@ class Camera:
         return np.array(self.lookat) - self.distance * self.axes()[2]
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Return pixel coordinates (x right, y down) at 480x360 of points, (N, 2)."""
+        """Return pixel coordinates (x right, y down) at `width` x 360 of points, (N, 2)."""
         right, up, depth = self.axes() @ (np.atleast_2d(points) - self.position()).T
         focal = HEIGHT / 2 / np.tan(np.radians(self.fovy_deg) / 2)
-        return np.stack([WIDTH / 2 + focal * right / depth, HEIGHT / 2 - focal * up / depth], axis=1)
+        return np.stack([self.width / 2 + focal * right / depth, HEIGHT / 2 - focal * up / depth], axis=1)
 
     def metres_a_pixel(self, point: np.ndarray) -> float:
-        """Return the length of a pixel of 480x360 at the depth of a point (3,)."""
+        """Return the length of a pixel of a height of 360 at the depth of a point (3,)."""
         depth = float(self.axes()[2] @ (point - self.position()))
         return depth * float(np.tan(np.radians(self.fovy_deg) / 2)) / (HEIGHT / 2)
+
+
+class WideCamera(Camera):
+    """A camera whose pictures are wide enough for two lanes."""
+
+    width: ClassVar[int] = WIDE
 
 
 @dataclass(frozen=True)
@@ -97,7 +105,7 @@ def _axes(azimuth_deg: float, elevation_deg: float) -> np.ndarray:
     return axes
 
 
-def fit_camera(view: View, points: np.ndarray) -> Camera:
+def fit_camera(view: View, points: np.ndarray, kind: type[Camera] = Camera) -> Camera:
     """Return the nearest camera along the view with all points (N, 3) in FRAME_FILL.
 
     With the orientation given, each frame edge is a half-space for the eye: the two pairs of edges give the largest
@@ -105,7 +113,7 @@ def fit_camera(view: View, points: np.ndarray) -> Camera:
     """
     right, up, forward = (points @ axis for axis in _axes(view.azimuth_deg, view.elevation_deg))
     tan_v = np.tan(np.radians(view.fovy_deg) / 2) * FRAME_FILL
-    tan_h = tan_v * WIDTH / HEIGHT
+    tan_h = tan_v * kind.width / HEIGHT
     edges = [(np.max(x - t * forward), np.max(-x - t * forward)) for x, t in ((right, tan_h), (up, tan_v))]
     eye_forward = min(-(high + low) / (2 * t) for (high, low), t in zip(edges, (tan_h, tan_v), strict=True))
     eye_right, eye_up = ((high - low) / 2 for high, low in edges)
@@ -113,7 +121,7 @@ def fit_camera(view: View, points: np.ndarray) -> Camera:
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     distance = float(centre @ axes[2] - eye_forward)
     eye = np.array([eye_right, eye_up, eye_forward]) @ axes
-    return Camera(
+    return kind(
         lookat=_vec(eye + distance * axes[2]),
         distance=round(distance, 6),
         azimuth_deg=view.azimuth_deg,
@@ -159,7 +167,7 @@ def fit_shot(view: View, points: np.ndarray, cover: Box | None) -> tuple[Camera,
 def is_in_frame(camera: Camera, points: np.ndarray) -> bool:
     """Return whether all points (N, 3) are inside the frame."""
     pixels = camera.project(points)
-    return bool((pixels > 0).all() and (pixels < (WIDTH, HEIGHT)).all())
+    return bool((pixels > 0).all() and (pixels < (camera.width, HEIGHT)).all())
 
 
 def _vec(values: np.ndarray) -> Vec3:

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH, Camera, Closing, Occluder
+from traps_pipeline.scenes.picture.camera import HEIGHT, Camera, Closing, Occluder
 
 ACCELERATION_M_S2 = 9.81  # as things fall; a board that slides in gains speed like one
 STEEP_DEG = 45.0  # a camera that looks down by more
@@ -52,7 +52,7 @@ def _direction(occluder: Occluder, camera: Camera) -> np.ndarray:
     if camera.elevation_deg >= -STEEP_DEG:
         return np.array([0.0, 0.0, 1.0])
     right = camera.axes()[0]
-    return right if camera.project(np.array(occluder.centre))[0, 0] >= WIDTH / 2 else -right
+    return right if camera.project(np.array(occluder.centre))[0, 0] >= camera.width / 2 else -right
 
 
 def _out_of_picture_m(occluder: Occluder, camera: Camera, way: np.ndarray) -> float:
@@ -60,6 +60,6 @@ def _out_of_picture_m(occluder: Occluder, camera: Camera, way: np.ndarray) -> fl
     corners = occluder.corners() + before_board(occluder)
     for distance in np.arange(0.0, FURTHEST_M, STEP_M):
         x, y = camera.project(corners + distance * way).T
-        if (x < 0).all() or (x > WIDTH).all() or (y < 0).all() or (y > HEIGHT).all():
+        if (x < 0).all() or (x > camera.width).all() or (y < 0).all() or (y > HEIGHT).all():
             return float(distance)
     return FURTHEST_M

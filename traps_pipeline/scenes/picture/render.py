@@ -89,7 +89,7 @@ def _make_floors_finite(model: mujoco.MjModel, camera: Camera) -> None:
 
 
 class Renderer:
-    """Context manager that draws a model from a camera: uint8 RGB, (360, 480, 3).
+    """Context manager that draws a model from a camera: uint8 RGB, (360, width, 3).
 
     Frames are (720, 960, 3) of a model whose look is as fine as that. supersample: factor by which the drawing is
     larger; 1 takes a quarter of the time, where edges need not be smooth.
@@ -101,7 +101,8 @@ class Renderer:
             raise RuntimeError("a Renderer is open in this process; close it before the next one")
         self._fine = max(1, model.vis.global_.offheight // (HEIGHT * SUPERSAMPLE))  # where a look says so
         self._scale = supersample * self._fine
-        self._width, self._height = (side * self._scale for side in (WIDTH, HEIGHT))
+        self._size = (camera.width * self._fine, HEIGHT * self._fine)
+        self._width, self._height = (side * supersample for side in self._size)
         _make_current(self._width, self._height)
         import mujoco
 
@@ -154,7 +155,7 @@ class Renderer:
         for row in qpos:
             self._put_board(board)
             raw = self._draw(row, occluder=occluder, without=without)
-            frame = cv2.resize(raw, (WIDTH * self._fine, HEIGHT * self._fine), interpolation=cv2.INTER_AREA)
+            frame = cv2.resize(raw, self._size, interpolation=cv2.INTER_AREA)
             yield cv2.flip(cv2.cvtColor(frame, cv2.COLOR_RGBA2RGB), 0)
 
     def visible_pixels(

@@ -18,11 +18,7 @@ from typing import Any
 import numpy as np
 
 from traps_pipeline.protocol.datasets import CROSSED
-from traps_pipeline.scenes.certification.certificates import (
-    EARLIEST_CUT_S,
-    legible_groups,
-    settled_answer,
-)
+from traps_pipeline.scenes.certification.certificates import EARLIEST_CUT_S, legible_groups, settled_answer
 from traps_pipeline.scenes.parts.wording import false_premise
 from traps_pipeline.scenes.physics.kit import View
 from traps_pipeline.scenes.physics.simulate import initial_velocity, replay

@@ -1,0 +1,159 @@
+"""Two events in one picture: each lane is as by itself, boards tell no side, and what is hidden is as its twin."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from bench.two_events.balance import auc, balance, lane_numbers
+from bench.two_events.certificates import certify_lanes
+from bench.two_events.draw import LEFT_OUT, DrawnLanes, draw_timetable, draw_two_events
+from traps_pipeline.scenes.family_registry import families
+from traps_pipeline.scenes.picture.render import Renderer
+from traps_pipeline.scenes.worlds.lane_layout import fit_lanes
+from traps_pipeline.scenes.worlds.lane_records import CLIPS, TwoEventsSpec
+from traps_pipeline.scenes.worlds.lanes import TwoLanes
+from traps_pipeline.scenes.worlds.outcome import Rejected
+from traps_pipeline.scenes.worlds.spec import trajectory_digest
+from traps_pipeline.scenes.worlds.timetable import Timetable
+
+
+@cache
+def drawn(family: str) -> TwoEventsSpec:
+    *_, last = draw_two_events(family, 0, seed=7)
+    assert isinstance(last, DrawnLanes)
+    return last.spec
+
+
+def worlds(spec: TwoEventsSpec) -> tuple[TwoLanes, list[TwoLanes]]:
+    return spec.world(), [spec.world(twin_in=k) for k in range(2)]
+
+
+# --- timetables -------------------------------------------------------------------------------------------------------
+
+
+def test_a_board_moves_for_four_frames_before_and_after_it_stands():
+    away = Timetable(((10, 20),)).away(30)
+    assert away[10:20].tolist() == [0] * 10
+    assert away[6:10].tolist() == [
+        1,
+        9 / 16,
+        4 / 16,
+        1 / 16,
+    ]  # it falls: the way left is as the square of the time left
+    assert away[20:24].tolist() == [1 / 16, 4 / 16, 9 / 16, 1]
+    assert (away[:6] == 1).all() and (away[24:] == 1).all()
+
+
+def test_a_board_that_stands_from_the_first_frame_did_not_come():
+    away = Timetable(((0, 5), (25, 30))).away(30)
+    assert (away[:5] == 0).all() and (away[25:] == 0).all()
+    assert Timetable(((0, 5), (25, 30))).window(0, 30) == (8, 22)  # frames 5 to 7 and 22 to 24 show it on its way
+
+
+def test_drawn_timetables_leave_a_second_that_shows_what_has_settled_and_begin_and_end_either_way():
+    rng = np.random.default_rng(1)
+    timetables = [draw_timetable(rng, settled, 50, 10) for settled in (5, 20, 36) for _ in range(60)]
+    ends = Counter[tuple[bool, bool]]()
+    for settled, timetable in zip(np.repeat((5, 20, 36), 60), timetables, strict=True):
+        assert timetable is not None
+        away = timetable.away(50)
+        start, stop = timetable.window(int(settled), 50)
+        assert start >= settled and stop - start >= 10 and (away[start:stop] == 1).all()
+        assert (away == 0).any()
+        ends[bool(away[0] == 0), bool(away[-1] == 0)] += 1
+    assert len(ends) == 4 and min(ends.values()) > 10
+
+
+# --- worlds -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("family", ["slide", "drop_split", "domino_chain", "balance"])
+def test_each_lane_ends_as_by_itself_and_its_twin_is_hidden_by_the_same_clip(family: str):
+    spec = drawn(family)
+    world, twins = worlds(spec)
+    assert trajectory_digest(world.qpos) == spec.trajectory_sha256
+    for k, record in enumerate(spec.lanes):
+        assert world.outcome(k).label == world.events[k].outcome.label == record.ground_truth
+        assert twins[k].outcome(k).label == record.twin.ground_truth != record.ground_truth
+        assert twins[k].outcome(1 - k).label == spec.lanes[1 - k].ground_truth
+        assert trajectory_digest(twins[k].qpos) == record.twin.trajectory_sha256
+    frames = [0, 24, 49]
+    shown = {}
+    for name, each in (("world", world), ("left", twins[0]), ("right", twins[1])):
+        with Renderer(each.model, each.camera) as renderer:
+            shown[name] = {clip: [*renderer.frames(each.clip(hidden)[frames])] for clip, hidden in CLIPS.items()}
+    assert shown["world"]["both"][0].shape == (360, 640, 3)
+    for clip in ("left", "both"):
+        assert np.array_equal(shown["world"][clip], shown["left"][clip])
+    for clip in ("right", "both"):
+        assert np.array_equal(shown["world"][clip], shown["right"][clip])
+    left, right = slice(None, 320), slice(320, None)
+    assert np.array_equal(
+        np.array(shown["world"]["left"])[:, :, right], np.array(shown["world"]["neither"])[:, :, right]
+    )
+    assert np.array_equal(
+        np.array(shown["world"]["right"])[:, :, left], np.array(shown["world"]["neither"])[:, :, left]
+    )
+
+
+@pytest.mark.slow
+def test_nothing_in_view_depends_on_which_of_its_worlds_a_lane_is_in():
+    world, twins = worlds(drawn("slide"))
+    pairs = [(world.events[k], twins[k].events[k]) for k in range(2)]
+    camera, layouts = fit_lanes(world.lanes, pairs)
+    exchanged_camera, exchanged_layouts = fit_lanes(world.lanes, [pair[::-1] for pair in pairs])
+    assert exchanged_camera == camera == world.camera
+    assert exchanged_layouts == layouts
+
+
+@pytest.mark.slow
+def test_a_board_beside_its_place_and_a_timetable_without_a_window_are_refused():
+    world, twins = worlds(drawn("slide"))
+    assert certify_lanes(world, twins)["settled_frames"]
+    layout = world.layouts[0]
+    scene, bench = layout.boards
+    narrow = replace(layout, boards=(replace(scene, half=(0.05, *scene.half[1:])), bench))
+    tampered = [replace(each, layouts=[narrow, world.layouts[1]]) for each in (world, *twins)]
+    with pytest.raises(Rejected, match=r"twin's clip is another|does not hide"):
+        certify_lanes(tampered[0], tampered[1:])
+    always = [replace(world.lanes[0], timetable=Timetable(((0, 50),))), world.lanes[1]]
+    with pytest.raises(Rejected, match="no window"):
+        certify_lanes(replace(world, lanes=always), twins)
+
+
+# --- items ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_every_text_and_every_mixed_clip_is_as_often_to_be_answered_as_not():
+    spec = TwoEventsSpec.model_validate_json(drawn("slide").model_dump_json())
+    assert spec == drawn("slide")
+    items = [*spec.items()]
+    assert len(items) == 8
+    texts = Counter((item.question, item.answer is None) for item in items)
+    assert [*texts.values()] == [2] * 4
+    mixed = Counter((item.clip, item.answer is None) for item in items if item.clip in ("left", "right"))
+    assert [*mixed.values()] == [1] * 4
+    assert {item.answer for item in items if item.clip == "neither"} == {r.ground_truth for r in spec.lanes}
+
+
+@pytest.mark.slow
+def test_both_sides_have_the_same_boards():
+    table = balance(lane_numbers([drawn("slide"), drawn("drop_split")])).set_index("number")
+    boards = table[table.index.str.startswith("boards")]
+    assert len(boards) == 8 and (boards["seen"] == boards["hidden"]).all() and (boards["auc"] == 0.5).all()
+
+
+def test_the_share_of_pairs_in_which_the_hidden_one_has_more_counts_ties_by_half():
+    assert auc(np.array([1.0, 2.0]), np.array([2.0, 3.0])) == (1 + 1 + 0.5 + 1) / 4
+
+
+def test_families_that_are_left_out_are_families():
+    names = {family.name for family in families() if family.taxonomy == "occlusion"}
+    assert {*LEFT_OUT} <= names
