@@ -103,10 +103,9 @@ def examine_files(place: Place) -> Iterator[Finding]:
 
     workspace = Workspace.open(place)
     store, missing = workspace.store, list[str]()
-    remote_paths = [store.below(workspace.root / folder) for folder in FOLDERS] if workspace.is_shared else []
-    for path in (
-        path for folder_paths in remote_paths for path in folder_paths
-    ):  # fetched, and compared with their digests
+    folders = FOLDERS if workspace.is_shared else ()
+    # Those of other hosts are fetched, and compared with their digests.
+    for path in (path for folder in folders for path in store.below(workspace.root / folder)):
         try:
             store.here(path)
         except TrapsError as error:
@@ -280,11 +279,9 @@ def _plugins() -> str:
     from traps_pipeline.base.plugins import KINDS, plugins
     from traps_pipeline.scenes.family_registry import get_family
 
-    for name in plugins("families"):
-        get_family(name)
     added = [plugin for group in KINDS for plugin in plugins(group).values()]
     for plugin in added:
-        plugin.load()
+        get_family(plugin.name) if plugin.group == "families" else plugin.load()
     return ", ".join(f"{KINDS[plugin.group]} {plugin.name} ({plugin.package})" for plugin in added) or "add no part"
 
 

@@ -120,9 +120,8 @@ def findings(
 ) -> LiveResult:
     """Return an entry's problems and notes, from outcomes of `requests_of`."""
     problems, notes, server_check = list[str](), list[str](), reached or ServerCheck()
-    answering_models = {
-        (outcome.served_model or "").partition("@")[0] for outcome in outcomes.values()
-    }  # @VERSION may follow
+    # @VERSION may follow.
+    answering_models = {(outcome.served_model or "").partition("@")[0] for outcome in outcomes.values()}
     if server_check.unlisted and model_name(entry) not in answering_models:
         return LiveResult(entry, [server_check.unlisted])
     if server_check.unlisted:

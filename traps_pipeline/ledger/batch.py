@@ -101,7 +101,7 @@ class Batch:
 
     def amounts(self) -> list[Amount]:
         """Return all money of the study. Raises TrapsError for what is no amount."""
-        amounts = [*map(Amount._make, self._execute(_AMOUNTS, {"of_study": self.study}).fetchall())]
+        amounts = [Amount(*row) for row in self._execute(_AMOUNTS, {"of_study": self.study})]
         for each in amounts:
             if not (is_amount(each.usd) and is_amount(each.failed)):
                 value = each.failed if is_amount(each.usd) else each.usd

@@ -126,7 +126,7 @@ class Database(ABC):
         try:
             with self.read() as connection:
                 self._check_additions(connection)
-                if sa.inspect(connection).has_table(SEALS.name) and (study := self._study(connection)):
+                if sa.inspect(connection).has_table(SEALS.name) and (study := self.find_study(connection)):
                     Batch(connection, study, self.session, self.damaged).is_sealed()
         except exc.DBAPIError as error:
             yield str(self.sentence(error))
@@ -265,7 +265,7 @@ class Database(ABC):
         self._check_additions(connection)
         METADATA.create_all(connection)
         self.study = (
-            self._study(connection)
+            self.find_study(connection)
             or connection.execute(sa.insert(STUDIES).values(name=self.study_name).returning(STUDIES.c.id)).scalar_one()
         )
         if connection.execute(sa.select(SESSIONS.c.id).where(SESSIONS.c.id == self.session)).first() is None:
@@ -294,7 +294,8 @@ class Database(ABC):
         if names := [*connection.exec_driver_sql(self.additions).scalars()]:
             raise self.damaged(f"it has {', '.join(map(str, names))}, which this program did not make")
 
-    def _study(self, connection: sa.Connection) -> int | None:
+    def find_study(self, connection: sa.Connection) -> int | None:
+        """Return this study's number, None before its first row."""
         return connection.execute(sa.select(STUDIES.c.id).where(STUDIES.c.name == self.study_name)).scalar()
 
     def _leave(self) -> None:

@@ -117,8 +117,10 @@ class _Copy:
         for rows in self._row_chunks(lost):
             whole = [row for row in rows if row.evaluation in copied and is_whole(row, copied[row.evaluation][1])]
             lost += {row.id for row in rows} - {row.id for row in whole}
-            values = ({**row._mapping, "evaluation": copied[row.evaluation][0]} for row in whole)
-            if values := [{name: value for name, value in each.items() if name != "id"} for each in values]:
+            values = (
+                {name: value for name, value in zip(ROWS.c.keys(), row, strict=True) if name != "id"} for row in whole
+            )
+            if values := [{**each, "evaluation": copied[each["evaluation"]][0]} for each in values]:
                 batch.connection.execute(sa.insert(ROWS), values)
             count += len(whole)
         if lost:
@@ -126,7 +128,7 @@ class _Copy:
             self._lost(f"{self.source.place}: {words}")
         for table in (TOTALS, RELEASES, RESERVATIONS):
             for row in self._rows(table):
-                values = {**row._mapping, "study": batch.study}
+                values = dict(zip(table.c.keys(), row, strict=True)) | {"study": batch.study}
                 if table is RELEASES:
                     del values["id"]
                 if all(

@@ -113,8 +113,9 @@ class SqliteDatabase(Database):
     def _fault(self, words: object) -> TrapsError:
         return self.damaged(f"it is damaged ({str(words).splitlines()[-1]})")
 
-    def _study(self, connection: sa.Connection) -> int | None:
-        number, other = super()._study(connection), sa.select(STUDIES.c.name).limit(1)
+    @override
+    def find_study(self, connection: sa.Connection) -> int | None:
+        number, other = super().find_study(connection), sa.select(STUDIES.c.name).limit(1)
         if number is None and (row := connection.execute(other).first()):
             raise self.damaged(f"it holds the study {row.name}, and not {self.study_name}")
         return number

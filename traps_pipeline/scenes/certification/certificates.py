@@ -353,9 +353,8 @@ def _legible(pair: Pair) -> Evidence:
 def _judge_legible(e: Evidence, claim: Claim) -> Failures:
     if e.get("too_small"):
         yield f"too small at the end: {e['too_small'][0]}"
-    min_pixels = (
-        LEGIBLE_PIXELS if claim.family.legible is None else 1
-    )  # a family's own groups are told by `too_small` alone
+    # A family's own groups are told by `too_small` alone.
+    min_pixels = LEGIBLE_PIXELS if claim.family.legible is None else 1
     if e["least_visible_px"] < min_pixels:
         yield f"too small at the end: {e['least_visible_px']:.0f} of {min_pixels:.0f} pixels"
 
@@ -515,9 +514,8 @@ def _referents(pair: Pair) -> Evidence:
     scene, model, fps = control.scene, control.model, control.physics.fps / control.frame_step
     rigid = np.flatnonzero((model.body_weldid > 0) & ~is_carrier(model))
     bodies = {*(model.body(int(i)).name for i in rigid), *flexes(model)}
-    moving_bodies = {
-        body for body in bodies if not body.startswith(DISTRACTOR)
-    }  # which are neither named nor the cause
+    # Distractors are neither named nor the cause.
+    moving_bodies = {body for body in bodies if not body.startswith(DISTRACTOR)}
     seconds_moving: dict[str, float] = {}
     for body in sorted(moving_bodies):
         pixels = control.pixels_of(decisive_geoms(model, [body]))

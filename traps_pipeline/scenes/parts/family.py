@@ -61,9 +61,8 @@ def scene_family(
         visible = before_occluder(frames)  # what an occluder covers at the end was seen before it came
         frames_without_flags = visible if twins is None else without_flags(visible)
         if foresee is not None and len(visible) < len(frames):
-            is_at_rest = is_still(visible) or is_still(
-                visible[:-1]
-            )  # the shadow of an occluder may come before it does
+            # The shadow of an occluder may come before it does.
+            is_at_rest = is_still(visible) or is_still(visible[:-1])
             return _first_answer(frames_without_flags, slots, (observe, foresee) if is_at_rest else (foresee, observe))
         answer = observe(frames_without_flags, slots)
         if (

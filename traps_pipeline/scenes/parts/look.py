@@ -163,9 +163,8 @@ def paint_occluders(spec: mujoco.MjSpec, occluders: Sequence[mujoco.MjsGeom], pa
     material.texuniform, material.texrepeat = True, [LINES_PER_M] * 2
     for geom in occluders:
         geom.material, geom.rgba = "occluder", [1, 1, 1, 1]
-        width, thickness, height = (
-            float(half_size) for half_size in geom.size
-        )  # a texture lies in a box's own x and y: stand it up
+        # A texture lies in a box's own x and y: stand it up.
+        width, thickness, height = (float(half_size) for half_size in geom.size)
         cos, _, _, sin = (float(part) for part in geom.quat)
         geom.size, geom.quat = [width, height, thickness], [part / np.sqrt(2) for part in (cos, cos, sin, sin)]
 

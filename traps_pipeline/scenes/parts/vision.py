@@ -21,10 +21,8 @@ COMING_PX = 600  # of an occluder on its way, that are new in a frame
 COMES_FRAMES = 4  # of five a second, in which it may be seen on its way
 EDGE = 60  # least contrast of an edge
 MOVED_PX = 24  # what moves changes more pixels from frame to frame
-CHANGED_LEVELS, SAME_COLOUR_LEVELS = (
-    16,
-    12,
-)  # levels of 255: by more than these a pixel changes, by no more two are of one colour
+# Levels of 255: by more than the first a pixel changes, by no more than the second two are of one colour.
+CHANGED_LEVELS, SAME_COLOUR_LEVELS = 16, 12
 # Hue (degrees), least saturation and value (0-1) of the saturated colours. Shade lowers the value, not the hue.
 _HUES: Mapping[str, tuple[float, float, float, float]] = {
     "red": (346, 8, 0.62, 0.22),
@@ -149,9 +147,8 @@ def before_occluder(frames: np.ndarray) -> np.ndarray:
             (_levels(frames[at][part], colour) <= SAME_COLOUR_LEVELS).mean() for part in (region, ring)
         )
         was_even = (_levels(frames[at - 1][region], previous_colour) <= SAME_COLOUR_LEVELS).mean()
-        stands_out = ring_share < 0.4 or (
-            ring_share < 0.75 and was_even < region_share
-        )  # some of what is around it may be as dark
+        # Some of what is around it may be as dark.
+        stands_out = ring_share < 0.4 or (ring_share < 0.75 and was_even < region_share)
         if sizes.max() >= STEP_PX and region_share > 0.5 and stands_out and _is_standing_later(frames, at, colour):
             return frames[: _first_moving_frame(frames, at, colour)]
     return frames
@@ -164,9 +161,8 @@ def _is_standing_later(frames: np.ndarray, comes: int, colour: np.ndarray) -> bo
         _levels(frames[at], colour) <= SAME_COLOUR_LEVELS for at in (comes - 1, earlier_frame, later_frame, -1)
     )
     new_region = level_at_end & ~level_before & ~level_early
-    filled_mask = cv2.morphologyEx(
-        new_region.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8)
-    )  # lines between slats
+    # Lines between slats are filled.
+    filled_mask = cv2.morphologyEx(new_region.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8))
     return bool(filled_mask.sum() >= OCCLUDER_PX and (soon_after & new_region).sum() > 0.9 * new_region.sum())
 
 
