@@ -20,8 +20,10 @@ from tests.build.errors import raises
 from tests.conftest import Checkout, copy_of
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.benchmark.held_out import MARKER, drawn_items, held_out_key
+from traps_pipeline.benchmark import held_out
+from traps_pipeline.benchmark.held_out import MARKER, drawn_items, held_out_key, require_secret_seed
 from traps_pipeline.benchmark.items import build_items
+from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.protocol.datasets import CROSSED, DATASETS
 from traps_pipeline.release.content import Content, content_of
 from traps_pipeline.release.folder import Options, write_release
@@ -269,3 +271,41 @@ def test_a_kill_while_a_release_is_written_leaves_nothing_half_made_and_the_same
     study.traps(*command).ok()
     study.traps("publish", "verify", folder).ok()
     assert sorted(path.name for path in tmp_path.iterdir() if "out" in path.name) == ["out"]
+
+
+def test_files_are_created_in_the_order_of_their_names(releases: list[tuple[Path, Path]]) -> None:
+    """A folder's own order, which archives keep, is that of creation on some disks; inodes are numbered by it."""
+    for folder, _ in releases:
+        clips = sorted((folder / "clips" / "items").glob("*.mp4"))
+        created = sorted(clips, key=lambda path: path.stat().st_ctime_ns)
+        assert len(clips) == 32 and created == clips
+
+
+def test_one_key_gives_other_names_in_another_benchmark(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    key = tmp_path / "key"
+    first = held_out_key(key, make=True)
+    another = load_release().model_copy(update={"canary": "ANOTHER:CANARY:1"})
+    monkeypatch.setattr(held_out, "load_release", lambda: another)
+    assert held_out_key(key) != first and len(first) == len(held_out_key(key)) == 32
+
+
+def test_a_map_of_another_release_is_not_overwritten(content: Content, tmp_path: Path) -> None:
+    (content.study / MARKER).unlink(missing_ok=True)
+    (tmp_path / "key.items.jsonl").write_text("{}\n")
+    with raises(TrapsError, "release.folder._held_out_release", str(tmp_path / "key.items.jsonl")):
+        write_release(content, tmp_path / "folder", Options(held_out=tmp_path / "key"))
+    assert (tmp_path / "key.items.jsonl").read_text() == "{}\n"
+
+
+@pytest.mark.parametrize(("name", "is_told"), [("private-2026", True), ("lab", False), ("lab-12026", False)])
+def test_a_name_that_holds_the_seed_of_a_private_benchmark_is_refused(tmp_path: Path, name: str, is_told: bool) -> None:
+    (tmp_path / "released").mkdir()
+    draws = {"plinko": {"seed": 2026, "wanted": 1, "draws": 1, "rejected": {}}}
+    (tmp_path / "released" / "draws.json").write_text(json.dumps(draws))
+    canary = f"{name.upper()}:CANARY:7c1b9a52-2026-4b7f-9a64-2f5d8e0c41b6"
+    (tmp_path / "benchmark.yaml").write_text(f"name: {name}\nversion: 1.0.0\ncanary: '{canary}'\n")
+    if is_told:
+        with raises(TrapsError, "benchmark.held_out.require_secret_seed", str(tmp_path / "benchmark.yaml")):
+            require_secret_seed(tmp_path)
+    else:
+        require_secret_seed(tmp_path)

@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import OWN_SPECS, SCENE_SPECS
+from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.storage.benchmark_tables import ItemRow
 
 KEY_BYTES = 32
@@ -43,7 +44,8 @@ def held_out_key(path: Path, *, make: bool = False) -> bytes:
         raise TrapsError(f"{path}: cannot be read ({error}); give the file of the held-out set's key") from error
     if not re.fullmatch(rf"[0-9a-f]{{{2 * KEY_BYTES}}}", text):
         raise TrapsError(f"{path}: is no key ({2 * KEY_BYTES} hexadecimal digits); give the one that the release made")
-    return bytes.fromhex(text)
+    # Another benchmark that has ids in common gets other names and another draw by the same key.
+    return hmac.digest(bytes.fromhex(text), load_release().canary.encode(), "sha256")
 
 
 def drawn_items(items: Iterable[Row], key: bytes) -> list[Row]:
@@ -60,9 +62,6 @@ def drawn_items(items: Iterable[Row], key: bytes) -> list[Row]:
         order = sorted(rows_of, key=lambda scenario: opaque(key, f"turn of {scenario}"))
         drawn += [rows_of[scenario][turn % len(rows_of[scenario])] for turn, scenario in enumerate(order)]
     return drawn
-
-
-# --- the guard --------------------------------------------------------------------------------------------------------
 
 
 def _markers(study: Path) -> list[Path]:
@@ -98,6 +97,20 @@ def mark_held_out(study: Path, drawn: Iterable[Row]) -> None:
         )
     for path in _markers(study):
         write_text(path, json.dumps(sorted({**former, **items}.values()), indent=0) + "\n", private=True)
+
+
+def require_secret_seed(benchmark: Path) -> None:
+    """Raise TrapsError if a benchmark's name or canary, which are published, hold the seed that draws its records."""
+    from traps_pipeline.scenes.draw.sample import load_tallies
+
+    release = load_release(benchmark / "benchmark.yaml")
+    public = f"{release.name} {release.canary.partition(':CANARY:')[0]}"
+    seeds = {tally.seed for tally in load_tallies(benchmark / "released").values()}
+    if seeds & {int(number) for number in re.findall(r"\d{1,19}", public)}:
+        raise TrapsError(
+            f"{benchmark / 'benchmark.yaml'}: its name holds the seed, by which anyone can draw the records again; "
+            "draw a new benchmark with another seed, and name it by `--name`"
+        )
 
 
 def refuse_held_out(study: Path, output: str) -> None:

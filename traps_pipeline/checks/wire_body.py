@@ -47,9 +47,6 @@ class WireBody:
         return next((api for ending, api in ENDPOINTS.items() if self.path.endswith(ending)), None)
 
 
-# --- parsing a body ---------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class ClipPart:
     """A video or an image in a body. fps: the rate in the body, if it has one."""
@@ -139,9 +136,6 @@ def flat(value: Any, name: str = "") -> dict[str, Any]:
     for key, element in value.items():
         leaves |= flat(element, f"{name}.{key}" if name else key)
     return leaves
-
-
-# --- the fields that a body must have ---------------------------------------------------------------------------------
 
 
 def declared_fields(api: Api, params: Mapping[str, Any]) -> dict[str, Any]:

@@ -41,7 +41,7 @@ def integer(least: int, most: int) -> Callable[[str], int]:
     """Return an argparse type for a whole number in plain digits, `least` to `most`."""
 
     def parse(text: str) -> int:
-        if not re.fullmatch(r"-?[0-9]{1,18}", text) or not least <= int(text) <= most:
+        if not re.fullmatch(r"-?[0-9]{1,19}", text) or not least <= int(text) <= most:
             raise argparse.ArgumentTypeError(f"{text[:40]!r} is no whole number from {least} to {most}")
         return int(text)
 

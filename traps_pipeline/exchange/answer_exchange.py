@@ -362,7 +362,7 @@ def _answers_by_item(
     answers, problems, failed = dict[str, Answer](), list[str](), set[str]()
     for log_answer in imported:
         run = context.run + log_answer.epoch - 1 if log_answer.run is None else log_answer.run
-        key = keys.get((names.get(log_answer.item, log_answer.item), log_answer.regime, run))
+        key = keys.get((names.get(log_answer.item, "" if context.key else log_answer.item), log_answer.regime, run))
         try:
             if key is None:
                 problems.append(

@@ -59,9 +59,6 @@ def _join(values: Iterable[str], by: str) -> str:
     return by.join(sorted({part for value in values for part in value.split(by)}))
 
 
-# --- coefficients -----------------------------------------------------------------------------------------------------
-
-
 def complete(values: np.ndarray) -> np.ndarray:
     """Return the rows on which every judge cast a valid vote."""
     return values[(values != INVALID).all(axis=1)]
@@ -123,9 +120,6 @@ def _chance_agreement(p: float) -> float:
 
 def _chance_corrected(observed: float, by_chance: float) -> float:
     return (observed - by_chance) / (1 - by_chance)
-
-
-# --- rows -------------------------------------------------------------------------------------------------------------
 
 
 def _shared_columns(values: np.ndarray, complete_rows: np.ndarray) -> dict[str, Any]:

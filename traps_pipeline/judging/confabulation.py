@@ -42,8 +42,6 @@ from traps_pipeline.storage.workspace import Workspace
 
 MAX_TRACE = 400_000  # characters of a trace that the judge is shown
 
-# --- the sample -------------------------------------------------------------------------------------------------------
-
 
 @dataclass(frozen=True)
 class Failure(Call):
@@ -103,9 +101,6 @@ def _void_failures(workspace: Workspace, cell: Cell) -> list[dict[str, Any]]:
     return [{str(name): value if isinstance(value, str) else None for name, value in row.items()} for row in rows]
 
 
-# --- the judge --------------------------------------------------------------------------------------------------------
-
-
 def render(question: str, kind: str, answer: str, trace: str | None) -> str:
     """Return the user message to the judge."""
     parts = [quote("reasoning trace", "TRACE", trace, MAX_TRACE)] if trace else ["No reasoning trace is given."]
@@ -128,9 +123,6 @@ class Labels(BaseModel):
     epistemic_surrender: Flag
     doubt_in_reasoning: Flag
     rationale: str
-
-
-# --- the confabulation stage ------------------------------------------------------------------------------------------
 
 
 def collect_labels(workspace: Workspace) -> StageOutput:

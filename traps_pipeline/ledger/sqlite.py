@@ -78,7 +78,8 @@ class SqliteDatabase(Database):
         """A file that is shorter than it says is otherwise refused as a whole."""
 
         def open_cut() -> sqlite3.Connection:
-            uri = f"file:{quote(str(self.path))}?mode=ro"
+            mode = "mode=ro" if self.path.with_name(f"{self.path.name}-wal").exists() else "immutable=1"
+            uri = f"file:{quote(str(self.path))}?{mode}"
             connection = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
             connection.execute("pragma writable_schema = 1")
             return connection

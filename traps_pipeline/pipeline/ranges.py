@@ -67,9 +67,6 @@ def _spans(numbers: Sequence[int]) -> list[tuple[int, int]]:
     return spans
 
 
-# --- for several hosts ------------------------------------------------------------------------------------------------
-
-
 def cut(scheme: Partitioning | None, keys: Sequence[str | None], most: int) -> list[Range]:
     """Return up to `most` ranges of about equally many keys, none twice.
 

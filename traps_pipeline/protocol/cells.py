@@ -70,9 +70,6 @@ class Cell:
         return Cell(dataset, Evaluation.parse(evaluation))
 
 
-# --- inside local models ----------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, order=True)
 class Extraction:
     """One local model under one VQA prompt: the partition of probes and directions."""

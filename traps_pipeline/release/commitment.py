@@ -23,6 +23,7 @@ from traps_pipeline.base.files import write_text
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.workers import keep_workers
 from traps_pipeline.base.yamlfile import explain, read_lines
+from traps_pipeline.benchmark.held_out import require_secret_seed
 from traps_pipeline.benchmark.records import load_release, load_released, parse_record
 from traps_pipeline.scenes.draw.sample import load_tallies, sample_family
 from traps_pipeline.scenes.parts.difficulty import DEFAULT_DIFFICULTY, Difficulty
@@ -90,6 +91,7 @@ def commit(benchmark: Path, commitment: Path, reveal: Path) -> Commitment:
             f"{benchmark}: is not one draw of one seed and difficulty; draw one with `traps benchmark sample` into a "
             "new folder"
         )
+    require_secret_seed(benchmark)
     ((seed, difficulty),) = draws_of
     secret = Reveal(seed=seed, nonce=secrets.token_hex(32))
     release, draws = load_release(benchmark / "benchmark.yaml"), {n: t.wanted for n, t in sorted(tallies.items())}

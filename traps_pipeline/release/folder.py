@@ -13,8 +13,15 @@ import yaml
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import replace_folder, write_bytes, write_text
-from traps_pipeline.base.paths import ASSETS, ROOT
-from traps_pipeline.benchmark.held_out import drawn_items, held_out_key, mark_held_out, opaque, refuse_held_out
+from traps_pipeline.base.paths import ASSETS, OWN_SPECS, ROOT, SCENE_SPECS
+from traps_pipeline.benchmark.held_out import (
+    drawn_items,
+    held_out_key,
+    mark_held_out,
+    opaque,
+    refuse_held_out,
+    require_secret_seed,
+)
 from traps_pipeline.protocol.datasets import CROSSED
 from traps_pipeline.release import content as rows_of
 from traps_pipeline.release.card import card, dictionary
@@ -140,6 +147,8 @@ def _held_out_release(folder: _Folder, content: Content, key_file: Path) -> Path
     """Write one item of each scenario with a clip of its own, and the answers beside the key."""
     if CROSSED in content.versions:
         raise TrapsError(f"--arms {CROSSED}: it asks questions of other scenarios, which tells sides; leave it out")
+    if SCENE_SPECS != OWN_SPECS:
+        require_secret_seed(SCENE_SPECS)
     key = held_out_key(key_file, make=True)
     items = drawn_items(content.items, key)
     mark_held_out(content.study, items)
@@ -147,7 +156,10 @@ def _held_out_release(folder: _Folder, content: Content, key_file: Path) -> Path
     folder.table(HELD_OUT_ITEMS, rows_of.held_out_rows(items, digests, key, content.release.canary))
     names = sorted((opaque(key, row["item_id"]), row["item_id"]) for row in items)
     answers = key_file.with_name(f"{key_file.name}.items.jsonl")
-    write_text(answers, "".join(json.dumps({"item": n, "item_id": id_}) + "\n" for n, id_ in names), private=True)
+    lines = "".join(json.dumps({"item": n, "item_id": id_}) + "\n" for n, id_ in names)
+    if answers.exists() and answers.read_text(encoding="utf-8") != lines:
+        raise TrapsError(f"{answers}: maps the items of another release; give each release a key of its own")
+    write_text(answers, lines, private=True)
     return answers
 
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import shutil
 import struct
+import tempfile
+from collections import deque
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -29,18 +32,19 @@ def write_held_out_clips(
     sources: the study's clips by path. A file is named by its digest.
     """
     folder.mkdir(parents=True)
-    parts = {row["item_id"]: folder / f"{opaque(key, row['item_id'])}.mp4" for row in items}
-    write = partial(_write_own_clip, sources, key, parts)
-    with ThreadPoolExecutor(cores()) as pool:
-        for _ in pool.map(write, items):
-            pass
-    size, digests = max(path.stat().st_size for path in parts.values()) + _BOX.size, dict[str, str]()
-    for item_id, path in parts.items():
-        padding = size - path.stat().st_size
-        with path.open("ab") as stream:
-            stream.write(_BOX.pack(padding, b"free") + bytes(padding - _BOX.size))
-        digests[item_id] = file_digest(path)
-        path.rename(folder / clip_name(digests[item_id]))
+    with tempfile.TemporaryDirectory(dir=folder) as scratch:
+        parts = {row["item_id"]: Path(scratch) / f"{opaque(key, row['item_id'])}.mp4" for row in items}
+        with ThreadPoolExecutor(cores()) as pool:
+            deque(pool.map(partial(_write_own_clip, sources, key, parts), items), maxlen=0)
+        size, digests = max(path.stat().st_size for path in parts.values()) + _BOX.size, dict[str, str]()
+        for item_id, path in parts.items():
+            padding = size - path.stat().st_size
+            with path.open("ab") as stream:
+                stream.write(_BOX.pack(padding, b"free") + bytes(padding - _BOX.size))
+            digests[item_id] = file_digest(path)
+        # A folder and an archive may list files as they were created: in the order of their names, not of sides.
+        for item_id in sorted(digests, key=lambda item: digests[item]):
+            shutil.copyfile(parts[item_id], folder / clip_name(digests[item_id]))
     return digests
 
 

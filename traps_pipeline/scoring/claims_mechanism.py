@@ -34,9 +34,6 @@ def text_figure(name: str) -> float:
     return float(row["value"])
 
 
-# --- probes -----------------------------------------------------------------------------------------------------------
-
-
 def _best() -> Recomputed:
     best = max(published_rows("probe_transfer", model=QWEN), key=lambda row: row["auroc"])
     return Recomputed(f"{best['auroc']:.3f} ({best['source']} to {best['target']})")
@@ -81,9 +78,6 @@ def _mean_layer(kind: str) -> Recomputed:
 
 def _near_chance() -> Recomputed:
     return Recomputed(f"{sum(row['auroc_confabulated'] <= 0.57 for row in published_rows('probe_transfer'))}")
-
-
-# --- steering ---------------------------------------------------------------------------------------------------------
 
 
 def _dose(side: str) -> Recomputed:

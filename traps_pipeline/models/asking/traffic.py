@@ -76,10 +76,7 @@ class RateLimiter:
     """
 
     def __init__(
-        self,
-        requests_per_minute: int | None,
-        tokens_per_minute: int | None,
-        sharers: Callable[[], int] = lambda: 1,
+        self, requests_per_minute: int | None, tokens_per_minute: int | None, sharers: Callable[[], int] = lambda: 1
     ) -> None:
         self._sharers = sharers
         self._rates = [None if rate is None else rate / 60 for rate in (requests_per_minute, tokens_per_minute)]

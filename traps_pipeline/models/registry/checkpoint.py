@@ -141,9 +141,6 @@ def _content_digest(folder: Path, stamps: tuple[tuple[str, int, int], ...]) -> s
     return digest({name: file_digest(folder / name) for name, _, _ in stamps})
 
 
-# --- memory -----------------------------------------------------------------------------------------------------------
-
-
 def weight_bytes(folder: Path, dtype: Dtype, quantisation: Quantisation) -> float:
     """Return the weights' bytes of memory at a precision, from their files' headers."""
     weights = sum(math.prod(shape) for file in sorted(folder.glob("*.safetensors")) for shape in _shapes(file))

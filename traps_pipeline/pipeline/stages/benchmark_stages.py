@@ -240,4 +240,6 @@ def items(workspace: Workspace, dataset: str) -> StageOutput:
     from traps_pipeline.benchmark.items import build_items
 
     rows = build_items(workspace, dataset)
-    return StageOutput(rows, shown={"benchmark version": rows[0].benchmark_version})
+    return StageOutput(
+        rows, shown={"benchmark version": rows[0].benchmark_version if rows else "none: no item of it was released"}
+    )

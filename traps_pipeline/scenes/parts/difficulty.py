@@ -111,9 +111,6 @@ class SceneDifficulty:
             raise ValueError(f"{'.'.join(map(str, ('difficulty', *first['loc'])))}: {first['msg']}") from None
 
 
-# --- drawing ----------------------------------------------------------------------------------------------------------
-
-
 def draw_distractors(
     rng: np.random.Generator, count: int, scene: Scene, points: np.ndarray, wording: Wording, p: Any, duration_s: float
 ) -> tuple[Distractor, ...]:
@@ -159,9 +156,6 @@ def _like_and_free(colour: str, taken: Collection[str]) -> list[Colour]:
     free: list[Colour] = [other for word, other in BALL_COLOURS.items() if word not in taken]
     similar_colours: list[Colour] = [other for other in free if {colour, other} in LOOK_ALIKE]
     return similar_colours or free
-
-
-# --- building ---------------------------------------------------------------------------------------------------------
 
 
 def add_distractors(scene: Scene, p: Any) -> Scene:

@@ -53,9 +53,6 @@ def _choose(asides: Sequence[Aside], rng: np.random.Generator) -> Aside:
     return asides[0] if len(asides) == 1 else asides[int(rng.integers(len(asides)))]
 
 
-# --- questions --------------------------------------------------------------------------------------------------------
-
-
 def yes_no(
     *templates: str,
     yes: Forms,
@@ -125,9 +122,6 @@ def how_many(
         return Filled(labels, aliases, {"choices": list_choices(labels), **fills(p, rng)})
 
     return Question("count_range", templates, fill)
-
-
-# --- answerable asides ------------------------------------------------------------------------------------------------
 
 
 def either(question: str, labels: Sequence[str], answer: Callable[[Any], str]) -> Aside:

@@ -15,9 +15,6 @@ from traps_pipeline.scenes.physics.kit import Motion, Reading
 Labels = list[str | None]
 
 
-# --- from when something holds ----------------------------------------------------------------------------------------
-
-
 def lasting_from(holds: np.ndarray) -> int:
     """Return the first frame from which `holds` (F,) stays true; F if none."""
     false_frames = np.flatnonzero(~holds)
@@ -39,9 +36,6 @@ def still_from(*paths: np.ndarray, within_m: float) -> int:
 def clear_m(past: np.ndarray, before_m: float = 0.0) -> float:
     """Return how far (m) a thing ends past a line, or its front ends before it."""
     return float(past[-1] if past[-1] > 0 else -past[-1] - before_m)
-
-
-# --- readings ---------------------------------------------------------------------------------------------------------
 
 
 def undecided(motion: Motion) -> Labels:

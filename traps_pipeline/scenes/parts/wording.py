@@ -92,10 +92,7 @@ BEYOND_VIDEO: Mapping[str, tuple[str, tuple[str, ...]]] = {
         ("How far is the {thing} from the wall behind the camera?",),
     ),
     "electric charge": (r"\b(electric charge|volts)\b", ("What is the electric charge of the {thing}?",)),
-    "material strength": (
-        r"\b(newtons?|break)\b",
-        ("How many newtons would it take to break the {thing}?",),
-    ),
+    "material strength": (r"\b(newtons?|break)\b", ("How many newtons would it take to break the {thing}?",)),
 }
 
 
