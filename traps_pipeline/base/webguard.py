@@ -26,15 +26,15 @@ MIN_TOKEN = 16  # characters
 TOKEN_OWNER = "traps.who"  # key of a request's scope: the owner of its token
 LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 _SAFE_METHODS = ("GET", "HEAD")
-# Added to every answer: it is not shown in a frame, its address (which may hold the token) goes to no other site.
+# Added to every answer, beside the app's own policy: it is in no frame, and nothing, its address included, leaves.
 _HEADERS = {
     "x-frame-options": "DENY",
-    "content-security-policy": "frame-ancestors 'none'",
     "x-content-type-options": "nosniff",
     "referrer-policy": "no-referrer",
     "cross-origin-opener-policy": "same-origin",
     "cross-origin-resource-policy": "same-origin",
 }
+_POLICY = "default-src 'self' data: blob: 'unsafe-inline' 'unsafe-eval'; form-action 'self'; frame-ancestors 'none'"
 
 
 def is_loopback(host: str) -> bool:
@@ -185,6 +185,7 @@ def _with_headers(send: Send) -> Send:
         if message["type"] == "http.response.start":
             headers = MutableHeaders(scope=message)
             headers.update(_HEADERS)
+            headers.append("content-security-policy", _POLICY)
             headers.setdefault("cache-control", "no-store")
         await send(message)
 
