@@ -25,7 +25,9 @@ def blocks(language: str) -> list[str]:
 
 def in_this_study(study: Checkout, command: str) -> str:
     """The command with the study's folders in place of the README's."""
-    command = re.sub("^pip ", f"{sys.executable} -m pip ", command)
+    # Into the checkout, which is on the path of its commands, and not into the environment of all tests.
+    options = f"--no-deps --no-build-isolation --no-index --target {study.root}"
+    command = re.sub("^pip install", f"{sys.executable} -m pip install {options}", command)
     command = command.replace("mine.yaml", str(study.workspace.parent / "mine.yaml")).replace(
         ".workspaces/mine", str(study.workspace.parent / "mine")
     )
