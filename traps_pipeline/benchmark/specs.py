@@ -27,6 +27,7 @@ from traps_pipeline.storage.benchmark_tables import SCENE_SPECS, SceneSpecRow
 from traps_pipeline.storage.workspace import Workspace
 
 if TYPE_CHECKING:
+    from traps_pipeline.scenes.draw.resolve import Resolved
     from traps_pipeline.scenes.physics.kit import Wording
 
 SECONDS_A_RECORD = 0.04  # measured on one core: read a scenario's trajectories, and recompute its evidence
@@ -68,19 +69,19 @@ def _resolve_again(workspace: Workspace, scenario: Scenario) -> tuple[SceneSpec,
         if (folder / f"{name}.json").is_file():
             record = (folder / f"{name}.json").read_text(encoding="utf-8")
             return parse_record(record, str(folder / f"{name}.json")), folder / f"{name}.npz"
-    spec, qpos, twin = _simulate(scenario)
+    resolution = _simulate(scenario)
     try:
-        save_trajectory(workspace.trajectories, name, qpos, twin)
+        save_trajectory(workspace.trajectories, name, resolution.worlds)
     except OSError as error:
         raise TrapsError(f"{workspace.trajectories / name}.npz: cannot be written ({error.strerror})") from error
-    record = json.dumps(spec.model_dump(mode="json"))
+    record = json.dumps(resolution.spec.model_dump(mode="json"))
     write_text(workspace.trajectories / f"{name}.json", record)  # last, so that it vouches for the trajectory
     workspace.store.keep(files)
     progress.current().note(
         f"{scenario.scenario_id}: simulated here after {scenario.where}; to freeze it for other machines copy "
         f"trajectories/{name}.* of the workspace to {CORRECTIONS / 'trajectories'}"
     )
-    return spec, workspace.trajectories / f"{name}.npz"
+    return resolution.spec, workspace.trajectories / f"{name}.npz"
 
 
 def _resolution_name(scenario: Scenario) -> str:
@@ -116,7 +117,7 @@ def _has_valid_words(scenario: Scenario) -> bool:
     return record is not None and _wording(scenario, record.params) == _wording(scenario, scenario.params or {})
 
 
-def _simulate(scenario: Scenario) -> tuple[SceneSpec, np.ndarray, np.ndarray]:
+def _simulate(scenario: Scenario) -> Resolved:
     """Simulate a corrected scene. Raises TrapsError naming the correction."""
     from traps_pipeline.scenes.draw.resolve import resolve
     from traps_pipeline.scenes.parts.wording import draw_ill_posed
@@ -130,10 +131,9 @@ def _simulate(scenario: Scenario) -> tuple[SceneSpec, np.ndarray, np.ndarray]:
         physics = Physics(**_physics(scenario))
         rng = np.random.default_rng([_seed(scenario), *scenario.scenario_id.encode(), 1])
         question = draw_ill_posed(family.taxonomy, family.build(params, physics).inventory, rng)
-        resolution = resolve(
+        return resolve(
             family, params, wording, question, scenario_id=scenario.scenario_id, seed=_seed(scenario), physics=physics
         )
-        return resolution.spec, resolution.qpos, resolution.twin
     except (Rejected, ValueError, TypeError) as error:
         raise TrapsError(
             f"{scenario.where}: {scenario.scenario_id}: these parameters make no valid pair ({error}); "
