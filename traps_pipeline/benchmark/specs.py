@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,8 +18,8 @@ from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import CORRECTIONS, PACKAGE, RELEASED, ROOT, user_cache
-from traps_pipeline.benchmark.corrections import WORDS, Scenario, apply_words, load_scenarios, subset
-from traps_pipeline.benchmark.records import parse_record, released_lines
+from traps_pipeline.benchmark.corrections import WORDS, Scenario, apply_words, load_scenarios, load_two_events, subset
+from traps_pipeline.benchmark.records import parse_record, released_lines, two_events_lines
 from traps_pipeline.benchmark.versions import version_of
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory, physics_record, save_trajectory
@@ -200,13 +200,17 @@ def released_in_study(workspace: Workspace, category: str) -> dict[str, SceneSpe
 
 def released_version(workspace: Workspace, category: str) -> str:
     """Return the version of a category's released records in a study."""
-    return digest([spec.spec_hash for spec in released_in_study(workspace, category).values()])[:16]
+    lanes = subset(two_events_lines(), workspace.study, two_events_lines()).values()
+    pairs = [spec.spec_hash for spec in released_in_study(workspace, category).values()]
+    return digest([*pairs, *(line.line for line in lanes if line.category == category)])[:16]
 
 
 def corrections_version(workspace: Workspace, category: str) -> str:
     """Return a category's version in a study, after the review decisions."""
     scenarios = load_scenarios(workspace.study).values()
-    return digest([[s.scenario_id, s.version] for s in scenarios if s.category == category])[:16]
+    lanes = load_two_events(workspace.study).items()
+    versions = [[s.scenario_id, s.version] for s in scenarios if s.category == category]
+    return digest([*versions, *([id_, lane.version] for id_, lane in lanes if lane.category == category)])[:16]
 
 
 def void_from_s(spec: SceneSpec) -> float:
@@ -251,7 +255,7 @@ def spec_of(row: Mapping[str, Any]) -> SceneSpec:
     return SceneSpec.model_validate(record)
 
 
-def trajectory_of(workspace: Workspace, row: Mapping[str, Any], world: Literal["qpos", "twin"] = "qpos") -> np.ndarray:
+def trajectory_of(workspace: Workspace, row: Mapping[str, Any], world: str = "qpos") -> np.ndarray:
     """Return the frozen qpos (F, nq) of a row's scene or twin. Raises TrapsError."""
     candidates: Sequence[Path] = (ROOT / row["trajectory"], workspace.resolve(row["trajectory"]))
     path = next((p for p in candidates if p.is_file()), candidates[0])

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from traps_pipeline.benchmark.corrections import load_scenarios
+from traps_pipeline.benchmark.corrections import load_scenarios, load_two_events
 from traps_pipeline.benchmark.items import expected_items
 from traps_pipeline.judging.confabulation import sample_failures
 from traps_pipeline.judging.confabulation_protocol import load_protocol
@@ -28,7 +28,15 @@ from traps_pipeline.pipeline.graph import Node
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.pipeline.run_plan import RunPlan
 from traps_pipeline.protocol.cells import Cell, SteeredEvaluation
-from traps_pipeline.protocol.datasets import DATASETS, UNPAIRED, all_datasets_of, datasets_of_category, sides_of
+from traps_pipeline.protocol.datasets import (
+    DATASETS,
+    TWO_EVENTS,
+    UNPAIRED,
+    all_datasets_of,
+    datasets_of_category,
+    sides_of,
+)
+from traps_pipeline.protocol.two_events import ITEMS_A_SIDE
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.tables import Table
@@ -196,6 +204,7 @@ def _count_calls(
     counts = {model: (Count(), Count()) for model in experiment.models}
     panel = load_panel(study.panel)
     scenes = Counter(name for scenario in load_scenarios(study).values() for name in all_datasets_of(scenario.category))
+    scenes[TWO_EVENTS] = ITEMS_A_SIDE * len(load_two_events(study))
     current = {dataset for dataset in experiment.datasets if plan and _has_current_items(plan.lineage, dataset)}
     items = {d: _items(plan, d, scenes[d], is_current=d in current) for d in experiment.datasets}
     for cell in experiment.cells():
