@@ -95,7 +95,7 @@ def plan_calls(plan: RunPlan | None, experiment: Experiment, study: Study, card:
     plan: of its workspace, None for a new one. study: with the panel that judges. card: one of CARDS.
     """
     panel = load_panel(study.panel)
-    calls, uncertain_datasets = _count_calls(plan, experiment, study)
+    calls, uncertain_datasets, items = _count_calls(plan, experiment, study)
     steered_counts = _count_steered(plan, experiment, study)
     local = [*_local_costs(plan, experiment, study, card, calls, steered_counts)]
     votes = sum(count.new for _, count in [*calls.values(), *steered_counts.values()])
@@ -110,7 +110,7 @@ def plan_calls(plan: RunPlan | None, experiment: Experiment, study: Study, card:
     }
     ledgers = [ledger.totals() for ledger in (plan.workspace.answers, plan.workspace.votes)] if plan else []
     forecasts = [
-        forecast(entry, count, experience(totals[entry.id] for totals in ledgers if entry.id in totals))
+        forecast(entry, count, experience(totals[entry.id] for totals in ledgers if entry.id in totals), items)
         for entry, count in new
     ]
     judge = load_protocol().judge(study.panel)
@@ -200,7 +200,7 @@ def _is_judged(lineage: Lineage, cells: Sequence[Cell]) -> bool:
 
 def _count_calls(
     plan: RunPlan | None, experiment: Experiment, study: Study
-) -> tuple[dict[str, tuple[Count, Count]], list[str]]:
+) -> tuple[dict[str, tuple[Count, Count]], list[str], Counter[str]]:
     counts = {model: (Count(), Count()) for model in experiment.models}
     panel = load_panel(study.panel)
     scenes = Counter(name for scenario in load_scenarios(study).values() for name in all_datasets_of(scenario.category))
@@ -221,7 +221,9 @@ def _count_calls(
             votes.add(cast, cast)
         else:
             _count_cell(plan.workspace, panel, cell, cell_items, answers, votes)
-    return counts, sorted(dataset for dataset, (_, unknown_items) in items.items() if unknown_items)
+    uncertain = sorted(dataset for dataset, (_, unknown_items) in items.items() if unknown_items)
+    sizes = Counter({dataset: len(known) + unknown.total() for dataset, (known, unknown) in items.items()})
+    return counts, uncertain, sizes
 
 
 def _items(
