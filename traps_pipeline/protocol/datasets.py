@@ -28,6 +28,9 @@ TWIN = "twin_control"
 INFERENCE_ARMS = ("late_occluder", "predictable_cut")  # the outcome is not shown, but can be inferred
 ROBUST_ARMS = ("decoy", "removed", "length_matched", TWIN, CROSSED)
 ARMS = (*ROBUST_ARMS, *INFERENCE_ARMS)
+# Two events side by side, with each, both or neither of them hidden, and a question about either
+# (protocol/two_events.py). No part of PECS or of the arms' figures; run on request.
+TWO_EVENTS = "two_events"
 # Controls cut where the likeliest answer has a stated probability (docs/arms.md, "Graded cuts"). In no figure
 # of pairs or arms; run on request.
 GRADED = "graded"
@@ -39,9 +42,9 @@ OCCLUDER_DOSES = ("occluder_alpha_50",)  # the occluder lets the outcome through
 SCHEMAS = ("schema_answer", "schema_reason", "schema_abstain")
 FRAMINGS = ("frames_later", "frames_few", "frames_all")
 VARIATIONS = (*LABEL_DOSES, *OCCLUDER_LOOKS, *OCCLUDER_DOSES, *SCHEMAS, *FRAMINGS)
-UNPAIRED = (*ARMS, GRADED, *VARIATIONS)  # all that is no dataset of the pairs
+UNPAIRED = (*ARMS, TWO_EVENTS, GRADED, *VARIATIONS)  # all that is no dataset of the pairs
 _ONE_TAXONOMY = {
-    **dict.fromkeys(("decoy", "removed", "late_occluder", *OCCLUDER_LOOKS, *OCCLUDER_DOSES), "occlusion"),
+    **dict.fromkeys(("decoy", "removed", "late_occluder", TWO_EVENTS, *OCCLUDER_LOOKS, *OCCLUDER_DOSES), "occlusion"),
     **dict.fromkeys(("length_matched", "predictable_cut", GRADED), "chaotic"),
 }
 ANSWERABLE = "occlusion_answerable"  # only in mechanistic stages: occlusion's voids, answerable
@@ -92,7 +95,7 @@ def all_datasets_of(category: str) -> tuple[str, ...]:
 
 
 def dataset_of(item_id: str) -> str:
-    """Return the dataset of an item from its id `dataset:scenario:side`."""
+    """Return the dataset of an item from its id: all before the first colon."""
     return item_id.partition(":")[0]
 
 

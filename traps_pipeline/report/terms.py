@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from traps_pipeline.protocol.datasets import ARMS, GRADED, VARIATIONS
+from traps_pipeline.protocol.datasets import ARMS, GRADED, TWO_EVENTS, VARIATIONS
 from traps_pipeline.protocol.metric_words import METRIC_WORDS, SHARES
 from traps_pipeline.scoring.score_rows import BROKEN_ABOVE, INCOMPLETE_BELOW
 
@@ -15,7 +15,7 @@ TITLES = {
 }
 # Neither arms nor variations enter a figure of the pairs.
 ARM_TITLES = {arm: f"Arm: {arm.replace('_', ' ')}" for arm in ARMS}
-ARM_TITLES[GRADED] = "Graded cuts"
+ARM_TITLES |= {TWO_EVENTS: "Two events", GRADED: "Graded cuts"}
 ARM_TITLES |= {name: f"Variation: {name.replace('_', ' ')}" for name in VARIATIONS}
 # Figures of a leaderboard with arms (docs/scoring.md, "Beyond PECS"): field, heading, unit, meaning.
 ROBUST_FIGURES = (
