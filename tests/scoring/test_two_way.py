@@ -90,7 +90,12 @@ def test_what_is_undecided_counts_for_nothing_unless_something_else_is_wrong() -
     neither = verdicts.index[verdicts["scenario_id"].eq(first) & verdicts["item_id"].str.endswith("left.neither")]
     verdicts.loc[neither, ["abstained", "correct"]] = None
     row = only(verdicts)
-    assert (row.conjunction, row.own_effect, row.n_missing, row.n_scenarios) == (1, 1, 1, 3)  # of two; of the other lane
+    assert (row.conjunction, row.own_effect, row.n_missing, row.n_scenarios) == (
+        1,
+        1,
+        1,
+        3,
+    )  # of two; of the other lane
     other = verdicts.index[verdicts["scenario_id"].eq(first) & verdicts["item_id"].str.endswith("right.neither")]
     verdicts.loc[other, ["abstained", "correct"]] = [False, False]
     assert only(verdicts).conjunction == pytest.approx(2 / 3)

@@ -76,12 +76,13 @@ def _entry(items: pd.DataFrame, resampling: Resampling, named: str) -> dict[str,
     main = events if len(events) else inferred
     runs = [rows for _, rows in events.groupby("run", sort=True)]
     tables = [by_scenario(rows) for rows in runs]
+    undecided = events["abstained"].isna() | (events["side"].eq("control") & events["correct"].isna())
     refused = _refusal(main)
     row: dict[str, Any] = {
         "n_runs": main["run"].nunique(),
         "n_scenarios": max((len(table) for table in tables), default=0),
         "n_items": max((len(rows) for rows in runs), default=0),
-        "n_missing": int((events["abstained"].isna() | (events["side"].eq("control") & events["correct"].isna())).sum()),
+        "n_missing": int(undecided.sum()),
         "epoch": joined_epochs(main["epoch"]),
         "panel": joined_epochs(main["panel"]),
         "benchmark_version": joined_versions(main["benchmark_version"]),

@@ -37,10 +37,10 @@ from traps_pipeline.report.leaderboard_page import legend, provenance
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.tables.human_tables import people_notes
 from traps_pipeline.report.tables.table_columns import entries
-from traps_pipeline.report.terms import ARM_TITLES, MARKS, ROBUST_FIGURES, TITLES
+from traps_pipeline.report.terms import ARM_TITLES, MARKS, TITLES, TWO_WAY_FIGURES
 from traps_pipeline.report.writing import environment
 from traps_pipeline.scoring.analyses import REASONING_PAIRS, SHARES
-from traps_pipeline.scoring.score_rows import CONTRASTS, LEADERBOARD, REGIME_TESTS, ROBUST
+from traps_pipeline.scoring.score_rows import CONTRASTS, LEADERBOARD, REGIME_TESTS, TWO_WAY
 from traps_pipeline.storage.benchmark_tables import SCENE_SPECS, VIDEOS
 from traps_pipeline.storage.tables import records
 from traps_pipeline.storage.workspace import Workspace
@@ -189,7 +189,7 @@ def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_c
     """Return the data that every page of the explorer needs, and the leaderboard."""
     from traps_pipeline.models.registry.entries import load_models
 
-    board, robust = workspace.tables.read_all(LEADERBOARD), workspace.tables.read_all(ROBUST)
+    board, two_way = workspace.tables.read_all(LEADERBOARD), workspace.tables.read_all(TWO_WAY)
     human_row = workspace.tables.read_all(HUMAN_ROW)
     release, registry = load_release(), load_models()
     published = entries(PublishedResults())
@@ -217,13 +217,13 @@ def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_c
             {"field": m.name, "title": m.heading, "unit": m.unit, "in_paper": m.name in printed_by_paper}
             for m in METRIC_WORDS.values()
         ],
-        "robust_figures": [{"field": name, "title": title, "unit": unit} for name, title, unit, _ in ROBUST_FIGURES],
+        "two_way_figures": [{"field": name, "title": title, "unit": unit} for name, title, unit, _ in TWO_WAY_FIGURES],
         "leaderboard": records(board),
-        "robust": records(robust),
+        "two_way": records(two_way),
         "people": records(human_row),
         "said": people_notes(human_row, workspace.tables.read_all(PANEL_ERRORS)),
         "published": records(published.loc[:, ["model", "regime", "dataset", "epoch", *printed_by_paper]]),
-        "legend": legend(board, robust) if len(board) else {},
+        "legend": legend(board, two_way) if len(board) else {},
         "marks": MARKS,
         "reasoning_pairs": [*map(list, REASONING_PAIRS)],
     }
