@@ -105,7 +105,7 @@ def _rewrite(
         if isinstance(result, str):
             rejections[spec.scenario_id] = result
         else:
-            save_trajectory(folder, spec.scenario_id, result.qpos, result.twin)
+            save_trajectory(folder, spec.scenario_id, result.worlds)
             records[spec.scenario_id] = result.spec
         report(f"{spec.scenario_id}: {rejections.get(spec.scenario_id, 'written again')}; {n_finished} of {len(jobs)}")
     write_text(released / f"{name}.jsonl", "".join(map(record_line, records.values())))

@@ -16,10 +16,19 @@ from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
 from traps_pipeline.benchmark.corrections import corrected_scenarios
+from traps_pipeline.benchmark.filmed_lanes import SECONDS_A_CLIP, film_lanes, lane_rows
+from traps_pipeline.benchmark.filmed_lanes import missing_clips as missing_lane_clips
 from traps_pipeline.benchmark.sharing import RenderWork, Row, existing_clips, share
 from traps_pipeline.benchmark.specs import clips_version, released_in_study, spec_of, spec_rows, trajectory_of
 from traps_pipeline.protocol.datasets import ARMS as ARM_NAMES
-from traps_pipeline.protocol.datasets import CROSSED, GRADED, extra_datasets_of, sides_of, taxonomy_of_category
+from traps_pipeline.protocol.datasets import (
+    CROSSED,
+    GRADED,
+    TWO_EVENTS,
+    extra_datasets_of,
+    sides_of,
+    taxonomy_of_category,
+)
 from traps_pipeline.scenes.variants import arms as shortcut_arms
 from traps_pipeline.scenes.variants import graded_cuts, variations
 from traps_pipeline.scenes.variants.arms import ARMS as SHORTCUT_ARMS
@@ -71,9 +80,14 @@ def asked_arms(workspace: Workspace, category: str) -> list[str]:
     return [arm for arm in extra_datasets_of(taxonomy_of_category(category)) if arm in datasets]
 
 
+def arms_of_pairs(workspace: Workspace, category: str) -> list[str]:
+    """Return those of them that scenarios of pairs have."""
+    return [arm for arm in asked_arms(workspace, category) if arm != TWO_EVENTS]
+
+
 def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tuple[int, bool]:
     """Render missing arms of a category; return `share`'s result. Raises TrapsError."""
-    specs, arms = spec_rows(workspace, category), asked_arms(workspace, category)
+    specs, arms = spec_rows(workspace, category), arms_of_pairs(workspace, category)
 
     def files(row: Row) -> list[Path]:
         return [file for clip in _clips(workspace, row, arms).values() for file in _files(clip)]
@@ -95,7 +109,11 @@ def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tupl
         progress.current().tick("arms", f"{category}, scenarios", finished, len(specs))
 
     render_work = RenderWork(f"arms/{category}", missing, files, job, film)
-    return share(workspace.store, specs, render_work, tick, wait=wait)
+    frames, is_whole = share(workspace.store, specs, render_work, tick, wait=wait)
+    if TWO_EVENTS not in asked_arms(workspace, category):
+        return frames, is_whole
+    lane_frames, are_lanes_whole = film_lanes(workspace, category, wait=wait)
+    return frames + lane_frames, is_whole and are_lanes_whole
 
 
 def seconds_left(workspace: Workspace, category: str) -> float:
@@ -103,14 +121,15 @@ def seconds_left(workspace: Workspace, category: str) -> float:
     clips = [
         _finding_of(workspace.clip(id_, arm, spec.scene_hash))
         for id_, spec in released_in_study(workspace, category).items()
-        for arm in asked_arms(workspace, category)
+        for arm in arms_of_pairs(workspace, category)
     ]
-    return SECONDS_AN_ARM * (len(clips) - len(workspace.store.there(clips)))
+    lane_clips = missing_lane_clips(workspace, category) if TWO_EVENTS in asked_arms(workspace, category) else 0
+    return SECONDS_AN_ARM * (len(clips) - len(workspace.store.there(clips))) + SECONDS_A_CLIP * lane_clips
 
 
 def build_arms(workspace: Workspace, category: str) -> list[ArmRow]:
     """Return a category's arms. Raises TrapsError for a missing or damaged one."""
-    specs, arms = spec_rows(workspace, category), asked_arms(workspace, category)
+    specs, arms = spec_rows(workspace, category), arms_of_pairs(workspace, category)
     pair_clips = {
         (row["scenario_id"], row["side"]): row
         for row in workspace.tables.read(VIDEOS, {"category": category}).to_dict("records")
@@ -119,9 +138,10 @@ def build_arms(workspace: Workspace, category: str) -> list[ArmRow]:
     workspace.store.bring(map(_finding_of, films))
     clips = existing_clips(workspace.store, films)
     version = clips_version(workspace, category, specs)
-    return [
+    rows = [
         arm_row for row in specs for arm in arms for arm_row in _rows(workspace, row, arm, pair_clips, clips, version)
     ]
+    return [*rows, *(lane_rows(workspace, category) if TWO_EVENTS in asked_arms(workspace, category) else ())]
 
 
 def _clips(workspace: Workspace, row: Row, arms: Sequence[str]) -> dict[str, Path]:
@@ -217,6 +237,7 @@ def _rows(
         scenario_id=spec.scenario_id,
         category=row["category"],
         arm=arm,
+        item=sides_of(arm)[0],
         side=sides_of(arm)[0],
         question=spec.question,
         labels=list(spec.labels),
@@ -245,7 +266,13 @@ def _rows(
 
 def _question_columns(question: Question, spec: SceneSpec) -> dict[str, Any]:
     labels = list(question.labels or spec.labels)
-    return {"side": question.side, "question": question.text, "labels": labels, "ground_truth": question.answer}
+    return {
+        "item": question.side,
+        "side": question.side,
+        "question": question.text,
+        "labels": labels,
+        "ground_truth": question.answer,
+    }
 
 
 def _clip_columns(path: str, clip: Clip) -> dict[str, Any]:

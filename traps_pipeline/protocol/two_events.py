@@ -12,6 +12,8 @@ CLIPS: dict[str, tuple[bool, bool]] = {  # by the lanes that are hidden in it: w
     "neither": (False, False), "left": (True, False), "right": (False, True), "both": (True, True),
 }  # fmt: skip
 
+ITEMS_A_SIDE = 4  # of a scenario: as many can be answered as must be abstained on
+
 
 @dataclass(frozen=True)
 class LaneItem:

@@ -241,7 +241,7 @@ class Records:
 
     def append(self, resolved: Resolved, tally: Tally) -> None:
         """Append a scenario and note the number of draws."""
-        save_trajectory(self._released / "trajectories", resolved.spec.scenario_id, resolved.qpos, resolved.twin)
+        save_trajectory(self._released / "trajectories", resolved.spec.scenario_id, resolved.worlds)
         with self._lines.open("a", encoding="utf-8") as lines:
             lines.write(record_line(resolved.spec))
         save_tallies(self._released, load_tallies(self._released) | {self._family: tally})

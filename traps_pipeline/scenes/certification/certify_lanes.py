@@ -2,34 +2,85 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from traps_pipeline.protocol.two_events import CLIPS, LANES
+from traps_pipeline.scenes.certification.certify_record import Verdict
 from traps_pipeline.scenes.physics.kit import flag_of
 from traps_pipeline.scenes.picture.camera import HEIGHT
 from traps_pipeline.scenes.picture.render import Renderer
 from traps_pipeline.scenes.worlds.lane_event import geom_corners
-from traps_pipeline.scenes.worlds.lane_records import CLIPS
-from traps_pipeline.scenes.worlds.lanes import LANES, PLACES, TwoLanes, board_of
+from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
+from traps_pipeline.scenes.worlds.lanes import PLACES, TwoLanes, board_of
 from traps_pipeline.scenes.worlds.outcome import Rejected
+from traps_pipeline.video.encode import frames_digest
 
 LEAST_PX = {"outcome": 75.0, "doubles": 40.0, "flag": 25.0, "strip": 100.0}  # of what must be seen
 SHARES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)  # of the clip, at which a record keeps what is in view
-EVERY = 2  # frames of which one is drawn
+EVERY = 2  # frames of which one is counted
+PX_APART, SHARE_APART = 4.0, 0.02  # that another renderer may count
 
 
-def certify_lanes(world: TwoLanes, twins: Sequence[TwoLanes]) -> dict[str, Any]:
+def certify_lane_record(spec: TwoEventsSpec, worlds: Mapping[str, np.ndarray]) -> Verdict:
+    """Certify a record from its trajectories alone; worlds: by name, as its file has them."""
+    start_s, failures, evidence = time.process_time(), dict[str, str](), dict[str, Any]()
+    world, *twins = (spec.world(worlds[name], k) for name, k in (("qpos", None), *((LANES[k], k) for k in range(2))))
+    try:
+        evidence = certify_lanes(world, twins, every=1)
+    except Rejected as failure:
+        failures["lanes"] = str(failure)
+    else:
+        failures |= _contradictions(spec, world, twins, evidence)
+    with Renderer(world.model, world.camera) as renderer:
+        ends = [frames_digest([*renderer.frames(world.clip(CLIPS[clip])[-1:])]) for clip in ("neither", "both")]
+    is_same = all(np.array_equal(each.simulated, each.qpos) for each in (world, *twins))
+    cpu_s = time.process_time() - start_s
+    return Verdict(spec.scenario_id, spec.family, failures, evidence, is_same, *ends, cpu_s=cpu_s)
+
+
+def _contradictions(
+    spec: TwoEventsSpec, world: TwoLanes, twins: Sequence[TwoLanes], evidence: Mapping[str, Any]
+) -> dict[str, str]:
+    """Return how a record contradicts what its trajectories show."""
+    failures = {}
+    for k, record in enumerate(spec.lanes):
+        answers = {"ground_truth": (record.ground_truth, world), "twin": (record.twin.ground_truth, twins[k])}
+        for name, (answer, each) in answers.items():
+            if each.outcome(k).label != answer:
+                failures[name] = f"{LANES[k]}: the outcome is {each.outcome(k).label!r}, the record says {answer!r}"
+    for name, value in evidence.items():
+        stored = spec.evidence.get(name)
+        if not _is_alike(value, stored):
+            failures[name] = f"is {value}, the record says {stored}"
+    return failures
+
+
+def _is_alike(value: Any, stored: Any) -> bool:
+    """Return whether a record holds the same evidence, counts of pixels but for the renderer's part in them."""
+    if isinstance(value, dict):
+        return isinstance(stored, dict) and {*value} == {*stored} and all(_is_alike(value[k], stored[k]) for k in value)
+    if isinstance(value, list):
+        return isinstance(stored, list) and len(value) == len(stored) and all(map(_is_alike, value, stored))
+    if isinstance(value, float) and isinstance(stored, float):
+        return abs(value - stored) <= PX_APART + SHARE_APART * abs(stored)
+    return type(value) is type(stored) and value == stored
+
+
+def certify_lanes(world: TwoLanes, twins: Sequence[TwoLanes], every: int = EVERY) -> dict[str, Any]:
     """Return a world's evidence; twins: the worlds with the twin in the left and in the right lane. Raises Rejected.
 
-    Each lane ends as by itself, and its twin otherwise; a window shows the settled outcome; boards pass through
-    nothing; what decides is hidden before that, and the doubles of a seen lane; strips are always seen; the clips in
-    which a lane is hidden are those of its twin, and show of the other lane what the others show.
+    every: one of so many frames is compared with the twin's. Each lane ends as by itself, and its twin otherwise; a
+    window shows the settled outcome; boards pass through nothing; what decides is hidden before that, and the doubles
+    of a seen lane; strips are always seen; the clips in which a lane is hidden are those of its twin, and show of the
+    other lane what the others show.
     """
     evidence = _outcomes(world, twins)
     _check_places(world)
-    _check_twins(world, twins)
+    _check_twins(world, twins, every)
     return evidence | _seen(world)
 
 
@@ -68,20 +119,22 @@ def _check_places(world: TwoLanes) -> None:
                     raise Rejected(f"{board} passes through {name}")
 
 
-def _check_twins(world: TwoLanes, twins: Sequence[TwoLanes]) -> None:
-    clips, half = _drawn(world, tuple(CLIPS)), world.camera.width // 2
+def _check_twins(world: TwoLanes, twins: Sequence[TwoLanes], every: int) -> None:
+    clips, half = _drawn(world, tuple(CLIPS), every), world.camera.width // 2
     for name, hidden in CLIPS.items():
         for is_hidden, part in zip(hidden, (slice(0, half), slice(half, None)), strict=True):
             if not np.array_equal(clips[name][:, :, part], clips["both" if is_hidden else "neither"][:, :, part]):
                 raise Rejected(f"{name}: what is hidden in one lane changes pixels of the other")
     for k, twin in enumerate(twins):
-        if not np.array_equal(_drawn(twin, ("both",))["both"], clips["both"]):
-            raise Rejected(f"{LANES[k]}: the twin's clip is another where the lane is hidden")
+        voids = [name for name, hidden in CLIPS.items() if hidden[k]]
+        for name, frames in _drawn(twin, voids, every).items():
+            if not np.array_equal(frames, clips[name]):
+                raise Rejected(f"{LANES[k]}: the twin's clip `{name}` is another, though the lane is hidden")
 
 
-def _drawn(world: TwoLanes, names: Sequence[str]) -> dict[str, np.ndarray]:
+def _drawn(world: TwoLanes, names: Sequence[str], every: int) -> dict[str, np.ndarray]:
     with Renderer(world.model, world.camera) as renderer:
-        return {name: np.stack([*renderer.frames(world.clip(CLIPS[name])[::EVERY])]) for name in names}
+        return {name: np.stack([*renderer.frames(world.clip(CLIPS[name])[::every])]) for name in names}
 
 
 def pixels_of(world: TwoLanes, clip: str, geoms: Sequence[str], frames: Sequence[int] | slice) -> np.ndarray:

@@ -1,41 +1,18 @@
-"""Read the records of two events, and measure that nothing in view tells hidden lanes from seen ones."""
+"""Measure that nothing in view tells hidden lanes of two events from seen ones."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from pydantic import ValidationError
 
-from bench.two_events.certificates import SHARES
-from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.yamlfile import explain
+from traps_pipeline.scenes.certification.certify_lanes import SHARES
 from traps_pipeline.scenes.physics.kit import Physics
 from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
 
 SIDES = ("seen", "hidden")
 LARGEST_AUC = 0.6  # of a number, over all records: how well it alone tells hidden lanes from seen ones
-
-
-def load_two_events(folder: Path) -> dict[str, TwoEventsSpec]:
-    """Return the records of a folder's JSONL files by id. Raises TrapsError naming file, line and remedy."""
-    records: dict[str, TwoEventsSpec] = {}
-    for path in sorted(folder.glob("*.jsonl")):
-        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
-            try:
-                spec = TwoEventsSpec.model_validate_json(line)
-            except ValidationError as error:
-                raise TrapsError(f"{path}:{number}: not a valid record ({explain(error)}); draw it anew") from error
-            if spec.scenario_id in records:
-                raise TrapsError(
-                    f"{path}:{number}: scenario {spec.scenario_id!r} occurs twice; remove one of the lines"
-                )
-            records[spec.scenario_id] = spec
-    if not records:
-        raise TrapsError(f"{folder}: holds no records of two events; draw some first")
-    return records
 
 
 def lane_numbers(specs: Iterable[TwoEventsSpec]) -> pd.DataFrame:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
+import json
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
@@ -12,8 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from bench.two_events.certificates import certify_lanes, pixels_of
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import write_text
+from traps_pipeline.base.workers import run_in_order
 from traps_pipeline.protocol.datasets import EXTENSION_CATEGORIES
+from traps_pipeline.scenes.certification.certify_lanes import certify_lanes, pixels_of
 from traps_pipeline.scenes.draw.resolve import plain
 from traps_pipeline.scenes.family_registry import families, get_family
 from traps_pipeline.scenes.parts.look import Look, draw_look
@@ -23,7 +26,7 @@ from traps_pipeline.scenes.worlds.lane_layout import Lane, fit_lanes
 from traps_pipeline.scenes.worlds.lane_records import LaneRecord, LaneTwin, TwoEventsSpec
 from traps_pipeline.scenes.worlds.lanes import TwoLanes
 from traps_pipeline.scenes.worlds.outcome import Rejected
-from traps_pipeline.scenes.worlds.spec import physics_record, trajectory_digest
+from traps_pipeline.scenes.worlds.spec import physics_record, save_trajectory, trajectory_digest
 from traps_pipeline.scenes.worlds.timetable import MOVES_FRAMES, Timetable
 
 STRIPS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
@@ -42,11 +45,14 @@ LEFT_OUT: Mapping[str, str] = dict.fromkeys(
 )
 
 
-FAMILIES = [
-    family.name
-    for family in families()
-    if family.taxonomy == "occlusion" and family.category not in EXTENSION_CATEGORIES and family.name not in LEFT_OUT
-]
+def lane_families() -> list[str]:
+    """Return the names of the families that have scenarios of two events."""
+    occlusion = [family for family in families() if family.taxonomy == "occlusion"]
+    return [
+        family.name
+        for family in occlusion
+        if family.category not in EXTENSION_CATEGORIES and family.name not in LEFT_OUT
+    ]
 
 
 @dataclass(frozen=True)
@@ -101,7 +107,7 @@ def _scenario(family: Family, number: int, rng: np.random.Generator, seed: int) 
         for k, lane in enumerate(lanes)
     ]
     spec = TwoEventsSpec(
-        scenario_id=f"{family.name}-e{number:03d}",
+        scenario_id=_id(family.name, number),
         category=family.category,
         family=family.name,
         seed=seed,
@@ -162,7 +168,8 @@ def _event(family: Family, rng: np.random.Generator, like: Any) -> tuple[LaneEve
         except Rejected:
             continue
         if others:
-            return event, others[int(rng.integers(len(others)))]
+            pair = event, others[int(rng.integers(len(others)))]
+            return pair if rng.integers(2) else (pair[1], pair[0])  # which of the two is shown tells no answer
     raise Rejected("no draw settles in time, with a twin that ends otherwise")
 
 
@@ -226,34 +233,47 @@ def draw_timetable(rng: np.random.Generator, settled: int, n_frames: int, fps: i
     return None
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("out", type=Path, help="folder for records, a JSON Lines file of each family")
-    parser.add_argument("--families", nargs="+", default=FAMILIES, choices=FAMILIES)
-    parser.add_argument("--count", type=int, default=8, help="scenarios of each family")
-    parser.add_argument("--seed", type=int, default=2026)
-    arguments = parser.parse_args()
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    for family in arguments.families:
-        specs = draw_family(family, arguments.count, arguments.seed)
-        lines = "".join(f"{spec.model_dump_json()}\n" for spec in specs)
-        (arguments.out / f"{family}.jsonl").write_text(lines, encoding="utf-8")
+def sample_two_events(
+    names: Iterable[str],
+    count: int,
+    seed: int,
+    released: Path,
+    *,
+    workers: int | None = None,
+    report: Callable[[str], None] = lambda _: None,
+) -> int:
+    """Draw `count` scenarios of each family into `released`; return how many there are.
+
+    Each is written at once, and stays where it was drawn from the same seed: a stopped call goes on. report: gets a
+    line for each scenario. Raises TrapsError for a place that no draw fills.
+    """
+    existing = {name: _drawn_before(released / f"{name}.jsonl", seed) for name in names}
+    jobs = [
+        (name, k, seed) for name, lines in existing.items() for k in range(1, count + 1) if _id(name, k) not in lines
+    ]
+    for (name, number, _), (drawn, rejected) in run_in_order(_draw, jobs, workers):
+        reasons = ", ".join(f"{n} x {reason}" for reason, n in Counter(rejected).most_common())
+        if drawn is None:
+            raise TrapsError(f"{_id(name, number)}: no draw of {TRIES} makes a scenario ({reasons}); take another seed")
+        save_trajectory(released / "trajectories", drawn.spec.scenario_id, drawn.worlds)
+        lines = existing[name]
+        lines[drawn.spec.scenario_id] = drawn.spec.model_dump_json()
+        write_text(released / f"{name}.jsonl", "".join(f"{lines[id_]}\n" for id_ in sorted(lines)))
+        report(f"{drawn.spec.scenario_id}: drawn; rejected before: {reasons or 'none'}")
+    return sum(map(len, existing.values()))
 
 
-def draw_family(family: str, count: int, seed: int) -> list[TwoEventsSpec]:
-    """Draw scenarios of a family; print why draws are rejected."""
-    specs = []
-    for number in range(count):
-        *rejected, last = draw_two_events(family, number, seed)
-        print(
-            family,
-            number,
-            Counter(map(str, rejected if isinstance(last, DrawnLanes) else [*rejected, last])),
-            flush=True,
-        )
-        specs += [last.spec] if isinstance(last, DrawnLanes) else []
-    return specs
+def _drawn_before(path: Path, seed: int) -> dict[str, str]:
+    """Return lines of records of a seed by id; a file of another seed counts as none."""
+    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    return {record["scenario_id"]: line for line in lines if (record := json.loads(line))["seed"] == seed}
 
 
-if __name__ == "__main__":
-    main()
+def _id(family: str, number: int) -> str:
+    return f"{family}-e{number:03d}"
+
+
+def _draw(job: tuple[str, int, int]) -> tuple[DrawnLanes | None, list[str]]:
+    """Return a scenario, if there is one, and why earlier draws are rejected."""
+    *rejected, last = draw_two_events(*job)
+    return (last, [*map(str, rejected)]) if isinstance(last, DrawnLanes) else (None, [*map(str, rejected), str(last)])
