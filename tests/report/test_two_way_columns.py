@@ -28,7 +28,7 @@ EMPTY = pd.DataFrame(columns=pd.Index(TWO_WAY.names))
 
 @pytest.fixture(scope="module")
 def rows() -> pd.DataFrame:
-    """TWO_WAY rows of `asked`, which looks where it is asked in three scenarios of four, and of `shy`, which abstains."""
+    """TWO_WAY rows of `asked`, which looks where it is asked in 3 of 4 scenarios, and of `shy`, which abstains."""
     asked = lane_verdicts(lambda item: reader(item) or item.scenario_id.endswith("3"), 4, model="asked")
     return two_way(pd.concat([asked, lane_verdicts(lambda item: True, 4, model="shy")], ignore_index=True), 200)
 

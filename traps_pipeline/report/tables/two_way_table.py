@@ -13,13 +13,17 @@ if TYPE_CHECKING:
     import pandas as pd
 
 WHY_EMPTY = "two events were not asked (name `two_events` under datasets)"
-_FIGURES = {
-    "conjunction": ("Conjunction %", percent),
-    "own_effect": ("Own effect", partial(fraction, digits=2)),
-    "other_effect": ("Other effect", partial(fraction, digits=2)),
-    "specificity": ("Specificity", partial(fraction, digits=2)),
-}
-_SHARES = {"neither": "Abstains %: neither hidden", "other": "the other", "asked": "the asked", "both": "both"}
+_WITH_INTERVAL = ("conjunction", "own_effect", "other_effect", "specificity")
+COLUMNS = (
+    MODEL, REGIME, Column("conjunction", "Conjunction %", "percent"), Column("own_effect", "Own effect", "fraction", 2),
+    Column("other_effect", "Other effect", "fraction", 2), Column("specificity", "Specificity", "fraction", 2),
+    Column("abstains_neither", "Abstains %: neither hidden", "percent", group=True),
+    Column("abstains_other", "the other", "percent"), Column("abstains_asked", "the asked", "percent"),
+    Column("abstains_both", "both", "percent"), Column("acc", "Acc %", "percent", group=True),
+    Column("n_scenarios", "Scenarios", "count"), Column("n_missing", "Missing", "count"),
+    Column("inference_acc", "Inferred %", "percent", group=True),
+    Column("inference_abstains", "abstained %", "percent"),
+)  # fmt: skip
 _NOTES = (
     "conjunction: share of scenarios with all eight items right; own and other effect: by how much abstention rises "
     "where the asked event alone, or the other one alone, is hidden; specificity: own minus other effect",
@@ -37,21 +41,17 @@ def two_way(results: Results) -> list[PrintedTable]:
 
 def two_way_table(rows: pd.DataFrame) -> PrintedTable:
     """Return the printed table of TWO_WAY rows, the most specific entry first."""
-    columns_of = {
-        f"{name}_shown": [figure_with_interval(row, name, words) for row in rows.to_dict("records")]
-        for name, (_, words) in _FIGURES.items()
-    }
-    rows = rows.assign(**columns_of).sort_values(
+    as_printed = {"percent": percent, "fraction": partial(fraction, digits=2)}
+    columns, shown = list[Column](), dict[str, list[str]]()
+    for column in COLUMNS:
+        if column.field in _WITH_INTERVAL:
+            words, name = as_printed[column.unit], f"{column.field}_shown"
+            shown[name] = [figure_with_interval(row, column.field, words) for row in rows.to_dict("records")]
+            column = Column(name, column.heading, "range")
+        columns.append(column)
+    rows = rows.assign(**shown).sort_values(
         ["specificity", "model", "regime"], ascending=[False, True, True], na_position="last", ignore_index=True
     )
-    columns = [
-        MODEL, REGIME, *[Column(f"{name}_shown", heading, "range") for name, (heading, _) in _FIGURES.items()],
-        *[Column(f"abstains_{name}", words, "percent", group=name == "neither") for name, words in _SHARES.items()],
-        Column("acc", "Acc %", "percent", group=True),
-        Column("n_scenarios", "Scenarios", "count"), Column("n_missing", "Missing", "count"),
-        Column("inference_acc", "Inferred %", "percent", group=True),
-        Column("inference_abstains", "abstained %", "percent"),
-    ]  # fmt: skip
     refusals = [f"{row['model']} {row['regime']}: no figure, {row['refused']}"
                 for row in rows.dropna(subset=["refused"]).to_dict("records")]  # fmt: skip
     notes = [*_NOTES, *refusals] if len(rows) else []

@@ -152,6 +152,7 @@ async function leaderboardView(route) {
           ? null
           : h("p", { class: "note" }, own.length ? "No model of this study is in the paper's tables." : null),
       ),
+      twoWaySection(info),
       meanings(info),
     ],
   };
