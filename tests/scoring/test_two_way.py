@@ -67,8 +67,8 @@ def test_the_interval_is_one_over_scenarios() -> None:
     row = only(lane_verdicts(reader))
     assert row.conjunction_ci_low == pytest.approx(0.025 ** (1 / 20), abs=0.03)
     assert (row.conjunction_ci_high, row.specificity_ci_high) == (1, 1)
-    # The one unseen scenario may have an effect of -1: the lower end is as far below on a scale of twice the length.
-    assert row.own_effect_ci_low == pytest.approx(2 * 0.025 ** (1 / 20) - 1, abs=0.06)
+    # Each of two shares has an unseen scenario of its own, as in J; one for both would reach down to 0.66.
+    assert 0.66 < row.own_effect_ci_low < row.conjunction_ci_low - 0.05
     assert row.other_effect_ci_low < 0 < row.other_effect_ci_high
 
 
@@ -86,29 +86,23 @@ def test_one_wrong_answer_costs_its_scenario_and_no_effect() -> None:
 
 def test_what_is_undecided_counts_for_nothing_unless_something_else_is_wrong() -> None:
     verdicts = lane_verdicts(reader, 3)
-    first = verdicts["scenario_id"].unique()[0]
-    neither = verdicts.index[verdicts["scenario_id"].eq(first) & verdicts["item_id"].str.endswith("left.neither")]
-    verdicts.loc[neither, ["abstained", "correct"]] = None
+    first = verdicts["scenario_id"].eq(verdicts["scenario_id"].unique()[0])
+    one, other = (verdicts.index[first & verdicts["item_id"].str.endswith(f"{lane}.neither")] for lane in LANES)
+    verdicts.loc[one, ["abstained", "correct"]] = None
     row = only(verdicts)
-    assert (row.conjunction, row.own_effect, row.n_missing, row.n_scenarios) == (
-        1,
-        1,
-        1,
-        3,
-    )  # of two; of the other lane
-    other = verdicts.index[verdicts["scenario_id"].eq(first) & verdicts["item_id"].str.endswith("right.neither")]
-    verdicts.loc[other, ["abstained", "correct"]] = [False, False]
-    assert only(verdicts).conjunction == pytest.approx(2 / 3)
-    verdicts.loc[other, ["abstained", "correct"]] = None  # no cell of the first scenario's effects is decided
-    assert only(verdicts).own_effect == 1
+    assert (row.conjunction, row.own_effect, row.n_missing, row.n_scenarios) == (1, 1, 1, 3)  # all right of two
+    verdicts.loc[other, ["abstained", "correct"]] = [True, False]
+    row = only(verdicts)  # of five questions where neither is hidden, one was abstained on
+    assert (row.conjunction, row.own_effect, row.other_effect) == pytest.approx((2 / 3, 4 / 5, -1 / 5))
 
 
-def test_a_scenario_without_all_eight_items_has_no_figure() -> None:
-    verdicts = lane_verdicts(reader, 2)
-    row = only(verdicts.drop(index=verdicts.index[3]))
-    assert (row.n_scenarios, row.n_items) == (1, 15)
+def test_one_item_of_each_scenario_gives_effects_and_no_conjunction() -> None:
+    verdicts = lane_verdicts(reader, 16)
+    row = only(verdicts.iloc[[8 * k + k % 8 for k in range(16)]].reset_index(drop=True))
+    assert (row.n_scenarios, row.n_items, row.own_effect, row.other_effect) == (16, 16, 1, 0)
+    assert np.isnan([row.conjunction, row.conjunction_ci_low]).all()
     alone = only(verdicts.iloc[:1])
-    assert np.isnan([*figures(alone), alone.specificity_ci_low, alone.abstains_neither]).all() and alone.acc == 1
+    assert np.isnan([*figures(alone), alone.specificity_ci_low]).all() and (alone.abstains_neither, alone.acc) == (0, 1)
 
 
 def test_runs_are_averaged() -> None:

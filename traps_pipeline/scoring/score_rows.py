@@ -174,10 +174,10 @@ class TwoWayRow(shared.EntryRow):
     """
 
     n_runs: Annotated[int, "runs averaged"]
-    n_scenarios: Annotated[int, "scenarios with all eight items, in the run that has most"]
+    n_scenarios: Annotated[int, "scenarios of two events"]
     n_items: Annotated[int, "items per run"]
     n_missing: Annotated[int, "items without an answer or a majority, over runs"]
-    conjunction: Annotated[float | None, "share of scenarios with all eight items right", CI]
+    conjunction: Annotated[float | None, "share of scenarios with all eight items right, of those with eight", CI]
     own_effect: Annotated[float | None, "rise of abstention from neither event hidden to the asked one alone", CI]
     other_effect: Annotated[float | None, "its rise from neither hidden to the other one alone", CI]
     specificity: Annotated[float | None, "own_effect - other_effect", CI]
