@@ -145,9 +145,10 @@ def lane_rows(workspace: Workspace, category: str) -> Iterator[ArmRow]:
 
 
 def _evidence(spec: TwoEventsSpec, lane: str) -> dict[str, Any]:
-    """Return the numbers behind a lane's certificate."""
+    """Return the numbers behind a lane's certificate, and between which frames the board stands that comes and goes."""
     k = LANES.index(lane)
-    return {name: spec.evidence[name][k] for name in ("settled_frames", "least_px", "hidden_from")}
+    numbers = {name: spec.evidence[name][k] for name in ("settled_frames", "least_px", "hidden_from")}
+    return numbers | {"fps": spec.physics["fps"], "stands": spec.lanes[k].lane.timetable.spans}
 
 
 def _clips(workspace: Workspace, spec: TwoEventsSpec) -> dict[str, Path]:

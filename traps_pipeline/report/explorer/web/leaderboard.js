@@ -9,7 +9,7 @@ function figure(row, { field, unit }, mark = "") {
   if (!row || row[field] === null || row[field] === undefined)
     return row ? NONE : h("span", { class: "absent" }, NOT_RUN);
   const low = row[`${field}_ci_low`];
-  const spread = row.n_runs > 1 ? `± ${print(row[`${field}_std`])}` : "";
+  const spread = row.n_runs > 1 && `${field}_std` in row ? `± ${print(row[`${field}_std`])}` : "";
   const interval = low === null || low === undefined ? "" : `[${print(low)}, ${print(row[`${field}_ci_high`])}]`;
   return [
     h("span", { class: "figure", "data-field": field }, print(row[field])),
@@ -34,7 +34,9 @@ async function leaderboardView(route) {
   const published = new Map(
     info.published.filter((row) => row.dataset === dataset).map((row) => [`${row.model} ${row.regime}`, row]),
   );
-  const robust = new Map((dataset === "overall" ? info.robust : []).map((row) => [`${row.model} ${row.regime}`, row]));
+  const beside = new Map(
+    (dataset === "overall" ? askedOfLanes(info) : []).map((row) => [`${row.model} ${row.regime}`, row]),
+  );
   const asked = new Map(own.map((row) => [`${row.model} ${row.regime}`, { model: row.model, regime: row.regime }]));
   const entries = [...asked.values()];
   if (paper) for (const row of published.values()) if (!asked.has(`${row.model} ${row.regime}`)) entries.push(row);
@@ -45,7 +47,7 @@ async function leaderboardView(route) {
       regime: of,
       own: here.get(`${model} ${of}`),
       paper: published.get(`${model} ${of}`),
-      robust: robust.get(`${model} ${of}`),
+      twoWay: beside.get(`${model} ${of}`),
     }))
     .filter((row) => (!regime || row.regime === regime) && (!group || groupOf.get(row.model) === group));
   shown.sort(ordering(sort, up, info.regimes));
@@ -55,8 +57,8 @@ async function leaderboardView(route) {
     { title: "Regime", sort: "regime" },
     ...info.figures.map(({ field, title }) => ({ title, number: true, sort: field, hint: info.legend[title] })),
     { title: "Rank", number: true, hint: "by PECS among the models of a regime; ranks in between are not separable" },
-    ...(robust.size
-      ? info.robust_figures.map(({ title }, k) => ({ title, number: true, group: !k, hint: info.legend[title] }))
+    ...(beside.size
+      ? info.two_way_figures.map(({ title }, k) => ({ title, number: true, group: !k, hint: info.legend[title] }))
       : []),
     ...(withPaper
       ? ofPaper.map(({ field, title }, k) => ({
@@ -80,8 +82,8 @@ async function leaderboardView(route) {
       figure(row.own, each, each.field === "pecs" && row.own && row.own.incomplete ? incompleteMark : ""),
     ),
     rankOf(row.own),
-    ...(robust.size
-      ? info.robust_figures.map((each) => (row.robust ? printerOf(each)(row.robust[each.field]) : NOT_RUN))
+    ...(beside.size
+      ? info.two_way_figures.map((each) => figure(row.twoWay, each))
       : []),
     ...(withPaper
       ? ofPaper.map((each) =>
@@ -150,6 +152,7 @@ async function leaderboardView(route) {
           ? null
           : h("p", { class: "note" }, own.length ? "No model of this study is in the paper's tables." : null),
       ),
+      twoWaySection(info),
       meanings(info),
     ],
   };
