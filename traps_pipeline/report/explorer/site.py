@@ -279,12 +279,15 @@ def _lanes(workspace: Workspace, clips: set[str]) -> list[dict[str, Any]]:
         items = sorted(lane_items(scenario_id), key=lambda item: LANES.index(item.lane))
         evidence = {lane: json.loads(row_of[f"{lane}.neither"]["evidence"]) for lane in LANES}
         paths = {name: row_of[f"{LANES[0]}.{name}"]["clip"] for name in LANE_CLIPS}
+        fps, n_frames = evidence[LANES[0]]["fps"], row_of[f"{LANES[0]}.neither"]["n_frames"]
+        standing = [sum(a <= k < b for lane in LANES for a, b in evidence[lane]["stands"]) for k in range(n_frames)]
         scenarios.append(
             {
                 "scenario_id": scenario_id,
                 "family": scenario_id.rpartition("-")[0],
-                "fps": evidence[LANES[0]]["fps"],
-                "n_frames": row_of[f"{LANES[0]}.neither"]["n_frames"],
+                "fps": fps,
+                "n_frames": n_frames,
+                "shown_at": max(k for k in range(n_frames) if standing[k] == min(standing)) / fps,
                 "lanes": [{"name": lane, "stands": evidence[lane]["stands"]} for lane in LANES],
                 "clips": [
                     {"name": name, "hidden": [*hidden], "path": paths[name] if paths[name] in clips else None}

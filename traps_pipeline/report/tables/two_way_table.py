@@ -43,7 +43,7 @@ def two_way_table(rows: pd.DataFrame) -> PrintedTable:
     """Return the printed table of TWO_WAY rows, the most specific entry first."""
     as_printed = {"percent": percent, "fraction": partial(fraction, digits=2)}
     columns, shown = list[Column](), dict[str, list[str]]()
-    for column in COLUMNS:
+    for column in COLUMNS if rows["inference_acc"].notna().any() else COLUMNS[:-2]:
         if column.field in _WITH_INTERVAL:
             words, name = as_printed[column.unit], f"{column.field}_shown"
             shown[name] = [figure_with_interval(row, column.field, words) for row in rows.to_dict("records")]
