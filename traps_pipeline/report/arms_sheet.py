@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -68,8 +68,8 @@ def _two_events_sheet(rows: pd.DataFrame, root: Path) -> dict[str, Figure]:
     clips = {name: root / str(row_of[f"{LANES[0]}.{name}"]["clip"]) for name in CLIPS}
     times, sheet = _moments(clips["neither"]), list[Row]()
     for name, clip in clips.items():
-        answers = [row_of[f"{lane}.{name}"]["ground_truth"] for lane in LANES]
-        right = [f"{lane}: {answer or 'must be abstained on'}" for lane, answer in zip(LANES, answers, strict=True)]
+        asked = {lane: row_of[f"{lane}.{name}"] for lane in LANES}
+        right = [f"{lane}: {_right(row)}" for lane, row in asked.items()]
         sheet.append(Row(f"{name} hidden", "\n".join(right), sample_clip(*decode(clip), times)))
     questions = [f"{lane.capitalize()}: {row_of[f'{lane}.neither']['question']}" for lane in LANES]
     return {TWO_EVENTS: _sheet(scenario, questions, sheet, times)}
@@ -88,9 +88,12 @@ def _rows(sides: pd.DataFrame, arms: pd.DataFrame, scenario: str, root: Path, ti
         frames, times_s = decode(root / str(row["clip"]))
         truth = row["ground_truth"]
         name = str(row.get("arm") or row["side"])
-        right = "must be abstained on" if row["side"] == "void" else f"must be answered: {truth}"
-        right = f"no void, {truth} shows through" if name in OCCLUDER_DOSES else right
+        right = f"no void, {truth} shows through" if name in OCCLUDER_DOSES else _right(row)
         yield Row(name, right, sample_clip(frames, times_s, times))
+
+
+def _right(row: Mapping[Any, Any]) -> str:
+    return "must be abstained on" if row["side"] == "void" else f"must be answered: {row['ground_truth']}"
 
 
 def _sheet(scenario: str, questions: list[str], rows: list[Row], times: np.ndarray) -> Figure:
