@@ -1,20 +1,21 @@
-"""Arms from an experiment to the conjunction, and variations to the table of hypotheses: asked on request, made once,
-and no part of the pairs' figures."""
+"""Arms and two events from an experiment to their figures, and variations to the table of hypotheses.
+
+They are asked on request, made once, and no part of the pairs' figures.
+"""
 
 from __future__ import annotations
 
 import json
-import re
 import shutil
 from pathlib import Path
 
 import pytest
 
 from tests.conftest import Checkout
-from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.benchmark.records import load_released, two_events_lines
 from traps_pipeline.models.asking.answer_rows import RESPONSES
-from traps_pipeline.report.leaderboard_page import leaderboard_text
-from traps_pipeline.scoring.score_rows import GRADED_CUTS, HYPOTHESES, LEADERBOARD, ROBUST
+from traps_pipeline.protocol.two_events import lane_items
+from traps_pipeline.scoring.score_rows import GRADED_CUTS, HYPOTHESES, LEADERBOARD, TWO_WAY
 from traps_pipeline.storage.benchmark_tables import ARMS, ITEMS
 from traps_pipeline.storage.parquet import TableStore
 from traps_pipeline.storage.workspace import Workspace
@@ -26,14 +27,14 @@ models: [oracle, any-rule, occluder-rule]
 regimes: [standard]
 panel: rules
 epoch: small
-scenarios: [hidden_race-0001, plinko-0001]
+scenarios: [hidden_race-0001, hidden_drop-e001, plinko-0001]
 datasets:
-  [occlusion, occlusion_ill_posed, chaotic, chaotic_ill_posed, decoy, twin_control, crossed,
+  [occlusion, occlusion_ill_posed, chaotic, chaotic_ill_posed, twin_control, two_events,
    labels_two, labels_six, occluder_grey, schema_abstain, frames_few, graded]
 """
 
 
-UNTIL = ("--until", "leaderboard,robust,hypotheses,graded")
+UNTIL = ("--until", "leaderboard,two_way,hypotheses,graded")
 
 
 @pytest.fixture(scope="module")
@@ -56,41 +57,39 @@ def test_arms_and_variations_are_asked_and_rendered_once(
     armed: tuple[Checkout, Path, dict[str, int]], tables: TableStore
 ) -> None:
     study, path, counts = armed
-    # Pairs: 2 scenarios x 2 datasets x 2 sides. Arms: decoy 1, twin_control 2, crossed 1 x 2: a race has no partner.
+    # Pairs: 2 scenarios x 2 datasets x 2 sides. Arms: twin_control 2. Two events: 8.
     # Variations: 2 x 2 of the race, whose answers are colours, panel 1, schema and frames 2 x 2 each. A graded cut.
-    assert counts["answers"] == 3 * (8 + (1 + 2 + 2) + (4 + 1 + 4 + 4) + 1)
+    assert counts["answers"] == 3 * (8 + 2 + 8 + (4 + 1 + 4 + 4) + 1)
     arms = tables.read_all(ARMS)
-    # Decoy and grey, and the graded cut; the others show the pair's own clips.
-    assert counts["frames"] == 50 + 50 + arms.set_index("arm").loc["graded", "n_frames"]
+    # Grey, the graded cut and the four clips of two events; the others show the pair's own clips.
+    assert counts["frames"] == 50 + 4 * 50 + arms.set_index("arm").loc["graded", "n_frames"]
     refused = arms.dropna(subset=["refused"])
     assert {*zip(refused["arm"], refused["scenario_id"], strict=True)} == {
-        ("crossed", "hidden_race-0001"),  # its choices are colours, which its question names
-        *((arm, "plinko-0001") for arm in ("labels_two", "labels_six")),  # the numbers of its buckets are no colours
+        (arm, "plinko-0001")  # the numbers of its buckets are no colours
+        for arm in ("labels_two", "labels_six")
     }
     assert study.traps("run", path, *UNTIL).counts() == {"answers": 0, "votes": 0, "frames": 0}
 
 
-def test_a_crossed_pair_shows_each_clip_with_another_question(tables: TableStore) -> None:
-    items = tables.read_all(ITEMS, dataset="crossed").set_index("item_id")
-    pair = tables.read_all(ITEMS, dataset="chaotic").set_index("item_id")
-    aside, foreign = (items.loc[f"crossed:plinko-0001:{side}"] for side in ("control", "void"))
-    answer = load_released()["plinko-0001"].answerable_question.answer
-    assert (aside["clip"], aside["ground_truth"]) == (pair.loc["chaotic:plinko-0001:void", "clip"], answer)
-    assert foreign["clip"] == pair.loc["chaotic:plinko-0001:control", "clip"]
-    assert items["ground_truth"].isna().groupby(items["side"]).all().to_dict() == {"control": False, "void": True}
+def test_each_text_and_each_clip_of_two_events_is_answered_as_often_as_not(tables: TableStore) -> None:
+    items = tables.read_all(ITEMS, dataset="two_events")
+    assert len(items) == 8 and items["clip"].nunique() == 4 and items["question"].nunique() == 2
+    assert items.groupby("question")["side"].value_counts().eq(2).all()
+    spec = two_events_lines()["hidden_drop-e001"].spec
+    right = items.loc[items["item_id"].str.contains(":right.")]
+    assert {*right["control_answer"]} == {*right["ground_truth"].dropna()} == {spec.lanes[1].ground_truth}
+    shown = tables.read_all(ARMS).query("arm == 'two_events'").set_index("item")
+    assert {*shown.index} == {item.name for item in lane_items("hidden_drop-e001")}
 
 
-def test_arms_take_the_shortcuts_gain_away(tables: TableStore) -> None:
-    robust = tables.read_all(ROBUST).set_index("model")
+def test_a_rule_of_boards_earns_nothing_on_two_events(tables: TableStore) -> None:
+    figures = tables.read_all(TWO_WAY).set_index("model")
     board = tables.read_all(LEADERBOARD).query("dataset == 'overall'").set_index("model")
-    assert robust.loc["oracle", ["conjunction", "robust"]].tolist() == [1.0, 1.0] and board.loc["oracle", "pecs"] == 1.0
+    names = ["conjunction", "own_effect", "other_effect", "specificity"]
+    assert figures.loc["oracle", names].tolist() == [1.0, 1.0, 0.0, 1.0] and board.loc["oracle", "pecs"] == 1.0
     assert board.loc["any-rule", "pecs"] == 1.0  # it understands nothing of a void
-    # Right in the pairs (weight 1) and twin_control (2 scenarios of 30), wrong in decoy and crossed (1 of 30 each).
-    robust_of_rule = 32 / 34 * (30 / 31 - 2 / 34)
-    assert robust.loc["any-rule", ["conjunction", "robust"]].tolist() == pytest.approx([0, robust_of_rule])
-    text = leaderboard_text(tables.read(LEADERBOARD, {}), tables.read_all(ROBUST))
-    assert re.search(r"\b3\b.* 7 .*: decoy, twin_control, crossed", text) and "nan" not in text
-    assert robust["refused"].isna().all()
+    assert figures.loc["any-rule", names].tolist() == [0.0, 0.0, 0.0, 0.0]  # a board stands in each of the four clips
+    assert figures["refused"].isna().all()
 
 
 def test_variations_are_doses_of_their_hypotheses(tables: TableStore) -> None:

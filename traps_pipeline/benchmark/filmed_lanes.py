@@ -54,11 +54,14 @@ def lanes_version(workspace: Workspace, categories: Sequence[str]) -> str:
     )
 
 
-def trajectories_of(spec: TwoEventsSpec, released: Path = TWO_EVENTS_RELEASED) -> dict[str, np.ndarray]:
-    """Return a record's trajectories by name: `qpos`, and those with a lane's twin. Raises ValueError."""
+def trajectories_of(spec: TwoEventsSpec, path: Path | None = None) -> dict[str, np.ndarray]:
+    """Return a record's trajectories by name: `qpos`, and those with a lane's twin. Raises ValueError.
+
+    path: of their file, by default the released one.
+    """
+    path = path or TWO_EVENTS_RELEASED / "trajectories" / f"{spec.scenario_id}.npz"
     digests = {"qpos": spec.trajectory_sha256}
     digests |= {lane: record.twin.trajectory_sha256 for lane, record in zip(LANES, spec.lanes, strict=True)}
-    path = released / "trajectories" / f"{spec.scenario_id}.npz"
     return {world: load_trajectory(path, sha256, world) for world, sha256 in digests.items()}
 
 

@@ -64,6 +64,16 @@ def balance(rows: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(table)
 
 
+def telling_numbers(specs: Iterable[TwoEventsSpec]) -> list[str]:
+    """Return a sentence for each number in view that tells hidden lanes from seen ones over a whole benchmark."""
+    table = balance(lane_numbers(specs))
+    telling = table.loc[(table["auc"] - 0.5).abs() > LARGEST_AUC - 0.5, ["number", "auc"]]
+    return [
+        f"two events: {number} tells hidden lanes from seen ones (AUC {value:.2f}, at most {LARGEST_AUC} is allowed)"
+        for number, value in telling.itertuples(index=False)
+    ]
+
+
 def auc(seen: np.ndarray, hidden: np.ndarray) -> float:
     """Return the probability that a hidden value is above a seen one, ties by half."""
     return float((np.sign(hidden[:, None] - seen[None]) / 2 + 0.5).mean())

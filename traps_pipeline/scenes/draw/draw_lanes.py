@@ -16,6 +16,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
 from traps_pipeline.base.workers import run_in_order
 from traps_pipeline.protocol.datasets import EXTENSION_CATEGORIES
+from traps_pipeline.protocol.two_events import LANES
 from traps_pipeline.scenes.certification.certify_lanes import certify_lanes, pixels_of
 from traps_pipeline.scenes.draw.resolve import plain
 from traps_pipeline.scenes.family_registry import families, get_family
@@ -38,6 +39,7 @@ ALIKE = (0.8, 1.25)  # the same, as a share of the size at which they have as ma
 BOARDS = (1.0, 1.2)  # widths of boards, as a share of the least
 SETS_OUT_S = (0.0, 2.5)
 STANDS_FRAMES = (5, 18)  # how long a board stands that comes and goes, at a time
+TURNS = 8  # scenarios of a family in which both answers have their turns
 TIMETABLES = 400  # draws of a timetable before a scenario is given up
 EVENTS, TRIES = 30, 60  # draws of a lane's event before a scenario is given up; of scenarios
 LEFT_OUT: Mapping[str, str] = dict.fromkeys(
@@ -79,6 +81,7 @@ def _scenario(family: Family, number: int, rng: np.random.Generator, seed: int) 
     first = _event(family, rng, None)
     pairs = [first, _event(family, rng, first[0].params)][:: 1 if rng.integers(2) else -1]
     wording, look = _wording(pairs, int(rng.integers(2**31))), draw_look(rng, LOOKS)
+    pairs = [_in_turn(pair, wording.labels, k, family, number, seed) for k, pair in enumerate(pairs)]
     assert look is not None
     above = [
         bool(number & 1),
@@ -168,9 +171,21 @@ def _event(family: Family, rng: np.random.Generator, like: Any) -> tuple[LaneEve
         except Rejected:
             continue
         if others:
-            pair = event, others[int(rng.integers(len(others)))]
-            return pair if rng.integers(2) else (pair[1], pair[0])  # which of the two is shown tells no answer
+            return event, others[int(rng.integers(len(others)))]
     raise Rejected("no draw settles in time, with a twin that ends otherwise")
+
+
+def _in_turn(
+    pair: tuple[LaneEvent, LaneEvent], labels: Sequence[str], lane: int, family: Family, number: int, seed: int
+) -> tuple[LaneEvent, LaneEvent]:
+    """Return an event and its twin, exchanged where the other answer has its turn.
+
+    In every eight scenarios of a family the earlier of the two answers is shown in as many lanes as the later one.
+    """
+    block, place = divmod(number - 1, TURNS)
+    turns = np.random.default_rng([seed, *family.name.encode(), block, TURNS]).permutation(len(LANES) * TURNS) % 2
+    is_earlier = labels.index(pair[0].outcome.answer) < labels.index(pair[1].outcome.answer)
+    return pair if is_earlier == bool(turns[len(LANES) * place + lane]) else (pair[1], pair[0])
 
 
 def _settles(event: LaneEvent) -> bool:
@@ -185,8 +200,8 @@ def _is_colour(value: Any) -> bool:
 
 def _wording(pairs: Pairs, seed: int) -> Wording:
     """Return the words that both lanes' scenes have in common."""
-    one, other = (event.family.word(event.params, np.random.default_rng(seed)) for event, _ in pairs)
-    if (one.question, one.labels, one.aliases) != (other.question, other.labels, other.aliases):
+    one, *others = (each.family.word(each.params, np.random.default_rng(seed)) for pair in pairs for each in pair)
+    if any((one.question, one.labels, one.aliases) != (each.question, each.labels, each.aliases) for each in others):
         raise Rejected("the lanes have no question in common")
     return one
 
