@@ -6,15 +6,19 @@ They are asked on request, made once, and no part of the pairs' figures.
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
 import pytest
+from playwright.sync_api import Browser
 
 from tests.conftest import Checkout
+from tests.pages import until, watched
 from traps_pipeline.benchmark.records import load_released, two_events_lines
 from traps_pipeline.models.asking.answer_rows import RESPONSES
-from traps_pipeline.protocol.two_events import lane_items
+from traps_pipeline.protocol.two_events import CLIPS, LANES, lane_items
+from traps_pipeline.report.explorer.site import write_site
 from traps_pipeline.scoring.score_rows import GRADED_CUTS, HYPOTHESES, LEADERBOARD, TWO_WAY
 from traps_pipeline.storage.benchmark_tables import ARMS, ITEMS
 from traps_pipeline.storage.parquet import TableStore
@@ -90,6 +94,47 @@ def test_a_rule_of_boards_earns_nothing_on_two_events(tables: TableStore) -> Non
     assert board.loc["any-rule", "pecs"] == 1.0  # it understands nothing of a void
     assert figures.loc["any-rule", names].tolist() == [0.0, 0.0, 0.0, 0.0]  # a board stands in each of the four clips
     assert figures["refused"].isna().all()
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+def test_four_clips_play_in_step_above_the_times_of_their_boards(
+    armed: tuple[Checkout, Path, dict[str, int]], browser: Browser, tmp_path: Path, width: int
+) -> None:
+    write_site(Workspace.open(armed[0].workspace), tmp_path / "site")
+    page, problems = watched(browser, width, ((tmp_path / "site").as_uri(), "data:,"))
+    page.goto(f"{(tmp_path / 'site' / 'index.html').as_uri()}#/pair/two_events/hidden_drop-e001?model=oracle")
+    until(page, "[...document.querySelectorAll('video')].filter(video => video.readyState >= 2).length === 4")
+    spec = two_events_lines()["hidden_drop-e001"].spec
+    comes_and_goes = [[[a / 10, b / 10] for a, b in record.lane.timetable.spans] for record in spec.lanes]
+    for clip, hidden in CLIPS.items():
+        figure = page.locator("figure").nth([*CLIPS].index(clip))
+        tracks = [figure.locator(".track").nth(k).get_attribute("aria-label") or "" for k in range(4)]
+        times = [[[float(t) for t in span] for span in re.findall(r"([\d.]+) to ([\d.]+) s", text)] for text in tracks]
+        still = [[0.0, 5.0]]
+        expected = [
+            (still, goes) if is_hidden else (goes, still)
+            for is_hidden, goes in zip(hidden, comes_and_goes, strict=True)
+        ]
+        assert times == [spans for lane in expected for spans in lane], clip
+    page.locator("h1").click()
+    for _ in range(12):
+        page.keyboard.press("ArrowRight")
+    seconds = "[...document.querySelectorAll('video')].map(video => video.currentTime)"
+    until(page, f"{seconds}.every(time => time > 1.2 && time < 1.3)")
+    assert page.locator(".now").evaluate_all("marks => marks.map(mark => mark.style.left)") == ["25%"] * 4
+    rows = [page.locator(f"table[data-name={lane}_lane] tbody tr").all_inner_texts() for lane in LANES]
+    for lane, record, texts in zip(LANES, spec.lanes, rows, strict=True):
+        asked = [item for item in lane_items(spec.scenario_id) if item.lane == lane]
+        answers = ["abstain" if item.asked_hidden else record.ground_truth for item in asked]
+        assert [text.split("\t")[1].strip() for text in texts] == answers
+        assert [("abstained" in text, "correct" in text) for text in texts] == [
+            (item.asked_hidden, not item.asked_hidden) for item in asked
+        ]
+    assert page.evaluate("document.documentElement.scrollWidth") == width
+    page.get_by_role("link", name="8 of 8").first.click()
+    assert page.get_by_role("link", name="4 of 8").count() == 2  # any-rule and occluder-rule abstain on all
+    page.context.close()
+    assert problems == []
 
 
 def test_variations_are_doses_of_their_hypotheses(tables: TableStore) -> None:
