@@ -81,8 +81,8 @@ def content_of(workspace: Workspace, arms: Sequence[str] = ()) -> Content:
         path = clips[row["clip"]]
         if not path.is_file() or file_digest(path) != row["media_digest"]:
             raise TrapsError(f"{path}: is missing or not the clip of its item; materialize videos again")
-    lanes = {row["scenario_id"] for row in items if row["dataset"] == TWO_EVENTS}
-    two_events = [load_two_events(workspace.study)[id_].spec for id_ in sorted(lanes)]
+    lanes = load_two_events(workspace.study)
+    two_events = [lanes[id_].spec for id_ in sorted(_ids(row for row in items if row["dataset"] == TWO_EVENTS))]
     return Content(workspace.root, items, specs, clips, load_release(), two_events)
 
 

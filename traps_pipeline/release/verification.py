@@ -127,15 +127,14 @@ def verify(submission: Submission, released: Released | None = None) -> Verifica
 
 
 def _wrong_items(items: Collection[Row]) -> Iterator[str]:
-    by_kind = dict[bool, dict[tuple[str, str], str]]()  # of lanes and of pairs; an answer of each lane or scenario
+    answers: dict[tuple[bool, str, str], str] = {}  # of each scenario, of two events of each lane
     for row in items:
         is_lane = row["dataset"] == TWO_EVENTS
         event = row["pair_id"].rpartition(".")[0] if is_lane else row["scenario_id"]
-        by_kind.setdefault(is_lane, {})[row["sub_scenario"], event] = row["control_answer"]
-    commonest = {
-        is_lane: commonest_answers([{"sub_scenario": k[0], "ground_truth": answers[k]} for k in sorted(answers)])
-        for is_lane, answers in by_kind.items()
-    }
+        answers[is_lane, row["sub_scenario"], event] = row["control_answer"]
+    commonest: Mapping[Any, str] = commonest_answers(
+        [{"sub_scenario": key[:2], "ground_truth": answer} for key, answer in sorted(answers.items())]
+    )
     for row in items:
         try:
             is_same = item_hash(row) == row["item_hash"]
@@ -145,7 +144,7 @@ def _wrong_items(items: Collection[Row]) -> Iterator[str]:
             yield f"item {row['item_id']}: is not what its digest says"
         elif row["dataset"] not in SUBMITTED_DATASETS:
             yield f"item {row['item_id']}: is none of the pairs' or of two events"
-        elif row["commonest_answer"] != commonest[row["dataset"] == TWO_EVENTS][row["sub_scenario"]]:
+        elif row["commonest_answer"] != commonest[row["dataset"] == TWO_EVENTS, row["sub_scenario"]]:
             yield f"item {row['item_id']}: its commonest answer is not that of its sub-scenario"
 
 

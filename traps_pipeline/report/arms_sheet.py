@@ -14,7 +14,7 @@ import pandas as pd
 
 from traps_pipeline.protocol.datasets import ARMS, OCCLUDER_DOSES, OCCLUDER_LOOKS, TWO_EVENTS
 from traps_pipeline.protocol.two_events import CLIPS, LANES
-from traps_pipeline.report.contact_sheet import SampledClip, sample_clip, telling_times
+from traps_pipeline.report.contact_sheet import SampledClip, hatch, sample_clip, telling_times
 from traps_pipeline.report.writing import figure_style, new_figure
 from traps_pipeline.video.encode import decode
 
@@ -132,10 +132,4 @@ def _draw_frame(axes: Axes, clip: SampledClip, moment: int) -> None:
     if moment < clip.known:
         axes.imshow(clip.frames[moment], interpolation="antialiased", aspect="auto")
         return
-    from matplotlib.patches import Rectangle
-
-    look: dict[str, Any] = {"hatch": "////", "facecolor": "#f2f4f7", "edgecolor": "#c3c9d2", "linewidth": 0.5}
-    axes.add_patch(Rectangle((0, 0), 1, 1, transform=axes.transAxes, **look))
-    box = {"facecolor": "white", "edgecolor": "none", "pad": 2}
-    place: dict[str, Any] = {"ha": "center", "va": "center", "transform": axes.transAxes}
-    axes.text(0.5, 0.5, f"ends at {clip.end_s:.1f} s", size=7, bbox=box, **place)
+    hatch(axes, (0, 0, 1, 1), f"ends at {clip.end_s:.1f} s", 7, transform=axes.transAxes)
