@@ -6,15 +6,32 @@ They are asked on request, made once, and no part of the pairs' figures.
 from __future__ import annotations
 
 import json
+import re
 import shutil
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import pandas as pd
 import pytest
+from playwright.sync_api import Browser
 
 from tests.conftest import Checkout
+from tests.pages import until, watched
 from traps_pipeline.benchmark.records import load_released, two_events_lines
 from traps_pipeline.models.asking.answer_rows import RESPONSES
-from traps_pipeline.protocol.two_events import lane_items
+from traps_pipeline.protocol.two_events import CLIPS, LANES, lane_items
+from traps_pipeline.release.checksums import altered_files
+from traps_pipeline.release.content import content_of
+from traps_pipeline.release.folder import Options, write_release
+from traps_pipeline.release.harness.scoring import TWO_WAY_FIGURES, figures, judge
+from traps_pipeline.release.harness.write import write_harness
+from traps_pipeline.release.submission import pack, read_submission
+from traps_pipeline.release.submissions import gather
+from traps_pipeline.release.verification import released_items, verify
+from traps_pipeline.report.explorer.site import write_site
+from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
 from traps_pipeline.scoring.score_rows import GRADED_CUTS, HYPOTHESES, LEADERBOARD, TWO_WAY
 from traps_pipeline.storage.benchmark_tables import ARMS, ITEMS
 from traps_pipeline.storage.parquet import TableStore
@@ -90,6 +107,90 @@ def test_a_rule_of_boards_earns_nothing_on_two_events(tables: TableStore) -> Non
     assert board.loc["any-rule", "pecs"] == 1.0  # it understands nothing of a void
     assert figures.loc["any-rule", names].tolist() == [0.0, 0.0, 0.0, 0.0]  # a board stands in each of the four clips
     assert figures["refused"].isna().all()
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+def test_four_clips_play_in_step_above_the_times_of_their_boards(
+    armed: tuple[Checkout, Path, dict[str, int]], browser: Browser, tmp_path: Path, width: int
+) -> None:
+    write_site(Workspace.open(armed[0].workspace), tmp_path / "site")
+    page, problems = watched(browser, width, ((tmp_path / "site").as_uri(), "data:,"))
+    page.goto(f"{(tmp_path / 'site' / 'index.html').as_uri()}#/pair/two_events/hidden_drop-e001?model=oracle")
+    until(page, "[...document.querySelectorAll('video')].filter(video => video.readyState >= 2).length === 4")
+    spec = two_events_lines()["hidden_drop-e001"].spec
+    comes_and_goes = [[[a / 10, b / 10] for a, b in record.lane.timetable.spans] for record in spec.lanes]
+    for clip, hidden in CLIPS.items():
+        figure = page.locator("figure").nth([*CLIPS].index(clip))
+        tracks = [figure.locator(".track").nth(k).get_attribute("aria-label") or "" for k in range(4)]
+        times = [[[float(t) for t in span] for span in re.findall(r"([\d.]+) to ([\d.]+) s", text)] for text in tracks]
+        still = [[0.0, 5.0]]
+        expected = [
+            (still, goes) if is_hidden else (goes, still)
+            for is_hidden, goes in zip(hidden, comes_and_goes, strict=True)
+        ]
+        assert times == [spans for lane in expected for spans in lane], clip
+    page.locator("h1").click()
+    for _ in range(12):
+        page.keyboard.press("ArrowRight")
+    seconds = "[...document.querySelectorAll('video')].map(video => video.currentTime)"
+    until(page, f"{seconds}.every(time => time > 1.2 && time < 1.3)")
+    assert page.locator(".now").evaluate_all("marks => marks.map(mark => mark.style.left)") == ["25%"] * 4
+    rows = [page.locator(f"table[data-name={lane}_lane] tbody tr").all_inner_texts() for lane in LANES]
+    for lane, record, texts in zip(LANES, spec.lanes, rows, strict=True):
+        asked = [item for item in lane_items(spec.scenario_id) if item.lane == lane]
+        answers = ["abstain" if item.asked_hidden else record.ground_truth for item in asked]
+        assert [text.split("\t")[1].strip() for text in texts] == answers
+        assert [("abstained" in text, "correct" in text) for text in texts] == [
+            (item.asked_hidden, not item.asked_hidden) for item in asked
+        ]
+    assert page.evaluate("document.documentElement.scrollWidth") == width
+    page.get_by_role("link", name="8 of 8").first.click()
+    assert page.get_by_role("link", name="4 of 8").count() == 2  # any-rule and occluder-rule abstain on all
+    page.context.close()
+    assert problems == []
+
+
+def test_two_events_are_released_submitted_and_scored_by_others(
+    armed: tuple[Checkout, Path, dict[str, int]], tables: TableStore, tmp_path: Path
+) -> None:
+    workspace, released = Workspace.open(armed[0].workspace), tmp_path / "released"
+    write_release(content_of(workspace), released, Options())
+    assert altered_files(released) == []
+    (record,) = map(json.loads, (released / "two_events.jsonl").read_text().splitlines())
+    spec = two_events_lines()["hidden_drop-e001"].spec
+    assert TwoEventsSpec.model_validate_json(record["record"]) == spec and record["labels"] == spec.labels
+    items = [json.loads(line) for line in (released / "clips" / "metadata.jsonl").read_text().splitlines()]
+    lanes = {row["item_id"]: row for row in items if row["dataset"] == "two_events"}
+    assert {*lanes} == {item.item_id for item in lane_items(spec.scenario_id)}
+    assert all((released / "clips" / row["file_name"]).is_file() for row in lanes.values())
+
+    pack(workspace, tmp_path / "mine.zip", "mine")
+    submission = read_submission(tmp_path / "mine.zip")
+    assert verify(submission, released_items(released)).problems == []
+    board = gather([tmp_path / "mine.zip"], released).groups[0]
+    stored = tables.read_all(TWO_WAY).drop(columns=["inference_acc", "inference_abstains"])
+    pd.testing.assert_frame_equal(board.two_way[stored.columns], stored, check_dtype=False)
+    frames = {name: frame.copy() for name, frame in submission.tables.items()}
+    frames["two_way.parquet"].loc[0, "conjunction"] = 0.5
+    forged = verify(replace(submission, tables=frames), released_items(released)).problems
+    assert len(forged) == 1 and "two_way" in forged[0] and "conjunction" in forged[0]
+    frames = {name: frame.loc[~is_of(frame, lanes, "left.both")] for name, frame in submission.tables.items()}
+    left_out = verify(replace(submission, tables=frames), released_items(released)).problems
+    assert any("left.both: is in the release and was not asked" in problem for problem in left_out)
+
+    write_harness(released, tmp_path / "harness")
+    package = tmp_path / "harness" / "traps_harness"
+    asked = [json.loads(line) for line in (package / "items.jsonl").read_text().splitlines()]
+    assert len(asked) == 8 + 8 and {*lanes} <= {row["item_id"] for row in asked}
+    said = tables.read_all(RESPONSES).query("model == 'any-rule'").set_index("item_id")["text"]
+    found = figures(judge(row, "answer", said[row["item_id"]], "standard") for row in asked)
+    assert {name: found[name] for name in TWO_WAY_FIGURES} == dict.fromkeys(TWO_WAY_FIGURES, 0.0)
+
+
+def is_of(frame: pd.DataFrame, lanes: Mapping[str, Any], name: str) -> pd.Series:
+    """Which rows are of an item of two events."""
+    ids = frame["item_id"] if "item_id" in frame else pd.Series("", frame.index)
+    return ids.isin([item_id for item_id in lanes if item_id.endswith(name)])
 
 
 def test_variations_are_doses_of_their_hypotheses(tables: TableStore) -> None:

@@ -38,6 +38,7 @@ from traps_pipeline.release.released_rows import (
     RELEASED_ITEMS,
     SCENARIOS,
     SPLITS,
+    TWO_EVENTS_SCENARIOS,
 )
 from traps_pipeline.storage.tables import Table
 
@@ -50,6 +51,7 @@ PLACES: Mapping[str, str] = {
     PAIRS.name: "metadata.jsonl",
     RELEASED_ITEMS.name: f"{CLIPS}/metadata.jsonl",
     SCENARIOS.name: "scenarios.jsonl",
+    TWO_EVENTS_SCENARIOS.name: "two_events.jsonl",
     CERTIFICATES.name: "certificates.jsonl",
     SPLITS.name: "splits.jsonl",
     PROMPTS.name: "prompts.jsonl",
@@ -136,6 +138,8 @@ def _open_release(folder: _Folder, content: Content) -> None:
     folder.table(PAIRS, rows_of.pair_rows(content))
     folder.table(RELEASED_ITEMS, rows_of.item_rows(content))
     folder.table(SCENARIOS, rows_of.scenario_rows(content))
+    if content.two_events:
+        folder.table(TWO_EVENTS_SCENARIOS, rows_of.two_events_rows(content))
     folder.table(CERTIFICATES, rows_of.certificate_rows(content))
     folder.table(SPLITS, rows_of.split_rows(content))
     for name, source in sorted(content.clips.items()):
@@ -163,7 +167,7 @@ def _held_out_release(folder: _Folder, content: Content, key_file: Path) -> Path
 def _pages(folder: _Folder, content: Content, options: Options) -> None:
     """Write everything but tables and clips."""
     canary = content.release.canary
-    tables = OPEN if options.held_out is None else HELD_OUT
+    tables = [table for table in (OPEN if options.held_out is None else HELD_OUT) if table.name in folder.rows]
     licence = (ROOT / LICENCE).read_text(encoding="utf-8")
     prompts = (ASSETS / "prompts" / "README.md").read_text(encoding="utf-8")
     folder.text(LICENCE, f"{licence.rstrip()}\n\n{canary}\n")
