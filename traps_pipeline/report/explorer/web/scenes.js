@@ -31,13 +31,12 @@ async function scenesView(route) {
 
 function sceneCard(info, { items }, about, pair) {
   const scene = about.get(pair.scenario) || { certificate: [] };
-  const clips = scene.clips
-    ? scene.clips.map(({ name, path }) => ["lane-clip", clipName(name), path])
-    : [
-        ["control", `Control: ${items.control_answer[pair.control] ?? ""}`, items.clip[pair.control]],
-        ["void", `Void: ${scene.intervention ?? ""}`, pair.void < 0 ? null : items.clip[pair.void]],
-        ["twin", `Twin, same void: ${scene.twin_answer ?? ""}`, scene.twin_clip],
-      ].filter(([, , path]) => path);
+  const all = scene.clips?.map(({ name, path }) => ["lane-clip", clipName(name), path]) || [
+    ["control", `Control: ${items.control_answer[pair.control] ?? ""}`, items.clip[pair.control]],
+    ["void", `Void: ${scene.intervention ?? ""}`, pair.void < 0 ? null : items.clip[pair.void]],
+    ["twin", `Twin, same void: ${scene.twin_answer ?? ""}`, scene.twin_clip],
+  ];
+  const clips = all.filter(([, , path]) => path);
   const isWide = Boolean(scene.clips);
   return section(
     null,
