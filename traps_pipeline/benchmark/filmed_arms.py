@@ -15,7 +15,7 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
-from traps_pipeline.benchmark.filmed_lanes import SECONDS_A_CLIP, film_lanes, lane_rows
+from traps_pipeline.benchmark.filmed_lanes import SECONDS_A_CLIP, film_lanes, lane_rows, lane_specs
 from traps_pipeline.benchmark.filmed_lanes import missing_clips as missing_lane_clips
 from traps_pipeline.benchmark.sharing import RenderWork, Row, existing_clips, share
 from traps_pipeline.benchmark.specs import clips_version, released_in_study, spec_of, spec_rows, trajectory_of
@@ -272,7 +272,10 @@ def incomplete_reasons(workspace: Workspace, category: str) -> list[str]:
     """Return why a category's table is incomplete: a new arm or a lost clip."""
     rows = workspace.tables.read(ARMS, {"category": category}, ["arm", "clip"])
     arms_in_table = set(rows["arm"])
-    reasons = [f"arm {arm} is asked for now" for arm in asked_arms(workspace, category) if arm not in arms_in_table]
+    expected = [*arms_of_pairs(workspace, category)]
+    if TWO_EVENTS in asked_arms(workspace, category) and lane_specs(workspace, category):
+        expected.append(TWO_EVENTS)
+    reasons = [f"arm {arm} is asked for now" for arm in expected if arm not in arms_in_table]
     clips = sorted({str(clip) for clip in rows["clip"].dropna()})
     sizes = workspace.sizes(clips)
     return reasons + [f"clip {clip} is gone" for clip in clips if clip not in sizes]
