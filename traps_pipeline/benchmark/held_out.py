@@ -57,9 +57,8 @@ def drawn_items(items: Iterable[Row], key: bytes) -> list[Row]:
     """
     scenarios = dict[tuple[str, bool], dict[str, list[Row]]]()
     for row in sorted(items, key=lambda row: (row["dataset"], row["side"], row["item_id"])):
-        scenarios.setdefault((row["taxonomy"], row["dataset"] == TWO_EVENTS), {}).setdefault(
-            row["scenario_id"], []
-        ).append(row)
+        group = row["taxonomy"], row["dataset"] == TWO_EVENTS
+        scenarios.setdefault(group, {}).setdefault(row["scenario_id"], []).append(row)
     drawn = list[Row]()
     for rows_of in scenarios.values():
         order = sorted(rows_of, key=lambda scenario: opaque(key, f"turn of {scenario}"))
