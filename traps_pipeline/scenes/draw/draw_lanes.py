@@ -85,10 +85,7 @@ def _scenario(family: Family, number: int, rng: np.random.Generator, seed: int) 
         place = [wording.labels.index(event.outcome.answer) for event in pair]
         pairs[k] = pair if (place[0] < place[1]) == is_turn_of_earlier(family.name, number, k, seed) else pair[::-1]
     assert look is not None
-    above = [
-        bool(number & 1),
-        bool((number + 1 ^ number >> 1) & 1),
-    ]  # of four scenarios each arrangement, of two each side
+    above = [bool(number & 1), bool((number + 1 ^ number >> 1) & 1)]  # each arrangement once in four scenarios
     strips = _strips(wording, pairs, rng)
     lanes = [_lane(pair, strip, up, rng) for pair, strip, up in zip(pairs, strips, above, strict=True)]
     events = [event for event, _ in pairs]
