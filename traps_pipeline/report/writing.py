@@ -94,8 +94,8 @@ class Column:
 
     Shares are fractions in the frame; `percent` prints them times 100. `spread` names the field of a standard
     deviation, which is printed after ±; `mark` names a field of text, such as a dagger, which is printed after the
-    number; `interval`: whether its fields `_ci_low` and `_ci_high` follow in brackets. For pages: the style of the cells
-    (a row's head, an emphasised number, a tag), whether a fraction is also drawn as a bar, and a group begins here.
+    number; `interval`: whether its `_ci_low` and `_ci_high` follow in brackets. For pages: the style of the cells (a
+    row's head, an emphasised number, a tag), whether a fraction is also drawn as a bar, and a group begins here.
     """
 
     field: str
