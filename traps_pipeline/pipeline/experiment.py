@@ -81,7 +81,9 @@ class Experiment(Settings):
         unknown = [value for value in values if value not in names]
         if unknown or not values:
             if gone := [value for value in unknown if value in REPLACED]:
-                raise ValueError(f"{', '.join(gone)} went with 0.3: {TWO_EVENTS} takes the place of such arms; ask that")
+                raise ValueError(
+                    f"{', '.join(gone)} went with 0.3: {TWO_EVENTS} takes the place of such arms; ask that"
+                )
             suggestion = did_you_mean(unknown[0], names) if unknown else ""
             raise ValueError(f"{unknown or 'nothing'} given; choose from {', '.join(names)}{suggestion}")
         return values
