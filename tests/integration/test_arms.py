@@ -187,7 +187,7 @@ def test_two_events_are_released_submitted_and_scored_by_others(
     assert {name: found[name] for name in TWO_WAY_FIGURES} == dict.fromkeys(TWO_WAY_FIGURES, 0.0)
 
 
-def is_of(frame: pd.DataFrame, lanes: Mapping[str, Any], name: str) -> pd.Series:
+def is_of(frame: pd.DataFrame, lanes: Mapping[str, Any], name: str) -> Any:
     """Which rows are of an item of two events."""
     ids = frame["item_id"] if "item_id" in frame else pd.Series("", frame.index)
     return ids.isin([item_id for item_id in lanes if item_id.endswith(name)])

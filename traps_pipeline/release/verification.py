@@ -127,14 +127,12 @@ def verify(submission: Submission, released: Released | None = None) -> Verifica
 
 
 def _wrong_items(items: Collection[Row]) -> Iterator[str]:
-    answers: dict[tuple[bool, str, str], str] = {}  # of each scenario, of two events of each lane
+    answers = dict[tuple[str, str], str]()  # of each scenario, of two events of each lane
     for row in items:
         is_lane = row["dataset"] == TWO_EVENTS
         event = row["pair_id"].rpartition(".")[0] if is_lane else row["scenario_id"]
-        answers[is_lane, row["sub_scenario"], event] = row["control_answer"]
-    commonest: Mapping[Any, str] = commonest_answers(
-        [{"sub_scenario": key[:2], "ground_truth": answer} for key, answer in sorted(answers.items())]
-    )
+        answers[_kind(row), event] = row["control_answer"]
+    commonest = commonest_answers([{"sub_scenario": key[0], "ground_truth": answers[key]} for key in sorted(answers)])
     for row in items:
         try:
             is_same = item_hash(row) == row["item_hash"]
@@ -144,8 +142,13 @@ def _wrong_items(items: Collection[Row]) -> Iterator[str]:
             yield f"item {row['item_id']}: is not what its digest says"
         elif row["dataset"] not in SUBMITTED_DATASETS:
             yield f"item {row['item_id']}: is none of the pairs' or of two events"
-        elif row["commonest_answer"] != commonest[row["dataset"] == TWO_EVENTS, row["sub_scenario"]]:
+        elif row["commonest_answer"] != commonest[_kind(row)]:
             yield f"item {row['item_id']}: its commonest answer is not that of its sub-scenario"
+
+
+def _kind(row: Row) -> str:
+    """Return what an item's commonest answer is of: its sub-scenario, apart from that of two events."""
+    return f"{row['dataset'] == TWO_EVENTS} {row['sub_scenario']}"
 
 
 def _own_ids(row: Row) -> list[str]:

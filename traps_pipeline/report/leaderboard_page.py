@@ -149,7 +149,7 @@ def legend(board: pd.DataFrame, two_way: pd.DataFrame | None = None) -> dict[str
     optional_terms = {column.heading: field for column, field in OPTIONAL.items()}
     optional_terms |= {INCOMPLETE_MARK: "incomplete", BROKEN_MARK: "is_broken"}
     unused_terms = {term for term, field in optional_terms.items() if not (board.loc[:, field].astype(float) > 0).any()}
-    if two_way is None or not two_way["n_scenarios"].any():
+    if two_way is None or not two_way["n_scenarios"].to_numpy().any():
         unused_terms |= {heading for _, heading, *_ in TWO_WAY_FIGURES}
     return {term: meaning for term, meaning in LEGEND.items() if term not in unused_terms}
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from traps_pipeline.protocol.datasets import ARMS, GRADED, TWO_EVENTS, VARIATIONS
 from traps_pipeline.protocol.metric_words import METRIC_WORDS, SHARES
 from traps_pipeline.scoring.score_rows import BROKEN_ABOVE, INCOMPLETE_BELOW
@@ -18,7 +20,7 @@ ARM_TITLES = {arm: f"Arm: {arm.replace('_', ' ')}" for arm in ARMS}
 ARM_TITLES |= {TWO_EVENTS: "Two events", GRADED: "Graded cuts"}
 ARM_TITLES |= {name: f"Variation: {name.replace('_', ' ')}" for name in VARIATIONS}
 # Figures of two events on the leaderboard (docs/scoring.md, "Two events"): field, heading, unit, meaning.
-TWO_WAY_FIGURES = (
+TWO_WAY_FIGURES: tuple[tuple[str, str, Literal["percent", "fraction"], str], ...] = (
     (
         "conjunction", "Conjunction %", "percent",
         "share of scenarios of two events with all eight items right; 0 for every rule of the clip alone or of the "

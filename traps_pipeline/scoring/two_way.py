@@ -7,7 +7,7 @@ and enter none.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
@@ -65,8 +65,8 @@ def decisions(items: pd.DataFrame) -> pd.DataFrame:
     for cell, name in enumerate(CELLS):
         abstained = items["abstained"].where(2 * hidden + other == cell)
         columns |= {name: abstained.fillna(0), f"{name}_of": abstained.notna()}
-    counts = pd.DataFrame(columns).astype(float).groupby(items["scenario_id"]).sum()
-    scenarios = right.groupby(items["scenario_id"])
+    counts = cast(pd.DataFrame, pd.DataFrame(columns).astype(float).groupby(items["scenario_id"]).sum())
+    scenarios: Any = right.groupby(items["scenario_id"])
     is_right = scenarios.min() > 0
     is_decided = (scenarios.size() == len(lane_items(""))) & (~is_right | (scenarios.count() == scenarios.size()))
     return counts.assign(conjunction=(is_right & is_decided).astype(float), conjunction_of=is_decided.astype(float))
@@ -113,7 +113,8 @@ def _entry(items: pd.DataFrame, resampling: Resampling, named: str) -> dict[str,
 
 
 def _mean_over_runs(items: pd.DataFrame, decision: str) -> float:
-    return float(items.groupby("run")[decision].mean().mean(skipna=False))
+    of_runs: Any = items.groupby("run")[decision].mean()
+    return float(of_runs.mean(skipna=False))
 
 
 def _refusal(items: pd.DataFrame) -> str | None:

@@ -107,9 +107,8 @@ def _two_way_figures(rows: list[PanelDecision]) -> dict[str, float | None]:
     whole = [rights for rights in scenarios.values() if len(rights) == len(lane_items(""))]
     conjunctions = [False if False in rights else None if None in rights else True for rights in whole]
     neither, other, asked = (_share(cells.get(cell, [])) for cell in ((False, False), (False, True), (True, False)))
-    effects = [
-        None if None in pair else pair[0] - pair[1] for pair in ((asked, neither), (other, neither), (asked, other))
-    ]
+    pairs = ((asked, neither), (other, neither), (asked, other))
+    effects = [None if high is None or low is None else high - low for high, low in pairs]
     return dict(zip(TWO_WAY_FIGURES, (_share(conjunctions), *effects), strict=True))
 
 
