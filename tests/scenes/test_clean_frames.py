@@ -1,4 +1,4 @@
-"""Boards pass through nothing, numbers beside voids tell no outcome, and questions name things by what they look like."""
+"""Boards pass through nothing, numbers beside voids tell no outcome, and questions name what is seen."""
 
 from __future__ import annotations
 
