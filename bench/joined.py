@@ -27,13 +27,15 @@ from sklearn.feature_extraction.text import CountVectorizer
 from sklearn.model_selection import GroupKFold
 
 from bench.quick import parse
-from bench.two_events.balance import balance, lane_numbers, load_two_events
-from bench.two_events.draw import FAMILIES, draw_family
 from bench.two_events.figures import two_way
+from traps_pipeline.base.paths import TWO_EVENTS_RELEASED
+from traps_pipeline.benchmark.lane_balance import balance, lane_numbers
+from traps_pipeline.benchmark.records import two_events_lines
+from traps_pipeline.protocol.two_events import CLIPS, LANES
 from traps_pipeline.scenes.physics.kit import COLOURS
 from traps_pipeline.scenes.picture.render import Renderer
-from traps_pipeline.scenes.worlds.lane_records import CLIPS, TwoEventsSpec
-from traps_pipeline.scenes.worlds.lanes import LANES, TwoLanes
+from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
+from traps_pipeline.scenes.worlds.lanes import TwoLanes
 
 STEP = 5  # frames from one that is looked at to the next
 PLAY = ("red", "green", "blue", "yellow", "orange", "cyan", "purple", "black", "white")
@@ -47,15 +49,12 @@ LIMITS = {"A clip": (0.05, 0.15), "B words": (0.05, 0.15), "C colours": (0.05, 0
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--records", type=Path, help="folder of records of two events; default: draw --count of each")
-    parser.add_argument("--families", nargs="+", default=FAMILIES, choices=FAMILIES)
-    parser.add_argument("--count", type=int, default=2, help="of each family to draw")
+    parser.add_argument("--records", type=Path, default=TWO_EVENTS_RELEASED, help="folder of records of two events")
+    parser.add_argument("--families", nargs="+", metavar="FAMILY", help="of these alone")
     parser.add_argument("--keep", type=Path, help="file to keep what is seen in frames, or to read it from")
     arguments = parse(parser, families=["slide", "drop_split", "chain"])
-    if arguments.records:
-        specs = [*load_two_events(arguments.records).values()]
-    else:
-        specs = [spec for family in arguments.families for spec in draw_family(family, arguments.count, seed=2026)]
+    lines = two_events_lines(arguments.records).values()
+    specs = [line.spec for line in lines if not arguments.families or line.family in arguments.families]
     print(balance(lane_numbers(specs)).round(3).to_string(index=False))
     kept = arguments.keep
     if kept and kept.exists():
@@ -98,13 +97,14 @@ def rows_of(spec: TwoEventsSpec) -> Iterator[dict[str, object]]:
         frames = drawn["both" if hidden else "neither"].astype(np.int16)[:, :, 160 * lane : 160 * (lane + 1)]
         seen[lane, hidden] = lane_numbers_of(frames, asked, named)
         counts[lane, hidden] = {c: like(frames, c).sum(axis=(1, 2)) for c in {asked, *named, *strips}}
-    for item in spec.items():
+    for asked_item in spec.questions():
+        item = asked_item.item
         lane, hidden = LANES.index(item.lane), CLIPS[item.clip]
         strip = strips[lane]
         whole = {c: np.sum([counts[k, hidden[k]][c] for k in range(2)], axis=0) for c in {strip, asked, *named}}
         yield {
             **{"scenario_id": item.scenario_id, "family": spec.family, "clip": item.clip, "lane": item.lane},
-            **{"asked_hidden": item.asked_hidden, "other_hidden": item.other_hidden, "question": item.question},
+            **{"asked_hidden": item.asked_hidden, "other_hidden": item.other_hidden, "question": asked_item.text},
             **{f"a {k} {name}": value for k in range(2) for name, value in seen[k, hidden[k]].items()},
             **{
                 f"c {n} {i}": float(v) for n, c in enumerate((strip, asked, *named[:2])) for i, v in enumerate(whole[c])

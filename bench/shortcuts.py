@@ -6,8 +6,8 @@ observer answers from the last shown frame alone, and how many nobody can, since
 question names shows there (certificate `referents`); when outcomes settle, and until when they are in view; how many
 records of a family have a neighbour whose first frame looks like theirs; how far each seesaw turns; how well the state
 at the cut predicts the outcome of a chaotic record, beside always saying the commonest outcome. With --observer also
-what the observer reads of each whole control, encoded and decoded (eight minutes more). From a study that asked the
-arms (`traps run arms`): PECS, conjunction, robust figure and inference of the shortcut rules and of the observer.
+what the observer reads of each whole control, encoded and decoded (eight minutes more). From a study of `traps run
+arms`: PECS, figures of two events, and inference of the shortcut rules and of the observer.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from traps_pipeline.scenes.observe import observe
 from traps_pipeline.scenes.picture.checks import closing_frames
 from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory
 from traps_pipeline.scenes.worlds.world import World
-from traps_pipeline.scoring.score_rows import LEADERBOARD, ROBUST
+from traps_pipeline.scoring.score_rows import LEADERBOARD, TWO_WAY
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.video.encode import encode
 
@@ -248,9 +248,10 @@ def print_states(found: Sequence[Measured]) -> None:
 
 def print_rules(workspace: Workspace) -> None:
     board = workspace.tables.read(LEADERBOARD, {}).query("dataset == 'overall'")
-    robust = workspace.tables.read(ROBUST, {})
-    both = board.merge(robust, on=["model", "regime"], suffixes=("", "_robust")).sort_values("model")
-    figures = ("pecs", "conjunction", "robust", "inference_acc")
+    both = board.merge(workspace.tables.read(TWO_WAY, {}), on=["model", "regime"], suffixes=("", "_lanes")).sort_values(
+        "model"
+    )
+    figures = ("pecs", "conjunction", "specificity", "inference_acc")
     print(f"\n{', '.join(figures)}")
     for row in both.to_dict("records"):
         print(f"  {row['model']:20} {row['regime']:9}", *(f"{row[name]:6.3f}" for name in figures))

@@ -55,7 +55,7 @@ def drawn_items(items: Iterable[Row], key: bytes) -> list[Row]:
     so that each is drawn as often as any other.
     """
     scenarios = dict[str, dict[str, list[Row]]]()
-    for row in sorted(items, key=lambda row: (row["dataset"], row["side"])):
+    for row in sorted(items, key=lambda row: (row["dataset"], row["side"], row["item_id"])):
         scenarios.setdefault(row["taxonomy"], {}).setdefault(row["scenario_id"], []).append(row)
     drawn = list[Row]()
     for rows_of in scenarios.values():
