@@ -1,0 +1,85 @@
+"""Show observers the scene of one lane, in frames of two lanes side by side.
+
+A board stands from first frame to last before the scene, which is then never seen, or before the bench. The plate of a
+bench tells it from a scene.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from traps_pipeline.scenes.parts.vision import Blob, blobs, colour_mask
+from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH
+
+BOARD_PX, BOARD_FILL = 400, 0.5  # least area of a board, and least share of its bounding box
+STRIP_PX, STRIP_LONG = 100, 4  # least area of a strip, and how many times as long as it is high
+MARGIN = 1.06  # of the strip's length, that the scene is shown in
+PLATE_ROWS, PLATE_SHARE = 2, 0.5  # so many rows of a board's place are of a bench's plate, over this share of it
+ABOVE_PX, BELOW_PX = 3, 10  # of a board's place, to which plates reach
+
+
+def scene_of_lane(frames: np.ndarray, strip: str) -> np.ndarray | None:
+    """Return the frames (M, 360, 480, 3) of a lane's scene before which no board is; None if there are none.
+
+    frames: (N, H, W, 3). Before them come those in which a board stands before the scene from the first frame on, as
+    what begins beside it is seen in them.
+    """
+    lane, strip_blob = max(
+        ((half, _strip(half, strip)) for half in np.split(frames, 2, axis=2)),
+        key=lambda seen: 0 if seen[1] is None else seen[1].area,
+    )
+    boards = np.stack([colour_mask(frame, "navy") for frame in lane])
+    still = next(iter(blobs(boards.all(axis=0), BOARD_PX)), None)
+    if strip_blob is None or still is None:
+        return None
+    _, top, _, height = still.box
+    boards[:, top - 2 : top + height + 3] = False
+    moving = [[blob for blob in blobs(mask, BOARD_PX) if blob.fill > BOARD_FILL] for mask in boards]
+    open_frames = np.array([not seen for seen in moving])
+    if open_frames.all() or not open_frames.any():
+        return None
+    place = max((blob for seen in moving for blob in seen), key=lambda blob: (_bottom(blob) // 4, blob.area))
+    background = np.median(lane[open_frames], axis=0).astype(np.uint8)
+    if _is_bench(background, place):
+        return None
+    first = int(open_frames.argmax())
+    stands = [any(np.ptp([blob.box, place.box], axis=0).max() < 4 for blob in seen) for seen in moving[:first]]
+    open_frames[:first] = stands
+    rows = slice(0, top - 1) if top > place.box[1] else slice(top + height + 1, strip_blob.box[1] - 1)
+    return _cropped(lane[open_frames], background, rows, strip_blob)
+
+
+def _strip(half: np.ndarray, colour: str) -> Blob | None:
+    """Return the largest region of a colour that may be a strip."""
+    still = np.median(half, axis=0).astype(np.uint8)
+    found = blobs(colour_mask(still, colour), STRIP_PX)
+    return next((blob for blob in found if blob.box[2] > STRIP_LONG * blob.box[3]), None)
+
+
+def _bottom(blob: Blob) -> int:
+    return blob.box[1] + blob.box[3]
+
+
+def _is_bench(background: np.ndarray, place: Blob) -> bool:
+    """Return whether the plate of a bench is seen at a board's place."""
+    x, y, width, height = place.box
+    red, green, blue = np.moveaxis(
+        background[max(0, y - ABOVE_PX) : y + height + BELOW_PX, x : x + width], 2, 0
+    ).astype(int)
+    plate = (abs(red - blue) < 10) & (red - green > 3) & (red - green < 16) & (red > 60) & (red < 125)
+    return int((plate.mean(axis=1) > PLATE_SHARE).sum()) >= PLATE_ROWS
+
+
+def _cropped(lane: np.ndarray, background: np.ndarray, rows: slice, strip: Blob) -> np.ndarray:
+    """Return what is in some rows, over the length of the strip, on plain floor at an observer's size."""
+    x, _, length, _ = strip.box
+    width = min(round(MARGIN * length) + 8, lane.shape[2])
+    left = int(np.clip(x + (length - width) // 2, 0, lane.shape[2] - width))
+    height = width * HEIGHT // WIDTH
+    bottom = max(rows.stop + 4, height)
+    shown = np.empty_like(lane)
+    shown[:] = np.median(background[rows].reshape(-1, 3), axis=0).astype(np.uint8)
+    shown[:, rows] = lane[:, rows]
+    part = shown[:, bottom - height : bottom, left : left + width]
+    return np.stack([cv2.resize(frame, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC) for frame in part])
