@@ -19,7 +19,7 @@ import pandas as pd
 
 from bench.quick import parse
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.paths import TWO_EVENTS_RELEASED
+from traps_pipeline.base.paths import TWO_EVENTS_RELEASED, WORKSPACES
 from traps_pipeline.benchmark.filmed_lanes import trajectories_of
 from traps_pipeline.benchmark.records import two_events_lines
 from traps_pipeline.models.reading.judged_answers import is_correct
@@ -35,8 +35,12 @@ UNKNOWN = "unknown"
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("command", choices=("sheets", "score"), nargs="?", default="sheets")
-    parser.add_argument("path", type=Path, nargs="?", default=Path("reading"), help="folder of sheets, or the answers")
-    parser.add_argument("--key", type=Path, default=Path("key.csv"), help="where the right answers are; not shown")
+    parser.add_argument(
+        "path", type=Path, nargs="?", default=WORKSPACES / "reading", help="folder of sheets, or the answers"
+    )
+    parser.add_argument(
+        "--key", type=Path, default=WORKSPACES / "reading-key.csv", help="where the right answers are; not shown"
+    )
     parser.add_argument("--records", type=Path, default=TWO_EVENTS_RELEASED)
     parser.add_argument("--scenarios", type=int, default=40)
     parser.add_argument("--seed", type=int, default=1)

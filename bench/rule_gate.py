@@ -103,12 +103,13 @@ def seen_items(specs: Sequence[TwoEventsSpec], records: Path, cache: Path, worke
     code = file_digest(Path(__file__))
     keys = {f"{code} {spec.spec_hash}": spec for spec in specs}
     stored = pd.read_parquet(cache) if cache.is_file() else pd.DataFrame({"key": []})
+    stored = stored[stored["key"].str.startswith(code)]
     missing = [(key, spec, records) for key, spec in keys.items() if key not in set(stored["key"])]
     drawn = pd.DataFrame([row for _, rows in run_in_order(_drawn, missing, workers) for row in rows])
-    items = pd.concat([frame for frame in (stored[stored["key"].isin(keys)], drawn) if len(frame)], ignore_index=True)
+    items = pd.concat([frame for frame in (stored, drawn) if len(frame)], ignore_index=True)
     cache.parent.mkdir(parents=True, exist_ok=True)
     items.to_parquet(cache)
-    return items
+    return items[items["key"].isin(keys)].reset_index(drop=True)
 
 
 def _drawn(job: tuple[str, TwoEventsSpec, Path]) -> list[dict[str, object]]:

@@ -14,7 +14,7 @@ from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH
 
 BOARD_PX, BOARD_FILL = 400, 0.5  # least area of a board, and least share of its bounding box
 STRIP_PX, STRIP_LONG = 100, 4  # least area of a strip, and how many times as long as it is high
-MARGIN = 1.06  # of the strip's length, that the scene is shown in
+MARGIN, INNER = 1.08, 0.8  # of the strip's length, that the scene is shown in; share of what is added on the inner side
 PLATE_ROWS, PLATE_SHARE = 2, 0.5  # so many rows of a board's place are of a bench's plate, over this share of it
 ABOVE_PX, BELOW_PX = 3, 10  # of a board's place, to which plates reach
 
@@ -25,10 +25,10 @@ def scene_of_lane(frames: np.ndarray, strip: str) -> np.ndarray | None:
     frames: (N, H, W, 3). Before them come those in which a board stands before the scene from the first frame on, as
     what begins beside it is seen in them.
     """
-    lane, strip_blob = max(
-        ((half, _strip(half, strip)) for half in np.split(frames, 2, axis=2)),
-        key=lambda seen: 0 if seen[1] is None else seen[1].area,
-    )
+    halves = np.split(frames, 2, axis=2)
+    strips = [_strip(half, strip) for half in halves]
+    side = int(np.argmax([0 if blob is None else blob.area for blob in strips]))
+    lane, strip_blob = halves[side], strips[side]
     boards = np.stack([colour_mask(frame, "navy") for frame in lane])
     still = next(iter(blobs(boards.all(axis=0), BOARD_PX)), None)
     if strip_blob is None or still is None:
@@ -47,7 +47,7 @@ def scene_of_lane(frames: np.ndarray, strip: str) -> np.ndarray | None:
     stands = [any(np.ptp([blob.box, place.box], axis=0).max() < 4 for blob in seen) for seen in moving[:first]]
     open_frames[:first] = stands
     rows = slice(0, top - 1) if top > place.box[1] else slice(top + height + 1, strip_blob.box[1] - 1)
-    return _cropped(lane[open_frames], background, rows, strip_blob)
+    return _cropped(lane[open_frames], background, rows, strip_blob, side)
 
 
 def _strip(half: np.ndarray, colour: str) -> Blob | None:
@@ -71,13 +71,17 @@ def _is_bench(background: np.ndarray, place: Blob) -> bool:
     return int((plate.mean(axis=1) > PLATE_SHARE).sum()) >= PLATE_ROWS
 
 
-def _cropped(lane: np.ndarray, background: np.ndarray, rows: slice, strip: Blob) -> np.ndarray:
-    """Return what is in some rows, over the length of the strip, on plain floor at an observer's size."""
+def _cropped(lane: np.ndarray, background: np.ndarray, rows: slice, strip: Blob, side: int) -> np.ndarray:
+    """Return what is in some rows, over the length of the strip, on plain floor at an observer's size.
+
+    What is behind the strip lies nearer to the middle of the picture.
+    """
     x, _, length, _ = strip.box
     width = min(round(MARGIN * length) + 8, lane.shape[2])
-    left = int(np.clip(x + (length - width) // 2, 0, lane.shape[2] - width))
+    outer = round((width - length) * (1 - INNER if side == 0 else INNER))
+    left = int(np.clip(x - outer, 0, lane.shape[2] - width))
     height = width * HEIGHT // WIDTH
-    bottom = max(rows.stop + 4, height)
+    bottom = min(max(rows.stop + 4, height), lane.shape[1])
     shown = np.empty_like(lane)
     shown[:] = np.median(background[rows].reshape(-1, 3), axis=0).astype(np.uint8)
     shown[:, rows] = lane[:, rows]
