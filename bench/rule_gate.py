@@ -102,7 +102,7 @@ def seen_items(specs: Sequence[TwoEventsSpec], records: Path, cache: Path, worke
     """Return the items of records, with what each class of rules knows of them; cached by record and this file."""
     code = file_digest(Path(__file__))
     keys = {f"{code} {spec.spec_hash}": spec for spec in specs}
-    stored = pd.read_parquet(cache) if cache.is_file() else pd.DataFrame({"key": []})
+    stored = pd.read_parquet(cache) if cache.is_file() else pd.DataFrame({"key": pd.Series(dtype=str)})
     stored = stored[stored["key"].str.startswith(code)]
     missing = [(key, spec, records) for key, spec in keys.items() if key not in set(stored["key"])]
     drawn = pd.DataFrame([row for _, rows in run_in_order(_drawn, missing, workers) for row in rows])
