@@ -81,12 +81,12 @@ def test_a_line_that_is_no_record_names_its_file_and_line(tmp_path: Path, line: 
 
 def test_an_id_that_occurs_twice_names_the_second_line(tmp_path: Path) -> None:
     one, two = records()
-    with raises(TrapsError, "benchmark.records.released_lines", "some.jsonl"):
+    with raises(TrapsError, "benchmark.records._lines", "some.jsonl"):
         load_released(write(tmp_path, one, two, one))
 
 
 def test_a_folder_without_records_says_what_to_do(tmp_path: Path) -> None:
-    with raises(TrapsError, "benchmark.records.released_lines"):
+    with raises(TrapsError, "benchmark.records._lines"):
         load_released(tmp_path)
 
 

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
+from pathlib import Path
+from typing import Any
 
 import pytest
 
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.benchmark.corrections import LaneScenario, fold_two_events, of_pairs, read_corrections, subset
+from traps_pipeline.benchmark.records import load_released, two_events_lines
 from traps_pipeline.protocol.two_events import LaneItem, lane_item, lane_items
+from traps_pipeline.storage.study import Study
 
 
 def test_an_item_id_says_which_lane_is_asked_and_which_are_hidden():
@@ -38,3 +45,78 @@ def test_another_id_is_refused_by_name(item_id: str):
 
 def test_an_item_makes_its_own_name():
     assert LaneItem("chain-e001", "left", "both").item_id == "two_events:chain-e001:left.both"
+
+
+# --- corrections ------------------------------------------------------------------------------------------------------
+
+ID = "slide-e001"
+
+
+def decide(tmp_path: Path, *changes: dict[str, Any]) -> dict[str, LaneScenario]:
+    signed = {"scenario_id": ID, "who": "jd", "when": "2026-11-21", "why": "reviewed"}
+    (tmp_path / "review.jsonl").write_text("".join(f"{json.dumps(signed | change)}\n" for change in changes))
+    return fold_two_events(two_events_lines(), read_corrections(tmp_path))
+
+
+def test_a_scenario_of_two_events_is_discarded_restored_and_reworded_in_both_lanes(tmp_path: Path):
+    assert ID not in decide(tmp_path, {"action": "discard"})
+    assert decide(tmp_path, {"action": "discard"}, {"action": "restore"})[ID].spec == two_events_lines()[ID].spec
+    reworded = decide(tmp_path, {"action": "correct", "question": "Does it stop, yes or no?"})[ID].spec
+    asked = [each.text for each in reworded.questions()]
+    assert len({*asked}) == 2 and all(text.endswith("does it stop, yes or no?") for text in asked)
+    assert reworded.scene_hash == two_events_lines()[ID].spec.scene_hash  # so no clip is drawn again
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"action": "correct", "params": {"radius_m": 0.1}}, "discard it"),
+        ({"action": "correct", "answer": "yes"}, "discard it"),
+        ({"action": "correct", "labels": ["a", "b"]}, "ground truths"),
+        ({"action": "correct"}, "no change"),
+        ({"action": "keep", "question": "Why?"}, "keep"),
+    ],
+)
+def test_a_wrong_decision_about_two_events_is_named_by_file_and_line(
+    tmp_path: Path, change: dict[str, Any], named: str
+):
+    with pytest.raises(TrapsError, match=rf"review\.jsonl:1: .*{named}"):
+        decide(tmp_path, change)
+
+
+def test_decisions_about_two_events_leave_the_pairs_as_they_are(tmp_path: Path):
+    decide(tmp_path, {"action": "discard"})
+    assert of_pairs(read_corrections(tmp_path)) == []
+
+
+# --- records ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_study_has_the_first_scenarios_of_each_family_or_those_that_it_names():
+    scenarios = fold_two_events(two_events_lines(), [])
+    assert {*subset(scenarios, Study(per_family=1), two_events_lines())} == {
+        id_ for id_ in scenarios if id_.endswith("e001")
+    }
+    named = Study(scenarios=["slide-e002", "slide-0001"])
+    assert [*subset(scenarios, named, two_events_lines())] == ["slide-e002"]
+    assert [*subset(load_released(), named)] == ["slide-0001"]
+
+
+def test_in_every_family_the_earlier_of_two_answers_is_shown_as_often_as_the_later_one():
+    earlier = Counter[str]()
+    for line in two_events_lines().values():
+        for lane in line.spec.lanes:
+            shown, twin = (line.spec.labels.index(each.ground_truth) for each in (lane, lane.twin))
+            earlier[line.family] += shown < twin
+    assert len(earlier) == 30 and {*earlier.values()} == {8}
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("camera", {"distance": -1.0}), ("physics", {"fps": 0}), ("labels", ["yes"])]
+)
+def test_an_implausible_record_is_named_by_file_line_and_field(tmp_path: Path, field: str, value: Any):
+    record = json.loads(two_events_lines()[ID].line)
+    record[field] = record[field] | value if isinstance(value, dict) else value
+    (tmp_path / "slide.jsonl").write_text(json.dumps(record) + "\n")
+    with pytest.raises(TrapsError, match=rf"slide\.jsonl:1: .*{field}"):
+        _ = two_events_lines(tmp_path)[ID].spec

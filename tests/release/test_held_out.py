@@ -24,7 +24,7 @@ from traps_pipeline.benchmark import held_out
 from traps_pipeline.benchmark.held_out import MARKER, drawn_items, held_out_key, require_secret_seed
 from traps_pipeline.benchmark.items import build_items
 from traps_pipeline.benchmark.records import load_release
-from traps_pipeline.protocol.datasets import CROSSED, DATASETS
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.release.content import Content, content_of
 from traps_pipeline.release.folder import Options, write_release
 from traps_pipeline.storage.benchmark_tables import VIDEOS
@@ -234,19 +234,13 @@ def test_secrets_are_readable_by_their_owner_alone(releases: list[tuple[Path, Pa
         assert stat.S_IMODE(path.stat().st_mode) == 0o600, path
 
 
-def test_a_key_inside_the_folder_no_key_and_an_arm_that_shares_questions_are_refused(
-    content: Content, tmp_path: Path
-) -> None:
+def test_a_key_inside_the_folder_and_no_key_are_refused(content: Content, tmp_path: Path) -> None:
     inside = tmp_path / "held" / "key"
     with raises(TrapsError, "release.folder.write_release", str(inside)):
         write_release(content, tmp_path / "held", Options(held_out=inside))
     (tmp_path / "other").write_text("no key")
     with raises(TrapsError, "benchmark.held_out.held_out_key", str(tmp_path / "other"), "64"):
         held_out_key(tmp_path / "other")
-    crossed = [{**row, "dataset": CROSSED} for row in content.items[:1]]
-    asked = Content(content.study, crossed, content.specs, content.clips, content.release)
-    with raises(TrapsError, "release.folder._held_out_release", CROSSED):
-        write_release(asked, tmp_path / "held", Options(held_out=tmp_path / "key"))
     assert not (tmp_path / "held").exists() and not (tmp_path / "key").exists()
 
 

@@ -9,9 +9,11 @@ from functools import cache
 import numpy as np
 import pytest
 
+from traps_pipeline.benchmark.filmed_lanes import trajectories_of
 from traps_pipeline.benchmark.lane_balance import auc, balance, lane_numbers
+from traps_pipeline.benchmark.records import two_events_lines
 from traps_pipeline.protocol.two_events import CLIPS
-from traps_pipeline.scenes.certification.certify_lanes import certify_lanes
+from traps_pipeline.scenes.certification.certify_lanes import certify_lane_record, certify_lanes
 from traps_pipeline.scenes.draw.draw_lanes import LEFT_OUT, DrawnLanes, draw_timetable, draw_two_events, lane_families
 from traps_pipeline.scenes.family_registry import families
 from traps_pipeline.scenes.picture.render import Renderer
@@ -128,6 +130,19 @@ def test_a_board_beside_its_place_and_a_timetable_without_a_window_are_refused()
     always = [replace(world.lanes[0], timetable=Timetable(((0, 50),))), world.lanes[1]]
     with pytest.raises(Rejected, match="no window"):
         certify_lanes(replace(world, lanes=always), twins)
+
+
+@pytest.mark.slow
+def test_a_released_record_is_certified_from_its_trajectories_and_an_altered_one_is_not():
+    spec = two_events_lines()["slide-e001"].spec
+    worlds = trajectories_of(spec)
+    verdict = certify_lane_record(spec, worlds)
+    assert verdict.passed, verdict.failures
+    lane = spec.lanes[0]
+    exchanged = lane.model_copy(update={"ground_truth": lane.twin.ground_truth})
+    altered = spec.model_copy(update={"lanes": (exchanged, spec.lanes[1])})
+    assert "ground_truth" in certify_lane_record(altered, worlds).failures
+    assert "lanes" in certify_lane_record(spec, worlds | {"left": worlds["qpos"]}).failures  # a twin that ends alike
 
 
 # --- items ------------------------------------------------------------------------------------------------------------

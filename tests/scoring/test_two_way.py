@@ -15,6 +15,8 @@ from tests.build.two_events import Rule, lane_verdicts, reader
 from tests.build.verdicts import Rows, of_arm, write
 from traps_pipeline.pipeline.stages import scoring_stages
 from traps_pipeline.protocol.two_events import CLIPS, LANES, lane_items
+from traps_pipeline.release.harness.scoring import PanelDecision
+from traps_pipeline.release.harness.scoring import figures as harness_figures
 from traps_pipeline.scoring.score_rows import TWO_WAY
 from traps_pipeline.scoring.two_way import CELLS, LOWEST, two_way, wrong_rows
 from traps_pipeline.storage.study import Study
@@ -135,6 +137,20 @@ def test_the_stage_writes_a_table_of_what_was_asked(rows: Rows, tmp_path: Path, 
     assert scoring_stages.two_way.checks[0].wrong(workspace, None, output) == ""
     workspace.tables.write(TWO_WAY, {}, output.frame, {})
     assert len(workspace.tables.read(TWO_WAY, {})) == asked
+
+
+def test_a_harness_scores_two_events_as_the_table_does() -> None:
+    wrong = lane_verdicts(lambda item: reader(item) and not item.scenario_id.endswith("1"), 3)
+    wrong.loc[wrong.index[-1], "abstained"] = None
+    row = only(wrong)
+    fields = PanelDecision.__dataclass_fields__
+    found = harness_figures(
+        PanelDecision(**{name: None if pd.isna(value) else value for name, value in each.items() if name in fields})
+        for each in wrong.assign(outcome="answer").to_dict("records")
+    )
+    assert (row.conjunction, row.own_effect) == (1 / 2, 2 / 3)  # right, answered, undecided
+    assert [found[name] for name in LOWEST] == pytest.approx(figures(row))
+    assert (found["pecs"], found["missing"]) == (None, 1)
 
 
 def test_a_figure_beyond_its_limits_is_counted() -> None:

@@ -15,14 +15,12 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
-from traps_pipeline.benchmark.corrections import corrected_scenarios
 from traps_pipeline.benchmark.filmed_lanes import SECONDS_A_CLIP, film_lanes, lane_rows
 from traps_pipeline.benchmark.filmed_lanes import missing_clips as missing_lane_clips
 from traps_pipeline.benchmark.sharing import RenderWork, Row, existing_clips, share
 from traps_pipeline.benchmark.specs import clips_version, released_in_study, spec_of, spec_rows, trajectory_of
 from traps_pipeline.protocol.datasets import ARMS as ARM_NAMES
 from traps_pipeline.protocol.datasets import (
-    CROSSED,
     GRADED,
     TWO_EVENTS,
     extra_datasets_of,
@@ -32,7 +30,7 @@ from traps_pipeline.protocol.datasets import (
 from traps_pipeline.scenes.variants import arms as shortcut_arms
 from traps_pipeline.scenes.variants import graded_cuts, variations
 from traps_pipeline.scenes.variants.arms import ARMS as SHORTCUT_ARMS
-from traps_pipeline.scenes.variants.arms import Arm, Question, Scenario, crossed, partners
+from traps_pipeline.scenes.variants.arms import Arm, Question, Scenario
 from traps_pipeline.scenes.variants.graded_cuts import GRADED_CUT
 from traps_pipeline.scenes.variants.variations import VARIATIONS
 from traps_pipeline.scenes.worlds.clip_notes import Clip, note_of, read_clip, save_clip
@@ -174,26 +172,8 @@ def _code(arm: str) -> str:
     return file_digest(Path(declared_in.__file__))
 
 
-def arm_of(spec: SceneSpec, arm: str) -> Arm:
-    """Return a scenario's arm or variation; for crossed questions, with its partner."""
-    return crossed(_partners(spec.family).get(spec.scenario_id)) if arm == CROSSED else ARMS_BY_NAME[arm]
-
-
-@cache
-def _partners(family: str) -> dict[str, SceneSpec]:
-    """Return a family's scenarios' partners; corrected and added scenes have none."""
-    members = [scenario for scenario in corrected_scenarios().values() if scenario.family == family]
-    specs = {
-        scenario.scenario_id: scenario.changed_words()
-        for scenario in members
-        if scenario.released and scenario.params is None
-    }
-    return {id_: specs[partner] for id_, partner in partners(specs.values()).items()}
-
-
 def _record_digest(spec: SceneSpec, arm: str) -> str:
-    partner = _partners(spec.family).get(spec.scenario_id) if arm == CROSSED else None
-    return digest([spec.spec_hash, arm, _code(arm), partner and partner.spec_hash])[:24]
+    return digest([spec.spec_hash, arm, _code(arm)])[:24]
 
 
 def _is_made(spec: SceneSpec, arm: str, clip: Path) -> bool:
@@ -208,7 +188,7 @@ def film(job: Job) -> int:
     for arm, clip in job.clips.items():
         record_digest = _record_digest(job.spec, arm)
         try:
-            variant = arm_of(job.spec, arm)
+            variant = ARMS_BY_NAME[arm]
             variant.ask(job.spec)
             arm_clip = variant.film(scenario)
             if arm_clip.frames:
@@ -254,7 +234,7 @@ def _rows(
     if result.refused is not None:
         yield replace(empty, ground_truth=None)
         return
-    for question in arm_of(spec, arm).ask(spec):
+    for question in ARMS_BY_NAME[arm].ask(spec):
         pair_side = question.clip
         if pair_side is not None:
             columns = _pair_clip_columns(of_pairs[spec.scenario_id, pair_side])

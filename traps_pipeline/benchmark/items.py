@@ -17,7 +17,6 @@ from traps_pipeline.benchmark.specs import expected_specs, released_in_study
 from traps_pipeline.benchmark.versions import item_content, spec_record, version_of
 from traps_pipeline.protocol.datasets import (
     ALL_CATEGORIES,
-    CROSSED,
     GRADED,
     SIDES,
     TWO_EVENTS,
@@ -160,11 +159,8 @@ def _lane_item(spec: TwoEventsSpec, row: Record, commonest: Mapping[str, str], v
 
 
 def _arm_item(spec: Record, row: Record, commonest: Mapping[str, str], version: str) -> ItemRow:
-    words = {"labels": row["labels"]}
-    if row["arm"] == CROSSED:  # a question of its own, whose labels have no other wordings
-        words |= {"aliases": "{}", "answer_type": answer_type_of(row["labels"])}
     decisive: dict[str, Any] = _decisive(
-        {**spec, **words},
+        {**spec, "labels": row["labels"]},
         dataset=row["arm"],
         side=row["side"],
         question=row["question"],
@@ -176,14 +172,6 @@ def _arm_item(spec: Record, row: Record, commonest: Mapping[str, str], version: 
     if row["arm"] == GRADED:  # its score depends on how probable each answer is
         return replace(item, item_hash=digest([item.item_hash, json.loads(row["evidence"])["posterior"]]))
     return item
-
-
-def answer_type_of(labels: Sequence[str]) -> str:
-    """Return the answer type of a question by its labels."""
-    if all(label.isdigit() for label in labels):
-        return "numeric"
-    type_of = {("left", "right"): "direction", ("no", "yes"): "binary"}
-    return next((kind for choices, kind in type_of.items() if sorted(labels) == [*choices]), "colour")
 
 
 def commonest_answers(specs: Sequence[Record]) -> dict[str, str]:

@@ -27,9 +27,9 @@ from traps_pipeline.report.tables.table_columns import (
     SHARES,
     N,
     cell_trace,
-    figure_with_interval,
     interval,
     meanings,
+    two_events_trace,
 )
 from traps_pipeline.report.terms import (
     BROKEN_MARK,
@@ -44,19 +44,16 @@ from traps_pipeline.report.terms import (
 )
 from traps_pipeline.report.writing import (
     NONE,
-    NOT_RUN,
     Column,
     PrintedTable,
     SourceItems,
     fraction,
-    percent,
     table_markdown,
     table_text,
 )
 from traps_pipeline.scoring.analyses import null_single_deviations
 from traps_pipeline.scoring.metrics import joined_epochs
 from traps_pipeline.scoring.score_rows import LEADERBOARD
-from traps_pipeline.storage.tables import records
 
 BOUNDS = "If missing: worst, best"
 _COUNTS = [count for count in COUNT_WORDS.values() if count.heading]
@@ -70,9 +67,8 @@ OPTIONAL = {
     Column("bounds", BOUNDS, "range"): "n_missing",
 }
 _SUMMED = ("n_pairs", "n_missing", *(column.field for column in OPTIONAL if column.unit == "count"))
-TwoWay = Mapping[tuple[str, str], Mapping[str, Any]]  # TWO_WAY rows by model and regime
 TWO_WAY_COLUMNS = [
-    Column(field, heading, "range", group=not place) for place, (field, heading, *_) in enumerate(TWO_WAY_FIGURES)
+    Column(field, heading, unit, group=not place) for place, (field, heading, unit, _) in enumerate(TWO_WAY_FIGURES)
 ]
 LEGEND = {
     **{metric.heading: metric.meaning for metric in METRIC_WORDS.values()},
@@ -140,15 +136,12 @@ def _panel_tables(board: pd.DataFrame, two_way: pd.DataFrame | None, brief: bool
     datasets = set(board["dataset"])
     ranked_dataset = next((name for name in TITLES if name in datasets), "overall")
     other_datasets = [name for name in DATASETS if name in datasets and name != ranked_dataset]
+    beside = two_way if ranked_dataset == "overall" else None
     other_tables = [
-        _leaderboard(board.loc[board["dataset"] == name], name, [], {}, brief, suffix)
+        _leaderboard(board.loc[board["dataset"] == name], name, [], None, brief, suffix)
         for name in ([] if brief else other_datasets)
     ]
-    rows = records(two_way) if two_way is not None and ranked_dataset == "overall" else []
-    entries = {*zip(board["model"], board["regime"], strict=True)}
-    row_of = {(row["model"], row["regime"]): row for row in rows if row["n_scenarios"]}
-    row_of = {key: row for key, row in row_of.items() if key in entries}
-    return [_leaderboard(board, ranked_dataset, other_datasets, row_of, brief, suffix), *other_tables]
+    return [_leaderboard(board, ranked_dataset, other_datasets, beside, brief, suffix), *other_tables]
 
 
 def legend(board: pd.DataFrame, two_way: pd.DataFrame | None = None) -> dict[str, str]:
@@ -197,22 +190,25 @@ def _distinct(values: Iterable[Any], separator: str) -> list[str]:
 
 
 def _leaderboard(
-    board: pd.DataFrame, dataset: str, others: Sequence[str], beside: TwoWay, brief: bool, suffix: str
+    board: pd.DataFrame, dataset: str, others: Sequence[str], two_way: pd.DataFrame | None, brief: bool, suffix: str
 ) -> PrintedTable:
     rows = _entries(board, dataset, others)
     columns = [MODEL, REGIME, replace(PECS, bar=True), Column("ci", "95 % CI", "range"), *SHARES, *OTHER_FIGURES]
     for name in others:
         title = name.replace("_ill_posed", " ill-posed") if brief else TITLES[name]  # a comma would end it in a list
         columns.append(Column(name, f"PECS {title}", "fraction", mark=f"{name}_mark", group=name == others[0]))
-    if beside:
-        rows, columns = _with_two_way(rows, beside, brief), [*columns, *TWO_WAY_COLUMNS]
+    refusals = list[str]()
+    if two_way is not None and len(shown := rows[["model", "regime"]].merge(two_way.loc[two_way["n_scenarios"] > 0])):
+        rows = rows.merge(shown[["model", "regime", *(name for name, *_ in TWO_WAY_FIGURES)]], "left")
+        columns += TWO_WAY_COLUMNS
+        refusals = [f"no figure of two events: {reason}" for reason in shown["refused"].dropna().unique()]
     columns += [replace(N, mark="n_mark", group=True), RUNS, replace(MISSING, mark="missing_mark")]
     columns += [column for column, field in OPTIONAL.items() if (rows.loc[:, field] > 0).any()]
     columns += [
         column for column in (EPOCH, Column("benchmark_version", "Version")) if rows.loc[:, column.field].nunique() > 1
     ]
     marks = [mark for name in ("n_mark", "missing_mark", "model_mark", "overruled_mark") for mark in rows[name]]
-    notes = [*meanings(marks), *_refusals(beside)]
+    notes = [*meanings(marks), *refusals]
     if brief:
         columns = [replace(c, spread="") for c in columns if c.field not in ("n_runs", "epoch", "benchmark_version")]
     else:
@@ -226,29 +222,9 @@ def _leaderboard(
     )  # fmt: skip
 
 
-def _with_two_way(rows: pd.DataFrame, beside: TwoWay, brief: bool) -> pd.DataFrame:
-    """Return the rows with TWO_WAY_COLUMNS as printed, unless brief with intervals."""
-    entry_rows = [beside.get((row["model"], row["regime"])) for row in rows.to_dict("records")]
-    columns = {}
-    for name, _, unit, _ in TWO_WAY_FIGURES:
-        as_printed = percent if unit == "percent" else fraction
-        shown = [
-            (as_printed(row[name]) if brief else figure_with_interval(row, name, as_printed)) if row else NOT_RUN
-            for row in entry_rows
-        ]
-        columns[name] = shown
-    return rows.assign(**columns)
-
-
-def _refusals(beside: TwoWay) -> list[str]:
-    """Return notes on why entries have no figure of two events."""
-    refusals = dict.fromkeys(row["refused"] for row in beside.values() if row["refused"])
-    return [f"no figure of two events: {reason}" for reason in refusals]
-
-
 def _trace(row: Mapping[str, Any], field: str) -> SourceItems | None:
-    if row.get(field) == NOT_RUN:
-        return None
+    if any(field == name for name, *_ in TWO_WAY_FIGURES):
+        return two_events_trace(row, field)
     return cell_trace({**row, "dataset": field} if field in DATASETS else row, field)
 
 

@@ -1,4 +1,4 @@
-"""Draw pictures of pairs: six pairs, a scenario's arms, an example, shortcuts."""
+"""Draw pictures of pairs: six pairs, two events, a scenario's arms, an example, shortcuts."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class PairPictures:
                     ("items", "responses", "votes", "verdicts"), lambda: inputs),
             Picture("six_pairs", "Six pairs: control above, void below", lambda: {"six_pairs": self._six(pair_items)},
                     ("items",), lambda: _as_json(pair_items)),
-            Picture("arms", "One scenario with its arms", self._arms, ("items", "arms"),
+            Picture("arms", "One scenario of two events, and one with its arms", self._arms, ("items", "arms"),
                     lambda: [_as_json(self.arms), _as_json(visual) if len(self.arms) else ""]),
             Picture("shortcuts", "How well one cue alone separates control from void (0.5 is chance)",
                     lambda: {"shortcuts": self._shortcuts()}, ("items", "videos"),
@@ -110,7 +110,7 @@ class PairPictures:
         clips = [*self.items["clip"], *self.arms["clip"].dropna()] if len(self.arms) else []
         sheets = arms_sheets(self.items, self.arms, self.workspace.bring(clips)) if clips else {}
         if not sheets:
-            raise NotRun("no arm was filmed in this study")
+            raise NotRun("no arm and no two events were filmed in this study")
         return sheets
 
     @cached_property

@@ -270,29 +270,22 @@ def _scenarios(workspace: Workspace) -> list[dict[str, Any]]:
 
 def _lanes(workspace: Workspace, clips: set[str]) -> list[dict[str, Any]]:
     """Return the data about scenarios of two events: clips, when boards stand, and items in the order of a page."""
-    rows: dict[str, dict[str, dict[str, Any]]] = {}
-    for row in records(workspace.tables.read_all(ARMS)):
-        if row["arm"] == TWO_EVENTS:
-            rows.setdefault(row["scenario_id"], {})[row["item"]] = row
+    rows = {(row["scenario_id"], row["item"]): row for row in records(workspace.tables.read_all(ARMS))}
     scenarios = []
-    for scenario_id, row_of in sorted(rows.items()):
-        items = sorted(lane_items(scenario_id), key=lambda item: LANES.index(item.lane))
-        evidence = {lane: json.loads(row_of[f"{lane}.neither"]["evidence"]) for lane in LANES}
-        paths = {name: row_of[f"{LANES[0]}.{name}"]["clip"] for name in LANE_CLIPS}
+    for scenario in sorted({id_ for (id_, _), row in rows.items() if row["arm"] == TWO_EVENTS}):
+        row_of = {item: rows[scenario, item.name] for item in lane_items(scenario)}
+        path_of = {item.clip: row["clip"] if row["clip"] in clips else None for item, row in row_of.items()}
+        evidence = {item.lane: json.loads(row["evidence"]) for item, row in row_of.items()}
+        n_frames, fps = next((row["n_frames"], each["fps"]) for row in row_of.values() for each in evidence.values())
+        standing = [sum(a <= k < b for lane in LANES for a, b in evidence[lane]["stands"]) for k in range(n_frames)]
+        of_items = [{name: getattr(i, name) for name in ("pair_id", "side", "lane", "clip")} for i in row_of]
         scenarios.append(
             {
-                "scenario_id": scenario_id,
-                "family": scenario_id.rpartition("-")[0],
-                "fps": evidence[LANES[0]]["fps"],
-                "n_frames": row_of[f"{LANES[0]}.neither"]["n_frames"],
+                **{"scenario_id": scenario, "family": scenario.rpartition("-")[0], "fps": fps, "n_frames": n_frames},
+                "shown_at": max(k for k in range(n_frames) if standing[k] == min(standing)) / fps,
                 "lanes": [{"name": lane, "stands": evidence[lane]["stands"]} for lane in LANES],
-                "clips": [
-                    {"name": name, "hidden": [*hidden], "path": paths[name] if paths[name] in clips else None}
-                    for name, hidden in LANE_CLIPS.items()
-                ],
-                "items": [
-                    {"pair_id": item.pair_id, "side": item.side, "lane": item.lane, "clip": item.clip} for item in items
-                ],
+                "clips": [{"name": n, "hidden": [*hidden], "path": path_of[n]} for n, hidden in LANE_CLIPS.items()],
+                "items": of_items,
             }
         )
     return scenarios

@@ -9,7 +9,17 @@ import numpy as np
 from traps_pipeline.report.figures.looks import legend_key
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.two_way_table import WHY_EMPTY
-from traps_pipeline.report.writing import COLOURS, PAGE_IN, SOFT, NotRun, figure_style, fraction, new_figure, plain
+from traps_pipeline.report.writing import (
+    COLOURS,
+    COLUMN_IN,
+    PAGE_IN,
+    SOFT,
+    NotRun,
+    figure_style,
+    fraction,
+    new_figure,
+    plain,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,11 +44,10 @@ def two_way(results: Results) -> Figure:
     )
     if not len(rows):
         raise NotRun(WHY_EMPTY)
-    entries, n_columns = rows.to_dict("records"), min(_COLUMNS, max(2, len(rows)))
+    entries, n_columns = rows.to_dict("records"), 2 if len(rows) <= 2 else _COLUMNS
     n_rows = -(-len(entries) // n_columns)
     with figure_style():
-        width = PAGE_IN * max(n_columns, 3) / _COLUMNS
-        figure = new_figure(width, 0.45 + _PANEL_IN * n_rows)
+        figure = new_figure(COLUMN_IN if n_columns == 2 else PAGE_IN, 0.45 + _PANEL_IN * n_rows)
         panels = figure.subplots(n_rows, n_columns, sharex=True, sharey=True, squeeze=False)
         for place, axes in enumerate(panels.flat):
             axes.set_visible(place < len(entries))

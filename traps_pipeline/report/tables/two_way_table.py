@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING
 
 from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.tables.table_columns import MODEL, REGIME, figure_with_interval
-from traps_pipeline.report.writing import Column, PrintedTable, fraction, percent
+from traps_pipeline.report.tables.table_columns import MODEL, REGIME, two_events_trace
+from traps_pipeline.report.writing import Column, PrintedTable
 
 if TYPE_CHECKING:
     import pandas as pd
 
 WHY_EMPTY = "two events were not asked (name `two_events` under datasets)"
-_WITH_INTERVAL = ("conjunction", "own_effect", "other_effect", "specificity")
 COLUMNS = (
-    MODEL, REGIME, Column("conjunction", "Conjunction %", "percent"), Column("own_effect", "Own effect", "fraction", 2),
-    Column("other_effect", "Other effect", "fraction", 2), Column("specificity", "Specificity", "fraction", 2),
+    MODEL, REGIME, Column("conjunction", "Conjunction %", "percent", interval=True),
+    Column("own_effect", "Own effect", "fraction", 2, interval=True),
+    Column("other_effect", "Other effect", "fraction", 2, interval=True),
+    Column("specificity", "Specificity", "fraction", 2, interval=True),
     Column("abstains_neither", "Abstains %: neither hidden", "percent", group=True),
     Column("abstains_other", "the other", "percent"), Column("abstains_asked", "the asked", "percent"),
     Column("abstains_both", "both", "percent"), Column("acc", "Acc %", "percent", group=True),
@@ -41,18 +41,9 @@ def two_way(results: Results) -> list[PrintedTable]:
 
 def two_way_table(rows: pd.DataFrame) -> PrintedTable:
     """Return the printed table of TWO_WAY rows, the most specific entry first."""
-    as_printed = {"percent": percent, "fraction": partial(fraction, digits=2)}
-    columns, shown = list[Column](), dict[str, list[str]]()
-    for column in COLUMNS:
-        if column.field in _WITH_INTERVAL:
-            words, name = as_printed[column.unit], f"{column.field}_shown"
-            shown[name] = [figure_with_interval(row, column.field, words) for row in rows.to_dict("records")]
-            column = Column(name, column.heading, "range")
-        columns.append(column)
-    rows = rows.assign(**shown).sort_values(
-        ["specificity", "model", "regime"], ascending=[False, True, True], na_position="last", ignore_index=True
-    )
+    columns = COLUMNS if rows["inference_acc"].notna().any() else COLUMNS[:-2]
+    rows = rows.sort_values(["specificity", "model", "regime"], ascending=[False, True, True], ignore_index=True)
     refusals = [f"{row['model']} {row['regime']}: no figure, {row['refused']}"
                 for row in rows.dropna(subset=["refused"]).to_dict("records")]  # fmt: skip
     notes = [*_NOTES, *refusals] if len(rows) else []
-    return PrintedTable("two_way", "Two events, one of them hidden", rows, columns, notes, WHY_EMPTY)
+    return PrintedTable("two_way", "Two events, one of them hidden", rows, columns, notes, WHY_EMPTY, two_events_trace)

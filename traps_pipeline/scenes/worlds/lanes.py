@@ -161,7 +161,8 @@ def _lane_spec(event: LaneEvent, layout: Layout, size: float) -> mujoco.MjSpec:
     data = mujoco.MjData(event.model)
     mujoco.mj_kinematics(event.model, data)
     x, y, z = np.subtract(layout.bench, layout.shift)
-    for n, (body, span) in enumerate(event.doubles(size).items()):
+    doubles = [*event.doubles(size).items()][: len(layout.paths)]  # as many as the record has
+    for n, (body, span) in enumerate(doubles):
         place = [float(at) for at in (x - middle_of(span[:, 0]), y - middle_of(span[:, 1]), z - span[:, 2].min())]
         double = spec.worldbody.add_body(name=f"double {n}", pos=place, quat=data.body(body).xquat)
         for axis in ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)):

@@ -7,13 +7,13 @@ function laneClips(scene) {
   return scene.clips.map(({ name, path, hidden }) => ({
     title: clipName(name),
     path,
-    kind: "wide",
+    kind: "lane-clip",
     below: boardBars(scene, hidden),
   }));
 }
 
 function clipName(name) {
-  return name === "neither" ? "Neither hidden" : name === "both" ? "Both hidden" : `The ${name} one hidden`;
+  return name === "neither" ? "Neither hidden" : name === "both" ? "Both hidden" : `${name === "left" ? "Left" : "Right"} hidden`;
 }
 
 // Of each lane a row for either board, filled where it stands, and a line at the frame that is shown. In a hidden lane

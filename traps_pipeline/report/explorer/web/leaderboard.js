@@ -51,6 +51,7 @@ async function leaderboardView(route) {
     }))
     .filter((row) => (!regime || row.regime === regime) && (!group || groupOf.get(row.model) === group));
   shown.sort(ordering(sort, up, info.regimes));
+  const withPairs = own.length > 0 || !askedOfLanes(info).length;
   const withPaper = shown.some((row) => row.paper);
   const columns = [
     { title: "Model", sort: "model" },
@@ -109,7 +110,7 @@ async function leaderboardView(route) {
         "Choose a model to see its answers. ",
         info.provenance,
       ),
-      h(
+      withPairs && h(
         "div",
         { class: "filters" },
         choice(
@@ -128,7 +129,7 @@ async function leaderboardView(route) {
         choice(route, "group", "Models", same(distinct(entries.map((row) => groupOf.get(row.model))).sort())),
         toggle(route, "paper", "also the paper's other models"),
       ),
-      section(
+      withPairs && section(
         null,
         table(columns, rows, {
           caption: `${info.titles[dataset] || dataset}: ${counted(shown.length, "entry", "entries")}`,

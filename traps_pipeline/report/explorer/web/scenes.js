@@ -27,7 +27,7 @@ async function scenesView(route) {
 
 function sceneCard(info, { items }, about, pair) {
   const scene = about.get(pair.scenario) || { certificate: [] };
-  const clips = scene.clips ? scene.clips.map(({ name, path }) => ["wide", clipName(name), path]) : [
+  const clips = scene.clips ? scene.clips.map(({ name, path }) => ["lane-clip", clipName(name), path]) : [
     ["control", `Control: ${items.control_answer[pair.control] ?? ""}`, items.clip[pair.control]],
     ["void", `Void: ${scene.intervention ?? ""}`, pair.void < 0 ? null : items.clip[pair.void]],
     ["twin", `Twin, same void: ${scene.twin_answer ?? ""}`, scene.twin_clip],
@@ -45,7 +45,7 @@ function sceneCard(info, { items }, about, pair) {
           "figure",
           { class: `clip ${kind}` },
           h("video", {
-            src: `${clipAddress(path)}#t=${(kind === "control" && scene.shown_at) || 1000}`,
+            src: `${clipAddress(path)}#t=${((kind === "control" || isWide) && scene.shown_at) || 1000}`,
             muted: true,
             controls: true,
             playsinline: true,
