@@ -309,11 +309,11 @@ def _drawn_before(path: Path, seed: int, difficulty: Difficulty) -> dict[str, st
     return {
         record["scenario_id"]: line
         for line, record in records.items()
-        if record["seed"] == seed and _difficulty_of(record) == difficulty
+        if record["seed"] == seed and difficulty_of(record) == difficulty
     }
 
 
-def _difficulty_of(record: Mapping[str, Any]) -> Difficulty:
+def difficulty_of(record: Mapping[str, Any]) -> Difficulty:
     """Return the settings with which a record was drawn."""
     drawn = record["lanes"][0]["params"].get("difficulty") or {}
     speed = record["physics"].get("speed", DEFAULT_DIFFICULTY.speed)
