@@ -12,7 +12,7 @@ from traps_pipeline.benchmark.filmed_lanes import trajectories_of
 from traps_pipeline.benchmark.records import two_events_lines
 from traps_pipeline.protocol.two_events import CLIPS
 from traps_pipeline.scenes.observe import observe
-from traps_pipeline.scenes.parts.lane_vision import scene_of_lane
+from traps_pipeline.scenes.parts.lane_vision import scenes_of_lane
 from traps_pipeline.scenes.parts.vision import largest
 from traps_pipeline.scenes.parts.wording import lane_asked, lane_question
 from traps_pipeline.scenes.physics.kit import COLOURS
@@ -46,14 +46,15 @@ def lane(strip: str, hidden: bool) -> np.ndarray:
 def test_the_named_lane_is_shown_without_its_bench_where_its_board_is_away(left: bool):
     lanes = [lane("red", hidden=False), lane("blue", hidden=True)][:: 1 if left else -1]
     frames = np.concatenate(lanes, axis=2)
-    scene = scene_of_lane(frames, "red")
-    assert scene is not None and scene.shape == (10, 360, 480, 3)  # with two before which the board stands at first
+    scene, shown = scenes_of_lane(frames, "red")
+    assert scene.shape == (10, 360, 480, 3)  # with two before which the board stands at first
+    assert np.array_equal(shown, scene[2:])
     balls = [largest(frame, "green") for frame in scene]
     assert balls[:2] == [None, None] and all(ball is not None for ball in balls[2:])
     steps = np.diff([ball.x for ball in balls if ball is not None])
     assert steps == pytest.approx(5 * 480 / (1.08 * 200 + 8), rel=0.1)  # it is enlarged to the strip's length
-    assert scene_of_lane(frames, "blue") is None
-    assert scene_of_lane(frames, "yellow") is None
+    assert scenes_of_lane(frames, "blue") == []
+    assert scenes_of_lane(frames, "yellow") == []
 
 
 def test_a_question_about_a_lane_gives_its_strip_and_the_familys_question_back():

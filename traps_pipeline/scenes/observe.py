@@ -10,7 +10,7 @@ from functools import cache
 from pathlib import Path
 
 from traps_pipeline.scenes.family_registry import families
-from traps_pipeline.scenes.parts.lane_vision import scene_of_lane
+from traps_pipeline.scenes.parts.lane_vision import scenes_of_lane
 from traps_pipeline.scenes.parts.wording import lane_asked, match_slots
 from traps_pipeline.scenes.physics.kit import Family
 from traps_pipeline.video.encode import decode_sampled
@@ -30,5 +30,5 @@ def observe(clip: Path, question: str, policy: FramePolicy = SAMPLED) -> str | N
     if family is None or family.observe is None:
         return None
     frames = decode_sampled(clip, policy)
-    scene = frames if strip is None else scene_of_lane(frames, strip)
-    return None if scene is None else family.observe(scene, question)
+    scenes = [frames] if strip is None else scenes_of_lane(frames, strip)
+    return next((answer for scene in scenes if (answer := family.observe(scene, question)) is not None), None)

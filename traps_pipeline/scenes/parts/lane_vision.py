@@ -19,11 +19,11 @@ PLATE_ROWS, PLATE_SHARE = 2, 0.5  # so many rows of a board's place are of a ben
 ABOVE_PX, BELOW_PX = 3, 10  # of a board's place, to which plates reach
 
 
-def scene_of_lane(frames: np.ndarray, strip: str) -> np.ndarray | None:
-    """Return the frames (M, 360, 480, 3) of a lane's scene before which no board is; None if there are none.
+def scenes_of_lane(frames: np.ndarray, strip: str) -> list[np.ndarray]:
+    """Return the frames (M, 360, 480, 3) of a lane's scene before which no board is; nothing if there are none.
 
-    frames: (N, H, W, 3). Before them come those in which a board stands before the scene from the first frame on, as
-    what begins beside it is seen in them.
+    frames: (N, H, W, 3). First come these after those in which a board stands before the scene from the first frame on,
+    since what begins beside it is seen in them; then these alone.
     """
     halves = np.split(frames, 2, axis=2)
     strips = [_strip(half, strip) for half in halves]
@@ -32,22 +32,23 @@ def scene_of_lane(frames: np.ndarray, strip: str) -> np.ndarray | None:
     boards = np.stack([colour_mask(frame, "navy") for frame in lane])
     still = next(iter(blobs(boards.all(axis=0), BOARD_PX)), None)
     if strip_blob is None or still is None:
-        return None
+        return []
     _, top, _, height = still.box
     boards[:, top - 2 : top + height + 3] = False
     moving = [[blob for blob in blobs(mask, BOARD_PX) if blob.fill > BOARD_FILL] for mask in boards]
     open_frames = np.array([not seen for seen in moving])
     if open_frames.all() or not open_frames.any():
-        return None
+        return []
     place = max((blob for seen in moving for blob in seen), key=lambda blob: (_bottom(blob) // 4, blob.area))
     background = np.median(lane[open_frames], axis=0).astype(np.uint8)
     if _is_bench(background, place):
-        return None
+        return []
     first = int(open_frames.argmax())
     stands = [any(np.ptp([blob.box, place.box], axis=0).max() < 4 for blob in seen) for seen in moving[:first]]
-    open_frames[:first] = stands
+    is_shown = np.concatenate([stands, open_frames[first:]]).astype(bool)
     rows = slice(0, top - 1) if top > place.box[1] else slice(top + height + 1, strip_blob.box[1] - 1)
-    return _cropped(lane[open_frames], background, rows, strip_blob, side)
+    scene = _cropped(lane[is_shown], background, rows, strip_blob, side)
+    return [scene, scene[sum(stands) :]]
 
 
 def _strip(half: np.ndarray, colour: str) -> Blob | None:
