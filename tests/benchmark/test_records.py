@@ -69,13 +69,13 @@ def test_a_question_may_hold_any_character(tmp_path: Path) -> None:
 )
 def test_a_malformed_record_names_its_file_and_line(tmp_path: Path, change: dict[str, Any]) -> None:
     one, two = records()
-    with raises(TrapsError, "benchmark.records.parse_record", "some.jsonl:2"):
+    with raises(TrapsError, "benchmark.records._parse", "some.jsonl:2"):
         load_released(write(tmp_path, one, two | change))
 
 
 @pytest.mark.parametrize("line", ["{", "not json", '{"scenario_id": "a-1"}', "[]"])
 def test_a_line_that_is_no_record_names_its_file_and_line(tmp_path: Path, line: str) -> None:
-    with raises(TrapsError, "benchmark.records.parse_record", "some.jsonl:3"):
+    with raises(TrapsError, "benchmark.records._parse", "some.jsonl:3"):
         load_released(write(tmp_path, records()[0], "", line))
 
 
@@ -86,7 +86,7 @@ def test_an_id_that_occurs_twice_names_the_second_line(tmp_path: Path) -> None:
 
 
 def test_a_folder_without_records_says_what_to_do(tmp_path: Path) -> None:
-    with raises(TrapsError, "benchmark.records._lines"):
+    with raises(TrapsError, "benchmark.records.released_lines"):
         load_released(tmp_path)
 
 

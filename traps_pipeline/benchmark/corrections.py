@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from datetime import date
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -31,9 +31,11 @@ from traps_pipeline.base.yamlfile import explain, read_lines
 from traps_pipeline.benchmark.records import ReleasedLine, load_release, released_lines, two_events_lines
 from traps_pipeline.protocol.datasets import ALL_CATEGORIES
 from traps_pipeline.scenes.family_registry import family_names, get_family
-from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
 from traps_pipeline.scenes.worlds.spec import Answerable, SceneSpec, Slug
 from traps_pipeline.storage.study import Study
+
+if TYPE_CHECKING:
+    from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
 
 WORDS = ("question", "labels", "aliases", "ill_posed_question", "answerable_question")
 LANE_WORDS = WORDS[:3]  # of scenarios of two events
@@ -133,7 +135,7 @@ class LaneScenario:
         if not self.words:
             return self.record.spec
         try:
-            return TwoEventsSpec.model_validate(self.record.spec.model_dump(mode="json") | dict(self.words))
+            return type(self.record.spec).model_validate(self.record.spec.model_dump(mode="json") | dict(self.words))
         except ValidationError as error:
             raise TrapsError(f"{self.where}: {self.record.scenario_id}: {explain(error)}; correct that line") from error
 

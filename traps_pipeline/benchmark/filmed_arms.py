@@ -15,8 +15,7 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
-from traps_pipeline.benchmark.filmed_lanes import SECONDS_A_CLIP, film_lanes, lane_rows
-from traps_pipeline.benchmark.filmed_lanes import missing_clips as missing_lane_clips
+from traps_pipeline.benchmark.filmed_lanes import SECONDS_A_CLIP, film_lanes, lane_paths, lane_rows, lane_specs
 from traps_pipeline.benchmark.sharing import RenderWork, Row, existing_clips, share
 from traps_pipeline.benchmark.specs import clips_version, released_in_study, spec_of, spec_rows, trajectory_of
 from traps_pipeline.protocol.datasets import ARMS as ARM_NAMES
@@ -34,6 +33,7 @@ from traps_pipeline.scenes.variants.arms import Arm, Question, Scenario
 from traps_pipeline.scenes.variants.graded_cuts import GRADED_CUT
 from traps_pipeline.scenes.variants.variations import VARIATIONS
 from traps_pipeline.scenes.worlds.clip_notes import Clip, note_of, read_clip, save_clip
+from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
 from traps_pipeline.scenes.worlds.outcome import Rejected
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 from traps_pipeline.storage.benchmark_tables import ARMS, VIDEOS, ArmRow
@@ -83,6 +83,11 @@ def arms_of_pairs(workspace: Workspace, category: str) -> list[str]:
     return [arm for arm in asked_arms(workspace, category) if arm != TWO_EVENTS]
 
 
+def asked_lanes(workspace: Workspace, category: str) -> dict[str, TwoEventsSpec]:
+    """Return a category's records of two events, if some experiment requests them."""
+    return lane_specs(workspace, category) if TWO_EVENTS in asked_arms(workspace, category) else {}
+
+
 def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tuple[int, bool]:
     """Render missing arms of a category; return `share`'s result. Raises TrapsError."""
     specs, arms = spec_rows(workspace, category), arms_of_pairs(workspace, category)
@@ -108,9 +113,7 @@ def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tupl
 
     render_work = RenderWork(f"arms/{category}", missing, files, job, film)
     frames, is_whole = share(workspace.store, specs, render_work, tick, wait=wait)
-    if TWO_EVENTS not in asked_arms(workspace, category):
-        return frames, is_whole
-    lane_frames, are_lanes_whole = film_lanes(workspace, category, wait=wait)
+    lane_frames, are_lanes_whole = film_lanes(workspace, category, asked_lanes(workspace, category), wait=wait)
     return frames + lane_frames, is_whole and are_lanes_whole
 
 
@@ -121,8 +124,9 @@ def seconds_left(workspace: Workspace, category: str) -> float:
         for id_, spec in released_in_study(workspace, category).items()
         for arm in arms_of_pairs(workspace, category)
     ]
-    lane_clips = missing_lane_clips(workspace, category) if TWO_EVENTS in asked_arms(workspace, category) else 0
-    return SECONDS_AN_ARM * (len(clips) - len(workspace.store.there(clips))) + SECONDS_A_CLIP * lane_clips
+    lane_clips = [path for spec in asked_lanes(workspace, category).values() for path in lane_paths(workspace, spec)]
+    n_missing, n_missing_lanes = (len(paths) - len(workspace.store.there(paths)) for paths in (clips, lane_clips))
+    return SECONDS_AN_ARM * n_missing + SECONDS_A_CLIP * n_missing_lanes
 
 
 def build_arms(workspace: Workspace, category: str) -> list[ArmRow]:
@@ -139,7 +143,7 @@ def build_arms(workspace: Workspace, category: str) -> list[ArmRow]:
     rows = [
         arm_row for row in specs for arm in arms for arm_row in _rows(workspace, row, arm, pair_clips, clips, version)
     ]
-    return [*rows, *(lane_rows(workspace, category) if TWO_EVENTS in asked_arms(workspace, category) else ())]
+    return [*rows, *lane_rows(workspace, category, asked_lanes(workspace, category))]
 
 
 def _clips(workspace: Workspace, row: Row, arms: Sequence[str]) -> dict[str, Path]:
@@ -272,7 +276,8 @@ def incomplete_reasons(workspace: Workspace, category: str) -> list[str]:
     """Return why a category's table is incomplete: a new arm or a lost clip."""
     rows = workspace.tables.read(ARMS, {"category": category}, ["arm", "clip"])
     arms_in_table = set(rows["arm"])
-    reasons = [f"arm {arm} is asked for now" for arm in asked_arms(workspace, category) if arm not in arms_in_table]
+    expected = [*arms_of_pairs(workspace, category), *([TWO_EVENTS] if asked_lanes(workspace, category) else [])]
+    reasons = [f"arm {arm} is asked for now" for arm in expected if arm not in arms_in_table]
     clips = sorted({str(clip) for clip in rows["clip"].dropna()})
     sizes = workspace.sizes(clips)
     return reasons + [f"clip {clip} is gone" for clip in clips if clip not in sizes]

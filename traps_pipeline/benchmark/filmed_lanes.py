@@ -65,14 +65,14 @@ def trajectories_of(spec: TwoEventsSpec, path: Path | None = None) -> dict[str, 
     return {world: load_trajectory(path, sha256, world) for world, sha256 in digests.items()}
 
 
-def film_lanes(workspace: Workspace, category: str, *, wait: bool) -> tuple[int, bool]:
-    """Render a category's missing clips; return `share`'s result. Raises TrapsError."""
-    specs = lane_specs(workspace, category)
+def film_lanes(
+    workspace: Workspace, category: str, specs: Mapping[str, TwoEventsSpec], *, wait: bool
+) -> tuple[int, bool]:
+    """Render missing clips of a category's records; return `share`'s result. Raises TrapsError."""
     rows: list[Row] = [{"scenario_id": id_} for id_ in specs]
 
     def files(row: Row) -> list[Path]:
-        clips = _clips(workspace, specs[row["scenario_id"]]).values()
-        return [file for clip in clips for file in (clip, note_of(clip))]
+        return [file for clip in lane_paths(workspace, specs[row["scenario_id"]]) for file in (clip, note_of(clip))]
 
     def missing(rows: Sequence[Row]) -> list[Row]:
         existing = workspace.store.there(file for row in rows for file in files(row))
@@ -104,21 +104,10 @@ def film(job: LaneJob) -> int:
         )
 
 
-def missing_clips(workspace: Workspace, category: str) -> int:
-    """Return how many clips of a category are yet to be rendered."""
-    clips = [clip for spec in lane_specs(workspace, category).values() for clip in _clips(workspace, spec).values()]
-    return len(clips) - len(workspace.store.there(clips))
-
-
-def lane_rows(workspace: Workspace, category: str) -> Iterator[ArmRow]:
-    """Yield eight rows of each scenario. Raises TrapsError for a missing or damaged clip."""
-    specs, version = lane_specs(workspace, category), lanes_version(workspace, [category])
-    if not specs and not two_events_lines():
-        raise TrapsError(
-            f"{TWO_EVENTS_RELEASED}: holds no records of two events, as benchmarks before 0.4.0; draw some by `traps "
-            f"benchmark sample --two-events 8`, or leave {TWO_EVENTS} out of the experiment's datasets"
-        )
-    clips = existing_clips(workspace.store, [c for spec in specs.values() for c in _clips(workspace, spec).values()])
+def lane_rows(workspace: Workspace, category: str, specs: Mapping[str, TwoEventsSpec]) -> Iterator[ArmRow]:
+    """Yield eight rows of each of a category's records. Raises TrapsError for a missing or damaged clip."""
+    version = lanes_version(workspace, [category])
+    clips = existing_clips(workspace.store, [path for spec in specs.values() for path in lane_paths(workspace, spec)])
     for spec in specs.values():
         for asked in spec.questions():
             path = _clips(workspace, spec)[asked.item.clip]
@@ -153,3 +142,8 @@ def _evidence(spec: TwoEventsSpec, lane: str) -> dict[str, Any]:
 
 def _clips(workspace: Workspace, spec: TwoEventsSpec) -> dict[str, Path]:
     return {name: workspace.clip(spec.scenario_id, name, spec.scene_hash) for name in CLIPS}
+
+
+def lane_paths(workspace: Workspace, spec: TwoEventsSpec) -> list[Path]:
+    """Return the paths of a record's four clips."""
+    return [*_clips(workspace, spec).values()]

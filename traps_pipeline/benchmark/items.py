@@ -10,9 +10,11 @@ from typing import Any
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.paths import TWO_EVENTS_RELEASED
 from traps_pipeline.benchmark.corrections import load_two_events
 from traps_pipeline.benchmark.filmed_lanes import lane_specs, lanes_version
 from traps_pipeline.benchmark.held_out import released_only
+from traps_pipeline.benchmark.records import two_events_lines
 from traps_pipeline.benchmark.specs import expected_specs, released_in_study
 from traps_pipeline.benchmark.versions import item_content, spec_record, version_of
 from traps_pipeline.protocol.datasets import (
@@ -123,6 +125,11 @@ def _lane_items(workspace: Workspace) -> list[ItemRow]:
     made = [c for c in categories if workspace.tables.state(ARMS_TABLE, {"category": c}) is not None]
     rows = [row for c in made for row in records(workspace.tables.read(ARMS_TABLE, {"category": c}))]
     rows = [row for row in rows if row["arm"] == TWO_EVENTS]
+    if not two_events_lines():
+        raise TrapsError(
+            f"{TWO_EVENTS_RELEASED}: holds no records of two events, as a benchmark drawn before 0.4.0; add some by "
+            f"`traps benchmark sample --two-events 8`, or leave {TWO_EVENTS} out of the experiment's datasets"
+        )
     if not rows:
         raise TrapsError(
             f"items {TWO_EVENTS}: the study has no scenario of two events; name some (as chain-e001) among its "

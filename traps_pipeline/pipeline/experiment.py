@@ -17,7 +17,7 @@ from traps_pipeline.models.registry.judges import require_panel
 from traps_pipeline.models.registry.user_registry import UserRegistry, add_entries
 from traps_pipeline.pipeline.wanted import evaluations_of
 from traps_pipeline.protocol.cells import Cell
-from traps_pipeline.protocol.datasets import DATASETS, SCHEMAS, UNPAIRED
+from traps_pipeline.protocol.datasets import DATASETS, REPLACED, SCHEMAS, TWO_EVENTS, UNPAIRED
 from traps_pipeline.protocol.regimes import BY_NAME, PAPER_REGIMES, REGIMES
 from traps_pipeline.storage.study import Asked, MechanismSettings, Settings, Study
 
@@ -81,6 +81,8 @@ class Experiment(Settings):
         unknown = [value for value in values if value not in names]
         if unknown or not values:
             suggestion = did_you_mean(unknown[0], names) if unknown else ""
+            if unknown and unknown[0] in REPLACED:
+                suggestion = f"; {unknown[0]} was an arm of 0.3: {TWO_EVENTS} takes its place"
             raise ValueError(f"{unknown or 'nothing'} given; choose from {', '.join(names)}{suggestion}")
         return values
 

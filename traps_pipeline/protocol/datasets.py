@@ -29,6 +29,7 @@ ARMS = ("length_matched", TWIN, *INFERENCE_ARMS)
 # Two events side by side, with each, both or neither of them hidden, and a question about either
 # (protocol/two_events.py). No part of PECS or of the arms' figures; run on request.
 TWO_EVENTS = "two_events"
+REPLACED = ("decoy", "removed", "crossed")  # arms of 0.3 that two events take the place of
 # Controls cut where the likeliest answer has a stated probability (docs/arms.md, "Graded cuts"). In no figure
 # of pairs or arms; run on request.
 GRADED = "graded"

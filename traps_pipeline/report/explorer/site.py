@@ -39,7 +39,7 @@ from traps_pipeline.report.leaderboard_page import legend, provenance
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.tables.human_tables import people_notes
 from traps_pipeline.report.tables.table_columns import entries
-from traps_pipeline.report.tables.two_way_table import COLUMNS, two_way_table
+from traps_pipeline.report.tables.two_way_table import two_way_table
 from traps_pipeline.report.terms import ARM_TITLES, MARKS, TITLES, TWO_WAY_FIGURES
 from traps_pipeline.report.writing import environment
 from traps_pipeline.scoring.analyses import REASONING_PAIRS, SHARES
@@ -234,7 +234,7 @@ def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_c
         "two_way_figures": [{"field": name, "title": title, "unit": unit} for name, title, unit, _ in TWO_WAY_FIGURES],
         "leaderboard": records(board),
         "two_way": records(printed.rows),
-        "two_way_table": [{"field": c.field, "title": c.heading, "unit": c.unit} for c in COLUMNS],
+        "two_way_table": [{"field": c.field, "title": c.heading, "unit": c.unit} for c in printed.columns],
         "two_way_notes": [*printed.notes],
         "people": records(human_row),
         "said": people_notes(human_row, workspace.tables.read_all(PANEL_ERRORS)),

@@ -84,7 +84,9 @@ def _scenario(family: Family, number: int, rng: np.random.Generator, seed: int, 
     first = _event(family, rng, None, difficulty)
     pairs = [first, _event(family, rng, first[0].params, difficulty)][:: 1 if rng.integers(2) else -1]
     wording, look = _wording(pairs, int(rng.integers(2**31))), draw_look(rng, LOOKS)
-    pairs = [_in_turn(pair, wording.labels, k, family, number, seed) for k, pair in enumerate(pairs)]
+    for k, pair in enumerate(pairs):  # which of its two worlds a lane shows is no matter of chance
+        place = [wording.labels.index(event.outcome.answer) for event in pair]
+        pairs[k] = pair if (place[0] < place[1]) == is_turn_of_earlier(family.name, number, k, seed) else pair[::-1]
     assert look is not None
     if difficulty.distractors:
         pairs = [_with_distractors(pair, wording, difficulty, rng) for pair in pairs]
@@ -195,17 +197,11 @@ def _with_distractors(
     return one, other
 
 
-def _in_turn(
-    pair: tuple[LaneEvent, LaneEvent], labels: Sequence[str], lane: int, family: Family, number: int, seed: int
-) -> tuple[LaneEvent, LaneEvent]:
-    """Return an event and its twin, exchanged where the other answer has its turn.
-
-    In every eight scenarios of a family the earlier of the two answers is shown in as many lanes as the later one.
-    """
+def is_turn_of_earlier(family: str, number: int, lane: int, seed: int) -> bool:
+    """Return whether a lane shows the earlier of its two answers, as half of the lanes in every eight scenarios do."""
     block, place = divmod(number - 1, TURNS)
-    turns = np.random.default_rng([seed, *family.name.encode(), block, TURNS]).permutation(len(LANES) * TURNS) % 2
-    is_earlier = labels.index(pair[0].outcome.answer) < labels.index(pair[1].outcome.answer)
-    return pair if is_earlier == bool(turns[len(LANES) * place + lane]) else (pair[1], pair[0])
+    turns = np.random.default_rng([seed, *family.encode(), block, TURNS]).permutation(len(LANES) * TURNS) % 2
+    return bool(turns[len(LANES) * place + lane])
 
 
 def _settles(event: LaneEvent) -> bool:

@@ -13,7 +13,11 @@ function laneClips(scene) {
 }
 
 function clipName(name) {
-  return name === "neither" ? "Neither hidden" : name === "both" ? "Both hidden" : `${name === "left" ? "Left" : "Right"} hidden`;
+  return name === "neither"
+    ? "Neither hidden"
+    : name === "both"
+      ? "Both hidden"
+      : `${name === "left" ? "Left" : "Right"} hidden`;
 }
 
 // Of each lane a row for either board, filled where it stands, and a line at the frame that is shown. In a hidden lane
@@ -25,7 +29,9 @@ function boardBars({ lanes, n_frames: frames, fps }, hidden) {
   const rows = lanes.flatMap(({ name, stands }, lane) =>
     BOARDS.map((before, board) => {
       const spans = hidden[lane] === (board === 0) ? [[0, frames]] : stands;
-      const words = spans.map(([from, until]) => `${(from / fps).toFixed(1)} to ${(until / fps).toFixed(1)} s`).join(", ");
+      const words = spans
+        .map(([from, until]) => `${(from / fps).toFixed(1)} to ${(until / fps).toFixed(1)} s`)
+        .join(", ");
       const parts = spans.map(([from, until]) =>
         h("span", { class: `stands b${board}`, style: { left: share(from), width: share(until - from) } }),
       );
@@ -44,7 +50,9 @@ function boardBars({ lanes, n_frames: frames, fps }, hidden) {
 }
 
 function boardKey() {
-  const each = BOARDS.map((before, board) => h("li", null, h("span", { class: `part b${board}` }), `a board stands ${before}`));
+  const each = BOARDS.map((before, board) =>
+    h("li", null, h("span", { class: `part b${board}` }), `a board stands ${before}`),
+  );
   return h("ul", { class: "key" }, each);
 }
 
@@ -112,7 +120,11 @@ async function laneTable(found, items, lane, evaluations) {
   const columns = ["Clip", "Expected", ...evaluations.map((evaluation) => evaluationName(info, evaluation))];
   return [
     h("h3", null, `Asked about the ${lane} lane: `, untrusted(found.items.question[own[0].place])),
-    table(columns.map((title) => ({ title })), await Promise.all(rows), { name: `${lane}_lane` }),
+    table(
+      columns.map((title) => ({ title })),
+      await Promise.all(rows),
+      { name: `${lane}_lane` },
+    ),
   ];
 }
 
@@ -128,7 +140,10 @@ function everyoneOnLanes(route, found, scenario, items) {
     const asked = items.some((item) => rowOf[item.place * width + evaluation] >= 0);
     const [model, regime, run] = info.evaluations[evaluation];
     const to = { ...secondOf(route.parameters), model, regime, run };
-    const attributes = { class: `chip ${right === items.length ? "right" : "plain"}`, title: `${model}, ${regime}, run ${run}` };
+    const attributes = {
+      class: `chip ${right === items.length ? "right" : "plain"}`,
+      title: `${model}, ${regime}, run ${run}`,
+    };
     return asked ? [link(["pair", LANES_DATASET, scenario], to, `${right} of ${items.length}`, attributes), " "] : [];
   };
   const rows = modelsOf(info).map((model) => [
@@ -166,7 +181,9 @@ function twoWaySection(info) {
             : figure(row, { field, unit }),
     ),
   );
-  const notes = info.two_way_notes.map((text) => h("p", { class: "note" }, `${text[0].toUpperCase()}${text.slice(1)}.`));
+  const notes = info.two_way_notes.map((text) =>
+    h("p", { class: "note" }, `${text[0].toUpperCase()}${text.slice(1)}.`),
+  );
   return section("Two events, one of them hidden", table(columns, cells, { name: "two_way", data: rows }), notes);
 }
 

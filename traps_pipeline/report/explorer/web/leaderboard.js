@@ -83,9 +83,7 @@ async function leaderboardView(route) {
       figure(row.own, each, each.field === "pecs" && row.own && row.own.incomplete ? incompleteMark : ""),
     ),
     rankOf(row.own),
-    ...(beside.size
-      ? info.two_way_figures.map((each) => figure(row.twoWay, each))
-      : []),
+    ...(beside.size ? info.two_way_figures.map((each) => figure(row.twoWay, each)) : []),
     ...(withPaper
       ? ofPaper.map((each) =>
           row.paper ? h("span", { title: `epoch ${row.paper.epoch}` }, printerOf(each)(row.paper[each.field])) : NONE,
@@ -110,49 +108,51 @@ async function leaderboardView(route) {
         "Choose a model to see its answers. ",
         info.provenance,
       ),
-      withPairs && h(
-        "div",
-        { class: "filters" },
-        choice(
-          route,
-          "dataset",
-          "Dataset",
-          datasetOptions(info, { overall: true }).filter(([id]) => id in info.titles),
-          { empty: null, fallback: dataset },
+      withPairs &&
+        h(
+          "div",
+          { class: "filters" },
+          choice(
+            route,
+            "dataset",
+            "Dataset",
+            datasetOptions(info, { overall: true }).filter(([id]) => id in info.titles),
+            { empty: null, fallback: dataset },
+          ),
+          choice(
+            route,
+            "regime",
+            "Regime",
+            same(distinct([...info.regimes, ...(paper ? info.published.map((row) => row.regime) : [])])),
+          ),
+          choice(route, "group", "Models", same(distinct(entries.map((row) => groupOf.get(row.model))).sort())),
+          toggle(route, "paper", "also the paper's other models"),
         ),
-        choice(
-          route,
-          "regime",
-          "Regime",
-          same(distinct([...info.regimes, ...(paper ? info.published.map((row) => row.regime) : [])])),
+      withPairs &&
+        section(
+          null,
+          table(columns, rows, {
+            caption: `${info.titles[dataset] || dataset}: ${counted(shown.length, "entry", "entries")}`,
+            name: "leaderboard",
+            order: { by: sort, down: !up },
+            sortBy: change,
+            data: shown.map(({ own: row, paper: printed, model, regime: of }) => ({
+              model,
+              regime: of,
+              ...(row || {}),
+              ...Object.fromEntries(ofPaper.map(({ field }) => [`paper_${field}`, printed?.[field] ?? null])),
+            })),
+            foot: own.length ? [rowOfPeople(info, dataset, columns)] : [],
+            absent: own.length ? "no entry fits these filters" : `${NOT_RUN}: this study has no leaderboard yet`,
+          }),
+          notes(info, shown, dataset),
+          own.length
+            ? info.said.map((text) => h("p", { class: "note" }, `${text[0].toUpperCase()}${text.slice(1)}.`))
+            : null,
+          inPaper
+            ? null
+            : h("p", { class: "note" }, own.length ? "No model of this study is in the paper's tables." : null),
         ),
-        choice(route, "group", "Models", same(distinct(entries.map((row) => groupOf.get(row.model))).sort())),
-        toggle(route, "paper", "also the paper's other models"),
-      ),
-      withPairs && section(
-        null,
-        table(columns, rows, {
-          caption: `${info.titles[dataset] || dataset}: ${counted(shown.length, "entry", "entries")}`,
-          name: "leaderboard",
-          order: { by: sort, down: !up },
-          sortBy: change,
-          data: shown.map(({ own: row, paper: printed, model, regime: of }) => ({
-            model,
-            regime: of,
-            ...(row || {}),
-            ...Object.fromEntries(ofPaper.map(({ field }) => [`paper_${field}`, printed?.[field] ?? null])),
-          })),
-          foot: own.length ? [rowOfPeople(info, dataset, columns)] : [],
-          absent: own.length ? "no entry fits these filters" : `${NOT_RUN}: this study has no leaderboard yet`,
-        }),
-        notes(info, shown, dataset),
-        own.length
-          ? info.said.map((text) => h("p", { class: "note" }, `${text[0].toUpperCase()}${text.slice(1)}.`))
-          : null,
-        inPaper
-          ? null
-          : h("p", { class: "note" }, own.length ? "No model of this study is in the paper's tables." : null),
-      ),
       twoWaySection(info),
       meanings(info),
     ],
@@ -168,7 +168,9 @@ function rowOfPeople(info, dataset, columns) {
     ...info.figures.map((each) => figure(row && row[each.field] !== null ? row : undefined, each)),
     NONE,
   ];
-  const rest = columns.slice(cells.length).map(({ title }) => (title === "n" && row ? counted(row.n_clips, "clip") : NONE));
+  const rest = columns
+    .slice(cells.length)
+    .map(({ title }) => (title === "n" && row ? counted(row.n_clips, "clip") : NONE));
   return [...cells, ...rest];
 }
 
@@ -200,7 +202,9 @@ function notes(info, shown, dataset) {
   if (shown.some((row) => row.own?.incomplete)) used.push(`${incompleteMark} ${info.marks[incompleteMark]}`);
   if (dataset === "overall" && shown.some((row) => !row.own))
     used.push(`${NOT_RUN}: this study did not ask the model, or not on all four datasets`);
-  used.push("Brackets: 95 % interval, Bayesian bootstrap over scenarios with one unseen. ±: population standard deviation over runs.");
+  used.push(
+    "Brackets: 95 % interval, Bayesian bootstrap over scenarios with one unseen. ±: population standard deviation over runs.",
+  );
   return used.map((text) => h("p", { class: "note" }, text));
 }
 

@@ -16,7 +16,11 @@ async function scenesView(route) {
   return {
     title: "Scenes",
     body: [
-      h("p", { class: "lead" }, "Each scene's control, its void, and a twin: another world behind the same void; of two events all four clips."),
+      h(
+        "p",
+        { class: "lead" },
+        "Each scene's control, its void, and a twin: another world behind the same void; of two events all four clips.",
+      ),
       h("div", { class: "filters" }, choice(route, "family", "Family", same(found.families))),
       scenes.length ? null : notice(`${NOT_RUN}: this study has no such scenes`),
       scenes.slice((page - 1) * SCENES_SHOWN, page * SCENES_SHOWN).map((pair) => sceneCard(info, found, about, pair)),
@@ -27,11 +31,12 @@ async function scenesView(route) {
 
 function sceneCard(info, { items }, about, pair) {
   const scene = about.get(pair.scenario) || { certificate: [] };
-  const clips = scene.clips ? scene.clips.map(({ name, path }) => ["lane-clip", clipName(name), path]) : [
+  const all = scene.clips?.map(({ name, path }) => ["lane-clip", clipName(name), path]) || [
     ["control", `Control: ${items.control_answer[pair.control] ?? ""}`, items.clip[pair.control]],
     ["void", `Void: ${scene.intervention ?? ""}`, pair.void < 0 ? null : items.clip[pair.void]],
     ["twin", `Twin, same void: ${scene.twin_answer ?? ""}`, scene.twin_clip],
-  ].filter(([, , path]) => path);
+  ];
+  const clips = all.filter(([, , path]) => path);
   const isWide = Boolean(scene.clips);
   return section(
     null,
