@@ -249,14 +249,8 @@ def _rows(
 
 
 def _question_columns(question: Question, spec: SceneSpec) -> dict[str, Any]:
-    labels = list(question.labels or spec.labels)
-    return {
-        "item": question.side,
-        "side": question.side,
-        "question": question.text,
-        "labels": labels,
-        "ground_truth": question.answer,
-    }
+    words = {"question": question.text, "labels": list(question.labels or spec.labels)}
+    return {"item": question.side, "side": question.side, "ground_truth": question.answer, **words}
 
 
 def _clip_columns(path: str, clip: Clip) -> dict[str, Any]:
@@ -264,12 +258,8 @@ def _clip_columns(path: str, clip: Clip) -> dict[str, Any]:
 
 
 def _pair_clip_columns(row: Row) -> dict[str, Any]:
-    return {
-        "clip": row["path"],
-        "media_digest": row["file_sha256"],
-        "n_frames": row["n_frames"],
-        "duration_s": row["duration_s"],
-    }
+    shown = {name: row[name] for name in ("n_frames", "duration_s")}
+    return {"clip": row["path"], "media_digest": row["file_sha256"], **shown}
 
 
 def incomplete_reasons(workspace: Workspace, category: str) -> list[str]:

@@ -88,12 +88,13 @@ def _scenario(family: Family, number: int, rng: np.random.Generator, seed: int, 
         place = [wording.labels.index(event.outcome.answer) for event in pair]
         pairs[k] = pair if (place[0] < place[1]) == is_turn_of_earlier(family.name, number, k, seed) else pair[::-1]
     assert look is not None
+<<<<<<< HEAD
     if difficulty.distractors:
         pairs = [_with_distractors(pair, wording, difficulty, rng) for pair in pairs]
-    above = [
-        bool(number & 1),
-        bool((number + 1 ^ number >> 1) & 1),
-    ]  # of four scenarios each arrangement, of two each side
+    above = [bool(number & 1), bool((number + 1 ^ number >> 1) & 1)]  # each arrangement once in four scenarios
+=======
+    above = [bool(number & 1), bool((number + 1 ^ number >> 1) & 1)]  # each arrangement once in four scenarios
+>>>>>>> lanesdata
     strips = _strips(wording, pairs, rng)
     lanes = [_lane(pair, strip, up, rng) for pair, strip, up in zip(pairs, strips, above, strict=True)]
     events = [event for event, _ in pairs]
@@ -135,7 +136,8 @@ def _scenario(family: Family, number: int, rng: np.random.Generator, seed: int, 
     return DrawnLanes(spec, {"qpos": world.qpos, "left": twins[0].qpos, "right": twins[1].qpos})
 
 
-Pairs = Sequence[tuple[LaneEvent, LaneEvent]]  # of each lane, its event and the twin
+Pair = tuple[LaneEvent, LaneEvent]  # a lane's event and its twin
+Pairs = Sequence[Pair]
 
 
 def _worlds(lanes: Sequence[Lane], pairs: Pairs, look: Look) -> tuple[TwoLanes, TwoLanes, TwoLanes]:
@@ -161,7 +163,7 @@ def _sizes(worlds: Sequence[TwoLanes]) -> list[float]:
     return sizes
 
 
-def _event(family: Family, rng: np.random.Generator, like: Any, difficulty: Difficulty) -> tuple[LaneEvent, LaneEvent]:
+def _event(family: Family, rng: np.random.Generator, like: Any, difficulty: Difficulty) -> Pair:
     """Return an event and its twin; like: the other lane's parameters, whose colours and view it takes."""
     assert family.twins is not None, f"{family.name}: an occlusion family needs twins"
     physics = replace(family.physics, speed=difficulty.speed)
@@ -185,16 +187,15 @@ def _event(family: Family, rng: np.random.Generator, like: Any, difficulty: Diff
     raise Rejected("no draw settles in time, with a twin that ends otherwise")
 
 
-def _with_distractors(
-    pair: tuple[LaneEvent, LaneEvent], wording: Wording, difficulty: Difficulty, rng: np.random.Generator
-) -> tuple[LaneEvent, LaneEvent]:
+def _with_distractors(pair: Pair, wording: Wording, difficulty: Difficulty, rng: np.random.Generator) -> Pair:
     """Return an event and its twin with the same distractors."""
     event, points = pair[0], np.concatenate([each.points for each in pair])
     duration_s = event.physics.duration_s * event.physics.speed
     things = draw_distractors(rng, difficulty.distractors, event.scene, points, wording, event.params, duration_s)
     added = SceneDifficulty(things, difficulty.longer)
-    one, other = (replace(each, params=replace(each.params, difficulty=added)) for each in pair)
-    return one, other
+    return replace(event, params=replace(event.params, difficulty=added)), replace(
+        pair[1], params=replace(pair[1].params, difficulty=added)
+    )
 
 
 def is_turn_of_earlier(family: str, number: int, lane: int, seed: int) -> bool:
@@ -280,12 +281,8 @@ def sample_two_events(
     report: gets a line for each scenario. Raises TrapsError for a place that no draw fills.
     """
     existing = {name: _drawn_before(released / f"{name}.jsonl", seed, difficulty) for name in names}
-    jobs = [
-        (name, k, seed, difficulty)
-        for name, lines in existing.items()
-        for k in range(1, count + 1)
-        if _id(name, k) not in lines
-    ]
+    places = [(name, k) for name, lines in existing.items() for k in range(1, count + 1) if _id(name, k) not in lines]
+    jobs = [(*place, seed, difficulty) for place in places]
     for (name, number, *_), (drawn, rejected) in run_in_order(_draw, jobs, workers):
         reasons = ", ".join(f"{n} x {reason}" for reason, n in Counter(rejected).most_common())
         if drawn is None:
@@ -301,12 +298,9 @@ def sample_two_events(
 def _drawn_before(path: Path, seed: int, difficulty: Difficulty) -> dict[str, str]:
     """Return lines of records of a seed and its settings by id; a file of another seed counts as none."""
     lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-    records = {line: json.loads(line) for line in lines}
-    return {
-        record["scenario_id"]: line
-        for line, record in records.items()
-        if record["seed"] == seed and difficulty_of(record) == difficulty
-    }
+    records = [(line, json.loads(line)) for line in lines]
+    drawn_as = (seed, difficulty)
+    return {each["scenario_id"]: line for line, each in records if (each["seed"], difficulty_of(each)) == drawn_as}
 
 
 def difficulty_of(record: Mapping[str, Any]) -> Difficulty:

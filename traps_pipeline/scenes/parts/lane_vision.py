@@ -12,11 +12,9 @@ import numpy as np
 from traps_pipeline.scenes.parts.vision import Blob, blobs, colour_mask
 from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH
 
-BOARD_PX, BOARD_FILL = 400, 0.5  # least area of a board, and least share of its bounding box
-STRIP_PX, STRIP_LONG = 100, 4  # least area of a strip, and how many times as long as it is high
+BOARD_PX, STRIP_PX = 400, 100  # least areas
 MARGIN, INNER = 1.08, 0.8  # of the strip's length, that the scene is shown in; share of what is added on the inner side
-PLATE_ROWS, PLATE_SHARE = 2, 0.5  # so many rows of a board's place are of a bench's plate, over this share of it
-ABOVE_PX, BELOW_PX = 3, 10  # of a board's place, to which plates reach
+PLATE_ROWS, PLATE_BELOW_PX = 2, 10  # of a bench's plate, at a board's place and so far below
 
 
 def scenes_of_lane(frames: np.ndarray, strip: str) -> list[np.ndarray]:
@@ -35,11 +33,13 @@ def scenes_of_lane(frames: np.ndarray, strip: str) -> list[np.ndarray]:
         return []
     _, top, _, height = still.box
     boards[:, top - 2 : top + height + 3] = False
-    moving = [[blob for blob in blobs(mask, BOARD_PX) if blob.fill > BOARD_FILL] for mask in boards]
+    moving = [[blob for blob in blobs(mask, BOARD_PX) if blob.fill > 0.5] for mask in boards]
     open_frames = np.array([not seen for seen in moving])
     if open_frames.all() or not open_frames.any():
         return []
-    place = max((blob for seen in moving for blob in seen), key=lambda blob: (_bottom(blob) // 4, blob.area))
+    place = max(
+        (blob for seen in moving for blob in seen), key=lambda blob: ((blob.box[1] + blob.box[3]) // 4, blob.area)
+    )
     background = np.median(lane[open_frames], axis=0).astype(np.uint8)
     if _is_bench(background, place):
         return []
@@ -53,23 +53,17 @@ def scenes_of_lane(frames: np.ndarray, strip: str) -> list[np.ndarray]:
 
 def _strip(half: np.ndarray, colour: str) -> Blob | None:
     """Return the largest region of a colour that may be a strip."""
-    still = np.median(half, axis=0).astype(np.uint8)
-    found = blobs(colour_mask(still, colour), STRIP_PX)
-    return next((blob for blob in found if blob.box[2] > STRIP_LONG * blob.box[3]), None)
-
-
-def _bottom(blob: Blob) -> int:
-    return blob.box[1] + blob.box[3]
+    found = blobs(colour_mask(np.median(half, axis=0).astype(np.uint8), colour), STRIP_PX)
+    return next((blob for blob in found if blob.box[2] > 4 * blob.box[3]), None)
 
 
 def _is_bench(background: np.ndarray, place: Blob) -> bool:
     """Return whether the plate of a bench is seen at a board's place."""
     x, y, width, height = place.box
-    red, green, blue = np.moveaxis(
-        background[max(0, y - ABOVE_PX) : y + height + BELOW_PX, x : x + width], 2, 0
-    ).astype(int)
+    part = background[y : y + height + PLATE_BELOW_PX, x : x + width].astype(int)
+    red, green, blue = np.moveaxis(part, 2, 0)
     plate = (abs(red - blue) < 10) & (red - green > 3) & (red - green < 16) & (red > 60) & (red < 125)
-    return int((plate.mean(axis=1) > PLATE_SHARE).sum()) >= PLATE_ROWS
+    return int((plate.mean(axis=1) > 0.5).sum()) >= PLATE_ROWS
 
 
 def _cropped(lane: np.ndarray, background: np.ndarray, rows: slice, strip: Blob, side: int) -> np.ndarray:
