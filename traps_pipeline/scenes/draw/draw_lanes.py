@@ -88,13 +88,9 @@ def _scenario(family: Family, number: int, rng: np.random.Generator, seed: int, 
         place = [wording.labels.index(event.outcome.answer) for event in pair]
         pairs[k] = pair if (place[0] < place[1]) == is_turn_of_earlier(family.name, number, k, seed) else pair[::-1]
     assert look is not None
-<<<<<<< HEAD
     if difficulty.distractors:
         pairs = [_with_distractors(pair, wording, difficulty, rng) for pair in pairs]
     above = [bool(number & 1), bool((number + 1 ^ number >> 1) & 1)]  # each arrangement once in four scenarios
-=======
-    above = [bool(number & 1), bool((number + 1 ^ number >> 1) & 1)]  # each arrangement once in four scenarios
->>>>>>> lanesdata
     strips = _strips(wording, pairs, rng)
     lanes = [_lane(pair, strip, up, rng) for pair, strip, up in zip(pairs, strips, above, strict=True)]
     events = [event for event, _ in pairs]
@@ -193,9 +189,8 @@ def _with_distractors(pair: Pair, wording: Wording, difficulty: Difficulty, rng:
     duration_s = event.physics.duration_s * event.physics.speed
     things = draw_distractors(rng, difficulty.distractors, event.scene, points, wording, event.params, duration_s)
     added = SceneDifficulty(things, difficulty.longer)
-    return replace(event, params=replace(event.params, difficulty=added)), replace(
-        pair[1], params=replace(pair[1].params, difficulty=added)
-    )
+    one, other = (replace(each, params=replace(each.params, difficulty=added)) for each in pair)
+    return one, other
 
 
 def is_turn_of_earlier(family: str, number: int, lane: int, seed: int) -> bool:
