@@ -265,10 +265,10 @@ def sample_two_events(
     count: int,
     seed: int,
     released: Path,
+    difficulty: Difficulty = DEFAULT_DIFFICULTY,
     *,
     workers: int | None = None,
     report: Callable[[str], None] = lambda _: None,
-    difficulty: Difficulty = DEFAULT_DIFFICULTY,
 ) -> int:
     """Draw `count` scenarios of each family into `released`; return how many there are.
 
