@@ -162,11 +162,14 @@ def sample(arguments: argparse.Namespace) -> int:
 
 
 def commit_benchmark(arguments: argparse.Namespace) -> int:
+    from traps_pipeline.benchmark.records import two_events_lines
     from traps_pipeline.release.commitment import commit
 
     public = commit(arguments.benchmark.absolute(), arguments.out, arguments.reveal)
     records = count_noun(len(public.specs), "record")
     print(f"committed {records} of {public.name} {public.version} in {arguments.out}: publish it")
+    if lanes := two_events_lines(arguments.benchmark.absolute() / "two_events" / "released"):
+        print(f"not committed: its {count_noun(len(lanes), 'scenario')} of two events")
     print(f"keep {arguments.reveal} secret until the benchmark is revealed; without it nothing can be proven")
     return OK
 

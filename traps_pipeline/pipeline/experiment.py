@@ -80,9 +80,11 @@ class Experiment(Settings):
         names = (*DATASETS, *UNPAIRED) if info.field_name == "datasets" else REGIMES
         unknown = [value for value in values if value not in names]
         if unknown or not values:
+            if gone := [value for value in unknown if value in REPLACED]:
+                raise ValueError(
+                    f"{', '.join(gone)} went with 0.3: {TWO_EVENTS} takes the place of such arms; ask that"
+                )
             suggestion = did_you_mean(unknown[0], names) if unknown else ""
-            if unknown and unknown[0] in REPLACED:
-                suggestion = f"; {unknown[0]} was an arm of 0.3: {TWO_EVENTS} takes its place"
             raise ValueError(f"{unknown or 'nothing'} given; choose from {', '.join(names)}{suggestion}")
         return values
 

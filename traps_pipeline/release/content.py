@@ -179,13 +179,9 @@ def scenario_rows(content: Content) -> list[ScenarioRow]:
 
 def two_events_rows(content: Content) -> list[TwoEventsRow]:
     """Return one row per scenario of two events: its record."""
-    named = ("scenario_id", "category", "family", "question", "labels")
+    canary = content.release.canary
     return [
-        TwoEventsRow(
-            **{name: getattr(spec, name) for name in named},
-            record=spec.model_dump_json(),
-            canary=content.release.canary,
-        )
+        TwoEventsRow(scenario_id=spec.scenario_id, record=spec.model_dump_json(), canary=canary)
         for spec in content.two_events
     ]
 

@@ -81,11 +81,7 @@ class TwoEventsRow:
     """A scenario of two events: its record, from which its four clips were rendered."""
 
     scenario_id: shared.ScenarioId
-    category: shared.Category
-    family: Annotated[str, "family of both events"]
-    question: Annotated[str, "the family's own, which items ask of either lane"]
-    labels: Labels
-    record: Annotated[str, "JSON: both lanes with their twins, camera, boards and when they stand, certificates"]
+    record: Annotated[str, "JSON: family, question, both lanes with their twins, camera, boards, certificates"]
     canary: Canary
 
 

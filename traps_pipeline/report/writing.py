@@ -94,9 +94,8 @@ class Column:
 
     Shares are fractions in the frame; `percent` prints them times 100. `spread` names the field of a standard
     deviation, which is printed after ±; `mark` names a field of text, such as a dagger, which is printed after the
-    number; `interval`: whether its fields `_ci_low` and `_ci_high` follow in brackets. For pages:
-    the style of the cells (a row's head, an emphasised number, a tag), whether a fraction is also drawn as a bar, and
-    whether a group of columns begins here.
+    number; `interval`: whether its `_ci_low` and `_ci_high` follow in brackets. For pages: the style of the cells (a
+    row's head, an emphasised number, a tag), whether a fraction is also drawn as a bar, and a group begins here.
     """
 
     field: str
@@ -308,11 +307,8 @@ def table_html(table: PrintedTable, address: Callable[[SourceItems], str] | None
 
 def _classes(column: Column) -> str:
     """Return the style classes of a column's cells."""
-    names = (
-        "" if column.is_number else "word",
-        "range" if column.unit == "range" or column.interval else "",
-        column.look,
-    )
+    is_range = column.interval or column.unit == "range"
+    names = ("" if column.is_number else "word", "range" if is_range else "", column.look)
     return " ".join(filter(None, (*names, "first" if column.group else "")))
 
 

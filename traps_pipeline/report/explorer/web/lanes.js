@@ -58,12 +58,14 @@ function boardKey() {
 
 async function lanesView(route, info, found, scene) {
   const { scenario_id: scenario } = scene;
-  const items = scene.items.map((item) => ({ ...item, place: found.pairs[found.byId.get(item.pair_id)][item.side] }));
+  const placed = scene.items.map((item) => ({ ...item, place: found.pairs[found.byId.get(item.pair_id)]?.[item.side] }));
+  const items = placed.filter(({ place }) => place >= 0); // a held-out study asks one of them
   const shown = player(laneClips(scene), scene.fps, info.has_clips);
   const around = scenariosAround(found, scenario, route.parameters);
   const chosen = [chosenEvaluation(info, route.parameters, ""), chosenEvaluation(info, route.parameters, "2")];
   const evaluations = distinct(chosen.filter((evaluation) => evaluation !== null));
-  const tables = await Promise.all(scene.lanes.map(({ name }) => laneTable(found, items, name, evaluations)));
+  const asked = scene.lanes.filter(({ name }) => items.some((item) => item.lane === name));
+  const tables = await Promise.all(asked.map(({ name }) => laneTable(found, items, name, evaluations)));
   return {
     title: scenario,
     heading: untrusted(scenario),
@@ -80,7 +82,7 @@ async function lanesView(route, info, found, scene) {
       unknownModels(info, route.parameters, ["model", "model2"]),
       section(null, shown.element, boardKey()),
       section(
-        "Eight items",
+        counted(items.length, "item"),
         h(
           "div",
           { class: "filters" },
