@@ -179,9 +179,8 @@ def scenario_rows(content: Content) -> list[ScenarioRow]:
 
 def two_events_rows(content: Content) -> list[TwoEventsRow]:
     """Return one row per scenario of two events: its record."""
-    canary = content.release.canary
     return [
-        TwoEventsRow(scenario_id=spec.scenario_id, record=spec.model_dump_json(), canary=canary)
+        TwoEventsRow(scenario_id=spec.scenario_id, record=spec.model_dump_json(), canary=content.release.canary)
         for spec in content.two_events
     ]
 

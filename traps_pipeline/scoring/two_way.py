@@ -55,8 +55,8 @@ def two_way(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED
 def decisions(items: pd.DataFrame) -> pd.DataFrame:
     """Return by scenario how often each of CELLS and the conjunction was yes, and how often it was decided (`_of`).
 
-    items: item_id, scenario_id, abstained and correct (1, 0 or NaN) of one run. The conjunction is decided where all
-    eight items were asked and decided, or one of them is wrong.
+    items: item_id, scenario_id, abstained, correct (1, 0 or NaN) of one run. The conjunction is decided where all eight
+    were asked and decided, or one of them is wrong.
     """
     lanes = [lane_item(item_id) for item_id in items["item_id"]]
     hidden, other = (np.array([getattr(lane, f"{name}_hidden") for lane in lanes], bool) for name in ("asked", "other"))

@@ -35,12 +35,12 @@ from traps_pipeline.protocol.two_events import CLIPS as LANE_CLIPS
 from traps_pipeline.protocol.two_events import LANES, lane_items
 from traps_pipeline.report.explorer.answer_shards import StudyAnswers, study_answers
 from traps_pipeline.report.explorer.scenario_words import certificate_phrases, closes_frame, intervention
-from traps_pipeline.report.leaderboard_page import legend, provenance
+from traps_pipeline.report.leaderboard_page import TWO_WAY_COLUMNS, legend, provenance
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.tables.human_tables import people_notes
 from traps_pipeline.report.tables.table_columns import entries
 from traps_pipeline.report.tables.two_way_table import two_way_table
-from traps_pipeline.report.terms import ARM_TITLES, MARKS, TITLES, TWO_WAY_FIGURES
+from traps_pipeline.report.terms import ARM_TITLES, MARKS, TITLES
 from traps_pipeline.report.writing import environment
 from traps_pipeline.scoring.analyses import REASONING_PAIRS, SHARES
 from traps_pipeline.scoring.score_rows import CONTRASTS, LEADERBOARD, REGIME_TESTS, TWO_WAY
@@ -231,7 +231,7 @@ def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_c
             {"field": m.name, "title": m.heading, "unit": m.unit, "in_paper": m.name in printed_by_paper}
             for m in METRIC_WORDS.values()
         ],
-        "two_way_figures": [{"field": name, "title": title, "unit": unit} for name, title, unit, _ in TWO_WAY_FIGURES],
+        "two_way_figures": [{"field": c.field, "title": c.heading, "unit": c.unit} for c in TWO_WAY_COLUMNS],
         "leaderboard": records(board),
         "two_way": records(printed.rows),
         "two_way_table": [{"field": c.field, "title": c.heading, "unit": c.unit} for c in printed.columns],
