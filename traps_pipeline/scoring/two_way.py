@@ -113,8 +113,7 @@ def _entry(items: pd.DataFrame, resampling: Resampling, named: str) -> dict[str,
 
 
 def _mean_over_runs(items: pd.DataFrame, decision: str) -> float:
-    of_runs: Any = items.groupby("run")[decision].mean()
-    return float(of_runs.mean(skipna=False))
+    return float(cast(Any, items.groupby("run")[decision].mean()).mean(skipna=False))
 
 
 def _refusal(items: pd.DataFrame) -> str | None:
