@@ -79,11 +79,11 @@ define compile
 $(BIN)/python -m compileall -qq -j 0 -x '/tests?/' $(VENV)/lib || true
 endef
 
-$(VENV)/.installed: requirements.lock pyproject.toml hatch_build.py
+$(VENV)/.installed: requirements.lock pyproject.toml hatch_build.py traps_soft_bodies/pyproject.toml
 	$(make-venv)
 	$(PIP_INSTALL) --no-deps --require-hashes -r requirements.lock
 	$(PIP_INSTALL) $(TORCH)
-	$(PIP_INSTALL) --no-deps --no-build-isolation --editable .
+	$(PIP_INSTALL) --no-deps --no-build-isolation --editable . --editable ./traps_soft_bodies
 	$(compile)
 	touch $(VENV)/.core $@
 

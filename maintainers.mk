@@ -9,6 +9,7 @@ test-newest: render-packages ## the newest libraries that pyproject.toml admits:
 	$(make-venv)
 	$(PIP_INSTALL) $(TORCH)
 	$(PIP_INSTALL) $(firstword $(TORCH)) --editable '.[all,test,docs]' hatchling hatch-vcs
+	$(PIP_INSTALL) --no-deps --no-build-isolation --editable ./traps_soft_bodies
 	$(compile)
 	$(BIN)/python -m pip --disable-pip-version-check list
 	$(BIN)/traps models check

@@ -154,7 +154,7 @@ class Checkout:
 
 def make_checkout(root: Path) -> Path:
     """Copy what the package needs to run, with what Python has compiled: the commands of tests need not do it again."""
-    for name in ("traps_pipeline", "traps_cluster", "assets", "scene_specs"):
+    for name in ("traps_pipeline", "traps_cluster", "traps_soft_bodies", "assets", "scene_specs"):
         shutil.copytree(ROOT / name, root / name)
     for name in ("LICENSE-DATA", "CITATION.cff"):
         shutil.copy(ROOT / name, root / name)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.build.packages import install_soft_bodies
 from tools.family_pages import family_pages
 from traps_pipeline.scenes.family_registry import families
 
@@ -17,7 +18,8 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def pages() -> dict[str, str | bytes]:
+def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str | bytes]:
+    install_soft_bodies(tmp_path_factory.mktemp("soft_bodies"))
     return family_pages()
 
 

@@ -7,7 +7,6 @@ import inspect
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import MISSING, Field, fields
-from importlib import import_module
 from statistics import median
 from typing import Any
 
@@ -99,7 +98,8 @@ def _page(family: Family, specs: Sequence[SceneSpec]) -> str:
 
 def _source(family: Family) -> tuple[str, str]:
     """Return the docstring and the text of a family's file."""
-    module = import_module(f"traps_pipeline.scenes.families.{family.name}")
+    module = inspect.getmodule(family.params)
+    assert module is not None, "a family's Params stand in its file"
     return inspect.getdoc(module) or "", inspect.getsource(module)
 
 

@@ -12,6 +12,7 @@ import pytest
 from traps_pipeline.benchmark.filmed_lanes import trajectories_of
 from traps_pipeline.benchmark.lane_balance import auc, balance, lane_numbers, telling_numbers
 from traps_pipeline.benchmark.records import two_events_lines
+from traps_pipeline.protocol.datasets import OCCLUSION_CATEGORIES
 from traps_pipeline.protocol.two_events import CLIPS
 from traps_pipeline.scenes.certification.certify_lanes import certify_lane_record, certify_lanes
 from traps_pipeline.scenes.draw.draw_lanes import (
@@ -31,8 +32,6 @@ from traps_pipeline.scenes.worlds.lanes import TwoLanes
 from traps_pipeline.scenes.worlds.outcome import Rejected
 from traps_pipeline.scenes.worlds.spec import trajectory_digest
 from traps_pipeline.scenes.worlds.timetable import Timetable
-
-SOFT = 3  # families of soft bodies, which have no lanes
 
 
 @cache
@@ -210,5 +209,5 @@ def test_the_share_of_pairs_in_which_the_hidden_one_has_more_counts_ties_by_half
 
 
 def test_families_that_are_left_out_are_families():
-    names = {family.name for family in families() if family.taxonomy == "occlusion"}
-    assert {*LEFT_OUT} <= names and len(lane_families()) == len(names - {*LEFT_OUT}) - SOFT
+    names = {family.name for family in families() if family.category in OCCLUSION_CATEGORIES}  # none of soft bodies
+    assert {*LEFT_OUT} <= names and {*lane_families()} == names - {*LEFT_OUT}

@@ -15,6 +15,7 @@ from tests.build.errors import raises
 from tests.conftest import ROOT
 from tests.scenes.released import SIX, Released
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.plugins import plugins
 from traps_pipeline.benchmark.composition import load_composition
 from traps_pipeline.scenes import families as package
 from traps_pipeline.scenes import family_registry as registry
@@ -147,6 +148,26 @@ def test_a_hidden_element_that_follows_what_is_seen_is_refused_before_anything_i
     with raises(TrapsError, "scenes.family_registry.fit_to_sample", "post_in_way", "seen_m"):
         sample_family("plank_post", 1, 1, tmp_path / "released")
     assert not (tmp_path / "released").exists()
+
+
+def test_what_is_kept_of_a_packages_family_is_kept_until_any_of_its_modules_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, about = tmp_path / "birds", tmp_path / "birds-1.dist-info"
+    folder.mkdir(), about.mkdir()
+    for name in ("__init__", "crow", "wings"):
+        (folder / f"{name}.py").write_text("")
+    (about / "METADATA").write_text("Name: birds\nVersion: 1\n")
+    (about / "entry_points.txt").write_text("[traps.families]\ncrow = birds.crow\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    plugins.cache_clear()
+    before = registry.family_digest("crow")
+    assert before in registry.added_digests()
+    (folder / "wings.py").write_text("SPAN_M = 0.9")
+    after = registry.family_digest("crow")
+    assert after in registry.added_digests() and before not in registry.added_digests()
+    monkeypatch.undo()
+    plugins.cache_clear()
 
 
 @pytest.mark.parametrize(

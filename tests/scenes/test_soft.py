@@ -9,11 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.build.packages import install_soft_bodies
 from tests.conftest import ROOT
 from tests.scenes.released import SAMPLED, load
 from traps_pipeline.base.paths import OWN_SPECS
 from traps_pipeline.benchmark.composition import load_composition
-from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.benchmark.records import load_released, released_lines
 from traps_pipeline.protocol.datasets import EXTENSION_CATEGORIES
 from traps_pipeline.scenes.certification.certificates import HIDDEN, SAME_START_M, pair_of
 from traps_pipeline.scenes.certification.certify_record import certify
@@ -27,10 +28,15 @@ FAMILIES = ("soft_ball", "soft_hammock", "soft_rope")
 FIRSTS = [f"{family}-0001" for family in FAMILIES]
 
 
+@pytest.fixture(scope="module", autouse=True)
+def soft_bodies(tmp_path_factory: pytest.TempPathFactory) -> None:
+    install_soft_bodies(tmp_path_factory.mktemp("soft_bodies"))
+
+
 BUILD = """
 import sys
 from traps_pipeline.scenes.physics.kit import Physics
-from traps_pipeline.scenes.parts.soft_bodies import soft_ball
+from traps_soft_bodies.bodies import soft_ball
 from traps_pipeline.scenes.parts.course import Course
 for radius in map(float, sys.argv[1:]):
     course = Course(Physics())
@@ -76,7 +82,7 @@ def test_the_extension_is_a_benchmark_of_its_own_beside_the_1404_pairs() -> None
     assert {get_family(name).category for name in FAMILIES} == {"soft_bodies"}
 
 
-@pytest.mark.parametrize("scenario_id", sorted(load_released(RELEASED)))
+@pytest.mark.parametrize("scenario_id", sorted(released_lines(RELEASED)))
 def test_every_frozen_trajectory_and_its_twin_end_as_the_record_says(scenario_id: str) -> None:
     case = load(scenario_id, RELEASED)
     for qpos, twin, answer in (

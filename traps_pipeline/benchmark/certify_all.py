@@ -25,6 +25,7 @@ from traps_pipeline.benchmark.records import load_released, two_events_lines
 from traps_pipeline.scenes.certification.certify_lanes import certify_lane_record
 from traps_pipeline.scenes.certification.certify_record import Verdict, certify
 from traps_pipeline.scenes.draw.sample import Tally, load_tallies
+from traps_pipeline.scenes.family_registry import added_digests
 from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
 from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory
 
@@ -86,7 +87,7 @@ def code_digest(family: str) -> str:
     """Return the digest of the code that certifies a family; it keys cached verdicts."""
     folder = PACKAGE / "scenes"
     files = [path for path in sorted(folder.rglob("*.py")) if path.parent.name != "families" or path.stem == family]
-    return digest([[path.name, file_digest(path)] for path in files])
+    return digest([*([path.name, file_digest(path)] for path in files), *added_digests()])
 
 
 def judge(case: Case) -> Verdict:

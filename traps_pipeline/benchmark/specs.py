@@ -21,7 +21,7 @@ from traps_pipeline.base.paths import CORRECTIONS, PACKAGE, RELEASED, ROOT, user
 from traps_pipeline.benchmark.corrections import WORDS, Scenario, apply_words, load_scenarios, load_two_events, subset
 from traps_pipeline.benchmark.records import parse_record, released_lines, two_events_lines
 from traps_pipeline.benchmark.versions import version_of
-from traps_pipeline.scenes.family_registry import get_family
+from traps_pipeline.scenes.family_registry import added_digests, get_family
 from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory, physics_record, save_trajectory
 from traps_pipeline.storage.benchmark_tables import SCENE_SPECS, SceneSpecRow
 from traps_pipeline.storage.workspace import Workspace
@@ -302,7 +302,7 @@ def _replayed(spec: SceneSpec) -> str:
 @cache
 def _replaying_code() -> str:
     files = sorted((PACKAGE / "scenes").rglob("*.py"))
-    return digest([metadata.version("mujoco"), *map(file_digest, files)])
+    return digest([metadata.version("mujoco"), *map(file_digest, files), *added_digests()])
 
 
 def _settled_path() -> Path:

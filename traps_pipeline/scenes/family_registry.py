@@ -14,7 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from traps_pipeline.base.digests import file_digest
+from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.plugins import plugins
 from traps_pipeline.protocol.datasets import CHAOTIC_CATEGORIES, EXTENSION_CATEGORIES, OCCLUSION_CATEGORIES
@@ -68,11 +68,19 @@ def get_family(name: str) -> Family:
 
 
 def family_digest(name: str) -> str:
-    """Return the SHA-256 of a family's file, the text that drew its records."""
+    """Return the SHA-256 of a family's file, the text that drew its records; in a package, of all modules beside it."""
     plugin = plugins("families").get(name)
-    module_spec = importlib.util.find_spec(plugin.entry_point.module if plugin else f"{package.__name__}.{name}")
+    module = plugin.entry_point.module if plugin else f"{package.__name__}.{name}"
+    module_spec = importlib.util.find_spec(module)
     assert module_spec is not None and module_spec.origin is not None, f"{_file(name)} is a file"
-    return file_digest(Path(module_spec.origin))
+    file = Path(module_spec.origin)
+    is_in_package = plugin is not None and "." in module
+    return digest([*map(file_digest, sorted(file.parent.glob("*.py")))]) if is_in_package else file_digest(file)
+
+
+def added_digests() -> list[str]:
+    """Return the digests of all families that packages add, which decide clips and verdicts as code of ours does."""
+    return [family_digest(name) for name in sorted(plugins("families"))]
 
 
 @cache

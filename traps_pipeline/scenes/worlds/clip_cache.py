@@ -17,6 +17,7 @@ from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
 from traps_pipeline.base.paths import PACKAGE, user_cache
+from traps_pipeline.scenes.family_registry import added_digests
 from traps_pipeline.scenes.picture.render import RenderingUnavailable, renderer_version
 from traps_pipeline.scenes.worlds.clip_notes import note_of, read_clip, read_note
 from traps_pipeline.video.encode import DamagedClip
@@ -140,4 +141,4 @@ def _renderer_digest() -> str:
     files = sorted(path for room in ("scenes", "video") for path in (PACKAGE / room).rglob("*.py"))
     code = {path.relative_to(PACKAGE).as_posix(): file_digest(path) for path in files}
     versions = (mujoco.__version__, cv2.__version__, av.__version__, sorted(av.library_versions.items()))
-    return digest([code, renderer_version(), versions])
+    return digest([code, added_digests(), renderer_version(), versions])

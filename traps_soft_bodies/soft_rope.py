@@ -17,10 +17,10 @@ from traps_pipeline.scenes.parts.course import SOFT, Course, Surface
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.questions import colour_of, either, yes_no
 from traps_pipeline.scenes.parts.readings import Reading, lasting_from, still_from
-from traps_pipeline.scenes.parts.soft_bodies import rope
 from traps_pipeline.scenes.parts.vary import apart, between, hidden, in_front, one_of, shuffled
 from traps_pipeline.scenes.parts.vision import is_at_rest, largest
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
+from traps_soft_bodies.bodies import rope
 
 FLOOR_M = 0.02  # thickness of the tray's floor
 WALL_M = 0.012

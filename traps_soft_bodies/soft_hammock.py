@@ -18,10 +18,10 @@ from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import round_blob
 from traps_pipeline.scenes.parts.questions import colour_of, either, yes_no
 from traps_pipeline.scenes.parts.readings import Reading, lasting_from, still_from
-from traps_pipeline.scenes.parts.soft_bodies import hammock
 from traps_pipeline.scenes.parts.vary import apart, between, hidden, in_front, one_of, shuffled
 from traps_pipeline.scenes.parts.vision import colour_mask, is_at_rest
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
+from traps_soft_bodies.bodies import hammock
 
 FLOOR_M = 0.02  # thickness of the tray's floor
 WALL_M = 0.012

@@ -17,11 +17,11 @@ from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import round_blob
 from traps_pipeline.scenes.parts.questions import colour_from, either, which_colour
 from traps_pipeline.scenes.parts.readings import Reading, still_from
-from traps_pipeline.scenes.parts.soft_bodies import soft_ball
 from traps_pipeline.scenes.parts.vary import apart, between, hidden, in_front, one_of, shuffled
 from traps_pipeline.scenes.parts.vision import colour_mask, is_at_rest
 from traps_pipeline.scenes.parts.wording import choices_in
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
+from traps_soft_bodies.bodies import soft_ball
 
 FLOOR_M = 0.02  # thickness of the tray's floor
 WALL_M = 0.012
