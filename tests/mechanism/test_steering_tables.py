@@ -5,11 +5,11 @@ from __future__ import annotations
 import pandas as pd
 import pytest
 
+from tools.paper_audit.printed_rows import published_rows
 from traps_pipeline.mechanism import effects
 from traps_pipeline.mechanism.transfer_paths import PATH_SETS, STEERING_PATHS, TRANSFER_TYPES
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.tables import probe_tables
-from traps_pipeline.scoring.published import published_rows
 
 PAPER = PublishedResults()
 

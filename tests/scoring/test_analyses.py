@@ -8,11 +8,11 @@ from tests.build.errors import raises
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.analyses import (
     accuracy_by_label,
+    frontier,
     hidden_against_others,
     naive_gap,
     overall,
     pair_differences,
-    pareto_frontier,
     scoped_cells,
     spread,
     study_cells,
@@ -95,7 +95,8 @@ def test_the_frontier_keeps_equals_and_drops_whoever_is_beaten_in_one_and_not_be
         cell("a", acc=0.9, abs_rec=0.5), cell("b", acc=0.9, abs_rec=0.4), cell("c", acc=0.5, abs_rec=0.9),
         cell("twin", acc=0.5, abs_rec=0.9), cell("d", acc=0.4, abs_rec=0.8),
     )  # fmt: skip
-    assert list(pareto_frontier(frame)["model"]) == ["a", "c", "twin"]
+    means = overall(frame)
+    assert list(frontier(means.assign(j=means["abs_rec"] - means["false_abs"]))["model"]) == ["a", "c", "twin"]
 
 
 def test_the_naive_gap_counts_cells_strictly_above_the_threshold():

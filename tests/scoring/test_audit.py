@@ -5,11 +5,12 @@ from pathlib import Path
 
 import pytest
 
+from tools.paper_audit.arranged import arranged
 from tools.paper_audit.claims import CLAIMS
 from tools.paper_audit.recomputed import recomputed
 from traps_pipeline.cli import main
 from traps_pipeline.scoring.audit import audit, counts_text
-from traps_pipeline.scoring.published import published
+from traps_pipeline.scoring.published import PUBLISHED, as_printed, published
 
 
 @pytest.fixture(scope="module")
@@ -20,6 +21,12 @@ def findings():
 def test_the_shipped_audit_is_what_the_tables_give(findings):
     again = recomputed().astype(str)
     assert again.to_dict("records") == findings.to_dict("records")
+
+
+def test_the_tables_that_the_paper_prints_across_are_what_the_other_files_give():
+    declared = as_printed("tables").set_index("name")["columns"]
+    shipped = {path.stem.removeprefix("arranged_"): path.read_text() for path in PUBLISHED.glob("arranged_*.csv")}
+    assert {name: (text, declared[name]) for name, text in shipped.items()} == arranged()
 
 
 def test_the_counts_are_the_documented_ones(findings):

@@ -9,18 +9,20 @@ from typing import Any
 import pandas as pd
 
 from tools.paper_audit.claims_mechanism import MECHANISM, Recomputed, text_figure
+from tools.paper_audit.printed_rows import published_rows
 from traps_pipeline.models.registry.entries import load_models
 from traps_pipeline.protocol.regimes import GUIDED, PAPER_REGIMES
 from traps_pipeline.scoring.analyses import (
+    frontier,
     hidden_against_others,
     models_of,
     naive_gap,
-    pareto_frontier,
+    overall,
     spread,
     uplift,
     zero_boundary,
 )
-from traps_pipeline.scoring.published import published, published_cells, published_overall, published_rows
+from traps_pipeline.scoring.published import published, published_cells, published_overall
 
 
 def _best(regime: str) -> Recomputed:
@@ -40,8 +42,9 @@ def _video_native() -> list[str]:
 
 def _frontier() -> Recomputed:
     cells = published_cells()
-    frontier = pareto_frontier(cells.loc[cells["regime"] == GUIDED])
-    return Recomputed("; ".join(sorted(frontier["model"])))
+    means = overall(cells.loc[cells["regime"] == GUIDED])
+    best = frontier(means.assign(j=means["abs_rec"] - means["false_abs"]))
+    return Recomputed("; ".join(sorted(best["model"])))
 
 
 def _main_cells(regime: str) -> pd.DataFrame:

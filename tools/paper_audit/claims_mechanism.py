@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from statistics import fmean, median
 
-from traps_pipeline.scoring.published import published_rows
+from tools.paper_audit.printed_rows import published_rows
 
 QWEN, GEMMA, LLAVA = "qwen3-vl-8b", "gemma-4-e4b", "llava-next-video-7b"
 TYPES = ("Cross-modality", "Cross-domain", "Cross-both")

@@ -17,10 +17,11 @@ import numpy as np
 import pandas as pd
 
 from tools.paper_audit.claims import CLAIMS
+from tools.paper_audit.printed_rows import published_rows
 from traps_pipeline.protocol.datasets import LONG, transfer_type
 from traps_pipeline.scoring.analyses import SHARES, models_of, overall
 from traps_pipeline.scoring.audit import AGREES, DECLARED, DIFFERS, ROUNDING
-from traps_pipeline.scoring.published import published, published_cells, published_overall, published_rows
+from traps_pipeline.scoring.published import published, published_cells, published_overall
 
 Verdict = Literal["agrees", "within rounding", "declared", "differs"]
 _NUMBER = re.compile(r"(?<![\w.-])\d+(?:\.\d+)?(?![\w-]*[a-z])")  # own text: the paper's statements

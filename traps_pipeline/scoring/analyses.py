@@ -131,15 +131,6 @@ def spread(cells: pd.DataFrame, column: str = "pecs_std") -> pd.DataFrame:
 # --- PECS and its limits ----------------------------------------------------------------------------------------------
 
 
-def pareto_frontier(cells: pd.DataFrame) -> pd.DataFrame:
-    """Return `frontier` of `overall`, in (acc, j).
-
-    It orders models and computes no ratio or gap, so epochs may differ.
-    """
-    means = overall(cells)
-    return frontier(means.assign(j=means["abs_rec"] - means["false_abs"]))
-
-
 def frontier(means: pd.DataFrame) -> pd.DataFrame:
     """Return rows not dominated in acc and j within their regime, by decreasing Acc.
 

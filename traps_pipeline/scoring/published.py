@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
@@ -31,11 +31,6 @@ def as_printed(name: str) -> pd.DataFrame:
     An empty cell is an empty text. Raises TrapsError that lists the files for another name.
     """
     return _read(name, texts=True).copy()
-
-
-def published_rows(name: str, /, **where: object) -> list[dict[str, Any]]:
-    """Return a published file's rows with these values, as numbers and texts."""
-    return [dict(row) for row in _records(name) if all(row[column] == value for column, value in where.items())]
 
 
 def published_digest() -> str:
@@ -67,11 +62,6 @@ def published_overall() -> pd.DataFrame:
     rows = published("overall")
     shares = {share: rows[printed_column] / 100 for share, printed_column in _RENAMED.items()}
     return rows.loc[:, ["model", "regime"]].assign(**shares, pecs=rows["pecs"])
-
-
-@cache
-def _records(name: str) -> list[dict[str, Any]]:
-    return _read(name).to_dict("records")  # pyright: ignore[reportReturnType]
 
 
 @cache
