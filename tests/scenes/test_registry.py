@@ -154,7 +154,8 @@ def test_what_is_kept_of_a_packages_family_is_kept_until_any_of_its_modules_chan
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, about = tmp_path / "birds", tmp_path / "birds-1.dist-info"
-    folder.mkdir(), about.mkdir()
+    folder.mkdir()
+    about.mkdir()
     for name in ("__init__", "crow", "wings"):
         (folder / f"{name}.py").write_text("")
     (about / "METADATA").write_text("Name: birds\nVersion: 1\n")

@@ -13,10 +13,10 @@ def no_formula(value: object) -> object:
     return f"'{value}" if isinstance(value, str) and value[:1] in ("=", "+", "-", "@", "\t", "\r") else value
 
 
-def csv_bytes(table: pd.DataFrame, float_format: str | None = None) -> bytes:
+def csv_bytes(table: pd.DataFrame) -> bytes:
     """Return a table as CSV with a header, with spreadsheet formulas escaped."""
     escaped = table.copy(deep=False)
     for place, kind in enumerate(table.dtypes):
         if kind.kind not in "biuf":  # numbers are no formulas, and a table has thousands
             escaped.isetitem(place, table.iloc[:, place].map(no_formula))
-    return escaped.to_csv(index=False, float_format=float_format).encode()
+    return escaped.to_csv(index=False).encode()

@@ -155,7 +155,6 @@ def declared_fields(api: Api, params: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _schema_fields(api: Api, response_format: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields by which an API gets a JSON schema."""
     schema = response_format["json_schema"]
     match api:
         case "chat":

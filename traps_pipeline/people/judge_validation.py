@@ -192,7 +192,6 @@ def validate(workspace: Workspace, path: Path) -> pd.DataFrame:
 
 
 def _judged_failures(workspace: Workspace) -> pd.DataFrame:
-    """Return the validly labelled failures."""
     labels = workspace.tables.read(CONFABULATION, {})
     return labels.loc[labels["valid"].to_numpy(bool)]
 

@@ -82,7 +82,6 @@ def lines_of(explanation: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _unknown_reason(workspace: Workspace, item_id: str) -> str:
-    """Return why an item is unknown, with the nearest one."""
     item_ids = workspace.tables.read_all(ITEMS, ["item_id"])["item_id"]
     if item_ids.empty:
         return f"item {item_id!r} is unknown: this study has no items yet; `traps run EXPERIMENT` makes them"

@@ -60,6 +60,5 @@ def two_judge_verdicts(
 
 
 def _standings_of(verdicts: pd.DataFrame) -> pd.DataFrame:
-    """Return the standings of verdicts."""
     cells = [cell_metrics(rows, {}) for _, rows in verdicts.groupby("dataset", sort=True)]
     return standings(pd.concat(cells, ignore_index=True))

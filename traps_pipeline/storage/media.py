@@ -204,7 +204,6 @@ class MediaStore:
         self._store.bring([note] if path is None else [note, path])
 
     def _local_path(self, clip_digest: str, spec: MediaSpec) -> Media | None:
-        """Return the path of the media on this machine."""
         try:
             media = read_note(self._note(clip_digest, spec))
             return media if media.path is None or media.path.stat().st_size == media.size_bytes else None
@@ -317,7 +316,6 @@ def _rate(clip: Path, sampled: Frames, spec: MediaSpec) -> int:
 
 
 def _sha256(parts: Sequence[bytes]) -> str:
-    """Return the SHA-256 of all parts, one after another."""
     hasher = hashlib.sha256()
     for part in parts:
         hasher.update(part)

@@ -53,7 +53,6 @@ def sentence_settings(workspace: Workspace, key: str) -> str:
 
 
 def _model(workspace: Workspace, key: str) -> tuple[ModelEntry, Extraction]:
-    """Return the model of an extraction, and the extraction."""
     from traps_pipeline.mechanism.stages import examined_model
 
     extraction = Extraction.parse(key)
@@ -61,7 +60,6 @@ def _model(workspace: Workspace, key: str) -> tuple[ModelEntry, Extraction]:
 
 
 def _model_and_states(workspace: Workspace, key: str) -> "tuple[ModelEntry, StoredStates]":
-    """Return the model of an extraction, and its stored states."""
     from traps_pipeline.mechanism.stored_states import StoredStates
 
     model, extraction = _model(workspace, key)

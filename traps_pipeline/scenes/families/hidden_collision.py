@@ -114,7 +114,6 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 
 def _shuffle_colours(p: Params, rng: np.random.Generator) -> Mapping[str, str]:
-    """Return the two colours in random order."""
     first, second = (str(c) for c in rng.permutation(p.colours))
     return {"first": first, "second": second}
 

@@ -331,7 +331,6 @@ def _ball(frame: np.ndarray, first: np.ndarray, colour: str) -> Blob | None:
 
 
 def _bin_of(ball: Blob | None, red: Blob, blue: Blob) -> str | None:
-    """Return the place of a ball by its pixels."""
     if ball is None or ball.y < red.y + (ball.x - red.x) * (blue.y - red.y) / (blue.x - red.x):
         return None
     if red.box[0] < ball.x < (red.x + blue.x) / 2:

@@ -98,5 +98,4 @@ def scene_family(
 
 
 def _first_answer(frames: np.ndarray, slots: Mapping[str, str], observers: Sequence[Observer]) -> str | None:
-    """Return the answer of the first observer that has one."""
     return next((answer for observe in observers if (answer := observe(frames, slots)) is not None), None)

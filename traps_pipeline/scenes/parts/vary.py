@@ -270,7 +270,6 @@ def draw_params(params: type[Params], rng: np.random.Generator, longer: bool = F
 
 
 def _group_values(group: Group, members: Sequence[Field[Any]], rng: np.random.Generator, so_far: Drawn) -> Drawn:
-    """Return the values of all fields of a group."""
     counts = {member.name: member.metadata[_COUNT] for member in members if member.metadata.get(_HOW) is group}
     numbers = {name: 1 if count is None else _number(count, so_far) for name, count in counts.items()}
     values = list(group.draw(rng, so_far, sum(numbers.values())))

@@ -14,9 +14,9 @@ from traps_pipeline.scenes.picture.render import Renderer
 SAMPLED_FPS = 5  # models are shown this rate (docs/spec.md 3.1)
 
 
-def last_sampled(n_frames: int, fps: int, count: int = 3) -> list[int]:
-    """Return indices of the last frames of a 5 FPS sample."""
-    return list(range(0, n_frames, fps // SAMPLED_FPS))[-count:]
+def last_sampled(n_frames: int, fps: int) -> list[int]:
+    """Return indices of the last three frames of a 5 FPS sample."""
+    return list(range(0, n_frames, fps // SAMPLED_FPS))[-3:]
 
 
 def least_visible(renderer: Renderer, qpos: np.ndarray, groups: Sequence[tuple[tuple[str, ...], float]]) -> list[float]:
