@@ -63,8 +63,14 @@ def versioned(group: Group, name: str) -> str:
 
 
 def require_known(name: str, group: Group, own: Collection[str]) -> str:
-    """Return a backend's name. Raises ValueError unless it is one of this project's, or a package's."""
+    """Return a backend's name.
+
+    Raises ValueError unless it is one of this project's, or a package's; TrapsError if it is both: the package's name
+    would stand in the keys of answers, which would all be asked again.
+    """
     known = [*own, *plugins(group)]
+    if name in own and name in plugins(group):
+        raise plugins(group)[name].error("has the name of a backend of this project")
     if name not in known:
         raise ValueError(
             f"{name!r} is none; known: {', '.join(known)}{did_you_mean(name, known)}; a package adds one by an "
