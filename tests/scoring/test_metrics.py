@@ -65,7 +65,7 @@ def test_undecided_items_leave_their_denominators_and_count_as_missing(rows):
 
 
 def test_a_side_that_nobody_is_asked_is_not_missing(rows):
-    # As in a held-out set: the controls of pairs 0 to 3 and the voids of pairs 4 to 7; no majority on a control, a void.
+    # As in a held-out set: controls of pairs 0 to 3, voids of pairs 4 to 7; one of each without a majority.
     pairs = [(True, False, True), (True, False, True), (False, True, True), (None, None, True)]
     pairs += [(True, False, True)] * 2 + [(True, False, False), (True, False, None)]
     verdicts = rows(pairs).iloc[[0, 2, 4, 6, 9, 11, 13, 15]]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -66,12 +67,14 @@ def export_calls(arguments: argparse.Namespace) -> int:
 
 
 def import_given(arguments: argparse.Namespace) -> int:
-    from traps_pipeline.benchmark.held_out import held_out_key
+    from traps_pipeline.benchmark.held_out import count_scoring, held_out_key
     from traps_pipeline.exchange.answer_exchange import AnswerContext, import_answers
 
     experiment = experiment_of(arguments)
     context = AnswerContext(arguments.model, arguments.run, arguments.key and held_out_key(arguments.key))
     import_result = import_answers(open_workspace(arguments), experiment, arguments.file, context, arguments.errors)
+    if arguments.key:
+        import_result = replace(import_result, scored=count_scoring(arguments.key, arguments.file))
     return _print_import(import_result, arguments, "answer")
 
 
@@ -107,5 +110,9 @@ def _print_import(imported: ImportResult, arguments: argparse.Namespace, noun: s
         print(f"{count_noun(imported.dropped, 'error message')} left out; their answers are still missing")
     if imported.failed:
         print(f"failed and still missing: {imported.failed}")
+    if imported.scored:
+        print(
+            f"{count_noun(imported.scored, 'file')} scored by this key: about 20 scores of one participant tell sides"
+        )
     print(f"next: traps run {arguments.experiment}")
     return OK

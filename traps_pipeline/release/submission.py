@@ -24,7 +24,7 @@ from traps_pipeline.base.files import write_bytes
 from traps_pipeline.base.names import Name
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.yamlfile import explain
-from traps_pipeline.benchmark.held_out import refuse_held_out
+from traps_pipeline.benchmark.held_out import begin_publication
 from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.models.asking.answer_rows import RESPONSES
@@ -109,7 +109,7 @@ def pack(workspace: Workspace, target: Path, name: str) -> About:
 
     Raises TrapsError if it is not judged or scored yet.
     """
-    refuse_held_out(workspace.root, "a submission")
+    begin_publication(workspace.root, "a submission")
     study = workspace.study
     frames = {
         "items.parquet": workspace.tables.read_all(ITEMS, dataset=SUBMITTED_DATASETS),

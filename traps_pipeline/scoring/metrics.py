@@ -126,7 +126,9 @@ def _with_scopes(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]
     is_answered = rejects_premise & ~verdicts["abstained"].astype("boolean").fillna(False)
     optional = (rejects_premise, is_answered, verdicts["overruled"].astype("boolean"))
     rejections = {name: f.astype("Int64") for name, f in zip(REJECTION_COLUMNS, optional, strict=True)}
-    flags = counts.assign(complete=is_complete, controls=is_control.astype("int64"), **outcomes, n_not_json=is_not_json, **rejections)
+    flags = counts.assign(
+        complete=is_complete, controls=is_control.astype("int64"), **outcomes, n_not_json=is_not_json, **rejections
+    )
     items = pd.concat([verdicts[[*CELL, "pair_id", "epoch", "panel", "benchmark_version"]], flags], axis=1)
     scopes = [pd.Series("all", index=items.index)]
     for prefix, columns in scoped_by.items():
