@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from tests.build.errors import raises
-from tests.conftest import Checkout, copy_of
+from tests.conftest import ROOT, Checkout, copy_of
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark import held_out
@@ -36,7 +36,8 @@ from traps_pipeline.protocol.datasets import DATASETS, TWO_EVENTS
 from traps_pipeline.protocol.two_events import LaneItem, lane_item, lane_items
 from traps_pipeline.release.content import Content, content_of
 from traps_pipeline.release.folder import Options, write_release
-from traps_pipeline.storage.benchmark_tables import VIDEOS
+from traps_pipeline.scoring.score_rows import LEADERBOARD
+from traps_pipeline.storage.benchmark_tables import ITEMS, VIDEOS
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.video.encode import decode, frames_digest
 
@@ -367,3 +368,23 @@ def test_a_private_benchmark_is_published_with_its_sides_or_held_out_and_copies_
     assert {*held_out_items(copy).values()} == {row["item_id"] for row in drawn}
     assert stat.S_IMODE(next((tmp_path / "state" / "traps").iterdir()).stat().st_mode) == 0o600
     mark_held_out(copy, drawn)
+
+
+def test_a_participant_who_answered_all_is_complete_though_a_dataset_has_no_drawn_item(tmp_path: Path) -> None:
+    study = Checkout(ROOT, tmp_path / "study")
+    study.workspace.mkdir()
+    drawn = ["occlusion:domino_chain-0001:control", "occlusion:domino_chain-0002:void"]
+    (study.workspace / MARKER).write_text(json.dumps(drawn))
+    scenarios = "scenarios: [domino_chain-0001, domino_chain-0002]\n"
+    (tmp_path / "held.yaml").write_text(
+        f"name: held\nmodels: [oracle]\nregimes: [standard]\nruns: [1]\npanel: rules\n{scenarios}"
+    )
+    study.traps("run", tmp_path / "held.yaml").ok()
+    tables = Workspace.open(study.workspace).tables
+    board = tables.read_all(LEADERBOARD)
+    columns = ["dataset", "n_pairs", "n_missing", "answered", "incomplete", "pecs", "rank"]
+    assert board[columns].to_numpy().tolist() == [["occlusion", 2, 0, 1.0, False, 1.0, 1]]
+    assert (
+        tables.state(ITEMS, {"dataset": "occlusion_ill_posed"}) and sorted(tables.read_all(ITEMS)["item_id"]) == drawn
+    )
+    assert "incomplete" not in (study.workspace / "reports" / "leaderboard.md").read_text()
