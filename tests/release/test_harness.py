@@ -171,10 +171,12 @@ def test_answers_by_opaque_name_are_imported_with_the_key_of_the_held_out_set(
         assert (refused.code, refused.raised) == (1, by + raised)
         assert [name for name in (lines[0]["item"], ids[0]) if name in refused.err] == [given_lines[0]["item"]]
     path.write_text("".join(json.dumps(line) + "\n" for line in lines))
-    scored = [json.loads(unasked.traps(*command, *keyed, "--json").ok().out) for _ in range(2)]
-    assert [(one["new"], one["known"], one["scored"]) for one in scored] == [(48, 0, 1), (0, 48, 1)]
-    (another := tmp_path / "another.jsonl").write_text(json.dumps(lines[0]) + "\n")
-    assert json.loads(unasked.traps(*command[:3], another, *command[4:], *keyed, "--json").ok().out)["scored"] == 2
+    scored = tmp_path / "key.scored"
+    for new, known in ((48, 0), (0, 48)):
+        finished = json.loads(unasked.traps(*command, *keyed, "--json").ok().out)
+        assert (finished["new"], finished["known"], len(scored.read_text().split())) == (new, known, 1)
+    path.write_text(json.dumps(lines[0]) + "\n")
+    assert " 2 files" in unasked.traps(*command, *keyed).ok().err
     assert imported_texts(workspace, "random-50", "json") == {id_: given[id_] for id_ in ids}
 
 

@@ -72,12 +72,8 @@ def drawn_items(items: Iterable[Row], key: bytes) -> list[Row]:
 
 
 def _markers(study: Path) -> list[Path]:
-    """Return where released items are noted.
-
-    These are the study's folder and, of a private benchmark, also its own and the user's, which copies share.
-    """
-    private = [] if SCENE_SPECS == OWN_SPECS else [SCENE_SPECS / MARKER, _of_user(MARKER)]
-    return [study / MARKER, *private]
+    # The user's folder is the one that copies of a study and of a private benchmark share.
+    return [study / MARKER, *([] if SCENE_SPECS == OWN_SPECS else [SCENE_SPECS / MARKER, _of_user(MARKER)])]
 
 
 def _of_user(name: str) -> Path:
@@ -106,7 +102,7 @@ def mark_held_out(study: Path, drawn: Iterable[Row]) -> None:
     """
     if SCENE_SPECS != OWN_SPECS and (note := _of_user(PUBLISHED)).is_file():
         raise TrapsError(
-            f"{note}: {note.read_text(encoding='utf-8').strip()} of this benchmark was published, which tells sides; "
+            f"{note}: {note.read_text()} of this benchmark was published, which tells sides; "
             "draw another benchmark, or delete this file if nobody has seen what was published"
         )
     items, former = {row["scenario_id"]: row["item_id"] for row in drawn}, held_out_items(study)
@@ -146,13 +142,12 @@ def begin_publication(study: Path, output: str) -> None:
             )
     if SCENE_SPECS != OWN_SPECS:
         with suppress(TrapsError):  # a home that cannot be written stops no open publication
-            write_text(_of_user(PUBLISHED), f"{output}\n")
+            write_text(_of_user(PUBLISHED), output)
 
 
 def count_scoring(key: Path, answers: Path) -> int:
     """Note a file of answers beside the key by which it was scored; return how many files were."""
     note = key.with_name(f"{key.name}.scored")
-    digests = {*note.read_text(encoding="ascii").split()} if note.is_file() else set[str]()
-    digests.add(file_digest(answers))
+    digests = {file_digest(answers), *(note.read_text().split() if note.is_file() else ())}
     write_text(note, "\n".join(sorted(digests)) + "\n", private=True)
     return len(digests)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -74,7 +74,8 @@ def import_given(arguments: argparse.Namespace) -> int:
     context = AnswerContext(arguments.model, arguments.run, arguments.key and held_out_key(arguments.key))
     import_result = import_answers(open_workspace(arguments), experiment, arguments.file, context, arguments.errors)
     if arguments.key:
-        import_result = replace(import_result, scored=count_scoring(arguments.key, arguments.file))
+        count = count_noun(count_scoring(arguments.key, arguments.file), "file")
+        print(f"scored by this key: {count}; about 20 scores of one participant tell every side", file=sys.stderr)
     return _print_import(import_result, arguments, "answer")
 
 
@@ -110,9 +111,5 @@ def _print_import(imported: ImportResult, arguments: argparse.Namespace, noun: s
         print(f"{count_noun(imported.dropped, 'error message')} left out; their answers are still missing")
     if imported.failed:
         print(f"failed and still missing: {imported.failed}")
-    if imported.scored:
-        print(
-            f"{count_noun(imported.scored, 'file')} scored by this key: about 20 scores of one participant tell sides"
-        )
     print(f"next: traps run {arguments.experiment}")
     return OK

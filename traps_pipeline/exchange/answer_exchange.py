@@ -100,15 +100,14 @@ class Answer(BaseModel):
 class ImportResult:
     """The result of an import.
 
-    New answers, answers already in the ledger, failed calls in words, which stay missing, the number of error messages
-    left out, and the number of files that a held-out set's key has scored.
+    New answers, answers already in the ledger, failed calls in words, which stay missing, and the number of error
+    messages left out.
     """
 
     new: int
     known: int
     failed: str = ""
     dropped: int = 0
-    scored: int | None = None
 
 
 @dataclass(frozen=True)
@@ -238,8 +237,12 @@ def import_answers(
         raise TrapsError(f"{path}: holds no answers; nothing was imported")
     like_errors = [key for key, answer in answers.items() if _ERROR_TEXT.match((answer.text or "")[:MAX_LOOKED_AT])]
     if like_errors and errors is None:
-        texts = [(context.name_of(requests_by_key[key]), answers[key].text) for key in like_errors]
-        raise TrapsError(_error_warning(path, texts))
+        texts = [(context.name_of(requests_by_key[key]), plain(answers[key].text)[:60]) for key in like_errors]
+        raise TrapsError(
+            f"{path}: {count_noun(len(texts), 'text')} may be an error message, not an answer "
+            f"({'; '.join(f'{item}: {text!r}' for item, text in texts[:MAX_LINES])}): say --errors drop to leave them "
+            "missing, or --errors keep if they are answers; nothing was imported"
+        )
     for key in like_errors if errors == "drop" else ():
         del answers[key]
     outcomes = [
@@ -249,15 +252,6 @@ def import_answers(
     new = asyncio.run(_store(workspace, workspace.answers, outcomes))
     failed = f"{count_noun(n_failed, 'sample')} of the log" if n_failed else ""
     return ImportResult(new, len(answers) - new, failed, dropped=len(like_errors) if errors == "drop" else 0)
-
-
-def _error_warning(path: Path, texts: Sequence[tuple[str, str | None]]) -> str:
-    """Return a message about texts, by item, that look like errors, with number and examples."""
-    examples = [f"{item}: {plain(text)[:60]!r}" for item, text in texts[:MAX_LINES]]
-    return (
-        f"{path}: {count_noun(len(texts), 'text')} may be an error message, not an answer ({'; '.join(examples)}): "
-        "say --errors drop to leave them missing, or --errors keep if they are answers; nothing was imported"
-    )
 
 
 def export_request_batches(

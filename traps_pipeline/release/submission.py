@@ -86,10 +86,7 @@ class About(_Strict):
 
 @dataclass(frozen=True)
 class Submission:
-    """A submission in memory.
-
-    altered: tables whose digest differs from `about`.
-    """
+    """A submission in memory. altered: tables whose digest differs from `about`."""
 
     path: Path
     about: About
@@ -105,10 +102,7 @@ class Submission:
 
 
 def pack(workspace: Workspace, target: Path, name: str) -> About:
-    """Write a study's submission, equal bytes for equal studies.
-
-    Raises TrapsError if it is not judged or scored yet.
-    """
+    """Write a study's submission, equal bytes for equal studies. Raises TrapsError unless it is judged and scored."""
     begin_publication(workspace.root, "a submission")
     study = workspace.study
     frames = {

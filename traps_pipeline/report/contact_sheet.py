@@ -91,7 +91,8 @@ def six_pairs(items: pd.DataFrame) -> pd.DataFrame:
 
     No two are of one sub-scenario, and their categories differ if possible; fewer if there are fewer sub-scenarios.
     """
-    visual = items.loc[items["dataset"].isin(["occlusion", "chaotic"]) & has_both_sides(items)]
+    is_whole = items.groupby("pair_id")["side"].transform("nunique") == 2  # a held-out set asks one side of each
+    visual = items.loc[items["dataset"].isin(["occlusion", "chaotic"]) & is_whole]
     pair_ids: list[str] = []
     for _, rows in visual.groupby("taxonomy", sort=True):
         pairs = rows.drop_duplicates("pair_id").sort_values(["category", "sub_scenario", "pair_id"])
@@ -101,14 +102,9 @@ def six_pairs(items: pd.DataFrame) -> pd.DataFrame:
     return visual.loc[visual["pair_id"].isin(pair_ids)]
 
 
-def has_both_sides(items: pd.DataFrame) -> pd.Series:
-    """Return by row whether its pair is whole; a held-out set asks one side of each."""
-    return items.groupby("pair_id")["side"].transform("nunique") == 2
-
-
 def whole_pairs(items: pd.DataFrame) -> list[pd.DataFrame]:
     """Return complete pairs as frames of two rows indexed by side, occlusion first."""
-    complete_items = items.loc[has_both_sides(items)]
+    complete_items = items.loc[items.groupby("pair_id")["side"].transform("nunique") == 2]
     complete_items = complete_items.assign(place=complete_items["dataset"].map(DATASETS.index)).sort_values(
         ["place", "sub_scenario", "pair_id"]
     )

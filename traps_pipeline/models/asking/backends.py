@@ -74,7 +74,6 @@ class _PluginBackend:
     backend: Backend
 
     async def ask(self, request: Request) -> Outcome:
-        """Return its outcome. Raises TrapsError for what is none."""
         try:
             outcome = await self.backend.ask(request)
         except (TransientError, TimeoutError):

@@ -91,10 +91,7 @@ class SiteSummary:
 
 
 def site_files(workspace: Workspace) -> dict[str, bytes]:
-    """Return the explorer's files by path, for a folder beside the study's clips.
-
-    Raises TrapsError without items.
-    """
+    """Return the explorer's files by path, for a folder beside the study's clips. Raises TrapsError without items."""
     answers, scenarios = study_answers(workspace), _scenarios(workspace)
     return _files(workspace, answers, scenarios, {*_clip_names(answers.items, scenarios)}, "../", report=True)
 
