@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import get_args
 
 from traps_pipeline.base.extras import require
@@ -82,6 +82,7 @@ class _PluginBackend:
             raise self.plugin.error(f"failed ({type(error).__name__}: {error})") from error
         if not isinstance(outcome, Outcome) or outcome.kind not in get_args(OutcomeKind):
             raise self.plugin.error(f"answered with {str(outcome)[:80]!r} in place of an Outcome")
-        if fields := replace_impossible({"outcome": outcome.kind, **vars(outcome)}):
+        row = {"outcome": outcome.kind, **vars(outcome)}
+        if fields := [name for name in replace_impossible(row) if row[name] is None]:
             raise self.plugin.error(f"answered with an impossible {fields[0]}")
-        return outcome
+        return replace(outcome, text=row["text"])  # without half characters
