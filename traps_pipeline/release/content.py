@@ -155,10 +155,7 @@ def item_rows(content: Content) -> list[ReleasedItemRow]:
 
 
 def held_out_rows(items: Rows, digests: Mapping[str, str], key: bytes, canary: str) -> list[HeldOutItemRow]:
-    """Return one row per item, sorted by opaque name; no field reveals the answer.
-
-    digests: of each item's own clip.
-    """
+    """Return one row per item, sorted by opaque name; no field reveals the answer. digests: of each item's own clip."""
     rows = [
         HeldOutItemRow(
             item=opaque(key, row["item_id"]),

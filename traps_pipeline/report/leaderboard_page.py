@@ -232,10 +232,7 @@ def _trace(row: Mapping[str, Any], field: str) -> SourceItems | None:
 
 
 def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.DataFrame:
-    """Return one row per (model, regime), best first.
-
-    Without a row of the dataset, counts are sums over all rows.
-    """
+    """Return one row per (model, regime), best first. Without a row of the dataset, counts are sums over all rows."""
     rows, entries = [], dict[tuple[str, str], dict[str, dict[str, Any]]]()
     for row in null_single_deviations(board).to_dict("records"):
         entries.setdefault((row["model"], row["regime"]), {})[row["dataset"]] = row

@@ -24,7 +24,7 @@ import pyarrow.parquet as pq
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
-from traps_pipeline.benchmark.held_out import refuse_held_out
+from traps_pipeline.benchmark.held_out import begin_publication
 from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.people.human_score_rows import HUMAN_ROW, PANEL_ERRORS
@@ -91,10 +91,7 @@ class SiteSummary:
 
 
 def site_files(workspace: Workspace) -> dict[str, bytes]:
-    """Return the explorer's files by path, for a folder beside the study's clips.
-
-    Raises TrapsError without items.
-    """
+    """Return the explorer's files by path, for a folder beside the study's clips. Raises TrapsError without items."""
     answers, scenarios = study_answers(workspace), _scenarios(workspace)
     return _files(workspace, answers, scenarios, {*_clip_names(answers.items, scenarios)}, "../", report=True)
 
@@ -106,7 +103,7 @@ def write_site(workspace: Workspace, folder: Path, *, clips: bool = True) -> Sit
     written last. clips: include clips, as hard links if the file system allows it, else as copies. Raises TrapsError if
     the folder holds something else, or the study has no items.
     """
-    refuse_held_out(workspace.root, "the explorer")
+    begin_publication(workspace.root, "the explorer")
     previous_files = _former_files(folder)
     answers, scenarios = study_answers(workspace), _scenarios(workspace)
     names = _clip_names(answers.items, scenarios) if clips else []
