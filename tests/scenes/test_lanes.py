@@ -10,12 +10,20 @@ import numpy as np
 import pytest
 
 from traps_pipeline.benchmark.filmed_lanes import trajectories_of
-from traps_pipeline.benchmark.lane_balance import auc, balance, lane_numbers
+from traps_pipeline.benchmark.lane_balance import auc, balance, lane_numbers, telling_numbers
 from traps_pipeline.benchmark.records import two_events_lines
 from traps_pipeline.protocol.two_events import CLIPS
 from traps_pipeline.scenes.certification.certify_lanes import certify_lane_record, certify_lanes
-from traps_pipeline.scenes.draw.draw_lanes import LEFT_OUT, DrawnLanes, draw_timetable, draw_two_events, lane_families
+from traps_pipeline.scenes.draw.draw_lanes import (
+    LEFT_OUT,
+    DrawnLanes,
+    difficulty_of,
+    draw_timetable,
+    draw_two_events,
+    lane_families,
+)
 from traps_pipeline.scenes.family_registry import families
+from traps_pipeline.scenes.parts.difficulty import Difficulty
 from traps_pipeline.scenes.picture.render import Renderer
 from traps_pipeline.scenes.worlds.lane_layout import fit_lanes
 from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
@@ -145,6 +153,20 @@ def test_a_released_record_is_certified_from_its_trajectories_and_an_altered_one
     assert "lanes" in certify_lane_record(spec, worlds | {"left": worlds["qpos"]}).failures  # a twin that ends alike
 
 
+@pytest.mark.slow
+def test_a_level_is_drawn_in_both_lanes_and_in_their_twins_and_read_back_from_the_record():
+    difficulty = Difficulty(distractors=2, speed=1.5)
+    *_, last = draw_two_events("slide", 1, 7, difficulty)
+    assert isinstance(last, DrawnLanes)
+    record = last.spec.model_dump(mode="json")
+    assert difficulty_of(record) == difficulty and difficulty_of(drawn("slide").model_dump(mode="json")) == Difficulty()
+    world, twins = worlds(last.spec)
+    names = {f"{lane} distractor_{n}" for lane in ("left", "right") for n in range(2)}
+    for each in (world, *twins):
+        assert names <= {each.model.body(i).name for i in range(each.model.nbody)}
+        assert each.physics.speed == 1.5
+
+
 # --- items ------------------------------------------------------------------------------------------------------------
 
 
@@ -166,6 +188,21 @@ def test_both_sides_have_the_same_boards():
     table = balance(lane_numbers([drawn("slide"), drawn("drop_split")])).set_index("number")
     boards = table[table.index.str.startswith("boards")]
     assert len(boards) == 8 and (boards["seen"] == boards["hidden"]).all() and (boards["auc"] == 0.5).all()
+
+
+def test_what_tells_the_sides_of_one_family_is_named_though_it_tells_nothing_over_all():
+    few = lane_families()[::4]
+    specs = [line.spec for line in two_events_lines().values() if line.family in {*few, "slide"}]
+    assert telling_numbers(specs) == []
+
+    def doubled(spec: TwoEventsSpec) -> TwoEventsSpec:
+        parts = [part | {"hidden": part["seen"] | {"alike_px": [9e9] * 6}} for part in spec.evidence["in_view"]]
+        return spec.model_copy(update={"evidence": spec.evidence | {"in_view": parts}})
+
+    planted = [doubled(spec) if spec.family == "slide" else spec for spec in specs]
+    found = telling_numbers(planted)
+    assert len(found) == 6 and all("alike_px" in line and "of slide" in line and "AUC 1.00" in line for line in found)
+    assert telling_numbers([spec for spec in planted if spec.family != "slide" or spec.scenario_id[-1] == "1"]) == []
 
 
 def test_the_share_of_pairs_in_which_the_hidden_one_has_more_counts_ties_by_half():

@@ -65,8 +65,8 @@ def sample_benchmark(
             reasons = ", ".join(f"{n} x {reason}" for reason, n in tally.rejected.most_common()) or "none rejected"
             report(f"{family}: {count} of {count_noun(tally.draws, 'draw')}; {reasons}")
         names = [family for family in lane_families() if family in counts]
-        folder = out / "two_events" / "released"
-        lanes = sample_two_events(names, two_events, seed, folder, workers=workers, report=report) if two_events else 0
+        drawn = (names, two_events, seed, out / "two_events" / "released", difficulty)
+        lanes = sample_two_events(*drawn, workers=workers, report=report) if two_events else 0
     if not (out / "benchmark.yaml").exists():
         release = {"name": name, "version": "1.0.0", "canary": f"{name.upper()}:CANARY:{uuid.uuid4()}"}
         write_text(out / "benchmark.yaml", yaml.safe_dump(release, sort_keys=False))

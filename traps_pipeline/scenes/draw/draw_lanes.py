@@ -20,6 +20,7 @@ from traps_pipeline.protocol.two_events import LANES
 from traps_pipeline.scenes.certification.certify_lanes import certify_lanes, pixels_of
 from traps_pipeline.scenes.draw.resolve import plain
 from traps_pipeline.scenes.family_registry import families, get_family
+from traps_pipeline.scenes.parts.difficulty import DEFAULT_DIFFICULTY, Difficulty, SceneDifficulty, draw_distractors
 from traps_pipeline.scenes.parts.look import Look, draw_look
 from traps_pipeline.scenes.physics.kit import COLOURS, LOOK_ALIKE, Family, Wording, params_to_dict, uniform
 from traps_pipeline.scenes.worlds.lane_event import LaneEvent
@@ -65,21 +66,23 @@ class DrawnLanes:
     worlds: Mapping[str, np.ndarray]
 
 
-def draw_two_events(family_name: str, number: int, seed: int) -> Iterator[DrawnLanes | Rejected]:
+def draw_two_events(
+    family_name: str, number: int, seed: int, difficulty: Difficulty = DEFAULT_DIFFICULTY
+) -> Iterator[DrawnLanes | Rejected]:
     """Yield why draws are rejected, and at last the scenario, if there is one."""
     for attempt in range(TRIES):
         rng = np.random.default_rng([seed, *family_name.encode(), number, attempt])
         try:
-            yield _scenario(get_family(family_name), number, rng, seed)
+            yield _scenario(get_family(family_name), number, rng, seed, difficulty)
         except Rejected as failure:
             yield failure
         else:
             return
 
 
-def _scenario(family: Family, number: int, rng: np.random.Generator, seed: int) -> DrawnLanes:
-    first = _event(family, rng, None)
-    pairs = [first, _event(family, rng, first[0].params)][:: 1 if rng.integers(2) else -1]
+def _scenario(family: Family, number: int, rng: np.random.Generator, seed: int, difficulty: Difficulty) -> DrawnLanes:
+    first = _event(family, rng, None, difficulty)
+    pairs = [first, _event(family, rng, first[0].params, difficulty)][:: 1 if rng.integers(2) else -1]
     wording, look = _wording(pairs, int(rng.integers(2**31))), draw_look(rng, LOOKS)
     for k, pair in enumerate(pairs):  # which of its two worlds a lane shows is no matter of chance
         place = [wording.labels.index(event.outcome.answer) for event in pair]
@@ -87,6 +90,8 @@ def _scenario(family: Family, number: int, rng: np.random.Generator, seed: int) 
             pair if (place[0] < place[1]) == is_turn_of_earlier(family.name, number, k, seed) else (pair[1], pair[0])
         )
     assert look is not None
+    if difficulty.distractors:
+        pairs = [_with_distractors(pair, wording, difficulty, rng) for pair in pairs]
     above = [bool(number & 1), bool((number + 1 ^ number >> 1) & 1)]  # each arrangement once in four scenarios
     strips = _strips(wording, pairs, rng)
     lanes = [_lane(pair, strip, up, rng) for pair, strip, up in zip(pairs, strips, above, strict=True)]
@@ -115,7 +120,7 @@ def _scenario(family: Family, number: int, rng: np.random.Generator, seed: int) 
         category=family.category,
         family=family.name,
         seed=seed,
-        physics=physics_record(family.physics),
+        physics=physics_record(world.physics),
         camera=plain(asdict(world.camera)),
         look=plain(asdict(look)),
         lanes=(records[0], records[1]),
@@ -129,7 +134,8 @@ def _scenario(family: Family, number: int, rng: np.random.Generator, seed: int) 
     return DrawnLanes(spec, {"qpos": world.qpos, "left": twins[0].qpos, "right": twins[1].qpos})
 
 
-Pairs = Sequence[tuple[LaneEvent, LaneEvent]]  # of each lane, its event and the twin
+Pair = tuple[LaneEvent, LaneEvent]  # a lane's event and its twin
+Pairs = Sequence[Pair]
 
 
 def _worlds(lanes: Sequence[Lane], pairs: Pairs, look: Look) -> tuple[TwoLanes, TwoLanes, TwoLanes]:
@@ -155,17 +161,20 @@ def _sizes(worlds: Sequence[TwoLanes]) -> list[float]:
     return sizes
 
 
-def _event(family: Family, rng: np.random.Generator, like: Any) -> tuple[LaneEvent, LaneEvent]:
+def _event(family: Family, rng: np.random.Generator, like: Any, difficulty: Difficulty) -> Pair:
     """Return an event and its twin; like: the other lane's parameters, whose colours and view it takes."""
     assert family.twins is not None, f"{family.name}: an occlusion family needs twins"
+    physics = replace(family.physics, speed=difficulty.speed)
     for _ in range(EVENTS):
-        params = replace(family.draw(rng), azimuth_deg=90.0)
+        params = replace(family.draw(rng, difficulty.longer), azimuth_deg=90.0)
         view = float(np.clip(params.elevation_deg, *ELEVATION_DEG)) if like is None else like.elevation_deg
         params = replace(params, elevation_deg=view)
         if like is not None:
             alike = {m.name: value for m in fields(like) if _is_colour(value := getattr(like, m.name))}
             params = replace(params, **alike)
-        event, *twins = (LaneEvent(family, p, family.physics) for p in (params, *family.twins(params)))
+        if difficulty.longer:
+            params = replace(params, difficulty=SceneDifficulty(longer=True))
+        event, *twins = (LaneEvent(family, p, physics) for p in (params, *family.twins(params)))
         try:
             others = [twin for twin in twins if _settles(event) and _settles(twin)]
             others = [twin for twin in others if twin.outcome.label != event.outcome.label]
@@ -174,6 +183,16 @@ def _event(family: Family, rng: np.random.Generator, like: Any) -> tuple[LaneEve
         if others:
             return event, others[int(rng.integers(len(others)))]
     raise Rejected("no draw settles in time, with a twin that ends otherwise")
+
+
+def _with_distractors(pair: Pair, wording: Wording, difficulty: Difficulty, rng: np.random.Generator) -> Pair:
+    """Return an event and its twin with the same distractors."""
+    event, points = pair[0], np.concatenate([each.points for each in pair])
+    duration_s = event.physics.duration_s * event.physics.speed
+    things = draw_distractors(rng, difficulty.distractors, event.scene, points, wording, event.params, duration_s)
+    added = SceneDifficulty(things, difficulty.longer)
+    one, other = (replace(each, params=replace(each.params, difficulty=added)) for each in pair)
+    return one, other
 
 
 def is_turn_of_earlier(family: str, number: int, lane: int, seed: int) -> bool:
@@ -248,20 +267,20 @@ def sample_two_events(
     count: int,
     seed: int,
     released: Path,
+    difficulty: Difficulty = DEFAULT_DIFFICULTY,
     *,
     workers: int | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> int:
     """Draw `count` scenarios of each family into `released`; return how many there are.
 
-    Each is written at once, and stays where it was drawn from the same seed: a stopped call goes on. report: gets a
-    line for each scenario. Raises TrapsError for a place that no draw fills.
+    Each is written at once, and stays where it was drawn from the same seed and settings: a stopped call goes on.
+    report: gets a line for each scenario. Raises TrapsError for a place that no draw fills.
     """
-    existing = {name: _drawn_before(released / f"{name}.jsonl", seed) for name in names}
-    jobs = [
-        (name, k, seed) for name, lines in existing.items() for k in range(1, count + 1) if _id(name, k) not in lines
-    ]
-    for (name, number, _), (drawn, rejected) in run_in_order(_draw, jobs, workers):
+    existing = {name: _drawn_before(released / f"{name}.jsonl", seed, difficulty) for name in names}
+    places = [(name, k) for name, lines in existing.items() for k in range(1, count + 1) if _id(name, k) not in lines]
+    jobs = [(*place, seed, difficulty) for place in places]
+    for (name, number, *_), (drawn, rejected) in run_in_order(_draw, jobs, workers):
         reasons = ", ".join(f"{n} x {reason}" for reason, n in Counter(rejected).most_common())
         if drawn is None:
             raise TrapsError(f"{_id(name, number)}: no draw of {TRIES} makes a scenario ({reasons}); take another seed")
@@ -273,17 +292,26 @@ def sample_two_events(
     return sum(map(len, existing.values()))
 
 
-def _drawn_before(path: Path, seed: int) -> dict[str, str]:
-    """Return lines of records of a seed by id; a file of another seed counts as none."""
+def _drawn_before(path: Path, seed: int, difficulty: Difficulty) -> dict[str, str]:
+    """Return lines of records of a seed and its settings by id; a file of another seed counts as none."""
     lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-    return {record["scenario_id"]: line for line in lines if (record := json.loads(line))["seed"] == seed}
+    records = [(line, json.loads(line)) for line in lines]
+    drawn_as = (seed, difficulty)
+    return {each["scenario_id"]: line for line, each in records if (each["seed"], difficulty_of(each)) == drawn_as}
+
+
+def difficulty_of(record: Mapping[str, Any]) -> Difficulty:
+    """Return the settings with which a record was drawn."""
+    drawn = record["lanes"][0]["params"].get("difficulty") or {}
+    speed = record["physics"].get("speed", DEFAULT_DIFFICULTY.speed)
+    return Difficulty(len(drawn.get("distractors", ())), speed, drawn.get("longer", False))
 
 
 def _id(family: str, number: int) -> str:
     return f"{family}-e{number:03d}"
 
 
-def _draw(job: tuple[str, int, int]) -> tuple[DrawnLanes | None, list[str]]:
+def _draw(job: tuple[str, int, int, Difficulty]) -> tuple[DrawnLanes | None, list[str]]:
     """Return a scenario, if there is one, and why earlier draws are rejected."""
     *rejected, last = draw_two_events(*job)
     return (last, [*map(str, rejected)]) if isinstance(last, DrawnLanes) else (None, [*map(str, rejected), str(last)])

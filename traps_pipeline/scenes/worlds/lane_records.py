@@ -13,6 +13,7 @@ from traps_pipeline.base.digests import digest
 from traps_pipeline.protocol.two_events import LANES, LaneItem, lane_items
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.parts.look import Look
+from traps_pipeline.scenes.parts.wording import lane_question
 from traps_pipeline.scenes.physics.kit import Physics
 from traps_pipeline.scenes.picture.camera import WideCamera
 from traps_pipeline.scenes.worlds.lane_event import LaneEvent
@@ -116,8 +117,3 @@ class LaneQuestion:
     def answer(self) -> str | None:
         """The right answer; None where it must be abstained on."""
         return None if self.item.asked_hidden else self.outcome
-
-
-def lane_question(strip: str, question: str) -> str:
-    """Return a family's question about the lane with a strip."""
-    return f"In the lane with the {strip} strip, leaving its bench aside: {question[0].lower()}{question[1:]}"
