@@ -85,8 +85,7 @@ def fit_lanes(lanes: Sequence[Lane], worlds: Sequence[Sequence[LaneEvent]]) -> t
     covers = [box_around([event.cover.corners() for event in events]).corners() for events in worlds]
     view = replace(worlds[0][0].scene.view, azimuth_deg=90.0)
     down = np.radians(-view.elevation_deg)
-    # Doubles move as in one of both worlds, whichever is shown: or how they come would tell what is hidden.
-    moves = [min(events, key=lambda event: event.outcome.answer) for events in worlds]
+    moves = [min(events, key=lambda event: event.outcome.answer) for events in worlds]  # whichever of both is shown
     benches = [_first_bench(lane.bench_above, shown, down) for lane, shown in zip(lanes, points, strict=True)]
     half = max(float(np.ptp(shown[:, 0])) for shown in points) / 2 + GAP_M / 2
     layouts: list[Layout] = []
