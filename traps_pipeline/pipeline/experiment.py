@@ -18,7 +18,7 @@ from traps_pipeline.models.registry.user_registry import UserRegistry, add_entri
 from traps_pipeline.pipeline.wanted import evaluations_of
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.protocol.datasets import DATASETS, SCHEMAS, UNPAIRED
-from traps_pipeline.protocol.regimes import BY_NAME, PAPER_REGIMES, REGIMES
+from traps_pipeline.protocol.regimes import BY_NAME, PAPER_REGIMES, REGIMES, fields_of
 from traps_pipeline.storage.study import Asked, MechanismSettings, Settings, Study
 
 EXPERIMENTS = ASSETS / "experiments"
@@ -103,6 +103,11 @@ class Experiment(Settings):
         fields += ("allow_unknown_prices", "mechanism", "judged_by_rules")
         values = {name: getattr(self, name) for name in fields}
         return Study(**{name: value for name, value in values.items() if value is not None})
+
+    @property
+    def is_structured(self) -> bool:
+        """Whether a model is asked for an object of a schema, in any of its calls."""
+        return self.canary or any(fields_of(r, d) for r in self.regimes for d in self.datasets)
 
     @property
     def asked(self) -> Asked:
