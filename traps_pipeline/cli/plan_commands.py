@@ -8,7 +8,7 @@ from math import comb
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.terminal import text_table, wrap_text
+from traps_pipeline.base.terminal import plain, text_table, wrap_text
 from traps_pipeline.base.wording import count_noun, in_percent
 from traps_pipeline.cli.command import (
     OK,
@@ -16,6 +16,7 @@ from traps_pipeline.cli.command import (
     add_experiment,
     add_panel,
     experiment_of,
+    ledger_faults,
     load_definitions,
     open_workspace,
     place_of,
@@ -57,11 +58,14 @@ def plan(arguments: argparse.Namespace) -> int:
     # An experiment that the study does not hold in this form wants other partitions, which a run would add.
     is_held = workspace is not None and workspace.study.experiments.get(experiment.name) == experiment.asked
     stages = [status for status in run_plan.statuses() if status.to_make] if run_plan and is_held else []
+    faults = ledger_faults(workspace) if workspace else []
     if arguments.json:
-        head = {"experiment": experiment.name, "workspace": str(place) if workspace else None}
+        head = {"experiment": experiment.name, "workspace": str(place) if workspace else None, "ledger": faults}
         print_json(head | {"plan": plan_counts, "stages": stages})
         return OK
     total = (Count(), Count())
+    for fault in faults:
+        print(wrap_text(plain(fault)))
     location = place if workspace else "a new workspace"
     print(wrap_text(f"{experiment.name} in {location}: calls wanted, known (in the ledger), new"))
     rows = {**plan_counts.calls, **{f"{model}, steered": counts for model, counts in plan_counts.steered.items()}}

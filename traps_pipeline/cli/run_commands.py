@@ -103,6 +103,7 @@ def run(arguments: argparse.Namespace) -> int:
     from traps_pipeline.cli.printed_progress import make_progress
 
     experiment = experiment_of(arguments)
+    _check_options(arguments)
     workspace = create(arguments, experiment, money=_money(experiment, arguments))
     stream = sys.stderr if arguments.json else sys.stdout
     title = f"{experiment.name}: {experiment.description}" if experiment.description else experiment.name
@@ -148,6 +149,19 @@ def run(arguments: argparse.Namespace) -> int:
         command = shlex.join(["traps", "run", arguments.experiment, *workspace_option])
         print(wrap_text(f"next: `{command}` for the stages after {arguments.until}"))
     return OK
+
+
+def _check_options(arguments: argparse.Namespace) -> None:
+    """Raise TrapsError, before a workspace is made, for unknown stages and a missing package."""
+    if arguments.until is not None:
+        load_definitions()
+        from traps_pipeline.pipeline.run_plan import stages_until
+
+        stages_until(arguments.until)
+    if arguments.cluster:
+        from traps_pipeline.storage.several_hosts import several_hosts
+
+        several_hosts()
 
 
 def _goes_on(arguments: argparse.Namespace, unchecked: str) -> bool:

@@ -12,8 +12,9 @@ from traps_pipeline.base.names import Name
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.base.yamlfile import name_file_in_errors, parse_yaml_model, read_yaml
+from traps_pipeline.benchmark.corrections import corrected_scenarios, current_benchmark, subset
 from traps_pipeline.models.registry.entries import LOCAL, get_model, local_models
-from traps_pipeline.models.registry.judges import require_panel
+from traps_pipeline.models.registry.judges import load_panel, require_panel
 from traps_pipeline.models.registry.user_registry import UserRegistry, add_entries
 from traps_pipeline.pipeline.wanted import evaluations_of
 from traps_pipeline.protocol.cells import Cell
@@ -170,6 +171,10 @@ def load_experiment(name: str) -> Experiment:
     with name_file_in_errors(path):
         for model in experiment.models:
             get_model(model)
+        for panel in dict.fromkeys((*experiment.own.panels, *([experiment.panel] if experiment.panel else []))):
+            load_panel(panel)
+        if experiment.scenarios is not None and experiment.benchmark == current_benchmark():
+            subset(corrected_scenarios(), experiment.study)
         for model in experiment.mechanism.models if experiment.mechanism else ():
             if get_model(model).backend != LOCAL:
                 raise TrapsError(

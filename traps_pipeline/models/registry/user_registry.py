@@ -46,6 +46,9 @@ class UserRegistry(BaseModel):
     def _have_ids(cls, values: list[dict[str, Any]]) -> list[dict[str, Any]]:
         if not all(isinstance(value.get("id"), str) for value in values):
             raise ValueError("each entry has an `id`, a word in lower case with hyphens")
+        names = [value["id"] for value in values]
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise ValueError(f"{twice[0]!r} is named twice; leave one out")
         for value in values:
             for name in SHORT_FIELDS[:2]:
                 if name in value and not (isinstance(value[name], str) and value[name].strip()):

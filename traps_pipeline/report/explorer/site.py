@@ -33,7 +33,7 @@ from traps_pipeline.protocol.metric_words import METRIC_WORDS
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.report.explorer.answer_shards import StudyAnswers, study_answers
 from traps_pipeline.report.explorer.scenario_words import certificate_phrases, closes_frame, intervention
-from traps_pipeline.report.leaderboard_page import legend, provenance
+from traps_pipeline.report.leaderboard_page import OPTIONAL, legend, provenance, shortfall
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.tables.human_tables import people_notes
 from traps_pipeline.report.tables.table_columns import entries
@@ -217,6 +217,12 @@ def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_c
             {"field": m.name, "title": m.heading, "unit": m.unit, "in_paper": m.name in printed_by_paper}
             for m in METRIC_WORDS.values()
         ],
+        "counts": [
+            {"field": column.field, "title": column.heading, "unit": column.unit}
+            for column, field in OPTIONAL.items()
+            if len(board) and column.unit != "range" and (board[field].astype(float) > 0).any()
+        ],
+        "shortfall": shortfall(board) if len(board) else "",
         "robust_figures": [{"field": name, "title": title, "unit": unit} for name, title, unit, _ in ROBUST_FIGURES],
         "leaderboard": records(board),
         "robust": records(robust),
