@@ -43,7 +43,7 @@ def test_what_is_missing_is_null_and_tables_are_lists_of_rows(capsys: pytest.Cap
     }
 
 
-def test_a_study_is_read_without_its_tables(small: Checkout) -> None:
+def test_a_study_is_read_without_its_tables(small: Checkout, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plan = read(small, "plan", EXPERIMENT)
     assert plan["plan"]["calls"]["oracle"][0] == {"wanted": 96, "known": 96}
     why = read(small, "why", ITEM)
@@ -58,7 +58,10 @@ def test_a_study_is_read_without_its_tables(small: Checkout) -> None:
     assert elsewhere["command"] == f"traps run {EXPERIMENT} --workspace {small.workspace}"
     # The study does not say where the file of its experiment lies.
     job = "dagster job execute -m traps_pipeline.definitions -j everything"
-    assert read(small, "status")["command"] == job
+    assert read(small, "status")["command"] == job and status["ledger"] == []
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "small.yaml").touch()  # the current folder may hold it
+    assert read(small, "status")["command"] == "traps run small.yaml"
 
 
 def test_a_site_says_what_it_holds(small: Checkout, tmp_path: Path) -> None:

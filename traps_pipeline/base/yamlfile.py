@@ -126,10 +126,11 @@ def name_file_in_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except TrapsError as error:
-        if str(error).startswith(f"{path}:"):
+        text = str(error).removeprefix(f"{path}: ")
+        if text.startswith(f"{path}:"):
             raise
-        word = _QUOTED.search(str(error))
-        raise TrapsError(f"{place_of(path, [], word[1] if word else '')}: {error}") from error
+        word = _QUOTED.search(text)
+        raise TrapsError(f"{place_of(path, [], word[1] if word else '')}: {text}") from error
 
 
 def place_of(path: Path, keys: Sequence[int | str], word: str = "") -> str:
