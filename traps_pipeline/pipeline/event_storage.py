@@ -1,9 +1,9 @@
 """Speed up Dagster's SQLite storage fourfold by persistent connections.
 
-For each event Dagster makes an engine, which compiles its statements anew, opens and closes the file, and looks up
-which tables and columns there are. Here the engine of a file is kept, and so is what was there. Its commits go to
-SQLite's write-ahead log beside the file, which Dagster's pages do not watch, so each commit that changes something also
-touches the file. `dagster.yaml` names this class; a study may name another storage in its own `dagster.yaml`.
+For each event Dagster makes an engine, which compiles its statements anew, and opens and closes the file. Here the
+engine of a file is kept. Its commits go to SQLite's write-ahead log beside the file, which its pages do not watch,
+so each commit that changes something also touches the file. `dagster.yaml` names this class; a study may name another
+storage in its own `dagster.yaml`. `bench/event_storage.py` compares both: it goes once it no longer pays.
 """
 
 import contextlib
@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import sqlalchemy as db
-from dagster._core.storage.event_log import AssetKeyTable, SqliteEventLogStorage
+from dagster._core.storage.event_log import SqliteEventLogStorage
 from dagster._core.storage.sqlite_storage import (
     DagsterSqliteStorage,
     SqliteRunStorage,  # pyright: ignore[reportPrivateImportUsage] - a part of the storage, of another module
@@ -75,7 +75,6 @@ class _EventStorage(SqliteEventLogStorage):
     def __init__(self, base_dir: str) -> None:
         self._engines: dict[str, db.Engine] = {}
         self._engines_lock = threading.Lock()  # threads of a web server ask at once
-        self._there: set[str] = set()  # tables, and columns of assets: what is there stays
         super().__init__(base_dir)
 
     @contextlib.contextmanager
@@ -113,17 +112,6 @@ class _EventStorage(SqliteEventLogStorage):
                     self._engines.pop(next(iter(self._engines))).dispose()
                 self._engines[shard] = _persistent_engine(self.conn_string_for_shard(shard))
             return self._engines[shard]
-
-    def has_table(self, table_name: str) -> bool:
-        if table_name not in self._there and super().has_table(table_name):
-            self._there.add(table_name)
-        return table_name in self._there
-
-    def _has_asset_key_col_on_connection(self, conn: db.Connection, column_name: str) -> bool:
-        column = f"{AssetKeyTable.name}.{column_name}"
-        if column not in self._there and super()._has_asset_key_col_on_connection(conn, column_name):
-            self._there.add(column)
-        return column in self._there
 
     def dispose(self) -> None:
         super().dispose()
