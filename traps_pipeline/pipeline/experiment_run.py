@@ -44,7 +44,8 @@ def run_experiment(
     plan = RunPlan(workspace, experiment.name, stages_until(until))
     plan.require_work(until)
     if plan.is_nothing_to_do():
-        return RunReport(plan.failed_checks())
+        warnings = plan.failed_checks(blocking=False)
+        return RunReport(plan.failed_checks() + warnings, warnings)
     from traps_pipeline.pipeline.machine import pending_entries, require_machine
     from traps_pipeline.pipeline.run import dagster_history, materialize_stale
 
