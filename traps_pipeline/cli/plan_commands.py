@@ -22,6 +22,7 @@ from traps_pipeline.cli.command import (
     place_of,
     print_json,
 )
+from traps_pipeline.protocol.datasets import taxonomy_of
 
 if TYPE_CHECKING:
     from traps_pipeline.mechanism.cost import Cost
@@ -108,10 +109,24 @@ def _print_precision(pairs: Mapping[str, int], models: int) -> None:
             f"FalseAbs {false_abs} (PECS {example.pecs:.2f}) gets a 95 % interval of PECS about {expected.width:.3f} "
             f"wide; {_power(expected.difference, 'two models with unrelated answers')}"
         )
+        if (balanced := _balanced(pairs, models)) and balanced[1] < (expected.difference or 2.0):
+            text += f"; as many scenarios, but {balanced[0]} of each taxonomy, find one of {balanced[1]:.3f}"
         if models > 2:
             all_models = f"two of {models} models, after Holm's correction over their {comb(models, 2)} comparisons"
             text += f"\n{_power(expected.among_all, all_models)}"
         print(wrap_text(text))
+
+
+def _balanced(pairs: Mapping[str, int], models: int) -> tuple[int, float] | None:
+    """Return scenarios of each taxonomy and what they detect, if one has less than half of the other's."""
+    from traps_pipeline.scoring.power import precision
+
+    sizes = {taxonomy_of(name): count for name, count in pairs.items() if count}
+    if len(sizes) != 2 or 2 * min(sizes.values()) > max(sizes.values()):
+        return None
+    half = sum(sizes.values()) // 2
+    difference = precision({name: half for name, count in pairs.items() if count}, models=models).difference
+    return None if difference is None else (half, difference)
 
 
 def _power(least: float | None, models: str) -> str:
