@@ -139,36 +139,28 @@ def place_of(path: Path, keys: Sequence[int | str], word: str = "") -> str:
     word: the value of a scalar, or the name or `id` of a mapping, somewhere in the file; the keys begin there.
     """
     try:
-        node = yaml.compose(path.read_text(encoding="utf-8"), Loader=_SAFE)
+        nodes = {keys: (value, line) for keys, value, line in _nodes(yaml.compose(path.read_text("utf-8"), _SAFE))}
     except (OSError, UnicodeDecodeError, yaml.YAMLError):
         return str(path)
-    if node is None or (word and (node := _named(node, word)) is None):
+    named = (place for place, (value, _) in nodes.items() if word in (value, *place[-1:]))
+    if (place := next(named, None) if word else () if nodes else None) is None:
         return str(path)
-    line = node.start_mark.line
-    for key in keys:
-        if isinstance(node, yaml.SequenceNode) and isinstance(key, int) and key < len(node.value):
-            node = node.value[key]
-        elif isinstance(node, yaml.MappingNode):
-            pairs = (pair for pair in node.value if pair[0].value == str(key))
-            if (pair := next(pairs, None)) is None:
-                continue
-            line, node = pair[0].start_mark.line, pair[1]
-            continue
-        line = node.start_mark.line
-    return f"{path}:{line + 1}"
+    place = place[:-1] if place[-1:] == ("id",) else place
+    for key in map(str, keys):
+        place = (*place, key) if (*place, key) in nodes else place
+    return f"{path}:{nodes[place][1]}"
 
 
-def _named(node: yaml.Node, word: str) -> yaml.Node | None:
-    """Return the scalar of this value, or the mapping of this name or `id`."""
-    if isinstance(node, yaml.ScalarNode):
-        return node if node.value == word else None
+def _nodes(node: yaml.Node | None, *keys: str, line: int = 0) -> Iterator[tuple[tuple[str, ...], str, int]]:
+    """Yield keys, value (of a scalar) and line of a node and of all below it."""
+    if node is not None:
+        yield keys, node.value if isinstance(node, yaml.ScalarNode) else "", line or node.start_mark.line + 1
     if isinstance(node, yaml.MappingNode):
-        if any((key.value, value.value) == ("id", word) for key, value in node.value):
-            return node
-        if named := next((value for key, value in node.value if key.value == word), None):
-            return named
-    members = [value for _, value in node.value] if isinstance(node, yaml.MappingNode) else node.value
-    return next((found for member in members if (found := _named(member, word)) is not None), None)
+        for key, value in node.value:
+            yield from _nodes(value, *keys, str(key.value), line=key.start_mark.line + 1)
+    elif isinstance(node, yaml.SequenceNode):
+        for number, value in enumerate(node.value):
+            yield from _nodes(value, *keys, str(number))
 
 
 def _complaint(error: Exception) -> str:

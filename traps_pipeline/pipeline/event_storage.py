@@ -8,11 +8,8 @@ storage in its own `dagster.yaml`. `bench/event_storage.py` compares both: it go
 
 import contextlib
 import os
-import sqlite3
 import threading
 from collections.abc import Iterator
-from importlib.metadata import version
-from pathlib import Path
 from typing import Any, cast
 
 import sqlalchemy as db
@@ -25,10 +22,8 @@ from sqlalchemy.event import listen
 from sqlalchemy.exc import DBAPIError, OperationalError
 
 from traps_pipeline.base.databases import reason_and_remedy
-from traps_pipeline.base.files import write_bytes
 
 OPEN_FILES = 32  # at most: each run has a file of its own, and a server sees many
-_INDEX = "index"  # the file of all runs' events of assets; each run has another
 _BUSY_S = 30  # wait for another process's lock, as long as Dagster itself
 
 
@@ -81,7 +76,7 @@ class _EventStorage(SqliteEventLogStorage):
     def _connect(self, shard: str) -> Iterator[db.Connection]:
         with self._db_lock:
             if shard not in self._initialized_dbs:
-                self._begin(shard)
+                self._initdb(self._engine(shard))
                 self._initialized_dbs.add(shard)
             engine = self._engine(shard)
             with _transaction(engine) as connection:
@@ -91,19 +86,6 @@ class _EventStorage(SqliteEventLogStorage):
             if is_changed:
                 with contextlib.suppress(FileNotFoundError):
                     os.utime(self.path_for_shard(shard))
-
-    def _begin(self, shard: str) -> None:
-        """Make a run's file, a copy of the first: Dagster would read all its migrations."""
-        path = Path(self.path_for_shard(shard))
-        empty = path.with_name(f"empty-{version('dagster')}")  # a run's file without events
-        is_new = shard != _INDEX and not path.exists()
-        if is_new and empty.exists():
-            write_bytes(path, empty.read_bytes())
-            return
-        self._initdb(self._engine(shard))
-        if is_new:
-            with contextlib.closing(sqlite3.connect(path)) as connection:
-                write_bytes(empty, connection.serialize())
 
     def _engine(self, shard: str) -> db.Engine:
         with self._engines_lock:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter, deque
-from collections.abc import AsyncIterator, Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import groupby
@@ -66,10 +66,7 @@ class SettledCell(Generic[AnyCell, AnyCall]):
 
 @dataclass(frozen=True)
 class Work(Generic[AnyCell, AnyCall, Finished]):
-    """A stage's calls by cell, and `finish`, which makes its table.
-
-    is_counted: whether the progress was told of all calls before the first.
-    """
+    """A stage's calls by cell, and `finish`, which makes its table."""
 
     stage: str
     ledger: Ledger
@@ -78,7 +75,7 @@ class Work(Generic[AnyCell, AnyCall, Finished]):
     epoch: str
     calls: Callable[[AnyCell], Sequence[AnyCall]]
     finish: Callable[[SettledCell[AnyCell, AnyCall]], Finished]
-    is_counted: bool = False
+    is_counted: bool = False  # the progress was told of all calls before the first
 
 
 def collect(
@@ -107,31 +104,28 @@ def collect(
         participants = Participants(entry_of, make, workspace.study, sharers=sharers)
         is_slow = any(entry.backend == NETWORK for entry in entry_of.values())
         work = Work(stage, ledger, participants, budget, workspace.study.epoch, calls, finish, is_slow)
-        if work.is_counted:
+        if is_slow:
             _expect(work, cells)
         yield from run_work(work, cells)
 
 
 def _expect(work: Work[AnyCell, Any, Any], cells: Sequence[AnyCell]) -> None:
     """Tell the progress of the missing calls of all cells."""
-    totals = dict[str, tuple[int, int]]()
+    totals = Counter[tuple[str, bool]]()
     for evaluation, evaluation_cells in _by_evaluation(cells):
         counted = set[str]()
         for cell in evaluation_cells:
             with suppress(TrapsError):  # the cell's own turn raises it
                 requests = [call.request for call in work.calls(cell) if call.request.key not in counted]
-                counted |= {request.key for request in requests}
+                counted.update(request.key for request in requests)
                 recorded = work.ledger.read(evaluation.key, [request.key for request in requests]).settled
-                for name, (missing, known) in _counts(requests, recorded).items():
-                    total = totals.get(name, (0, 0))
-                    totals[name] = (total[0] + missing, total[1] + known)
-    progress.current().expect(work.stage, totals, sum(cell.share for cell in cells))
+                totals.update((request.participant, request.key in recorded) for request in requests)
+    progress.current().expect(work.stage, _by_name(totals), sum(cell.share for cell in cells))
 
 
-def _counts(requests: Iterable[Request], recorded: Collection[str]) -> dict[str, tuple[int, int]]:
+def _by_name(counts: Counter[tuple[str, bool]]) -> dict[str, tuple[int, int]]:
     """Return the numbers of missing and of recorded calls by model or judge."""
-    names = Counter((request.participant, request.key in recorded) for request in requests)
-    return {name: (names[name, False], names[name, True]) for name, _ in names}
+    return {name: (counts[name, False], counts[name, True]) for name, _ in counts}
 
 
 def _by_evaluation(cells: Sequence[AnyCell]) -> list[tuple[Evaluation, list[AnyCell]]]:
@@ -275,7 +269,8 @@ async def _settle_cell(
     rows = {key: _Held(row) for key, row in recorded_rows.settled.items()}
     missing = [request for key, request in requests.items() if key not in rows]
     if not work.is_counted:
-        report.asking(work.stage, _counts(requests.values(), rows), cell.share)
+        counts = Counter((request.participant, key in rows) for key, request in requests.items())
+        report.asking(work.stage, _by_name(counts), cell.share)
     asker = _Asking(work, its.writer, missing, stop)
     await asker.run()
     rows |= asker.rows
