@@ -35,7 +35,7 @@ def test_a_budget_that_is_no_number_is_named(said: str, tmp_path: Path, capsys: 
     assert f"--budget-usd {said}: " in capsys.readouterr().err
 
 
-def test_a_stage_that_is_none_is_refused_before_a_workspace_is_made(
+def test_a_stage_that_is_none_is_refused_and_leaves_no_workspace(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["run", "demo", "--workspace", str(tmp_path / "w"), "--until", "vidos"]) == 1

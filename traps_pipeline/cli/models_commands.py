@@ -38,7 +38,7 @@ def check(arguments: argparse.Namespace) -> int:
     if arguments.live:
         return _check_live([*names], {name for name, structured in names.items() if not structured}, arguments)
     if arguments.json:
-        checks = [*check_named(names)]
+        checks = [*check_named([*names])]
         print_json(
             [
                 {"id": entry_check.entry.id, "sent": entry_check.line, "problems": entry_check.problems}
@@ -47,7 +47,7 @@ def check(arguments: argparse.Namespace) -> int:
         )
         return FAILED if any(entry_check.problems for entry_check in checks) else OK
     n_problems = 0
-    for result in check_named(names):
+    for result in check_named([*names]):
         print("\n    ".join([result.line, *result.problems]), flush=True)
         n_problems += bool(result.problems)
     print(

@@ -156,8 +156,8 @@ def _print_forecasts(forecasts: Sequence[Forecast], minutes: float) -> None:
     print("tokens: millions read, written; minutes of all: models, then judges")
     for row in forecasts:
         if row.queued_minutes >= 1 and row.queued_minutes > 2 * row.minutes:
-            minutes = f"{row.queued_minutes:,.0f} minutes"
-            print(wrap_text(f"{row.participant}: {minutes} instead, if its server takes one call at a time"))
+            duration = f"{row.queued_minutes:,.0f} minutes"
+            print(wrap_text(f"{row.participant}: {duration} instead, if its server takes one call at a time"))
     batch_usd = sum(row.dollars[1] * row.batch_price for row in forecasts if row.dollars is not None)
     if batch_usd < total[1]:
         heading = "expected if all calls are made in batches (traps study export-requests --batch)"
