@@ -308,6 +308,7 @@ _MAPPING, _LIST, _TEXT = (
 )
 _COMPLAINTS = {
     "missing": "is missing; add it",
+    "json_invalid": "Invalid JSON: {error}",
     **dict.fromkeys(("dict", "mapping", "model", "model_attributes"), _MAPPING),
     **dict.fromkeys(("list", "tuple", "set", "iterable"), _LIST),
     "string": _TEXT,
