@@ -220,7 +220,7 @@ def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_c
         "counts": [
             {"field": column.field, "title": column.heading, "unit": column.unit}
             for column, field in OPTIONAL.items()
-            if len(board) and column.unit != "range" and board[field].astype(float).gt(0).any()
+            if column.unit != "range" and any(value > 0 for value in board[field].astype(float))
         ],
         "shortfall": shortfall(board) if len(board) else "",
         "robust_figures": [{"field": name, "title": title, "unit": unit} for name, title, unit, _ in ROBUST_FIGURES],
