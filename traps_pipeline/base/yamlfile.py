@@ -292,7 +292,7 @@ def explain(error: ValidationError, model: type[BaseModel] | None = None, also: 
             field_names = [] if model is None else [*_fields_at(model, place[:-1]), *also]
             message = f"there is no such key{did_you_mean(str(place[-1]), field_names)}"
         else:
-            message = _COMPLAINTS.get(kind.removesuffix("_type").removesuffix("_parsing"), "is not valid, {given}")
+            message = _COMPLAINTS.get(kind.removesuffix("_type").removesuffix("_parsing"), "must be of another kind, {given}")
             given = "nothing stands there" if value in (None, {}) and kind != "missing" else f"not {value!r:.60}"
             message = message.format(given=given, **details.get("ctx", {}))
         field = ".".join(map(str, place))
@@ -301,17 +301,12 @@ def explain(error: ValidationError, model: type[BaseModel] | None = None, also: 
 
 
 # By kind of pydantic's error, whose own sentences name Python's types.
-_MAPPING, _LIST, _TEXT = (
-    "must be a mapping, a line `key: value` for each, {given}",
-    "must be a list, as [a, b], {given}",
-    "must be a text, {given}; write it in quotes",
-)
 _COMPLAINTS = {
     "missing": "is missing; add it",
     "json_invalid": "Invalid JSON: {error}",
-    **dict.fromkeys(("dict", "mapping", "model", "model_attributes"), _MAPPING),
-    **dict.fromkeys(("list", "tuple", "set", "iterable"), _LIST),
-    "string": _TEXT,
+    **dict.fromkeys(("dict", "mapping", "model"), "must be a mapping, a line `key: value` for each, {given}"),
+    **dict.fromkeys(("list", "tuple"), "must be a list, as [a, b], {given}"),
+    "string": "must be a text, {given}; write it in quotes",
     "bool": "must be true or false, {given}",
     "float": "must be a number, {given}",
     **dict.fromkeys(("int", "int_from_float"), "must be a whole number, {given}"),
@@ -325,8 +320,7 @@ _COMPLAINTS = {
     "string_too_long": "must have {max_length} characters at most, {given}",
     "string_pattern_mismatch": "must be of the form {pattern}, {given}",
     **dict.fromkeys(("literal_error", "enum"), "must be one of {expected}, {given}"),
-    "date": "must be a date, as 2026-11-21, {given}",
-    "date_from_datetime": "must be a date, as 2026-11-21, {given}",
+    **dict.fromkeys(("date", "date_from_datetime"), "must be a date, as 2026-11-21, {given}"),
 }
 
 
