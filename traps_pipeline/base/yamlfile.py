@@ -292,10 +292,12 @@ def explain(error: ValidationError, model: type[BaseModel] | None = None, also: 
             field_names = [] if model is None else [*_fields_at(model, place[:-1]), *also]
             message = f"there is no such key{did_you_mean(str(place[-1]), field_names)}"
         else:
-            message = _COMPLAINTS.get(kind.removesuffix("_type").removesuffix("_parsing"), "must be of another kind, {given}")
+            message = _COMPLAINTS.get(
+                kind.removesuffix("_type").removesuffix("_parsing"), "must be of another kind, {given}"
+            )
             given = "nothing stands there" if value in (None, {}) and kind != "missing" else f"not {value!r:.60}"
             message = message.format(given=given, **details.get("ctx", {}))
-        field = ".".join(map(str, place))
+        field = ".".join(str(step) for step in place if step != "[key]")  # pydantic's word for a name itself
         parts.append(f"{field}: {message}" if field else message)
     return plain("; ".join(dict.fromkeys(parts)))[:MAX_SAID]
 
