@@ -10,11 +10,11 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.names import Name
 from traps_pipeline.base.paths import ASSETS
-from traps_pipeline.base.suggestions import did_you_mean
+from traps_pipeline.base.suggestions import did_you_mean, nearest
 from traps_pipeline.base.yamlfile import name_file_in_errors, parse_yaml_model, read_yaml
 from traps_pipeline.benchmark.corrections import corrected_scenarios, current_benchmark, subset
 from traps_pipeline.models.registry.entries import LOCAL, get_model, local_models
-from traps_pipeline.models.registry.judges import load_panel, require_panel
+from traps_pipeline.models.registry.judges import load_panel, load_panels, require_panel
 from traps_pipeline.models.registry.user_registry import UserRegistry, add_entries
 from traps_pipeline.pipeline.wanted import evaluations_of
 from traps_pipeline.protocol.cells import Cell
@@ -171,8 +171,9 @@ def load_experiment(name: str) -> Experiment:
     with name_file_in_errors(path):
         for model in experiment.models:
             get_model(model)
-        for panel in dict.fromkeys((*experiment.own.panels, *([experiment.panel] if experiment.panel else []))):
-            load_panel(panel)
+        for panel in (*experiment.own.panels, experiment.panel or ""):
+            if nearest(panel, load_panels()):  # another one may be the workspace's own
+                load_panel(panel)
         if experiment.scenarios is not None and experiment.benchmark == current_benchmark():
             subset(corrected_scenarios(), experiment.study)
         for model in experiment.mechanism.models if experiment.mechanism else ():
