@@ -63,7 +63,7 @@ def test_a_stage_tells_models_apart_if_its_claim_holds_in_every_seed_of_one_and_
     def told(gap: list[float], no_gap: list[float]) -> str:
         of = [[Figure(n, "w", claim.name, value) for n, value in enumerate(values)] for values in (gap, no_gap)]
         lines = markdown(*of).splitlines()
-        assert len(lines) == 3 and lines[2].startswith(f"| {claim.stage} | {claim.says} |")
+        assert len(lines) == 3 and lines[2].startswith(f"| {claim.stage}: {claim.says} |")
         return lines[2].split(" | ")[-1].removesuffix(" |")
 
     bound, above, below = claim.bound, claim.bound + 0.1, claim.bound - 0.1

@@ -50,7 +50,7 @@ def test_a_gate_stands_beside_its_controls_and_what_it_costs() -> None:
     ]
     (row,) = cells(answerable)
     assert (row["Abstained on %"], row["n"]) == ("40.0 †", "8") and any(n.startswith("†") for n in answerable.notes)
-    assert row["Items"].startswith("decoy")
+    assert row["Items"].startswith("whole clip")
 
 
 def test_what_the_prompt_changes_stands_for_answers_and_for_states() -> None:

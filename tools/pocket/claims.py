@@ -125,12 +125,6 @@ def _transfer(results: Results) -> float | None:
     return _mean(rows.loc[(rows["analysis"] == "transfer") & rows["chosen"].eq(True), "value"])
 
 
-def _removed(results: Results) -> float | None:
-    rows = results.probes
-    rows = rows.loc[(rows["analysis"] == "answerable_void") & (rows["target"] == "removed")]
-    return _mean(rows.loc[(rows["source"] == "occlusion") & rows["chosen"].eq(True), "value"])
-
-
 def _same_direction(results: Results) -> float | None:
     rows = results.cosines
     same = (rows["dataset"] == rows["other_dataset"]) & (rows["prompt"] != rows["other_prompt"])
@@ -187,8 +181,6 @@ CLAIMS = (
           "share of pairs whose sides differ in the margin’s sign", 0.5, _differ),
     Claim("transfer", "`probe_transfer`", "states carry the void over datasets",
           "AUROC at the chosen layer", 0.65, _transfer),
-    Claim("removed", "`probe_look_alikes`", "a probe tells voids from their own occluder",
-          "AUROC against `removed`", 0.65, _removed),
     Claim("direction", "`cosines`", "one direction of the void under both prompts",
           "cosine standard, guided", 0.65, _same_direction),
     Claim("followed", "`steering_effects`", "answers follow what guided states encode alone",

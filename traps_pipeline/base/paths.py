@@ -21,6 +21,7 @@ SPECS_VARIABLE = "TRAPS_SCENE_SPECS"  # names the folder of a sampled benchmark
 OWN_SPECS = ROOT / "scene_specs"  # the specs shipped with this version
 SCENE_SPECS = Path(os.environ.get(SPECS_VARIABLE) or OWN_SPECS).absolute()
 RELEASED = SCENE_SPECS / "released"
+TWO_EVENTS_RELEASED = SCENE_SPECS / "two_events" / "released"
 CORRECTIONS = SCENE_SPECS / "corrections"
 # Default output of commands: in the checkout, else below the current folder.
 WORKSPACES = (Path.cwd() if IS_INSTALLED else ROOT) / ".workspaces"

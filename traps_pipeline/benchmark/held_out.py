@@ -18,6 +18,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import OWN_SPECS, SCENE_SPECS
 from traps_pipeline.benchmark.records import load_release
+from traps_pipeline.protocol.datasets import TWO_EVENTS
 from traps_pipeline.storage.benchmark_tables import ItemRow
 
 KEY_BYTES = 32
@@ -51,12 +52,13 @@ def held_out_key(path: Path, *, make: bool = False) -> bytes:
 def drawn_items(items: Iterable[Row], key: bytes) -> list[Row]:
     """Return one ITEMS row of each scenario, drawn by the key.
 
-    Over the scenarios of a taxonomy, in an order that only the key tells, kinds of items (dataset and side) take turns,
-    so that each is drawn as often as any other.
+    Over the scenarios of a taxonomy, and over those of two events, in an order that only the key tells, kinds of items
+    (dataset and side, or lane and clip) take turns, so that each is drawn as often as any other.
     """
-    scenarios = dict[str, dict[str, list[Row]]]()
-    for row in sorted(items, key=lambda row: (row["dataset"], row["side"])):
-        scenarios.setdefault(row["taxonomy"], {}).setdefault(row["scenario_id"], []).append(row)
+    scenarios = dict[tuple[str, bool], dict[str, list[Row]]]()
+    for row in sorted(items, key=lambda row: (row["dataset"], row["side"], row["item_id"])):
+        group = row["taxonomy"], row["dataset"] == TWO_EVENTS
+        scenarios.setdefault(group, {}).setdefault(row["scenario_id"], []).append(row)
     drawn = list[Row]()
     for rows_of in scenarios.values():
         order = sorted(rows_of, key=lambda scenario: opaque(key, f"turn of {scenario}"))

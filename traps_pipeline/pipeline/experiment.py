@@ -18,7 +18,7 @@ from traps_pipeline.models.registry.judges import load_panel, load_panels, requi
 from traps_pipeline.models.registry.user_registry import UserRegistry, add_entries
 from traps_pipeline.pipeline.wanted import evaluations_of
 from traps_pipeline.protocol.cells import Cell
-from traps_pipeline.protocol.datasets import DATASETS, SCHEMAS, UNPAIRED
+from traps_pipeline.protocol.datasets import DATASETS, REPLACED, SCHEMAS, TWO_EVENTS, UNPAIRED
 from traps_pipeline.protocol.regimes import BY_NAME, PAPER_REGIMES, REGIMES, fields_of
 from traps_pipeline.storage.study import Asked, MechanismSettings, Settings, Study
 
@@ -81,6 +81,10 @@ class Experiment(Settings):
         names = (*DATASETS, *UNPAIRED) if info.field_name == "datasets" else REGIMES
         unknown = [value for value in values if value not in names]
         if unknown or not values:
+            if gone := [value for value in unknown if value in REPLACED]:
+                raise ValueError(
+                    f"{', '.join(gone)} went with 0.3: {TWO_EVENTS} takes the place of such arms; ask that"
+                )
             suggestion = did_you_mean(unknown[0], names) if unknown else ""
             raise ValueError(f"{unknown or 'nothing'} given; choose from {', '.join(names)}{suggestion}")
         return values

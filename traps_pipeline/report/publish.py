@@ -101,10 +101,10 @@ def report_files(
     )
     page = report_html(
         study.board, figures, pictures, tables, findings=study_findings(study), address=address,
-        explorer=EXPLORER if address else "", robust=study.robust, notes=remarks,
+        explorer=EXPLORER if address else "", two_way=study.two_way, notes=remarks,
         terms=INSIDE_TERMS if study.mechanism else None,
     )  # fmt: skip
-    markdown = leaderboard_markdown(study.board, study.robust, remarks)
+    markdown = leaderboard_markdown(study.board, study.two_way, remarks)
     return {PAGE: page.encode(), MARKDOWN: markdown.encode(), METRICS: metrics_lines(study.board).encode()}
 
 

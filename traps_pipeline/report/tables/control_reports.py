@@ -40,8 +40,6 @@ SIGNS = {"label": "+ controls, − voids", "plus": "+ everywhere", "minus": "−
 
 SOURCE_WORDS = {
     "occlusion_answerable": "void clip, answerable question",
-    "decoy": "decoy: an occluder that hides nothing",
-    "removed": "the void’s own occluder, gone before the end",
     "length_matched": "whole clip as short as a void",
     "chaotic_time_swapped": "frame times of the other side",
 }
