@@ -23,6 +23,7 @@ from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.models.registry.prompts import system_prompt
 from traps_pipeline.pipeline.experiment import load_experiment
 from traps_pipeline.protocol.metric_words import METRIC_WORDS
+from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.release.harness.scoring import RUN_FIGURES, figures, judge
 from traps_pipeline.release.harness.write import MEDIA_SETTINGS, media_settings, rewritten_source, write_harness
 from traps_pipeline.storage.benchmark_tables import ITEMS
@@ -92,7 +93,7 @@ def test_its_items_prompts_and_frames_are_those_that_a_model_is_sent(
 ) -> None:
     package = harness / "traps_harness"
     about = json.loads((package / "about.json").read_text())
-    assert about["prompts"] == {regime: system_prompt(regime) for regime in ("guided", "json", "standard")}
+    assert about["prompts"] == {regime: system_prompt(regime) for regime in REGIMES if regime != "logprobs"}
     assert about["parameters"] == {"temperature": 0.8, "top_p": 0.95, "max_tokens": 8000}
     items = {row["item_id"]: row for row in map(json.loads, (package / "items.jsonl").read_text().splitlines())}
     asked = workspace.tables.read_all(ITEMS).to_dict("records")

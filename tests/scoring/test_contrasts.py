@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -377,4 +378,12 @@ def test_the_command_compares_what_both_benchmarks_still_hold(rows, tmp_path, ca
     assert written["n_pairs"].tolist() == [3, 3]
     assert written["difference"].tolist() == [0, 0]
     assert {"n_missing_now", "epoch_then", "benchmark_version_now", "refused"} <= set(written.columns)
-    assert "occlusion" in capsys.readouterr().out
+    assert "occlusion" not in capsys.readouterr().out  # nothing differs
+    then_rows = rows([(True, False, True), (True, False, False), (True, False, True)])
+    Workspace.open(Path(then)).tables.write(VERDICTS, cell.partition, then_rows, {})
+    assert main(["results", "compare", then, "--workspace", now]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    # AbsRec was 2/3 with Acc 1 and FalseAbs 0, and is 1 now
+    pecs, j = (line.split() for line in lines if line.startswith("occlusion"))
+    assert pecs[:5] == ["occlusion", "pecs", "0.667", "1.000", "+0.333"] and j[1:5] == ["j", *pecs[2:5]]
+    assert max(map(len, lines)) <= 100

@@ -286,9 +286,14 @@ def load_scenarios(study: Study) -> dict[str, Scenario]:
     return subset(corrected_scenarios(), study)
 
 
+def current_benchmark() -> str:
+    """Return the name of the benchmark whose records are active."""
+    return "released" if SCENE_SPECS == OWN_SPECS else load_release().name
+
+
 def check_benchmark(study: Study) -> None:
     """Raise TrapsError unless the active records are of the study's benchmark."""
-    current = "released" if SCENE_SPECS == OWN_SPECS else load_release().name
+    current = current_benchmark()
     if study.benchmark != current:
         raise TrapsError(
             f"the benchmark of the study is {study.benchmark!r}, the records in {SCENE_SPECS} are {current!r}; "

@@ -264,13 +264,20 @@ def enter_workspace(workspace: Workspace) -> Workspace:
 
     os.environ[VARIABLE] = str(workspace.place)
     clear_caches()  # the workspace may define models
-    os.environ.setdefault("DAGSTER_HOME", str(workspace.dagster_home))
+    os.environ["DAGSTER_HOME"] = os.environ.get("DAGSTER_HOME") or str(
+        workspace.dagster_home
+    )  # `DAGSTER_HOME=` is none
     return workspace
 
 
 def load_definitions() -> None:
     """Declare the pipeline's graph, for staleness, without importing Dagster."""
     import traps_pipeline.pipeline.stages  # noqa: F401 - its import is what declares the graph
+
+
+def ledger_faults(workspace: Workspace) -> list[str]:
+    """Return what is wrong with the ledger's database and its money, before a run refuses to write on it."""
+    return [*workspace.ledger.faults()] if workspace.ledger.exists() else []
 
 
 def add_experiment(parser: argparse.ArgumentParser, **settings: Any) -> None:

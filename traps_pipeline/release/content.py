@@ -19,7 +19,7 @@ from traps_pipeline.judging.panel import tasks_for
 from traps_pipeline.models.registry.prompts import prompt, system_prompt
 from traps_pipeline.pipeline.experiment import LITE_FILE
 from traps_pipeline.protocol.datasets import ARMS, DATASETS, TWO_EVENTS
-from traps_pipeline.protocol.regimes import PAPER_REGIMES
+from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.release.held_out_clips import clip_name
 from traps_pipeline.release.released_rows import (
     CertificateRow,
@@ -225,7 +225,7 @@ def prompt_rows(canary: str) -> list[PromptRow]:
     """Return one row per system prompt: of each regime, and of each task of the panel."""
     texts = {(JUDGE, task): prompt(f"judge_{task}") for task in tasks_for("control")}
     texts[JUDGE, "premise"] = prompt("judge_premise_suffix")
-    texts |= {(SYSTEM, regime): system_prompt(regime) for regime in PAPER_REGIMES}
+    texts |= {(SYSTEM, regime): system_prompt(regime) for regime in REGIMES}
     return [
         PromptRow(name=name, role=role, text=text, version=digest(text)[:16], licence=PROMPT_LICENCE, canary=canary)
         for (role, name), text in sorted(texts.items())

@@ -12,6 +12,7 @@ from typing import Any
 import pandas as pd
 
 from traps_pipeline.base.terminal import TextTable
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.models.registry.judges import BY_RULES, ONE_JUDGE, is_judged_by_rules
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.metric_words import COUNT_WORDS, METRIC_WORDS
@@ -56,6 +57,8 @@ from traps_pipeline.scoring.analyses import null_single_deviations
 from traps_pipeline.scoring.metrics import joined_epochs
 from traps_pipeline.scoring.score_rows import LEADERBOARD
 
+LACKING = 0.2  # share of a model's answers without a decision above which a study says so first
+_UNDECIDED = ("undecided by the panel", "look at its votes (traps why ITEM)")
 BOUNDS = "If missing: worst, best"
 _COUNTS = [count for count in COUNT_WORDS.values() if count.heading]
 # Columns shown only if their count, or that of another field, is not 0, because the table is already wide.
@@ -103,15 +106,17 @@ def leaderboard_text(board: pd.DataFrame, two_way: pd.DataFrame | None = None, n
 def leaderboard_tables(
     board: pd.DataFrame, two_way: pd.DataFrame | None = None, notes: Sequence[str] = ()
 ) -> list[TextTable]:
-    """Return what `leaderboard_text` says, a table per panel."""
-    return [table_text(table) for table in leaderboards(board, two_way, notes, brief=True)]
+    """Return what `leaderboard_text` says, a table per panel, the first below what is missing."""
+    first, *others = (table_text(table) for table in leaderboards(board, two_way, notes, brief=True))
+    lacking = shortfall(board)
+    return [replace(first, title=f"{lacking}\n{first.title}") if lacking else first, *others]
 
 
 def leaderboard_markdown(board: pd.DataFrame, two_way: pd.DataFrame | None = None, notes: Sequence[str] = ()) -> str:
     """Return LEADERBOARD rows as Markdown, with TWO_WAY, notes and a legend."""
     terms = [f"- **{term}**: {meaning}" for term, meaning in legend(board, two_way).items()]
-    tables = leaderboards(board, two_way, notes, brief=True)
-    return "\n".join([*map(table_markdown, tables), *terms]) + "\n"
+    tables, lacking = leaderboards(board, two_way, notes, brief=True), shortfall(board)
+    return "\n".join([*([f"{lacking}\n"] if lacking else []), *map(table_markdown, tables), *terms]) + "\n"
 
 
 def leaderboards(
@@ -145,6 +150,26 @@ def _panel_tables(board: pd.DataFrame, two_way: pd.DataFrame | None, brief: bool
         for name in ([] if brief else other_datasets)
     ]
     return [_leaderboard(board, ranked_dataset, other_datasets, beside, brief, suffix), *other_tables]
+
+
+def shortfall(board: pd.DataFrame) -> str:
+    """Return why models lack answers, and what to change, in a sentence; empty if none lacks a fifth of them."""
+    rows = board.loc[board["dataset"] != "overall"]
+    rows = rows.assign(asked=2 * rows["n_pairs"].astype(int) * rows["n_runs"].astype(int))
+    sums = rows.groupby("model", sort=False)[["asked", "n_missing"]].sum()
+    models = [*sums.index[sums["n_missing"] > LACKING * sums["asked"]]]
+    if not models:
+        return ""
+    lacking = rows.loc[rows["model"].isin(models)]
+    counts = {(c.participle, c.remedy): int(lacking[c.name].sum()) for c in COUNT_WORDS.values() if c.participle}
+    counts[_UNDECIDED] = int(lacking["n_missing"].sum()) - sum(counts.values())
+    reasons = sorted(((count, *words) for words, count in counts.items() if count > 0), key=lambda reason: -reason[0])
+    (first, participle, _), *others = reasons
+    were = f"{'was' if first == 1 else 'were'} {participle}"
+    text = f"{first:,} of {count_noun(int(lacking['asked'].sum()), 'answer')} {were}"
+    text += "".join(f", {count:,} {words}" for count, words, _ in others)
+    names = ", ".join(models[:3]) + (f" and {len(models) - 3} more" if len(models) > 3 else "")
+    return f"{names}: {text}: {', or '.join(dict.fromkeys(remedy for _, _, remedy in reasons[:2]))}."
 
 
 def legend(board: pd.DataFrame, two_way: pd.DataFrame | None = None) -> dict[str, str]:

@@ -9,6 +9,7 @@ from typing import Any
 
 import pandas as pd
 
+from traps_pipeline.base.archives import pack
 from traps_pipeline.base.files import write_bytes
 from traps_pipeline.benchmark.held_out import begin_publication
 from traps_pipeline.report.cards import (
@@ -113,16 +114,20 @@ def metrics_lines(board: pd.DataFrame) -> str:
 
 
 def export(workspace: Workspace, target: Path, say: Callable[[str], None] = lambda line: None) -> int:
-    """Write all tables, available figures and the report page; return the file count.
+    """Write all tables, available figures and the report page to a folder or a .zip; return the file count.
 
     Each file is written atomically, `index.html`, which lists them, last. say: receives a line per file.
     """
     begin_publication(workspace.root, "its tables and pictures")
-    sources, paths = Sources(workspace), list[str]()
-    for path, content in _export_reports(sources, say):
-        write_bytes(target / path, content)
+    is_zip, members, paths = target.suffix == ".zip", dict[str, bytes](), list[str]()
+    for path, content in _export_reports(Sources(workspace), say):
         paths.append(path)
-    write_bytes(target / INDEX, _index(paths).encode())
+        if is_zip:
+            members[path] = content
+        else:
+            write_bytes(target / path, content)
+    index = _index(paths).encode()
+    write_bytes(*((target, pack(members | {INDEX: index}, level=6)) if is_zip else (target / INDEX, index)))
     return len(paths) + 1
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from traps_pipeline.base.wording import count_noun
 from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, REGIMES, STANDARD
 from traps_pipeline.report.catalogue import FIGURE_REPORTS
+from traps_pipeline.report.leaderboard_page import shortfall
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.table_columns import interval, ranks
 from traps_pipeline.report.writing import fraction, percent
@@ -32,16 +33,17 @@ class StudyFinding:
 
 def study_findings(results: Results) -> list[StudyFinding]:
     """Return a study's findings, the most important first. Of reference strategies only if no other model was asked."""
-    overall = results.overall
+    overall, lacking = results.overall, shortfall(results.board) if len(results.board) else ""
+    missing = [StudyFinding(lacking, "leaderboard")] if lacking else []
     rows = overall.loc[overall["pecs"].notna()] if len(overall) else overall
     if not len(rows):
-        return [*_two_events(results)]
+        return [*missing, *_two_events(results)]
     model_rows = _models_first(rows)
     figure_findings = [(report.name, report.finding(results)) for report in FIGURE_REPORTS] if results.mechanism else []
     return [
-        *_best(model_rows), *_abstention(model_rows), *_accuracy(model_rows), *_gaps(results, model_rows),
+        *missing, *_best(model_rows), *_abstention(model_rows), *_accuracy(model_rows), *_gaps(results, model_rows),
         *_two_events(results), *_separable(results, model_rows),
-        *_missing_answers(model_rows),
+        *(() if missing else _missing_answers(model_rows)),
         *(StudyFinding(text, f"figure-{name}") for name, text in figure_findings if text),
     ]  # fmt: skip
 

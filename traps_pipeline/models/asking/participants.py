@@ -214,8 +214,9 @@ async def _send(participant: Participant, request: Request, allowed: CallContext
             # slept.
             await allowed.require()
             cost_usd = worst_usd
-            async with asyncio.timeout(entry.limits.timeout_s):
-                outcome = await participant.backend.ask(request)
+            with progress.current().in_flight(entry.id):
+                async with asyncio.timeout(entry.limits.timeout_s):
+                    outcome = await participant.backend.ask(request)
             if entry.prices is not None:
                 cost_usd = _believed_cost(outcome.cost_usd, worst_usd)
                 outcome = replace(outcome, cost_usd=cost_usd)

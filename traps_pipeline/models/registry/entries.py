@@ -252,7 +252,8 @@ def _add(
             f"{path}: {what} ({name}): {', '.join(short_fields)}: an entry with an address of its own stands in an "
             "experiment's file (docs/models.md); one of the registry has backend, account and provider_id"
         )
-    entry = parse_yaml_model(kind, raw, path, f"{what} ({name})", context)
+    also = user_registry.SHORT_FIELDS if path != MODELS_FILE else ()
+    entry = parse_yaml_model(kind, raw, path, f"{what} ({name})", context, entry=str(name), also=also)
     if entry.id in entries:
         raise TrapsError(f"{path}: {what}: id {entry.id!r} occurs twice, here or in {MODELS_FILE.parent}")
     entries[entry.id] = entry
@@ -284,7 +285,10 @@ def load_accounts(path: Path = MODELS_FILE) -> dict[str, Account]:
         raise TrapsError(f"{path}: `accounts:` must be a mapping of names")
     if path == MODELS_FILE:
         accounts = {**accounts, **user_registry.accounts()}
-    return {name: parse_yaml_model(Account, raw or {}, path, f"account {name}") for name, raw in accounts.items()}
+    return {
+        name: parse_yaml_model(Account, raw or {}, path, f"account {name}", entry=name)
+        for name, raw in accounts.items()
+    }
 
 
 def account_of(entry: Entry) -> Account:

@@ -212,7 +212,7 @@ def steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | 
 
 @_stage(
     STEERING_VOTES,
-    code="4",
+    code="5",
     parents=[of(items, by_dataset), steering, judges],
     scheme=schemes.STEERING,
     cost="money",

@@ -35,7 +35,7 @@ from traps_pipeline.protocol.two_events import CLIPS as LANE_CLIPS
 from traps_pipeline.protocol.two_events import LANES, lane_items
 from traps_pipeline.report.explorer.answer_shards import StudyAnswers, study_answers
 from traps_pipeline.report.explorer.scenario_words import certificate_phrases, closes_frame, intervention
-from traps_pipeline.report.leaderboard_page import TWO_WAY_COLUMNS, legend, provenance
+from traps_pipeline.report.leaderboard_page import OPTIONAL, TWO_WAY_COLUMNS, legend, provenance, shortfall
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.tables.human_tables import people_notes
 from traps_pipeline.report.tables.table_columns import entries
@@ -229,6 +229,12 @@ def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_c
             for m in METRIC_WORDS.values()
         ],
         "two_way_figures": [{"field": c.field, "title": c.heading, "unit": c.unit} for c in TWO_WAY_COLUMNS],
+        "counts": [
+            {"field": column.field, "title": column.heading, "unit": column.unit}
+            for column, field in OPTIONAL.items()
+            if column.unit != "range" and any(value > 0 for value in board[field].astype(float))
+        ],
+        "shortfall": shortfall(board) if len(board) else "",
         "leaderboard": records(board),
         "two_way": records(printed.rows),
         "two_way_table": [{"field": c.field, "title": c.heading, "unit": c.unit} for c in printed.columns],

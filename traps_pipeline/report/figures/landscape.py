@@ -45,6 +45,8 @@ def landscape_figure(points: pd.DataFrame, scope: str) -> Figure:
     PECS is averaged per run and dataset, so it can differ from the contours. Coinciding points share one label.
     """
     points = points.loc[points["acc"].notna() & points["j"].notna()]
+    if not len(points):
+        raise NotRun("no model has both Acc and J, since too few of its answers are decided")
     with figure_style():
         figure = new_figure(COLUMN_IN, 3.7)
         axes = figure.add_subplot()
