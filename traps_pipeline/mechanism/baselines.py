@@ -18,7 +18,7 @@ import pandas as pd
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.mechanism.control_rows import ProbeBaselineRow
+from traps_pipeline.mechanism.control_rows import LOGITS, ProbeBaselineRow
 from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS
 from traps_pipeline.mechanism.probes import Fit, fit_probe
 from traps_pipeline.mechanism.probing import ProbeRun, Row
@@ -37,6 +37,7 @@ THUMBNAIL = (32, 24)  # pixels of a frame that a baseline sees, width and height
 NOISE_DRAWS = 10
 RAW = ("question words", "first frame", "all frames", "length", "time stamps")
 MARGIN, NOISE = "output margin", "noise"
+LIKELIEST = 256  # first tokens, the likeliest over all items, that a probe of the output reads
 Features = Mapping[str, np.ndarray]  # dataset -> (n, columns), rows in the order of the dataset's items
 
 
@@ -63,7 +64,9 @@ def baseline_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates)
         progress.current().tick("probe_baselines", f"of {states.extraction.key}", number + 1, len(raw) + 2)
         add(name, score_features(run, features))
     try:
-        add(MARGIN, score_features(run, output_margins(entry, states, [*items]), lambda states, void: IdentityScorer()))
+        output = output_features(entry, states, states, [*items])
+        add(MARGIN, score_features(run, output[MARGIN], lambda states, void: IdentityScorer()))
+        add(LOGITS, score_features(run, output[LOGITS]))
     except NoMargin as error:
         add(MARGIN, [_undefined_row()], str(error))
     add(NOISE, noise_floor(run, settings.seed))
@@ -168,25 +171,46 @@ def margin_tokens(entry: ModelEntry, states: StoredStates) -> tuple[LocalModel, 
 
     if set(states.items["pooling"]) != {"last"}:
         raise NoMargin("states are means over tokens; set `pooling: last` to read the output margin")
-    model = load_local_model(entry, inside=True)
+    model = load_local_model(entry, inside=True, seed=states.extraction.weights_seed)
     try:
         return model, abstention_tokens(model)
     except TrapsError as error:
         raise NoMargin(str(error)) from error
 
 
-def output_margins(entry: ModelEntry, states: StoredStates, datasets: Sequence[str]) -> Features:
-    """Return every item's output margin under the extraction's prompt, (n, 1).
+def output_features(
+    entry: ModelEntry, states: StoredStates, order: StoredStates, datasets: Sequence[str]
+) -> dict[str, Features]:
+    """Return every item's output margin (n, 1), and log-probabilities of the LIKELIEST first tokens (n, k).
 
-    No pass is needed: the stored state after the final norm goes through the model's head. Raises NoMargin.
+    They are of the extraction's prompt, in the order of `order`'s items. No pass is needed: the stored state after the
+    final norm goes through the model's head. Raises NoMargin.
     """
-    from traps_pipeline.mechanism.margin import first_token_margins
+    import torch
+
+    from traps_pipeline.mechanism.margin import first_token_margins, head_logits
 
     model, tokens = margin_tokens(entry, states)
-    return {
-        name: first_token_margins(model, states.read(name, "normed"), tokens).double().numpy()[:, None]
-        for name in datasets
-    }
+    margins, chances = dict[str, np.ndarray](), dict[str, np.ndarray]()
+    with torch.inference_mode():
+        for name in datasets:
+            normed = torch.from_numpy(states.read_as(order, name, "normed"))
+            margins[name] = first_token_margins(model, normed, tokens).double().numpy()[:, None]
+            chances[name] = head_logits(model, normed).log_softmax(-1).cpu().numpy()
+    means = np.mean([values.mean(axis=0) for values in chances.values()], axis=0)
+    likeliest = np.argsort(-means, kind="stable")[:LIKELIEST]
+    return {MARGIN: margins, LOGITS: {name: values[:, likeliest].astype(float) for name, values in chances.items()}}
+
+
+def output_or_note(
+    stage: str, entry: ModelEntry, states: StoredStates, order: StoredStates, datasets: Sequence[str]
+) -> dict[str, Features]:
+    """Return `output_features`; without a margin nothing, and a note in the progress of a stage."""
+    try:
+        return output_features(entry, states, order, datasets)
+    except NoMargin as error:
+        progress.current().note(f"{stage}: no output margin ({error})")
+        return {}
 
 
 # --- noise ------------------------------------------------------------------------------------------------------------

@@ -166,6 +166,38 @@ class LensRow(ExtractionColumns):
 
 LENS = Table("lens", LensRow, partition_by=("model", "prompt"), key=("dataset", "layer"))
 
+MODEL, STATES, RESIDUAL, LOGITS = "model", "states", "states, residual", "first-token logits"
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeadRow(ExtractionColumns):
+    """How well features order a dataset's sides, by probes of the other datasets."""
+
+    subject: Annotated[
+        str,
+        "model; a control: random_0, random_1 (the network with random weights of that seed), or a placebo: answerable "
+        "items that stand for the target's voids, by their dataset",
+    ]
+    target: shared.Dataset
+    features: Annotated[
+        str,
+        "states; states, residual (without what is linear in words, pixels and length); or a rival: a raw input, "
+        "output margin or first-token logits (log-probabilities of 256 tokens, with a probe)",
+    ]
+    layer: Annotated[int, "of the states, chosen on pairs of other datasets than the target; -1 for rivals"]
+    auroc: Annotated[float, "voids against controls, by probes that have seen neither the dataset nor the scenario"]
+    low: Annotated[float, "95 % interval, scenarios resampled, probes held fixed"]
+    high: Annotated[float, "95 % interval, scenarios resampled, probes held fixed"]
+    rival: Annotated[str | None, "of states: the rival with the highest AUROC"]
+    lead: Annotated[float | None, "of states: their AUROC less that rival's"]
+    lead_low: Annotated[float | None, "95 % interval of the lead, both resampled together"]
+    lead_high: Annotated[float | None, "95 % interval of the lead, both resampled together"]
+    n_voids: Annotated[int, "items that stand for voids"]
+    n_controls: Annotated[int, "control items"]
+
+
+LEADS = Table("leads", LeadRow, partition_by=("model", "prompt"), key=("subject", "target", "features"))
+
 UNSEEN = "log-odds of void above the mid threshold, by a probe that has not seen the scenario"
 
 

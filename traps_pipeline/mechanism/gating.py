@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import product
 from typing import Any
 
@@ -14,8 +14,8 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.judging_rows import VERDICTS
-from traps_pipeline.mechanism.baselines import MARGIN, NoMargin, output_margins, probed_items, raw_features
-from traps_pipeline.mechanism.control_rows import GateRow, RiskCoverageRow
+from traps_pipeline.mechanism.baselines import output_or_note, probed_items, raw_features
+from traps_pipeline.mechanism.control_rows import STATES, GateRow, RiskCoverageRow
 from traps_pipeline.mechanism.gate import (
     MID,
     OTHER_DATASETS,
@@ -37,14 +37,14 @@ from traps_pipeline.mechanism.probes import swapped_labels
 from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.mechanism.transfer_paths import probed_taxonomy
 from traps_pipeline.models.registry.entries import ModelEntry
-from traps_pipeline.protocol.cells import Cell, Evaluation
+from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction
 from traps_pipeline.protocol.datasets import DATASETS
-from traps_pipeline.protocol.regimes import PROMPTING
+from traps_pipeline.protocol.regimes import PROMPTING, RANDOM_WEIGHTS
 from traps_pipeline.scoring.bootstrap import RESAMPLED_FIGURES, draw_scenarios, figures_of, interval, run_sums
 from traps_pipeline.scoring.metrics import COUNTS
 from traps_pipeline.storage.workspace import Workspace
 
-STATES, SHUFFLED, UNTRAINED, NO_GATE = "states", "shuffled labels", "untrained model", "no gate"
+SHUFFLED, NO_GATE = "shuffled labels", "no gate"
 COVERAGES = tuple(k / 20 for k in range(1, 21))
 ALL = "all"
 _PECS = RESAMPLED_FIGURES.index("pecs")
@@ -54,12 +54,14 @@ _PECS = RESAMPLED_FIGURES.index("pecs")
 class Gates:
     """A kind of features, and the sources of its gates.
 
-    by_layer: by layer of the states (-1 for other features), then by dataset, (n, d).
+    by_layer: by layer of the states (-1 for other features), then by dataset, (n, d). layers: the layer of each target;
+    none for other features.
     """
 
     name: str
     by_layer: Mapping[int, Mapping[str, np.ndarray]]
     sources: Sequence[str]
+    layers: Mapping[str, int] = field(default_factory=dict)
 
 
 Gated = dict[tuple[str, str], tuple[Decisions, int]]  # source and target -> decisions, and layer of the states
@@ -126,7 +128,7 @@ def _all_decisions(workspace: Workspace, entry: ModelEntry, states: StoredStates
         gated_by_features: dict[str, Gated] = {}
         for number, gates in enumerate(kinds):
             progress.current().tick("gate", f"features of {states.extraction.key}", number + 1, len(kinds))
-            gated_by_features[gates.name] = _decisions(workspace, table, gates, layers)
+            gated_by_features[gates.name] = _decisions(workspace, table, gates)
         _GATED[key] = gated_by_features
     return _GATED[key]
 
@@ -150,21 +152,20 @@ def _kinds(workspace: Workspace, entry: ModelEntry, states: StoredStates, layers
     """Yield states by every source, and control features by sources of many datasets."""
     names = [*dict.fromkeys(states.items["dataset"])]
     states_by_layer = {layer: read_states(states, names, layer) for layer in sorted({*layers.values()})}
-    yield Gates(STATES, states_by_layer, SOURCES)
+    yield Gates(STATES, states_by_layer, SOURCES, layers)
     controls = (OTHER_DATASETS,)
     assert entry.media is not None, "local entries have media"
     items = {name: probed_items(workspace, states, name) for name in names}
     for name, features in raw_features(items, entry.media, workspace.resolve).items():
         yield Gates(name, {-1: features}, controls)
-    try:
-        yield Gates(MARGIN, {-1: output_margins(entry, states, names)}, controls)
-    except NoMargin as error:
-        progress.current().note(f"gate: no output margin ({error})")
-    yield Gates(SHUFFLED, states_by_layer, controls)
-    if workspace.mechanism.gate.untrained:
-        from traps_pipeline.mechanism.untrained import untrained_states
-
-        yield Gates(UNTRAINED, {-1: untrained_states(workspace, entry, states, items)}, controls)
+    for name, features in output_or_note("gate", entry, states, states, names).items():
+        yield Gates(name, {-1: features}, controls)
+    yield Gates(SHUFFLED, states_by_layer, controls, layers)
+    for name in RANDOM_WEIGHTS if entry.has_random_weights else ():
+        random = StoredStates.of(workspace, Extraction(entry.id, name))
+        own_layers = chosen_layers(workspace, random, names)
+        by_layer = {n: {d: random.read_as(states, d, n) for d in names} for n in sorted({*own_layers.values()})}
+        yield Gates(name, by_layer, controls, own_layers)
 
 
 def read_states(states: StoredStates, names: Sequence[str], layer: int) -> dict[str, np.ndarray]:
@@ -172,7 +173,7 @@ def read_states(states: StoredStates, names: Sequence[str], layer: int) -> dict[
     return {name: states.read(name, layer) for name in names}
 
 
-def _decisions(workspace: Workspace, table: pd.DataFrame, gates: Gates, layers: Mapping[str, int]) -> Gated:
+def _decisions(workspace: Workspace, table: pd.DataFrame, gates: Gates) -> Gated:
     """Return decisions and states' layer (-1 for other features), by source, target."""
     settings, seed = workspace.mechanism, workspace.mechanism.seed
     settings_of_gate = {"folds": settings.probes.folds, "seed": seed, "false_abs": settings.gate.false_abs}
@@ -184,7 +185,7 @@ def _decisions(workspace: Workspace, table: pd.DataFrame, gates: Gates, layers: 
     for source, target in product(gates.sources, dict.fromkeys(table["dataset"])):
         if not sources_of_gate(source, str(target), datasets):
             continue  # a study without all datasets has fewer gates
-        layer = layers[str(target)] if layers[str(target)] in gates.by_layer else -1
+        layer = gates.layers.get(str(target), -1)
         decision = decide(items_of[layer], source, str(target), **settings_of_gate)
         if np.isfinite(decision.score).any():
             decisions[source, str(target)] = decision, layer

@@ -134,10 +134,16 @@ class ProbeRun:
 
     # --- the parts of the protocol ---
 
-    def rows(self, progress: Callable[[int, int], None] = lambda layers_done, total: None) -> list[Row]:
-        """Return every row of the probes table without the columns that partition it."""
+    def rows(
+        self, progress: Callable[[int, int], None] = lambda layers_done, total: None, *, comparable: bool = False
+    ) -> list[Row]:
+        """Return every row of the probes table without the columns that partition it.
+
+        comparable: without those within a dataset and those of centroids.
+        """
         rows: list[Row] = []
-        for layers_done, layer_rows in enumerate(each_layer(self.layer_rows, self.n_layers), start=1):
+        of_layer = self.comparable_rows if comparable else self.layer_rows
+        for layers_done, layer_rows in enumerate(each_layer(of_layer, self.n_layers), start=1):
             rows += layer_rows
             progress(layers_done, self.n_layers)
         return mark_layers(rows + self._problems())

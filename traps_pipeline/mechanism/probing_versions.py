@@ -67,8 +67,10 @@ def extraction_version(workspace: Workspace, extraction: Extraction) -> str:
         entry = mechanism_entry(entry, settings)
     media = profile_digest(entry.media) if entry.media else None
     pooling = settings.pooling if settings else None
-    system = states_prompt(settings.system if settings else "vqa", extraction.prompt)
+    system = states_prompt(settings.system if settings else "vqa", extraction.text)
     made_of = [loaded_params(entry), media, system, pooling]
+    if extraction.weights_seed is not None:
+        made_of.append(extraction.weights_seed)
     if pooling in OF_PAIRS:  # an item's states depend on the other clip of its scenario, which is not in its own table
         made_of.append(sorted(workspace.tables.read_all(VIDEOS, ["file_sha256"])["file_sha256"]))
     return digest(made_of)[:16]

@@ -46,6 +46,13 @@ class StoredStates:
         """Return the rows of a dataset."""
         return self.items.loc[self.items["dataset"] == name]
 
+    def read_as(self, order: StoredStates, dataset: str, layer: int | Literal["normed"]) -> np.ndarray:
+        """Return states as `read`, in the order of another extraction's items."""
+        places = pd.Index(self.dataset(dataset)["item_id"]).get_indexer(pd.Index(order.dataset(dataset)["item_id"]))
+        if (places < 0).any():
+            raise TrapsError(f"{self.extraction.key} lacks states of items of {dataset}; materialize hidden_states again")
+        return self.read(dataset, layer)[places]
+
     def read(self, dataset: str, layer: int | Literal["normed"]) -> np.ndarray:
         """Return states (n, d) float32 in the order of the rows.
 

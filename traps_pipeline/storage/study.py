@@ -111,9 +111,6 @@ class GateSettings(Settings):
     """The settings of probe-gated abstention (docs/mechanism.md)."""
 
     false_abs: float = Field(default=0.05, gt=0, lt=1, description="of source controls, that conformal gates promise")
-    untrained: bool = Field(
-        default=False, description="also a gate on states of the same network with random weights, loaded beside it"
-    )
 
 
 class PatchingSettings(Settings):

@@ -63,6 +63,9 @@ class MechanismSpec(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
     quantisation: Quantisation | None = None
     nf4_skip: tuple[str, ...] = ()
+    random_weights: bool = Field(
+        default=True, description="also states of the network with random weights, twice; false: claims lack this control"
+    )
 
     @model_validator(mode="after")
     def _skips_are_of_nf4(self) -> MechanismSpec:

@@ -8,7 +8,7 @@ from traps_pipeline.mechanism.mechanism_rows import STEERING_EFFECTS
 from traps_pipeline.mechanism.probing_versions import patching_version, sentence_version
 from traps_pipeline.models.registry.entries import ModelEntry, local_models
 from traps_pipeline.pipeline.partitioning import EVERY, SAME
-from traps_pipeline.pipeline.schemes import CELL, EXTRACTION, by_extraction, these_keys
+from traps_pipeline.pipeline.schemes import CELL, EXTRACTION, by_extraction, these_keys, to_keys
 from traps_pipeline.pipeline.stage import of, source, stage
 from traps_pipeline.pipeline.stages.evaluation_stages import responses, verdicts
 from traps_pipeline.pipeline.stages.mechanism_stages import (
@@ -24,7 +24,7 @@ from traps_pipeline.pipeline.stages.mechanism_stages import (
 from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction
 from traps_pipeline.protocol.datasets import DATASETS, PROBED_ARMS
-from traps_pipeline.protocol.regimes import PROBE_PROMPT, PROMPTING
+from traps_pipeline.protocol.regimes import PROBE_PROMPT, PROMPTING, RANDOM_WEIGHTS
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
@@ -38,6 +38,20 @@ _ANSWERED_DATASETS = (*DATASETS, *PROBED_ARMS)
 _GATED = these_keys(
     CELL, [Cell(d, Evaluation(m, r, 1)).key for d in _ANSWERED_DATASETS for m in local_models() for r in PROMPTING]
 )
+
+
+def _with_random(key: str) -> list[str]:
+    """Return the extraction that is compared with states (of random weights, too) under its prompt."""
+    extraction = Extraction.parse(key)
+    return [Extraction(extraction.model, PROBE_PROMPT).key] if extraction.text == PROBE_PROMPT else []
+
+
+_COMPARED = [
+    _STATES,  # those of random weights are upstream of their probes
+    of(probes, to_keys(EXTRACTION, EXTRACTION, _with_random), need="some"),
+    of(probe_items, EVERY),
+    probing_settings,
+]
 
 
 @_source()
@@ -73,7 +87,7 @@ def _model_and_states(workspace: Workspace, key: str) -> "tuple[ModelEntry, Stor
     code="2",
     parents=[_STATES, of(probe_items, EVERY), of(verdicts, ANSWERED_CELLS, need="none"), probing_settings],
     kinds=["parquet", "scikitlearn"],
-    wants=lambda study, key: Extraction.parse(key).prompt in study.probed_prompts,
+    wants=lambda study, key: Extraction.parse(key).weights_seed is None and Extraction.parse(key).prompt in study.probed_prompts,
 )
 def probe_baselines(workspace: Workspace, key: str) -> StageOutput:
     """Return probes on raw inputs, the output margin and noise instead of states."""
@@ -92,7 +106,7 @@ def _is_gated(partitions: StudyPartitions, key: str) -> bool:
 _gates = partial(
     _stage,
     code="2",
-    parents=[_STATES, of(probe_items, EVERY), of(probes, SAME), of(verdicts, _GATED, need="some"), probing_settings],
+    parents=[*_COMPARED, of(verdicts, _GATED, need="some")],
     wants=_is_gated,
 )
 
@@ -117,12 +131,26 @@ def risk_coverage(workspace: Workspace, key: str) -> StageOutput:
     return StageOutput(curve_rows(workspace, *_model_and_states(workspace, key)))
 
 
-@_stage(tables.LENS, parents=[_STATES, probing_settings])
+@_stage(
+    tables.LENS,
+    parents=[_STATES, probing_settings],
+    wants=lambda _, key: Extraction.parse(key).weights_seed is None,
+)
 def lens(workspace: Workspace, key: str) -> StageOutput:
     """Return the output margin of stored states at every layer (final norm and head)."""
     from traps_pipeline.mechanism.lens import lens_rows
 
     return StageOutput(lens_rows(workspace, *_model_and_states(workspace, key)))
+
+
+@_stage(
+    tables.LEADS, parents=_COMPARED, wants=lambda _, key: Extraction.parse(key).prompt == PROBE_PROMPT
+)
+def leads(workspace: Workspace, key: str) -> StageOutput:
+    """Return how states and rivals order each dataset's sides, of the model and its controls."""
+    from traps_pipeline.mechanism.leads import lead_rows
+
+    return StageOutput(lead_rows(workspace, *_model_and_states(workspace, key)))
 
 
 @_stage(

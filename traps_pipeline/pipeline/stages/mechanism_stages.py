@@ -79,8 +79,8 @@ def _probed_datasets(dataset: str) -> list[str]:
 
 
 def steers(partitions: StudyPartitions, key: str | None) -> bool:
-    """Return whether the study steers models."""
-    return partitions.steers
+    """Return whether the study steers models, along directions of the model's own weights."""
+    return partitions.steers and (key is None or Extraction.parse(key).weights_seed is None)
 
 
 @_stage(
