@@ -31,7 +31,7 @@ _DECIDED_BY: dict[str, tuple[str, ...]] = {
     "hidden_states": ("mechanism/hidden_states.py", "models/local/capture.py"),
     "probes": ("mechanism/probes.py", "mechanism/probing.py"),
     "probe_baselines": ("mechanism/baselines.py",),
-    "steering": ("mechanism/steering.py", "mechanism/hook.py", "mechanism/shared_answers.py"),
+    "steering": ("mechanism/steering.py", "mechanism/hook.py"),
     "steering_votes": ("mechanism/steering.py",),
     "steering_effects": ("mechanism/shares.py", "mechanism/effects.py"),
     "steering_shares": ("mechanism/shares.py",),

@@ -11,8 +11,17 @@ Share = Annotated[float | None, "share, 0 to 1"]
 
 
 @dataclass(frozen=True, kw_only=True)
+class JoinedColumns(ExtractionColumns):
+    """Columns of rows that join a model's states with its answers."""
+
+    joins: Annotated[
+        str | None, "null: one model; else precision and frames of the two that are joined: no claim reads the row"
+    ]
+
+
+@dataclass(frozen=True, kw_only=True)
 class SteeringNullRow(SteeringColumns):
-    """A void direction's largest-dose effect on its dataset, ranked among nulls."""
+    """A void direction's effect on its dataset at one dose, ranked among nulls."""
 
     target: Annotated[str, "dataset of the direction, which is also the one that was steered; all: mean over datasets"]
     layer: Block
@@ -29,7 +38,11 @@ class SteeringNullRow(SteeringColumns):
     draws: Annotated[int, "draws of the null"]
     n_at_least: Annotated[int, "draws whose effect is at least that of the void direction"]
     p: Annotated[float, "(1 + n_at_least) / (1 + draws), one-sided"]
-    n: Annotated[int, "decided answers steered along the void direction, one per scenario and dataset"]
+    n: Annotated[int, "answers steered along the void direction, one per scenario and dataset"]
+    undecided: Annotated[float, "share of these that neither abstain nor answer"]
+    null_undecided: Annotated[float, "the same of the null"]
+    perplexity: Annotated[float | None, "of the answers under the unsteered model; null without one"]
+    null_perplexity: Annotated[float | None, "the same of the null"]
     epoch: shared.AnswerEpochs
 
 
@@ -57,6 +70,8 @@ class SteeringPecsRow(SteeringColumns):
     j: Annotated[float | None, "abs_rec - false_abs"]
     pecs: Share
     degenerate: Annotated[float, "share of answers that are cut off, repetitive, or in another script or language"]
+    undecided: Annotated[float, "share of answers that neither abstain nor answer; the other shares leave these out"]
+    perplexity: Annotated[float | None, "of the answers under the unsteered model, mean over sides; null without one"]
     n_controls: Annotated[int, "decided answers to controls"]
     n_voids: Annotated[int, "decided answers to voids"]
     epoch: shared.AnswerEpochs
@@ -99,7 +114,7 @@ PROBE_BASELINES = Table(
 
 
 @dataclass(frozen=True, kw_only=True)
-class GateRow(ExtractionColumns):
+class GateRow(JoinedColumns):
     """Scores on a target before and after a gate, by features, source and threshold."""
 
     regime: Annotated[str, "system prompt of the answers that are gated"]
@@ -134,7 +149,7 @@ GATE = Table(
 
 
 @dataclass(frozen=True, kw_only=True)
-class RiskCoverageRow(ExtractionColumns):
+class RiskCoverageRow(JoinedColumns):
     """A point of a risk-coverage curve, as a gate withholds the riskiest answers."""
 
     regime: Annotated[str, "system prompt of the answers"]
@@ -202,7 +217,7 @@ UNSEEN = "log-odds of void above the mid threshold, by a probe that has not seen
 
 
 @dataclass(frozen=True, kw_only=True)
-class ItemScoreRow(ExtractionColumns):
+class ItemScoreRow(JoinedColumns):
     """An item's scores from a model's states and output, beside its verdicts."""
 
     item_id: shared.ItemId
@@ -221,7 +236,7 @@ ITEM_SCORES = Table("item_scores", ItemScoreRow, partition_by=("model", "prompt"
 
 
 @dataclass(frozen=True, kw_only=True)
-class SentenceRow(ExtractionColumns):
+class SentenceRow(JoinedColumns):
     """Log-probabilities of an abstention and of the model's answer, for an item."""
 
     item_id: shared.ItemId

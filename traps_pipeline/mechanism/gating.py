@@ -296,7 +296,7 @@ def _row(
     figures = {**values, "auroc": area, "pecs_low": float(low), "pecs_high": float(high)}
     row_keys: dict[str, Any] = dict(zip(("features", "regime", "source", "threshold", "target"), about, strict=True))
     return GateRow(
-        **states.extraction.partition,
+        **states.joined,
         **row_keys,
         **nan_to_null(figures),
         layer=layer,
@@ -328,6 +328,6 @@ def _curves(
             (NO_GATE, n_answered / len(score), float(np.nanmean(risk_of_item)) if n_answered else 0.0, n_answered)
         )
     return [
-        RiskCoverageRow(**states.extraction.partition, regime=regime, features=name, coverage=c, risk=r, n=n)
+        RiskCoverageRow(**states.joined, regime=regime, features=name, coverage=c, risk=r, n=n)
         for name, c, r, n in points
     ]

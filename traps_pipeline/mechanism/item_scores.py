@@ -29,7 +29,7 @@ def item_score_rows(workspace: Workspace, entry: ModelEntry, states: StoredState
     outcomes = {regime: outcomes_of(workspace, entry.id, regime, states) for regime in PROMPTING}
     margins = output_or_note("item_scores", entry, states, states, datasets).get(MARGIN, {})
     probe_settings = {"folds": settings.probes.folds, "seed": settings.seed, "false_abs": settings.gate.false_abs}
-    rows: list[ItemScoreRow] = []
+    rows, joined = list[ItemScoreRow](), states.joined
     for dataset in datasets:
         features = read_states(states, [*dict.fromkeys(table["dataset"])], layers[dataset])
         scores: dict[str, np.ndarray] = {}
@@ -45,7 +45,7 @@ def item_score_rows(workspace: Workspace, entry: ModelEntry, states: StoredState
             }
             rows.append(
                 ItemScoreRow(
-                    **states.extraction.partition,
+                    **joined,
                     **{name: item[name] for name in ("item_id", "dataset", "scenario_id", "side")},
                     layer=layers[dataset],
                     own=_number(scores["own"][place]),

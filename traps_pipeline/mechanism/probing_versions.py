@@ -35,6 +35,24 @@ def mechanism_entry(entry: ModelEntry, settings: MechanismSettings) -> ModelEntr
     return entry if media is None else entry.model_copy(update={"media": media})
 
 
+def joined_models(entry: ModelEntry, settings: MechanismSettings) -> str | None:
+    """Return which two models a row joins that has a model's states and its answers; None for one.
+
+    They are two if the entry is looked into in another precision than it answers in, or on other frames.
+    """
+    states, answers = mechanism_entry(entry, settings).media, entry.media
+    inside, asked = entry.inside_params(), entry.local_params()
+    if (inside, states) == (asked, answers):
+        return None
+    sides = (("states", inside, states), ("answers", asked, answers))
+    return "; ".join(
+        f"{name}: {params.dtype if params.quantisation == 'none' else params.quantisation}, "
+        + (f"{media.uniform} frames" if media.uniform else f"{media.fps:g} frames a second")
+        for name, params, media in sides
+        if media
+    )
+
+
 def states_folder(workspace: Workspace, cell: StatesCell) -> Path:
     """Return the folder of a partition's shards."""
     return workspace.root / "states" / cell.extraction.model / cell.extraction.prompt / cell.dataset

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -11,7 +11,8 @@ import pandas as pd
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES
-from traps_pipeline.mechanism.probing_versions import states_folder
+from traps_pipeline.mechanism.probing_versions import joined_models, states_folder
+from traps_pipeline.models.registry.entries import get_model
 from traps_pipeline.protocol.cells import Extraction, StatesCell
 from traps_pipeline.storage.workspace import Workspace
 
@@ -42,6 +43,12 @@ class StoredStates:
         """Digest of the items and their states."""
         return digest(sorted(zip(self.items["item_id"], self.items["states_key"], strict=True)))
 
+    @property
+    def joined(self) -> dict[str, Any]:
+        """Values of the columns of rows that join these states with answers."""
+        entry = get_model(self.extraction.model)
+        return {**self.extraction.partition, "joins": joined_models(entry, self.workspace.mechanism)}
+
     def dataset(self, name: str) -> pd.DataFrame:
         """Return the rows of a dataset."""
         return self.items.loc[self.items["dataset"] == name]
@@ -50,7 +57,9 @@ class StoredStates:
         """Return states as `read`, in the order of another extraction's items."""
         places = pd.Index(self.dataset(dataset)["item_id"]).get_indexer(pd.Index(order.dataset(dataset)["item_id"]))
         if (places < 0).any():
-            raise TrapsError(f"{self.extraction.key} lacks states of items of {dataset}; materialize hidden_states again")
+            raise TrapsError(
+                f"{self.extraction.key} lacks states of items of {dataset}; materialize hidden_states again"
+            )
         return self.read(dataset, layer)[places]
 
     def read(self, dataset: str, layer: int | Literal["normed"]) -> np.ndarray:

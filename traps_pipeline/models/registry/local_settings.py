@@ -64,7 +64,8 @@ class MechanismSpec(BaseModel):
     quantisation: Quantisation | None = None
     nf4_skip: tuple[str, ...] = ()
     random_weights: bool = Field(
-        default=True, description="also states of the network with random weights, twice; false: claims lack this control"
+        default=True,
+        description="also states of the network with random weights, twice; false: claims lack this control",
     )
 
     @model_validator(mode="after")

@@ -24,7 +24,7 @@ from traps_pipeline.pipeline.stages.mechanism_stages import (
 from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction
 from traps_pipeline.protocol.datasets import DATASETS, PROBED_ARMS
-from traps_pipeline.protocol.regimes import PROBE_PROMPT, PROMPTING, RANDOM_WEIGHTS
+from traps_pipeline.protocol.regimes import PROBE_PROMPT, PROMPTING
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
@@ -82,12 +82,16 @@ def _model_and_states(workspace: Workspace, key: str) -> "tuple[ModelEntry, Stor
     return model, StoredStates.of(workspace, extraction)
 
 
+def _is_trained(_: StudyPartitions, key: str) -> bool:
+    return Extraction.parse(key).weights_seed is None
+
+
 @_stage(
     tables.PROBE_BASELINES,  # on this machine, since the output margin needs the model's head
     code="2",
     parents=[_STATES, of(probe_items, EVERY), of(verdicts, ANSWERED_CELLS, need="none"), probing_settings],
     kinds=["parquet", "scikitlearn"],
-    wants=lambda study, key: Extraction.parse(key).weights_seed is None and Extraction.parse(key).prompt in study.probed_prompts,
+    wants=lambda study, key: _is_trained(study, key) and Extraction.parse(key).prompt in study.probed_prompts,
 )
 def probe_baselines(workspace: Workspace, key: str) -> StageOutput:
     """Return probes on raw inputs, the output margin and noise instead of states."""
@@ -134,7 +138,7 @@ def risk_coverage(workspace: Workspace, key: str) -> StageOutput:
 @_stage(
     tables.LENS,
     parents=[_STATES, probing_settings],
-    wants=lambda _, key: Extraction.parse(key).weights_seed is None,
+    wants=_is_trained,
 )
 def lens(workspace: Workspace, key: str) -> StageOutput:
     """Return the output margin of stored states at every layer (final norm and head)."""
@@ -143,9 +147,7 @@ def lens(workspace: Workspace, key: str) -> StageOutput:
     return StageOutput(lens_rows(workspace, *_model_and_states(workspace, key)))
 
 
-@_stage(
-    tables.LEADS, parents=_COMPARED, wants=lambda _, key: Extraction.parse(key).prompt == PROBE_PROMPT
-)
+@_stage(tables.LEADS, parents=_COMPARED, wants=lambda _, key: Extraction.parse(key).prompt == PROBE_PROMPT)
 def leads(workspace: Workspace, key: str) -> StageOutput:
     """Return how states and rivals order each dataset's sides, of the model and its controls."""
     from traps_pipeline.mechanism.leads import lead_rows

@@ -14,6 +14,7 @@ from traps_pipeline.mechanism.mechanism_rows import (
     PROBE_ITEMS,
     PROBES,
     STEERING_EFFECTS,
+    STEERING_FLUENCY,
     STEERING_SHARES,
     STEERING_VOTES,
     CosineRow,
@@ -226,6 +227,22 @@ def steering_votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[
         yield finished_cell.key, output
 
 
+@_stage(
+    STEERING_FLUENCY,
+    parents=[of(items, by_dataset), steering],
+    scheme=schemes.STEERING,
+    kinds=["parquet", "pytorch"],
+    cost="machine",
+)
+def steering_fluency(workspace: Workspace, key: str) -> StageOutput:
+    """Return how likely the unsteered model finds each steered answer."""
+    from traps_pipeline.mechanism.fluency import fluency_rows
+    from traps_pipeline.mechanism.stages import examined_model
+
+    cell = SteeringCell.parse(key)
+    return StageOutput(fluency_rows(workspace, examined_model(workspace, cell.evaluation.model), cell))
+
+
 def _answers_and_votes(workspace: Workspace) -> "tuple[pd.DataFrame, pd.DataFrame]":
     """Return the steered answers, and the votes on them."""
     from traps_pipeline.mechanism.shares import VOTE_COLUMNS
@@ -236,15 +253,15 @@ def _answers_and_votes(workspace: Workspace) -> "tuple[pd.DataFrame, pd.DataFram
 _STEERING_PARENTS = (of(steering, need="some"), of(steering_votes, need="some"))
 
 
-@_stage(STEERING_EFFECTS, code="3", parents=_STEERING_PARENTS, wants=steers)
+@_stage(STEERING_EFFECTS, code="4", parents=(*_STEERING_PARENTS, of(steering_fluency, need="some")), wants=steers)
 def steering_effects(workspace: Workspace, _: None) -> list[SteeringEffectRow]:
     """Return abstention by path, kind of direction, layer, strength and side."""
     from traps_pipeline.mechanism.shares import effect_rows
 
-    return effect_rows(*_answers_and_votes(workspace))
+    return effect_rows(*_answers_and_votes(workspace), workspace.tables.read_all(STEERING_FLUENCY))
 
 
-@_stage(STEERING_SHARES, code="4", parents=_STEERING_PARENTS, wants=steers)
+@_stage(STEERING_SHARES, code="5", parents=_STEERING_PARENTS, wants=steers)
 def steering_shares(workspace: Workspace, _: None) -> list[SteeringShareRow]:
     """Return abstention over the paths of a set, with intervals by scenario."""
     from traps_pipeline.mechanism.shares import share_rows
