@@ -142,8 +142,11 @@ class LocalModel:
         """
         text = self._render(system, user)
         marks = [round(1000 * float(time)) for time in times_s]
-        clock = {"total_num_frames": marks[-1] + 1, "fps": float(CLOCK_FPS), "frames_indices": marks,
-                 "duration": marks[-1] / CLOCK_FPS, "height": frames.shape[1], "width": frames.shape[2]}  # fmt: skip
+        # Classes that are told one number take frames / total_num_frames for the share that is shown: the step, as here.
+        step = (marks[-1] - marks[0]) / (len(marks) - 1) if len(marks) > 1 else marks[-1] + 1
+        total = max(1, round(len(marks) * step))
+        clock = {"total_num_frames": total, "fps": float(CLOCK_FPS), "frames_indices": marks,
+                 "duration": total / CLOCK_FPS, "height": frames.shape[1], "width": frames.shape[2]}  # fmt: skip
         bos = self.processor.tokenizer.bos_token
         with self._processing:
             inputs = self.processor(

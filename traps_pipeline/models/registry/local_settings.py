@@ -65,7 +65,7 @@ class MechanismSpec(BaseModel):
     nf4_skip: tuple[str, ...] = ()
     random_weights: bool = Field(
         default=True,
-        description="also states of the network with random weights, twice; false: claims lack this control",
+        description="also read the network with random weights, twice; false: claims lack it",
     )
 
     @model_validator(mode="after")
