@@ -31,6 +31,10 @@ JUDGED_STAGES = {
     *("item_scores", "corrected", "gate", "risk_coverage"),
     *("steering_effects", "steering_shares", "steering_nulls", "steering_pecs"),
 }
+CLAIM_STAGES = (
+    *("leads", "probes", "probe_baselines", "gate", "risk_coverage", "item_scores", "sentences", "lens", "patching"),
+    *("cosines", "steering_effects", "steering_nulls"),
+)
 
 
 @dataclass(frozen=True)
@@ -195,6 +199,7 @@ TABLE_REPORTS: tuple[TableReport, ...] = (
     TableReport("judge_corrected", "human_tables.judge_corrected", ("panel_errors", "corrected"),
         title="Corrected for judges’ errors"),
     TableReport("judge_validation", "judge_tables.validation", ("judge_validation",), paper=True),
+    TableReport("claims", "claims.claims", CLAIM_STAGES, title="What is claimed of a model"),
     TableReport("probes", "probe_tables.probes", ("probes", "probe_baselines"), paper=True,
         recomputed=("probe_means",), title="Probes"),
     TableReport("probe_baselines", "control_reports.probe_baselines", ("probes", "probe_baselines"),
@@ -227,14 +232,12 @@ FIGURE_REPORTS: tuple[FigureReport, ...] = (
         frames=("visual_sub_scenarios", "visual_sub_cells")),
     FigureReport("graded", "Graded cuts", "graded_figure.graded", ("graded",), published=False),
     FigureReport("confabulation", "Prevalence of confabulation", "grids.confabulation", ("confabulation_prevalence",)),
-    FigureReport("states_and_output", "States against output, item by item", "expression_figures.states_and_output",
-        ("item_scores", "sentences", "probe_baselines"), published=False, has_finding=True),
+    FigureReport("claims", "What is claimed of a model", "expression_figures.claims", CLAIM_STAGES, published=False,
+        has_finding=True),
+    FigureReport("leads", "States among their rivals", "expression_figures.leads", ("leads",), published=False,
+        has_finding=True),
     FigureReport("lens", "The margin by layer", "expression_figures.lens", ("lens",), published=False,
         has_finding=True),
-    FigureReport("probe_baselines", "Probes against their baselines", "control_figures.probe_baselines",
-        ("probes", "probe_baselines"), published=False, has_finding=True),
-    FigureReport("gate_arrows", "Probe-gated abstention", "control_figures.gate_arrows", ("gate", "risk_coverage"),
-        published=False, has_finding=True),
     FigureReport("patching", "Activation patching", "control_figures.patching", ("patching",), published=False,
         has_finding=True),
     FigureReport("doses_among_nulls", "Doses among nulls", "control_figures.doses_among_nulls",
@@ -249,7 +252,7 @@ FIGURE_REPORTS: tuple[FigureReport, ...] = (
 )  # fmt: skip
 
 # Leading figures of a study with mechanistic analyses: the claim, and its possible refutations.
-INSIDE = ("states_and_output", "lens", "probe_baselines", "gate_arrows", "patching", "doses_among_nulls")
+INSIDE = ("claims", "leads", "lens", "patching", "doses_among_nulls")
 
 
 def folder(kind: str, results: Results) -> str:

@@ -142,7 +142,7 @@ class LocalModel:
         """
         text = self._render(system, user)
         marks = [round(1000 * float(time)) for time in times_s]
-        # Classes that are told one number take frames / total_num_frames for the share that is shown: the step, as here.
+        # A class that takes one number for the step has it from frames / total_num_frames.
         step = (marks[-1] - marks[0]) / (len(marks) - 1) if len(marks) > 1 else marks[-1] + 1
         total = max(1, round(len(marks) * step))
         clock = {"total_num_frames": total, "fps": float(CLOCK_FPS), "frames_indices": marks,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from traps_pipeline.mechanism.transfer_paths import probed_taxonomy
 from traps_pipeline.protocol.datasets import DATASETS, SHORT, taxonomy_of
 from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.report.result_frames import Results
@@ -48,8 +47,8 @@ SOURCE_WORDS = {
 
 
 def probe_baselines(results: Results) -> list[PrintedTable]:
-    """Return the probe beside raw inputs, margin and noise; also on look-alikes."""
-    return [_baseline_table(results), _look_alikes(results)]
+    """Return the probe beside raw inputs, margin and noise."""
+    return [_baseline_table(results)]
 
 
 def beside(results: Results) -> pd.DataFrame:
@@ -66,15 +65,6 @@ def beside(results: Results) -> pd.DataFrame:
     )
     probe = results.probes.loc[results.probes["chosen"].eq(True)]
     return _with_baselines(results, probe.merge(target_layers, on=["source", "target", "analysis"]))
-
-
-def look_alikes(results: Results) -> pd.DataFrame:
-    """Return `beside` for look-alikes of voids, by probes of their own taxonomy."""
-    probe = results.probes.loc[results.probes["chosen"].eq(True) & results.probes["target"].isin([*SOURCE_WORDS])]
-    is_own_taxonomy = [
-        taxonomy_of(s) == probed_taxonomy(t) for s, t in zip(probe["source"], probe["target"], strict=True)
-    ]
-    return _with_baselines(results, probe.loc[is_own_taxonomy])
 
 
 def _with_baselines(results: Results, probe: pd.DataFrame) -> pd.DataFrame:
@@ -112,32 +102,6 @@ def _baseline_table(results: Results) -> PrintedTable:
     reason = why(results, "the paper has no such baselines")
     title = "Probes beside their baselines"
     return PrintedTable("probe_baselines", title, rows, columns, notes, reason, deviation=DRAWS)
-
-
-def _look_alikes(results: Results) -> PrintedTable:
-    rows = look_alikes(results)
-    table_rows = rows.assign(
-        what=[SOURCE_WORDS[name] for name in rows["target"]],
-        against=[OPPOSITES[name] for name in rows["analysis"]],
-        path=short_names(rows["source"]),
-    )
-    columns = [
-        MODEL, Column("what", "Items"), Column("against", "Told apart from"), Column("path", "Source"), *_PROBE,
-        *_BASELINES, *SIDES,
-    ]  # fmt: skip
-    notes = [
-        *_NOTES[:2],
-        "told apart from voids: 1 for a probe that detects what cannot be known, 0.5 for one that detects what both "
-        "have; from controls: the reverse",
-        "frame times of the other side: 1 for a probe that reads the frames, 0 for one that reads the time stamps",
-        *few_note(rows),
-    ]
-    reason = why(results, "the paper has no such items")
-    title = "What only looks like a void"
-    return PrintedTable("probe_look_alikes", title, table_rows, columns, notes, reason, deviation=DRAWS)
-
-
-OPPOSITES = {"answerable_void": "voids", "answerable_control": "controls", "time_swapped": "its other side"}
 
 
 # --- steering ---------------------------------------------------------------------------------------------------------
@@ -228,7 +192,7 @@ SOURCE_NAMES = {f"one:{name}": short for name, short in SHORT.items()}
 
 def gate(results: Results) -> list[PrintedTable]:
     """Return PECS before and after gates and prompts, by source, threshold, features."""
-    return [_gate_sources(results), _gate_controls(results), _gate_answerable(results), _prompts(results)]
+    return [_gate_sources(results), _gate_answerable(results), _prompts(results)]
 
 
 _GATED = (
@@ -274,21 +238,6 @@ def _gate_sources(results: Results) -> PrintedTable:
     ]
     reason = why(results, "the paper gates nothing")
     return PrintedTable("gate", "Probe-gated abstention", rows, columns, notes, reason)
-
-
-def _gate_controls(results: Results) -> PrintedTable:
-    rows = _gates(results)
-    for name, value in (DEFAULT_GATE | {"target": "all"}).items():
-        rows = rows.loc[rows[name] == value]
-    columns = [MODEL, Column("regime", "Answers"), Column("features", "Features"), *_GATED]
-    notes = [
-        "gates from other datasets at the mid threshold, mean over the four datasets",
-        "a gate on states shows what states add only as far as it is above gates on raw inputs, on the output margin "
-        "and on an untrained model’s states",
-        *few_note(rows),
-    ]
-    reason = why(results, "the paper gates nothing")
-    return PrintedTable("gate_controls", "The gate beside its controls", rows, columns, notes, reason)
 
 
 def _gate_answerable(results: Results) -> PrintedTable:
