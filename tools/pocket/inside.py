@@ -18,7 +18,7 @@ FACTS = "training.json"  # beside the folder of the weights
 def figures_of(workspace: Workspace) -> list[Figure]:
     """Return the figures of a finished workspace. Raises TrapsError if the seed of its weights is not known."""
     seed, weights = _seed_of(workspace, looked_into(workspace))
-    return [Figure(seed, weights, name, round(value, 6)) for name, value in claimed(workspace).items()]
+    return [Figure(seed, weights, *key, round(value, 6)) for key, value in claimed(workspace).items()]
 
 
 def looked_into(workspace: Workspace) -> str:

@@ -113,7 +113,7 @@ def sentence_version(workspace: Workspace, extraction: Extraction) -> str:
     settings = workspace.study.mechanism
     if settings is None or extraction.model not in settings.models:
         return "none"
-    prompt = system_prompt(extraction.prompt)
+    prompt = system_prompt(extraction.text)
     return digest([extraction_version(workspace, extraction), list(settings.sentences), prompt])[:16]
 
 

@@ -133,7 +133,7 @@ def share_rows(
         path_answers.loc[path_answers["side"] == "void", ["model", "layer"]].drop_duplicates()
     )  # no sweep
     path_answers = path_answers.assign(
-        undecided=path_answers["abstained"].isna(), abstained=path_answers["abstained"].eq(True)
+        undecided=path_answers["abstained"].isna(), abstained=path_answers["abstained"].eq(True).fillna(False)
     )
     rows: list[SteeringShareRow] = []
     for _, model_answers in path_answers.groupby("model", sort=True):

@@ -77,7 +77,7 @@ def _claim_row(ax: Axes, y: int, row: Mapping[Any, Any], claim: Claim) -> None:
     from matplotlib.patches import Rectangle
 
     for x, subject in enumerate(SUBJECTS):
-        value = row[subject]
+        value = row[f"in_{subject}"]
         is_known = value is not None and value == value
         reaches = is_known and value >= claim.bound
         must_fail = subject in claim.fails_in

@@ -32,7 +32,6 @@ NO_GAP_FILE = ASSETS / "pocket" / "no_gap" / "mechanism.csv"  # by `python -m to
 OTHER_GATES = ("question words", "first frame", "all frames", "length", "time stamps", "output margin", LOGITS)
 VISUAL = tuple(name for name in DATASETS if not is_ill_posed(name))
 TEXTUAL = tuple(name for name in DATASETS if is_ill_posed(name))
-P = 0.05 + 1e-9
 
 
 class TwoModels(Exception):
@@ -206,11 +205,11 @@ def _followed(results: Results, model: str) -> float | None:
 
 
 def _ahead(results: Results, model: str) -> float | None:
-    """Return in which share of datasets controls abstain more along guided directions than along every null."""
+    """Return how much more controls abstain at the largest alpha along guided directions than along any null."""
     rows = _of_model(results.nulls, model)
-    rows = rows.loc[rows["target"].isin(DATASETS) & (rows["side"] == "control") & (rows["unit"] == "alpha")]
+    rows = rows.loc[(rows["target"] == "all") & (rows["side"] == "control") & (rows["unit"] == "alpha")]
     rows = rows.loc[(rows["dose"] == rows["dose"].max()) & (rows["directions"] == GUIDED)]
-    return _mean(rows.groupby(["regime", "target"], observed=True)["p"].max() <= P)
+    return min((float(value) for value in rows["effect"] - rows["null_highest"]), default=None)
 
 
 def _differ(results: Results, model: str) -> float | None:
@@ -230,13 +229,14 @@ _ALL, _GAP = (*RANDOM, PLACEBO, NO_GAP), (*RANDOM, PLACEBO)
 CLAIMS = (
     Claim("lead_visual", "states tell visual voids better than all rivals", "AUROC, states − best rival", 0.1,
           _by_features(_lead, VISUAL), _GAP),
-    Claim("lead_textual", "the same of ill-posed questions", "AUROC, states − best rival", 0.1,
+    Claim("lead_textual", "states tell ill-posed voids better than all rivals", "AUROC, states − best rival", 0.1,
           _by_features(_lead, TEXTUAL), _GAP),
-    Claim("residual", "and without words, pixels, length: visual voids", "AUROC of residual states", 0.65,
+    Claim("residual", "states without words, pixels, length tell visual voids", "AUROC of residual states", 0.65,
           _by_features(lambda results, target, areas: areas[RESIDUAL], VISUAL), _GAP),
-    Claim("output", "states know more than the output: visual voids", "AUROC, states − best of the output", 0.1,
+    Claim("output", "states tell visual voids better than the output", "AUROC, states − best of the output", 0.1,
           _by_features(_beyond_output, VISUAL), _ALL),
-    Claim("sentence", "and more than a whole abstention tells", "AUROC, states − sentence", 0.1, _sentences, (NO_GAP,)),
+    Claim("sentence", "states tell voids better than a whole abstention", "AUROC, states − sentence", 0.1, _sentences,
+          (NO_GAP,)),
     Claim("unexpressed", "voids are encoded and answered", "share of voids − of controls", 0.3, _unexpressed,
           (NO_GAP,)),
     Claim("transfer_visual", "one probe carries over to visual voids", "AUROC at the chosen layer", 0.65,
@@ -261,7 +261,7 @@ CLAIMS = (
           _of_own(_same_direction), (NO_GAP,)),
     Claim("followed", "answers follow what guided states hold alone", "controls, guided − standard directions", 0.3,
           _of_own(_followed), (NO_GAP,)),
-    Claim("ahead", "guided directions do more than nulls", "share of datasets, p ≤ .05 at the largest α", 0.5,
+    Claim("ahead", "guided directions do more than nulls", "controls, direction − highest null draw, largest α", 0.1,
           _of_own(_ahead), ()),
 )  # fmt: skip
 
@@ -269,7 +269,7 @@ CLAIMS = (
 
 
 def claim_frame(results: Results) -> pd.DataFrame:
-    """Return a row for each model and claim: its figure in each of SUBJECTS (NaN without one), and a verdict."""
+    """Return a row for each model and claim: its figure `in_` each of SUBJECTS (NaN without one), and a verdict."""
     import pandas as pd
 
     rows, without_gap = [], no_gap_figures()
@@ -281,8 +281,10 @@ def claim_frame(results: Results) -> pd.DataFrame:
                     values[subject] = claim.of(results, str(model), subject)
                 except TwoModels as joined:
                     values[subject], note = None, f"two models ({joined})"
-            rows.append({"model": model, "claim": claim.name, **values, "verdict": note or verdict(claim, values)})
-    return pd.DataFrame(rows, columns=pd.Index(["model", "claim", *SUBJECTS, "verdict"]))
+            figures = {f"in_{subject}": value for subject, value in values.items()}
+            rows.append({"model": model, "claim": claim.name, **figures, "verdict": note or verdict(claim, values)})
+    columns = ["model", "claim", *(f"in_{subject}" for subject in SUBJECTS), "verdict"]
+    return pd.DataFrame(rows, columns=pd.Index(columns))
 
 
 def verdict(claim: Claim, values: dict[str, float | None]) -> str:
@@ -301,7 +303,7 @@ def no_gap_figures() -> dict[str, float]:
     """Return the largest figure of each claim in the pocket model without the gap, over its training seeds."""
     largest: dict[str, float] = {}
     with NO_GAP_FILE.open(encoding="utf-8", newline="") as stream:
-        for row in csv.DictReader(stream):
+        for row in (row for row in csv.DictReader(stream) if row["subject"] == MODEL):
             largest[row["claim"]] = max(float(row["value"]), largest.get(row["claim"], -np.inf))
     return largest
 
@@ -323,7 +325,7 @@ def _claims(results: Results) -> PrintedTable:
     )
     columns = [
         MODEL_COLUMN, Column("says", "Claim"), Column("figure", "Holds if"),
-        *(Column(name, SUBJECT_NAMES[name], "fraction") for name in SUBJECTS), Column("verdict", "Verdict"),
+        *(Column(f"in_{name}", SUBJECT_NAMES[name], "fraction") for name in SUBJECTS), Column("verdict", "Verdict"),
     ]  # fmt: skip
     notes = [
         "a claim holds if its figure reaches the bound in the model and in none of the controls that it must fail in; "
