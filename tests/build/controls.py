@@ -11,6 +11,7 @@ import pandas as pd
 from traps_pipeline.mechanism.control_rows import (
     GATE,
     ITEM_SCORES,
+    LEADS,
     LENS,
     PATCHING,
     PROBE_BASELINES,
@@ -19,7 +20,7 @@ from traps_pipeline.mechanism.control_rows import (
     STEERING_NULLS,
 )
 from traps_pipeline.mechanism.effects import own_effects
-from traps_pipeline.mechanism.mechanism_rows import PROBES, STEERING_EFFECTS
+from traps_pipeline.mechanism.mechanism_rows import COSINES, PROBES, STEERING_EFFECTS
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.storage.tables import Table
 
@@ -50,6 +51,19 @@ def baselines() -> pd.DataFrame:
     return frame(PROBE_BASELINES, *rows)
 
 
+def leads() -> pd.DataFrame:
+    """States lead the best rival by .2; the network with random weights has .1 more than its own, a placebo .05."""
+    rows = []
+    for subject, states, rival in (("model", 0.9, 0.7), ("random_0", 0.6, 0.5), ("length_matched", 0.55, 0.5)):
+        at = {"subject": subject, "target": "chaotic", "n_voids": 16, "n_controls": 16, "layer": -1}
+        own = {"features": "states", "auroc": states, "low": 0.5, "high": 1.0, "layer": 3, "rival": "question words"}
+        own |= {"lead": states - rival, "lead_low": 0.05, "lead_high": 0.3}
+        others = {"states, residual": 0.8, "question words": rival, "output margin": rival - 0.1}
+        others["first-token logits"] = rival - 0.05
+        rows += [at | own, *(at | {"features": name, "auroc": value} for name, value in others.items())]
+    return frame(LEADS, *rows)
+
+
 def gate() -> pd.DataFrame:
     figures = {"acc": 0.8, "false_abs": 0.1, "abs_rec": 0.9, "pecs": 0.64, "pecs_low": 0.5, "pecs_high": 0.7}
     plain = {"plain_acc": 0.9, "plain_false_abs": 0.0, "plain_abs_rec": 0.5, "plain_pecs": 0.45}
@@ -78,7 +92,8 @@ def item_scores() -> pd.DataFrame:
     """Two voids, both answered: states rank them above both controls, the output between them."""
     scored = (("void", 2.0, -3.0), ("void", 1.0, -1.0), ("control", -1.0, -2.0), ("control", -4.0, -4.0))
     about = {"dataset": "chaotic", "abstained_standard": False}
-    rows = [about | {"item_id": str(n), "side": s, "own": own, "margin": m} for n, (s, own, m) in enumerate(scored)]
+    rows = [about | {"item_id": str(n), "side": s, "own": own, "others": own, "margin": m}
+            for n, (s, own, m) in enumerate(scored)]  # fmt: skip
     return frame(ITEM_SCORES, *rows)
 
 
@@ -101,7 +116,19 @@ def lens() -> pd.DataFrame:
 def nulls() -> pd.DataFrame:
     row = {"directions": "guided", "regime": "guided", "target": "chaotic", "layer": 3, "unit": "gap", "dose": 1.0}
     row |= {"side": "control", "null": "isotropic", "effect": 0.8, "null_mean": 0.1, "null_lowest": 0.0}
-    return frame(STEERING_NULLS, row | {"null_highest": 0.3, "draws": 20, "n_at_least": 0, "p": 1 / 21, "n": 5})
+    return frame(
+        STEERING_NULLS,
+        row
+        | {
+            "null_highest": 0.3,
+            "draws": 20,
+            "n_at_least": 0,
+            "p": 1 / 21,
+            "n": 5,
+            "undecided": 0.2,
+            "null_undecided": 0.1,
+        },
+    )
 
 
 def effects() -> pd.DataFrame:
@@ -127,6 +154,9 @@ class Made(Results):
     risk_coverage = cached_property(lambda _: curves())
     patching = cached_property(lambda _: patching())
     item_scores = cached_property(lambda _: item_scores())
+    leads = cached_property(lambda _: leads())
+    cosines = cached_property(lambda _: frame(COSINES))
+    effects = cached_property(lambda _: effects())
     lens = cached_property(lambda _: lens())
     sentences = cached_property(lambda _: sentences())
     nulls = cached_property(lambda _: nulls())

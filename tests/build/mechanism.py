@@ -33,11 +33,15 @@ def entry(patch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -
     return made
 
 
-def extract_all(workspace: Workspace, datasets: Sequence[str] = (*DATASETS, ANSWERABLE, TIME_SWAPPED)) -> int:
+def extract_all(
+    workspace: Workspace,
+    datasets: Sequence[str] = (*DATASETS, ANSWERABLE, TIME_SWAPPED),
+    extraction: Extraction = STANDARD,
+) -> int:
     made = 0
     for dataset in datasets:
         workspace.tables.write(PROBE_ITEMS, {"dataset": dataset}, probe_items(workspace, dataset), {})
-        cell = StatesCell(dataset, STANDARD)
+        cell = StatesCell(dataset, extraction)
         rows, new = stages.extract_states(workspace, cell)
         workspace.tables.write(HIDDEN_STATES, cell.partition, rows, {})
         made += new
