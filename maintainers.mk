@@ -12,6 +12,7 @@ test-newest: render-packages ## the newest libraries that pyproject.toml admits:
 	$(compile)
 	$(BIN)/python -m pip --disable-pip-version-check list
 	$(BIN)/traps models check
+	$(BIN)/traps doctor --local # what looking inside relies on, with the newest transformers
 	$(PYTEST) -n auto $(FAST) --any-cpu # newer libraries may import longer
 
 # A number to look at, no threshold: what only slow tests reach counts as not reached.

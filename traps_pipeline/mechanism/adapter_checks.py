@@ -202,7 +202,9 @@ def _check_times(subject: Subject) -> str:
 def _require_stamps(subject: Subject, slow: Prompt) -> float:
     """Return how far written times are from those of the frames that they stand for, at half the speed."""
     parts = spans(subject.model, slow, SYSTEM, QUESTIONS[1])
-    text = subject.model.processor.tokenizer.decode(slow.inputs["input_ids"][0][parts["stamps"]])
+    ids, places = slow.inputs["input_ids"][0], np.flatnonzero(parts["stamps"])
+    runs = np.split(places, np.flatnonzero(np.diff(places) > 1) + 1)  # a stamp each, between pictures
+    text = " ".join(subject.model.processor.tokenizer.decode(ids[run]) for run in runs)
     written = [60 * float(minutes or 0) + float(s) for minutes, s in re.findall(r"(?:(\d+):)?(\d+(?:\.\d+)?)", text)]
     times = 2 * subject.times_s
     merged = len(times) // max(1, len(written))
@@ -262,6 +264,10 @@ def _clips(subject: Subject) -> str:
 
 def _batches(subject: Subject) -> str:
     model, prompts = subject.model, subject.prompts
+    again, push = [prompts[0], *prompts, prompts[0]], subject.steered(0.5, -0.5, 0.5, 0.5, 0.5)  # equal prompts share
+    steered = model.generate(again, NEW_TOKENS, steering=push)
+    alone = [model.generate([prompt], NEW_TOKENS, steering=push.rows([n]))[0] for n, prompt in enumerate(again)]
+    _require([a.tokens for a in steered] == [a.tokens for a in alone], "a steered answer depends on its batch")
     with _end_at(model, model.generate(prompts[:1], 2)[0].tokens[-1]):
         batched_answers = model.generate(prompts, NEW_TOKENS)
         single_answers = [model.generate([prompt], NEW_TOKENS)[0] for prompt in prompts]
@@ -293,7 +299,7 @@ CHECKS = (
     Check("means", "the mean over the question's tokens is that of the library's states", _check_pooling),
     Check("patching", "a patch with itself changes nothing, one of all positions gives the source", _check_patching),
     Check("clips", "the vision tower sees a clip once, and states stay as they are", _clips),
-    Check("batches", "answers do not depend on their batch, nor on rows that end early", _batches),
+    Check("batches", "answers, steered or not, do not depend on their batch, nor on rows that end early", _batches),
 )
 
 

@@ -18,6 +18,7 @@ from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS
 from traps_pipeline.mechanism.probing_versions import joined_models
 from traps_pipeline.mechanism.stages import probed_item
 from traps_pipeline.models.asking.answer_rows import RESPONSES
+from traps_pipeline.models.local.sidepaths import cache_argument
 from traps_pipeline.models.registry.entries import ModelEntry, get_model
 from traps_pipeline.models.registry.prompts import system_prompt
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction
@@ -96,7 +97,8 @@ def mean_log_probabilities(model: LocalModel, prompt: Prompt, answers: Sequence[
     with torch.inference_mode():
         output = model.network.base_model(**model.placed(prompt.inputs), use_cache=True)
         output.past_key_values.batch_repeat_interleave(len(answers))
-        behind = model.network.base_model(input_ids=rows, past_key_values=output.past_key_values)
+        read = {cache_argument(model.network.base_model): output.past_key_values}
+        behind = model.network.base_model(input_ids=rows, **read)
         ends = output.last_hidden_state[:, -1:].expand(len(answers), -1, -1)
         states = torch.cat([ends, behind.last_hidden_state[:, :-1].to(ends.device)], dim=1)
         chances = head_logits(model, states).log_softmax(-1).gather(-1, rows[..., None].to(ends.device))[..., 0]
