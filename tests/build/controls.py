@@ -15,11 +15,9 @@ from traps_pipeline.mechanism.control_rows import (
     LENS,
     PATCHING,
     PROBE_BASELINES,
-    RISK_COVERAGE,
     SENTENCES,
     STEERING_NULLS,
 )
-from traps_pipeline.mechanism.effects import own_effects
 from traps_pipeline.mechanism.mechanism_rows import COSINES, PROBES, STEERING_EFFECTS
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.storage.tables import Table
@@ -73,11 +71,6 @@ def gate() -> pd.DataFrame:
     rows = [row | {"features": features, "target": target} for features, target in kinds]
     decoys = at | {"features": "states", "target": "decoy", "false_abs": 0.4, "n_controls": 8, "n_voids": 0}
     return frame(GATE, *rows, decoys)
-
-
-def curves() -> pd.DataFrame:
-    point = {"regime": "guided", "coverage": 0.5, "risk": 0.2, "n": 5}
-    return frame(RISK_COVERAGE, *(point | {"features": name} for name in ("states", "no gate")))
 
 
 def patching() -> pd.DataFrame:
@@ -151,7 +144,6 @@ class Made(Results):
     prompted_probes = cached_property(lambda _: probes())
     prompted_baselines = cached_property(lambda _: baselines())
     gate = cached_property(lambda _: gate())
-    risk_coverage = cached_property(lambda _: curves())
     patching = cached_property(lambda _: patching())
     item_scores = cached_property(lambda _: item_scores())
     leads = cached_property(lambda _: leads())
@@ -160,4 +152,3 @@ class Made(Results):
     lens = cached_property(lambda _: lens())
     sentences = cached_property(lambda _: sentences())
     nulls = cached_property(lambda _: nulls())
-    own_effects = cached_property(lambda _: own_effects(effects()))

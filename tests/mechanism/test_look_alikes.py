@@ -16,7 +16,7 @@ import torch
 
 from tests.build.errors import raises
 from tests.build.mechanism import STANDARD, entry, extract_all, patch
-from tests.mechanism.study import CATEGORY, PAIRS, filled, make_study
+from tests.mechanism.study import CATEGORY, PAIRS, filled, make_study, register
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.mechanism import stages
@@ -184,8 +184,11 @@ def test_gates_of_random_weights_stand_beside_the_trained_ones_but_where_the_ent
     }
     assert all(row.pecs is not None and row.auroc is not None for row in rows if row.target in DATASETS)
     without = entry.model_copy(update={"mechanism": MechanismSpec(random_weights=False)})
-    assert not {*RANDOM_WEIGHTS} & {row.features for row in gate_rows(study, without, StoredStates.of(study, STANDARD))}
-    assert {row.subject for row in lead_rows(study, without, StoredStates.of(study, STANDARD))} == {MODEL, *ARMS}
+    with pytest.MonkeyPatch.context() as patch:
+        register(patch, without)
+        states = StoredStates.of(study, STANDARD)
+        assert not {*RANDOM_WEIGHTS} & {row.features for row in gate_rows(study, without, states)}
+        assert {row.subject for row in lead_rows(study, without, states)} == {MODEL, *ARMS}
 
 
 # --- states among their rivals ----------------------------------------------------------------------------------------

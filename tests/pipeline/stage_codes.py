@@ -38,7 +38,6 @@ _DECIDED_BY: dict[str, tuple[str, ...]] = {
     "steering_nulls": ("mechanism/nulls.py",),
     "steering_pecs": ("mechanism/nulls.py",),
     "gate": ("mechanism/gate.py", "mechanism/gating.py"),
-    "risk_coverage": ("mechanism/gate.py", "mechanism/gating.py"),
     "patching": ("mechanism/patching_effects.py", "mechanism/patching_stage.py"),
 }  # else the module of the stage's own name
 

@@ -149,22 +149,6 @@ GATE = Table(
 
 
 @dataclass(frozen=True, kw_only=True)
-class RiskCoverageRow(JoinedColumns):
-    """A point of a risk-coverage curve, as a gate withholds the riskiest answers."""
-
-    regime: Annotated[str, "system prompt of the answers"]
-    features: Annotated[str, "as in gate; no gate: answers given up in no order, the risk of all"]
-    coverage: Annotated[float, "share of items that are answered"]
-    risk: Annotated[float, "share of these answers that are wrong; every answer to a void is"]
-    n: Annotated[int, "answers"]
-
-
-RISK_COVERAGE = Table(
-    "risk_coverage", RiskCoverageRow, partition_by=("model", "prompt"), key=("regime", "features", "coverage")
-)
-
-
-@dataclass(frozen=True, kw_only=True)
 class LensRow(ExtractionColumns):
     """The margin of a dataset's states at a layer (logit lens: final norm and head)."""
 

@@ -210,25 +210,6 @@ class Outcomes:
         )
 
 
-def risk_coverage(score: np.ndarray, outcomes: Outcomes, coverages: Sequence[float]) -> list[tuple[float, float, int]]:
-    """Return (coverage, risk, answers kept) as the highest scores are withheld.
-
-    Answered items are those on which the model did not abstain. Coverage is the share of all items that are answered
-    and kept; risk is the share of kept answers that are wrong: every answer to a void, and every incorrect answer to a
-    control. Coverages above the share of answered items are left out.
-    """
-    is_answered = outcomes.abstained == 0
-    risk_of_item = np.where(outcomes.void, 1.0, 1 - outcomes.correct)
-    is_known = is_answered & np.isfinite(risk_of_item) & np.isfinite(score)
-    order = np.flatnonzero(is_known)[np.argsort(score[is_known], kind="stable")]
-    points = []
-    for coverage in coverages:
-        count = round(coverage * len(score))
-        if 0 < count <= len(order):
-            points.append((count / len(score), float(risk_of_item[order[:count]].mean()), count))
-    return points
-
-
 def separation(decisions: Decisions, void: np.ndarray) -> float:
     """Return AUROC of a gate's scores against labels void (n,); NaN with one side."""
     is_known = np.isfinite(decisions.score)

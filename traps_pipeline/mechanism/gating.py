@@ -1,4 +1,4 @@
-"""Build GATE and RISK_COVERAGE rows (gate stage) from stored states and verdicts."""
+"""Build GATE rows from stored states and verdicts."""
 
 from __future__ import annotations
 
@@ -15,9 +15,8 @@ from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.mechanism.baselines import output_or_note, probed_items, raw_features
-from traps_pipeline.mechanism.control_rows import STATES, GateRow, RiskCoverageRow
+from traps_pipeline.mechanism.control_rows import STATES, GateRow
 from traps_pipeline.mechanism.gate import (
-    MID,
     OTHER_DATASETS,
     SOURCES,
     THRESHOLDS,
@@ -26,7 +25,6 @@ from traps_pipeline.mechanism.gate import (
     Outcomes,
     decide,
     families,
-    risk_coverage,
     separation,
     sources_of_gate,
 )
@@ -37,15 +35,14 @@ from traps_pipeline.mechanism.probes import swapped_labels
 from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.mechanism.transfer_paths import probed_taxonomy
 from traps_pipeline.models.registry.entries import ModelEntry
-from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction
+from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import DATASETS
-from traps_pipeline.protocol.regimes import PROMPTING, RANDOM_WEIGHTS
+from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.scoring.bootstrap import RESAMPLED_FIGURES, draw_scenarios, figures_of, interval, run_sums
 from traps_pipeline.scoring.metrics import COUNTS
 from traps_pipeline.storage.workspace import Workspace
 
-SHUFFLED, NO_GATE = "shuffled labels", "no gate"
-COVERAGES = tuple(k / 20 for k in range(1, 21))
+SHUFFLED = "shuffled labels"
 ALL = "all"
 _PECS = RESAMPLED_FIGURES.index("pecs")
 
@@ -79,15 +76,6 @@ def gate_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> 
         for regime, outcomes, features, gated in _each_regime(workspace, entry, states)
         for source in dict.fromkeys(source for source, _ in gated)
         for row in _rows(states, (features, regime, source), _of_source(gated, source), outcomes, resamples, seed)
-    ]
-
-
-def curve_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> list[RiskCoverageRow]:
-    """Return RISK_COVERAGE rows, as `gate_rows`, for gates from other datasets."""
-    return [
-        row
-        for regime, outcomes, features, gated in _each_regime(workspace, entry, states)
-        for row in _curves(states, features, regime, _of_source(gated, OTHER_DATASETS), outcomes)
     ]
 
 
@@ -161,11 +149,10 @@ def _kinds(workspace: Workspace, entry: ModelEntry, states: StoredStates, layers
     for name, features in output_or_note("gate", entry, states, states, names).items():
         yield Gates(name, {-1: features}, controls)
     yield Gates(SHUFFLED, states_by_layer, controls, layers)
-    for name in RANDOM_WEIGHTS if entry.has_random_weights else ():
-        random = StoredStates.of(workspace, Extraction(entry.id, name))
+    for random in StoredStates.of_random(workspace, entry.id):
         own_layers = chosen_layers(workspace, random, names)
         by_layer = {n: {d: random.read_as(states, d, n) for d in names} for n in sorted({*own_layers.values()})}
-        yield Gates(name, by_layer, controls, own_layers)
+        yield Gates(random.extraction.prompt, by_layer, controls, own_layers)
 
 
 def read_states(states: StoredStates, names: Sequence[str], layer: int) -> dict[str, np.ndarray]:
@@ -303,31 +290,3 @@ def _row(
         n_controls=sides[0],
         n_voids=sides[1],
     )
-
-
-def _curves(
-    states: StoredStates, features: str, regime: str, decided: DecisionsByTarget, outcomes: Mapping[str, Outcomes]
-) -> list[RiskCoverageRow]:
-    """Return risk against coverage over the four datasets together.
-
-    A score is relative to its own gate's mid threshold, so that the scores of four gates are comparable.
-    """
-    datasets = [name for name in decided if name in DATASETS]
-    if not datasets:
-        return []
-    score = np.concatenate([decided[name][0].score - decided[name][0].threshold[MID] for name in datasets])
-    parts = [outcomes[name] for name in datasets]
-    pooled_outcomes = Outcomes(
-        *(np.concatenate([getattr(part, f) for part in parts]) for f in ("void", "correct", "abstained"))
-    )
-    points = [(features, *point) for point in risk_coverage(score, pooled_outcomes, COVERAGES)]
-    if features == STATES:
-        n_answered = int((pooled_outcomes.abstained == 0).sum())
-        risk_of_item = np.where(pooled_outcomes.void, 1.0, 1 - pooled_outcomes.correct)[pooled_outcomes.abstained == 0]
-        points.append(
-            (NO_GATE, n_answered / len(score), float(np.nanmean(risk_of_item)) if n_answered else 0.0, n_answered)
-        )
-    return [
-        RiskCoverageRow(**states.joined, regime=regime, features=name, coverage=c, risk=r, n=n)
-        for name, c, r, n in points
-    ]

@@ -25,7 +25,6 @@ from traps_pipeline.mechanism.transfer_paths import LOOK_ALIKES
 from traps_pipeline.models.registry.entries import ModelEntry
 from traps_pipeline.protocol.cells import Extraction
 from traps_pipeline.protocol.datasets import DATASETS
-from traps_pipeline.protocol.regimes import RANDOM_WEIGHTS
 from traps_pipeline.scoring.bootstrap import scenario_weights
 from traps_pipeline.storage.workspace import Workspace
 
@@ -76,9 +75,10 @@ def subjects(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> I
     for placebo, target in LOOK_ALIKES.items():
         if placebo in names and target in targets:
             yield Subject(placebo, states, output, [target], {target: placebo})
-    for name in RANDOM_WEIGHTS if entry.has_random_weights else ():
-        random = StoredStates.of(workspace, Extraction(entry.id, name))
-        yield Subject(name, random, output_or_note("leads", entry, random, states, names), targets, {})
+    for random in StoredStates.of_random(workspace, entry.id):
+        yield Subject(
+            random.extraction.prompt, random, output_or_note("leads", entry, random, states, names), targets, {}
+        )
 
 
 def stacked(table: pd.DataFrame, features: Features) -> np.ndarray:

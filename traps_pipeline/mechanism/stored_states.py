@@ -14,6 +14,7 @@ from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES
 from traps_pipeline.mechanism.probing_versions import joined_models, states_folder
 from traps_pipeline.models.registry.entries import get_model
 from traps_pipeline.protocol.cells import Extraction, StatesCell
+from traps_pipeline.protocol.regimes import RANDOM_WEIGHTS
 from traps_pipeline.storage.workspace import Workspace
 
 
@@ -32,6 +33,18 @@ class StoredStates:
         if items.empty:
             raise TrapsError(f"no hidden states of {extraction.key}; materialize hidden_states for it first")
         return StoredStates(workspace, extraction, items.reset_index(drop=True))
+
+    @staticmethod
+    def of_random(workspace: Workspace, model: str) -> list[StoredStates]:
+        """Return states of a model's network with random weights, for each seed that was extracted."""
+        entry = get_model(model)
+        extractions = [Extraction(model, name) for name in RANDOM_WEIGHTS if entry.has_random_weights]
+        made = workspace.tables.partitions(HIDDEN_STATES)
+        return [
+            StoredStates.of(workspace, extraction)
+            for extraction in extractions
+            if any(extraction.partition.items() <= part.items() for part in made)
+        ]
 
     @property
     def n_layers(self) -> int:

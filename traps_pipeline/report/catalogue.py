@@ -28,11 +28,11 @@ RECOMPUTED = "recomputed"  # folder below tables/ for tables computed from the p
 # with the graph.
 JUDGED_STAGES = {
     *("leaderboard", "metrics", "contrasts", "regime_tests", "hypotheses", "graded", "leave_one_out"),
-    *("item_scores", "corrected", "gate", "risk_coverage"),
+    *("item_scores", "corrected", "gate"),
     *("steering_effects", "steering_shares", "steering_nulls", "steering_pecs"),
 }
 CLAIM_STAGES = (
-    *("leads", "probes", "probe_baselines", "gate", "risk_coverage", "item_scores", "sentences", "lens", "patching"),
+    *("leads", "probes", "probe_baselines", "gate", "item_scores", "sentences", "lens", "patching"),
     *("cosines", "steering_effects", "steering_nulls"),
 )
 
@@ -202,8 +202,6 @@ TABLE_REPORTS: tuple[TableReport, ...] = (
     TableReport("claims", "claims.claims", CLAIM_STAGES, title="What is claimed of a model"),
     TableReport("probes", "probe_tables.probes", ("probes", "probe_baselines"), paper=True,
         recomputed=("probe_means",), title="Probes"),
-    TableReport("probe_baselines", "control_reports.probe_baselines", ("probes", "probe_baselines"),
-        title="Probes and their baselines"),
     TableReport("gate", "control_reports.gate", ("gate", "probes", "probe_baselines"), title="Probe-gated abstention"),
     TableReport("patching", "patching_tables.patching", ("patching",)),
     TableReport("cosines", "steering_tables.cosines", ("cosines",), paper=True,
@@ -240,8 +238,6 @@ FIGURE_REPORTS: tuple[FigureReport, ...] = (
         has_finding=True),
     FigureReport("patching", "Activation patching", "control_figures.patching", ("patching",), published=False,
         has_finding=True),
-    FigureReport("doses_among_nulls", "Doses among nulls", "control_figures.doses_among_nulls",
-        ("steering_effects", "steering_nulls"), published=False, has_finding=True),
     FigureReport("probe_curves", "Probe transfer by layer", "steering_figures.probe_curves", ("probes",),
         published=False),
     FigureReport("confabulated_strip", "Probes on confabulated voids", "steering_figures.confabulated_strip",
@@ -252,7 +248,7 @@ FIGURE_REPORTS: tuple[FigureReport, ...] = (
 )  # fmt: skip
 
 # Leading figures of a study with mechanistic analyses: the claim, and its possible refutations.
-INSIDE = ("claims", "leads", "lens", "patching", "doses_among_nulls")
+INSIDE = ("claims", "leads", "lens", "patching")
 
 
 def folder(kind: str, results: Results) -> str:

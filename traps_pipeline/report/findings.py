@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
 
 from traps_pipeline.base.terminal import plain
-from traps_pipeline.base.wording import count_noun, in_percent
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.mechanism.control_rows import MODEL, STATES
 from traps_pipeline.protocol.datasets import SHORT
 from traps_pipeline.protocol.regimes import PROMPTING
@@ -16,8 +16,6 @@ from traps_pipeline.report.tables.claims import CLAIMS, claim_frame, lead_rows
 if TYPE_CHECKING:
     import pandas as pd
 
-ALPHA = 0.05 + 1e-9
-_CELL = ["regime", "target", "layer", "unit", "dose", "side"]
 _POSITIONS = {"changed": "changed visual tokens", "unchanged": "unchanged visual tokens", "last": "the last token"}
 
 
@@ -78,32 +76,6 @@ def lens(results: Results) -> Iterator[str]:
             f"{above[1]:+.1f} under {PROMPTING[1]} at the last layer; one layer before, {above[2]:+.1f} and "
             f"{above[3]:+.1f} (means over datasets)."
         )
-
-
-@_join_sentences
-def doses_among_nulls(results: Results) -> Iterator[str]:
-    """Yield where directions of each prompt's states exceed 19 of 20 draws of all nulls."""
-    rows = results.nulls
-    for model, of_model in _models(rows.loc[rows["target"] != "all"]):
-        for directions, group in of_model.groupby("directions", sort=False, observed=True):
-            cells = [of_cell for _, of_cell in group.groupby(_CELL, sort=False, observed=True)]
-            ahead = [
-                of_cell.to_dict("records")[0] for of_cell in cells if (of_cell["p"].to_numpy(float) <= ALPHA).all()
-            ]
-            best = max(ahead, key=lambda row: row["effect"], default=None)
-            yield (
-                f"{model}: void directions of {directions} states do more than 19 of 20 draws of every null in "
-                f"{len(ahead)} of {count_noun(len(cells), 'cell')}" + (f", most of all {_cell(best)}." if best else ".")
-            )
-
-
-def _cell(row: Mapping[Any, Any]) -> str:
-    moved = "more" if row["side"] == "control" else "fewer"
-    dose = f"{row['dose']:g} × the class gap" if row["unit"] == "gap" else f"α {row['dose']:g}"
-    return (
-        f"{SHORT[row['target']]} at {dose}, where {in_percent(row['effect'])} {moved} of {row['n']} {row['side']}s are "
-        "abstained on"
-    )
 
 
 @_join_sentences

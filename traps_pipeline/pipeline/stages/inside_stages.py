@@ -127,14 +127,6 @@ def gate(workspace: Workspace, key: str) -> StageOutput:
     return StageOutput(gate_rows(workspace, *_model_and_states(workspace, key)))
 
 
-@_gates(tables.RISK_COVERAGE)
-def risk_coverage(workspace: Workspace, key: str) -> StageOutput:
-    """Return risk against coverage over four datasets, as a gate withholds answers."""
-    from traps_pipeline.mechanism.gating import curve_rows
-
-    return StageOutput(curve_rows(workspace, *_model_and_states(workspace, key)))
-
-
 @_stage(
     tables.LENS,
     parents=[_STATES, probing_settings],

@@ -1,26 +1,18 @@
-"""Draw tests of mechanistic claims: patching, doses and nulls."""
+"""Draw activation patching."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from traps_pipeline.base.wording import count_noun
-from traps_pipeline.mechanism.directions import NULLS
-from traps_pipeline.protocol.datasets import SHORT
-from traps_pipeline.report.figures.looks import legend_key, range_text
-from traps_pipeline.report.result_frames import Results, datasets_of
-from traps_pipeline.report.tables.inside_columns import few_marks, why
+from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.patching_tables import SITES
 from traps_pipeline.report.terms import TITLES
 from traps_pipeline.report.writing import (
-    COLOURS,
-    GRID,
     INK,
     PAGE_IN,
-    SOFT,
     NotRun,
     figure_style,
     fraction,
@@ -34,10 +26,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 GROUPS = ("system", "stamps", "changed", "unchanged", "question", "last", "all")
-
-
-def _colours(names: Sequence[str]) -> dict[str, str]:
-    return dict(zip(names, COLOURS, strict=False))
 
 
 def patching(results: Results) -> Figure:
@@ -117,78 +105,3 @@ def _effects(ax: Axes, part: pd.DataFrame) -> Any:
                 shade = "white" if abs(value) > 0.6 else "black"
                 ax.text(column, row, fraction(value, 2), ha="center", va="center", size=6, color=shade)
     return image
-
-
-def doses_among_nulls(results: Results) -> Figure:
-    """Return abstention of controls (+) and voids (−) along a direction, by dose.
-
-    Each dataset has its own direction; the dose is in units of the class gap, on pairs that the direction does not come
-    from; doses beyond the cap, in states, are left out. Right of the line: the nulls, which are orthogonal to the
-    direction, at the largest dose, added on controls (+) and subtracted on voids (−); a larger dot means more draws.
-    The direction has a specific effect where its line ends away from the dots. oc and ch are occlusion and chaotic, and
-    with _ip their ill-posed questions. n: answers of a side, † fewer than ten. p: share of the draws of each null, in
-    the order of the legend, with at least the direction's effect, counting the direction itself; on controls, then on
-    voids.
-    """
-    rows = results.own_effects
-    if not len(rows):
-        raise NotRun(why(results, "the paper has no such nulls"))
-    cells = list(dict.fromkeys(zip(rows["model"], rows["directions"], rows["regime"], strict=True)))
-    datasets, colour = datasets_of(rows.assign(dataset=rows["target"])), _colours(NULLS)
-    kinds = [null for null in NULLS if null in set(rows["kind"])]
-    with figure_style():
-        figure = new_figure(PAGE_IN, 0.7 + 2.0 * len(cells))
-        axes = figure.subplots(len(cells), len(datasets), squeeze=False, sharey=True)
-        for line, (model, directions, regime) in zip(axes, cells, strict=True):
-            of = rows.loc[(rows["model"] == model) & (rows["directions"] == directions) & (rows["regime"] == regime)]
-            for ax, dataset in zip(line, datasets, strict=True):
-                part = of.loc[of["target"] == dataset]
-                _dose(ax, part, colour)
-                own = part.loc[part["kind"] == "void"].assign(mark=few_marks(part.loc[part["kind"] == "void"], "n"))
-                n = range_text(int(own["n"].min()), int(own["n"].max())) + max(own["mark"])
-                ranks = _p_values(results.nulls, kinds, str(model), str(directions), str(regime), dataset)
-                ax.set_title("\n".join([f"{SHORT[dataset]}, {directions}→{regime}", f"n {n}", *ranks]), size=6)
-            line[0].set_ylabel(f"{plain(str(model))[:14]}\nabstained, %")
-        for ax in axes[-1]:
-            ax.set_xlabel("dose in class gaps | nulls", size=7)
-        axes[0, 0].set_ylim(-6, 106)
-        handles = [legend_key("+ on controls", INK, "o", "-", 3.5), legend_key("− on voids", SOFT, "s", "--", 3.5)]
-        handles += [legend_key(f"{null} null", colour[null], "o", size=3) for null in kinds]
-        figure.legend(handles=handles, loc="outside lower center", ncols=5)
-    return figure
-
-
-def _p_values(
-    nulls: pd.DataFrame, kinds: Sequence[str], model: str, directions: str, regime: str, dataset: str
-) -> list[str]:
-    """Return a direction's p among each null at the largest dose, one line per side."""
-    of = nulls.loc[(nulls["model"] == model) & (nulls["directions"] == directions) & (nulls["regime"] == regime)]
-    of = of.loc[(of["target"] == dataset) & (of["unit"] == "gap")]
-    lines: list[str] = []
-    for side, sign in (("control", "+"), ("void", "−")):
-        rows = of.loc[of["side"] == side].sort_values("dose").drop_duplicates("null", keep="last")
-        known = {str(row["null"]): f"{row['p']:.2f}".removeprefix("0") for row in rows.to_dict("records")}
-        lines += [f"p {sign} {' '.join(known.get(null, '–') for null in kinds)}"] if known else []
-    return lines
-
-
-def _dose(ax: Axes, rows: pd.DataFrame, colour: dict[str, str]) -> None:
-    # Doses in alpha have their own figure; with a small gap they would dominate the scale of this one.
-    rows = rows.loc[rows["unit"] == "gap"]
-    for side, line, marker, ink in (("control", "-", "o", INK), ("void", "--", "s", SOFT)):
-        of = rows.loc[rows["side"] == side]
-        void = of.loc[of["kind"] == "void"].sort_values("gaps").drop_duplicates("gaps")
-        ax.plot(void["gaps"], 100 * void["abstention"].astype(float), color=ink, linestyle=line, marker=marker,
-                markersize=3.2, linewidth=1.0, clip_on=False)  # fmt: skip
-        for place, null_kind in enumerate(NULLS):
-            nulls = of.loc[(of["kind"] == null_kind) & (of["dose"] > 0)]
-            if not len(nulls):
-                continue
-            top = float(nulls["gaps"].iloc[0])
-            at = top * (1.25 + 0.14 * place + (0.55 if side == "void" else 0))
-            counts = (100 * nulls["abstention"].astype(float)).round(6).value_counts()
-            ax.scatter([at] * len(counts), counts.index, s=3 + 1.6 * counts.to_numpy(), color=colour[null_kind],
-                       marker=marker, linewidths=0, clip_on=False)  # fmt: skip
-            ax.axvline(1.12 * top, color=GRID, linewidth=0.7, zorder=0)
-            doses = [dose for dose in sorted(set(void["gaps"])) if dose == 0 or dose >= top / 4]
-            ax.set_xticks([*doses, 1.39 * top, 1.94 * top], [*(f"{dose:g}" for dose in doses), "+", "−"])

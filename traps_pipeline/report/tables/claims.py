@@ -157,19 +157,13 @@ def _gate(results: Results, model: str, subject: str) -> float | None:
     rows = _of_model(results.gate, model)
     rows = rows.loc[(rows["regime"] == STANDARD) & (rows["source"] == "other datasets") & (rows["threshold"] == "mid")]
     pecs = rows.loc[rows["target"] == "all"].set_index("features")["pecs"].astype(float).to_dict()
-    return _above_others(pecs, subject, 1)
+    return _above_others(pecs, subject)
 
 
-def _risk(results: Results, model: str, subject: str) -> float | None:
-    rows = _of_model(results.risk_coverage, model)
-    rows = rows.loc[(rows["regime"] == STANDARD) & np.isclose(rows["coverage"].astype(float), 0.5, atol=0.01)]
-    return _above_others(rows.set_index("features")["risk"].astype(float).to_dict(), subject, -1)
-
-
-def _above_others(figures: dict[Any, float], subject: str, sign: int) -> float | None:
+def _above_others(figures: dict[Any, float], subject: str) -> float | None:
     own = figures.get({MODEL: STATES}.get(subject, subject))
-    others = [sign * figures[name] for name in OTHER_GATES if name in figures]
-    return None if own is None or not others else sign * own - max(others)
+    others = [figures[name] for name in OTHER_GATES if name in figures]
+    return None if own is None or not others else own - max(others)
 
 
 def _of_own(figure: Callable[[Results, str], float | None]) -> Callable[[Results, str, str], float | None]:
@@ -245,8 +239,6 @@ CLAIMS = (
           _transfer(TEXTUAL), RANDOM),
     Claim("look_alikes", "voids differ from all that looks like them", "lowest AUROC", 0.65, _look_alikes, RANDOM),
     Claim("gate", "a gate on states beats all other gates", "PECS, states − best other", 0.05, _gate,
-          (*RANDOM, NO_GAP)),
-    Claim("risk", "states know wrong answers best", "risk at half coverage, best other − states", 0.05, _risk,
           (*RANDOM, NO_GAP)),
     Claim("answers", "abstains on voids when told that it may", "AbsRec, guided − standard", 0.3,
           _prompt(lambda rows: rows["change"]), (NO_GAP,)),
