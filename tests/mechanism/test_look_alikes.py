@@ -157,7 +157,7 @@ def test_states_of_random_weights_are_those_of_a_fresh_network_of_the_class_and_
     stream, trained = torch.get_rng_state(), load_local_model(entry, inside=True)
     states = [StoredStates.of(study, extraction) for extraction in (STANDARD, *RANDOM)]
     read = [of.read("chaotic", trained.n_layers) for of in states]
-    for one, other in ((0, 1), (0, 2), (1, 2)):
+    for one, other in ((0, 2), (1, 2)):  # the tiny checkpoint is itself a fresh network, of seed 0
         assert np.abs(read[one] - read[other]).max(axis=1).min() > 1e-2  # of every item
     assert len({of.items["checkpoint_digest"].iloc[0] for of in states}) == 3
     items = study.tables.read(PROBE_ITEMS, {"dataset": "chaotic"}).to_dict("records")

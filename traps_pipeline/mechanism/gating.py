@@ -11,7 +11,6 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.base import progress
-from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.mechanism.baselines import output_or_note, probed_items, raw_features
@@ -62,7 +61,7 @@ class Gates:
 
 
 Gated = dict[tuple[str, str], tuple[Decisions, int]]  # source and target -> decisions, and layer of the states
-_GATED: dict[str, dict[str, Gated]] = {}  # by digest of what decides them: those that this process has made
+DecisionsByTarget = Mapping[str, tuple[Decisions, int]]  # target -> decisions and layer
 
 
 def gate_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> list[GateRow]:
@@ -70,26 +69,7 @@ def gate_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> 
 
     Raises TrapsError if the model has no verdicts yet.
     """
-    resamples, seed = workspace.mechanism.probes.resamples, workspace.mechanism.seed
-    return [
-        row
-        for regime, outcomes, features, gated in _each_regime(workspace, entry, states)
-        for source in dict.fromkeys(source for source, _ in gated)
-        for row in _rows(states, (features, regime, source), _of_source(gated, source), outcomes, resamples, seed)
-    ]
-
-
-DecisionsByTarget = Mapping[str, tuple[Decisions, int]]  # target -> decisions and layer
-
-
-def _of_source(gated: Gated, source: str) -> DecisionsByTarget:
-    return {target: decisions for (name, target), decisions in gated.items() if name == source}
-
-
-def _each_regime(
-    workspace: Workspace, entry: ModelEntry, states: StoredStates
-) -> Iterator[tuple[str, Mapping[str, Outcomes], str, Gated]]:
-    """Yield regime, its outcomes, features and the decisions of all gates on them."""
+    settings, rows = workspace.mechanism, list[GateRow]()
     outcomes = {
         regime: regime_outcomes
         for regime in PROMPTING
@@ -100,25 +80,16 @@ def _each_regime(
             f"gate {states.extraction.key}: {entry.id} has no verdicts under {' or '.join(PROMPTING)} in run 1; the "
             "experiment must ask the model under one of these regimes"
         )
-    for features, gated in _all_decisions(workspace, entry, states).items():
-        for regime in outcomes:
-            yield regime, outcomes[regime], features, gated
-
-
-def _all_decisions(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> dict[str, Gated]:
-    """Return the decisions of every kind of features, which `gate_rows` and `curve_rows` share."""
-    settings = workspace.mechanism
     layers = chosen_layers(workspace, states, dict.fromkeys(states.items["dataset"]))
-    probe_settings = settings.probes.model_dump(mode="json")
-    key = digest([states.digest, layers, probe_settings, settings.gate.model_dump(mode="json"), settings.seed])
-    if key not in _GATED:
-        table, kinds = gate_table(states), [*_kinds(workspace, entry, states, layers)]
-        gated_by_features: dict[str, Gated] = {}
-        for number, gates in enumerate(kinds):
-            progress.current().tick("gate", f"features of {states.extraction.key}", number + 1, len(kinds))
-            gated_by_features[gates.name] = _decisions(workspace, table, gates)
-        _GATED[key] = gated_by_features
-    return _GATED[key]
+    table, kinds = gate_table(states), [*_kinds(workspace, entry, states, layers)]
+    for number, gates in enumerate(kinds, start=1):
+        progress.current().tick("gate", f"features of {states.extraction.key}", number, len(kinds))
+        gated = _decisions(workspace, table, gates)
+        for regime, source in product(outcomes, gates.sources):
+            decided = {target: decisions for (name, target), decisions in gated.items() if name == source}
+            about, resamples = (gates.name, regime, source), settings.probes.resamples
+            rows += _rows(states, about, decided, outcomes[regime], resamples, settings.seed)
+    return rows
 
 
 def gate_table(states: StoredStates) -> pd.DataFrame:
