@@ -32,6 +32,7 @@ _DECIDED_BY: dict[str, tuple[str, ...]] = {
     "probes": ("mechanism/probes.py", "mechanism/probing.py"),
     "probe_baselines": ("mechanism/baselines.py",),
     "steering": ("mechanism/steering.py", "mechanism/hook.py"),
+    "steering_fluency": ("mechanism/fluency.py",),
     "steering_votes": ("mechanism/steering.py",),
     "steering_effects": ("mechanism/shares.py", "mechanism/effects.py"),
     "steering_shares": ("mechanism/shares.py",),

@@ -88,7 +88,7 @@ def _is_trained(_: StudyPartitions, key: str) -> bool:
 
 @_stage(
     tables.PROBE_BASELINES,  # on this machine, since the output margin needs the model's head
-    code="2",
+    code="3",
     parents=[_STATES, of(probe_items, EVERY), of(verdicts, ANSWERED_CELLS, need="none"), probing_settings],
     kinds=["parquet", "scikitlearn"],
     wants=lambda study, key: _is_trained(study, key) and Extraction.parse(key).prompt in study.probed_prompts,
@@ -109,7 +109,7 @@ def _is_gated(partitions: StudyPartitions, key: str) -> bool:
 
 _gates = partial(
     _stage,
-    code="2",
+    code="3",
     parents=[*_COMPARED, of(verdicts, _GATED, need="some")],
     wants=_is_gated,
 )
@@ -149,6 +149,7 @@ def leads(workspace: Workspace, key: str) -> StageOutput:
 
 @_stage(
     tables.ITEM_SCORES,
+    code="2",
     parents=[_STATES, of(probes, SAME), of(verdicts, _GATED, need="none"), probing_settings],
     wants=_is_gated,
 )
@@ -167,6 +168,7 @@ def _has_sentences(partitions: StudyPartitions, key: str) -> bool:
 
 @_stage(
     tables.SENTENCES,
+    code="2",
     parents=[of(probe_items, EVERY, need="some"), of(responses, _GATED, need="some"), sentence_settings],
     wants=_has_sentences,
 )
@@ -190,7 +192,7 @@ def patching(workspace: Workspace, key: str) -> StageOutput:
     return StageOutput(patching_rows(workspace, *_model(workspace, key)))
 
 
-_of_effects = partial(stage, group=GROUP, parents=[steering_effects], wants=steers)
+_of_effects = partial(stage, code="2", group=GROUP, parents=[steering_effects], wants=steers)
 
 
 @_of_effects(tables.STEERING_NULLS)

@@ -191,7 +191,7 @@ def cosines(workspace: Workspace, _: None) -> list[CosineRow]:
 
 @_stage(
     STEERING_TABLE,
-    code="4",
+    code="5",
     parents=[of(items, by_dataset), of(directions, EVERY, need="some"), of(steering_settings, schemes.by_steering)],
     scheme=schemes.STEERING,
     kinds=["parquet", "pytorch"],
