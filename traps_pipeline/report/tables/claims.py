@@ -265,12 +265,13 @@ def claim_frame(results: Results) -> pd.DataFrame:
     import pandas as pd
 
     rows, without_gap = [], no_gap_figures()
-    for model in dict.fromkeys(results.leads["model"]):
+    tables = (results.leads, results.prompted_probes, results.patching)
+    for model in dict.fromkeys(str(model) for table in tables for model in table["model"]):
         for claim in CLAIMS:
             values, note = {NO_GAP: without_gap.get(claim.name)}, ""
             for subject in (MODEL, *RANDOM, PLACEBO):
                 try:
-                    values[subject] = claim.of(results, str(model), subject)
+                    values[subject] = claim.of(results, model, subject)
                 except TwoModels as joined:
                     values[subject], note = None, f"two models ({joined})"
             figures = {f"in_{subject}": value for subject, value in values.items()}
