@@ -33,8 +33,7 @@ def probes() -> pd.DataFrame:
     sides = {"n_voids": 16, "n_controls": 16, "layer": 3, "chosen": True, "own_best": True}
     rows = [
         {"analysis": a, "source": s, "target": t, "value": 0.98, "low": 0.79, "high": 1.0} | sides
-        for s, t, a in (("chaotic", "chaotic", "held_out"), ("chaotic", "occlusion", "transfer"),
-                        ("chaotic", "chaotic_time_swapped", "time_swapped"))
+        for s, t, a in (("chaotic", "chaotic", "held_out"), ("chaotic", "occlusion", "transfer"))
     ]  # fmt: skip
     guided = rows[0] | {"prompt": "guided", "value": 0.96}
     return frame(PROBES, *rows, rows[0] | {"layer": 1, "chosen": False, "value": 0.2}, guided)
@@ -42,7 +41,7 @@ def probes() -> pd.DataFrame:
 
 def baselines() -> pd.DataFrame:
     rows = []
-    for analysis, target in (("held_out", "chaotic"), ("time_swapped", "chaotic_time_swapped")):
+    for analysis, target in (("held_out", "chaotic"),):
         for features, value in (("time stamps", 1.0), ("output margin", 0.9), ("noise", 0.5)):
             row = {"analysis": analysis, "source": "chaotic", "target": target, "features": features, "value": value}
             rows.append(row | {"spread": 0.1 if features == "noise" else None})

@@ -33,14 +33,14 @@ def test_the_passes_of_the_papers_study_are_counted() -> None:
     )
     scenarios = {"occlusion": 202, "chaotic": 500}
     passes = {work.kind: work.passes for work in mechanism_passes(settings, DATASETS, scenarios)}
-    assert passes["states"] == 2 * (4 * 202 + 4 * 500) + 202 + 2 * 500
+    assert passes["states"] == 2 * (4 * 202 + 4 * 500) + 202
     assert passes["sentences"] == 2 * (4 * 202 + 4 * 500)  # one pass an item under each of two regimes
-    assert passes["states of random weights"] == 2 * (4 * 202 + 4 * 500 + 202 + 2 * 500)
+    assert passes["states of random weights"] == 2 * (4 * 202 + 4 * 500 + 202)
     assert RANDOM not in {w.kind for w in mechanism_passes(settings, DATASETS, scenarios, random_weights=False)}
     # Two directions of 100 pairs: 2 records and a gradient (3); 1 + 4 records; 4 sources x (24 + 1) rows of half a pass
     assert passes["patching"] == 2 * 100 * (5 + 5 + 50)
     few = mechanism_passes(settings, ["chaotic"], {"chaotic": 3, "occlusion": 202})[0]
-    assert few.passes == 2 * (2 * 3) + 2 * 3
+    assert few.passes == 2 * (2 * 3)
 
 
 def test_hours_and_gigabytes_follow_from_parameters_tokens_and_the_card() -> None:

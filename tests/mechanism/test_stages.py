@@ -74,8 +74,8 @@ def test_a_second_extraction_computes_nothing_and_a_corrected_item_alone_is_extr
     before = own.tables.read(HIDDEN_STATES, StatesCell("chaotic", STANDARD).partition).set_index("item_id")
     names = sorted(set(items["scenario_id"]))
     write_items(own, "chaotic", names, clips, **{names[0]: "Which side does the ball end on?"})
-    # control and void of one scenario of chaotic, and the same with swapped times
-    assert extract_all(own) == 4
+    # control and void of one scenario of chaotic
+    assert extract_all(own) == 2
     after = own.tables.read(HIDDEN_STATES, StatesCell("chaotic", STANDARD).partition).set_index("item_id")
     changed = before.index[(before["states_key"] != after["states_key"]).to_numpy()]
     assert sorted(changed) == [f"chaotic:{names[0]}:control", f"chaotic:{names[0]}:void"]
@@ -189,7 +189,7 @@ def test_probes_of_another_prompt_are_fitted_where_they_are_asked_for(own: Works
         own.tables.write(HIDDEN_STATES, cell.partition, stages.extract_states(own, cell)[0], {})
     of = {each.prompt: pd.DataFrame(stages.probe_rows(own, each)) for each in (STANDARD, guided)}
     found, here = ({*of[prompt]["analysis"]} for prompt in ("standard", "guided"))
-    assert found - here == {"answerable_void", "answerable_control", "time_swapped"} and here < found
+    assert found - here == {"answerable_void", "answerable_control"} and here < found
     assert {*of["guided"]["prompt"]} == {"guided"}
     both = of["guided"].merge(of["standard"], on=["analysis", "source", "target", "layer", "scope"])
     assert not np.allclose(both["value_x"].astype(float), both["value_y"].astype(float), equal_nan=True)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -118,7 +118,7 @@ def raw_features(
 
     questions = [question for rows in items.values() for question in rows["question"]]
     words = CountVectorizer(ngram_range=(1, 2), binary=True, token_pattern=r"(?u)\b\w+\b").fit(questions)
-    clips = {clip for rows in items.values() for name in ("clip", "times_clip") for clip in rows[name].dropna()}
+    clips = {clip for rows in items.values() for clip in rows["clip"]}
     clip_frames = {clip: _thumbnails(resolve(clip), spec) for clip in sorted(clips)}
     max_frames = max(len(frames) for frames, _, _ in clip_frames.values())
 
@@ -127,9 +127,9 @@ def raw_features(
         missing = np.repeat(frames.mean(axis=0, keepdims=True), max_frames - len(frames), axis=0)
         return np.concatenate([frames, missing]).ravel()
 
-    def stamps(row: Mapping[str, Any]) -> list[float]:
-        times = clip_frames[row["times_clip"] or row["clip"]][1]
-        return [len(clip_frames[row["clip"]][1]), times[0], times.mean(), times[-1]]
+    def stamps(clip: str) -> list[float]:
+        times = clip_frames[clip][1]
+        return [len(times), times[0], times.mean(), times[-1]]
 
     features: dict[str, dict[str, np.ndarray]] = {name: {} for name in RAW}
     for dataset, rows in items.items():
@@ -138,7 +138,7 @@ def raw_features(
         features["first frame"][dataset] = np.stack([clip_frames[row["clip"]][0][0].ravel() for row in shown_items])
         features["all frames"][dataset] = np.stack([pixels(row["clip"]) for row in shown_items])
         features["length"][dataset] = np.array([[clip_frames[row["clip"]][2]] for row in shown_items])
-        features["time stamps"][dataset] = np.array([stamps(row) for row in shown_items])
+        features["time stamps"][dataset] = np.array([stamps(row["clip"]) for row in shown_items])
     return dict(features)
 
 

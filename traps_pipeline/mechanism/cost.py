@@ -103,7 +103,6 @@ def mechanism_passes(
     """
     n_pair_items = sum(2 * scenarios.get(taxonomy_of(name), 0) for name in datasets if name in DATASETS)
     extra_prompts = scenarios.get("occlusion", 0) * ("occlusion" in datasets)  # voids with a question that they answer
-    extra_prompts += 2 * scenarios.get("chaotic", 0) * ("chaotic" in datasets)  # sides with the other's times
     extra_prompts += sum(len(sides_of(arm)) * sum(scenarios.values()) for arm in datasets if arm in PROBED_ARMS)
     work = [Work("states", len(settings.prompts) * n_pair_items + extra_prompts)]
     if settings.sentences:  # under each regime; the sentences themselves are few tokens behind one pass

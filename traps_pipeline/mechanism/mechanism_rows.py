@@ -71,8 +71,7 @@ class ProbeItemRow:
     pair_id: shared.PairId
     dataset: Annotated[
         str,
-        "one of four; occlusion_answerable: the void clips of occlusion with a question that they answer; "
-        "chaotic_time_swapped: clips with the frame times of the other side; or an arm",
+        "one of four; occlusion_answerable: the void clips of occlusion with a question that they answer; or an arm",
     ]
     scenario_id: shared.ScenarioId
     side: Annotated[str, "control (it can be answered) or void"]
@@ -81,8 +80,6 @@ class ProbeItemRow:
     question: shared.Question
     clip: shared.ClipPath
     media_digest: shared.MediaDigest
-    times_clip: Annotated[str | None, "clip whose frame times are shown; null: the item's own"]
-    times_digest: Annotated[str | None, "digest of that clip's file"]
     benchmark_version: shared.BenchmarkVersion
 
 
@@ -123,7 +120,7 @@ class ProbeRow(ExtractionColumns):
     analysis: Annotated[
         str,
         "transfer, held_out, confabulated, confabulated_held_out, within, shuffled, answerable_void, "
-        "answerable_control, time_swapped or centroid_..",
+        "answerable_control or centroid_..",
     ]
     source: Annotated[str, "dataset that the probe or the centroids were fitted on"]
     target: Annotated[str, "dataset that they were applied to"]

@@ -121,9 +121,8 @@ def probed_item(workspace: Workspace, model: LocalModel, spec: MediaSpec, row: M
     from traps_pipeline.mechanism.hidden_states import clip_item
     from traps_pipeline.models.local.capture import OF_PAIRS
 
-    times = workspace.resolve(row["times_clip"]) if isinstance(row["times_clip"], str) else None
     other_prompt = other_clip(workspace, row) if workspace.mechanism.pooling in OF_PAIRS else None
-    return clip_item(model, spec, row, workspace.resolve(row["clip"]), system, times, other_prompt)
+    return clip_item(model, spec, row, workspace.resolve(row["clip"]), system, other_prompt)
 
 
 def unsound_layers(workspace: Workspace, cell: StatesCell, n_layers: int) -> list[int]:

@@ -20,7 +20,6 @@ from traps_pipeline.protocol.datasets import (
     DATASETS,
     PROBED_ARMS,
     PROBED_DATASETS,
-    TIME_SWAPPED,
     UNPAIRED,
     all_datasets_of,
 )
@@ -145,9 +144,7 @@ class StudyPartitions:
         datasets = self._mechanism[0] if self._mechanism else []
         asked_datasets = self._datasets(experiment for experiment in self._asked if experiment.mechanism)
         existing = {*datasets, *(arm for arm in PROBED_ARMS if self._mechanism and arm in asked_datasets)}
-        existing |= {
-            dataset for dataset, origin in ((ANSWERABLE, "occlusion"), (TIME_SWAPPED, "chaotic")) if origin in existing
-        }
+        existing |= {ANSWERABLE} if "occlusion" in existing else set()
         return [d for d in PROBED_DATASETS if d in existing]
 
     @cached_property

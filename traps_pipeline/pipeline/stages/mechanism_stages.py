@@ -43,7 +43,7 @@ from traps_pipeline.pipeline.stages.benchmark_stages import items, scene_specs, 
 from traps_pipeline.pipeline.stages.evaluation_stages import judges, verdicts
 from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction, StatesCell, SteeringCell
-from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS, TIME_SWAPPED, taxonomy_of_category
+from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS, taxonomy_of_category
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
@@ -75,10 +75,6 @@ def steering_settings(workspace: Workspace, key: str) -> str:
     return versions.steering_version(workspace, key)
 
 
-def _probed_datasets(dataset: str) -> list[str]:
-    return [dataset, TIME_SWAPPED] if dataset == "chaotic" else [dataset]
-
-
 def steers(partitions: StudyPartitions, key: str | None) -> bool:
     """Return whether the study steers models, along directions of the model's own weights."""
     return partitions.steers and (key is None or Extraction.parse(key).weights_seed is None)
@@ -86,9 +82,9 @@ def steers(partitions: StudyPartitions, key: str | None) -> bool:
 
 @_stage(
     PROBE_ITEMS,
-    code="2",
+    code="3",
     parents=[
-        of(items, to_keys(DATASET, PROBED, _probed_datasets)),
+        of(items, to_keys(DATASET, PROBED, lambda dataset: [dataset])),
         of(scene_specs, _OCCLUSION),
         of(videos, _OCCLUSION),
     ],
@@ -97,8 +93,7 @@ def steers(partitions: StudyPartitions, key: str | None) -> bool:
 def probe_items(workspace: Workspace, dataset: str) -> StageOutput:
     """Return the clips and questions for which hidden states are extracted.
 
-    These are a dataset's items, occlusion's void clips with an answerable question, and chaotic's clips with the frame
-    times of the other side.
+    These are a dataset's items, and occlusion's void clips with an answerable question.
     """
     from traps_pipeline.mechanism.probe_items import probe_items as rows_of
 
