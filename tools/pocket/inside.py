@@ -10,6 +10,7 @@ from tools.pocket.seeds import Figure
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES
 from traps_pipeline.models.registry.checkpoint import as_folder, folder_digest
+from traps_pipeline.protocol.regimes import VQA_PROMPTS
 from traps_pipeline.storage.workspace import Workspace
 
 FACTS = "training.json"  # beside the folder of the weights
@@ -34,7 +35,8 @@ def looked_into(workspace: Workspace) -> str:
 
 def _seed_of(workspace: Workspace, model: str) -> tuple[int, str]:
     """Return training seed and digest of the weights whose states a workspace has."""
-    states = workspace.tables.read_all(HIDDEN_STATES, ["checkpoint", "checkpoint_digest"], model=model)
+    columns = ["checkpoint", "checkpoint_digest"]
+    states = workspace.tables.read_all(HIDDEN_STATES, columns, model=model, prompt=VQA_PROMPTS)
     checkpoints = sorted(set(zip(states["checkpoint"], states["checkpoint_digest"], strict=True)))
     if len(checkpoints) != 1:
         raise TrapsError(

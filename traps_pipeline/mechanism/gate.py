@@ -120,8 +120,8 @@ def decide(items: Items, source: str, target: str, *, folds: int, seed: int, fal
 
 def unseen_scores(items: Items, source: str, target: str, folds: int, seed: int) -> np.ndarray:
     """Return the log-odds (n,) of a dataset's items by the probes of `decide`, without thresholds."""
-    score = np.full(int((items.table["dataset"] == target).sum()), np.nan)
-    target_features = items.features[(items.table["dataset"] == target).to_numpy()]
+    target_features = items.features[items.table["dataset"].to_numpy(str) == target]
+    score = np.full(len(target_features), np.nan)
     for is_in_fold, is_training in _each_fold(items, source, target, folds, seed):
         probe = fit_probe(items.features[is_training], items.void[is_training])
         score[is_in_fold] = probe.scores(target_features[is_in_fold])

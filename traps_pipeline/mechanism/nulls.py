@@ -76,9 +76,9 @@ def _rank(moved: pd.DataFrame, target: str) -> Iterator[SteeringNullRow]:
             )
 
 
-def _beside(effects: pd.DataFrame, prefix: str) -> dict[str, float | None]:
+def _beside(effects: pd.DataFrame, prefix: str) -> dict[str, Any]:
     """Return the undecided share, and the mean perplexity, of the answers behind effects."""
-    figures = {"undecided": effects["undecided"].mean(), "perplexity": effects["perplexity"].astype(float).mean()}
+    figures = {name: float(effects[name].astype(float).mean()) for name in ("undecided", "perplexity")}
     return {f"{prefix}{name}": value for name, value in nan_to_null(figures).items()}
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from traps_pipeline.mechanism.control_rows import MODEL, RESIDUAL, STATES
 from traps_pipeline.protocol.datasets import SHORT
 from traps_pipeline.protocol.regimes import PROMPTING
@@ -78,13 +80,13 @@ def _claim_row(ax: Axes, y: int, row: Mapping[Any, Any], claim: Claim) -> None:
 
     for x, subject in enumerate(SUBJECTS):
         value = row[f"in_{subject}"]
-        is_known = value is not None and value == value
-        reaches = is_known and value >= claim.bound
+        figure = np.nan if value is None else float(value)
+        is_known, reaches = bool(np.isfinite(figure)), figure >= claim.bound
         must_fail = subject in claim.fails_in
         face = (VOID if must_fail else HOLDS if subject == MODEL else GRID) if reaches else "white"
         edge = INK if must_fail and is_known else GRID
         ax.add_patch(Rectangle((x - 0.44, y - 0.42), 0.88, 0.84, facecolor=face, edgecolor=edge, linewidth=0.7))
-        ax.text(x, y, fraction(value, 2) if is_known else "–", ha="center", va="center", size=6.5)
+        ax.text(x, y, fraction(figure, 2) if is_known else "–", ha="center", va="center", size=6.5)
     held = row["verdict"] == "holds"
     ax.text(len(SUBJECTS) - 0.4, y, row["verdict"][:60], va="center", size=6.5, color=INK if held else SOFT,
             weight="bold" if held else "normal")  # fmt: skip

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -66,8 +66,9 @@ def _mean(values: Any) -> float | None:
 def _of_model(rows: pd.DataFrame, model: str) -> pd.DataFrame:
     """Return a model's rows. Raises TwoModels if they join two."""
     rows = rows.loc[rows["model"] == model]
-    if "joins" in rows and rows["joins"].notna().any():
-        raise TwoModels(str(rows["joins"].dropna().iloc[0]))
+    joined = [*rows["joins"].dropna()] if "joins" in rows else []
+    if joined:
+        raise TwoModels(str(joined[0]))
     return rows
 
 
@@ -280,7 +281,7 @@ def claim_frame(results: Results) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=pd.Index(columns))
 
 
-def verdict(claim: Claim, values: dict[str, float | None]) -> str:
+def verdict(claim: Claim, values: Mapping[str, float | None]) -> str:
     """Return whether a claim is held, and if not, why."""
     own = values.get(MODEL)
     if own is None or own < claim.bound:
