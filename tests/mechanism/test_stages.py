@@ -46,6 +46,7 @@ from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.cells import Extraction, StatesCell, SteeringCell
 from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS, taxonomy_of
+from traps_pipeline.protocol.regimes import RANDOM_WEIGHTS
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.media import MediaSpec
 from traps_pipeline.storage.parquet import StageOutput
@@ -181,8 +182,9 @@ def test_probes_of_another_prompt_are_fitted_where_they_are_asked_for(own: Works
     for prompts in (("standard",), ("standard", "guided")):
         probes = own.mechanism.probes.model_copy(update={"prompts": prompts})
         own = own.allow(mechanism=own.mechanism.model_copy(update={"probes": probes}))
-        for name in ("probes", "probe_baselines"):
-            assert the_graph()[name].wanted(StudyPartitions(own)) == [f"tiny__{prompt}" for prompt in prompts]
+        for name, others in (("probes", [*RANDOM_WEIGHTS]), ("probe_baselines", [])):
+            expected = [f"tiny__{prompt}" for prompt in (*prompts, *others)]
+            assert the_graph()[name].wanted(StudyPartitions(own)) == expected
     guided = Extraction("tiny", "guided")
     for dataset in DATASETS:
         cell = StatesCell(dataset, guided)
