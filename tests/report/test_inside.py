@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,8 +14,9 @@ import pytest
 
 from tests.build.controls import Made, effects, gate, item_scores, patching, probes
 from traps_pipeline.report import publish, study_results
-from traps_pipeline.report.cards import Sources
-from traps_pipeline.report.catalogue import FIGURE_REPORTS, INSIDE
+from traps_pipeline.report.cards import Sources, figure_card, table_card
+from traps_pipeline.report.catalogue import FIGURE_REPORTS, INSIDE, TABLE_REPORTS
+from traps_pipeline.report.figures.looks import arrow
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.report.tables import control_reports
@@ -164,6 +166,30 @@ def test_steered_cells_have_their_dose_in_class_gaps_their_counts_and_what_is_no
     assert [line["in class gaps"] for line in cells(found["steering_dose"])] == ["0.00", "0.05"]
     for name in ("steering_top", "steering_dose", "steering_regimes", "steering_domains"):
         assert {"n =", "†"} <= {re.split(r" \w", note)[0] for note in found[name].notes}, name
+
+
+def test_a_figure_or_table_that_cannot_be_made_is_named_with_its_models_and_the_others_are_made() -> None:
+    made = Made()
+    made.overall = pd.DataFrame({"model": ["m"]})
+    made.leads = made.leads.drop(columns="target")
+    sources = cast(Sources, SimpleNamespace(study=made))
+    by_name = {report.name: report for report in FIGURE_REPORTS}
+    broken, sound = (figure_card(by_name[name], sources) for name in ("leads", "lens"))
+    assert not broken.html and broken.why.startswith("figure leads of m: ") and "KeyError" in broken.why
+    assert sound.html and not sound.why
+    (table,) = (report for report in TABLE_REPORTS if report.name == "claims")
+    assert table_card(table, sources).why.startswith("table claims of m: ")
+
+
+def test_an_arrow_from_or_to_an_undefined_point_is_left_out_and_the_figure_is_saved() -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure()
+    axes = figure.add_subplot()
+    for start, end in (((0.1, 0.2), (float("nan"), 0.5)), ((float("nan"), 0.2), (0.3, 0.5)), ((0.1, 0.1), (0.4, 0.5))):
+        arrow(axes, start, end, "black")
+    figure.savefig(io.BytesIO())
+    assert len(axes.texts) == 1
 
 
 def test_only_a_study_without_a_mechanism_section_is_told_so() -> None:
