@@ -93,12 +93,14 @@ def test_a_text_that_is_no_answer_is_told(text: str | None, outcome: str, why: s
         (99.0, [("alpha", 3)]),
     ],
 )
-def test_doses_in_gaps_end_at_the_cap_and_nulls_have_every_dose(gap: float, doses: list[tuple[str, float]]) -> None:
+def test_doses_in_gaps_end_at_the_cap_and_nulls_have_alphas_and_the_largest(
+    gap: float, doses: list[tuple[str, float]]
+) -> None:
     unit = np.eye(4, dtype=np.float32)[None, [0, 0, 0]]
     of = Directions({"void": unit, "isotropic": unit}, np.full(3, gap), np.full(3, 8.0))
     steering = {"alphas": [3], "signs": [], "nulls": {"kinds": ["isotropic"], "draws": 1}}
     settings = MechanismSettings.model_validate({"models": {"m": {"steering": 2, "centroid": 1}}, "steering": steering})
     given = strengths("chaotic", settings.models["m"], settings, {"chaotic": of})
     steered = {kind: [(s.unit, s.dose) for s, _ in given if s.kind == kind] for kind in ("void", "isotropic")}
-    assert steered == {"void": doses, "isotropic": doses}
+    assert steered == {"void": doses, "isotropic": [("alpha", 3), *doses[1:][-1:]]}
     assert all(s.alpha == pytest.approx(s.dose * gap) for s, _ in given if s.unit == "gap")

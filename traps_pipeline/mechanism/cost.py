@@ -25,6 +25,7 @@ ATTENTION_S = 14e-9  # beside it, per block, step, row and token of its prompt
 NF4_TIMES = 1.5  # factor on time, since weights are unpacked at every use
 BFLOAT16_BYTES = 2.0  # per parameter
 ROWS = 64  # rows of a batch of answers
+ROWS_BEHIND = 16  # texts behind one pass over a prompt, whose keys and values each of them repeats
 PEAK_WIDTHS = 28  # numbers per token and unit of width at a block's peak
 GRAPH = 22  # numbers per token, block and unit of width that a backward pass keeps
 RANDOM = "states of random weights"  # in bfloat16, whatever the entry says

@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base import progress
+from traps_pipeline.mechanism.cost import ROWS_BEHIND
 from traps_pipeline.mechanism.mechanism_rows import STEERING, SteeringFluencyRow
 from traps_pipeline.mechanism.sentences import answer_tokens, mean_log_probabilities
 from traps_pipeline.models.registry.prompts import system_prompt
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
     from traps_pipeline.models.registry.entries import ModelEntry
     from traps_pipeline.protocol.cells import SteeringCell
     from traps_pipeline.storage.workspace import Workspace
-
-ROWS = 16  # texts behind one pass over a prompt, whose keys and values each of them repeats
 
 
 def fluency_rows(workspace: Workspace, entry: ModelEntry, cell: SteeringCell) -> list[SteeringFluencyRow]:
@@ -40,8 +39,8 @@ def fluency_rows(workspace: Workspace, entry: ModelEntry, cell: SteeringCell) ->
         tokens = {text: ids for text in dict.fromkeys(group["text"]) if (ids := answer_tokens(model, text))}
         texts, chances = [*tokens], list[float]()
         with model.caching_clips():
-            for start in range(0, len(texts), ROWS):
-                part = [tokens[text] for text in texts[start : start + ROWS]]
+            for start in range(0, len(texts), ROWS_BEHIND):
+                part = [tokens[text] for text in texts[start : start + ROWS_BEHIND]]
                 chances += mean_log_probabilities(model, prompt, part)
         nats = {text: -chance for text, chance in zip(texts, chances, strict=True)}
         rows += [

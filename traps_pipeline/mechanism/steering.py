@@ -6,7 +6,7 @@ three, so that all directions share one answer. The two datasets of a taxonomy h
 their answers too; so do two sign policies that add the same.
 
 Doses are given as alphas, as in the paper, and in units of the class gap, since one alpha is a large step in one model
-and none in another. Nulls are steered at the same doses, beside the direction of the dataset that is steered.
+and none in another. Nulls are steered at every alpha and at the largest gap, beside the direction of the dataset that is steered.
 """
 
 from __future__ import annotations
@@ -127,7 +127,14 @@ Dose = tuple[str, float]  # unit and number
 def _doses_within(row: _Planned, of: Directions, layer: int, cap: float) -> Sequence[Dose]:
     """Return the doses of a direction, without those in class gaps beyond `cap` control states."""
     longest = cap * float(of.residual_norms[layer]) * (1 + 1e-9)
-    return [(unit, dose) for unit, dose in row.doses if unit == "alpha" or dose * float(of.gaps[layer]) <= longest]
+    within = [(unit, dose) for unit, dose in row.doses if unit == "alpha" or dose * float(of.gaps[layer]) <= longest]
+    return _doses_of(row.kind, within)
+
+
+def _doses_of(kind: str, doses: Sequence[Dose]) -> Sequence[Dose]:
+    """Return the doses of a kind of direction: a null has those that claims read, every alpha and the largest gap."""
+    gaps = [dose for dose in doses if dose[0] == "gap"]
+    return doses if kind == "void" else [*(dose for dose in doses if dose[0] != "gap"), *gaps[-1:]]
 
 
 class _Planned(NamedTuple):
@@ -178,7 +185,10 @@ def count_answers(
         for row in _plan(target, settings.models[model], steering, datasets):
             if side in row.sides:
                 along = (owner, side, row.source, row.kind, row.draw, row.layer, sign_of(row.signs, side))
-                cells |= {(*along, *combination) for combination in product(steering.direction_regimes, row.doses)}
+                cells |= {
+                    (*along, *combination)
+                    for combination in product(steering.direction_regimes, _doses_of(row.kind, row.doses))
+                }
     answers = Counter[str]()
     for cell in cells:
         source, taxonomy = str(cell[2]), taxonomy_of(str(cell[0]))

@@ -13,7 +13,7 @@ from traps_pipeline.judging.confabulation import sample_failures
 from traps_pipeline.judging.confabulation_protocol import load_protocol
 from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.judging.panel import tasks_for, vote_requests
-from traps_pipeline.mechanism.cost import CARDS, RANDOM, Cost, Work, cost_of, mechanism_passes
+from traps_pipeline.mechanism.cost import CARDS, RANDOM, ROWS_BEHIND, Cost, Work, cost_of, mechanism_passes
 from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES
 from traps_pipeline.mechanism.probing_versions import mechanism_entry
 from traps_pipeline.mechanism.steering import count_answers
@@ -160,7 +160,9 @@ def _local_costs(
                 work += [(inside_entry, passes, params) for passes in passes_of_all]
             if settings.steering and model in steered:
                 max_tokens = min(entry.expected_completion_tokens, settings.steering.max_new_tokens)
-                work.append((inside_entry, Work("steered answers", steered[model][0].new, max_tokens), params))
+                answers = steered[model][0].new
+                work.append((inside_entry, Work("steered answers", answers, max_tokens), params))
+                work.append((inside_entry, Work("their perplexity", answers / ROWS_BEHIND), params))
         for media, passes, params in work:
             assert media.media is not None, "local entries have media"
             if passes.passes:

@@ -57,7 +57,7 @@ class ProbeSettings(Settings):
 class NullSettings(Settings):
     """The number of null directions of each kind against which an effect is ranked.
 
-    They are steered at the largest dose on the datasets that they come from.
+    They are steered at every alpha and the largest gap on the datasets that they come from.
     """
 
     kinds: tuple[Literal["isotropic", "covariance", "shuffled"], ...] = Field(
