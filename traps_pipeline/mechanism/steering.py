@@ -6,7 +6,7 @@ three, so that all directions share one answer. The two datasets of a taxonomy h
 their answers too; so do two sign policies that add the same.
 
 Doses are given as alphas, as in the paper, and in units of the class gap, since one alpha is a large step in one model
-and none in another. Nulls are steered at every alpha and at the largest gap, beside the direction of the dataset that is steered.
+and none in another. Nulls are steered at every alpha and at the largest gap, beside the dataset's own direction.
 """
 
 from __future__ import annotations
