@@ -29,7 +29,7 @@ from traps_pipeline.mechanism.mechanism_rows import (
     STEERING_VOTES,
 )
 from traps_pipeline.mechanism.nulls import null_rows, pecs_rows
-from traps_pipeline.mechanism.probing_versions import extraction_version, steering_version
+from traps_pipeline.mechanism.probing_versions import extraction_version, joined_models, steering_version
 from traps_pipeline.mechanism.shares import effect_rows, paper_protocol_rows
 from traps_pipeline.mechanism.steering import (
     UNSTEERED,
@@ -40,6 +40,7 @@ from traps_pipeline.mechanism.steering import (
 )
 from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.models.registry.entries import ModelEntry
+from traps_pipeline.models.registry.local_settings import MechanismSpec
 from traps_pipeline.models.request import WITH_TEXT
 from traps_pipeline.pipeline.graph import the_graph
 from traps_pipeline.pipeline.lineage import Lineage
@@ -366,3 +367,13 @@ def test_settings_that_cannot_be_are_refused() -> None:
     ):
         with raises(ValidationError, "MechanismSettings", *named):
             MechanismSettings.model_validate(wrong)
+
+
+def test_a_row_of_states_and_answers_names_the_two_models_that_it_joins(own: Workspace, entry: ModelEntry) -> None:
+    """One precision and the same frames are one model; other frames, or NF4 inside, are two."""
+    assert joined_models(entry, own.mechanism) is None
+    packed = entry.model_copy(update={"mechanism": MechanismSpec(quantisation="nf4")})
+    assert joined_models(packed, own.mechanism) == "states: nf4, 2 frames; answers: float32, 2 frames"
+    layers = own.mechanism.models["tiny"].model_copy(update={"media": MediaSpec(profile="frames", fps=4)})
+    shown = own.mechanism.model_copy(update={"models": {"tiny": layers}})
+    assert joined_models(entry, shown) == "states: float32, 4 frames a second; answers: float32, 2 frames"

@@ -65,6 +65,8 @@ def test_a_row_that_joins_two_models_is_left_out_of_claims() -> None:
     made = Made()
     made.item_scores = item_scores().assign(joins="states: nf4, 25 frames; answers: bfloat16, 16 frames")
     rows = claim_frame(made).set_index("claim")
+    made.gate = gate().assign(joins="states: nf4, 25 frames; answers: bfloat16, 16 frames")
+    assert any(note.startswith("m joins two models (states: nf4") for note in control_reports.gate(made)[0].notes)
     for name in ("unexpressed", "sentence"):
         assert rows.loc[name, "verdict"].startswith("two models (states: nf4") and np.isnan(rows.loc[name, "in_model"])
     assert rows.loc["lead_visual", "verdict"] == "holds in random 0 too"

@@ -18,6 +18,7 @@ from traps_pipeline.report.tables.inside_columns import (
     few_marks,
     few_note,
     interval,
+    joined_notes,
     path_names,
     short_names,
     why,
@@ -162,6 +163,7 @@ def _gate_sources(results: Results) -> PrintedTable:
         *_GATE_NOTES,
         "mid: half-way between the means of the sides; J: the cut with the largest J on unseen source items; "
         "conformal: at most 5 % of new source controls in expectation, or as the experiment says",
+        *joined_notes(rows),
         *few_note(rows),
     ]
     reason = why(results, "the paper gates nothing")
