@@ -14,6 +14,7 @@ from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES
 from traps_pipeline.mechanism.probing_versions import joined_models, states_folder
 from traps_pipeline.models.registry.entries import get_model
 from traps_pipeline.protocol.cells import Extraction, StatesCell
+from traps_pipeline.protocol.datasets import PROBED_DATASETS
 from traps_pipeline.protocol.regimes import RANDOM_WEIGHTS
 from traps_pipeline.storage.workspace import Workspace
 
@@ -29,7 +30,7 @@ class StoredStates:
     @staticmethod
     def of(workspace: Workspace, extraction: Extraction) -> StoredStates:
         """Return an extraction's states. Raises TrapsError if nothing was extracted."""
-        items = workspace.tables.read_all(HIDDEN_STATES, **extraction.partition)
+        items = workspace.tables.read_all(HIDDEN_STATES, dataset=PROBED_DATASETS, **extraction.partition)
         if items.empty:
             raise TrapsError(f"no hidden states of {extraction.key}; materialize hidden_states for it first")
         return StoredStates(workspace, extraction, items.reset_index(drop=True))
