@@ -126,7 +126,7 @@ def test_a_figure_is_drawn_from_them(name: str) -> None:
 
 # The numbers of each sentence, in their order.
 FINDINGS = {
-    "claims": "0 17",  # none: not measured, no control, or held in one too
+    "claims": "3 17",  # above the shipped figures of the pocket without the gap, and in no other control
     "leads": "0.90 0.70 +0.20 +0.05 +0.30",
     "lens": "+3.0 +9.0 +1.0 +1.0",  # standard, guided; one layer before
     "patching": "0.99 0 1 1 0.99 0 1 1",  # share, layer, panels of panels
