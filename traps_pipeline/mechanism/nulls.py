@@ -78,7 +78,9 @@ def _rank(moved: pd.DataFrame, target: str) -> Iterator[SteeringNullRow]:
 
 def _beside(effects: pd.DataFrame, prefix: str) -> dict[str, Any]:
     """Return the undecided share, and the mean perplexity, of the answers behind effects."""
-    figures = {name: float(effects[name].astype(float).mean()) for name in ("undecided", "perplexity")}
+    columns = {name: effects[name].to_numpy(float) for name in ("undecided", "perplexity")}
+    known = {name: values[np.isfinite(values)] for name, values in columns.items()}
+    figures = {name: float(values.mean()) if len(values) else np.nan for name, values in known.items()}
     return {f"{prefix}{name}": value for name, value in nan_to_null(figures).items()}
 
 
