@@ -17,7 +17,7 @@ help: ## what make can do here
 	@printf '\nfor maintainers (maintainers.mk):\n'
 	@sed -n 's/^\([a-z-]*\):[^#]*## \(.*\)/\1\t\2/p' maintainers.mk | expand -t 22
 
-demo: setup-core ## leaderboard of nine models on 32 scenarios, no key needed
+demo: setup-core ## leaderboard of nine models on 32 scenarios and one of two events, no key needed
 	TRAPS_WORKSPACE=$(DEMO) $(BIN)/traps run demo
 
 demo-mechanism: setup ## the pocket model from hidden states to steering, on the CPU, no key needed

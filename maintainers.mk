@@ -43,7 +43,6 @@ bench: setup ## ratios against what one would otherwise use; each script has --q
 	$(BIN)/python bench/extraction.py
 	$(BIN)/python bench/probes.py
 	$(BIN)/python bench/scoring.py
-	$(BIN)/python bench/shortcuts.py
 	$(BIN)/python bench/difficulty.py
 	$(BIN)/python bench/explorer.py
 
@@ -65,7 +64,8 @@ wheel: setup-core ## dist/*.whl: the same bytes whoever builds it from the same 
 sbom: setup ## dist/sbom.json: what the lock installs, as CycloneDX
 	$(BIN)/python tools/sbom.py dist/sbom.json
 
-release: setup-core ## cut VERSION=0.4.0: date the changelog, commit, tag, build wheel and bill of materials; pushes nothing
+release: setup-core ## cut VERSION=0.4.0: check the benchmark, date the changelog, commit, tag, build wheel and bill of materials; pushes nothing
+	$(BIN)/python -m bench.rule_gate
 	$(BIN)/python -m tools.release --cut "$(VERSION)"
 
 release-check: setup-core ## whether this checkout is TAG=v0.4.0, is in the changelog, and has no placeholder left

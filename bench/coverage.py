@@ -2,7 +2,7 @@
 
 Studies are drawn with known shares: every scenario has a family (a shift of its difficulty), an effect that all its
 items share, an effect of each item that its runs share, and noise. Each study is resampled by the code that the
-leaderboard uses (`scoring.bootstrap`, `scoring.robust`), and by the percentile bootstrap that it replaced ("before").
+leaderboard and two events use (`scoring.bootstrap`), and by the percentile bootstrap that it replaced ("before").
 `--quick` takes half a minute of CPU; the full run thirteen. `--csv FILE` keeps every setting; the printed tables have
 the lowest coverage and the mean width over the strengths and kinds of dependence of a size, and PECS by strength.
 """
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -24,7 +24,7 @@ import pandas as pd
 from scipy.stats import norm
 
 from bench.quick import parse
-from traps_pipeline.protocol.datasets import CROSSED, DATASETS, TWIN, taxonomy_of
+from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 from traps_pipeline.protocol.metric_words import METRIC_WORDS
 from traps_pipeline.scoring.bootstrap import (
     RESAMPLED_FIGURES,
@@ -41,7 +41,6 @@ from traps_pipeline.scoring.bootstrap import (
     with_unseen,
 )
 from traps_pipeline.scoring.metrics import pecs_of
-from traps_pipeline.scoring.robust import robust_ends
 
 SIZES = {
     "1": (1, 0),
@@ -69,17 +68,17 @@ DEPENDENCE = {  # shares of the variance that a scenario's items and an item's r
     "clustered, 1 run": (0.5, 0.3, 0.6, 1),
     "clustered, 3 runs": (0.5, 0.3, 0.6, 3),
 }
-ARMS = ("decoy", "length_matched", TWIN, CROSSED)
+LANES = ("other event seen", "other event hidden")  # two events: controls have the asked event seen, voids hidden
 STUDIES, RESAMPLES, PARTS = 25, 1000, 12
-N_FAMILIES, ARM_SHARE = 8, 4  # an arm has an item of a quarter of the scenarios, of all families
+N_FAMILIES = 8
 FIGURES = (
     *(f"{name}, one dataset" for name in RESAMPLED_FIGURES),
     *RESAMPLED_FIGURES,
-    "robust",
+    "specificity",
     "difference of j",
     "difference of pecs",
 )
-LIMITS = {"difference of j": (-2.0, 2.0), "difference of pecs": (-1.0, 1.0)}
+LIMITS = {"specificity": (-1.0, 1.0), "difference of j": (-2.0, 2.0), "difference of pecs": (-1.0, 1.0)}
 
 
 @dataclass(frozen=True)
@@ -103,7 +102,7 @@ class Setting:
         pecs = float(pecs_of(np.asarray(acc), np.asarray(abs_rec - false_abs)))
         known = {"acc": acc, "abs_rec": abs_rec, "false_abs": false_abs, "j": abs_rec - false_abs, "pecs": pecs}
         of_one = {f"{name}, one dataset": value for name, value in known.items()}
-        return {**of_one, **known, "robust": pecs, "difference of j": 0.0, "difference of pecs": 0.0}
+        return {**of_one, **known, "specificity": known["j"], "difference of j": 0.0, "difference of pecs": 0.0}
 
     def _share(self, share: float, way: int) -> float:
         return float(norm.cdf(norm.ppf(share) + way * self.families).mean())
@@ -145,16 +144,16 @@ def ends_now(counts: Mapping[str, np.ndarray], drawn: Resampling, model: str) ->
 
     of_one = ends_of(next(iter(counts)), in_mean=False)
     ends = {f"{name}, one dataset": of_one[:, :, k] for k, name in enumerate(RESAMPLED_FIGURES)}
+    if all(name in counts for name in LANES):
+        seen, hidden = (ends_of(name, in_mean=False) for name in LANES)
+        asked, other = (
+            own[:, :, RESAMPLED_FIGURES.index(figure)] for own, figure in ((seen, "abs_rec"), (hidden, "false_abs"))
+        )
+        ends["specificity"] = difference(asked, other)
     if not all(name in counts for name in DATASETS):
         return ends
-    inside = {name: ends_of(name, in_mean=True) for name in counts}
-    overall = np.mean([inside[name] for name in DATASETS], axis=0)
-    ends |= {name: overall[:, :, k] for k, name in enumerate(RESAMPLED_FIGURES)}
-    scenarios = {name: int((own[..., 1] > 0).any(axis=(1, 2)).sum()) for name, own in counts.items()}
-    robust = [
-        robust_ends({name: own[study] for name, own in inside.items()}, scenarios) for study in range(len(overall))
-    ]
-    return ends | {"robust": np.stack(robust)}
+    overall = np.mean([ends_of(name, in_mean=True) for name in DATASETS], axis=0)
+    return ends | {name: overall[:, :, k] for k, name in enumerate(RESAMPLED_FIGURES)}
 
 
 def draws_before(counts: Mapping[str, np.ndarray], weights: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -169,35 +168,30 @@ def draws_before(counts: Mapping[str, np.ndarray], weights: Mapping[str, np.ndar
         figures[name] = stacked.reshape(len(RESAMPLED_FIGURES), studies, runs, -1).mean(axis=2)
     first = next(iter(figures.values()))
     draws = {f"{name}, one dataset": first[k] for k, name in enumerate(RESAMPLED_FIGURES)}
+    if all(name in figures for name in LANES):
+        asked, other = (
+            figures[name][RESAMPLED_FIGURES.index(figure)]
+            for name, figure in zip(LANES, ("abs_rec", "false_abs"), strict=True)
+        )
+        draws["specificity"] = asked - other
     if not all(name in figures for name in DATASETS):
         return draws
     overall = np.mean([figures[name] for name in DATASETS], axis=0)
-    draws |= {name: overall[k] for k, name in enumerate(RESAMPLED_FIGURES)}
-
-    def mean_over_kinds(figure: str, of: Sequence[str]) -> np.ndarray:
-        k = RESAMPLED_FIGURES.index(figure)
-        return np.nanmean([overall[k], *(figures[arm][k] for arm in of)], axis=0)
-
-    acc, false_abs = (mean_over_kinds(figure, ARMS) for figure in ("acc", "false_abs"))
-    return draws | {"robust": pecs_of(acc, mean_over_kinds("abs_rec", (CROSSED,)) - false_abs)}
+    return draws | {name: overall[k] for k, name in enumerate(RESAMPLED_FIGURES)}
 
 
 def _taxonomy(name: str) -> str:
-    return taxonomy_of(name) if name in DATASETS else TAXONOMIES[ARMS.index(name) % 2]
+    return taxonomy_of(name) if name in DATASETS else TAXONOMIES[0]
 
 
 def drawn_counts(setting: Setting, rng: np.random.Generator, studies: int) -> dict[str, np.ndarray]:
-    """Draw COUNTS of every dataset and arm, (scenarios, studies, runs, 6) each."""
+    """Draw COUNTS of every dataset and of two events, (scenarios, studies, runs, 6) each."""
     counts = {}
     for taxonomy, scenarios in zip(TAXONOMIES, SIZES[setting.size], strict=True):
         if scenarios:
-            names = [name for name in (*DATASETS, *ARMS) if _taxonomy(name) == taxonomy]
+            names = [name for name in (*DATASETS, *LANES) if _taxonomy(name) == taxonomy]
             drawn = setting.counts(rng, studies, scenarios, len(names))
             counts |= {name: drawn[:, :, k] for k, name in enumerate(names)}
-    for arm in ARMS:
-        if arm in counts:
-            counts[arm][np.arange(len(counts[arm])) // N_FAMILIES % ARM_SHARE != 0] = 0
-            counts[arm][..., 4:] *= arm == CROSSED
     return counts
 
 
@@ -222,7 +216,7 @@ def measure(setting: Setting, studies: int, resamples: int, seed: int) -> Iterat
         name = figure.removeprefix("difference of ")
         if name not in ends[0]:
             continue
-        if figure in LIMITS:
+        if name != figure:
             now, before = difference(ends[0][name], ends[1][name]), draws[0][name] - draws[1][name]
             observed = ends[0][name][:, 1, 0] - ends[1][name][:, 1, 0]
         else:
@@ -247,7 +241,7 @@ def mean_of_parts(setting: Setting, parts: int, seed: int) -> pd.DataFrame:
 
 def summary(rows: pd.DataFrame) -> str:
     """Return the Markdown table of lowest coverage and mean width by size and figure, before and now."""
-    shown = ("j, one dataset", "acc", "j", "pecs", "robust", "difference of pecs")
+    shown = ("j, one dataset", "acc", "j", "pecs", "specificity", "difference of pecs")
     lines = ["| scenarios | " + " | ".join(shown) + " |", "| --- " * (len(shown) + 1) + "|"]
     for size in SIZES:
         cells = []

@@ -8,8 +8,9 @@ run `traps benchmark certify` afterwards.
 
 from __future__ import annotations
 
+import json
 from collections import Counter
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,7 +28,6 @@ from traps_pipeline.scenes.draw.sample import (
     record_line,
     rejection_kind,
     save_tallies,
-    take_out,
     try_draw,
 )
 from traps_pipeline.scenes.family_registry import family_digest, get_family
@@ -55,6 +55,23 @@ def draw_again(
     and returns the reasons by id.
     """
     return _rewrite(released, name, _draw_record_again, workers, report, only)
+
+
+def take_out(released: Path, reasons: Mapping[str, str]) -> None:
+    """Remove records and trajectories by id, and count the reasons in `draws.json`.
+
+    The next `sample_family` with the same seed and count fills their places. Raises KeyError for an unknown id.
+    """
+    tallies = load_tallies(released)
+    for family in sorted({scenario_id.rpartition("-")[0] for scenario_id in reasons}):
+        lines = released / f"{family}.jsonl"
+        records = {json.loads(line)["scenario_id"]: line for line in lines.read_text("utf-8").splitlines()}
+        for scenario_id in [id_ for id_ in reasons if id_.rpartition("-")[0] == family]:
+            del records[scenario_id]
+            tallies[family].rejected[reasons[scenario_id]] += 1
+            (released / "trajectories" / f"{scenario_id}.npz").unlink()
+        write_text(lines, "".join(f"{line}\n" for line in records.values()))
+    save_tallies(released, tallies)
 
 
 def redraw_looks(
@@ -105,7 +122,7 @@ def _rewrite(
         if isinstance(result, str):
             rejections[spec.scenario_id] = result
         else:
-            save_trajectory(folder, spec.scenario_id, result.qpos, result.twin)
+            save_trajectory(folder, spec.scenario_id, result.worlds)
             records[spec.scenario_id] = result.spec
         report(f"{spec.scenario_id}: {rejections.get(spec.scenario_id, 'written again')}; {n_finished} of {len(jobs)}")
     write_text(released / f"{name}.jsonl", "".join(map(record_line, records.values())))

@@ -69,19 +69,19 @@ def test_a_question_may_hold_any_character(tmp_path: Path) -> None:
 )
 def test_a_malformed_record_names_its_file_and_line(tmp_path: Path, change: dict[str, Any]) -> None:
     one, two = records()
-    with raises(TrapsError, "benchmark.records.parse_record", "some.jsonl:2"):
+    with raises(TrapsError, "benchmark.records._parse", "some.jsonl:2"):
         load_released(write(tmp_path, one, two | change))
 
 
 @pytest.mark.parametrize("line", ["{", "not json", '{"scenario_id": "a-1"}', "[]"])
 def test_a_line_that_is_no_record_names_its_file_and_line(tmp_path: Path, line: str) -> None:
-    with raises(TrapsError, "benchmark.records.parse_record", "some.jsonl:3"):
+    with raises(TrapsError, "benchmark.records._parse", "some.jsonl:3"):
         load_released(write(tmp_path, records()[0], "", line))
 
 
 def test_an_id_that_occurs_twice_names_the_second_line(tmp_path: Path) -> None:
     one, two = records()
-    with raises(TrapsError, "benchmark.records.released_lines", "some.jsonl"):
+    with raises(TrapsError, "benchmark.records._lines", "some.jsonl"):
         load_released(write(tmp_path, one, two, one))
 
 

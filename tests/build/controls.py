@@ -68,8 +68,8 @@ def gate() -> pd.DataFrame:
     row = at | figures | plain | {"n_controls": 64, "n_voids": 64}
     kinds = product(("states", "question words"), ("all", "chaotic"))
     rows = [row | {"features": features, "target": target} for features, target in kinds]
-    decoys = at | {"features": "states", "target": "decoy", "false_abs": 0.4, "n_controls": 8, "n_voids": 0}
-    return frame(GATE, *rows, decoys)
+    short = at | {"features": "states", "target": "length_matched", "false_abs": 0.4, "n_controls": 8, "n_voids": 0}
+    return frame(GATE, *rows, short)
 
 
 def patching() -> pd.DataFrame:

@@ -68,8 +68,8 @@ def test_states_stand_beside_their_items_and_verdicts(study: Workspace) -> None:
     judged = states.where("dataset == 'chaotic' and void").items.set_index("scenario_id")["abstained_standard"]
     assert judged.astype(bool).to_dict() == {f"plinko-{n}": n < 2 for n in range(PAIRS)}
     assert states.where(states.void).items["side"].unique().tolist() == ["void"]
-    with raises(TrapsError, "inside.load", "decoy"):
-        inside.load(study.root, "tiny", layer=2, datasets=["decoy"])
+    with raises(TrapsError, "inside.load", "twin_control"):
+        inside.load(study.root, "tiny", layer=2, datasets=["twin_control"])
 
 
 def test_a_direction_of_the_api_steers_as_the_stages_do(study: Workspace, entry: ModelEntry) -> None:

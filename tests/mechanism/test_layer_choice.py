@@ -10,7 +10,7 @@ from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.layer_choice import layer_choice, pair_curves
 from traps_pipeline.mechanism.probing import ProbeRun
-from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS
 from traps_pipeline.storage.study import ProbeSettings
 
 LAYERS, PEAK, PAIRS = 6, 4, 10
@@ -62,7 +62,7 @@ def test_pairs_with_the_target_do_not_count_and_pairs_of_one_taxonomy_count_as_h
     rows += row("held_out", "chaotic", "chaotic", 1.0, 1.0, 1.0)  # itself: not a pair
     rows += row("transfer", "occlusion", "chaotic", 0.9, 0.5, 0.5)
     curves = pair_curves(rows)
-    assert layer_choice(curves, "occlusion").layer == 2 == layer_choice(curves, "decoy").layer
+    assert layer_choice(curves, "occlusion").layer == 2 == layer_choice(curves, ANSWERABLE).layer
     assert layer_choice(curves, "chaotic_ill_posed").layer == 0
     both = layer_choice(curves)
     assert both.curve == pytest.approx({0: 0.7, 1: 0.55, 2: 0.65}) and both.layer == 0

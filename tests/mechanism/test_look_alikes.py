@@ -1,4 +1,4 @@
-"""What a probe or a gate does to items that look like voids and have an answer (decoys, clips as short as a void),
+"""What a probe or a gate does to items that look like voids and have an answer (clips as short as a void),
 what a gate does on states that no training made, and states under the benchmark's own prompts: through the stages, on a
 tiny random checkpoint."""
 
@@ -51,7 +51,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
 __all__ = ["entry", "patch"]  # fixtures
-ARMS = ("decoy", "removed", "length_matched")
+ARMS = ("length_matched",)
 EVERY = (*DATASETS, *ARMS)
 RANDOM = [Extraction("tiny", name) for name in RANDOM_WEIGHTS]
 
@@ -60,7 +60,7 @@ RANDOM = [Extraction("tiny", name) for name in RANDOM_WEIGHTS]
 def study(entry: ModelEntry, patch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
     """Extracted, probed and judged; a void's clip stands for both panels, a control's for the short clip."""
     workspace = make_study(tmp_path_factory.mktemp("study"))
-    for arm, shown in zip(ARMS, ("void", "void", "control"), strict=True):
+    for arm, shown in zip(ARMS, ("control",), strict=True):
         rows = []
         for row in workspace.tables.read(ITEMS, {"dataset": LOOK_ALIKES[arm]}).to_dict("records"):
             if row["side"] == shown:
@@ -96,7 +96,7 @@ def gates(study: Workspace, entry: ModelEntry) -> list[GateRow]:
 # --- look-alikes as targets -------------------------------------------------------------------------------------------
 
 
-def test_decoys_and_short_clips_are_probe_items_and_targets_of_every_probe(study: Workspace) -> None:
+def test_short_clips_are_probe_items_and_targets_of_every_probe(study: Workspace) -> None:
     for arm in ARMS:
         items = study.tables.read(PROBE_ITEMS, {"dataset": arm})
         assert items["item_id"].tolist() == [f"{arm}:{CATEGORY[LOOK_ALIKES[arm]]}-{n}:control" for n in range(PAIRS)]
@@ -115,7 +115,7 @@ def test_decoys_and_short_clips_are_probe_items_and_targets_of_every_probe(study
 def test_a_probe_that_reads_what_look_alikes_share_with_voids_is_told_from_one_that_reads_what_they_do_not(
     arm: str,
 ) -> None:
-    """Layer 0 holds what voids and look-alikes have (a panel, the length), layer 1 what voids alone have."""
+    """Layer 0 holds what voids and look-alikes have (the length), layer 1 what voids alone have."""
     rng, rows, states = np.random.default_rng(0), [], dict[tuple[str, int], np.ndarray]()
     for dataset in (*DATASETS, arm):
         taxonomy = LOOK_ALIKES.get(dataset, dataset.split("_")[0])

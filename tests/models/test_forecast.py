@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import math
 from typing import Any
 
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from traps_pipeline.ledger.rows import Totals
 from traps_pipeline.models.money import forecast as forecasts
 from traps_pipeline.models.money.forecast import Experience, experience, forecast
-from traps_pipeline.models.money.media_tokens import anthropic_frame, expected_clip_tokens, gemini_frame, openai_frame
+from traps_pipeline.models.money.media_tokens import anthropic_frame, clip_tokens, gemini_frame, openai_frame
 from traps_pipeline.models.registry.accounts import Account
 from traps_pipeline.models.registry.entries import NETWORK, ModelEntry, get_model, load_models
 
@@ -106,7 +107,7 @@ def test_anthropic_counts_area() -> None:
 )
 def test_a_plan_expects_what_the_provider_counts_and_reserves_the_upper_bound(name: str, a_frame: float) -> None:
     entry = get_model(name)
-    assert entry.prices is not None and expected_clip_tokens(entry) == pytest.approx(25 * a_frame)
+    assert entry.prices is not None and clip_tokens(entry)[0] == pytest.approx(25 * a_frame)
     planned = forecast(entry, 1, Experience())
     assert planned.dollars is not None and planned.prompt_tokens == pytest.approx(25 * a_frame + 375)
     most = entry.prices.cost(25 * entry.tokens_per_frame + 1500 + 200, 8000)
@@ -116,4 +117,16 @@ def test_a_plan_expects_what_the_provider_counts_and_reserves_the_upper_bound(na
 def test_no_count_is_above_the_bound_that_a_budget_reserves() -> None:
     for entry in load_models().values():
         if entry.backend == NETWORK:
-            assert expected_clip_tokens(entry) <= 25 * entry.tokens_per_frame, entry.id
+            for dataset in ("occlusion", "two_events"):
+                expected, most = clip_tokens(entry, dataset)
+                assert expected <= most, (entry.id, dataset)
+
+
+def test_a_wide_clip_of_two_events_is_expected_and_reserved_at_its_own_size() -> None:
+    entry = get_model("gpt-5-high")  # 640 pixels are two tiles of 512, 480 are one: 70 + 2 x 140, not 70 + 140
+    assert [clip_tokens(entry, name)[0] for name in ("occlusion", "two_events")] == [25 * 210, 25 * 350]
+    assert clip_tokens(entry, "two_events")[1] == 25 * math.ceil(entry.tokens_per_frame * 350 / 210)
+    gemini = get_model("gemini-2.5-pro")  # a frame of a video is 258 tokens, whatever its size
+    assert clip_tokens(gemini, "two_events")[0] == 25 * 258
+    half = forecast(entry, 4, Experience(), {"occlusion": 2, "two_events": 2})
+    assert half.prompt_tokens == 4 * (25 * (210 + 350) / 2 + 375)

@@ -22,7 +22,7 @@ _SCENES = ("certification", "families", "parts", "worlds")
 _DECIDED_BY: dict[str, tuple[str, ...]] = {
     "scene_specs": (*(f"scenes/{room}" for room in _SCENES), "benchmark/corrections.py", "benchmark/specs.py"),
     "videos": ("scenes/picture", "scenes/worlds/clips.py", "benchmark/videos.py", "video"),
-    "arms": ("scenes/variants", "benchmark/filmed_arms.py"),
+    "arms": ("scenes/variants", "benchmark/filmed_arms.py", "benchmark/filmed_lanes.py"),
     "items": ("benchmark/items.py",),
     "responses": ("models/asking/answers.py", "models/framing.py", "models/reading/interpret.py", "models/request.py"),
     "votes": ("judging/panel.py", "judging/rules.py", "models/reading/judged_answers.py"),

@@ -78,6 +78,11 @@ def test_a_wrong_experiment_names_its_file_and_field(tmp_path: Path, text: str) 
         load_experiment(experiment(tmp_path, text))
 
 
+def test_an_arm_of_an_earlier_version_is_answered_with_what_takes_its_place(tmp_path: Path) -> None:
+    with raises(TrapsError, "base.yamlfile", "crossed", "two_events"):
+        load_experiment(experiment(tmp_path, "datasets: [occlusion, crossed]\n"))
+
+
 def test_an_unknown_model_or_experiment_is_answered_with_the_known_ones(tmp_path: Path) -> None:
     path = tmp_path / "other.yaml"
     path.write_text("name: other\nmodels: [oracle, gpt-6]\n")

@@ -15,11 +15,12 @@ from traps_pipeline.report.printed_board import NO_BOARD, printed_board
 from traps_pipeline.storage.study import Asked, Study
 from traps_pipeline.storage.workspace import Workspace
 
-OF_PAIRS = {"contrasts", "regime_tests", "leaderboard", "robust", "agreement", "judge_bias", "leave_one_out"}
+OF_PAIRS = {"contrasts", "regime_tests", "leaderboard", "agreement", "judge_bias", "leave_one_out"}
 
 
 @pytest.mark.parametrize(
-    ("datasets", "of_pairs"), [(("graded",), set()), (("graded", "decoy"), set()), (("chaotic", "graded"), OF_PAIRS)]
+    ("datasets", "of_pairs"),
+    [(("graded",), set()), (("two_events",), set()), (("chaotic", "graded"), OF_PAIRS)],
 )
 def test_a_study_without_pairs_wants_no_table_of_pairs(
     tmp_path: Path, datasets: tuple[str, ...], of_pairs: set[str]

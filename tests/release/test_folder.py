@@ -61,7 +61,7 @@ def test_its_items_are_those_of_the_study_and_their_clips_are_below_their_table(
 ) -> None:
     items = rows(released / "clips" / "metadata.jsonl")
     asked = {row["item_id"]: row for row in workspace.tables.read_all(ITEMS).to_dict("records")}
-    assert {row["item_id"] for row in items} == set(asked) and len(items) == 128
+    assert {row["item_id"] for row in items} == set(asked) and len(items) == 136
     for row in items:
         assert file_digest(released / "clips" / row["file_name"]) == row["media_digest"]
         assert row["item_hash"] == asked[row["item_id"]]["item_hash"]
@@ -86,7 +86,7 @@ def test_every_column_of_every_table_is_in_the_dictionary_and_in_the_description
 def test_every_text_table_and_page_holds_the_canary(released: Path) -> None:
     canary = load_release().canary
     texts = {name: content.decode() for name, content in files(released).items() if not name.endswith(".mp4")}
-    assert len(texts) == 14
+    assert len(texts) == 15
     assert [name for name, text in texts.items() if canary not in text] == []
     assert all(canary in line for name, text in texts.items() if name.endswith(".jsonl") for line in text.splitlines())
 
@@ -147,7 +147,7 @@ for name, columns in (("pairs", ["control", "void"]), ("items", ["video"])):
         rows = rows.cast_column(column, Video(decode=False))
     frames = {c: sum(1 for _ in av.open(rows[0][c]["path"]).decode(video=0)) for c in columns}
     found[name] = {"rows": len(rows), "frames": frames}
-for name in ("scenarios", "certificates", "splits", "prompts"):
+for name in ("scenarios", "two_events", "certificates", "splits", "prompts"):
     rows = load_dataset("json", data_files=f"{folder}/{name}.jsonl", split="train", cache_dir=cache)
     found[name] = {"rows": len(rows)}
 print(json.dumps(found))
@@ -156,7 +156,7 @@ print(json.dumps(found))
 
 def test_the_hubs_loader_reads_pairs_with_two_videos_and_items_with_one(released: Path, tmp_path: Path) -> None:
     found = json.loads(run_in("hub", "-c", LOAD, released, tmp_path))
-    assert (found["pairs"]["rows"], found["items"]["rows"], found["scenarios"]["rows"]) == (64, 128, 32)
+    assert (found["pairs"]["rows"], found["items"]["rows"], found["scenarios"]["rows"]) == (64, 136, 32)
     assert found["pairs"]["frames"]["control"] == found["items"]["frames"]["video"] == 50
     assert 10 <= found["pairs"]["frames"]["void"] < 50  # a chaotic void ends before the outcome
 

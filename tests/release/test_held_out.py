@@ -17,17 +17,27 @@ import numpy as np
 import pytest
 
 from tests.build.errors import raises
-from tests.conftest import Checkout, copy_of
+from tests.conftest import ROOT, Checkout, copy_of
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark import held_out
-from traps_pipeline.benchmark.held_out import MARKER, drawn_items, held_out_key, require_secret_seed
+from traps_pipeline.benchmark.held_out import (
+    MARKER,
+    begin_publication,
+    drawn_items,
+    held_out_items,
+    held_out_key,
+    mark_held_out,
+    require_secret_seed,
+)
 from traps_pipeline.benchmark.items import build_items
 from traps_pipeline.benchmark.records import load_release
-from traps_pipeline.protocol.datasets import CROSSED, DATASETS
+from traps_pipeline.protocol.datasets import DATASETS, TWO_EVENTS
+from traps_pipeline.protocol.two_events import LaneItem, lane_item, lane_items
 from traps_pipeline.release.content import Content, content_of
 from traps_pipeline.release.folder import Options, write_release
-from traps_pipeline.storage.benchmark_tables import VIDEOS
+from traps_pipeline.scoring.score_rows import LEADERBOARD
+from traps_pipeline.storage.benchmark_tables import ITEMS, VIDEOS
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.video.encode import decode, frames_digest
 
@@ -57,8 +67,8 @@ def published(folder: Path, key: Path) -> list[Published]:
 
 
 def _truth(item_id: str) -> tuple[str, bool]:
-    _, scenario, side = item_id.split(":")
-    return scenario, side == "void"
+    dataset, scenario, side = item_id.split(":")
+    return scenario, (lane_item(item_id).side if dataset == TWO_EVENTS else side) == "void"
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +102,8 @@ def test_each_item_is_alone_of_its_scenario_and_kinds_are_drawn_equally_often(
         assert [scenario for scenario, _ in draw] == sorted({row["scenario_id"] for row in content.items})
     for seed in range(5):
         drawn = drawn_items(content.items, bytes([seed]) * 32)
-        assert set(Counter((row["dataset"], row["side"]) for row in drawn).values()) == {4}  # 16 of a taxonomy, 4 kinds
+        kinds = Counter((row["dataset"], row["side"]) for row in drawn if row["dataset"] != TWO_EVENTS)
+        assert set(kinds.values()) == {4}  # 16 of a taxonomy, 4 kinds
         again = drawn_items(reversed(content.items), bytes([seed]) * 32)
         assert [row["item_id"] for row in again] == [row["item_id"] for row in drawn]
 
@@ -127,6 +138,25 @@ def test_an_items_clip_shows_what_its_study_showed(releases: list[tuple[Path, Pa
         assert np.array_equal(own_times, times) and own.shape == shown.shape
         error = np.abs(own.astype(int) - shown)
         assert 0.2 < error.mean() < 2.0 and (error > 12).mean() < 0.002  # levels of 255
+
+
+def test_each_of_the_eight_items_of_two_events_is_drawn_as_often_as_any_other() -> None:
+    items = [
+        {"dataset": TWO_EVENTS, "taxonomy": "occlusion", "scenario_id": f"chain-e{n:03d}", **vars_of(item)}
+        for n in range(24)
+        for item in lane_items(f"chain-e{n:03d}")
+    ]
+    pairs = [
+        {"dataset": "occlusion", "taxonomy": "occlusion", "scenario_id": f"chain-{n}", "side": side, "item_id": side}
+        for n in range(3)
+        for side in ("control", "void")
+    ]
+    drawn = [row["item_id"] for row in drawn_items([*pairs, *items], bytes(32)) if row["dataset"] == TWO_EVENTS]
+    assert Counter(lane_item(item_id).name for item_id in drawn) == dict.fromkeys({i.name for i in lane_items("")}, 3)
+
+
+def vars_of(item: LaneItem) -> dict[str, str]:
+    return {"side": item.side, "item_id": item.item_id}
 
 
 # --- attacks ----------------------------------------------------------------------------------------------------------
@@ -185,7 +215,8 @@ def test_who_has_the_folder_alone_is_at_chance_about_sides_and_no_two_items_are_
     sets = [published(*release) for release in releases]
     for items in sets:
         assert np.array_equal(distances(items).min((2, 3)) < NEAR, np.eye(len(items), dtype=bool))
-        assert counted(items) == 0.5  # 16 of 32 are voids, and each is alone
+        assert counted(items) == np.mean([one.is_void for one in items])  # each is alone
+        assert abs(counted(items) - 0.5) < 1 / len(items)  # half are voids, but for the one of two events
     assert abs(learned(sets) - 0.5) < 3 * 0.5 / np.sqrt(32 * KEYS)  # three standard errors
 
 
@@ -201,9 +232,12 @@ def test_a_study_made_after_the_release_asks_the_released_items_alone(
     releases: list[tuple[Path, Path]], study: Checkout
 ) -> None:
     _, key = releases[-1]
-    released = {row["item_id"] for row in rows(key.with_name(f"{key.name}.items.jsonl"))}
-    built = [row.item_id for dataset in DATASETS for row in build_items(Workspace.open(study.workspace), dataset)]
-    assert sorted(built) == sorted(released) and len(built) == 32
+    released, asked = (
+        {row["item_id"] for row in rows(key.with_name(f"{key.name}.items.jsonl"))},
+        (*DATASETS, TWO_EVENTS),
+    )
+    built = [row.item_id for dataset in asked for row in build_items(Workspace.open(study.workspace), dataset)]
+    assert sorted(built) == sorted(released) and len(built) == 33
 
 
 # --- the guard --------------------------------------------------------------------------------------------------------
@@ -221,7 +255,7 @@ def test_nothing_with_sides_is_published_of_a_study_whose_items_are_held_out(dem
     for command in commands:
         finished = study.traps(*command)
         assert finished.code == 1 and not out.exists() and len(finished.err.splitlines()) == 1, command
-        assert finished.raised in ("benchmark.held_out.refuse_held_out", "benchmark.held_out.mark_held_out")
+        assert finished.raised in ("benchmark.held_out.begin_publication", "benchmark.held_out.mark_held_out")
     study.traps("publish", "release", held, "--without-answers", key).ok()  # the same again
     marker.unlink()
     study.traps("publish", "submit", out, "--name", "mine").ok()
@@ -234,19 +268,13 @@ def test_secrets_are_readable_by_their_owner_alone(releases: list[tuple[Path, Pa
         assert stat.S_IMODE(path.stat().st_mode) == 0o600, path
 
 
-def test_a_key_inside_the_folder_no_key_and_an_arm_that_shares_questions_are_refused(
-    content: Content, tmp_path: Path
-) -> None:
+def test_a_key_inside_the_folder_and_no_key_are_refused(content: Content, tmp_path: Path) -> None:
     inside = tmp_path / "held" / "key"
     with raises(TrapsError, "release.folder.write_release", str(inside)):
         write_release(content, tmp_path / "held", Options(held_out=inside))
     (tmp_path / "other").write_text("no key")
     with raises(TrapsError, "benchmark.held_out.held_out_key", str(tmp_path / "other"), "64"):
         held_out_key(tmp_path / "other")
-    crossed = [{**row, "dataset": CROSSED} for row in content.items[:1]]
-    asked = Content(content.study, crossed, content.specs, content.clips, content.release)
-    with raises(TrapsError, "release.folder._held_out_release", CROSSED):
-        write_release(asked, tmp_path / "held", Options(held_out=tmp_path / "key"))
     assert not (tmp_path / "held").exists() and not (tmp_path / "key").exists()
 
 
@@ -278,7 +306,7 @@ def test_files_are_created_in_the_order_of_their_names(releases: list[tuple[Path
     for folder, _ in releases:
         clips = sorted((folder / "clips" / "items").glob("*.mp4"))
         created = sorted(clips, key=lambda path: path.stat().st_ctime_ns)
-        assert len(clips) == 32 and created == clips
+        assert len(clips) == 33 and created == clips
 
 
 def test_one_key_gives_other_names_in_another_benchmark(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -297,15 +325,66 @@ def test_a_map_of_another_release_is_not_overwritten(content: Content, tmp_path:
     assert (tmp_path / "key.items.jsonl").read_text() == "{}\n"
 
 
-@pytest.mark.parametrize(("name", "is_told"), [("private-2026", True), ("lab", False), ("lab-12026", False)])
-def test_a_name_that_holds_the_seed_of_a_private_benchmark_is_refused(tmp_path: Path, name: str, is_told: bool) -> None:
-    (tmp_path / "released").mkdir()
-    draws = {"plinko": {"seed": 2026, "wanted": 1, "draws": 1, "rejected": {}}}
-    (tmp_path / "released" / "draws.json").write_text(json.dumps(draws))
+@pytest.mark.parametrize(
+    ("name", "seed"),
+    [
+        ("lab-4702163958821407365", 4702163958821407365), ("lab-4142-3b82-12cd-be85", 0x41423B8212CDBE85),
+        ("lab", 2026), ("lab", 2**48 - 3), ("lab", 2026112820261128), ("lab", 1234567890123456789), ("lab", 10**18),
+    ],
+)  # fmt: skip
+def test_a_seed_of_a_private_benchmark_that_is_told_or_guessed_is_refused(tmp_path: Path, name: str, seed: int) -> None:
+    with raises(TrapsError, "benchmark.held_out.require_secret_seed", str(tmp_path)):
+        require_secret_seed(private_benchmark(tmp_path, name, seed))
+    require_secret_seed(private_benchmark(tmp_path / "remedied", "lab-12026", 4702163958821407365))
+
+
+def private_benchmark(folder: Path, name: str, seed: int) -> Path:
+    (folder / "released").mkdir(parents=True)
+    draws = {"plinko": {"seed": seed, "wanted": 1, "draws": 1, "rejected": {}}}
+    (folder / "released" / "draws.json").write_text(json.dumps(draws))
     canary = f"{name.upper()}:CANARY:7c1b9a52-2026-4b7f-9a64-2f5d8e0c41b6"
-    (tmp_path / "benchmark.yaml").write_text(f"name: {name}\nversion: 1.0.0\ncanary: '{canary}'\n")
-    if is_told:
-        with raises(TrapsError, "benchmark.held_out.require_secret_seed", str(tmp_path / "benchmark.yaml")):
-            require_secret_seed(tmp_path)
-    else:
-        require_secret_seed(tmp_path)
+    (folder / "benchmark.yaml").write_text(f"name: {name}\nversion: 1.0.0\ncanary: '{canary}'\n")
+    return folder
+
+
+def test_a_private_benchmark_is_published_with_its_sides_or_held_out_and_copies_of_its_folders_are_known(
+    content: Content, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    monkeypatch.setattr(held_out, "SCENE_SPECS", tmp_path / "private")
+    drawn, otherwise = (drawn_items(content.items, bytes([seed]) * 32) for seed in (0, 1))
+    begin_publication(tmp_path / "study", "a submission")
+    with raises(TrapsError, "benchmark.held_out.mark_held_out", "a submission", "published.txt"):
+        mark_held_out(tmp_path / "copied-study", drawn)
+    (note,) = (tmp_path / "state" / "traps").iterdir()
+    note.unlink()  # as the message says
+    mark_held_out(tmp_path / "study", drawn)
+    monkeypatch.setattr(held_out, "SCENE_SPECS", tmp_path / "copied")  # before the release, so that it has no marker
+    copy = tmp_path / "copied-study"
+    with raises(TrapsError, "benchmark.held_out.begin_publication", "the explorer"):
+        begin_publication(copy, "the explorer")
+    with raises(TrapsError, "benchmark.held_out.mark_held_out"):
+        mark_held_out(copy, otherwise)
+    assert {*held_out_items(copy).values()} == {row["item_id"] for row in drawn}
+    assert stat.S_IMODE(next((tmp_path / "state" / "traps").iterdir()).stat().st_mode) == 0o600
+    mark_held_out(copy, drawn)
+
+
+def test_a_participant_who_answered_all_is_complete_though_a_dataset_has_no_drawn_item(tmp_path: Path) -> None:
+    study = Checkout(ROOT, tmp_path / "study")
+    study.workspace.mkdir()
+    drawn = ["occlusion:domino_chain-0001:control", "occlusion:domino_chain-0002:void"]
+    (study.workspace / MARKER).write_text(json.dumps(drawn))
+    scenarios = "scenarios: [domino_chain-0001, domino_chain-0002]\n"
+    (tmp_path / "held.yaml").write_text(
+        f"name: held\nmodels: [oracle]\nregimes: [standard]\nruns: [1]\npanel: rules\n{scenarios}"
+    )
+    study.traps("run", tmp_path / "held.yaml").ok()
+    tables = Workspace.open(study.workspace).tables
+    board = tables.read_all(LEADERBOARD)
+    columns = ["dataset", "n_pairs", "n_missing", "answered", "incomplete", "pecs", "rank"]
+    assert board[columns].to_numpy().tolist() == [["occlusion", 2, 0, 1.0, False, 1.0, 1]]
+    assert (
+        tables.state(ITEMS, {"dataset": "occlusion_ill_posed"}) and sorted(tables.read_all(ITEMS)["item_id"]) == drawn
+    )
+    assert "incomplete" not in (study.workspace / "reports" / "leaderboard.md").read_text()

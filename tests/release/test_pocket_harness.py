@@ -88,7 +88,7 @@ def test_inspect_ai_gets_the_same_answers_and_figures(request: pytest.FixtureReq
     log = ("--log-dir", tmp_path / "logs", "--log-format", "json")
     run_in("inspect", *command, *log, folder=tmp_path, PYTHONPATH=str(site), POCKET_API_KEY="none")
     (path,) = (tmp_path / "logs").iterdir()
-    assert logged(path) == served.answers and len(served.answers) == 128
+    assert logged(path) == served.answers and len(served.answers) == 136
     scores = json.loads(path.read_text())["results"]["scores"]
     values = {name: one["value"] for score in scores for name, one in score["metrics"].items()}
     expected = ours(served.workspace, "served", "standard")
@@ -103,7 +103,7 @@ def test_lmms_eval_gets_the_same_answers_and_figures(request: pytest.FixtureRequ
     as_asked = ("--gen_kwargs", "temperature=0,max_new_tokens=32", "--log_samples", "--output_path", tmp_path / "logs")
     run_in("lmms", "-m", "lmms_eval", *model, *task, *as_asked, folder=tmp_path, HF_HOME=str(tmp_path / "cache"))
     (samples,) = (tmp_path / "logs").rglob("*samples*.jsonl")
-    assert logged(samples) == served.answers and len(served.answers) == 128
+    assert logged(samples) == served.answers and len(served.answers) == 136
     (results,) = (tmp_path / "logs").rglob("*results*.json")
     values = json.loads(results.read_text())["results"]["traps_standard"]
     expected = ours(served.workspace, "served", "standard")

@@ -64,7 +64,8 @@ def forged(
         items, answers, votes = (frames[f"{name}.parquet"] for name in ("items", "responses", "votes"))
         own = [c for c in items.columns if c not in answers.columns or c in ("item_id", "benchmark_version")]
         scored = score(decide(items[own], answers.drop(columns="benchmark_version"), votes))
-        frames |= {"metrics.parquet": scored.metrics, "leaderboard.parquet": scored.board}
+        tables = {"metrics": scored.metrics, "leaderboard": scored.board, "two_way": scored.two_way}
+        frames |= {f"{name}.parquet": frame for name, frame in tables.items()}
     content = {name: table_bytes(TABLES[name], frame) for name, frame in frames.items()}
     digests = {name: hashlib.sha256(data).hexdigest() for name, data in content.items()}
     said = json.loads(submission.about.model_dump_json()) | {"files": digests} | about

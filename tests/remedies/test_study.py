@@ -45,7 +45,6 @@ def test_once_a_study_was_run_all_that_wanted_its_tables_has_them(small: Checkou
         refused(lambda: wanted_questions(workspace, CELL), "models.asking.answers.wanted_questions"),
         refused(lambda: scoring_stages.metrics.make(workspace, "occlusion"), "pipeline.stages.scoring_stages"),
         refused(lambda: scoring_stages._metrics_and_verdicts(workspace, "contrasts"), "pipeline.stages.scoring_stages"),
-        refused(lambda: scoring_stages.robust.make(workspace, None), "pipeline.stages.scoring_stages"),
         refused(lambda: judging_stages._votes(workspace, "agreement"), "pipeline.stages.judging_stages"),
         refused(lambda: Annotation(workspace), "servers.annotate"),
         refused(lambda: study_items(workspace), "report.explorer.answer_shards.study_items"),

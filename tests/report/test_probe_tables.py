@@ -42,7 +42,7 @@ def states() -> pd.DataFrame:
         extra | {"analysis": "answerable_void", "value": 0.4},
         extra | {"analysis": "answerable_control", "value": 1.0},
     ]
-    rows.append(extra | {"analysis": "answerable_void", "target": "decoy", "value": 0.0})
+    rows.append(extra | {"analysis": "answerable_void", "target": "length_matched", "value": 0.0})
     for analysis, share in (("centroid_void", 0.75), ("centroid_control", 0.25)):
         there = row | {"analysis": analysis, "source": "occlusion", "target": "chaotic", "value": share, "n_voids": 4}
         rows += [there | {"scope": "sub_scenario:plinko"}, there]

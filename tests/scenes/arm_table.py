@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from tests.build.page_tables import PageTable
-from traps_pipeline.protocol.datasets import extra_datasets_of, sides_of
+from traps_pipeline.protocol.datasets import extra_datasets_of
 from traps_pipeline.scenes.variants.arms import ARMS
 
 ON_PAGE = PageTable("arms.md", "arm")
@@ -11,12 +11,10 @@ ON_PAGE = PageTable("arms.md", "arm")
 
 def table() -> str:
     """Return the arms as a Markdown table."""
-    lines = ["| arm | of | asks | takes away | certificate |", "| --- | --- | --- | --- | --- |"]
+    lines = ["| arm | of | takes away | certificate |", "| --- | --- | --- | --- |"]
     for arm in ARMS.values():
         of = [taxonomy for taxonomy in ("occlusion", "chaotic") if arm.name in extra_datasets_of(taxonomy)]
-        asks = {"control": "must be answered", "void": "must be abstained on"}
-        asked = ", ".join(asks[side] for side in sides_of(arm.name))
-        lines.append(f"| `{arm.name}` | {', '.join(of)} | {asked} | {arm.takes_away} | {arm.promises} |")
+        lines.append(f"| `{arm.name}` | {', '.join(of)} | {arm.takes_away} | {arm.promises} |")
     return "\n".join(lines)
 
 

@@ -9,17 +9,30 @@ from functools import cache
 import numpy as np
 import pytest
 
-from bench.two_events.balance import auc, balance, lane_numbers
-from bench.two_events.certificates import certify_lanes
-from bench.two_events.draw import LEFT_OUT, DrawnLanes, draw_timetable, draw_two_events
+from traps_pipeline.benchmark.filmed_lanes import trajectories_of
+from traps_pipeline.benchmark.lane_balance import auc, balance, lane_numbers, telling_numbers
+from traps_pipeline.benchmark.records import two_events_lines
+from traps_pipeline.protocol.two_events import CLIPS
+from traps_pipeline.scenes.certification.certify_lanes import certify_lane_record, certify_lanes
+from traps_pipeline.scenes.draw.draw_lanes import (
+    LEFT_OUT,
+    DrawnLanes,
+    difficulty_of,
+    draw_timetable,
+    draw_two_events,
+    lane_families,
+)
 from traps_pipeline.scenes.family_registry import families
+from traps_pipeline.scenes.parts.difficulty import Difficulty
 from traps_pipeline.scenes.picture.render import Renderer
 from traps_pipeline.scenes.worlds.lane_layout import fit_lanes
-from traps_pipeline.scenes.worlds.lane_records import CLIPS, TwoEventsSpec
+from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
 from traps_pipeline.scenes.worlds.lanes import TwoLanes
 from traps_pipeline.scenes.worlds.outcome import Rejected
 from traps_pipeline.scenes.worlds.spec import trajectory_digest
 from traps_pipeline.scenes.worlds.timetable import Timetable
+
+SOFT = 3  # families of soft bodies, which have no lanes
 
 
 @cache
@@ -120,11 +133,38 @@ def test_a_board_beside_its_place_and_a_timetable_without_a_window_are_refused()
     scene, bench = layout.boards
     narrow = replace(layout, boards=(replace(scene, half=(0.05, *scene.half[1:])), bench))
     tampered = [replace(each, layouts=[narrow, world.layouts[1]]) for each in (world, *twins)]
-    with pytest.raises(Rejected, match=r"twin's clip is another|does not hide"):
+    with pytest.raises(Rejected, match=r"twin's clip|does not hide"):
         certify_lanes(tampered[0], tampered[1:])
     always = [replace(world.lanes[0], timetable=Timetable(((0, 50),))), world.lanes[1]]
     with pytest.raises(Rejected, match="no window"):
         certify_lanes(replace(world, lanes=always), twins)
+
+
+@pytest.mark.slow
+def test_a_released_record_is_certified_from_its_trajectories_and_an_altered_one_is_not():
+    spec = two_events_lines()["slide-e001"].spec
+    worlds = trajectories_of(spec)
+    verdict = certify_lane_record(spec, worlds)
+    assert verdict.passed, verdict.failures
+    lane = spec.lanes[0]
+    exchanged = lane.model_copy(update={"ground_truth": lane.twin.ground_truth})
+    altered = spec.model_copy(update={"lanes": (exchanged, spec.lanes[1])})
+    assert "ground_truth" in certify_lane_record(altered, worlds).failures
+    assert "lanes" in certify_lane_record(spec, worlds | {"left": worlds["qpos"]}).failures  # a twin that ends alike
+
+
+@pytest.mark.slow
+def test_a_level_is_drawn_in_both_lanes_and_in_their_twins_and_read_back_from_the_record():
+    difficulty = Difficulty(distractors=2, speed=1.5)
+    *_, last = draw_two_events("slide", 1, 7, difficulty)
+    assert isinstance(last, DrawnLanes)
+    record = last.spec.model_dump(mode="json")
+    assert difficulty_of(record) == difficulty and difficulty_of(drawn("slide").model_dump(mode="json")) == Difficulty()
+    world, twins = worlds(last.spec)
+    names = {f"{lane} distractor_{n}" for lane in ("left", "right") for n in range(2)}
+    for each in (world, *twins):
+        assert names <= {each.model.body(i).name for i in range(each.model.nbody)}
+        assert each.physics.speed == 1.5
 
 
 # --- items ------------------------------------------------------------------------------------------------------------
@@ -134,13 +174,13 @@ def test_a_board_beside_its_place_and_a_timetable_without_a_window_are_refused()
 def test_every_text_and_every_mixed_clip_is_as_often_to_be_answered_as_not():
     spec = TwoEventsSpec.model_validate_json(drawn("slide").model_dump_json())
     assert spec == drawn("slide")
-    items = [*spec.items()]
-    assert len(items) == 8
-    texts = Counter((item.question, item.answer is None) for item in items)
+    asked = [*spec.questions()]
+    assert len(asked) == 8
+    texts = Counter((each.text, each.answer is None) for each in asked)
     assert [*texts.values()] == [2] * 4
-    mixed = Counter((item.clip, item.answer is None) for item in items if item.clip in ("left", "right"))
+    mixed = Counter((each.item.clip, each.answer is None) for each in asked if each.item.clip in ("left", "right"))
     assert [*mixed.values()] == [1] * 4
-    assert {item.answer for item in items if item.clip == "neither"} == {r.ground_truth for r in spec.lanes}
+    assert {each.answer for each in asked if each.item.clip == "neither"} == {r.ground_truth for r in spec.lanes}
 
 
 @pytest.mark.slow
@@ -150,10 +190,25 @@ def test_both_sides_have_the_same_boards():
     assert len(boards) == 8 and (boards["seen"] == boards["hidden"]).all() and (boards["auc"] == 0.5).all()
 
 
+def test_what_tells_the_sides_of_one_family_is_named_though_it_tells_nothing_over_all():
+    few = lane_families()[::4]
+    specs = [line.spec for line in two_events_lines().values() if line.family in {*few, "slide"}]
+    assert telling_numbers(specs) == []
+
+    def doubled(spec: TwoEventsSpec) -> TwoEventsSpec:
+        parts = [part | {"hidden": part["seen"] | {"alike_px": [9e9] * 6}} for part in spec.evidence["in_view"]]
+        return spec.model_copy(update={"evidence": spec.evidence | {"in_view": parts}})
+
+    planted = [doubled(spec) if spec.family == "slide" else spec for spec in specs]
+    found = telling_numbers(planted)
+    assert len(found) == 6 and all("alike_px" in line and "of slide" in line and "AUC 1.00" in line for line in found)
+    assert telling_numbers([spec for spec in planted if spec.family != "slide" or spec.scenario_id[-1] == "1"]) == []
+
+
 def test_the_share_of_pairs_in_which_the_hidden_one_has_more_counts_ties_by_half():
     assert auc(np.array([1.0, 2.0]), np.array([2.0, 3.0])) == (1 + 1 + 0.5 + 1) / 4
 
 
 def test_families_that_are_left_out_are_families():
     names = {family.name for family in families() if family.taxonomy == "occlusion"}
-    assert {*LEFT_OUT} <= names
+    assert {*LEFT_OUT} <= names and len(lane_families()) == len(names - {*LEFT_OUT}) - SOFT

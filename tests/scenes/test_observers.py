@@ -66,13 +66,6 @@ def test_the_observer_answers_after_a_late_occluder_from_what_was_seen_before(sc
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scenario_id", ["domino_count-0001", "transfer-0001"])
-def test_the_observer_answers_from_the_end_alone_where_an_occluder_hid_the_beginning(scenario_id: str) -> None:
-    said, answer = _reads("removed", scenario_id)
-    assert said == answer
-
-
-@pytest.mark.slow
 def test_the_observer_foretells_a_cut_that_is_predictable_and_no_die_whose_slow_tumbling_tells_nothing() -> None:
     said, answer = _reads("predictable_cut", "seesaw_sorter-0001")
     assert said == answer

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.build.errors import raises
-from tools.redraw import draw_again
+from tools.redraw import draw_again, take_out
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.records import load_released
@@ -32,7 +32,6 @@ from traps_pipeline.scenes.draw.sample import (
     load_tallies,
     rejection_kind,
     sample_family,
-    take_out,
     try_draw,
 )
 from traps_pipeline.scenes.family_registry import get_family

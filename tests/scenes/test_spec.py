@@ -26,7 +26,7 @@ def test_a_digest_is_over_shape_and_little_endian_values() -> None:
 
 
 def test_a_trajectory_comes_back_bit_for_bit(tmp_path: Path) -> None:
-    save_trajectory(tmp_path / "new", "plinko-0001", QPOS, QPOS + 1)
+    save_trajectory(tmp_path / "new", "plinko-0001", {"qpos": QPOS, "twin": QPOS + 1})
     digest = trajectory_digest(QPOS)
     read = load_trajectory(tmp_path / "new" / "plinko-0001.npz", digest)
     assert read.dtype == np.float32
@@ -35,12 +35,12 @@ def test_a_trajectory_comes_back_bit_for_bit(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("damage", ["altered", "cut off", "empty", "no archive", "missing", "a pickle"])
 def test_what_is_not_the_trajectory_that_was_written_is_named(tmp_path: Path, damage: str) -> None:
-    save_trajectory(tmp_path, "plinko-0001", QPOS, QPOS)
+    save_trajectory(tmp_path, "plinko-0001", {"qpos": QPOS, "twin": QPOS})
     path, other = tmp_path / "plinko-0001.npz", QPOS.copy()
     other[2, 1] += 1e-6
     match damage:
         case "altered":
-            save_trajectory(tmp_path, "plinko-0001", other, QPOS)
+            save_trajectory(tmp_path, "plinko-0001", {"qpos": other, "twin": QPOS})
         case "cut off":
             path.write_bytes(path.read_bytes()[:-30])
         case "missing":

@@ -60,7 +60,11 @@ def test_rows_of_arms_beside_the_pairs_change_no_figure(
 
 @pytest.mark.parametrize(
     ("arm", "acc", "false_abs", "abs_rec", "missing"),
-    [("decoy", 0.5, 0.5, np.nan, 1), ("occluder_grey", np.nan, np.nan, 1.0, 1), ("crossed", 0.5, 0.5, 1.0, 2)],
+    [
+        ("length_matched", 0.5, 0.5, np.nan, 1),
+        ("occluder_grey", np.nan, np.nan, 1.0, 1),
+        ("labels_two", 0.5, 0.5, 1.0, 2),
+    ],
 )
 def test_an_arm_has_the_figures_of_the_sides_that_it_has(
     rows: Rows, arm: str, acc: float, false_abs: float, abs_rec: float, missing: int
@@ -69,5 +73,5 @@ def test_an_arm_has_the_figures_of_the_sides_that_it_has(
     one = cells.loc[cells["scope"] == "all"].iloc[0]
     np.testing.assert_equal([one.acc, one.false_abs, one.abs_rec], [acc, false_abs, abs_rec])
     assert (one.n_pairs, one.n_missing) == (3, missing)
-    assert np.isnan(one.pecs) == (arm != "crossed")
+    assert np.isnan(one.pecs) == (arm != "labels_two")
     assert wrong_figures(cells) == 0

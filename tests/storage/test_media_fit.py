@@ -35,6 +35,15 @@ def test_frames_that_are_shown_later_are_the_next_ones_and_the_last_one_stays():
     assert profile_digest(spec) != profile_digest(media_for_dataset(spec, "frames_later"))
 
 
+def test_a_wide_clip_is_shown_whole_in_its_own_shape_with_no_more_pixels_than_another():
+    unsized = MediaSpec(profile="images", fps=5)
+    assert media_for_dataset(unsized, "two_events") is unsized  # 640 x 360, as it is
+    small = media_for_dataset(MediaSpec(profile="frames", uniform=8, size=(128, 96)), "two_events")
+    assert small.size == (144, 80) and 144 * 80 <= 128 * 96
+    square = media_for_dataset(MediaSpec(profile="frames", fps=2, size=(336, 336), fit="crop"), "two_events")
+    assert (square.size, square.fit) == ((336, 336), "stretch")  # a crop would cut both lanes
+
+
 @pytest.mark.parametrize("profile", ["video", "images", "frames"])
 def test_a_rate_of_frames_takes_the_place_of_a_models_own(profile: Literal["video", "images", "frames"]):
     times = np.arange(50) / 10

@@ -125,7 +125,7 @@ def test_partitions_are_read_together_and_by_column(store: TableStore) -> None:
     assert len(store.read_all(RESPONSES)) == 6
     assert len(store.read_all(RESPONSES, dataset="chaotic", run=2)) == 2
     assert list(store.read_all(RESPONSES, ["item_id"], run=1)["item_id"]) == ["chaotic:0", "occlusion:0"]
-    chosen = store.read_all(RESPONSES, ["item_id"], run=1, dataset=("occlusion", "decoy"))
+    chosen = store.read_all(RESPONSES, ["item_id"], run=1, dataset=("occlusion", "length_matched"))
     assert list(chosen["item_id"]) == ["occlusion:0"]
     assert len(store.read_all(RESPONSES, dataset=[])) == 0
 

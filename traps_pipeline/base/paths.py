@@ -21,6 +21,7 @@ SPECS_VARIABLE = "TRAPS_SCENE_SPECS"  # names the folder of a sampled benchmark
 OWN_SPECS = ROOT / "scene_specs"  # the specs shipped with this version
 SCENE_SPECS = Path(os.environ.get(SPECS_VARIABLE) or OWN_SPECS).absolute()
 RELEASED = SCENE_SPECS / "released"
+TWO_EVENTS_RELEASED = SCENE_SPECS / "two_events" / "released"
 CORRECTIONS = SCENE_SPECS / "corrections"
 # Default output of commands: in the checkout, else below the current folder.
 WORKSPACES = (Path.cwd() if IS_INSTALLED else ROOT) / ".workspaces"
@@ -30,6 +31,11 @@ _NO_ADDRESS = re.compile(r"\?|%[0-9A-Fa-f]{2}")
 def user_cache() -> Path:
     """Return this user's cache folder, for files that can be rebuilt."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache").absolute() / "traps"
+
+
+def user_state() -> Path:
+    """Return this user's folder of notes that must outlive any one study."""
+    return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state").absolute() / "traps"
 
 
 def require_root() -> Path:

@@ -18,10 +18,14 @@ from traps_pipeline.base.paths import PACKAGE
 from traps_pipeline.base.terminal import text_table
 from traps_pipeline.base.workers import run_in_order
 from traps_pipeline.benchmark.composition import load_composition, problems
+from traps_pipeline.benchmark.filmed_lanes import trajectories_of
+from traps_pipeline.benchmark.lane_balance import telling_numbers
 from traps_pipeline.benchmark.outcome_leakage import MAX_GAIN, MIN_RECORDS, outcome_leakage
-from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.benchmark.records import load_released, two_events_lines
+from traps_pipeline.scenes.certification.certify_lanes import certify_lane_record
 from traps_pipeline.scenes.certification.certify_record import Verdict, certify
 from traps_pipeline.scenes.draw.sample import Tally, load_tallies
+from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
 from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory
 
 
@@ -29,7 +33,7 @@ from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory
 class Case:
     """A record to certify, its trajectories' file, and the file for its verdict."""
 
-    spec: SceneSpec
+    spec: SceneSpec | TwoEventsSpec
     trajectory: Path
     verdict: Path
 
@@ -43,15 +47,18 @@ def certify_all(
     fresh: bool = False,
     report: Callable[[str], None] = lambda _: None,
 ) -> tuple[list[Verdict], list[str]]:
-    """Return verdicts on a folder's records, and problems, scenarios' before others.
+    """Return verdicts on a folder's records, of pairs and of two events, and problems, scenarios' before others.
 
     Verdicts are cached in `cache_folder` by record and code, so that an interrupted call resumes.
     """
-    released_folder = folder / "released"
+    released_folder, lanes_folder = folder / "released", folder / "two_events" / "released"
     specs = [s for s in load_released(released_folder).values() if families is None or s.family in families]
-    if not specs:
+    lines = two_events_lines(lanes_folder).values()
+    lanes = [line.spec for line in lines if families is None or line.family in families]
+    if not specs and not lanes:
         raise TrapsError(f"{released_folder}: holds no records of {', '.join(families or ())}")
     cases = [_case(released_folder, cache_folder, spec) for spec in specs]
+    cases += [_case(lanes_folder, cache_folder, spec) for spec in lanes]
     if fresh:
         for case in cases:
             case.verdict.unlink(missing_ok=True)
@@ -63,10 +70,11 @@ def certify_all(
     failures = [f"{v.scenario_id}: {name}: {reason}" for v in verdicts for name, reason in v.failures.items()]
     is_complete = families is None and (folder / "composition.yaml").is_file()
     failures += problems(specs, load_composition(folder / "composition.yaml") if is_complete else None)
+    failures += telling_numbers(lanes) if is_complete and lanes else []
     return verdicts, failures + _repeated_endings(verdicts) + foreseeable(specs, verdicts)
 
 
-def _case(released: Path, folder: Path, spec: SceneSpec) -> Case:
+def _case(released: Path, folder: Path, spec: SceneSpec | TwoEventsSpec) -> Case:
     trajectory = released / "trajectories" / f"{spec.scenario_id}.npz"
     content = file_digest(trajectory) if trajectory.is_file() else "missing"
     name = digest([spec.spec_hash, content, code_digest(spec.family)])[:24]
@@ -87,11 +95,17 @@ def judge(case: Case) -> Verdict:
         return Verdict(**json.loads(case.verdict.read_text(encoding="utf-8")))
     spec = case.spec
     try:
+        if isinstance(spec, TwoEventsSpec):
+            return _kept(case, certify_lane_record(spec, trajectories_of(spec, case.trajectory)))
         qpos = load_trajectory(case.trajectory, spec.trajectory_sha256)
         twin = load_trajectory(case.trajectory, spec.twin.trajectory_sha256, "twin")
         verdict = certify(spec, qpos, twin)
     except (ValueError, KeyError, TypeError) as error:  # an altered record may not even build
         verdict = Verdict(spec.scenario_id, spec.family, {"record": str(error)}, {}, same_physics=False)
+    return _kept(case, verdict)
+
+
+def _kept(case: Case, verdict: Verdict) -> Verdict:
     write_text(case.verdict, json.dumps(asdict(verdict)))
     return verdict
 

@@ -17,6 +17,7 @@ from traps_pipeline.base.wording import count_noun
 from traps_pipeline.base.workers import keep_workers
 from traps_pipeline.base.yamlfile import explain, read_yaml
 from traps_pipeline.benchmark.items import commonest_answers
+from traps_pipeline.scenes.draw.draw_lanes import lane_families, sample_two_events
 from traps_pipeline.scenes.draw.sample import answer_quota, ill_posed_quota, require_difficulty, sample_family
 from traps_pipeline.scenes.parts.difficulty import DEFAULT_DIFFICULTY, Difficulty
 from traps_pipeline.scenes.worlds.spec import SceneSpec
@@ -44,12 +45,14 @@ def sample_benchmark(
     *,
     look: Collection[str] = (),
     difficulty: Difficulty = DEFAULT_DIFFICULTY,
+    two_events: int = 0,
     workers: int | None = None,
     report: Callable[[str], None] = lambda _: None,
-) -> None:
-    """Sample a benchmark into `out`: records, trajectories, and `benchmark.yaml`.
+) -> int:
+    """Sample a benchmark into `out`: records, trajectories, and `benchmark.yaml`; return its number of scenarios.
 
-    It has a canary of its own. Existing records of the same seed and numbers stay: an interrupted sampling resumes.
+    two_events: how many scenarios of two events of each of these families that has them. It has a canary of its own.
+    Existing records of the same seed and numbers stay: an interrupted sampling resumes.
     Raises TrapsError if a family cannot be filled, or does not support a setting of the difficulty.
     """
     require_difficulty(counts, difficulty)
@@ -61,9 +64,13 @@ def sample_benchmark(
             )
             reasons = ", ".join(f"{n} x {reason}" for reason, n in tally.rejected.most_common()) or "none rejected"
             report(f"{family}: {count} of {count_noun(tally.draws, 'draw')}; {reasons}")
+        names = [family for family in lane_families() if family in counts]
+        drawn = (names, two_events, seed, out / "two_events" / "released", difficulty)
+        lanes = sample_two_events(*drawn, workers=workers, report=report) if two_events else 0
     if not (out / "benchmark.yaml").exists():
         release = {"name": name, "version": "1.0.0", "canary": f"{name.upper()}:CANARY:{uuid.uuid4()}"}
         write_text(out / "benchmark.yaml", yaml.safe_dump(release, sort_keys=False))
+    return sum(counts.values()) + lanes
 
 
 def problems(specs: Sequence[SceneSpec], counts: Mapping[str, int] | None = None) -> list[str]:

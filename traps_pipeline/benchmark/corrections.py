@@ -14,12 +14,12 @@ released scenario is again as it was released; all earlier decisions about it ar
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import date
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -28,13 +28,17 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import CORRECTIONS, OWN_SPECS, SCENE_SPECS, SPECS_VARIABLE
 from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.base.yamlfile import explain, read_lines
-from traps_pipeline.benchmark.records import ReleasedLine, load_release, released_lines
+from traps_pipeline.benchmark.records import ReleasedLine, load_release, released_lines, two_events_lines
 from traps_pipeline.protocol.datasets import ALL_CATEGORIES
 from traps_pipeline.scenes.family_registry import family_names, get_family
 from traps_pipeline.scenes.worlds.spec import Answerable, SceneSpec, Slug
 from traps_pipeline.storage.study import Study
 
+if TYPE_CHECKING:
+    from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
+
 WORDS = ("question", "labels", "aliases", "ill_posed_question", "answerable_question")
+LANE_WORDS = WORDS[:3]  # of scenarios of two events
 
 
 class Correction(BaseModel):
@@ -71,7 +75,7 @@ class Scenario:
     scenario_id: str
     family: str
     category: str
-    record: SceneSpec | ReleasedLine | None
+    record: SceneSpec | ReleasedLine[SceneSpec] | None
     words: Mapping[str, Any] = field(default_factory=dict)
     params: Mapping[str, Any] | None = None
     where: str = ""
@@ -100,6 +104,40 @@ class _HasFamily(Protocol):
 
 
 _OfFamily = TypeVar("_OfFamily", bound=_HasFamily)
+
+
+@dataclass(frozen=True)
+class LaneScenario:
+    """A scenario of two events with its corrections."""
+
+    record: ReleasedLine[TwoEventsSpec]
+    words: Mapping[str, Any] = field(default_factory=dict)
+    where: str = ""
+
+    @property
+    def family(self) -> str:
+        """The family of both events."""
+        return self.record.family
+
+    @property
+    def category(self) -> str:
+        """The category of both events."""
+        return self.record.category
+
+    @property
+    def version(self) -> str:
+        """Digest of the released record and every effective change."""
+        return digest([self.record.line, dict(self.words)])[:16]
+
+    @cached_property
+    def spec(self) -> TwoEventsSpec:
+        """The corrected record. Raises TrapsError if the words do not fit."""
+        if not self.words:
+            return self.record.spec
+        try:
+            return type(self.record.spec).model_validate(self.record.spec.model_dump(mode="json") | dict(self.words))
+        except ValidationError as error:
+            raise TrapsError(f"{self.where}: {self.record.scenario_id}: {explain(error)}; correct that line") from error
 
 
 def apply_words(spec: SceneSpec, words: Mapping[str, Any], where: str) -> SceneSpec:
@@ -134,7 +172,7 @@ def read_corrections(folder: Path = CORRECTIONS) -> list[tuple[str, Correction]]
 
 
 def fold(
-    released: Mapping[str, SceneSpec | ReleasedLine], corrections: Sequence[tuple[str, Correction]]
+    released: Mapping[str, SceneSpec | ReleasedLine[SceneSpec]], corrections: Sequence[tuple[str, Correction]]
 ) -> dict[str, Scenario]:
     """Return scenarios by id after all decisions. Raises TrapsError with `file:line`."""
     scenarios = {
@@ -149,27 +187,57 @@ def fold(
                 )
             scenarios[correction.scenario_id] = _add(location, correction)
             continue
-        if correction.action in ("keep", "discard", "restore") and correction.changes():
-            raise TrapsError(
-                f"{location}: `{correction.action}` changes nothing, yet gives {sorted(correction.changes())}; "
-                "use `correct`"
-            )
+        _check_decision(location, correction, scenarios, released)
         if correction.action == "restore":
             scenarios[correction.scenario_id] = _restore(location, correction.scenario_id, released)
-            continue
-        if scenario is None:
-            state = "was discarded" if correction.scenario_id in released else "is unknown"
-            raise TrapsError(
-                f"{location}: scenario {correction.scenario_id!r} {state}; name a scenario of the benchmark"
-            )
-        if correction.action == "discard":
+        elif correction.action == "discard":
             del scenarios[correction.scenario_id]
         elif correction.action == "correct":
-            scenarios[correction.scenario_id] = _correct(location, scenario, correction)
+            scenarios[correction.scenario_id] = _correct(location, scenarios[correction.scenario_id], correction)
     return dict(sorted(scenarios.items()))
 
 
-def _restore(where: str, scenario_id: str, released: Mapping[str, SceneSpec | ReleasedLine]) -> Scenario:
+def _check_decision(
+    where: str, correction: Correction, scenarios: Mapping[str, Any], released: Mapping[str, Any]
+) -> None:
+    """Raise TrapsError for changes where none are made, and for a scenario that is not there."""
+    if correction.action != "correct" and correction.changes():
+        raise TrapsError(
+            f"{where}: `{correction.action}` changes nothing, yet gives {sorted(correction.changes())}; use `correct`"
+        )
+    if correction.action != "restore" and correction.scenario_id not in scenarios:
+        state = "was discarded" if correction.scenario_id in released else "is unknown"
+        raise TrapsError(f"{where}: scenario {correction.scenario_id!r} {state}; name a scenario of the benchmark")
+
+
+def fold_two_events(
+    released: Mapping[str, ReleasedLine[TwoEventsSpec]], corrections: Sequence[tuple[str, Correction]]
+) -> dict[str, LaneScenario]:
+    """Return scenarios of two events by id after all decisions about them. Raises TrapsError with `file:line`."""
+    scenarios = {id_: LaneScenario(line) for id_, line in released.items()}
+    for location, correction in corrections:
+        id_, changes = correction.scenario_id, correction.changes()
+        if id_ not in released:
+            continue
+        if correction.action == "add" or changes.keys() - {*LANE_WORDS}:
+            raise TrapsError(
+                f"{location}: {id_} is a scenario of two events, of which {', '.join(LANE_WORDS)} may be corrected; "
+                "discard it where anything else is wrong"
+            )
+        _check_decision(location, correction, scenarios, released)
+        if correction.action == "discard":
+            del scenarios[id_]
+        elif correction.action == "restore":
+            scenarios[id_] = LaneScenario(released[id_])
+        elif correction.action == "correct":
+            if not changes:
+                raise TrapsError(f"{location}: `correct` gives no change; give words, or use `keep`")
+            scenarios[id_] = LaneScenario(released[id_], dict(scenarios[id_].words) | changes, location)
+            _ = scenarios[id_].spec  # an unknown label is an error of this line, found before anything runs
+    return scenarios
+
+
+def _restore(where: str, scenario_id: str, released: Mapping[str, SceneSpec | ReleasedLine[SceneSpec]]) -> Scenario:
     spec = released.get(scenario_id)
     if spec is None:
         raise TrapsError(f"{where}: scenario {scenario_id!r} was never released; `discard` takes back an added one")
@@ -237,11 +305,31 @@ def _records_advice(benchmark: str) -> str:
 @cache
 def corrected_scenarios() -> dict[str, Scenario]:
     """Return the released records after all corrections."""
-    return fold(released_lines(), read_corrections())
+    return fold(released_lines(), of_pairs(read_corrections()))
 
 
-def subset(scenarios: Mapping[str, _OfFamily], study: Study) -> dict[str, _OfFamily]:
-    """Return the study's named scenarios, or the first n per family, or all.
+def of_pairs(corrections: Iterable[tuple[str, Correction]]) -> list[tuple[str, Correction]]:
+    """Return the decisions that are not about scenarios of two events."""
+    lanes = two_events_lines()
+    return [(where, correction) for where, correction in corrections if correction.scenario_id not in lanes]
+
+
+@cache
+def corrected_two_events() -> dict[str, LaneScenario]:
+    """Return the released records of two events after all corrections."""
+    return fold_two_events(two_events_lines(), read_corrections())
+
+
+def load_two_events(study: Study) -> dict[str, LaneScenario]:
+    """Return a study's corrected subset of scenarios of two events."""
+    check_benchmark(study)
+    return subset(corrected_two_events(), study, two_events_lines())
+
+
+def subset(
+    scenarios: Mapping[str, _OfFamily], study: Study, released: Mapping[str, ReleasedLine[Any]] | None = None
+) -> dict[str, _OfFamily]:
+    """Return the study's named scenarios, or the first n per family, or all. released: by default those of pairs.
 
     Discarded scenarios are left out without replacement.
     """
@@ -253,7 +341,7 @@ def subset(scenarios: Mapping[str, _OfFamily], study: Study) -> dict[str, _OfFam
         return {id_: scenarios[id_] for id_ in sorted(study.scenarios) if id_ in scenarios}
     if study.per_family is None:
         return dict(scenarios)
-    families = {id_: spec.family for id_, spec in released_lines().items()}
+    families = {id_: line.family for id_, line in (released_lines() if released is None else released).items()}
     families |= {id_: scenario.family for id_, scenario in scenarios.items()}
     ids_by_family: dict[str, list[str]] = {}
     for id_, family in sorted(families.items()):
@@ -264,10 +352,10 @@ def subset(scenarios: Mapping[str, _OfFamily], study: Study) -> dict[str, _OfFam
 
 def _all_ids() -> set[str]:
     """Return ids that are or were in the benchmark: released, added, discarded."""
-    return set(released_lines()) | {correction.scenario_id for _, correction in read_corrections()}
+    return {*released_lines(), *two_events_lines()} | {correction.scenario_id for _, correction in read_corrections()}
 
 
-def categories_of(scenarios: Mapping[str, Scenario]) -> list[str]:
+def categories_of(scenarios: Mapping[str, Scenario | LaneScenario]) -> list[str]:
     """Return the categories that have scenarios, in their fixed order."""
     categories = {scenario.category for scenario in scenarios.values()}
     return [category for category in ALL_CATEGORIES if category in categories]

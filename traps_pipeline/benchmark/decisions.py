@@ -19,8 +19,17 @@ from typing import Any
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import sync_folder
 from traps_pipeline.base.paths import CORRECTIONS, require_own_corrections
-from traps_pipeline.benchmark.corrections import Correction, Scenario, corrected_scenarios, fold, read_corrections
-from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.benchmark.corrections import (
+    Correction,
+    Scenario,
+    corrected_scenarios,
+    corrected_two_events,
+    fold,
+    fold_two_events,
+    of_pairs,
+    read_corrections,
+)
+from traps_pipeline.benchmark.records import load_released, two_events_lines
 
 FILE = "review.jsonl"
 Sign = Callable[..., Correction]
@@ -61,14 +70,10 @@ def undo(scenario_id: str, n_seen: int, *, who: str, why: str, folder: Path = CO
         if not is_reviewed(decisions):
             raise TrapsError(f"{scenario_id}: no decision stands that could be taken back")
         records = load_released()
-        other_decisions = [
-            (location, correction)
-            for location, correction in read_corrections(folder)
-            if correction.scenario_id != scenario_id
-        ]
-        previous = fold(records, [*other_decisions, *(("before", correction) for correction in decisions[:-1])]).get(
-            scenario_id
-        )
+        of_others = [(at, other) for at, other in read_corrections(folder) if other.scenario_id != scenario_id]
+        previous = fold(
+            records, [*of_pairs(of_others), *(("before", correction) for correction in decisions[:-1])]
+        ).get(scenario_id)
 
         def sign(action: str, **changes: Any) -> Correction:
             signature = {"who": who, "when": date.today(), "why": why}
@@ -123,7 +128,9 @@ def _open_for_append(folder: Path) -> Iterator[Callable[[Sequence[Correction]], 
 
         def append(corrections: Sequence[Correction]) -> None:
             location = f"{path} (new)"
-            fold(load_released(), [*read_corrections(folder), *((location, correction) for correction in corrections)])
+            decisions = [*read_corrections(folder), *((location, correction) for correction in corrections)]
+            fold(load_released(), of_pairs(decisions))
+            fold_two_events(two_events_lines(), decisions)
             lines = [correction.model_dump(mode="json", exclude_none=True) for correction in corrections]
             stream.write("".join(json.dumps(line, ensure_ascii=False) + "\n" for line in lines).encode())
             stream.flush()
@@ -131,6 +138,7 @@ def _open_for_append(folder: Path) -> Iterator[Callable[[Sequence[Correction]], 
             if is_new:
                 sync_folder(folder)
             corrected_scenarios.cache_clear()
+            corrected_two_events.cache_clear()
 
         yield append
 

@@ -15,18 +15,25 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
-from traps_pipeline.benchmark.corrections import corrected_scenarios
+from traps_pipeline.benchmark.filmed_lanes import SECONDS_A_CLIP, film_lanes, lane_paths, lane_rows, lane_specs
 from traps_pipeline.benchmark.sharing import RenderWork, Row, existing_clips, share
 from traps_pipeline.benchmark.specs import clips_version, released_in_study, spec_of, spec_rows, trajectory_of
 from traps_pipeline.protocol.datasets import ARMS as ARM_NAMES
-from traps_pipeline.protocol.datasets import CROSSED, GRADED, extra_datasets_of, sides_of, taxonomy_of_category
+from traps_pipeline.protocol.datasets import (
+    GRADED,
+    TWO_EVENTS,
+    extra_datasets_of,
+    sides_of,
+    taxonomy_of_category,
+)
 from traps_pipeline.scenes.variants import arms as shortcut_arms
 from traps_pipeline.scenes.variants import graded_cuts, variations
 from traps_pipeline.scenes.variants.arms import ARMS as SHORTCUT_ARMS
-from traps_pipeline.scenes.variants.arms import Arm, Question, Scenario, crossed, partners
+from traps_pipeline.scenes.variants.arms import Arm, Question, Scenario
 from traps_pipeline.scenes.variants.graded_cuts import GRADED_CUT
 from traps_pipeline.scenes.variants.variations import VARIATIONS
 from traps_pipeline.scenes.worlds.clip_notes import Clip, note_of, read_clip, save_clip
+from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
 from traps_pipeline.scenes.worlds.outcome import Rejected
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 from traps_pipeline.storage.benchmark_tables import ARMS, VIDEOS, ArmRow
@@ -71,9 +78,19 @@ def asked_arms(workspace: Workspace, category: str) -> list[str]:
     return [arm for arm in extra_datasets_of(taxonomy_of_category(category)) if arm in datasets]
 
 
+def arms_of_pairs(workspace: Workspace, category: str) -> list[str]:
+    """Return those of them that scenarios of pairs have."""
+    return [arm for arm in asked_arms(workspace, category) if arm != TWO_EVENTS]
+
+
+def asked_lanes(workspace: Workspace, category: str) -> dict[str, TwoEventsSpec]:
+    """Return a category's records of two events, if some experiment requests them."""
+    return lane_specs(workspace, category) if TWO_EVENTS in asked_arms(workspace, category) else {}
+
+
 def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tuple[int, bool]:
     """Render missing arms of a category; return `share`'s result. Raises TrapsError."""
-    specs, arms = spec_rows(workspace, category), asked_arms(workspace, category)
+    specs, arms = spec_rows(workspace, category), arms_of_pairs(workspace, category)
 
     def files(row: Row) -> list[Path]:
         return [file for clip in _clips(workspace, row, arms).values() for file in _files(clip)]
@@ -95,7 +112,9 @@ def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tupl
         progress.current().tick("arms", f"{category}, scenarios", finished, len(specs))
 
     render_work = RenderWork(f"arms/{category}", missing, files, job, film)
-    return share(workspace.store, specs, render_work, tick, wait=wait)
+    frames, is_whole = share(workspace.store, specs, render_work, tick, wait=wait)
+    lane_frames, are_lanes_whole = film_lanes(workspace, category, asked_lanes(workspace, category), wait=wait)
+    return frames + lane_frames, is_whole and are_lanes_whole
 
 
 def seconds_left(workspace: Workspace, category: str) -> float:
@@ -103,14 +122,16 @@ def seconds_left(workspace: Workspace, category: str) -> float:
     clips = [
         _finding_of(workspace.clip(id_, arm, spec.scene_hash))
         for id_, spec in released_in_study(workspace, category).items()
-        for arm in asked_arms(workspace, category)
+        for arm in arms_of_pairs(workspace, category)
     ]
-    return SECONDS_AN_ARM * (len(clips) - len(workspace.store.there(clips)))
+    lane_clips = [path for spec in asked_lanes(workspace, category).values() for path in lane_paths(workspace, spec)]
+    n_missing, n_missing_lanes = (len(paths) - len(workspace.store.there(paths)) for paths in (clips, lane_clips))
+    return SECONDS_AN_ARM * n_missing + SECONDS_A_CLIP * n_missing_lanes
 
 
 def build_arms(workspace: Workspace, category: str) -> list[ArmRow]:
     """Return a category's arms. Raises TrapsError for a missing or damaged one."""
-    specs, arms = spec_rows(workspace, category), asked_arms(workspace, category)
+    specs, arms = spec_rows(workspace, category), arms_of_pairs(workspace, category)
     pair_clips = {
         (row["scenario_id"], row["side"]): row
         for row in workspace.tables.read(VIDEOS, {"category": category}).to_dict("records")
@@ -119,9 +140,10 @@ def build_arms(workspace: Workspace, category: str) -> list[ArmRow]:
     workspace.store.bring(map(_finding_of, films))
     clips = existing_clips(workspace.store, films)
     version = clips_version(workspace, category, specs)
-    return [
+    rows = [
         arm_row for row in specs for arm in arms for arm_row in _rows(workspace, row, arm, pair_clips, clips, version)
     ]
+    return [*rows, *lane_rows(workspace, category, asked_lanes(workspace, category))]
 
 
 def _clips(workspace: Workspace, row: Row, arms: Sequence[str]) -> dict[str, Path]:
@@ -154,26 +176,8 @@ def _code(arm: str) -> str:
     return file_digest(Path(declared_in.__file__))
 
 
-def arm_of(spec: SceneSpec, arm: str) -> Arm:
-    """Return a scenario's arm or variation; for crossed questions, with its partner."""
-    return crossed(_partners(spec.family).get(spec.scenario_id)) if arm == CROSSED else ARMS_BY_NAME[arm]
-
-
-@cache
-def _partners(family: str) -> dict[str, SceneSpec]:
-    """Return a family's scenarios' partners; corrected and added scenes have none."""
-    members = [scenario for scenario in corrected_scenarios().values() if scenario.family == family]
-    specs = {
-        scenario.scenario_id: scenario.changed_words()
-        for scenario in members
-        if scenario.released and scenario.params is None
-    }
-    return {id_: specs[partner] for id_, partner in partners(specs.values()).items()}
-
-
 def _record_digest(spec: SceneSpec, arm: str) -> str:
-    partner = _partners(spec.family).get(spec.scenario_id) if arm == CROSSED else None
-    return digest([spec.spec_hash, arm, _code(arm), partner and partner.spec_hash])[:24]
+    return digest([spec.spec_hash, arm, _code(arm)])[:24]
 
 
 def _is_made(spec: SceneSpec, arm: str, clip: Path) -> bool:
@@ -188,7 +192,7 @@ def film(job: Job) -> int:
     for arm, clip in job.clips.items():
         record_digest = _record_digest(job.spec, arm)
         try:
-            variant = arm_of(job.spec, arm)
+            variant = ARMS_BY_NAME[arm]
             variant.ask(job.spec)
             arm_clip = variant.film(scenario)
             if arm_clip.frames:
@@ -217,6 +221,7 @@ def _rows(
         scenario_id=spec.scenario_id,
         category=row["category"],
         arm=arm,
+        item=sides_of(arm)[0],
         side=sides_of(arm)[0],
         question=spec.question,
         labels=list(spec.labels),
@@ -233,7 +238,7 @@ def _rows(
     if result.refused is not None:
         yield replace(empty, ground_truth=None)
         return
-    for question in arm_of(spec, arm).ask(spec):
+    for question in ARMS_BY_NAME[arm].ask(spec):
         pair_side = question.clip
         if pair_side is not None:
             columns = _pair_clip_columns(of_pairs[spec.scenario_id, pair_side])
@@ -244,8 +249,8 @@ def _rows(
 
 
 def _question_columns(question: Question, spec: SceneSpec) -> dict[str, Any]:
-    labels = list(question.labels or spec.labels)
-    return {"side": question.side, "question": question.text, "labels": labels, "ground_truth": question.answer}
+    words = {"question": question.text, "labels": list(question.labels or spec.labels)}
+    return {"item": question.side, "side": question.side, "ground_truth": question.answer, **words}
 
 
 def _clip_columns(path: str, clip: Clip) -> dict[str, Any]:
@@ -253,19 +258,16 @@ def _clip_columns(path: str, clip: Clip) -> dict[str, Any]:
 
 
 def _pair_clip_columns(row: Row) -> dict[str, Any]:
-    return {
-        "clip": row["path"],
-        "media_digest": row["file_sha256"],
-        "n_frames": row["n_frames"],
-        "duration_s": row["duration_s"],
-    }
+    shown = {name: row[name] for name in ("n_frames", "duration_s")}
+    return {"clip": row["path"], "media_digest": row["file_sha256"], **shown}
 
 
 def incomplete_reasons(workspace: Workspace, category: str) -> list[str]:
     """Return why a category's table is incomplete: a new arm or a lost clip."""
     rows = workspace.tables.read(ARMS, {"category": category}, ["arm", "clip"])
     arms_in_table = set(rows["arm"])
-    reasons = [f"arm {arm} is asked for now" for arm in asked_arms(workspace, category) if arm not in arms_in_table]
+    expected = [*arms_of_pairs(workspace, category), *([TWO_EVENTS] if asked_lanes(workspace, category) else [])]
+    reasons = [f"arm {arm} is asked for now" for arm in expected if arm not in arms_in_table]
     clips = sorted({str(clip) for clip in rows["clip"].dropna()})
     sizes = workspace.sizes(clips)
     return reasons + [f"clip {clip} is gone" for clip in clips if clip not in sizes]

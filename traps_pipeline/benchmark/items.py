@@ -10,19 +10,26 @@ from typing import Any
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.paths import TWO_EVENTS_RELEASED
+from traps_pipeline.benchmark.corrections import load_two_events
+from traps_pipeline.benchmark.filmed_lanes import lane_specs, lanes_version
 from traps_pipeline.benchmark.held_out import released_only
+from traps_pipeline.benchmark.records import two_events_lines
 from traps_pipeline.benchmark.specs import expected_specs, released_in_study
 from traps_pipeline.benchmark.versions import item_content, spec_record, version_of
 from traps_pipeline.protocol.datasets import (
     ALL_CATEGORIES,
-    CROSSED,
     GRADED,
     SIDES,
+    TWO_EVENTS,
     UNPAIRED,
     all_datasets_of,
     is_ill_posed,
 )
+from traps_pipeline.protocol.two_events import LANES, LaneItem
+from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.worlds.clip_notes import check_clip
+from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
 from traps_pipeline.storage.benchmark_tables import ARMS as ARMS_TABLE
 from traps_pipeline.storage.benchmark_tables import ITEMS, SCENE_SPECS, VIDEOS, ItemRow
 from traps_pipeline.storage.tables import records
@@ -47,6 +54,8 @@ def build_items(workspace: Workspace, dataset: str) -> list[ItemRow]:
         specs += workspace.tables.read(SCENE_SPECS, {"category": category}).to_dict("records")
         for row in workspace.tables.read(VIDEOS, {"category": category}).to_dict("records"):
             clips[row["scenario_id"], row["side"]] = row
+    if dataset == TWO_EVENTS:
+        return released_only(workspace.root, _lane_items(workspace))
     if not specs:
         raise TrapsError(f"items {dataset}: no scene_specs yet; materialize scene_specs and videos first")
     if dataset not in UNPAIRED:
@@ -70,6 +79,12 @@ def expected_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
     It uses the clips that exist: items whose clip must be rendered first are left out, and of arms those of changed
     scenarios. Raises TrapsError.
     """
+    if dataset == TWO_EVENTS:
+        lanes = [scenario.spec for scenario in load_two_events(workspace.study).values()]
+        current = {(asked.item.item_id, asked.text, tuple(spec.labels)) for spec in lanes for asked in spec.questions()}
+        rows = workspace.tables.read_all(ITEMS, dataset=dataset).to_dict("records")
+        rows = [row for row in rows if (row["item_id"], row["question"], tuple(row["labels"])) in current]
+        return [{str(name): value for name, value in row.items()} for row in rows]
     specs = [asdict(row) for category in categories_of_dataset(dataset) for row in expected_specs(workspace, category)]
     if dataset in UNPAIRED:
         stored_hashes = workspace.tables.read_all(SCENE_SPECS, ["spec_hash"])["spec_hash"]
@@ -103,12 +118,56 @@ def _arm_items(
     return [_arm_item(specs[row["scenario_id"]], row, commonest, version) for row in rows]
 
 
+def _lane_items(workspace: Workspace) -> list[ItemRow]:
+    """Return the eight items of each scenario of two events in the study."""
+    categories = categories_of_dataset(TWO_EVENTS)
+    specs = {id_: spec for category in categories for id_, spec in lane_specs(workspace, category).items()}
+    made = [c for c in categories if workspace.tables.state(ARMS_TABLE, {"category": c}) is not None]
+    rows = [row for c in made for row in records(workspace.tables.read(ARMS_TABLE, {"category": c}))]
+    rows = [row for row in rows if row["arm"] == TWO_EVENTS]
+    if not two_events_lines():
+        raise TrapsError(
+            f"{TWO_EVENTS_RELEASED}: holds no records of two events, as a benchmark drawn before 0.4.0; add some by "
+            f"`traps benchmark sample --two-events 8`, or leave {TWO_EVENTS} out of the experiment's datasets"
+        )
+    if not rows:
+        raise TrapsError(
+            f"items {TWO_EVENTS}: the study has no scenario of two events; name some (as chain-e001) among its "
+            "scenarios, or leave the dataset out"
+        )
+    if lost := {*specs} - {row["scenario_id"] for row in rows}:
+        raise TrapsError(f"items {TWO_EVENTS}: {min(lost)} was not filmed; materialize arms")
+    lanes = [(get_family(spec.family), lane) for spec in specs.values() for lane in spec.lanes]
+    answers = [{"sub_scenario": family.sub_scenario, "ground_truth": lane.ground_truth} for family, lane in lanes]
+    commonest, version = commonest_answers(answers), lanes_version(workspace, categories)
+    return [_lane_item(specs[row["scenario_id"]], row, commonest, version) for row in rows]
+
+
+def _lane_item(spec: TwoEventsSpec, row: Record, commonest: Mapping[str, str], version: str) -> ItemRow:
+    item, family = LaneItem(spec.scenario_id, *str(row["item"]).split(".")), get_family(spec.family)
+    decisive: dict[str, Any] = {
+        "item_id": item.item_id,
+        "pair_id": item.pair_id,
+        "dataset": TWO_EVENTS,
+        "scenario_id": spec.scenario_id,
+        "side": item.side,
+        "taxonomy": family.taxonomy,
+        "category": spec.category,
+        "sub_scenario": family.sub_scenario,
+        "question": row["question"],
+        "labels": list(row["labels"]),
+        "aliases": json.dumps(spec.aliases),
+        "answer_type": spec.answer_type,
+        "ground_truth": row["ground_truth"],
+        "control_answer": spec.lanes[LANES.index(item.lane)].ground_truth,
+        "media_digest": row["media_digest"],
+    }
+    return _row(decisive, decisive, commonest, row["clip"], version)
+
+
 def _arm_item(spec: Record, row: Record, commonest: Mapping[str, str], version: str) -> ItemRow:
-    words = {"labels": row["labels"]}
-    if row["arm"] == CROSSED:  # a question of its own, whose labels have no other wordings
-        words |= {"aliases": "{}", "answer_type": answer_type_of(row["labels"])}
     decisive: dict[str, Any] = _decisive(
-        {**spec, **words},
+        {**spec, "labels": row["labels"]},
         dataset=row["arm"],
         side=row["side"],
         question=row["question"],
@@ -120,14 +179,6 @@ def _arm_item(spec: Record, row: Record, commonest: Mapping[str, str], version: 
     if row["arm"] == GRADED:  # its score depends on how probable each answer is
         return replace(item, item_hash=digest([item.item_hash, json.loads(row["evidence"])["posterior"]]))
     return item
-
-
-def answer_type_of(labels: Sequence[str]) -> str:
-    """Return the answer type of a question by its labels."""
-    if all(label.isdigit() for label in labels):
-        return "numeric"
-    type_of = {("left", "right"): "direction", ("no", "yes"): "binary"}
-    return next((kind for choices, kind in type_of.items() if sorted(labels) == [*choices]), "colour")
 
 
 def commonest_answers(specs: Sequence[Record]) -> dict[str, str]:

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic_core import from_json
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.names import Name
-from traps_pipeline.base.paths import RELEASED, SCENE_SPECS
+from traps_pipeline.base.paths import RELEASED, SCENE_SPECS, TWO_EVENTS_RELEASED
 from traps_pipeline.base.yamlfile import check_line, explain, parse_yaml_model, read_unchecked_lines, read_yaml
 from traps_pipeline.protocol.datasets import ALL_CATEGORIES
 from traps_pipeline.scenes.family_registry import family_names
 from traps_pipeline.scenes.worlds.spec import SceneSpec
+
+if TYPE_CHECKING:  # importing it takes longer than reading the lines
+    from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
+
+Record = TypeVar("Record", SceneSpec, "TwoEventsSpec")
 
 
 class Release(BaseModel):
@@ -35,7 +41,7 @@ def load_release(path: Path = SCENE_SPECS / "benchmark.yaml") -> Release:
 
 
 @dataclass(frozen=True)
-class ReleasedLine:
+class ReleasedLine(Generic[Record]):
     """A line of a released record, checked and parsed when `spec` is asked for.
 
     A command of a small study asks for a few of hundreds, and parsing all takes longer than all else it does.
@@ -46,12 +52,13 @@ class ReleasedLine:
     category: str
     line: str
     where: str
+    parse: Callable[[str, str], Record]
 
     @cached_property
-    def spec(self) -> SceneSpec:
+    def spec(self) -> Record:
         """The record. Raises TrapsError naming file, line and remedy."""
         check_line(self.line, self.where)
-        return parse_record(self.line, self.where)
+        return self.parse(self.line, self.where)
 
 
 @cache
@@ -61,40 +68,61 @@ def load_released(folder: Path = RELEASED) -> dict[str, SceneSpec]:
 
 
 @cache
-def released_lines(folder: Path = RELEASED) -> dict[str, ReleasedLine]:
+def released_lines(folder: Path = RELEASED) -> dict[str, ReleasedLine[SceneSpec]]:
     """Return lines of released records by id. Raises TrapsError with file and remedy."""
-    records: dict[str, ReleasedLine] = {}
+    if records := _lines(folder, parse_record):
+        return records
+    raise TrapsError(
+        f"{folder}: holds no released records; restore it from git or draw some with `traps benchmark sample`"
+    )
+
+
+@cache
+def two_events_lines(folder: Path = TWO_EVENTS_RELEASED) -> dict[str, ReleasedLine[TwoEventsSpec]]:
+    """Return lines of the released records of two events by id; none in a benchmark without them."""
+    return _lines(folder, parse_two_events)
+
+
+def _lines(folder: Path, parse: Callable[[str, str], Record]) -> dict[str, ReleasedLine[Record]]:
+    records: dict[str, ReleasedLine[Record]] = {}
     for path in sorted(folder.glob("*.jsonl")):
         for number, line in read_unchecked_lines(path):
-            record_line = _line(line, f"{path}:{number}")
+            record_line = _line(line, f"{path}:{number}", parse)
             if record_line.scenario_id in records:
                 raise TrapsError(
                     f"{path}:{number}: scenario {record_line.scenario_id!r} occurs twice; remove one of the lines"
                 )
             records[record_line.scenario_id] = record_line
-    if not records:
-        raise TrapsError(
-            f"{folder}: holds no released records; restore it from git or draw some with `traps benchmark sample`"
-        )
     return records
 
 
-def _line(line: str, where: str) -> ReleasedLine:
+def _line(line: str, where: str, parse: Callable[[str, str], Record]) -> ReleasedLine[Record]:
     """Return a line that names scenario, family and category, or raise TrapsError."""
     try:
         fields: Any = from_json(line)
         scenario_id, family, category = (str(fields[name]) for name in ("scenario_id", "family", "category"))
     except (ValueError, KeyError, TypeError):
         check_line(line, where)
-        spec = parse_record(line, where)
+        spec = parse(line, where)
         scenario_id, family, category = spec.scenario_id, spec.family, spec.category
-    return ReleasedLine(scenario_id, family, category, line, where)
+    return ReleasedLine(scenario_id, family, category, line, where, parse)
 
 
 def parse_record(line: str, where: str) -> SceneSpec:
     """Parse a released file's line. Raises TrapsError."""
+    return _parse(SceneSpec, line, where)
+
+
+def parse_two_events(line: str, where: str) -> TwoEventsSpec:
+    """Parse a line of records of two events. Raises TrapsError."""
+    from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
+
+    return _parse(TwoEventsSpec, line, where)
+
+
+def _parse(kind: type[Record], line: str, where: str) -> Record:
     try:
-        spec = SceneSpec.model_validate(from_json(line))  # twice as fast as `json`, with the same numbers
+        spec = kind.model_validate(from_json(line))  # twice as fast as `json`, with the same numbers
     except ValidationError as error:
         raise TrapsError(f"{where}: not a valid record ({explain(error)}); restore the line from git") from error
     except ValueError as error:

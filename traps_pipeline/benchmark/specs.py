@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,8 +18,8 @@ from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import CORRECTIONS, PACKAGE, RELEASED, ROOT, user_cache
-from traps_pipeline.benchmark.corrections import WORDS, Scenario, apply_words, load_scenarios, subset
-from traps_pipeline.benchmark.records import parse_record, released_lines
+from traps_pipeline.benchmark.corrections import WORDS, Scenario, apply_words, load_scenarios, load_two_events, subset
+from traps_pipeline.benchmark.records import parse_record, released_lines, two_events_lines
 from traps_pipeline.benchmark.versions import version_of
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory, physics_record, save_trajectory
@@ -27,6 +27,7 @@ from traps_pipeline.storage.benchmark_tables import SCENE_SPECS, SceneSpecRow
 from traps_pipeline.storage.workspace import Workspace
 
 if TYPE_CHECKING:
+    from traps_pipeline.scenes.draw.resolve import Resolved
     from traps_pipeline.scenes.physics.kit import Wording
 
 SECONDS_A_RECORD = 0.04  # measured on one core: read a scenario's trajectories, and recompute its evidence
@@ -68,19 +69,19 @@ def _resolve_again(workspace: Workspace, scenario: Scenario) -> tuple[SceneSpec,
         if (folder / f"{name}.json").is_file():
             record = (folder / f"{name}.json").read_text(encoding="utf-8")
             return parse_record(record, str(folder / f"{name}.json")), folder / f"{name}.npz"
-    spec, qpos, twin = _simulate(scenario)
+    resolution = _simulate(scenario)
     try:
-        save_trajectory(workspace.trajectories, name, qpos, twin)
+        save_trajectory(workspace.trajectories, name, resolution.worlds)
     except OSError as error:
         raise TrapsError(f"{workspace.trajectories / name}.npz: cannot be written ({error.strerror})") from error
-    record = json.dumps(spec.model_dump(mode="json"))
+    record = json.dumps(resolution.spec.model_dump(mode="json"))
     write_text(workspace.trajectories / f"{name}.json", record)  # last, so that it vouches for the trajectory
     workspace.store.keep(files)
     progress.current().note(
         f"{scenario.scenario_id}: simulated here after {scenario.where}; to freeze it for other machines copy "
         f"trajectories/{name}.* of the workspace to {CORRECTIONS / 'trajectories'}"
     )
-    return spec, workspace.trajectories / f"{name}.npz"
+    return resolution.spec, workspace.trajectories / f"{name}.npz"
 
 
 def _resolution_name(scenario: Scenario) -> str:
@@ -116,7 +117,7 @@ def _has_valid_words(scenario: Scenario) -> bool:
     return record is not None and _wording(scenario, record.params) == _wording(scenario, scenario.params or {})
 
 
-def _simulate(scenario: Scenario) -> tuple[SceneSpec, np.ndarray, np.ndarray]:
+def _simulate(scenario: Scenario) -> Resolved:
     """Simulate a corrected scene. Raises TrapsError naming the correction."""
     from traps_pipeline.scenes.draw.resolve import resolve
     from traps_pipeline.scenes.parts.wording import draw_ill_posed
@@ -130,10 +131,9 @@ def _simulate(scenario: Scenario) -> tuple[SceneSpec, np.ndarray, np.ndarray]:
         physics = Physics(**_physics(scenario))
         rng = np.random.default_rng([_seed(scenario), *scenario.scenario_id.encode(), 1])
         question = draw_ill_posed(family.taxonomy, family.build(params, physics).inventory, rng)
-        resolution = resolve(
+        return resolve(
             family, params, wording, question, scenario_id=scenario.scenario_id, seed=_seed(scenario), physics=physics
         )
-        return resolution.spec, resolution.qpos, resolution.twin
     except (Rejected, ValueError, TypeError) as error:
         raise TrapsError(
             f"{scenario.where}: {scenario.scenario_id}: these parameters make no valid pair ({error}); "
@@ -200,13 +200,17 @@ def released_in_study(workspace: Workspace, category: str) -> dict[str, SceneSpe
 
 def released_version(workspace: Workspace, category: str) -> str:
     """Return the version of a category's released records in a study."""
-    return digest([spec.spec_hash for spec in released_in_study(workspace, category).values()])[:16]
+    lanes = subset(two_events_lines(), workspace.study, two_events_lines()).values()
+    pairs = [spec.spec_hash for spec in released_in_study(workspace, category).values()]
+    return digest([*pairs, *(line.line for line in lanes if line.category == category)])[:16]
 
 
 def corrections_version(workspace: Workspace, category: str) -> str:
     """Return a category's version in a study, after the review decisions."""
     scenarios = load_scenarios(workspace.study).values()
-    return digest([[s.scenario_id, s.version] for s in scenarios if s.category == category])[:16]
+    lanes = load_two_events(workspace.study).items()
+    versions = [[s.scenario_id, s.version] for s in scenarios if s.category == category]
+    return digest([*versions, *([id_, lane.version] for id_, lane in lanes if lane.category == category)])[:16]
 
 
 def void_from_s(spec: SceneSpec) -> float:
@@ -251,7 +255,7 @@ def spec_of(row: Mapping[str, Any]) -> SceneSpec:
     return SceneSpec.model_validate(record)
 
 
-def trajectory_of(workspace: Workspace, row: Mapping[str, Any], world: Literal["qpos", "twin"] = "qpos") -> np.ndarray:
+def trajectory_of(workspace: Workspace, row: Mapping[str, Any], world: str = "qpos") -> np.ndarray:
     """Return the frozen qpos (F, nq) of a row's scene or twin. Raises TrapsError."""
     candidates: Sequence[Path] = (ROOT / row["trajectory"], workspace.resolve(row["trajectory"]))
     path = next((p for p in candidates if p.is_file()), candidates[0])

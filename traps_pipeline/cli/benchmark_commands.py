@@ -48,6 +48,13 @@ def add(commands: Commands) -> None:
         "--count", type=integer(1, 1_000_000), help="number of scenarios of each family, instead of --scale"
     )
     parser.add_argument(
+        "--two-events",
+        type=integer(0, 1000),
+        default=0,
+        metavar="N",
+        help="scenarios of two events of each family that has them, besides (default: none)",
+    )
+    parser.add_argument(
         "--look",
         nargs="+",
         choices=LOOKS,
@@ -133,17 +140,18 @@ def sample(arguments: argparse.Namespace) -> int:
         check_name(name)
     except ValueError as error:
         raise TrapsError(f"--name: {error}") from None
-    sample_benchmark(
+    n_scenarios = sample_benchmark(
         arguments.out.absolute(),
         targets,
         arguments.seed,
         name,
         look=arguments.look,
         difficulty=Difficulty(arguments.distractors, arguments.speed, arguments.longer),
+        two_events=arguments.two_events,
         workers=arguments.workers,
         report=lambda line: print(line, flush=True),
     )
-    scenarios, families = count_noun(sum(targets.values()), "scenario"), count_noun(len(targets), "family", "families")
+    scenarios, families = count_noun(n_scenarios, "scenario"), count_noun(len(targets), "family", "families")
     print(f"{scenarios} of {families} in {arguments.out}")
     benchmark = load_release(arguments.out.absolute() / "benchmark.yaml").name
     print(
@@ -154,11 +162,14 @@ def sample(arguments: argparse.Namespace) -> int:
 
 
 def commit_benchmark(arguments: argparse.Namespace) -> int:
+    from traps_pipeline.benchmark.records import two_events_lines
     from traps_pipeline.release.commitment import commit
 
     public = commit(arguments.benchmark.absolute(), arguments.out, arguments.reveal)
     records = count_noun(len(public.specs), "record")
     print(f"committed {records} of {public.name} {public.version} in {arguments.out}: publish it")
+    if lanes := two_events_lines(arguments.benchmark.absolute() / "two_events" / "released"):
+        print(f"not committed: its {count_noun(len(lanes), 'scenario')} of two events")
     print(f"keep {arguments.reveal} secret until the benchmark is revealed; without it nothing can be proven")
     return OK
 

@@ -201,7 +201,7 @@ def leaderboard(arguments: argparse.Namespace) -> int:
         print_json({"groups": board.groups, "refused": board.refused})
         return FAILED if board.refused else OK
     for group in board.groups:
-        print(f"\n{group.title}\n{leaderboard_text(group.board)}")
+        print(f"\n{group.title}\n{leaderboard_text(group.board, group.two_way)}")
     for entry in board.refused:
         print(plain(f"refused: {entry.name}: {entry.problems[0]}"))
     print(f"next: open {arguments.out / PAGE}")

@@ -241,10 +241,10 @@ class ProbeRun:
     ) -> list[Row]:
         """Return answerable clips that resemble voids, scored by each dataset's probes.
 
-        These are void clips with an answerable question, decoys (an occluder that hides nothing), and whole clips as
-        short as a void. answerable_void: AUROC of void items against these; 0.5 for a probe that detects what both have
-        (an occluder, the length), 1 for a probe that detects that the answer cannot be known. answerable_control: AUROC
-        of these against the controls; the reverse. Probes of the same taxonomy are fitted without the scored scenario.
+        These are void clips with an answerable question, and whole clips as short as a void. answerable_void: AUROC of
+        void items against these; 0.5 for a probe that detects what both have (an occluder, the length), 1 for a probe
+        that detects that the answer cannot be known. answerable_control: AUROC of these against the controls; the
+        reverse. Probes of the same taxonomy are fitted without the scored scenario.
         """
         rows = []
         for source, (extra, extra_kind) in product(self._own, LOOK_ALIKES.items()):

@@ -34,7 +34,7 @@ CURVES = (
 )
 
 # Items that can be answered although they look like voids, and the dataset whose voids they look like.
-LOOK_ALIKES = {ANSWERABLE: "occlusion", "decoy": "occlusion", "removed": "occlusion", "length_matched": "chaotic"}
+LOOK_ALIKES = {ANSWERABLE: "occlusion", "length_matched": "chaotic"}
 TRANSFER_TYPES = ("Cross-modality", "Cross-domain", "Cross-both", "Within")
 
 

@@ -16,8 +16,8 @@ from sqlalchemy.exc import IntegrityError
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.benchmark.corrections import corrected_scenarios
-from traps_pipeline.benchmark.records import load_released, released_lines
+from traps_pipeline.benchmark.corrections import corrected_scenarios, corrected_two_events
+from traps_pipeline.benchmark.records import load_released, released_lines, two_events_lines
 from traps_pipeline.judging.confabulation_protocol import load_protocol
 from traps_pipeline.models.registry.entries import load_accounts, load_models
 from traps_pipeline.models.registry.judges import load_judges, load_panel
@@ -60,7 +60,8 @@ def reread_sources() -> None:
     The set of evaluations stays: partition keys are built from it when the code location is loaded.
     """
     registries = (load_models, load_accounts, load_judges, load_panel, load_protocol)
-    for reader in (load_released, released_lines, corrected_scenarios, prompt, system_prompt, vqa_prompt, *registries):
+    benchmark = (load_released, released_lines, two_events_lines, corrected_scenarios, corrected_two_events)
+    for reader in (*benchmark, prompt, system_prompt, vqa_prompt, *registries):
         reader.cache_clear()
 
 

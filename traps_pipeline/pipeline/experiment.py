@@ -17,7 +17,7 @@ from traps_pipeline.models.registry.judges import require_panel
 from traps_pipeline.models.registry.user_registry import UserRegistry, add_entries
 from traps_pipeline.pipeline.wanted import evaluations_of
 from traps_pipeline.protocol.cells import Cell
-from traps_pipeline.protocol.datasets import DATASETS, SCHEMAS, UNPAIRED
+from traps_pipeline.protocol.datasets import DATASETS, REPLACED, SCHEMAS, TWO_EVENTS, UNPAIRED
 from traps_pipeline.protocol.regimes import BY_NAME, PAPER_REGIMES, REGIMES
 from traps_pipeline.storage.study import Asked, MechanismSettings, Settings, Study
 
@@ -27,10 +27,7 @@ LITE_FILE = ASSETS / "lite.yaml"
 
 
 class Experiment(Settings):
-    """The fields of an experiment's file.
-
-    benchmark, scenarios, per_family and panel are copied to the study.
-    """
+    """The fields of an experiment's file. benchmark, scenarios, per_family and panel are copied to the study."""
 
     name: Name = Field(pattern=r"^[a-z0-9-]+$", description="of the experiment in `study.yaml`")
     description: str = Field(default="", description="one line, printed when it runs")
@@ -80,6 +77,10 @@ class Experiment(Settings):
         names = (*DATASETS, *UNPAIRED) if info.field_name == "datasets" else REGIMES
         unknown = [value for value in values if value not in names]
         if unknown or not values:
+            if gone := [value for value in unknown if value in REPLACED]:
+                raise ValueError(
+                    f"{', '.join(gone)} went with 0.3: {TWO_EVENTS} takes the place of such arms; ask that"
+                )
             suggestion = did_you_mean(unknown[0], names) if unknown else ""
             raise ValueError(f"{unknown or 'nothing'} given; choose from {', '.join(names)}{suggestion}")
         return values

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from traps_pipeline.benchmark.corrections import load_scenarios
+from traps_pipeline.benchmark.corrections import load_scenarios, load_two_events
 from traps_pipeline.benchmark.items import expected_items
 from traps_pipeline.judging.confabulation import sample_failures
 from traps_pipeline.judging.confabulation_protocol import load_protocol
@@ -28,7 +28,15 @@ from traps_pipeline.pipeline.graph import Node
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.pipeline.run_plan import RunPlan
 from traps_pipeline.protocol.cells import Cell, SteeredEvaluation
-from traps_pipeline.protocol.datasets import DATASETS, UNPAIRED, all_datasets_of, datasets_of_category, sides_of
+from traps_pipeline.protocol.datasets import (
+    DATASETS,
+    TWO_EVENTS,
+    UNPAIRED,
+    all_datasets_of,
+    datasets_of_category,
+    sides_of,
+)
+from traps_pipeline.protocol.two_events import ITEMS_A_SIDE
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.tables import Table
@@ -87,7 +95,7 @@ def plan_calls(plan: RunPlan | None, experiment: Experiment, study: Study, card:
     plan: of its workspace, None for a new one. study: with the panel that judges. card: one of CARDS.
     """
     panel = load_panel(study.panel)
-    calls, uncertain_datasets = _count_calls(plan, experiment, study)
+    calls, uncertain_datasets, items = _count_calls(plan, experiment, study)
     steered_counts = _count_steered(plan, experiment, study)
     local = [*_local_costs(plan, experiment, study, card, calls, steered_counts)]
     votes = sum(count.new for _, count in [*calls.values(), *steered_counts.values()])
@@ -102,7 +110,7 @@ def plan_calls(plan: RunPlan | None, experiment: Experiment, study: Study, card:
     }
     ledgers = [ledger.totals() for ledger in (plan.workspace.answers, plan.workspace.votes)] if plan else []
     forecasts = [
-        forecast(entry, count, experience(totals[entry.id] for totals in ledgers if entry.id in totals))
+        forecast(entry, count, experience(totals[entry.id] for totals in ledgers if entry.id in totals), items)
         for entry, count in new
     ]
     judge = load_protocol().judge(study.panel)
@@ -195,10 +203,11 @@ def _is_judged(lineage: Lineage, cells: Sequence[Cell]) -> bool:
 
 def _count_calls(
     plan: RunPlan | None, experiment: Experiment, study: Study
-) -> tuple[dict[str, tuple[Count, Count]], list[str]]:
+) -> tuple[dict[str, tuple[Count, Count]], list[str], Counter[str]]:
     counts = {model: (Count(), Count()) for model in experiment.models}
     panel = load_panel(study.panel)
     scenes = Counter(name for scenario in load_scenarios(study).values() for name in all_datasets_of(scenario.category))
+    scenes[TWO_EVENTS] = ITEMS_A_SIDE * len(load_two_events(study))
     current = {dataset for dataset in experiment.datasets if plan and _has_current_items(plan.lineage, dataset)}
     items = {d: _items(plan, d, scenes[d], is_current=d in current) for d in experiment.datasets}
     for cell in experiment.cells():
@@ -215,7 +224,9 @@ def _count_calls(
             votes.add(cast, cast)
         else:
             _count_cell(plan.workspace, panel, cell, cell_items, answers, votes)
-    return counts, sorted(dataset for dataset, (_, unknown_items) in items.items() if unknown_items)
+    uncertain = sorted(dataset for dataset, (_, unknown_items) in items.items() if unknown_items)
+    sizes = Counter({dataset: len(known) + unknown.total() for dataset, (known, unknown) in items.items()})
+    return counts, uncertain, sizes
 
 
 def _items(

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from functools import cached_property
 from itertools import product
 
-from traps_pipeline.benchmark.corrections import categories_of, load_scenarios
+from traps_pipeline.benchmark.corrections import categories_of, load_scenarios, load_two_events
 from traps_pipeline.models.registry.entries import get_model, load_models, local_models
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction, StatesCell, SteeringCell
 from traps_pipeline.protocol.datasets import (
@@ -60,7 +60,10 @@ class StudyPartitions:
 
     @cached_property
     def _present(self) -> list[str]:
-        return [*CATEGORIES] if self._workspace is None else categories_of(load_scenarios(self._workspace.study))
+        if self._workspace is None:
+            return [*CATEGORIES]
+        study = self._workspace.study
+        return categories_of({**load_scenarios(study), **load_two_events(study)})
 
     @cached_property
     def datasets(self) -> list[str]:

@@ -23,11 +23,13 @@ DATASETS = ("occlusion", "occlusion_ill_posed", "chaotic", "chaotic_ill_posed")
 SHORT = {"occlusion": "oc", "occlusion_ill_posed": "oc_ip", "chaotic": "ch", "chaotic_ill_posed": "ch_ip"}
 LONG = {short: dataset for dataset, short in SHORT.items()}
 # Datasets beside the pairs, each of which removes one shortcut (docs/arms.md). No part of PECS; run on request.
-CROSSED = "crossed"  # has controls and voids; all other arms have controls alone
 TWIN = "twin_control"
 INFERENCE_ARMS = ("late_occluder", "predictable_cut")  # the outcome is not shown, but can be inferred
-ROBUST_ARMS = ("decoy", "removed", "length_matched", TWIN, CROSSED)
-ARMS = (*ROBUST_ARMS, *INFERENCE_ARMS)
+ARMS = ("length_matched", TWIN, *INFERENCE_ARMS)
+# Two events side by side, with each, both or neither of them hidden, and a question about either
+# (protocol/two_events.py). No part of PECS or of the arms' figures; run on request.
+TWO_EVENTS = "two_events"
+REPLACED = ("decoy", "removed", "crossed")  # arms of 0.3 that two events take the place of
 # Controls cut where the likeliest answer has a stated probability (docs/arms.md, "Graded cuts"). In no figure
 # of pairs or arms; run on request.
 GRADED = "graded"
@@ -39,13 +41,13 @@ OCCLUDER_DOSES = ("occluder_alpha_50",)  # the occluder lets the outcome through
 SCHEMAS = ("schema_answer", "schema_reason", "schema_abstain")
 FRAMINGS = ("frames_later", "frames_few", "frames_all")
 VARIATIONS = (*LABEL_DOSES, *OCCLUDER_LOOKS, *OCCLUDER_DOSES, *SCHEMAS, *FRAMINGS)
-UNPAIRED = (*ARMS, GRADED, *VARIATIONS)  # all that is no dataset of the pairs
+UNPAIRED = (*ARMS, TWO_EVENTS, GRADED, *VARIATIONS)  # all that is no dataset of the pairs
 _ONE_TAXONOMY = {
-    **dict.fromkeys(("decoy", "removed", "late_occluder", *OCCLUDER_LOOKS, *OCCLUDER_DOSES), "occlusion"),
+    **dict.fromkeys(("late_occluder", TWO_EVENTS, *OCCLUDER_LOOKS, *OCCLUDER_DOSES), "occlusion"),
     **dict.fromkeys(("length_matched", "predictable_cut", GRADED), "chaotic"),
 }
 ANSWERABLE = "occlusion_answerable"  # only in mechanistic stages: occlusion's voids, answerable
-PROBED_ARMS = ("decoy", "removed", "length_matched")  # arms that probes are applied to where an experiment asks them
+PROBED_ARMS = ("length_matched",)  # arms that probes are applied to where an experiment asks them
 PROBED_DATASETS = (*DATASETS, ANSWERABLE, *PROBED_ARMS)
 SIDES = ("control", "void")
 
@@ -91,11 +93,11 @@ def all_datasets_of(category: str) -> tuple[str, ...]:
 
 
 def dataset_of(item_id: str) -> str:
-    """Return the dataset of an item from its id `dataset:scenario:side`."""
+    """Return the dataset of an item from its id: all before the first colon."""
     return item_id.partition(":")[0]
 
 
 def sides_of(dataset: str) -> tuple[str, ...]:
     """Return the sides that a dataset, an arm or a variation asks of each scenario."""
-    controls = {*ARMS, GRADED, *OCCLUDER_DOSES} - {CROSSED}
+    controls = {*ARMS, GRADED, *OCCLUDER_DOSES}
     return ("control",) if dataset in controls else ("void",) if dataset in OCCLUDER_LOOKS else SIDES

@@ -11,13 +11,14 @@ from typing import Any
 from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.yamlfile import read_yaml
+from traps_pipeline.benchmark.corrections import load_two_events
 from traps_pipeline.benchmark.held_out import opaque
 from traps_pipeline.benchmark.records import Release, load_release
 from traps_pipeline.benchmark.specs import spec_of
 from traps_pipeline.judging.panel import tasks_for
 from traps_pipeline.models.registry.prompts import prompt, system_prompt
 from traps_pipeline.pipeline.experiment import LITE_FILE
-from traps_pipeline.protocol.datasets import ARMS, DATASETS
+from traps_pipeline.protocol.datasets import ARMS, DATASETS, TWO_EVENTS
 from traps_pipeline.protocol.regimes import PAPER_REGIMES
 from traps_pipeline.release.held_out_clips import clip_name
 from traps_pipeline.release.released_rows import (
@@ -28,9 +29,11 @@ from traps_pipeline.release.released_rows import (
     ReleasedItemRow,
     ScenarioRow,
     SplitRow,
+    TwoEventsRow,
 )
 from traps_pipeline.scenes.certification.certificates import certificates_for, pair_of, stored_evidence
 from traps_pipeline.scenes.certification.evidence import Claim
+from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 from traps_pipeline.storage.benchmark_tables import ITEMS, SCENE_SPECS
 from traps_pipeline.storage.tables import records
@@ -46,13 +49,14 @@ Rows = Sequence[Mapping[str, Any]]
 
 @dataclass(frozen=True)
 class Content:
-    """A release's content: the study's folder, ITEMS and SCENE_SPECS rows, clips by path, benchmark."""
+    """A release's content: the study's folder, ITEMS and SCENE_SPECS rows, clips by path, benchmark, two events."""
 
     study: Path
     items: Rows
     specs: Rows
     clips: Mapping[str, Path]
     release: Release
+    two_events: Sequence[TwoEventsSpec] = ()
 
     @property
     def versions(self) -> dict[str, str]:
@@ -61,9 +65,9 @@ class Content:
 
 
 def content_of(workspace: Workspace, arms: Sequence[str] = ()) -> Content:
-    """Return a study's pairs and these arms' items. Raises TrapsError if unsound."""
-    items = _records(workspace, ITEMS, (*DATASETS, *arms))
-    if not items:
+    """Return a study's pairs, its two events and these arms' items. Raises TrapsError if unsound."""
+    items = _records(workspace, ITEMS, (*DATASETS, TWO_EVENTS, *arms))
+    if not any(row["dataset"] in DATASETS for row in items):
         raise TrapsError(f"{workspace.root}: no pairs to release; make items first (traps run ... --until items)")
     for arm in arms:
         if arm not in ARMS or arm not in {row["dataset"] for row in items}:
@@ -77,7 +81,9 @@ def content_of(workspace: Workspace, arms: Sequence[str] = ()) -> Content:
         path = clips[row["clip"]]
         if not path.is_file() or file_digest(path) != row["media_digest"]:
             raise TrapsError(f"{path}: is missing or not the clip of its item; materialize videos again")
-    return Content(workspace.root, items, specs, clips, load_release())
+    lanes = load_two_events(workspace.study)
+    two_events = [lanes[id_].spec for id_ in sorted(_ids(row for row in items if row["dataset"] == TWO_EVENTS))]
+    return Content(workspace.root, items, specs, clips, load_release(), two_events)
 
 
 def _records(workspace: Workspace, table: Any, datasets: Sequence[str] | None = None) -> list[dict[str, Any]]:
@@ -149,10 +155,7 @@ def item_rows(content: Content) -> list[ReleasedItemRow]:
 
 
 def held_out_rows(items: Rows, digests: Mapping[str, str], key: bytes, canary: str) -> list[HeldOutItemRow]:
-    """Return one row per item, sorted by opaque name; no field reveals the answer.
-
-    digests: of each item's own clip.
-    """
+    """Return one row per item, sorted by opaque name; no field reveals the answer. digests: of each item's own clip."""
     rows = [
         HeldOutItemRow(
             item=opaque(key, row["item_id"]),
@@ -169,6 +172,14 @@ def held_out_rows(items: Rows, digests: Mapping[str, str], key: bytes, canary: s
 def scenario_rows(content: Content) -> list[ScenarioRow]:
     """Return one row per scenario: its complete record."""
     return [ScenarioRow(**row, canary=content.release.canary) for row in content.specs]
+
+
+def two_events_rows(content: Content) -> list[TwoEventsRow]:
+    """Return one row per scenario of two events: its record."""
+    return [
+        TwoEventsRow(scenario_id=spec.scenario_id, record=spec.model_dump_json(), canary=content.release.canary)
+        for spec in content.two_events
+    ]
 
 
 def certificate_rows(content: Content) -> list[CertificateRow]:

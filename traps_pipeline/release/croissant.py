@@ -53,7 +53,7 @@ _RAI: Mapping[str, Any] = {
     ],
     "rai:dataLimitations": [
         "Scenes are synthetic rigid bodies; how far results carry over to real video is not measured.",
-        "Each void is made by one kind of change, which can be recognised; arms take such cues away.",
+        "Each void of a pair is made by one kind of change, which can be recognised; two events balance such cues.",
         "A high PECS is no proof that a model is safe or honest.",
     ],
     "rai:dataBiases": [

@@ -15,14 +15,13 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import replace_folder, write_bytes, write_text
 from traps_pipeline.base.paths import ASSETS, OWN_SPECS, ROOT, SCENE_SPECS
 from traps_pipeline.benchmark.held_out import (
+    begin_publication,
     drawn_items,
     held_out_key,
     mark_held_out,
     opaque,
-    refuse_held_out,
     require_secret_seed,
 )
-from traps_pipeline.protocol.datasets import CROSSED
 from traps_pipeline.release import content as rows_of
 from traps_pipeline.release.card import card, dictionary
 from traps_pipeline.release.checksums import CHECKSUMS, write_checksums
@@ -39,6 +38,7 @@ from traps_pipeline.release.released_rows import (
     RELEASED_ITEMS,
     SCENARIOS,
     SPLITS,
+    TWO_EVENTS_SCENARIOS,
 )
 from traps_pipeline.storage.tables import Table
 
@@ -51,6 +51,7 @@ PLACES: Mapping[str, str] = {
     PAIRS.name: "metadata.jsonl",
     RELEASED_ITEMS.name: f"{CLIPS}/metadata.jsonl",
     SCENARIOS.name: "scenarios.jsonl",
+    TWO_EVENTS_SCENARIOS.name: "two_events.jsonl",
     CERTIFICATES.name: "certificates.jsonl",
     SPLITS.name: "splits.jsonl",
     PROMPTS.name: "prompts.jsonl",
@@ -102,11 +103,12 @@ class _Folder:
 
 def write_release(content: Content, target: Path, options: Options) -> ReleaseSummary:
     """Write the folder; it may replace only a former release. Raises TrapsError."""
-    if options.held_out is not None and options.held_out.is_relative_to(target):  # before removing a former release
+    # Before a former release is removed.
+    if options.held_out is not None and options.held_out.resolve().is_relative_to(target.resolve()):
         raise TrapsError(f"{options.held_out}: lies in the folder that is published; keep the key elsewhere")
     _require_own(target)
     if options.held_out is None:
-        refuse_held_out(content.study, "an open release")
+        begin_publication(content.study, "an open release")
     with replace_folder(target) as part:
         folder = _Folder(part, anonymize if options.anonymous else str)
         answers = _open_release(folder, content) if options.held_out is None else None
@@ -137,6 +139,8 @@ def _open_release(folder: _Folder, content: Content) -> None:
     folder.table(PAIRS, rows_of.pair_rows(content))
     folder.table(RELEASED_ITEMS, rows_of.item_rows(content))
     folder.table(SCENARIOS, rows_of.scenario_rows(content))
+    if content.two_events:
+        folder.table(TWO_EVENTS_SCENARIOS, rows_of.two_events_rows(content))
     folder.table(CERTIFICATES, rows_of.certificate_rows(content))
     folder.table(SPLITS, rows_of.split_rows(content))
     for name, source in sorted(content.clips.items()):
@@ -145,8 +149,6 @@ def _open_release(folder: _Folder, content: Content) -> None:
 
 def _held_out_release(folder: _Folder, content: Content, key_file: Path) -> Path:
     """Write one item of each scenario with a clip of its own, and the answers beside the key."""
-    if CROSSED in content.versions:
-        raise TrapsError(f"--arms {CROSSED}: it asks questions of other scenarios, which tells sides; leave it out")
     if SCENE_SPECS != OWN_SPECS:
         require_secret_seed(SCENE_SPECS)
     key = held_out_key(key_file, make=True)
@@ -166,7 +168,7 @@ def _held_out_release(folder: _Folder, content: Content, key_file: Path) -> Path
 def _pages(folder: _Folder, content: Content, options: Options) -> None:
     """Write everything but tables and clips."""
     canary = content.release.canary
-    tables = OPEN if options.held_out is None else HELD_OUT
+    tables = [table for table in (OPEN if options.held_out is None else HELD_OUT) if table.name in folder.rows]
     licence = (ROOT / LICENCE).read_text(encoding="utf-8")
     prompts = (ASSETS / "prompts" / "README.md").read_text(encoding="utf-8")
     folder.text(LICENCE, f"{licence.rstrip()}\n\n{canary}\n")

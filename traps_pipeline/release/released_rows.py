@@ -77,6 +77,18 @@ SCENARIOS = Table("scenarios", ScenarioRow, partition_by=(), key=("scenario_id",
 
 
 @dataclass(frozen=True, kw_only=True)
+class TwoEventsRow:
+    """A scenario of two events: its record, from which its four clips were rendered."""
+
+    scenario_id: shared.ScenarioId
+    record: Annotated[str, "JSON: family, question, both lanes with their twins, camera, boards, certificates"]
+    canary: Canary
+
+
+TWO_EVENTS_SCENARIOS = Table("two_events", TwoEventsRow, partition_by=(), key=("scenario_id",))
+
+
+@dataclass(frozen=True, kw_only=True)
 class CertificateRow:
     """A certificate of a scenario's pair, checked against its record's numbers."""
 
@@ -130,5 +142,5 @@ class SubmittedRow(LeaderboardRow):
 
 SUBMITTED = Table("submitted", SubmittedRow, partition_by=(), key=("group", "model", "regime", "dataset"))
 
-OPEN = (PAIRS, RELEASED_ITEMS, SCENARIOS, CERTIFICATES, SPLITS, PROMPTS)
+OPEN = (PAIRS, RELEASED_ITEMS, SCENARIOS, TWO_EVENTS_SCENARIOS, CERTIFICATES, SPLITS, PROMPTS)
 HELD_OUT = (HELD_OUT_ITEMS, PROMPTS)

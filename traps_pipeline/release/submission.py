@@ -24,7 +24,7 @@ from traps_pipeline.base.files import write_bytes
 from traps_pipeline.base.names import Name
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.yamlfile import explain
-from traps_pipeline.benchmark.held_out import refuse_held_out
+from traps_pipeline.benchmark.held_out import begin_publication
 from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.models.asking.answer_rows import RESPONSES
@@ -32,8 +32,8 @@ from traps_pipeline.models.reading.interpret import READING
 from traps_pipeline.models.reading.thinking import Marks
 from traps_pipeline.models.registry.judges import RULES_VERSION, load_panel, panel_id
 from traps_pipeline.models.registry.prompts import prompt_version
-from traps_pipeline.protocol.datasets import DATASETS
-from traps_pipeline.scoring.score_rows import LEADERBOARD, METRICS
+from traps_pipeline.protocol.datasets import DATASETS, TWO_EVENTS
+from traps_pipeline.scoring.score_rows import LEADERBOARD, METRICS, TWO_WAY
 from traps_pipeline.storage.benchmark_tables import ITEMS, current_rows
 from traps_pipeline.storage.tables import Table, records
 from traps_pipeline.storage.workspace import Workspace
@@ -42,7 +42,10 @@ if TYPE_CHECKING:
     import pandas as pd
 
 ABOUT = "submission.json"
-TABLES: Mapping[str, Table[Any]] = {f"{t.name}.parquet": t for t in (ITEMS, RESPONSES, VOTES, METRICS, LEADERBOARD)}
+TABLES: Mapping[str, Table[Any]] = {
+    f"{t.name}.parquet": t for t in (ITEMS, RESPONSES, VOTES, METRICS, LEADERBOARD, TWO_WAY)
+}
+SUBMITTED_DATASETS = (*DATASETS, TWO_EVENTS)  # the second may be absent
 MAX_FILE_BYTES, MAX_TABLE_BYTES, MAX_ROWS = 2 * 2**30, 4 * 2**30, 20_000_000
 MAX_ABOUT_BYTES = 2**20
 
@@ -83,10 +86,7 @@ class About(_Strict):
 
 @dataclass(frozen=True)
 class Submission:
-    """A submission in memory.
-
-    altered: tables whose digest differs from `about`.
-    """
+    """A submission in memory. altered: tables whose digest differs from `about`."""
 
     path: Path
     about: About
@@ -102,20 +102,18 @@ class Submission:
 
 
 def pack(workspace: Workspace, target: Path, name: str) -> About:
-    """Write a study's submission, equal bytes for equal studies.
-
-    Raises TrapsError if it is not judged or scored yet.
-    """
-    refuse_held_out(workspace.root, "a submission")
+    """Write a study's submission, equal bytes for equal studies. Raises TrapsError unless it is judged and scored."""
+    begin_publication(workspace.root, "a submission")
     study = workspace.study
     frames = {
-        "items.parquet": workspace.tables.read_all(ITEMS, dataset=DATASETS),
-        "responses.parquet": current_rows(workspace, RESPONSES),
-        "votes.parquet": current_rows(workspace, VOTES),
-        "metrics.parquet": workspace.tables.read_all(METRICS, dataset=DATASETS),
+        "items.parquet": workspace.tables.read_all(ITEMS, dataset=SUBMITTED_DATASETS),
+        "responses.parquet": current_rows(workspace, RESPONSES, dataset=SUBMITTED_DATASETS),
+        "votes.parquet": current_rows(workspace, VOTES, dataset=SUBMITTED_DATASETS),
+        "metrics.parquet": workspace.tables.read_all(METRICS, dataset=SUBMITTED_DATASETS),
         "leaderboard.parquet": workspace.tables.read_all(LEADERBOARD),
+        "two_way.parquet": _two_events_alone(workspace.tables.read_all(TWO_WAY)),
     }
-    empty = [file.partition(".")[0] for file, frame in frames.items() if frame.empty]
+    empty = [file.partition(".")[0] for file, frame in frames.items() if frame.empty and file != "two_way.parquet"]
     if empty:
         raise TrapsError(f"{workspace.root}: has no {', '.join(empty)}; run it first: traps run EXPERIMENT")
     frames["votes.parquet"] = frames["votes.parquet"].loc[lambda votes: votes["panel"] == panel_id(study.panel)]
@@ -140,6 +138,11 @@ def pack(workspace: Workspace, target: Path, name: str) -> About:
         raise TrapsError(f"--name {name!r:.100}: {explain(error)}; use lower-case letters, digits, - and .") from error
     write_bytes(target, pack_archive({ABOUT: description.model_dump_json(indent=1).encode() + b"\n", **content}))
     return description
+
+
+def _two_events_alone(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the TWO_WAY rows of two events, without what arms give, which are not submitted."""
+    return rows.loc[rows["n_scenarios"] > 0].assign(inference_acc=None, inference_abstains=None)
 
 
 def table_bytes(table: Table[Any], frame: pd.DataFrame) -> bytes:

@@ -57,13 +57,14 @@ class RefusedSubmission:
 
 @dataclass(frozen=True)
 class RankedGroup:
-    """LEADERBOARD rows ranked together, named model@submission if names repeat."""
+    """LEADERBOARD and TWO_WAY rows ranked together, named model@submission if names repeat."""
 
     items: str
     panel: str
     versions: str
     n_items: int
     board: pd.DataFrame
+    two_way: pd.DataFrame
     submissions: dict[str, str]
 
     @property
@@ -125,7 +126,8 @@ def _group(key: tuple[str, str], members: Sequence[AcceptedSubmission]) -> Ranke
     verdicts = pd.concat(parts, ignore_index=True)
     versions = " + ".join(sorted(verdicts["benchmark_version"].unique()))
     items = len(members[0].submission.table(ITEMS))
-    return RankedGroup(*key, versions, items, score(verdicts).board, submissions)
+    scored = score(verdicts)
+    return RankedGroup(*key, versions, items, scored.board, scored.two_way, submissions)
 
 
 def _verdicts(one: AcceptedSubmission) -> pd.DataFrame:
@@ -138,10 +140,13 @@ def write_board(board: Board, folder: Path) -> None:
     """Write the page, and all its rows as Parquet."""
     entries: list[dict[str, Any]] = []
     for group in board.groups:
-        tables = [(table.title, table_html(table)) for table in leaderboards(group.board)]
+        tables = [(table.title, table_html(table)) for table in leaderboards(group.board, group.two_way)]
         entries.append({"title": group.title, "tables": tables})
     page = environment().get_template("submissions.html.j2")
-    terms = legend(pd.concat([group.board for group in board.groups], ignore_index=True))
+    every = (
+        pd.concat(rows, ignore_index=True) for rows in zip(*((g.board, g.two_way) for g in board.groups), strict=True)
+    )
+    terms = legend(*every)
     html = page.render(title=TITLE, groups=entries, accepted=board.accepted, refused=board.refused, legend=terms)
     write_bytes(folder / TABLE, _parquet(board))
     write_text(folder / PAGE, html)

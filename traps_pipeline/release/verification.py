@@ -33,10 +33,11 @@ from traps_pipeline.models.registry.judges import RULE, RULES_VERSION, id_of_jud
 from traps_pipeline.models.registry.prompts import prompt_version
 from traps_pipeline.models.request import JUDGED, Outcome, Request
 from traps_pipeline.protocol.cells import Cell, Evaluation
-from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.protocol.datasets import DATASETS, TWO_EVENTS, dataset_of
 from traps_pipeline.protocol.regimes import REGIMES
-from traps_pipeline.release.submission import Submission, SubmittedJudge, read_submission
-from traps_pipeline.scoring.score_rows import LEADERBOARD, METRICS
+from traps_pipeline.protocol.two_events import lane_items
+from traps_pipeline.release.submission import SUBMITTED_DATASETS, Submission, SubmittedJudge, read_submission
+from traps_pipeline.scoring.score_rows import LEADERBOARD, METRICS, TWO_WAY
 from traps_pipeline.scoring.scores import Scores, score
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.tables import Table, records
@@ -126,19 +127,36 @@ def verify(submission: Submission, released: Released | None = None) -> Verifica
 
 
 def _wrong_items(items: Collection[Row]) -> Iterator[str]:
-    answers = {(row["sub_scenario"], row["scenario_id"]): row["control_answer"] for row in items}
-    commonest = commonest_answers([{"sub_scenario": k[0], "ground_truth": answers[k]} for k in sorted(answers)])
+    answers = dict[tuple[str, str], str]()  # of each scenario, of two events of each lane
+    for row in items:
+        is_lane = row["dataset"] == TWO_EVENTS
+        event = row["pair_id"].rpartition(".")[0] if is_lane else row["scenario_id"]
+        answers[_kind(row), event] = row["control_answer"]
+    commonest = commonest_answers([{"sub_scenario": key[0], "ground_truth": answers[key]} for key in sorted(answers)])
     for row in items:
         try:
             is_same = item_hash(row) == row["item_hash"]
         except (ValueError, RecursionError):
             is_same = False
-        if not is_same or row["item_id"] != f"{row['dataset']}:{row['scenario_id']}:{row['side']}":
+        if not is_same or row["item_id"] not in _own_ids(row):
             yield f"item {row['item_id']}: is not what its digest says"
-        elif row["dataset"] not in DATASETS:
-            yield f"item {row['item_id']}: is none of the pairs'"
-        elif row["commonest_answer"] != commonest[row["sub_scenario"]]:
+        elif row["dataset"] not in SUBMITTED_DATASETS:
+            yield f"item {row['item_id']}: is none of the pairs' or of two events"
+        elif row["commonest_answer"] != commonest[_kind(row)]:
             yield f"item {row['item_id']}: its commonest answer is not that of its sub-scenario"
+
+
+def _kind(row: Row) -> str:
+    """Return what an item's commonest answer is of: its sub-scenario, apart from that of two events."""
+    return f"{row['dataset'] == TWO_EVENTS} {row['sub_scenario']}"
+
+
+def _own_ids(row: Row) -> list[str]:
+    """Return the ids that an item may have by its dataset, scenario and side, of two events also by its pair."""
+    if row["dataset"] != TWO_EVENTS:
+        return [f"{row['dataset']}:{row['scenario_id']}:{row['side']}"]
+    names = row["side"], row["pair_id"]
+    return [item.item_id for item in lane_items(row["scenario_id"]) if (item.side, item.pair_id) == names]
 
 
 def _wrong_prompts(submission: Submission) -> Iterator[str]:
@@ -165,7 +183,7 @@ def released_items(release: Path) -> Released:
         if "item_hash" not in row:
             raise TrapsError(f"{release}: is a held-out set; verify against the open release")
         items[row["item_id"]] = row["item_hash"], row["media_digest"]
-        if row["dataset"] in DATASETS and item_hash(row) != row["item_hash"]:
+        if row["dataset"] in SUBMITTED_DATASETS and item_hash(row) != row["item_hash"]:
             raise TrapsError(f"{release}: line {number} of its items is not what its digest says")
     return items
 
@@ -178,7 +196,8 @@ def _foreign_items(items: Mapping[str, Row], released_digests: Released) -> Iter
             yield f"item {id_}: its clip is not the released one"
         elif released_digests[id_][0] != row["item_hash"]:
             yield f"item {id_}: its question, choices or answer are not the released ones"
-    missing_ids = sorted(id_ for id_ in released_digests if id_.partition(":")[0] in DATASETS and id_ not in items)
+    datasets = {*DATASETS} | {dataset_of(id_) for id_ in items}
+    missing_ids = sorted(id_ for id_ in released_digests if dataset_of(id_) in datasets and id_ not in items)
     for id_ in missing_ids:
         yield f"item {id_}: is in the release and was not asked"
 
@@ -336,6 +355,8 @@ def _numbers(verified: Verification, submission: Submission) -> None:
         return
     verified.look("metrics", _number_differences(METRICS, submission.table(METRICS), verified.scored.metrics))
     verified.look("leaderboard", _number_differences(LEADERBOARD, submission.table(LEADERBOARD), verified.scored.board))
+    if len(submission.table(TWO_WAY)) or len(verified.scored.two_way):
+        verified.look("two events", _number_differences(TWO_WAY, submission.table(TWO_WAY), verified.scored.two_way))
 
 
 def _number_differences(table: Table[Any], stated: pd.DataFrame, recomputed: pd.DataFrame) -> Iterator[str]:

@@ -163,7 +163,7 @@ def _failure(what: str, sources: Sources, error: Exception) -> str:
 def picture_card(picture: Picture) -> Card:
     """Return the card of pictures of clips."""
     try:
-        images = [_picture(name, figure, picture.kind) for name, figure in picture.figures().items()]
+        images = [_picture(name, figure, "webp") for name, figure in picture.figures().items()]
     except NotRun as reason:
         return Card(picture.name, picture.title, why=str(reason))
     pictures = {f"{k}" if k > 1 else "": image for k, image in enumerate(images, 1)}

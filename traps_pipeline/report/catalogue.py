@@ -27,7 +27,7 @@ RECOMPUTED = "recomputed"  # folder below tables/ for tables computed from the p
 # Stages whose tables hold decisions of the panel: reports that read them name the judges. A test compares this
 # with the graph.
 JUDGED_STAGES = {
-    *("leaderboard", "metrics", "contrasts", "regime_tests", "hypotheses", "graded", "leave_one_out"),
+    *("leaderboard", "metrics", "contrasts", "regime_tests", "two_way", "hypotheses", "graded", "leave_one_out"),
     *("item_scores", "corrected", "gate"),
     *("steering_effects", "steering_shares", "steering_nulls", "steering_pecs"),
 }
@@ -188,6 +188,7 @@ TABLE_REPORTS: tuple[TableReport, ...] = (
         paper=True, recomputed=("occlusion_sub_scenarios", "hidden_sub_scenarios")),
     TableReport("chaotic_sub_scenarios", "sub_scenarios.chaotic_sub_scenarios", ("metrics", "items"),
         paper=True, recomputed=("chaotic_sub_scenarios",)),
+    TableReport("two_way", "two_way_table.two_way", ("two_way",)),
     TableReport("hypotheses", "hypothesis_tables.hypotheses", ("hypotheses",),
         title="Hypotheses of the paper, by dose"),
     TableReport("graded", "graded_tables.graded", ("graded",)),
@@ -228,6 +229,8 @@ FIGURE_REPORTS: tuple[FigureReport, ...] = (
         ("leaderboard", "confabulation_prevalence"), frames=("rates", "confabulation")),
     FigureReport("sub_scenarios", "AbsRec by sub-scenario", "grids.sub_scenarios", ("metrics", "items"),
         frames=("visual_sub_scenarios", "visual_sub_cells")),
+    FigureReport("two_way", "Two events, one of them hidden", "two_way_figure.two_way", ("two_way",), published=False,
+        frames=("two_way",)),
     FigureReport("graded", "Graded cuts", "graded_figure.graded", ("graded",), published=False),
     FigureReport("confabulation", "Prevalence of confabulation", "grids.confabulation", ("confabulation_prevalence",)),
     FigureReport("claims", "What is claimed of a model", "expression_figures.claims", CLAIM_STAGES, published=False,

@@ -91,7 +91,8 @@ def six_pairs(items: pd.DataFrame) -> pd.DataFrame:
 
     No two are of one sub-scenario, and their categories differ if possible; fewer if there are fewer sub-scenarios.
     """
-    visual = items.loc[items["dataset"].isin(["occlusion", "chaotic"])]
+    is_whole = items.groupby("pair_id")["side"].transform("nunique") == 2  # a held-out set asks one side of each
+    visual = items.loc[items["dataset"].isin(["occlusion", "chaotic"]) & is_whole]
     pair_ids: list[str] = []
     for _, rows in visual.groupby("taxonomy", sort=True):
         pairs = rows.drop_duplicates("pair_id").sort_values(["category", "sub_scenario", "pair_id"])
@@ -149,10 +150,7 @@ def draw_pair(
     axes: Axes, pair: pd.DataFrame, control: SampledClip, void: SampledClip, times: np.ndarray, layout: Layout
 ) -> None:
     """Draw the result of `moments_of`: timed frames below the texts of `pair`."""
-    from matplotlib.patches import Rectangle
-
     moments, height, width, _ = control.frames.shape
-    middle: dict[str, Any] = {"ha": "center", "va": "center"}
     canvas = np.full((2 * height + GAP, moments * width + (moments - 1) * GAP, 3), 255, np.uint8)
     for row, (side, clip) in enumerate({"control": control, "void": void}.items()):
         top = row * (height + GAP)
@@ -162,18 +160,24 @@ def draw_pair(
             if k < clip.known:
                 canvas[top : top + height, left : left + width] = _fit(clip.frames[k], height, width)
                 continue
-            hatch = {"hatch": "////", "facecolor": "#f2f4f7", "edgecolor": "#c3c9d2", "linewidth": 0.5}
-            axes.add_patch(Rectangle((left, top), width - 1, height - 1, **hatch))
-            box = {"facecolor": "white", "edgecolor": "none", "pad": 2}
-            axes.text(
-                left + width / 2, top + height / 2, f"cut at {clip.end_s:.1f} s", bbox=box, size=layout.small, **middle
-            )
+            hatch(axes, (left, top, width - 1, height - 1), f"cut at {clip.end_s:.1f} s", layout.small)
     axes.imshow(canvas, interpolation="antialiased")
     for k, time in enumerate(times):
         place = (k * (width + GAP) + width / 2, 2 * height + 2 * GAP)
         axes.text(*place, f"{time:.1f} s", ha="center", va="top", size=layout.small, color="#667085")
     axes.set_axis_off()
     _draw_header(axes, pair, layout)
+
+
+def hatch(axes: Axes, box: tuple[float, float, float, float], words: str, size: float, **place: Any) -> None:
+    """Hatch a box (left, top, width, height) that has no frame, and write in its middle why."""
+    from matplotlib.patches import Rectangle
+
+    left, top, width, height = box
+    look: dict[str, Any] = {"hatch": "////", "facecolor": "#f2f4f7", "edgecolor": "#c3c9d2", "linewidth": 0.5}
+    axes.add_patch(Rectangle((left, top), width, height, **look, **place))
+    look = {"bbox": {"facecolor": "white", "edgecolor": "none", "pad": 2}, "ha": "center", "va": "center"}
+    axes.text(left + width / 2, top + height / 2, words, size=size, **look, **place)
 
 
 def _draw_header(axes: Axes, pair: pd.DataFrame, layout: Layout) -> None:

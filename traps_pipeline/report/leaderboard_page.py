@@ -13,7 +13,7 @@ import pandas as pd
 
 from traps_pipeline.base.terminal import TextTable
 from traps_pipeline.models.registry.judges import BY_RULES, ONE_JUDGE, is_judged_by_rules
-from traps_pipeline.protocol.datasets import ARMS, DATASETS
+from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.metric_words import COUNT_WORDS, METRIC_WORDS
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.report.tables.table_columns import (
@@ -29,7 +29,9 @@ from traps_pipeline.report.tables.table_columns import (
     cell_trace,
     interval,
     meanings,
+    two_events_trace,
 )
+from traps_pipeline.report.tables.two_way_table import COLUMNS as TWO_WAY_TABLE
 from traps_pipeline.report.terms import (
     BROKEN_MARK,
     BROKEN_TEXTS,
@@ -38,24 +40,21 @@ from traps_pipeline.report.terms import (
     MISSING_MARK,
     OVERRULED_ABOVE,
     OVERRULED_MARK,
-    ROBUST_FIGURES,
     TITLES,
+    TWO_WAY_MEANINGS,
 )
 from traps_pipeline.report.writing import (
     NONE,
-    NOT_RUN,
     Column,
     PrintedTable,
     SourceItems,
     fraction,
-    percent,
     table_markdown,
     table_text,
 )
 from traps_pipeline.scoring.analyses import null_single_deviations
 from traps_pipeline.scoring.metrics import joined_epochs
 from traps_pipeline.scoring.score_rows import LEADERBOARD
-from traps_pipeline.storage.tables import records
 
 BOUNDS = "If missing: worst, best"
 _COUNTS = [count for count in COUNT_WORDS.values() if count.heading]
@@ -69,9 +68,10 @@ OPTIONAL = {
     Column("bounds", BOUNDS, "range"): "n_missing",
 }
 _SUMMED = ("n_pairs", "n_missing", *(column.field for column in OPTIONAL if column.unit == "count"))
-Robust = Mapping[tuple[str, str], Mapping[str, Any]]  # ROBUST rows by model and regime
-ROBUST_COLUMNS = [
-    Column(field, heading, "range", group=not place) for place, (field, heading, *_) in enumerate(ROBUST_FIGURES)
+TWO_WAY_COLUMNS = [
+    replace(column, interval=False, group=column.field == "conjunction")
+    for column in TWO_WAY_TABLE
+    if column.heading in TWO_WAY_MEANINGS
 ]
 LEGEND = {
     **{metric.heading: metric.meaning for metric in METRIC_WORDS.values()},
@@ -89,40 +89,40 @@ LEGEND = {
     "Broken %": "share of items whose text is empty, cut off, unfinished, degenerate or unread",
     BOUNDS: "PECS of all items if every missing decision were the worst for the model (a control wrong and abstained "
     "on, a void not abstained on), and if every one were the best; computed per run, then averaged",
-    **{heading: meaning for _, heading, _, meaning in ROBUST_FIGURES},
+    **TWO_WAY_MEANINGS,
     "Epoch": "the evaluation campaign; figures of different epochs are not put in one ratio",
     "Overall": "equal-weight mean over the four datasets",
 }
 
 
-def leaderboard_text(board: pd.DataFrame, robust: pd.DataFrame | None = None, notes: Sequence[str] = ()) -> str:
-    """Return LEADERBOARD rows as text, a table per panel, with ROBUST and notes."""
-    return "\n".join(table.text() for table in leaderboard_tables(board, robust, notes))
+def leaderboard_text(board: pd.DataFrame, two_way: pd.DataFrame | None = None, notes: Sequence[str] = ()) -> str:
+    """Return LEADERBOARD rows as text, a table per panel, with TWO_WAY and notes."""
+    return "\n".join(table.text() for table in leaderboard_tables(board, two_way, notes))
 
 
 def leaderboard_tables(
-    board: pd.DataFrame, robust: pd.DataFrame | None = None, notes: Sequence[str] = ()
+    board: pd.DataFrame, two_way: pd.DataFrame | None = None, notes: Sequence[str] = ()
 ) -> list[TextTable]:
     """Return what `leaderboard_text` says, a table per panel."""
-    return [table_text(table) for table in leaderboards(board, robust, notes, brief=True)]
+    return [table_text(table) for table in leaderboards(board, two_way, notes, brief=True)]
 
 
-def leaderboard_markdown(board: pd.DataFrame, robust: pd.DataFrame | None = None, notes: Sequence[str] = ()) -> str:
-    """Return LEADERBOARD rows as Markdown, with ROBUST, notes and a legend."""
-    terms = [f"- **{term}**: {meaning}" for term, meaning in legend(board, robust).items()]
-    tables = leaderboards(board, robust, notes, brief=True)
+def leaderboard_markdown(board: pd.DataFrame, two_way: pd.DataFrame | None = None, notes: Sequence[str] = ()) -> str:
+    """Return LEADERBOARD rows as Markdown, with TWO_WAY, notes and a legend."""
+    terms = [f"- **{term}**: {meaning}" for term, meaning in legend(board, two_way).items()]
+    tables = leaderboards(board, two_way, notes, brief=True)
     return "\n".join([*map(table_markdown, tables), *terms]) + "\n"
 
 
 def leaderboards(
-    board: pd.DataFrame, robust: pd.DataFrame | None = None, notes: Sequence[str] = (), *, brief: bool = False
+    board: pd.DataFrame, two_way: pd.DataFrame | None = None, notes: Sequence[str] = (), *, brief: bool = False
 ) -> list[PrintedTable]:
     """Return each panel's tables of LEADERBOARD rows: ranking, then other datasets.
 
     The ranking is of `overall`, or the board's first dataset if no model has all four. An entry without a row comes
     last. notes: further notes of the first table. brief: only the first table of each panel, with fewer columns.
     """
-    tables = [table for suffix, part in _rows_by_panel(board) for table in _panel_tables(part, robust, brief, suffix)]
+    tables = [table for suffix, part in _rows_by_panel(board) for table in _panel_tables(part, two_way, brief, suffix)]
     return [replace(tables[0], notes=[*tables[0].notes, *notes]), *tables[1:]]
 
 
@@ -135,30 +135,25 @@ def _rows_by_panel(board: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
     return [(f"_{number}" if number else "", board.loc[entry_panels == name]) for number, name in enumerate(panels)]
 
 
-def _panel_tables(board: pd.DataFrame, robust: pd.DataFrame | None, brief: bool, suffix: str) -> list[PrintedTable]:
+def _panel_tables(board: pd.DataFrame, two_way: pd.DataFrame | None, brief: bool, suffix: str) -> list[PrintedTable]:
     datasets = set(board["dataset"])
     ranked_dataset = next((name for name in TITLES if name in datasets), "overall")
     other_datasets = [name for name in DATASETS if name in datasets and name != ranked_dataset]
+    beside = two_way if ranked_dataset == "overall" else None
     other_tables = [
-        _leaderboard(board.loc[board["dataset"] == name], name, [], {}, brief, suffix)
+        _leaderboard(board.loc[board["dataset"] == name], name, [], None, brief, suffix)
         for name in ([] if brief else other_datasets)
     ]
-    rows = []
-    if robust is not None and ranked_dataset == "overall":
-        rows = records(robust)
-    row_of = {(row["model"], row["regime"]): row for row in rows}
-    entries = {*zip(board["model"], board["regime"], strict=True)}
-    row_of = {key: row for key, row in row_of.items() if key in entries}
-    return [_leaderboard(board, ranked_dataset, other_datasets, row_of, brief, suffix), *other_tables]
+    return [_leaderboard(board, ranked_dataset, other_datasets, beside, brief, suffix), *other_tables]
 
 
-def legend(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> dict[str, str]:
+def legend(board: pd.DataFrame, two_way: pd.DataFrame | None = None) -> dict[str, str]:
     """Return the entries of LEGEND for the board's columns and marks."""
     optional_terms = {column.heading: field for column, field in OPTIONAL.items()}
     optional_terms |= {INCOMPLETE_MARK: "incomplete", BROKEN_MARK: "is_broken"}
     unused_terms = {term for term, field in optional_terms.items() if not (board.loc[:, field].astype(float) > 0).any()}
-    if robust is None or robust.empty:
-        unused_terms |= {heading for _, heading, *_ in ROBUST_FIGURES}
+    if two_way is None or not two_way["n_scenarios"].to_numpy().any():
+        unused_terms |= {*TWO_WAY_MEANINGS}
     return {term: meaning for term, meaning in LEGEND.items() if term not in unused_terms}
 
 
@@ -198,22 +193,25 @@ def _distinct(values: Iterable[Any], separator: str) -> list[str]:
 
 
 def _leaderboard(
-    board: pd.DataFrame, dataset: str, others: Sequence[str], beside: Robust, brief: bool, suffix: str
+    board: pd.DataFrame, dataset: str, others: Sequence[str], two_way: pd.DataFrame | None, brief: bool, suffix: str
 ) -> PrintedTable:
     rows = _entries(board, dataset, others)
     columns = [MODEL, REGIME, replace(PECS, bar=True), Column("ci", "95 % CI", "range"), *SHARES, *OTHER_FIGURES]
     for name in others:
         title = name.replace("_ill_posed", " ill-posed") if brief else TITLES[name]  # a comma would end it in a list
         columns.append(Column(name, f"PECS {title}", "fraction", mark=f"{name}_mark", group=name == others[0]))
-    if beside:
-        rows, columns = _with_robust(rows, beside), [*columns, *ROBUST_COLUMNS]
+    refusals = list[str]()
+    if two_way is not None and len(shown := rows[["model", "regime"]].merge(two_way.loc[two_way["n_scenarios"] > 0])):
+        rows = rows.merge(shown[["model", "regime", *(column.field for column in TWO_WAY_COLUMNS)]], "left")
+        columns += TWO_WAY_COLUMNS
+        refusals = [f"no figure of two events: {reason}" for reason in shown["refused"].dropna().unique()]
     columns += [replace(N, mark="n_mark", group=True), RUNS, replace(MISSING, mark="missing_mark")]
     columns += [column for column, field in OPTIONAL.items() if (rows.loc[:, field] > 0).any()]
     columns += [
         column for column in (EPOCH, Column("benchmark_version", "Version")) if rows.loc[:, column.field].nunique() > 1
     ]
     marks = [mark for name in ("n_mark", "missing_mark", "model_mark", "overruled_mark") for mark in rows[name]]
-    notes = [*meanings(marks), *_notes_on_arms(beside)]
+    notes = [*meanings(marks), *refusals]
     if brief:
         columns = [replace(c, spread="") for c in columns if c.field not in ("n_runs", "epoch", "benchmark_version")]
     else:
@@ -227,40 +225,14 @@ def _leaderboard(
     )  # fmt: skip
 
 
-def _with_robust(rows: pd.DataFrame, beside: Robust) -> pd.DataFrame:
-    """Return the rows with ROBUST_COLUMNS as printed."""
-    robust_rows = [beside.get((row["model"], row["regime"])) for row in rows.to_dict("records")]
-    columns = {}
-    for name, _, unit, _ in ROBUST_FIGURES:
-        as_printed = percent if unit == "percent" else fraction
-        columns[name] = [as_printed(row[name]) if row else NOT_RUN for row in robust_rows]
-    return rows.assign(**columns)
-
-
-def _notes_on_arms(beside: Robust) -> list[str]:
-    """Return notes on each entry's arms, and on why pairs and arms are not joined."""
-    entries: dict[tuple[str, ...], list[str]] = {}
-    for (model, regime), row in beside.items():
-        entries.setdefault(tuple(row["arms"]), []).append(f"{model} {regime}")
-    notes = [
-        f"{', '.join(names) if len(entries) > 1 else 'all'} over {len(arms)} of {len(ARMS)} arms: {', '.join(arms)}"
-        for arms, names in entries.items()
-    ]
-    refusals = dict.fromkeys(row["refused"] for row in beside.values() if row["refused"])
-    return [*notes, *(f"no conjunction and no robust figure: {reason}" for reason in refusals)]
-
-
 def _trace(row: Mapping[str, Any], field: str) -> SourceItems | None:
-    if row.get(field) == NOT_RUN:
-        return None
+    if any(field == column.field for column in TWO_WAY_COLUMNS):
+        return two_events_trace(row, field)
     return cell_trace({**row, "dataset": field} if field in DATASETS else row, field)
 
 
 def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.DataFrame:
-    """Return one row per (model, regime), best first.
-
-    Without a row of the dataset, counts are sums over all rows.
-    """
+    """Return one row per (model, regime), best first. Without a row of the dataset, counts are sums over all rows."""
     rows, entries = [], dict[tuple[str, str], dict[str, dict[str, Any]]]()
     for row in null_single_deviations(board).to_dict("records"):
         entries.setdefault((row["model"], row["regime"]), {})[row["dataset"]] = row

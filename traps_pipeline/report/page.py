@@ -25,7 +25,7 @@ def report_html(
     findings: Sequence[StudyFinding] = (),
     address: Address | None = None,
     explorer: str = "",
-    robust: pd.DataFrame | None = None,
+    two_way: pd.DataFrame | None = None,
     notes: Sequence[str] = (),
     terms: Mapping[str, str] | None = None,
 ) -> str:
@@ -34,7 +34,7 @@ def report_html(
     Cards with results are shown, tables in a collapsed appendix; for the others the reasons are listed. With `address`
     every number links to the items behind it. notes: those below the leaderboard; terms: words of the legend.
     """
-    boards = leaderboards(board, robust, notes)
+    boards = leaderboards(board, two_way, notes)
     ranked_tables = [table for table in boards if table.title == boards[0].title]  # one per panel
     other_cards = [
         Card(table.name, f"Leaderboard, {table.title.lower()}", environment().get_template("tables.html.j2").render(
@@ -66,7 +66,7 @@ def report_html(
             appendix=run[2],
             absent={reason: list(dict.fromkeys(titles)) for reason, titles in names_by_reason.items()},
             shown={"leaderboard", *(card.name for cards in run for card in cards)},
-            legend={**legend(board, robust), **(terms or {})},
+            legend={**legend(board, two_way), **(terms or {})},
             script=script,
             script_digest=b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii"),
         )

@@ -1,10 +1,8 @@
-"""Draw pictures of pairs: six pairs, a scenario's arms, an example, shortcuts."""
+"""Draw pictures of pairs: six pairs, two events, a scenario's arms, an example."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -13,10 +11,9 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report.arms_sheet import arms_sheets
 from traps_pipeline.report.contact_sheet import pairs_figure, six_pairs
-from traps_pipeline.report.figures.grids import shortcut_figure
 from traps_pipeline.report.worked_example import Example, example_figure, worked_example
 from traps_pipeline.report.writing import NotRun
-from traps_pipeline.storage.benchmark_tables import ARMS, ITEMS, VIDEOS
+from traps_pipeline.storage.benchmark_tables import ARMS, ITEMS
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.video.encode import DamagedClip
 
@@ -32,7 +29,7 @@ class Picture:
     """One or several figures of clips, by file name.
 
     make: raises NotRun and DamagedClip. inputs: returns what they show of the stages `reads`, as JSON; raises
-    DamagedClip. kind: "webp" if they show frames, else "svg".
+    DamagedClip.
     """
 
     name: str
@@ -40,7 +37,6 @@ class Picture:
     make: Callable[[], Mapping[str, Figure]]
     reads: tuple[str, ...]
     inputs: Callable[[], Any]
-    kind: str = "webp"
 
     def figures(self) -> Mapping[str, Figure]:
         """Return figures by file name. Raises NotRun, or TrapsError for a damaged clip."""
@@ -89,11 +85,8 @@ class PairPictures:
                     ("items", "responses", "votes", "verdicts"), lambda: inputs),
             Picture("six_pairs", "Six pairs: control above, void below", lambda: {"six_pairs": self._six(pair_items)},
                     ("items",), lambda: _as_json(pair_items)),
-            Picture("arms", "One scenario with its arms", self._arms, ("items", "arms"),
+            Picture("arms", "One scenario of two events, and one with its arms", self._arms, ("items", "arms"),
                     lambda: [_as_json(self.arms), _as_json(visual) if len(self.arms) else ""]),
-            Picture("shortcuts", "How well one cue alone separates control from void (0.5 is chance)",
-                    lambda: {"shortcuts": self._shortcuts()}, ("items", "videos"),
-                    lambda: repr(self.shortcuts.to_dict("split")), kind="svg"),
         ]  # fmt: skip
 
     def _example(self, example: Example | None) -> Figure:
@@ -103,38 +96,15 @@ class PairPictures:
 
     def _six(self, rows: pd.DataFrame) -> Figure:
         if not len(rows):
-            raise NotRun(NO_ITEMS)
+            raise NotRun("no pair has items of both sides")
         return pairs_figure(rows, self.workspace.bring(rows["clip"]))
 
     def _arms(self) -> Mapping[str, Figure]:
         clips = [*self.items["clip"], *self.arms["clip"].dropna()] if len(self.arms) else []
         sheets = arms_sheets(self.items, self.arms, self.workspace.bring(clips)) if clips else {}
         if not sheets:
-            raise NotRun("no arm was filmed in this study")
+            raise NotRun("no arm and no two events were filmed in this study")
         return sheets
-
-    @cached_property
-    def shortcuts(self) -> pd.DataFrame:
-        """The table of `benchmark.shortcuts`; unchanged results come from a cache."""
-        from traps_pipeline.benchmark.shortcuts import shortcuts
-
-        cache_path, store = self.workspace.reports / ".state" / "shortcuts.json", self.workspace.store
-        cache: dict[str, list[float]] = {}
-        with suppress(ValueError):  # a damaged file counts as none
-            cache = json.loads(store.here(cache_path).read_text(encoding="utf-8")) if store.has(cache_path) else {}
-        clips = self.workspace.bring(self.items["clip"]) if len(self.items) else self.workspace.root
-        table = shortcuts(self.items, self.workspace.tables.read_all(VIDEOS), clips, cache)
-        store.write({cache_path: json.dumps(cache).encode()})
-        return table
-
-    def _shortcuts(self) -> Figure:
-        from traps_pipeline.benchmark.shortcuts import FOLDS
-
-        if not len(self.items):
-            raise NotRun(NO_ITEMS)
-        if not len(self.shortcuts):
-            raise NotRun(f"no dataset has {FOLDS} scenarios")
-        return shortcut_figure(self.shortcuts)
 
 
 def _as_json(rows: pd.DataFrame) -> str:

@@ -10,7 +10,7 @@ from traps_pipeline.base.terminal import TextTable
 from traps_pipeline.storage.workspace import Workspace
 
 BOARD_FILE = ".state/leaderboard.json"  # in the folder `reports`, beside the report's versions
-NO_BOARD = "no leaderboard: no pairs were asked; the report has the tables of what was"
+NO_BOARD = "no leaderboard: neither pairs nor two events were asked; the report has the tables of what was"
 
 
 def board_bytes(tables: Sequence[TextTable]) -> bytes:
@@ -43,14 +43,16 @@ def _asked_earlier(workspace: Workspace) -> str:
 
 
 def board_tables(workspace: Workspace) -> list[TextTable]:
-    """Return the leaderboard from the tables, one per panel; none without pairs."""
+    """Return the leaderboard from the tables, one per panel, and two events by themselves; none without either."""
     from traps_pipeline.people.human_score_rows import HUMAN_ROW, PANEL_ERRORS
     from traps_pipeline.report.leaderboard_page import leaderboard_tables
     from traps_pipeline.report.tables.human_tables import people_notes
-    from traps_pipeline.scoring.score_rows import LEADERBOARD, ROBUST
+    from traps_pipeline.report.tables.two_way_table import two_way_table
+    from traps_pipeline.report.writing import table_text
+    from traps_pipeline.scoring.score_rows import LEADERBOARD, TWO_WAY
 
-    board = workspace.tables.read_all(LEADERBOARD)
+    board, events = (workspace.tables.read_all(table) for table in (LEADERBOARD, TWO_WAY))
     if board.empty:
-        return []
+        return [table_text(two_way_table(events))] if len(events) else []
     notes = people_notes(workspace.tables.read_all(HUMAN_ROW), workspace.tables.read_all(PANEL_ERRORS))
-    return leaderboard_tables(board, workspace.tables.read_all(ROBUST), notes)
+    return leaderboard_tables(board, events, notes)

@@ -11,7 +11,7 @@ import pandas as pd
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
-from traps_pipeline.benchmark.held_out import refuse_held_out
+from traps_pipeline.benchmark.held_out import begin_publication
 from traps_pipeline.report.cards import (
     EXPLORER,
     Address,
@@ -111,10 +111,10 @@ def report_files(
     )
     page = report_html(
         study.board, figures, pictures, tables, findings=study_findings(study), address=address,
-        explorer=EXPLORER if address else "", robust=study.robust, notes=remarks,
+        explorer=EXPLORER if address else "", two_way=study.two_way, notes=remarks,
         terms=INSIDE_TERMS if study.mechanism else None,
     )  # fmt: skip
-    markdown = leaderboard_markdown(study.board, study.robust, remarks)
+    markdown = leaderboard_markdown(study.board, study.two_way, remarks)
     return {PAGE: page.encode(), MARKDOWN: markdown.encode(), METRICS: metrics_lines(study.board).encode()}
 
 
@@ -128,7 +128,7 @@ def export(workspace: Workspace, target: Path, say: Callable[[str], None] = lamb
 
     Each file is written atomically, `index.html`, which lists them, last. say: receives a line per file.
     """
-    refuse_held_out(workspace.root, "its tables and pictures")
+    begin_publication(workspace.root, "its tables and pictures")
     sources, paths = Sources(workspace), list[str]()
     for path, content in _export_reports(sources, say):
         write_bytes(target / path, content)

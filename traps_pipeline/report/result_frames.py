@@ -37,7 +37,7 @@ from traps_pipeline.scoring.score_rows import (
     LEADERBOARD,
     LEAVE_ONE_OUT,
     REGIME_TESTS,
-    ROBUST,
+    TWO_WAY,
 )
 from traps_pipeline.storage.study import MechanismSettings
 from traps_pipeline.storage.tables import Table
@@ -106,7 +106,7 @@ class Results:
     agreement = table_frame(AGREEMENT)
     bias = table_frame(JUDGE_BIAS)
     leave_one_out = table_frame(LEAVE_ONE_OUT)
-    robust = table_frame(ROBUST)
+    two_way = table_frame(TWO_WAY)
     hypotheses = table_frame(HYPOTHESES)
     graded = table_frame(GRADED_CUTS)
     contrasts = table_frame(CONTRASTS)

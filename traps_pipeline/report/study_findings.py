@@ -36,16 +36,13 @@ def study_findings(results: Results) -> list[StudyFinding]:
     overall = results.overall
     rows = overall.loc[overall["pecs"].notna()] if len(overall) else overall
     if not len(rows):
-        return []
-    references = models_of(group="reference")
-    model_rows = rows.loc[[model not in references for model in rows["model"]]]
-    model_rows = model_rows if len(model_rows) else rows
-    figure_findings = (
-        [(report.name, _finding(report, results)) for report in FIGURE_REPORTS] if results.mechanism else []
-    )
+        return [*_two_events(results)]
+    model_rows = _models_first(rows)
+    reports = FIGURE_REPORTS if results.mechanism else ()
+    figure_findings = [(report.name, _finding(report, results)) for report in reports]
     return [
         *_best(model_rows), *_abstention(model_rows), *_accuracy(model_rows), *_gaps(results, model_rows),
-        *_separable(results, model_rows),
+        *_two_events(results), *_separable(results, model_rows),
         *_missing_answers(model_rows),
         *(StudyFinding(text, f"figure-{name}") for name, text in figure_findings if text),
     ]  # fmt: skip
@@ -59,6 +56,13 @@ def _finding(report: FigureReport, results: Results) -> str:
         raise
     except Exception:  # noqa: BLE001 - one figure must not cost the others
         return ""
+
+
+def _models_first(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows of models; those of reference strategies if there are no others."""
+    references = models_of(group="reference")
+    model_rows = rows.loc[[model not in references for model in rows["model"]]]
+    return model_rows if len(model_rows) else rows
 
 
 def _best(rows: pd.DataFrame) -> Iterator[StudyFinding]:
@@ -119,7 +123,7 @@ def _accuracy(rows: pd.DataFrame) -> Iterator[StudyFinding]:
 
 
 def _gaps(results: Results, rows: pd.DataFrame) -> Iterator[StudyFinding]:
-    """Yield visual against textual voids, and how much PECS may come from shortcuts."""
+    """Yield visual against textual voids."""
     rates = results.rates
     pooled_rates = (
         rates.loc[rates["taxonomy"].eq("pooled") & rates["model"].isin(rows["model"])] if len(rates) else rates
@@ -134,14 +138,20 @@ def _gaps(results: Results, rows: pd.DataFrame) -> Iterator[StudyFinding]:
             f"{' (means)' if len(pooled_rates) > 1 else ''}.",
             "figure-visual_textual",
         )
-    robust = results.robust
-    robust = robust.loc[robust["model"].isin(rows["model"])].dropna(subset=["conjunction"]) if len(robust) else robust
-    if len(robust):
-        row = robust.sort_values(["conjunction", "model"], ascending=[False, True]).to_dict("records")[0]
+
+
+def _two_events(results: Results) -> Iterator[StudyFinding]:
+    """Yield the most specific entry's figures of two events."""
+    rows = results.two_way
+    rows = _models_first(rows.dropna(subset=["specificity"])) if len(rows) else rows
+    if len(rows):
+        row = rows.sort_values(["specificity", "model"], ascending=[False, True]).to_dict("records")[0]
+        own, other = (_signed(row[name]) for name in ("own_effect", "other_effect"))
         yield StudyFinding(
-            f"Control, twin, void and crossed questions of one scene are all right in at most "
-            f"{percent(row['conjunction'])} % of the scenes ({row['model']} under {row['regime']}).",
-            "leaderboard",
+            f"Of two events in one scene, hiding the one that is asked about changes abstention by {own} points, and "
+            f"hiding the other one by {other} ({row['model']} under {row['regime']}, the most specific); all eight "
+            f"items are right in {percent(row['conjunction'])} % of the scenes.",
+            "figure-two_way",
         )
 
 
@@ -165,10 +175,9 @@ def _separable(results: Results, rows: pd.DataFrame) -> Iterator[StudyFinding]:
 def _missing_answers(rows: pd.DataFrame) -> Iterator[StudyFinding]:
     missing = int(np.nansum(rows["n_missing"].to_numpy(float)))
     if missing:
-        answers = 2 * int((rows["n_pairs"].to_numpy(int) * rows["n_runs"].to_numpy(int)).sum())
         worst_row = rows.sort_values(["n_missing", "model"], ascending=[False, True]).to_dict("records")[0]
         yield StudyFinding(
-            f"Without text or majority: {missing:,} of {count_noun(answers, 'answer')}; {worst_row['model']} under "
+            f"Without text or majority: {count_noun(missing, 'answer')}; {worst_row['model']} under "
             f"{worst_row['regime']} lacks most, {int(worst_row['n_missing'])}.",
             "leaderboard",
         )
@@ -182,5 +191,10 @@ def _span(shares: pd.Series) -> str:
 
 def _points(changes: pd.Series) -> str:
     """Return the smallest and the largest signed change in percentage points."""
-    low, high = (("+" if value > 0 else "") + percent(value) for value in (changes.min(), changes.max()))
+    low, high = map(_signed, (changes.min(), changes.max()))
     return low if low == high else f"{low} to {high}"
+
+
+def _signed(change: float) -> str:
+    """Return a change in percentage points, with its sign."""
+    return ("+" if change > 0 else "") + percent(change)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from traps_pipeline.protocol.datasets import ARMS, GRADED, VARIATIONS
+from traps_pipeline.protocol.datasets import ARMS, GRADED, TWO_EVENTS, VARIATIONS
 from traps_pipeline.protocol.metric_words import METRIC_WORDS, SHARES
 from traps_pipeline.scoring.score_rows import BROKEN_ABOVE, INCOMPLETE_BELOW
 
@@ -15,25 +15,15 @@ TITLES = {
 }
 # Neither arms nor variations enter a figure of the pairs.
 ARM_TITLES = {arm: f"Arm: {arm.replace('_', ' ')}" for arm in ARMS}
-ARM_TITLES[GRADED] = "Graded cuts"
+ARM_TITLES |= {TWO_EVENTS: "Two events", GRADED: "Graded cuts"}
 ARM_TITLES |= {name: f"Variation: {name.replace('_', ' ')}" for name in VARIATIONS}
-# Figures of a leaderboard with arms (docs/scoring.md, "Beyond PECS"): field, heading, unit, meaning.
-ROBUST_FIGURES = (
-    (
-        "conjunction", "Conjunction %", "percent",
-        "share of scenarios with control, twin, void and both crossed questions right; 0 for every rule that abstains "
-        "for the clip alone or for the question alone",
-    ),
-    (
-        "robust", "Robust", "fraction",
-        "PECS over kinds: the well-posed pairs and each arm that takes a shortcut away. Entries over different arms "
-        "are not compared",
-    ),
-    (
-        "inference_acc", "Inferred %", "percent",
-        "share of the items of late_occluder and predictable_cut answered correctly: their outcome is not shown",
-    ),
-)  # fmt: skip
+# Headings and meanings of the figures of two events on the leaderboard (docs/scoring.md, "Two events").
+TWO_WAY_MEANINGS = {
+    "Conjunction %": "share of scenarios of two events with all eight items right; 0 for every rule of clip or "
+    "question alone, for always and for never abstaining",
+    "Specificity": "by how much more abstention rises where the asked event is hidden than where the other one is, −1 "
+    "to 1; 0 for every rule of clip or question alone, 1 for an oracle",
+}
 # The side whose items a share counts.
 SIDE_OF = {name: METRIC_WORDS[name].side for name in SHARES}
 ENOUGH = f"{100 * INCOMPLETE_BELOW:g} %"

@@ -94,8 +94,8 @@ class Column:
 
     Shares are fractions in the frame; `percent` prints them times 100. `spread` names the field of a standard
     deviation, which is printed after ±; `mark` names a field of text, such as a dagger, which is printed after the
-    number. The last three are for pages: the style of the cells (a row's head, an emphasised number, a tag), whether a
-    fraction is also drawn as a bar, and whether a group of columns begins here.
+    number; `interval`: whether its `_ci_low` and `_ci_high` follow in brackets. For pages: the style of the cells (a
+    row's head, an emphasised number, a tag), whether a fraction is also drawn as a bar, and a group begins here.
     """
 
     field: str
@@ -107,6 +107,7 @@ class Column:
     look: Literal["", "head", "strong", "tag"] = ""
     bar: bool = False
     group: bool = False
+    interval: bool = False
 
     @property
     def is_number(self) -> bool:
@@ -125,6 +126,9 @@ class Column:
         if self.unit in ("text", "range"):
             return "" if value is None or value is pd.NA or value != value else plain(value), "", ""
         figure = self._number(value)
+        low, high = (self._number(row.get(f"{self.field}_ci_{end}")) for end in ("low", "high"))
+        if self.interval and NONE not in (figure, low):
+            figure += f" [{low}, {high}]"
         spread = self._number(row.get(self.spread)) if self.spread and figure != NONE else NONE
         mark = row.get(self.mark) if self.mark else ""
         return figure, "" if spread == NONE else spread, plain(mark) if isinstance(mark, str) and mark else ""
@@ -303,7 +307,8 @@ def table_html(table: PrintedTable, address: Callable[[SourceItems], str] | None
 
 def _classes(column: Column) -> str:
     """Return the style classes of a column's cells."""
-    names = ("" if column.is_number else "word", "range" if column.unit == "range" else "", column.look)
+    is_range = column.interval or column.unit == "range"
+    names = ("" if column.is_number else "word", "range" if is_range else "", column.look)
     return " ".join(filter(None, (*names, "first" if column.group else "")))
 
 

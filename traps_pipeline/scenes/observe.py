@@ -10,7 +10,8 @@ from functools import cache
 from pathlib import Path
 
 from traps_pipeline.scenes.family_registry import families
-from traps_pipeline.scenes.parts.wording import match_slots
+from traps_pipeline.scenes.parts.lane_vision import scenes_of_lane
+from traps_pipeline.scenes.parts.wording import lane_asked, match_slots
 from traps_pipeline.scenes.physics.kit import Family
 from traps_pipeline.video.encode import decode_sampled
 from traps_pipeline.video.policies import SAMPLED, FramePolicy
@@ -24,7 +25,10 @@ def family_asking(question: str) -> Family | None:
 
 def observe(clip: Path, question: str, policy: FramePolicy = SAMPLED) -> str | None:
     """Return the observer's answer from frames (at 5 per second); None if unknown."""
+    strip, question = lane_asked(question) or (None, question)
     family = family_asking(question)
     if family is None or family.observe is None:
         return None
-    return family.observe(decode_sampled(clip, policy), question)
+    frames = decode_sampled(clip, policy)
+    scenes = [frames] if strip is None else scenes_of_lane(frames, strip)
+    return next((answer for scene in scenes if (answer := family.observe(scene, question)) is not None), None)

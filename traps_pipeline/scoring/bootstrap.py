@@ -214,17 +214,17 @@ def shares_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:
         return np.stack([yes, yes + unseen_weights]) / (n_decided + unseen_weights)
 
 
-def ends_of_mean(values: pd.Series, resampling: Resampling, named: str) -> np.ndarray:
-    """Return ends (2, 1 + resamples) of the mean of scenarios' values in [0, 1].
+def ends_of_shares(counts: pd.DataFrame, resampling: Resampling, named: str) -> np.ndarray:
+    """Return ends (2, decisions, 1 + resamples) of shares.
 
-    values: one per scenario of the index. named: as in `run_sums`.
+    counts: by scenario, how often each decision was yes and was made, in turn. named: as in `run_sums`.
     """
-    sums = np.zeros((1, 2, 1 + resampling.resamples))
-    for scenarios, weights in resampling.scenarios.values():
-        scenario_values = values.reindex(scenarios)
-        counts = np.stack([scenario_values.fillna(0.0), scenario_values.notna()], axis=1).astype(float)
-        sums += resampled_sums(weights, counts[:, None])
-    return shares_of(with_unseen(sums, np.array([[len(values)]]), resampling.unseen(named, 1)))[:, 0, 0]
+    decided = counts.iloc[:, 1::2].gt(0).sum().to_numpy()
+    parts = [
+        resampled_sums(weights, counts.reindex(scenarios, fill_value=0).to_numpy(float)[:, None])[0]
+        for scenarios, weights in resampling.scenarios.values()
+    ]
+    return shares_of(with_unseen(np.sum(parts, axis=0), decided, resampling.unseen(named, len(decided))))
 
 
 def figures_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:

@@ -19,7 +19,7 @@ import pandas as pd
 
 from traps_pipeline.models.reading.judged_answers import is_correct, read_object, to_label
 from traps_pipeline.protocol.regimes import ANSWER_FROM, BY_NAME, WRONG_COSTS, fields_of
-from traps_pipeline.scoring.bootstrap import RESAMPLES, SEED, Resampling, draw_scenarios, ends_of_mean, with_interval
+from traps_pipeline.scoring.bootstrap import RESAMPLES, SEED, Resampling, draw_scenarios, ends_of_shares, with_interval
 from traps_pipeline.scoring.metrics import joined_epochs, joined_versions
 from traps_pipeline.scoring.score_rows import GRADED_CUTS
 
@@ -239,7 +239,8 @@ def _row(items: pd.DataFrame, named: str, resampling: Resampling) -> dict[str, A
         "benchmark_version": joined_versions(items["benchmark_version"]),
     }
     for name, (low, high) in WITH_INTERVAL.items():
-        ends = ends_of_mean((scenario_means[name].dropna() - low) / (high - low), resampling, f"{named}|{name}")
+        scaled = (scenario_means[name].dropna() - low) / (high - low)
+        ends = ends_of_shares(pd.DataFrame({"yes": scaled, "of": 1.0}), resampling, f"{named}|{name}")[:, 0]
         row |= with_interval(name, low + (high - low) * ends, (low, high))
     return row
 

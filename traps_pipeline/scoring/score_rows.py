@@ -41,7 +41,7 @@ class MetricsRow(shared.CellRow):
 
     scope: Annotated[str, "all, category:.., sub_scenario:.. or label:../.. (the control's answer in a sub-scenario)"]
     n_pairs: Annotated[int, "pairs in scope"]
-    n_missing: Annotated[int, "items (of 2 n_pairs; in an arm of one side of n_pairs) without an answer or a majority"]
+    n_missing: Annotated[int, "asked items without an answer or a majority"]
     counts: Annotated[int, "", EACH_COUNT]
     decisions: Annotated[int | None, "", EACH_COUNT_OF_DECISIONS]
     n_answered: Annotated[int, "items with an answer"]
@@ -139,7 +139,7 @@ class LeaderboardRow(shared.EntryRow):
     n_missing: Annotated[int, "items without an answer or a majority, over runs"]
     counts: Annotated[int, "over runs", EACH_COUNT]
     decisions: Annotated[int | None, "over runs", EACH_COUNT_OF_DECISIONS]
-    answered: Annotated[float, "share of items (2 a pair and run) with an answer"]
+    answered: Annotated[float, "share of asked items with an answer"]
     incomplete: Annotated[bool, "whether answered is below 0.99; for overall, in any of its datasets"]
     broken: Annotated[float, "share of items whose text is empty, truncated, unfinished, degenerate or unread"]
     is_broken: Annotated[bool, "whether broken is above 0.01; for overall, in any of its datasets"]
@@ -167,33 +167,31 @@ LEADERBOARD = Table("leaderboard", LeaderboardRow, partition_by=(), key=("model"
 
 @dataclass(frozen=True, kw_only=True)
 @with_neighbours
-class RobustRow(shared.EntryRow):
-    """A model under a regime, on well-posed pairs and arms (clip and question together)."""
+class TwoWayRow(shared.EntryRow):
+    """A model under a regime on two events: is it the asked or the other event whose hiding makes it abstain?
 
-    arms: Annotated[list[str], "arms (of datasets.ARMS) in the figures; entries with other arms are not compared"]
-    n_runs: Annotated[int, "runs averaged: those that have all four datasets and these arms"]
-    n_items: Annotated[int, "items per run, of occlusion, chaotic and the arms"]
+    Figures are means over runs. Beside them stands what must be inferred (the arms late_occluder and predictable_cut).
+    """
+
+    n_runs: Annotated[int, "runs averaged"]
+    n_scenarios: Annotated[int, "scenarios of two events"]
+    n_items: Annotated[int, "items per run"]
     n_missing: Annotated[int, "items without an answer or a majority, over runs"]
-    conjunction: Annotated[
-        float | None,
-        "share of scenarios with control, twin, void and both crossed questions right, mean over runs; null without "
-        "the arms twin_control and crossed",
-        CI,
-    ]
-    n_conjunction: Annotated[int, "scenarios in which that is decided, in the run that has most"]
-    robust: Annotated[
-        float | None,
-        "mean over runs of Acc x max(0, AbsRec - FalseAbs), each a mean over kinds; null without a robust arm",
-        CI,
-    ]
-    inference_acc: Annotated[
-        float | None, "share of the items of late_occluder and predictable_cut answered correctly, mean over runs"
-    ]
-    inference_abstains: Annotated[float | None, "share of these items abstained on, mean over runs"]
-    refused: Annotated[str | None, "why no figure joins pairs and arms; then conjunction and robust are null"]
+    conjunction: Annotated[float | None, "share of scenarios with all eight items right, of those with eight", CI]
+    own_effect: Annotated[float | None, "rise of abstention from neither event hidden to the asked one alone", CI]
+    other_effect: Annotated[float | None, "its rise from neither hidden to the other one alone", CI]
+    specificity: Annotated[float | None, "own_effect - other_effect", CI]
+    abstains_neither: Annotated[float | None, "share of questions abstained on, where neither event is hidden"]
+    abstains_other: Annotated[float | None, "the same where the other event alone is hidden"]
+    abstains_asked: Annotated[float | None, "the same where the asked event alone is hidden"]
+    abstains_both: Annotated[float | None, "the same where both are hidden"]
+    acc: Annotated[float | None, "share of the questions answered correctly that the clip answers"]
+    inference_acc: Annotated[float | None, "share of the items of late_occluder and predictable_cut answered correctly"]
+    inference_abstains: Annotated[float | None, "share of these items abstained on"]
+    refused: Annotated[str | None, "why no figure joins the items; then all figures are null"]
 
 
-ROBUST = Table("robust", RobustRow, partition_by=(), key=("model", "regime"))
+TWO_WAY = Table("two_way", TwoWayRow, partition_by=(), key=("model", "regime"))
 
 
 @dataclass(frozen=True, kw_only=True)

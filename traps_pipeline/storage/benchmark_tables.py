@@ -89,6 +89,7 @@ class ArmRow:
     scenario_id: shared.ScenarioId
     category: shared.Category
     arm: Annotated[str, "name of the arm or variation, which is its dataset"]
+    item: Annotated[str, "last part of the item's id: the side, of two events the asked lane and the clip"]
     side: Annotated[str, "control: must be answered; void: must be abstained on"]
     question: shared.Question
     labels: Labels
@@ -103,7 +104,7 @@ class ArmRow:
     benchmark_version: shared.BenchmarkVersion
 
 
-ARMS = Table("arms", ArmRow, partition_by=("category",), key=("scenario_id", "arm", "side"))
+ARMS = Table("arms", ArmRow, partition_by=("category",), key=("scenario_id", "arm", "item"))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,8 +14,10 @@ from dataclasses import dataclass
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.ledger.money import CapExhausted, Money
 from traps_pipeline.models.money.account_budget import AccountBudget
+from traps_pipeline.models.money.media_tokens import frame_bound
 from traps_pipeline.models.registry.entries import NETWORK, Entry, ModelEntry
 from traps_pipeline.models.request import Request
+from traps_pipeline.protocol.datasets import dataset_of
 from traps_pipeline.storage.study import Study
 
 OVERHEAD_TOKENS = 200  # roles, separators, JSON around the text
@@ -38,7 +40,8 @@ class Tokens:
 def most_tokens(entry: Entry, request: Request) -> Tokens:
     """Return an upper bound of a call's tokens."""
     frames = request.sent.n_frames if request.sent else 0
-    tokens_per_frame = entry.tokens_per_frame if isinstance(entry, ModelEntry) else 0
+    dataset = dataset_of(str(request.about.get("item_id", "")))
+    tokens_per_frame = frame_bound(entry, dataset) if isinstance(entry, ModelEntry) else 0
     schema = json.dumps(request.params.get("response_format", ""))
     text = len((request.system + request.user + schema).encode()) // BYTES_A_TOKEN
     return Tokens(frames * tokens_per_frame + text + OVERHEAD_TOKENS, entry.max_tokens)

@@ -5,12 +5,13 @@ Means over a participant's ledger rows come first; without any, the registry's e
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 from traps_pipeline.ledger.rows import AVERAGED_COLUMNS, Totals
 from traps_pipeline.models.money.budget import BYTES_A_TOKEN, OVERHEAD_TOKENS
-from traps_pipeline.models.money.media_tokens import expected_clip_tokens
+from traps_pipeline.models.money.media_tokens import clip_tokens
 from traps_pipeline.models.registry.entries import Entry, ModelEntry, load_accounts
 
 TYPICAL_TEXT_BYTES = 1500  # system prompt, question and, for a judge, the answer
@@ -56,9 +57,12 @@ def experience(totals: Iterable[Totals]) -> Experience:
     return Experience(*(sum_of_totals.mean(column) for column in AVERAGED_COLUMNS))
 
 
-def forecast(entry: Entry, calls: int, seen: Experience) -> Forecast:
-    """Forecast a number of new calls; the high end is what a budget reserves."""
-    frames, most_frames = _clip_tokens(entry)
+def forecast(entry: Entry, calls: int, seen: Experience, items: Mapping[str, int] = MappingProxyType({})) -> Forecast:
+    """Forecast a number of new calls; the high end is what a budget reserves.
+
+    items: number of items by dataset, whose clips may differ in size.
+    """
+    frames, most_frames = _clip_tokens(entry, items)
     prompt = seen.prompt_tokens or frames + TYPICAL_TEXT_BYTES / TYPICAL_BYTES_A_TOKEN
     completion = seen.completion_tokens or entry.expected_completion_tokens
     most_prompt = max(prompt, most_frames + TYPICAL_TEXT_BYTES / BYTES_A_TOKEN + OVERHEAD_TOKENS)
@@ -94,9 +98,11 @@ def minutes_of(forecasts: Iterable[Forecast]) -> float:
     return max([row.minutes for row in rows] + [*minutes_by_account.values()], default=0.0)
 
 
-def _clip_tokens(entry: Entry) -> tuple[float, float]:
-    """Return the prompt tokens of a clip: expected, and maximum."""
-    if not isinstance(entry, ModelEntry) or entry.media is None:
+def _clip_tokens(entry: Entry, items: Mapping[str, int]) -> tuple[float, float]:
+    """Return the prompt tokens of a clip, means over items: expected, and maximum."""
+    if not isinstance(entry, ModelEntry):
         return 0.0, 0.0
-    max_tokens = entry.tokens_per_frame * (entry.media.uniform or entry.media.most)
-    return min(expected_clip_tokens(entry), max_tokens), max_tokens
+    weights = items if sum(items.values()) else {"": 1}
+    sums = [(clip_tokens(entry, dataset), n) for dataset, n in weights.items()]
+    expected, most = (sum(tokens[k] * n for tokens, n in sums) / sum(weights.values()) for k in range(2))
+    return min(expected, most), most

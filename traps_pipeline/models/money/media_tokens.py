@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from math import ceil
 
+from traps_pipeline.models.framing import clip_size, media_for_dataset
 from traps_pipeline.models.registry.entries import ModelEntry
 from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH
 from traps_pipeline.storage.media import Profile
@@ -70,18 +71,34 @@ def qwen3_vl_frame(size: Size, profile: Profile) -> float:
     return (cells + STAMP) / 2 if profile == "video" else cells + 2
 
 
-def expected_clip_tokens(entry: ModelEntry) -> float:
-    """Return a clip's prompt tokens; for unknown models by `tokens_per_frame`."""
-    media = entry.media
-    if media is None:
-        return 0.0
+def clip_tokens(entry: ModelEntry, dataset: str = "") -> tuple[float, float]:
+    """Return the prompt tokens of a dataset's clip: expected (of an unknown model the maximum), and maximum."""
+    if entry.media is None:
+        return 0.0, 0.0
+    media = media_for_dataset(entry.media, dataset)
+    frames, bound = media.uniform or media.most, frame_bound(entry, dataset)
+    count = _frame_tokens(entry, media.size or clip_size(dataset), media.profile)
+    return frames * (bound if count is None else count), float(frames * bound)
+
+
+def frame_bound(entry: ModelEntry, dataset: str) -> int:
+    """Return the maximum tokens of a frame: `tokens_per_frame`, of a wide clip as many more as it may count for."""
+    size = clip_size(dataset)
+    if entry.media is None or entry.media.size is not None or size == (WIDTH, HEIGHT):
+        return entry.tokens_per_frame
+    counts = [_frame_tokens(entry, each, entry.media.profile) for each in (size, (WIDTH, HEIGHT))]
+    by_count = counts[0] / counts[1] if counts[0] and counts[1] else 1.0
+    return ceil(entry.tokens_per_frame * max(by_count, size[0] / WIDTH))
+
+
+def _frame_tokens(entry: ModelEntry, size: Size, profile: Profile) -> float | None:
+    """Return a frame's prompt tokens; None for unknown models."""
     route, _, model_name = str(entry.provider_id).partition("/")
-    model, size = model_name.removeprefix("responses/"), media.size or (WIDTH, HEIGHT)
+    model = model_name.removeprefix("responses/")
     counts: dict[str, Callable[[], float | None]] = {
         "openai": lambda: openai_frame(model, size),
-        "gemini": lambda: gemini_frame(model, size, media.profile),
-        "vertex_ai": lambda: gemini_frame(model, size, media.profile),
+        "gemini": lambda: gemini_frame(model, size, profile),
+        "vertex_ai": lambda: gemini_frame(model, size, profile),
         "anthropic": lambda: anthropic_frame(size),
     }
-    count = qwen3_vl_frame(size, media.profile) if "qwen3-vl" in model.lower() else counts.get(route, lambda: None)()
-    return (media.uniform or media.most) * (entry.tokens_per_frame if count is None else count)
+    return qwen3_vl_frame(size, profile) if "qwen3-vl" in model.lower() else counts.get(route, lambda: None)()

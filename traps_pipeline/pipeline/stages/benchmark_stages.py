@@ -183,9 +183,9 @@ def _lost_arms(workspace: Workspace, category: str) -> list[str]:
 @_stage(
     ARMS,
     group="arms",
-    parents=[scene_specs, videos],
+    parents=[scene_specs, videos, released_specs, corrections],  # records of two events are in no table before
     scheme=CATEGORY,
-    code="4",
+    code="5",
     kinds=["parquet", "mp4"],
     takes=RENDERS,
     shared=ConcurrentBuild(_film, _seconds_of_filming),

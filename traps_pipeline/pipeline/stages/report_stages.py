@@ -18,7 +18,7 @@ GROUP = "report"
 # Declared before this group, which reads their tables, as the package's file does for the mechanism's.
 GROUPS_READ = (judging_stages, people_stages, scoring_stages)
 NAMES = 12  # names of pieces listed in an event
-SCORES = ("leaderboard", "robust", "human_row", "panel_errors")  # on the page and in the explorer
+SCORES = ("leaderboard", "two_way", "human_row", "panel_errors")  # on the page and in the explorer
 ANSWERS = ("items", "videos", "responses", "votes", "verdicts")
 _REPORTED = [name for report in (*TABLE_REPORTS, *FIGURE_REPORTS) for name in report.reads]
 _stage = partial(stage, group=GROUP, kinds=["html"])

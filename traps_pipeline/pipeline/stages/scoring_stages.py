@@ -15,7 +15,7 @@ from traps_pipeline.pipeline.stage import SHARED_IN_RUN, is_declared, of, stage
 from traps_pipeline.pipeline.stages.benchmark_stages import arms, items
 from traps_pipeline.pipeline.stages.evaluation_stages import judges, responses, verdicts, votes
 from traps_pipeline.pipeline.wanted import StudyPartitions
-from traps_pipeline.protocol.datasets import ARMS, DATASETS, GRADED
+from traps_pipeline.protocol.datasets import DATASETS, GRADED, INFERENCE_ARMS, TWO_EVENTS
 from traps_pipeline.scoring.score_rows import (
     CONTRASTS,
     GRADED_CUTS,
@@ -23,7 +23,7 @@ from traps_pipeline.scoring.score_rows import (
     LEADERBOARD,
     METRICS,
     REGIME_TESTS,
-    ROBUST,
+    TWO_WAY,
 )
 from traps_pipeline.storage.benchmark_tables import ITEMS, current_rows
 from traps_pipeline.storage.parquet import StageOutput
@@ -70,7 +70,7 @@ def metrics(workspace: Workspace, dataset: str) -> StageOutput:
     from traps_pipeline.scoring.metrics import cell_metrics
 
     judged = current_rows(workspace, VERDICTS, dataset=dataset)
-    if judged.empty:
+    if judged.empty and len(workspace.tables.read_all(ITEMS, ["item_id"], dataset=dataset)):
         raise TrapsError(f"metrics {dataset}: no verdicts yet; materialize verdicts for a cell of this dataset first")
     return StageOutput(cell_metrics(judged))
 
@@ -146,28 +146,24 @@ def leaderboard(workspace: Workspace, _: None) -> StageOutput:
 
 
 @_stage(
-    ROBUST,
-    parents=_SCORED,
+    TWO_WAY,
+    parents=[of(verdicts, need="some"), judges],
     checks=[
         Check(
-            "robust_rows_hold",
-            "Figures lie in [0, 1] and in their intervals.",
-            _zero_check("robust.wrong_rows", "rows"),
+            "two_way_rows_hold",
+            "Shares lie in [0, 1], effects in [-1, 1], and each figure in its interval.",
+            _zero_check("two_way.wrong_rows", "rows"),
         )
     ],
-    wants=has_pairs,
 )
-def robust(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return conjunction, robust PECS and inference by model and regime with an arm.
+def two_way(workspace: Workspace, _: None) -> "pd.DataFrame":
+    """Return whether abstention follows the asked event or the other one, by model and regime.
 
-    Only those with all four datasets have a row; the table is empty if no arm was run.
+    The table is empty if no two events, and nothing that must be inferred, were asked.
     """
-    from traps_pipeline.scoring.robust import robust as without_shortcuts
+    from traps_pipeline.scoring.two_way import two_way as by_event
 
-    judged = current_rows(workspace, VERDICTS, dataset=(*DATASETS, *ARMS))
-    if judged.empty:
-        raise TrapsError("robust: no verdicts yet; materialize verdicts for a cell first")
-    return without_shortcuts(judged)
+    return by_event(current_rows(workspace, VERDICTS, dataset=(TWO_EVENTS, *INFERENCE_ARMS)))
 
 
 @_stage(

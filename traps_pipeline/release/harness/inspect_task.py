@@ -59,7 +59,7 @@ def _text(item: dict[str, Any]) -> Any:
 
 @metric
 def traps_figures() -> Any:
-    """Return the metric: PECS and its factors, overall and by dataset."""
+    """Return the metric: PECS and its factors, overall and by dataset, and the figures of two events."""
 
     def compute(scores: list[Any]) -> dict[str, float]:
         results = figures(PanelDecision.of(score.score.metadata) for score in scores)

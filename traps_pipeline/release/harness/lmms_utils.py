@@ -12,7 +12,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # lmms-eval loads this file alone, from any folder
 
 from traps_pipeline.release.harness.harness_items import media_of, prompt
-from traps_pipeline.release.harness.scoring import PanelDecision, figures, judge
+from traps_pipeline.release.harness.scoring import RUN_FIGURES, TWO_WAY_FIGURES, PanelDecision, figures, judge
 
 
 def doc_to_visual(doc: dict[str, Any]) -> list[Any]:
@@ -56,13 +56,14 @@ def _figure(rows: list[dict[str, Any]], *, name: str) -> float | None:
     return figures(PanelDecision.of(row) for row in rows).get(name)
 
 
-NAMES = ("pecs", "acc", "abs_rec", "false_abs", "j", "missing", "unread")
+NAMES = (*RUN_FIGURES, *TWO_WAY_FIGURES, "missing", "unread")
 _BY_REGIME = {"text": _text, "messages": _messages, "results": _results}  # a task of a regime names `REGIME_text`
-pecs, acc, abs_rec, false_abs, j, missing, unread = (partial(_figure, name=name) for name in NAMES)
 
 
 def __getattr__(name: str) -> Callable[..., Any]:
-    """Return a regime's function by its name in a task's YAML (`guided_results`)."""
+    """Return a function by its name in a task's YAML: a figure's, or a regime's (`guided_results`)."""
+    if name in NAMES:
+        return partial(_figure, name=name)
     regime, _, kind = name.rpartition("_")
     if not regime or kind not in _BY_REGIME:
         raise AttributeError(name)

@@ -11,9 +11,12 @@ from traps_pipeline.judging.rules import read_statement
 from traps_pipeline.models.reading.interpret import read_answer
 from traps_pipeline.models.reading.judged_answers import UNREAD, is_correct
 from traps_pipeline.models.request import JUDGED
+from traps_pipeline.protocol.datasets import TWO_EVENTS
+from traps_pipeline.protocol.two_events import lane_item, lane_items
 
 DATASETS = ("chaotic", "chaotic_ill_posed", "occlusion", "occlusion_ill_posed")  # means are summed in this order
 RUN_FIGURES = ("pecs", "acc", "abs_rec", "false_abs", "j")
+TWO_WAY_FIGURES = ("conjunction", "own_effect", "other_effect", "specificity")
 
 
 @dataclass(frozen=True)
@@ -68,8 +71,8 @@ def figures(judged: Iterable[PanelDecision]) -> dict[str, float | None]:
     """Return Acc, AbsRec, FalseAbs, J and PECS of one run.
 
     Keys: `DATASET_FIGURE` for each dataset, and FIGURE overall, the equal-weight mean over the four datasets, None
-    unless all four are present; `missing`, the number of undecided items, and `unread`, those among them that the rules
-    could not read.
+    unless all four are present; TWO_WAY_FIGURES if two events were asked; `missing`, the number of undecided items, and
+    `unread`, those among them that the rules could not read.
     """
     rows = list(judged)
     results: dict[str, float | None] = {}
@@ -81,11 +84,31 @@ def figures(judged: Iterable[PanelDecision]) -> dict[str, float | None]:
         values = [dataset_figures[figure] for dataset_figures in figures_of.values()]
         values_present = [value for value in values if value is not None]
         results[figure] = sum(values_present) / len(DATASETS) if len(values_present) == len(DATASETS) else None
+    results |= _two_way_figures([row for row in rows if row.dataset == TWO_EVENTS])
     undecided_rows = [row for row in rows if row.abstained is None or (row.side == "control" and row.correct is None)]
     return results | {
         "missing": float(len(undecided_rows)),
         "unread": float(sum(row.outcome == UNREAD for row in rows)),
     }
+
+
+def _two_way_figures(rows: list[PanelDecision]) -> dict[str, float | None]:
+    """Return TWO_WAY_FIGURES (`scoring.two_way`); none without rows."""
+    if not rows:
+        return {}
+    cells: dict[tuple[bool, bool], list[bool | None]] = {}  # by whether the asked and the other event is hidden
+    scenarios: dict[str, list[bool | None]] = {}
+    for row in rows:
+        item = lane_item(row.item_id)
+        cells.setdefault((item.asked_hidden, item.other_hidden), []).append(row.abstained)
+        answered = None if row.abstained is None or row.correct is None else row.correct and not row.abstained
+        scenarios.setdefault(item.scenario_id, []).append(row.abstained if row.side == "void" else answered)
+    whole = [rights for rights in scenarios.values() if len(rights) == len(lane_items(""))]
+    conjunctions = [False if False in rights else None if None in rights else True for rights in whole]
+    neither, other, asked = (_share(cells.get(cell, [])) for cell in ((False, False), (False, True), (True, False)))
+    pairs = ((asked, neither), (other, neither), (asked, other))
+    effects = [None if high is None or low is None else high - low for high, low in pairs]
+    return dict(zip(TWO_WAY_FIGURES, (_share(conjunctions), *effects), strict=True))
 
 
 def _dataset_figures(rows: list[PanelDecision]) -> dict[str, float | None]:

@@ -16,20 +16,21 @@ from traps_pipeline.base.files import write_bytes, write_text
 from traps_pipeline.base.yamlfile import read_lines
 from traps_pipeline.models.registry.entries import PROTOCOL
 from traps_pipeline.models.registry.judges import RULES_PANEL, panel_id
-from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.protocol.datasets import DATASETS, TWO_EVENTS
 from traps_pipeline.protocol.metric_words import METRIC_WORDS
 from traps_pipeline.protocol.regimes import PAPER_REGIMES
 from traps_pipeline.release.checksums import altered_files
 from traps_pipeline.release.content import CLIPS, SYSTEM
 from traps_pipeline.release.folder import MANIFEST
 from traps_pipeline.release.harness.harness_items import ABOUT, ITEMS, MEDIA
+from traps_pipeline.release.harness.scoring import TWO_WAY_FIGURES
 from traps_pipeline.storage.media import MediaSpec, MediaStore, payload
 
 PACKAGE, LMMS = "traps_harness", "lmms"
 _CODE = Path(__file__).parents[2]
 # Modules that are copied under their own names. They import each other and the standard library.
 _COPIED = (
-    *("base/digests.py", "base/redaction.py", "protocol/regimes.py"),
+    *("base/digests.py", "base/redaction.py", "protocol/regimes.py", "protocol/datasets.py", "protocol/two_events.py"),
     *("models/request.py", "models/reading/endings.py", "models/reading/thinking.py", "models/reading/interpret.py"),
     *("models/reading/judged_answers.py", "judging/rules.py", "release/harness/scoring.py"),
     *("release/harness/harness_items.py", "release/harness/inspect_task.py"),
@@ -52,7 +53,7 @@ def media_settings(media: Literal["images", "video"], uniform: int | None = None
 
 
 def write_harness(release: Path, target: Path, media: MediaSpec = MEDIA_SETTINGS["images"]) -> int:
-    """Write the harness of a release's pairs to an empty folder; return item count.
+    """Write the harness of a release's pairs and two events to an empty folder; return item count.
 
     media: of `media_settings`: the JPEGs or the mp4 that the pipeline sends, byte for byte. Raises TrapsError for an
     altered release or one without answers, and for a folder that holds other files.
@@ -103,7 +104,7 @@ def _items(release: Path, package: Path, media: MediaSpec) -> list[str]:
     )
     for _, line in read_lines(release / CLIPS / "metadata.jsonl"):
         row: dict[str, Any] = json.loads(line)
-        if row["dataset"] not in DATASETS:
+        if row["dataset"] not in (*DATASETS, TWO_EVENTS):
             continue
         clip = row["media_digest"]
         if clip not in media_paths:
@@ -163,15 +164,13 @@ traps_harness = ["*.json", "*.jsonl", "media/**"]
 
 
 def _lmms(target: Path, about: Mapping[str, Any]) -> None:
-    """Write a task for each regime.
-
-    lmms-eval uses the items' path verbatim from the YAML, so the folder must not be moved.
-    """
+    """Write a task for each regime. lmms-eval uses its path as written, so the folder must not be moved."""
     write_text(
         target / LMMS / "utils.py", rewritten_source((_CODE / "release/harness/lmms_utils.py").read_text("utf-8"))
     )
     parameters = {"max_new_tokens": about["parameters"]["max_tokens"], "do_sample": True}
     parameters |= {name: about["parameters"][name] for name in ("temperature", "top_p")}
+    less_is_better = ["other_effect", *(name for name, metric in METRIC_WORDS.items() if metric.less_is_better)]
     for regime in PAPER_REGIMES:
         task = {
             "task": f"traps_{regime}",
@@ -189,9 +188,9 @@ def _lmms(target: Path, about: Mapping[str, Any]) -> None:
                 {
                     "metric": f"traps_{name}",
                     "aggregation": _Function(f"utils.{name}"),
-                    "higher_is_better": name in METRIC_WORDS and not METRIC_WORDS[name].less_is_better,
+                    "higher_is_better": name in (*METRIC_WORDS, *TWO_WAY_FIGURES) and name not in less_is_better,
                 }
-                for name in (*METRIC_WORDS, "missing", "unread")
+                for name in (*METRIC_WORDS, *TWO_WAY_FIGURES, "missing", "unread")
             ],
             "metadata": [{"version": about["version"], "canary": about["canary"]}],
         }

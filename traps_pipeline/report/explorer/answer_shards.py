@@ -22,7 +22,7 @@ from traps_pipeline.models.reading.judged_answers import UNREAD
 from traps_pipeline.protocol.cells import Evaluation
 from traps_pipeline.protocol.datasets import DATASETS, SIDES, UNPAIRED
 from traps_pipeline.protocol.regimes import REGIMES
-from traps_pipeline.storage.benchmark_tables import ITEMS, SCENE_SPECS
+from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
@@ -84,13 +84,12 @@ class StudyAnswers:
 
 def study_items(workspace: Workspace) -> pd.DataFrame:
     """Return ITEMS rows with `family`, by dataset. Raises TrapsError without items."""
-    items, specs = workspace.tables.read_all(ITEMS), workspace.tables.read_all(SCENE_SPECS, ["scenario_id", "family"])
+    items = workspace.tables.read_all(ITEMS)
     if items.empty:
         raise TrapsError(f"{workspace.root}: has no items yet; run `traps run EXPERIMENT` in it first")
     place = {name: k for k, name in enumerate((*DATASETS, *UNPAIRED, *SIDES))}
-    items = items.merge(specs, on="scenario_id", how="left", validate="many_to_one")
-    items["family"] = items["family"].fillna(items["sub_scenario"])
-    order = ["dataset", "family", "scenario_id", "side"]
+    items["family"] = items["scenario_id"].str.rpartition("-")[0]
+    order = ["dataset", "family", "scenario_id", "pair_id", "side"]
     return items.sort_values(
         order, key=lambda column: column.map(lambda value: place.get(value, value)), ignore_index=True
     )

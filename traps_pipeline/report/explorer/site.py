@@ -24,24 +24,27 @@ import pyarrow.parquet as pq
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
-from traps_pipeline.benchmark.held_out import refuse_held_out
+from traps_pipeline.benchmark.held_out import begin_publication
 from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.people.human_score_rows import HUMAN_ROW, PANEL_ERRORS
-from traps_pipeline.protocol.datasets import DATASETS, UNPAIRED, sides_of
+from traps_pipeline.protocol.datasets import DATASETS, TWO_EVENTS, UNPAIRED, sides_of
 from traps_pipeline.protocol.metric_words import METRIC_WORDS
 from traps_pipeline.protocol.regimes import REGIMES
+from traps_pipeline.protocol.two_events import CLIPS as LANE_CLIPS
+from traps_pipeline.protocol.two_events import LANES, lane_items
 from traps_pipeline.report.explorer.answer_shards import StudyAnswers, study_answers
 from traps_pipeline.report.explorer.scenario_words import certificate_phrases, closes_frame, intervention
-from traps_pipeline.report.leaderboard_page import legend, provenance
+from traps_pipeline.report.leaderboard_page import TWO_WAY_COLUMNS, legend, provenance
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.tables.human_tables import people_notes
 from traps_pipeline.report.tables.table_columns import entries
-from traps_pipeline.report.terms import ARM_TITLES, MARKS, ROBUST_FIGURES, TITLES
+from traps_pipeline.report.tables.two_way_table import two_way_table
+from traps_pipeline.report.terms import ARM_TITLES, MARKS, TITLES
 from traps_pipeline.report.writing import environment
 from traps_pipeline.scoring.analyses import REASONING_PAIRS, SHARES
-from traps_pipeline.scoring.score_rows import CONTRASTS, LEADERBOARD, REGIME_TESTS, ROBUST
-from traps_pipeline.storage.benchmark_tables import SCENE_SPECS, VIDEOS
+from traps_pipeline.scoring.score_rows import CONTRASTS, LEADERBOARD, REGIME_TESTS, TWO_WAY
+from traps_pipeline.storage.benchmark_tables import ARMS, SCENE_SPECS, VIDEOS
 from traps_pipeline.storage.tables import records
 from traps_pipeline.storage.workspace import Workspace
 
@@ -54,7 +57,17 @@ DATA, CLIPS = "data", "clips"
 LIBRARY = WEB / "vendor" / "parquet.js"
 _SOURCES = (
     *("dom.js", "keys.js", "search.js", "download.js", "numbers.js", "store.js", "outcomes.js", "parts.js"),
-    *("leaderboard.js", "landscape.js", "model.js", "matrix.js", "answers.js", "player.js", "pair.js", "compare.js"),
+    *(
+        "leaderboard.js",
+        "landscape.js",
+        "model.js",
+        "matrix.js",
+        "answers.js",
+        "player.js",
+        "pair.js",
+        "lanes.js",
+        "compare.js",
+    ),
     *("cases.js", "scenes.js", "main.js"),
 )
 _ITEM_COLUMNS = (
@@ -78,10 +91,7 @@ class SiteSummary:
 
 
 def site_files(workspace: Workspace) -> dict[str, bytes]:
-    """Return the explorer's files by path, for a folder beside the study's clips.
-
-    Raises TrapsError without items.
-    """
+    """Return the explorer's files by path, for a folder beside the study's clips. Raises TrapsError without items."""
     answers, scenarios = study_answers(workspace), _scenarios(workspace)
     return _files(workspace, answers, scenarios, {*_clip_names(answers.items, scenarios)}, "../", report=True)
 
@@ -93,7 +103,7 @@ def write_site(workspace: Workspace, folder: Path, *, clips: bool = True) -> Sit
     written last. clips: include clips, as hard links if the file system allows it, else as copies. Raises TrapsError if
     the folder holds something else, or the study has no items.
     """
-    refuse_held_out(workspace.root, "the explorer")
+    begin_publication(workspace.root, "the explorer")
     previous_files = _former_files(folder)
     answers, scenarios = study_answers(workspace), _scenarios(workspace)
     names = _clip_names(answers.items, scenarios) if clips else []
@@ -179,7 +189,7 @@ def _contents(
     contents["items"] = {"items": parquet_text(pa.Table.from_pandas(items, preserve_index=False))}
     contents["decisions"] = {"decisions": parquet_text(answers.decisions)}
     rows = [{**row, "twin_clip": row["twin_clip"] if row["twin_clip"] in clips else None} for row in scenarios]
-    contents["scenarios"] = {"scenarios": rows}
+    contents["scenarios"] = {"scenarios": [*rows, *_lanes(workspace, clips)]}
     for table in (CONTRASTS, REGIME_TESTS):
         contents[table.name] = {table.name: parquet_text(workspace.tables.read_arrow(table))}
     return {"study": _study(workspace, answers, shards, bool(clips)), **contents}
@@ -189,7 +199,8 @@ def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_c
     """Return the data that every page of the explorer needs, and the leaderboard."""
     from traps_pipeline.models.registry.entries import load_models
 
-    board, robust = workspace.tables.read_all(LEADERBOARD), workspace.tables.read_all(ROBUST)
+    board, two_way = workspace.tables.read_all(LEADERBOARD), workspace.tables.read_all(TWO_WAY)
+    printed = two_way_table(two_way)
     human_row = workspace.tables.read_all(HUMAN_ROW)
     release, registry = load_release(), load_models()
     published = entries(PublishedResults())
@@ -217,13 +228,15 @@ def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_c
             {"field": m.name, "title": m.heading, "unit": m.unit, "in_paper": m.name in printed_by_paper}
             for m in METRIC_WORDS.values()
         ],
-        "robust_figures": [{"field": name, "title": title, "unit": unit} for name, title, unit, _ in ROBUST_FIGURES],
+        "two_way_figures": [{"field": c.field, "title": c.heading, "unit": c.unit} for c in TWO_WAY_COLUMNS],
         "leaderboard": records(board),
-        "robust": records(robust),
+        "two_way": records(printed.rows),
+        "two_way_table": [{"field": c.field, "title": c.heading, "unit": c.unit} for c in printed.columns],
+        "two_way_notes": [*printed.notes],
         "people": records(human_row),
         "said": people_notes(human_row, workspace.tables.read_all(PANEL_ERRORS)),
         "published": records(published.loc[:, ["model", "regime", "dataset", "epoch", *printed_by_paper]]),
-        "legend": legend(board, robust) if len(board) else {},
+        "legend": legend(board, two_way) if len(board) else {},
         "marks": MARKS,
         "reasoning_pairs": [*map(list, REASONING_PAIRS)],
     }
@@ -250,6 +263,29 @@ def _scenarios(workspace: Workspace) -> list[dict[str, Any]]:
             }
         )
     return rows
+
+
+def _lanes(workspace: Workspace, clips: set[str]) -> list[dict[str, Any]]:
+    """Return the data about scenarios of two events: clips, when boards stand, and items in the order of a page."""
+    rows = {(row["scenario_id"], row["item"]): row for row in records(workspace.tables.read_all(ARMS))}
+    scenarios = []
+    for scenario in sorted({id_ for (id_, _), row in rows.items() if row["arm"] == TWO_EVENTS}):
+        row_of = {item: rows[scenario, item.name] for item in lane_items(scenario)}
+        path_of = {item.clip: row["clip"] if row["clip"] in clips else None for item, row in row_of.items()}
+        evidence = {item.lane: json.loads(row["evidence"]) for item, row in row_of.items()}
+        n_frames, fps = next((row["n_frames"], each["fps"]) for row in row_of.values() for each in evidence.values())
+        standing = [sum(a <= k < b for lane in LANES for a, b in evidence[lane]["stands"]) for k in range(n_frames)]
+        of_items = [{name: getattr(i, name) for name in ("pair_id", "side", "lane", "clip")} for i in row_of]
+        scenarios.append(
+            {
+                **{"scenario_id": scenario, "family": scenario.rpartition("-")[0], "fps": fps, "n_frames": n_frames},
+                "shown_at": max(k for k in range(n_frames) if standing[k] == min(standing)) / fps,
+                "lanes": [{"name": lane, "stands": evidence[lane]["stands"]} for lane in LANES],
+                "clips": [{"name": n, "hidden": [*hidden], "path": path_of[n]} for n, hidden in LANE_CLIPS.items()],
+                "items": of_items,
+            }
+        )
+    return scenarios
 
 
 BOARD_COMES_S = 0.6  # maximum time for which an occluder is visible on its way

@@ -1,4 +1,4 @@
-"""Draw heatmaps over sub-scenarios, bars of confabulation axes, points of cues."""
+"""Draw heatmaps over sub-scenarios, bars of confabulation axes."""
 
 from __future__ import annotations
 
@@ -8,14 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from traps_pipeline.models.registry.entries import load_models
-from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.terms import TITLES
 from traps_pipeline.report.writing import (
     COLOURS,
-    COLUMN_IN,
-    MARKERS,
     PAGE_IN,
     SOFT,
     NotRun,
@@ -154,37 +150,4 @@ def confabulation(results: Results) -> Figure:
         axes.set_xticks(at, names)
         axes.set(ylim=(0, 112), yticks=(0, 25, 50, 75, 100), ylabel="void failures, %")
         figure.legend(loc="outside upper center", ncols=5)
-    return figure
-
-
-def shortcut_figure(table: pd.DataFrame) -> Figure:
-    """Return the accuracy of predicting the side by each cue, with a line at chance.
-
-    table: of `benchmark.shortcuts`.
-    """
-    datasets = [name for name in TITLES if name in set(table["dataset"])] or list(DATASETS)
-    cues = list(dict.fromkeys(table["cue"]))
-    with figure_style():
-        figure = new_figure(COLUMN_IN, 0.75 + 0.42 * len(datasets))
-        axes = figure.add_subplot()
-        axes.axvline(0.5, color="#98a2b3", linewidth=0.8, zorder=0.5)
-        for k, cue in enumerate(cues):
-            rows = table.loc[table["cue"] == cue].set_index("dataset")
-            at = [datasets.index(str(name)) + 0.17 * (k - (len(cues) - 1) / 2) for name in rows.index]
-            share, half_width = rows["accuracy"].to_numpy(float), rows["half_width"].to_numpy(float)
-            ends = np.minimum(half_width, share), np.minimum(half_width, 1 - share)  # no share is below 0 or above 1
-            axes.errorbar(
-                share, at, xerr=np.vstack(ends), fmt=MARKERS[k], color=COLOURS[k], markersize=4,
-                linestyle="none", linewidth=0.8, label=cue, clip_on=False, zorder=3,
-            )  # fmt: skip
-        lowest_value = min([0.4, *(table["accuracy"] - table["half_width"])])
-        axes.set(
-            xlim=(max(0.0, lowest_value) - 0.02, 1.02),
-            ylim=(len(datasets) - 0.5, -0.5),
-            xlabel="share of sides predicted correctly",
-        )
-        axes.set_yticks(range(len(datasets)), [TITLES[name] for name in datasets])
-        if cues:
-            columns = len(cues)
-            figure.legend(loc="outside upper center", ncols=columns, handletextpad=0.1, columnspacing=0.8, fontsize=6)
     return figure

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING
 
 from traps_pipeline.protocol.regimes import ANSWER_FROM, WRONG_COSTS
 from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.tables.table_columns import MODEL, REGIME, figure_with_interval, sort_rows
+from traps_pipeline.report.tables.table_columns import MODEL, REGIME, sort_rows
 from traps_pipeline.report.writing import Column, PrintedTable, fraction
 
 if TYPE_CHECKING:
@@ -23,21 +22,16 @@ def graded(results: Results) -> list[PrintedTable]:
     """
     rows = results.graded
     rows = rows.loc[rows["scope"] == "all"]
-    two_digits = partial(fraction, digits=2)
-    columns_of = {
-        f"{name}_shown": [figure_with_interval(row, name, two_digits) for row in rows.to_dict("records")]
-        for name in ("points", "brier")
-    }
-    rows = sort_rows(rows.assign(**columns_of), ["regime", "model"])
+    rows = sort_rows(rows, ["regime", "model"])
     columns = [
         MODEL, REGIME, Column("n_items", "Cuts", "count"), Column("n_missing", "Missing", "count"),
         Column("coverage", "Answers %", "percent"), Column("risk", "Wrong %", "percent"),
-        Column("points_shown", "Points", "range"),
+        Column("points", "Points", "fraction", 2, interval=True),
         Column("regret", "Regret", "fraction", 2, group=True), Column("regret_label", "by answer", "fraction", 2),
         Column("regret_rash", "rash", "fraction", 2), Column("regret_shy", "shy", "fraction", 2),
         Column("abstains_right", "Abstains rightly %", "percent", group=True),
         Column("abstains_wrong", "wrongly %", "percent"),
-        Column("brier_shown", "Brier", "range", group=True),
+        Column("brier", "Brier", "fraction", 2, group=True, interval=True),
     ]  # fmt: skip
     return [PrintedTable("graded", "Graded cuts", rows, columns, _notes(rows) if len(rows) else [], WHY_EMPTY)]
 

@@ -2,38 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from traps_pipeline.base.wording import count_noun
-from traps_pipeline.protocol.metric_words import METRIC_WORDS, SHARES
+from traps_pipeline.protocol.metric_words import METRIC_WORDS
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.table_columns import (
     DATASET,
     MODEL,
     REGIME,
     RUNS,
-    figure_with_interval,
     sort_rows,
     with_titles,
 )
-from traps_pipeline.report.writing import NOT_RUN, Column, PrintedTable, fraction, percent
+from traps_pipeline.report.writing import NOT_RUN, Column, PrintedTable
 
 if TYPE_CHECKING:
     import pandas as pd
 
 BY_PEOPLE = "nobody has labelled yet (run traps people annotate)"
-_FIGURES = {name: metric.heading for name, metric in METRIC_WORDS.items()}
-_PERCENT = (*SHARES, "sensitivity", "specificity")
+_FIGURES = [Column(name, metric.heading, metric.unit, interval=True) for name, metric in METRIC_WORDS.items()]
+_RATES = [Column(name, f"{name.capitalize()} %", "percent", interval=True) for name in ("sensitivity", "specificity")]
 
 
 def people(results: Results) -> list[PrintedTable]:
     """Return people's scores by dataset, and their agreement on clips and answers."""
     rows = sort_rows(with_titles(results.human_row), ["dataset"])
-    rows = _with_intervals(rows, [*_FIGURES])
-    figures = [Column(f"{field}_shown", heading, "range") for field, heading in _FIGURES.items()]
     columns = [
-        DATASET, *figures, Column("agreement", "Agree %", "percent"),
+        DATASET, *_FIGURES, Column("agreement", "Agree %", "percent"),
         Column("alpha", "Krippendorff’s α", "fraction", 2),
         Column("seconds", "Seconds", "ratio"), Column("n_people", "People", "count"),
         Column("n_clips", "Clips", "count"), Column("n_labels", "Labels", "count"),
@@ -60,22 +56,19 @@ def people(results: Results) -> list[PrintedTable]:
 
 def judge_corrected(results: Results) -> list[PrintedTable]:
     """Return the panel against people, and the leaderboard corrected for its errors."""
-    errors = _with_intervals(results.panel_errors, ["sensitivity", "specificity"])
     panel_notes = [
-        Column("task", "Task"), Column("sensitivity_shown", "Sensitivity %", "range"),
-        Column("specificity_shown", "Specificity %", "range"), Column("n_answers", "Answers", "count"),
+        Column("task", "Task"), *_RATES, Column("n_answers", "Answers", "count"),
         Column("n_yes", "People’s yes", "count"), Column("n_tied", "Tied", "count"),
         Column("n_people", "People", "count"),
     ]  # fmt: skip
     rows = results.corrected
     overall = rows.loc[rows["dataset"] == "overall"] if "overall" in set(rows["dataset"]) else rows
-    entries = _with_intervals(overall, [f"{name}{end}" for name in _FIGURES for end in ("", "_corrected")])
-    entries = sort_rows(with_titles(entries), ["dataset", "model", "regime"])
+    entries = sort_rows(with_titles(overall), ["dataset", "model", "regime"])
     figures = [
-        Column(f"{field}{end}_shown", f"{heading}{', corrected' if end else ''}", "range", group=not end)
-        for field, heading in _FIGURES.items()
+        Column(f"{name}{end}", f"{m.heading}{', corrected' if end else ''}", m.unit, group=not end, interval=True)
+        for name, m in METRIC_WORDS.items()
         for end in ("", "_corrected")
-        if field != "j"
+        if name != "j"
     ]
     notes = [
         "judged and corrected in the same resamples of scenarios; a correction assumes that the panel errs alike on "
@@ -84,22 +77,12 @@ def judge_corrected(results: Results) -> list[PrintedTable]:
     reason = "not validated: people labelled no answers (run traps people annotate)"
     reasons = sorted(set(results.panel_errors["undefined"].dropna()))
     return [
-        PrintedTable("panel_errors", "The panel against people", errors, panel_notes, reasons, reason),
+        PrintedTable("panel_errors", "The panel against people", results.panel_errors, panel_notes, reasons, reason),
         PrintedTable(
             "judge_corrected", "Judged, and corrected for the panel’s errors", entries,
             [MODEL, REGIME, DATASET, *figures, RUNS], notes if len(entries) else [], reason,
         ),
     ]  # fmt: skip
-
-
-def _with_intervals(rows: pd.DataFrame, fields: list[str]) -> pd.DataFrame:
-    """Return the rows with `FIELD_shown`: the figure and its interval as printed."""
-    columns = {f"{field}_shown": [_with_range(row, field) for row in rows.to_dict("records")] for field in fields}
-    return rows.assign(**columns)
-
-
-def _with_range(row: Mapping[Any, Any], field: str) -> str:
-    return figure_with_interval(row, field, percent if field.removesuffix("_corrected") in _PERCENT else fraction)
 
 
 def people_notes(human_row: pd.DataFrame, panel_errors: pd.DataFrame) -> list[str]:
@@ -114,9 +97,7 @@ def _score_of_people(rows: pd.DataFrame) -> str:
     row = row_of.get("overall", {})
     if not row or row["pecs"] != row["pecs"]:
         return f"{NOT_RUN} in full, since PECS needs labels of both sides of all four datasets"
-    figures = ", ".join(
-        f"{heading.removesuffix(' %')} {_with_range(row, field)}" for field, heading in _FIGURES.items()
-    )
+    figures = ", ".join(f"{each.heading.removesuffix(' %')} {each.text(row)}" for each in _FIGURES)
     readers, clips_seen = count_noun(row["n_people"], "person", "people"), count_noun(row["n_clips"], "clip")
     return f"{figures} ({readers}, {clips_seen}, {row['seconds']:.0f} s a clip)"
 
@@ -125,8 +106,7 @@ def _validation_note(rows: pd.DataFrame) -> str:
     if rows.empty:
         return "not validated, people have labelled none of its answers (run traps people annotate)"
     remarks = [
-        f"{row['task']} sensitivity {_with_range(row, 'sensitivity')} %, "
-        f"specificity {_with_range(row, 'specificity')} %"
+        f"{row['task']} {', '.join(f'{rate.field} {rate.text(row)} %' for rate in _RATES)}"
         for row in rows.to_dict("records")
     ]
     remainder = " (the other task is not validated)" if len(remarks) == 1 else ""

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.tables.table_columns import MODEL, REGIME, figure_with_interval, sort_rows
+from traps_pipeline.report.tables.table_columns import MODEL, REGIME, sort_rows
 from traps_pipeline.report.writing import NONE, NOT_RUN, Column, PrintedTable, percent
 
 if TYPE_CHECKING:
@@ -36,18 +36,14 @@ def _hypothesis_table(rows: pd.DataFrame, hypothesis: Hypothesis) -> PrintedTabl
     doses = rows.loc[rows["hypothesis"] == hypothesis.name]
     place = {dose.name: k for k, dose in enumerate(hypothesis.doses)}
     doses = doses.assign(place=doses["dose"].map(place))
-    columns_of = {
-        f"{name}_shown": [figure_with_interval(row, name, percent) for row in doses.to_dict("records")]
-        for name in (*_HEADINGS, "change")
-    }
     rules = {f"{name}_shown": [_rule(row, name) for row in doses.to_dict("records")] for name in ("value", "change")}
-    doses = doses.assign(**columns_of, **{f"rule_{name}": values for name, values in rules.items()})
+    doses = doses.assign(**{f"rule_{name}": values for name, values in rules.items()})
     kind = "J" if hypothesis.figure == "j" else "abstentions"
     columns = [
         MODEL, REGIME, Column("dose", "Dose"), Column("counts_as", "Counts as"),
         Column("n_scenarios", "Scenarios", "count"),
-        *[Column(f"{name}_shown", heading, "range") for name, heading in _HEADINGS.items()],
-        Column("change_shown", f"Change of {kind}", "range", group=True),
+        *[Column(name, heading, "percent", interval=True) for name, heading in _HEADINGS.items()],
+        Column("change", f"Change of {kind}", "percent", group=True, interval=True),
         Column("chance", "Guess %", "percent", group=True),
         Column("rule_value_shown", f"Best rule’s {kind} %"), Column("rule_change_shown", "Largest change of a rule"),
     ]  # fmt: skip

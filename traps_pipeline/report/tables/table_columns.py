@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -10,12 +10,12 @@ import numpy as np
 
 from traps_pipeline.models.registry.entries import load_models
 from traps_pipeline.protocol import metric_words
-from traps_pipeline.protocol.datasets import DATASETS, SHORT
+from traps_pipeline.protocol.datasets import DATASETS, SHORT, TWO_EVENTS
 from traps_pipeline.protocol.metric_words import METRIC_WORDS
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.terms import INCOMPLETE_MARK, MARKS, MISSING_MARK, SIDE_OF, TITLES
-from traps_pipeline.report.writing import NONE, Column, PrintedTable, SourceItems, fraction
+from traps_pipeline.report.writing import Column, PrintedTable, SourceItems, fraction
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -46,6 +46,11 @@ def cell_trace(row: Mapping[str, Any], field: str) -> SourceItems | None:
     dataset = row.get("dataset")
     side = SIDE_OF.get(field, "")
     return SourceItems(dataset if dataset in DATASETS else "", row["model"], row["regime"], side)
+
+
+def two_events_trace(row: Mapping[str, Any], field: str) -> SourceItems:
+    """Return the items of two events behind a model's and regime's number."""
+    return SourceItems(TWO_EVENTS, row["model"], row["regime"])
 
 
 def with_marks(rows: pd.DataFrame) -> pd.DataFrame:
@@ -140,12 +145,6 @@ def interval(row: Mapping[str, Any]) -> str:
     """Return the interval of PECS as printed; empty if there is none."""
     low, high = row.get("pecs_ci_low"), row.get("pecs_ci_high")
     return "" if low != low or low is None else f"[{fraction(low)}, {fraction(high)}]"
-
-
-def figure_with_interval(row: Mapping[Any, Any], name: str, as_printed: Callable[[float], str]) -> str:
-    """Return a figure as printed, with its interval in brackets where it has one."""
-    value, low, high = (as_printed(row[column]) for column in (name, f"{name}_ci_low", f"{name}_ci_high"))
-    return value if NONE in (value, low) else f"{value} [{low}, {high}]"
 
 
 def ranks(row: Mapping[str, Any]) -> str:

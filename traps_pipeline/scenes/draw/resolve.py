@@ -45,6 +45,11 @@ class Resolved:
     qpos: np.ndarray
     twin: np.ndarray
 
+    @property
+    def worlds(self) -> dict[str, np.ndarray]:
+        """The trajectories by name."""
+        return {"qpos": self.qpos, "twin": self.twin}
+
 
 def resolve(
     family: Family,

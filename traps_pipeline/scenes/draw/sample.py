@@ -128,8 +128,8 @@ def sample_family(
     """Draw until `released` holds `count` scenarios of a family.
 
     The same seed gives the same ones on a machine type. A stopped call goes on at the same seed and count, and fills
-    the places of records that were taken out (`take_out`); anything else of the family is replaced, as are records of
-    another version of its file.
+    the places of records that `tools.redraw.take_out` took out; anything else of the family is replaced, as are records
+    of another version of its file.
 
     look: parts of the look (`look.PARTS`) that vary besides those that always do in the family. difficulty: of every
     scene. report: gets a line for each record and for the first rejection of each kind. Raises TrapsError for a family
@@ -241,27 +241,10 @@ class Records:
 
     def append(self, resolved: Resolved, tally: Tally) -> None:
         """Append a scenario and note the number of draws."""
-        save_trajectory(self._released / "trajectories", resolved.spec.scenario_id, resolved.qpos, resolved.twin)
+        save_trajectory(self._released / "trajectories", resolved.spec.scenario_id, resolved.worlds)
         with self._lines.open("a", encoding="utf-8") as lines:
             lines.write(record_line(resolved.spec))
         save_tallies(self._released, load_tallies(self._released) | {self._family: tally})
-
-
-def take_out(released: Path, reasons: Mapping[str, str]) -> None:
-    """Remove records and trajectories by id, and count the reasons in `draws.json`.
-
-    The next `sample_family` with the same seed and count fills their places. Raises KeyError for an unknown id.
-    """
-    tallies = load_tallies(released)
-    for family in sorted({scenario_id.rpartition("-")[0] for scenario_id in reasons}):
-        lines = released / f"{family}.jsonl"
-        records = {json.loads(line)["scenario_id"]: line for line in lines.read_text("utf-8").splitlines()}
-        for scenario_id in [id_ for id_ in reasons if id_.rpartition("-")[0] == family]:
-            del records[scenario_id]
-            tallies[family].rejected[reasons[scenario_id]] += 1
-            (released / "trajectories" / f"{scenario_id}.npz").unlink()
-        write_text(lines, "".join(f"{line}\n" for line in records.values()))
-    save_tallies(released, tallies)
 
 
 def save_tallies(released: Path, tallies: Mapping[str, Tally]) -> None:

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from traps_pipeline.scenes.certification.evidence import Pair
-from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH, Camera, Occluder
+from traps_pipeline.scenes.picture.camera import HEIGHT, Camera, Occluder
 from traps_pipeline.scenes.worlds.outcome import decisive_geoms
 
 MARGINS_PX = (3, 9)  # around what must be hidden, to be tried one after the other
@@ -34,7 +34,7 @@ def trim_candidates(pair: Pair) -> Iterator[Pair]:
 
 def must_hide(pair: Pair) -> np.ndarray:
     """Return the pixels (H, W) that an occluder must cover to hide what differs."""
-    needed_mask, videos = np.zeros((HEIGHT, WIDTH), bool), list[list[np.ndarray]]()
+    needed_mask, videos = np.zeros((HEIGHT, pair.control.camera.width), bool), list[list[np.ndarray]]()
     for world in (pair.control, pair.other_world):
         settled_from = max(world.outcome.commit_frame - 1, 0)
         decisive = decisive_geoms(world.model, world.scene.decisive)
@@ -68,13 +68,13 @@ def cut_to(occluder: Occluder, camera: Camera, needed: np.ndarray, margin_px: in
 
 
 def _differing_pixels(frames: Iterable[np.ndarray], counterparts: Iterable[np.ndarray]) -> np.ndarray:
-    """Return where any frame differs from its counterpart, on the grid of 480x360."""
-    mask = np.zeros((HEIGHT, WIDTH), bool)
+    """Return where any frame differs from its counterpart, on the grid of 360 rows."""
+    masks = []
     for frame, counterpart in zip(frames, counterparts, strict=True):
         is_different = (frame != counterpart).any(axis=2)
         scale = is_different.shape[0] // HEIGHT
-        mask |= is_different.reshape(HEIGHT, scale, WIDTH, scale).any(axis=(1, 3))
-    return mask
+        masks.append(is_different.reshape(HEIGHT, scale, -1, scale).any(axis=(1, 3)))
+    return np.any(masks, axis=0)
 
 
 def _directions(occluder: Occluder) -> tuple[np.ndarray, np.ndarray]:
@@ -87,7 +87,7 @@ def _plane_points(camera: Camera, pixels: np.ndarray, ahead: np.ndarray, front: 
     """Return where lines of sight through pixels (N, 2) meet an upright plane, (N, 3)."""
     right, up, forward = camera.axes()
     focal = HEIGHT / 2 / np.tan(np.radians(camera.fovy_deg) / 2)
-    ray_x, ray_y = (pixels[:, 0] - WIDTH / 2) / focal, (HEIGHT / 2 - pixels[:, 1]) / focal
+    ray_x, ray_y = (pixels[:, 0] - camera.width / 2) / focal, (HEIGHT / 2 - pixels[:, 1]) / focal
     rays = forward + ray_x[:, None] * right + ray_y[:, None] * up
     eye = camera.position()
     return eye + rays * ((front - eye @ ahead) / (rays @ ahead))[:, None]

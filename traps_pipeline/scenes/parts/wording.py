@@ -45,6 +45,20 @@ def choices_in(text: str) -> tuple[str, ...]:
     return tuple(re.split(r", | or ", text))
 
 
+LANE_QUESTION = "In the lane with the {strip} strip, leaving its bench aside: {question}"  # of two events
+
+
+def lane_question(strip: str, question: str) -> str:
+    """Return a family's question about the lane with a strip."""
+    return LANE_QUESTION.format(strip=strip, question=f"{question[0].lower()}{question[1:]}")
+
+
+def lane_asked(question: str) -> tuple[str, str] | None:
+    """Return the colour of a lane's strip and the family's question; None for a question of no lane."""
+    slots = match_slots((LANE_QUESTION,), question)
+    return None if slots is None else (slots["strip"], f"{slots['question'][0].upper()}{slots['question'][1:]}")
+
+
 # --- ill-posed questions about what no video shows (occlusion) --------------------------------------------------------
 
 # Property -> (words that ask for it, templates over a thing that is in view).
@@ -151,9 +165,6 @@ _FALSE_PREMISES = (
     "Which way does the {present} arrow point?",
     "What colour is the stripe on the {object}?",
     "Is the stripe on the {object} thick or thin?",
-    "What is the weight of the colour {present}?",
-    "What is the temperature of the colour {present}?",
-    "What is the age of the colour {present} in years?",
 )
 # Words by which a question may be answered truly though nothing that it presumes is there -> that answer.
 _TRULY_NONE = (

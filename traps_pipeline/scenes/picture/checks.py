@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH, Camera, Occluder
+from traps_pipeline.scenes.picture.camera import HEIGHT, Camera, Occluder
 from traps_pipeline.scenes.picture.coming_board import LANDED, Coming
 from traps_pipeline.scenes.picture.render import Renderer
 
@@ -66,7 +66,7 @@ def swept_behind(camera: Camera, swept: Sequence[np.ndarray], occluder: Occluder
     """
     import cv2
 
-    motion_mask, board = (np.zeros((HEIGHT, WIDTH), np.uint8) for _ in range(2))
+    motion_mask, board = (np.zeros((HEIGHT, camera.width), np.uint8) for _ in range(2))
     for mask, solids in ((motion_mask, swept), (board, [occluder.corners()])):
         for corners in solids:
             outline = cv2.convexHull(camera.project(corners).round().astype(np.int32))

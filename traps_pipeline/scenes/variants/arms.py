@@ -9,37 +9,29 @@ away.
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from traps_pipeline.protocol.datasets import CROSSED
-from traps_pipeline.scenes.certification.certificates import EARLIEST_CUT_S, legible_groups, settled_answer
-from traps_pipeline.scenes.parts.wording import false_premise
-from traps_pipeline.scenes.physics.kit import View
+from traps_pipeline.scenes.certification.certificates import EARLIEST_CUT_S, settled_answer
 from traps_pipeline.scenes.physics.simulate import initial_velocity, replay
 from traps_pipeline.scenes.picture import checks
-from traps_pipeline.scenes.picture.camera import OCCLUDER_HALF_THICKNESS, Occluder, fit_camera
-from traps_pipeline.scenes.picture.render import Renderer
-from traps_pipeline.scenes.worlds.outcome import Rejected, compile_scene, decisive_geoms
-from traps_pipeline.scenes.worlds.shot import shown_points
+from traps_pipeline.scenes.picture.camera import Closing
+from traps_pipeline.scenes.picture.coming_board import coming_board
+from traps_pipeline.scenes.worlds.outcome import Rejected
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 from traps_pipeline.scenes.worlds.world import World
 
 # --- thresholds -------------------------------------------------------------------------------------------------------
 
-SHOWN_AGAIN_S = 1.0  # before the end the occluder of `removed` goes
 SEEN_PX = 150.0  # of what must be seen of a moving thing, or must differ between two worlds, in one sampled frame
-OCCLUDER_PX = 2000.0  # of a decoy in the first frame: 1 % of the picture
 EARLIEST_COVER_S = 0.5  # the late occluder comes no earlier
 AGREE_SHARE = 0.95  # of the futures of a predictable cut
 FUTURES = 64  # of the last frame that it shows
 LEAD_FRAMES = (5, 3, 2, 1)  # frames before commitment at which it may cut, the earliest first
-BEHIND_M = 0.05  # a decoy stands so far behind all that is shown
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,70 +120,7 @@ def must_answer(spec: SceneSpec) -> list[Question]:
     return [Question("control", spec.question, spec.ground_truth)]
 
 
-# --- an occluder that hides nothing, or not for good ------------------------------------------------------------------
-
-
-def _decoys(scenario: Scenario, points: np.ndarray) -> Iterator[Occluder]:
-    """Yield places of the void's occluder behind everything, then beside it."""
-    occluder, control = scenario.control.occluder, scenario.control
-    assert occluder is not None, "an occlusion scenario has an occluder"
-    azimuth = np.radians(control.camera.azimuth_deg)
-    ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-    across = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
-    centre, half_width = np.array(occluder.centre), occluder.half[0]
-    low, high = float((points @ across).min()), float((points @ across).max())
-    depth_behind = float((points @ ahead).max()) - float(centre @ ahead) + BEHIND_M + OCCLUDER_HALF_THICKNESS
-    at = float(centre @ across)
-    for offset in (0.0, high - at, low - at):
-        yield _move(occluder, ahead * depth_behind + across * offset)
-    for offset in (high + half_width + BEHIND_M - at, low - half_width - BEHIND_M - at):
-        yield _move(occluder, across * offset)
-
-
-def _move(occluder: Occluder, by: np.ndarray) -> Occluder:
-    x, y, z = (round(float(value), 6) for value in np.array(occluder.centre) + by)
-    return replace(occluder, centre=(x, y, z))
-
-
-def _decoy(scenario: Scenario) -> Take:
-    control, spec = scenario.control, scenario.spec
-    points = shown_points(control.model, control.scene, control.qpos)
-    view = View(control.camera.azimuth_deg, control.camera.elevation_deg, control.camera.fovy_deg)
-    reason = ""
-    for occluder in _decoys(scenario, points):
-        camera = fit_camera(view, np.concatenate([points, occluder.corners()]))
-        model, scene = compile_scene(control.family, control.params, control.physics, occluder)
-        geoms = [*decisive_geoms(model, scene.decisive), *scene.hidden]
-        groups = legible_groups(control.family, model, scene, control.motion, control.params)
-        sampled_qpos = control.qpos[scenario.sampled]
-        with Renderer(model, camera) as renderer:
-            occluder_px = float(renderer.visible_pixels(sampled_qpos[:1], ["occluder"], occluder=True)[0, 0])
-            pixels = [renderer.visible_pixels(sampled_qpos, geoms, occluder=is_drawn) for is_drawn in (False, True)]
-            hidden = float(np.abs(pixels[0] - pixels[1]).sum())
-            min_pixels = checks.least_visible(renderer, sampled_qpos[-3:], groups)
-            needs = [needed for _, needed in groups]
-            too_small = [f"{px:.0f} of {n:.0f} pixels" for px, n in zip(min_pixels, needs, strict=True) if px < n]
-            if occluder_px < OCCLUDER_PX or hidden or too_small:
-                visible = too_small or "enough"
-                reason = f"the decoy shows {occluder_px:.0f} pixels, hides {hidden:.0f}, leaves {visible} to be seen"
-                continue
-            evidence = {"panel_px": occluder_px, "hides_px": hidden, "least_visible_px": min(min_pixels)}
-            evidence |= {"panel": vars(occluder)}
-            return Take(list(renderer.frames(control.qpos, occluder=True)), evidence)
-    raise Rejected(f"{spec.scenario_id}: no place for an occluder that hides nothing ({reason})")
-
-
-def _removed(scenario: Scenario) -> Take:
-    spec, at = scenario.spec, len(scenario.control.qpos) - round(SHOWN_AGAIN_S * scenario.fps)
-    commit = scenario.control.outcome.commit_frame
-    last_seen = checks.last_sampled(len(scenario.control.qpos), scenario.fps)[0]
-    if spec.void["hidden_from_frame"] >= at or commit > last_seen or last_seen < at:
-        raise Rejected("the outcome is not both hidden before the occluder goes and settled after it")
-    order = scenario.control.outcome.in_order
-    if order is not None and order[0] < at:
-        raise Rejected("the first of the two events that are asked about happens behind the occluder")
-    frames = [*scenario.void_frames[:at], *scenario.control_frames[at:]]
-    return Take(frames, {"hidden_until_s": at / scenario.fps, "settled_s": commit / scenario.fps})
+# --- an occluder that comes late --------------------------------------------------------------------------------------
 
 
 def _late_occluder(scenario: Scenario) -> Take:
@@ -199,14 +128,19 @@ def _late_occluder(scenario: Scenario) -> Take:
     at = scenario.control.outcome.commit_frame - 1
     if at < EARLIEST_COVER_S * scenario.fps:
         raise Rejected(f"the outcome is settled at {(at + 1) / scenario.fps:.1f} s: nothing can be seen before it")
-    frames_before = slice(0, at, scenario.fps // checks.SAMPLED_FPS)
+    control = scenario.control
+    assert control.occluder is not None, "an occlusion scenario has an occluder"
+    board = coming_board(Closing(at, control.occluder), control.camera, len(control.qpos), scenario.fps)
+    comes = next(frame for frame, offset in enumerate(board) if offset is not None)
+    frames_before = slice(0, comes, scenario.fps // checks.SAMPLED_FPS)
     pairs = zip(scenario.control_frames[frames_before], scenario.twin_frames[frames_before], strict=True)
-    n_differing = max(int((a != b).any(axis=2).sum()) for a, b in pairs)
+    n_differing = max((int((a != b).any(axis=2).sum()) for a, b in pairs), default=0)
     if n_differing < SEEN_PX:
         raise Rejected(
             f"before the occluder comes the two worlds differ in {n_differing} pixels, {SEEN_PX:.0f} are wanted"
         )
-    frames = [*scenario.control_frames[:at], *scenario.void_frames[at:]]
+    with control.renderer() as renderer:
+        frames = list(checks.closing_frames(renderer, control.qpos, board))
     return Take(frames, {"covered_from_s": at / scenario.fps, "differing_px": n_differing})
 
 
@@ -268,7 +202,7 @@ def _count_agreeing(scenario: Scenario, frame: int) -> int | None:
     return FUTURES - n_disagreeing
 
 
-# --- the other world, other words -------------------------------------------------------------------------------------
+# --- the other world --------------------------------------------------------------------------------------------------
 
 
 def _twin_answers(spec: SceneSpec) -> list[Question]:
@@ -282,84 +216,11 @@ def _twin(scenario: Scenario) -> Take:
     return Take([], {"settled_s": scenario.twin.outcome.commit_frame / scenario.fps})
 
 
-def crossed(partner: SceneSpec | None) -> Arm:
-    """Return the arm that asks the void its aside, the control a partner's question."""
-
-    def ask(spec: SceneSpec) -> list[Question]:
-        if partner is None:
-            raise Rejected("it has no partner: a scenario of its family whose scene and its own refute each other's")
-        aside = spec.answerable_question
-        return [
-            Question("control", aside.question, aside.answer, clip="void", labels=tuple(aside.labels)),
-            Question("void", partner.question, None, clip="control", labels=tuple(partner.labels)),
-        ]
-
-    def film(scenario: Scenario) -> Take:
-        ask(scenario.spec)
-        assert partner is not None, "asked for above"
-        if premise := false_premise(_presumed(partner), scenario.control.inventory):
-            return Take([], {"refuted_by": premise})
-        raise Rejected(f"the scene does not refute {partner.question!r}")
-
-    return Arm(
-        CROSSED,
-        "this clip, or this question, means: abstain",
-        "the void with a question that it answers; the control with the question of its partner, which presumes, "
-        "beside its choices, a colour that nothing in the scene has, as does its own question in the partner's scene",
-        ask,
-        film,
-    )
-
-
-def _presumed(spec: SceneSpec) -> str:
-    """Return the question without its choices, which it does not presume."""
-    text = re.sub(r"\([^)]*\)", "", spec.question.lower())  # own text: a record's question
-    matches = [re.search(rf"\b{re.escape(label.lower())}\b", text) for label in spec.labels]
-    spans = [match.span() for match in matches if match]
-    return text[: min(spans)[0]] + text[max(end for _, end in spans) :] if spans else text
-
-
-def partners(specs: Iterable[SceneSpec]) -> dict[str, str]:
-    """Return the partner of each scenario of a family that has one, by id.
-
-    The scenes of partners refute each other's question. So each question is asked in vain as often as it is answered.
-    Scenarios with the fewest candidates choose first, which leaves few without a partner.
-    """
-    spec_of = {spec.scenario_id: spec for spec in sorted(specs, key=lambda spec: spec.scenario_id)}
-    inventories = {id_: World.of_record(spec, np.empty((0, 0))).inventory for id_, spec in spec_of.items()}
-    presumed = {id_: _presumed(spec) for id_, spec in spec_of.items()}
-    refuted = {(a, b) for a in spec_of for b in spec_of if false_premise(presumed[b], inventories[a]) is not None}
-    free = {a: {b for b in spec_of if (a, b) in refuted and (b, a) in refuted} for a in spec_of}
-    partner_of: dict[str, str] = {}
-    while candidates := [a for a in free if free[a]]:
-        a = min(candidates, key=lambda name: len(free[name]))
-        b = min(sorted(free[a]), key=lambda name: len(free[name]))
-        partner_of |= {a: b, b: a}
-        free = {name: candidates_left - {a, b} for name, candidates_left in free.items() if name not in (a, b)}
-    return partner_of
-
-
 # --- all of them ------------------------------------------------------------------------------------------------------
 
 ARMS: Mapping[str, Arm] = {
     arm.name: arm
     for arm in (
-        Arm(
-            "decoy",
-            "an occluder means: abstain",
-            f"the void's own occluder stands behind or beside the scene with at least {OCCLUDER_PX:.0f} pixels, takes "
-            "no pixel of a decisive body or the hidden element in any sampled frame, and the outcome stays legible",
-            must_answer,
-            _decoy,
-        ),
-        Arm(
-            "removed",
-            "an occluder in the first frames means: abstain",
-            f"the occluder stands as in the void until {SHOWN_AGAIN_S} s before the end; the last three sampled frames "
-            "are the control's, with the outcome settled; which of two events was first is not asked",
-            must_answer,
-            _removed,
-        ),
         Arm(
             "late_occluder",
             "an occluder at the end means: abstain",
@@ -391,6 +252,5 @@ ARMS: Mapping[str, Arm] = {
             _twin_answers,
             _twin,
         ),
-        crossed(None),
     )
 }

@@ -4,27 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import product
 from typing import Any
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from traps_pipeline.base.digests import digest
+from traps_pipeline.protocol.two_events import LANES, LaneItem, lane_items
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.parts.look import Look
+from traps_pipeline.scenes.parts.wording import lane_question
 from traps_pipeline.scenes.physics.kit import Physics
 from traps_pipeline.scenes.picture.camera import WideCamera
 from traps_pipeline.scenes.worlds.lane_event import LaneEvent
 from traps_pipeline.scenes.worlds.lane_layout import Lane, Layout
-from traps_pipeline.scenes.worlds.lanes import LANES, TwoLanes
-from traps_pipeline.scenes.worlds.spec import Slug
-
-CLIPS: dict[str, tuple[bool, bool]] = {  # by the lanes that are hidden in it: whether the left and the right one is
-    "neither": (False, False), "left": (True, False), "right": (False, True), "both": (True, True),
-}  # fmt: skip
+from traps_pipeline.scenes.worlds.lanes import TwoLanes
+from traps_pipeline.scenes.worlds.spec import Slug, check_camera_and_physics
 
 
 class _Record(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class LaneTwin(_Record):
@@ -64,7 +63,8 @@ class TwoEventsSpec(_Record):
     evidence: dict[str, Any]
 
     @model_validator(mode="after")
-    def _answers_and_names_agree(self) -> TwoEventsSpec:
+    def _parts_agree(self) -> TwoEventsSpec:
+        check_camera_and_physics(self.camera, self.physics)
         for record in self.lanes:
             answers = {record.ground_truth, record.twin.ground_truth}
             if len(answers) < 2 or not answers <= {*self.labels}:
@@ -73,8 +73,19 @@ class TwoEventsSpec(_Record):
             raise ValueError(f"both lanes have a {self.lanes[0].lane.strip} strip, so no question names one")
         return self
 
-    def world(self, twin_in: int | None = None) -> TwoLanes:
-        """Return the world, or that with the twin in a lane."""
+    @property
+    def scene_hash(self) -> str:
+        """Digest of the clips' content; a corrected question does not change it."""
+        parts = {"family", "physics", "camera", "look", "lanes", "trajectory_sha256"}
+        return digest(self.model_dump(mode="json", include=parts))
+
+    @property
+    def spec_hash(self) -> str:
+        """Digest of the whole record."""
+        return digest(self.model_dump(mode="json"))
+
+    def world(self, qpos: np.ndarray | None = None, twin_in: int | None = None) -> TwoLanes:
+        """Return the world, or that with the twin in a lane. qpos: its frozen trajectory; None: to be simulated."""
         family, physics = get_family(self.family), Physics(**self.physics)
         params = [record.twin.params if k == twin_in else record.params for k, record in enumerate(self.lanes)]
         return TwoLanes(
@@ -83,29 +94,26 @@ class TwoEventsSpec(_Record):
             WideCamera.from_record(self.camera),
             [record.layout for record in self.lanes],
             Look.from_record(self.look),
+            qpos,
         )
 
-    def items(self) -> Iterator[LaneItem]:
-        """Yield the eight items, four of which can be answered."""
-        for (clip, hidden), k in product(CLIPS.items(), range(len(LANES))):
-            record = self.lanes[k]
-            answer, text = None if hidden[k] else record.ground_truth, lane_question(record.lane.strip, self.question)
-            yield LaneItem(self.scenario_id, clip, LANES[k], hidden[k], hidden[1 - k], text, answer)
+    def questions(self) -> Iterator[LaneQuestion]:
+        """Yield the eight items' questions, four of which can be answered."""
+        for item in lane_items(self.scenario_id):
+            record = self.lanes[LANES.index(item.lane)]
+            text = lane_question(record.lane.strip, self.question)
+            yield LaneQuestion(item, text, record.ground_truth)
 
 
 @dataclass(frozen=True)
-class LaneItem:
-    """A question on a clip. answer: None where it must be abstained on, since the asked lane is hidden."""
+class LaneQuestion:
+    """An item's question, and what its lane ends in, hidden or not."""
 
-    scenario_id: str
-    clip: str
-    lane: str
-    asked_hidden: bool
-    other_hidden: bool
-    question: str
-    answer: str | None
+    item: LaneItem
+    text: str
+    outcome: str
 
-
-def lane_question(strip: str, question: str) -> str:
-    """Return a family's question about the lane with a strip."""
-    return f"In the lane with the {strip} strip, leaving its bench aside: {question[0].lower()}{question[1:]}"
+    @property
+    def answer(self) -> str | None:
+        """The right answer; None where it must be abstained on."""
+        return None if self.item.asked_hidden else self.outcome

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from traps_pipeline.protocol.two_events import LANES
 from traps_pipeline.scenes.parts.look import Look, apply_look
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, Vec3, View, add_box, new_spec
 from traps_pipeline.scenes.physics.simulate import replay
@@ -31,7 +32,6 @@ from traps_pipeline.scenes.worlds.outcome import Outcome, decisive_geoms, read_o
 if TYPE_CHECKING:
     import mujoco
 
-LANES = ("left", "right")  # halves of the picture; names of all that is in a lane begin with it
 PLACES = ("scene", "bench")  # what a lane's two boards are before
 LEG_M = 0.012  # half width of a bench's leg
 BENCH_RGBA = (0.36, 0.33, 0.36, 1.0)  # of no colour that a question names
@@ -40,13 +40,17 @@ AWAY_M = 60.0  # so high hangs a board that is not there
 
 @dataclass(frozen=True, eq=False)
 class TwoLanes:
-    """A world of two lanes in its shot. events: of each lane. look: of floor and light."""
+    """A world of two lanes in its shot.
+
+    events: of each lane. look: of floor and light. frozen: the trajectory as a record has it; None: to be simulated.
+    """
 
     lanes: Sequence[Lane]
     events: Sequence[LaneEvent]
     camera: Camera
     layouts: Sequence[Layout]
     look: Look
+    frozen: np.ndarray | None = None
 
     @property
     def physics(self) -> Physics:
@@ -55,7 +59,8 @@ class TwoLanes:
 
     def with_event(self, lane: int, event: LaneEvent) -> TwoLanes:
         """Return the world with another event in a lane, such as its twin."""
-        return replace(self, events=[event if k == lane else own for k, own in enumerate(self.events)])
+        events = [event if k == lane else own for k, own in enumerate(self.events)]
+        return replace(self, events=events, frozen=None)
 
     @cached_property
     def model(self) -> mujoco.MjModel:
@@ -72,8 +77,13 @@ class TwoLanes:
                 _hang(spec, board_of(name, place), board)
         return spec.compile()
 
-    @cached_property
+    @property
     def qpos(self) -> np.ndarray:
+        """The trajectory, frozen or simulated."""
+        return self.simulated if self.frozen is None else self.frozen
+
+    @cached_property
+    def simulated(self) -> np.ndarray:
         """The trajectory with all boards standing, (F, nq): each lane's is the family's own, simulated by itself.
 
         Nothing of one lane can touch the other. Simulated together, the solver would let rounding pass between them,
@@ -151,7 +161,8 @@ def _lane_spec(event: LaneEvent, layout: Layout, size: float) -> mujoco.MjSpec:
     data = mujoco.MjData(event.model)
     mujoco.mj_kinematics(event.model, data)
     x, y, z = np.subtract(layout.bench, layout.shift)
-    for n, (body, span) in enumerate(event.doubles(size).items()):
+    doubles = [*event.doubles(size).items()][: len(layout.paths)]  # as many as the record has
+    for n, (body, span) in enumerate(doubles):
         place = [float(at) for at in (x - middle_of(span[:, 0]), y - middle_of(span[:, 1]), z - span[:, 2].min())]
         double = spec.worldbody.add_body(name=f"double {n}", pos=place, quat=data.body(body).xquat)
         for axis in ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
@@ -162,8 +163,7 @@ class SceneSpec(BaseModel):
 
     @model_validator(mode="after")
     def _what_decides_the_pixels_is_plausible(self) -> SceneSpec:
-        physics = _checked(_Physics, "physics", self.physics)
-        _checked(_Camera, "camera", self.camera)
+        physics = check_camera_and_physics(self.camera, self.physics)
         void = _checked(_Truncation if self.void_kind == "truncation" else _Occluder, "void", self.void)
         frame = void.cut_frame if isinstance(void, _Truncation) else void.hidden_from_frame
         frames = {"void": frame}
@@ -210,22 +210,27 @@ def _checked(kind: type[_Part], name: str, values: dict[str, Any]) -> _Part:
         raise ValueError(f"{'.'.join(map(str, (name, *first['loc'])))}: {first['msg']}") from None
 
 
+def check_camera_and_physics(camera: dict[str, Any], physics: dict[str, Any]) -> _Physics:
+    """Return a record's physics; raise ValueError for implausible values, naming the field."""
+    _checked(_Camera, "camera", camera)
+    return _checked(_Physics, "physics", physics)
+
+
 def trajectory_digest(qpos: np.ndarray) -> str:
     """Return the SHA-256 over shape and little-endian float32 values."""
     values = np.ascontiguousarray(qpos, dtype="<f4")
     return hashlib.sha256(repr(values.shape).encode() + values.tobytes()).hexdigest()
 
 
-def save_trajectory(folder: Path, scenario_id: str, qpos: np.ndarray, twin: np.ndarray) -> None:
-    """Write `<folder>/<scenario_id>.npz`: trajectories of a scenario and its twin."""
-    arrays = {"qpos": qpos, "twin": twin}
-    plain_arrays = {name: np.ascontiguousarray(values, dtype="<f4") for name, values in arrays.items()}
+def save_trajectory(folder: Path, scenario_id: str, worlds: Mapping[str, np.ndarray]) -> None:
+    """Write `<folder>/<scenario_id>.npz`: trajectories (`qpos`) of a scenario and of its twins, by name."""
+    plain_arrays = {name: np.ascontiguousarray(values, dtype="<f4") for name, values in worlds.items()}
     with replace_file(folder / f"{scenario_id}.npz") as part, part.open("wb") as stream:
         np.savez_compressed(stream, allow_pickle=False, **plain_arrays)
 
 
-def load_trajectory(path: Path, sha256: str, world: Literal["qpos", "twin"] = "qpos") -> np.ndarray:
-    """Return qpos (F, nq) float32 of a scenario or its twin. Raises ValueError naming a missing or altered file."""
+def load_trajectory(path: Path, sha256: str, world: str = "qpos") -> np.ndarray:
+    """Return qpos (F, nq) float32 of a scenario or of a twin. Raises ValueError naming a missing or altered file."""
     try:
         with np.load(path, allow_pickle=False) as archive:
             qpos = archive[world]

@@ -9,7 +9,7 @@ function figure(row, { field, unit }, mark = "") {
   if (!row || row[field] === null || row[field] === undefined)
     return row ? NONE : h("span", { class: "absent" }, NOT_RUN);
   const low = row[`${field}_ci_low`];
-  const spread = row.n_runs > 1 ? `± ${print(row[`${field}_std`])}` : "";
+  const spread = row.n_runs > 1 && `${field}_std` in row ? `± ${print(row[`${field}_std`])}` : "";
   const interval = low === null || low === undefined ? "" : `[${print(low)}, ${print(row[`${field}_ci_high`])}]`;
   return [
     h("span", { class: "figure", "data-field": field }, print(row[field])),
@@ -34,7 +34,9 @@ async function leaderboardView(route) {
   const published = new Map(
     info.published.filter((row) => row.dataset === dataset).map((row) => [`${row.model} ${row.regime}`, row]),
   );
-  const robust = new Map((dataset === "overall" ? info.robust : []).map((row) => [`${row.model} ${row.regime}`, row]));
+  const beside = new Map(
+    (dataset === "overall" ? askedOfLanes(info) : []).map((row) => [`${row.model} ${row.regime}`, row]),
+  );
   const asked = new Map(own.map((row) => [`${row.model} ${row.regime}`, { model: row.model, regime: row.regime }]));
   const entries = [...asked.values()];
   if (paper) for (const row of published.values()) if (!asked.has(`${row.model} ${row.regime}`)) entries.push(row);
@@ -45,18 +47,19 @@ async function leaderboardView(route) {
       regime: of,
       own: here.get(`${model} ${of}`),
       paper: published.get(`${model} ${of}`),
-      robust: robust.get(`${model} ${of}`),
+      twoWay: beside.get(`${model} ${of}`),
     }))
     .filter((row) => (!regime || row.regime === regime) && (!group || groupOf.get(row.model) === group));
   shown.sort(ordering(sort, up, info.regimes));
+  const withPairs = own.length > 0 || !askedOfLanes(info).length;
   const withPaper = shown.some((row) => row.paper);
   const columns = [
     { title: "Model", sort: "model" },
     { title: "Regime", sort: "regime" },
     ...info.figures.map(({ field, title }) => ({ title, number: true, sort: field, hint: info.legend[title] })),
     { title: "Rank", number: true, hint: "by PECS among the models of a regime; ranks in between are not separable" },
-    ...(robust.size
-      ? info.robust_figures.map(({ title }, k) => ({ title, number: true, group: !k, hint: info.legend[title] }))
+    ...(beside.size
+      ? info.two_way_figures.map(({ title }, k) => ({ title, number: true, group: !k, hint: info.legend[title] }))
       : []),
     ...(withPaper
       ? ofPaper.map(({ field, title }, k) => ({
@@ -80,9 +83,7 @@ async function leaderboardView(route) {
       figure(row.own, each, each.field === "pecs" && row.own && row.own.incomplete ? incompleteMark : ""),
     ),
     rankOf(row.own),
-    ...(robust.size
-      ? info.robust_figures.map((each) => (row.robust ? printerOf(each)(row.robust[each.field]) : NOT_RUN))
-      : []),
+    ...(beside.size ? info.two_way_figures.map((each) => figure(row.twoWay, each)) : []),
     ...(withPaper
       ? ofPaper.map((each) =>
           row.paper ? h("span", { title: `epoch ${row.paper.epoch}` }, printerOf(each)(row.paper[each.field])) : NONE,
@@ -107,49 +108,52 @@ async function leaderboardView(route) {
         "Choose a model to see its answers. ",
         info.provenance,
       ),
-      h(
-        "div",
-        { class: "filters" },
-        choice(
-          route,
-          "dataset",
-          "Dataset",
-          datasetOptions(info, { overall: true }).filter(([id]) => id in info.titles),
-          { empty: null, fallback: dataset },
+      withPairs &&
+        h(
+          "div",
+          { class: "filters" },
+          choice(
+            route,
+            "dataset",
+            "Dataset",
+            datasetOptions(info, { overall: true }).filter(([id]) => id in info.titles),
+            { empty: null, fallback: dataset },
+          ),
+          choice(
+            route,
+            "regime",
+            "Regime",
+            same(distinct([...info.regimes, ...(paper ? info.published.map((row) => row.regime) : [])])),
+          ),
+          choice(route, "group", "Models", same(distinct(entries.map((row) => groupOf.get(row.model))).sort())),
+          toggle(route, "paper", "also the paper's other models"),
         ),
-        choice(
-          route,
-          "regime",
-          "Regime",
-          same(distinct([...info.regimes, ...(paper ? info.published.map((row) => row.regime) : [])])),
+      withPairs &&
+        section(
+          null,
+          table(columns, rows, {
+            caption: `${info.titles[dataset] || dataset}: ${counted(shown.length, "entry", "entries")}`,
+            name: "leaderboard",
+            order: { by: sort, down: !up },
+            sortBy: change,
+            data: shown.map(({ own: row, paper: printed, model, regime: of }) => ({
+              model,
+              regime: of,
+              ...(row || {}),
+              ...Object.fromEntries(ofPaper.map(({ field }) => [`paper_${field}`, printed?.[field] ?? null])),
+            })),
+            foot: own.length ? [rowOfPeople(info, dataset, columns)] : [],
+            absent: own.length ? "no entry fits these filters" : `${NOT_RUN}: this study has no leaderboard yet`,
+          }),
+          notes(info, shown, dataset),
+          own.length
+            ? info.said.map((text) => h("p", { class: "note" }, `${text[0].toUpperCase()}${text.slice(1)}.`))
+            : null,
+          inPaper
+            ? null
+            : h("p", { class: "note" }, own.length ? "No model of this study is in the paper's tables." : null),
         ),
-        choice(route, "group", "Models", same(distinct(entries.map((row) => groupOf.get(row.model))).sort())),
-        toggle(route, "paper", "also the paper's other models"),
-      ),
-      section(
-        null,
-        table(columns, rows, {
-          caption: `${info.titles[dataset] || dataset}: ${counted(shown.length, "entry", "entries")}`,
-          name: "leaderboard",
-          order: { by: sort, down: !up },
-          sortBy: change,
-          data: shown.map(({ own: row, paper: printed, model, regime: of }) => ({
-            model,
-            regime: of,
-            ...(row || {}),
-            ...Object.fromEntries(ofPaper.map(({ field }) => [`paper_${field}`, printed?.[field] ?? null])),
-          })),
-          foot: own.length ? [rowOfPeople(info, dataset, columns)] : [],
-          absent: own.length ? "no entry fits these filters" : `${NOT_RUN}: this study has no leaderboard yet`,
-        }),
-        notes(info, shown, dataset),
-        own.length
-          ? info.said.map((text) => h("p", { class: "note" }, `${text[0].toUpperCase()}${text.slice(1)}.`))
-          : null,
-        inPaper
-          ? null
-          : h("p", { class: "note" }, own.length ? "No model of this study is in the paper's tables." : null),
-      ),
+      twoWaySection(info),
       meanings(info),
     ],
   };
@@ -164,7 +168,9 @@ function rowOfPeople(info, dataset, columns) {
     ...info.figures.map((each) => figure(row && row[each.field] !== null ? row : undefined, each)),
     NONE,
   ];
-  const rest = columns.slice(cells.length).map(({ title }) => (title === "n" && row ? counted(row.n_clips, "clip") : NONE));
+  const rest = columns
+    .slice(cells.length)
+    .map(({ title }) => (title === "n" && row ? counted(row.n_clips, "clip") : NONE));
   return [...cells, ...rest];
 }
 
@@ -196,7 +202,9 @@ function notes(info, shown, dataset) {
   if (shown.some((row) => row.own?.incomplete)) used.push(`${incompleteMark} ${info.marks[incompleteMark]}`);
   if (dataset === "overall" && shown.some((row) => !row.own))
     used.push(`${NOT_RUN}: this study did not ask the model, or not on all four datasets`);
-  used.push("Brackets: 95 % interval, Bayesian bootstrap over scenarios with one unseen. ±: population standard deviation over runs.");
+  used.push(
+    "Brackets: 95 % interval, Bayesian bootstrap over scenarios with one unseen. ±: population standard deviation over runs.",
+  );
   return used.map((text) => h("p", { class: "note" }, text));
 }
 

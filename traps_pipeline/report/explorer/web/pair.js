@@ -4,6 +4,8 @@ async function pairView(route) {
   const [dataset, scenario] = route.path;
   const [info, found, about] = await Promise.all([study(), world(), scenarios()]);
   const place = found.pairs.findIndex((pair) => pair.dataset === dataset && pair.scenario === scenario);
+  const lanes = dataset === LANES_DATASET && about.get(scenario);
+  if (lanes) return lanesView(route, info, found, lanes);
   if (!scenario) return missingView("Which pair?", "The address names no scenario: choose one under Scenes.");
   if (place < 0) return missingView(`No pair ${scenario} in ${dataset}`, "This study does not hold it.");
   const pair = found.pairs[place];
@@ -72,17 +74,7 @@ async function pairView(route) {
             ),
           ]),
       ),
-      h(
-        "nav",
-        { class: "pages", "aria-label": "pairs" },
-        neighbours.before
-          ? h("a", { class: "button", href: neighbours.before, id: "pair-before" }, "Previous pair")
-          : h("span", { class: "button off" }, "Previous pair"),
-        neighbours.after
-          ? h("a", { class: "button", href: neighbours.after, id: "pair-after" }, "Next pair")
-          : h("span", { class: "button off" }, "Next pair"),
-        h("span", { class: "soft keys" }, "Keys: space plays, ← → a frame, [ ] a pair"),
-      ),
+      neighbourLinks(neighbours, "pair"),
       unknownModels(info, route.parameters, ["model", "model2"]),
       section(null, questions(items, pair, sides, scene), shown.element),
       section(
@@ -113,6 +105,21 @@ async function pairView(route) {
         : null,
     ],
   };
+}
+
+// Links to what comes before and after, of a kind (a pair or a scene).
+function neighbourLinks({ before, after }, kind) {
+  const to = (href, place, title) =>
+    href
+      ? h("a", { class: "button", href, id: `${kind}-${place}` }, `${title} ${kind}`)
+      : h("span", { class: "button off" }, `${title} ${kind}`);
+  return h(
+    "nav",
+    { class: "pages", "aria-label": `${kind}s` },
+    to(before, "before", "Previous"),
+    to(after, "after", "Next"),
+    h("span", { class: "soft keys" }, `Keys: space plays, ← → a frame, [ ] a ${kind}`),
+  );
 }
 
 function follow(href) {

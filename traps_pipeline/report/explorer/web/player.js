@@ -23,11 +23,12 @@ function clipAddress(path) {
 
 let speed = 1; // stays for the next pair
 
-// clips: [{title, path, note}]; path is null where the folder has no such clip. fps: frames a second.
+// clips: [{title, path, note, kind, below}]; path is null where the folder has no such clip; below: {element, show},
+// which is told of each frame. fps: frames a second.
 function player(clips, fps, hasClips) {
   const videos = [];
   for (const held of HELD.splice(0)) URL.revokeObjectURL(held);
-  const figures = clips.map(({ title, path, note, kind }) => {
+  const figures = clips.map(({ title, path, note, kind, below }) => {
     const video = path
       ? h("video", { muted: true, playsinline: true, preload: "auto", "aria-label": title, tabindex: "-1" })
       : null;
@@ -43,6 +44,7 @@ function player(clips, fps, hasClips) {
       { class: `clip ${kind}` },
       video || h("div", { class: "clip-absent" }, absent),
       h("figcaption", null, h("b", null, title), note ? ` ${note}` : null),
+      below ? below.element : null,
     );
   });
   const element = h("div", { class: "player" }, h("div", { class: `clips of-${clips.length}` }, figures));
@@ -68,6 +70,7 @@ function player(clips, fps, hasClips) {
   const last = (video) => Math.max(0, Math.round((video.duration || 0) / step) - 1);
   const tell = (frame) => {
     slider.value = frame;
+    for (const { below } of clips) if (below) below.show(frame);
     const ended = videos
       .filter((video) => frame > last(video))
       .map((video) => video.getAttribute("aria-label").split(":")[0].toLowerCase());

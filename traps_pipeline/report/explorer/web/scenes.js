@@ -16,7 +16,11 @@ async function scenesView(route) {
   return {
     title: "Scenes",
     body: [
-      h("p", { class: "lead" }, "Each scene's control, its void, and a twin: another world behind the same void."),
+      h(
+        "p",
+        { class: "lead" },
+        "Each scene's control, its void, and a twin: another world behind the same void; of two events all four clips.",
+      ),
       h("div", { class: "filters" }, choice(route, "family", "Family", same(found.families))),
       scenes.length ? null : notice(`${NOT_RUN}: this study has no such scenes`),
       scenes.slice((page - 1) * SCENES_SHOWN, page * SCENES_SHOWN).map((pair) => sceneCard(info, found, about, pair)),
@@ -27,24 +31,26 @@ async function scenesView(route) {
 
 function sceneCard(info, { items }, about, pair) {
   const scene = about.get(pair.scenario) || { certificate: [] };
-  const clips = [
+  const all = scene.clips?.map(({ name, path }) => ["lane-clip", clipName(name), path]) || [
     ["control", `Control: ${items.control_answer[pair.control] ?? ""}`, items.clip[pair.control]],
     ["void", `Void: ${scene.intervention ?? ""}`, pair.void < 0 ? null : items.clip[pair.void]],
     ["twin", `Twin, same void: ${scene.twin_answer ?? ""}`, scene.twin_clip],
-  ].filter(([, , path]) => path);
+  ];
+  const clips = all.filter(([, , path]) => path);
+  const isWide = Boolean(scene.clips);
   return section(
     null,
     h("h2", null, link(["pair", pair.dataset, pair.scenario], {}, pair.scenario)),
     h("p", null, untrusted(items.question[pair.control])),
     h(
       "div",
-      { class: "clips of-3" },
+      { class: isWide ? "clips of-4" : "clips of-3" },
       clips.map(([kind, caption, path]) =>
         h(
           "figure",
           { class: `clip ${kind}` },
           h("video", {
-            src: `${clipAddress(path)}#t=${(kind === "control" && scene.shown_at) || 1000}`,
+            src: `${clipAddress(path)}#t=${((kind === "control" || isWide) && scene.shown_at) || 1000}`,
             muted: true,
             controls: true,
             playsinline: true,
@@ -55,6 +61,6 @@ function sceneCard(info, { items }, about, pair) {
         ),
       ),
     ),
-    scene.certificate.length ? h("p", { class: "note" }, scene.certificate.join(" · ")) : null,
+    scene.certificate?.length ? h("p", { class: "note" }, scene.certificate.join(" · ")) : null,
   );
 }
