@@ -168,7 +168,10 @@ def _print_forecasts(forecasts: Sequence[Forecast], minutes: float) -> None:
 
 
 def _print_local(costs: Sequence[Cost], card: str) -> None:
-    """Print passes, tokens, GPU-hours and memory; sums omit models without a size."""
+    """Print passes, tokens, GPU-hours, memory, and what does not fit; sums omit models without a size."""
+    from traps_pipeline.mechanism.cost import CARDS, too_large
+    from traps_pipeline.models.registry.entries import get_model
+
     rows = [
         (
             cost.model, cost.kind, f"{cost.passes:,}", f"{cost.tokens_in / 1e6:,.2f}, {cost.tokens_out / 1e6:,.2f}",
@@ -180,6 +183,9 @@ def _print_local(costs: Sequence[Cost], card: str) -> None:
     rows.append(("all", "", f"{sum(cost.passes for cost in costs):,}", "", f"{hours:,.1f}", ""))
     print(f"\n{text_table(('on this machine', 'work', 'new', 'M tokens in, out', f'{card} hours', 'GB'), rows)}")
     print("hours and GB are arithmetic, checked on one card: docs/mechanism.md#cost")
+    quantised = {c.model for c in costs if get_model(c.model).inside_params().quantisation == "nf4"}
+    for sentence in too_large(costs, CARDS[card], quantised):
+        print(wrap_text(sentence))
 
 
 def _dollars(amounts: tuple[float, float, float] | None) -> list[str]:

@@ -47,9 +47,8 @@ _ONE_TAXONOMY = {
     **dict.fromkeys(("length_matched", "predictable_cut", GRADED), "chaotic"),
 }
 ANSWERABLE = "occlusion_answerable"  # only in mechanistic stages: occlusion's voids, answerable
-TIME_SWAPPED = "chaotic_time_swapped"  # only in mechanistic stages: frames with the other side's times
 PROBED_ARMS = ("length_matched",)  # arms that probes are applied to where an experiment asks them
-PROBED_DATASETS = (*DATASETS, ANSWERABLE, TIME_SWAPPED, *PROBED_ARMS)
+PROBED_DATASETS = (*DATASETS, ANSWERABLE, *PROBED_ARMS)
 SIDES = ("control", "void")
 
 

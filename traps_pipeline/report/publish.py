@@ -10,6 +10,7 @@ from typing import Any
 import pandas as pd
 
 from traps_pipeline.base.archives import pack
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
 from traps_pipeline.benchmark.held_out import begin_publication
 from traps_pipeline.report.cards import (
@@ -23,7 +24,7 @@ from traps_pipeline.report.cards import (
     picture_card,
     table_card,
 )
-from traps_pipeline.report.catalogue import FIGURE_REPORTS, INSIDE, RECOMPUTED, TABLE_REPORTS
+from traps_pipeline.report.catalogue import FIGURE_REPORTS, INSIDE, RECOMPUTED, TABLE_REPORTS, TableReport
 from traps_pipeline.report.leaderboard_page import leaderboard_markdown
 from traps_pipeline.report.page import report_html
 from traps_pipeline.report.pair_pictures import PairPictures
@@ -76,7 +77,7 @@ def report_parts(sources: Sources, address: Address | None = explorer_address) -
             report.name,
             lambda report=report: table_card(report, sources, address),
             report.reads,
-            lambda report=report: [table.content for table in report.tables(sources.study)],
+            lambda report=report: _contents(report, sources.study),
         )
         for report in TABLE_REPORTS
     ]
@@ -87,6 +88,16 @@ def report_parts(sources: Sources, address: Address | None = explorer_address) -
         if report.published
     ]
     return [*figures, *pictures, *tables, *paper]
+
+
+def _contents(report: TableReport, study: Results) -> list[Any]:
+    """Return what a report's tables show; of one that cannot be made, the error, which its card names."""
+    try:
+        return [table.content for table in report.tables(study)]
+    except TrapsError:
+        raise
+    except Exception as error:  # noqa: BLE001 - one table must not cost the others
+        return [repr(error)]
 
 
 def report_files(

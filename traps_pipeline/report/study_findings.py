@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.wording import count_noun
 from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, REGIMES, STANDARD
-from traps_pipeline.report.catalogue import FIGURE_REPORTS
+from traps_pipeline.report.catalogue import FIGURE_REPORTS, FigureReport
 from traps_pipeline.report.leaderboard_page import shortfall
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.table_columns import interval, ranks
@@ -39,13 +40,24 @@ def study_findings(results: Results) -> list[StudyFinding]:
     if not len(rows):
         return [*missing, *_two_events(results)]
     model_rows = _models_first(rows)
-    figure_findings = [(report.name, report.finding(results)) for report in FIGURE_REPORTS] if results.mechanism else []
+    reports = FIGURE_REPORTS if results.mechanism else ()
+    figure_findings = [(report.name, _finding(report, results)) for report in reports]
     return [
         *missing, *_best(model_rows), *_abstention(model_rows), *_accuracy(model_rows), *_gaps(results, model_rows),
         *_two_events(results), *_separable(results, model_rows),
         *(() if missing else _missing_answers(model_rows)),
         *(StudyFinding(text, f"figure-{name}") for name, text in figure_findings if text),
     ]  # fmt: skip
+
+
+def _finding(report: FigureReport, results: Results) -> str:
+    """Return a figure's finding; empty if it cannot be made, which its card says."""
+    try:
+        return report.finding(results)
+    except TrapsError:
+        raise
+    except Exception:  # noqa: BLE001 - one figure must not cost the others
+        return ""
 
 
 def _models_first(rows: pd.DataFrame) -> pd.DataFrame:

@@ -57,7 +57,7 @@ class ProbeSettings(Settings):
 class NullSettings(Settings):
     """The number of null directions of each kind against which an effect is ranked.
 
-    They are steered at the largest dose on the datasets that they come from.
+    They are steered at every alpha and the largest gap on the datasets that they come from.
     """
 
     kinds: tuple[Literal["isotropic", "covariance", "shuffled"], ...] = Field(
@@ -111,9 +111,6 @@ class GateSettings(Settings):
     """The settings of probe-gated abstention (docs/mechanism.md)."""
 
     false_abs: float = Field(default=0.05, gt=0, lt=1, description="of source controls, that conformal gates promise")
-    untrained: bool = Field(
-        default=False, description="also a gate on states of the same network with random weights, loaded beside it"
-    )
 
 
 class PatchingSettings(Settings):

@@ -207,6 +207,11 @@ class ModelEntry(Entry):
         """Return the validated `params` of backend local, or raise ValidationError."""
         return LocalParams.model_validate(self.params)
 
+    @property
+    def has_random_weights(self) -> bool:
+        """Whether states of the network with random weights are controls of its claims."""
+        return self.mechanism is None or self.mechanism.random_weights
+
     def inside_params(self) -> LocalParams:
         """Return the parameters for mechanistic analyses: `params` with their overrides."""
         params = self.local_params()

@@ -98,7 +98,9 @@ def legend_key(label: str, colour: str, marker: str = "", line: Any = "none", si
 
 
 def arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float], colour: str) -> None:
-    """Draw a thin arrow between two markers' rims."""
+    """Draw a thin arrow between two markers' rims; none where either is undefined."""
+    if not np.isfinite([*start, *end]).all():
+        return  # matplotlib's arrow raises StopIteration while the figure is saved
     style = {"arrowstyle": "-|>,head_width=0.12,head_length=0.25", "color": colour, "linewidth": 0.8}
     style |= {"shrinkA": 2.5, "shrinkB": 2.5, "mutation_scale": 10}
     axes.annotate("", end, start, arrowprops=style, zorder=2.5, annotation_clip=False)
