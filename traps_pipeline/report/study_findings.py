@@ -13,8 +13,8 @@ from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, REGIMES, STANDARD
 from traps_pipeline.report.catalogue import FIGURE_REPORTS
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.table_columns import interval, ranks
-from traps_pipeline.report.writing import fraction, percent
-from traps_pipeline.scoring.analyses import models_of
+from traps_pipeline.report.writing import REFERENCE_ROWS, fraction, percent
+from traps_pipeline.scoring.analyses import reference_rows
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -36,8 +36,7 @@ def study_findings(results: Results) -> list[StudyFinding]:
     rows = overall.loc[overall["pecs"].notna()] if len(overall) else overall
     if not len(rows):
         return []
-    references = models_of(group="reference")
-    model_rows = rows.loc[[model not in references for model in rows["model"]]]
+    model_rows = rows.loc[~rows["model"].isin(reference_rows())]
     model_rows = model_rows if len(model_rows) else rows
     figure_findings = [(report.name, report.finding(results)) for report in FIGURE_REPORTS] if results.mechanism else []
     return [
@@ -60,7 +59,8 @@ def _best(rows: pd.DataFrame) -> Iterator[StudyFinding]:
         best = (
             "have the highest PECS," if len(equal) > 1 else "has the highest PECS," if worse_rows else "has a PECS of"
         )
-        text = f"Under {regime}, {_names(equal)} {best} {figure} {interval(first)}".strip()
+        group = "" if _noun(part) == "models" else f" among {_noun(part)}"
+        text = f"Under {regime},{group} {_names(equal)} {best} {figure} {interval(first)}".strip()
         if worse_rows:
             text += (
                 f", before {worse_rows[0]} with {fraction(part.loc[part['model'] == worse_rows[0], 'pecs'].iloc[0])}"
@@ -69,6 +69,11 @@ def _best(rows: pd.DataFrame) -> Iterator[StudyFinding]:
         if len(equal) == 1 and "–" in rank_range:
             text += f"; its rank may be {rank_range}, since contrasts do not separate it from others"
         yield StudyFinding(f"{text}.", "leaderboard")
+
+
+def _noun(rows: pd.DataFrame) -> str:
+    """Return what the rows are of: models, or reference rows alone."""
+    return REFERENCE_ROWS.lower() if rows["model"].isin(reference_rows()).any() else "models"
 
 
 def _names(models: list[str]) -> str:
@@ -82,7 +87,7 @@ def _abstention(rows: pd.DataFrame) -> Iterator[StudyFinding]:
     for regime, words in REGIME_WORDS.items():
         part = rows.loc[rows["regime"] == regime]
         if len(part):
-            subject = f"the {len(part)} models abstain" if len(part) > 1 else f"{part['model'].iloc[0]} abstains"
+            subject = f"the {len(part)} {_noun(part)} abstain" if len(part) > 1 else f"{part['model'].iloc[0]} abstains"
             voids, controls = (_span(part[name]) for name in ("abs_rec", "false_abs"))
             yield StudyFinding(
                 f"{words}, {subject} on {voids} of the voids, which cannot be answered, and on {controls} of the "
@@ -114,7 +119,11 @@ def _gaps(results: Results, rows: pd.DataFrame) -> Iterator[StudyFinding]:
     pooled_rates = pooled_rates.dropna(subset=["visual", "textual"])
     if len(pooled_rates):
         textual, visual = (percent(pooled_rates[name].to_numpy(float).mean()) for name in ("textual", "visual"))
-        subject = f"the {len(pooled_rates)} models" if len(pooled_rates) > 1 else str(pooled_rates["model"].iloc[0])
+        subject = (
+            f"the {len(pooled_rates)} {_noun(pooled_rates)}"
+            if len(pooled_rates) > 1
+            else str(pooled_rates["model"].iloc[0])
+        )
         yield StudyFinding(
             f"Asked plainly, {subject} abstain{'' if len(pooled_rates) > 1 else 's'} on {textual} % of the questions "
             f"about something that no clip shows, and on {visual} % of the clips whose outcome is hidden or cut off"
@@ -143,7 +152,7 @@ def _separable(results: Results, rows: pd.DataFrame) -> Iterator[StudyFinding]:
         if len(tested):
             count = int(tested["separable"].eq(True).sum())
             yield StudyFinding(
-                f"Of {count_noun(len(tested), 'difference')} of PECS between models under one regime, {count} "
+                f"Of {count_noun(len(tested), 'difference')} of PECS between {_noun(rows)} under one regime, {count} "
                 f"{'is' if count == 1 else 'are'} significant after Holm’s correction.",
                 "table-contrasts",
             )

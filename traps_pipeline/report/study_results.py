@@ -127,7 +127,7 @@ def _ill_posed(frame: pd.DataFrame) -> pd.DataFrame:
 
 def _without_references(rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows without reference strategies, if other models were asked."""
-    kept_rows = rows.loc[~rows["model"].isin(analyses.models_of(group="reference"))]
+    kept_rows = rows.loc[~rows["model"].isin(analyses.reference_rows())]
     return kept_rows if len(kept_rows) else rows
 
 

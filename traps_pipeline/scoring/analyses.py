@@ -72,6 +72,11 @@ def scoped_cells(metrics: pd.DataFrame, scope: str) -> pd.DataFrame:
     return cells.reset_index()
 
 
+def reference_rows() -> frozenset[str]:
+    """Return ids of the registry's strategies and rules: rows to compare with, which no text calls models."""
+    return frozenset(models_of(group="reference"))
+
+
 def models_of(group: str | None = None, family: str | None = None, media: str | None = None) -> list[str]:
     """Return ids of the registry's models by group (main, ..), family and input media."""
     criteria = {"group": group, "family": family, "input": media}

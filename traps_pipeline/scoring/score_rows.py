@@ -146,7 +146,7 @@ class LeaderboardRow(shared.EntryRow):
     figures: Annotated[Mean, EACH_METRIC, STD, CI]
     rank: Annotated[
         int | None,
-        "by PECS among the models of this regime, dataset and panel; equal values share a rank; null if of two panels",
+        "by PECS among models, or reference rows, of a regime, dataset and panel; ties share it; null if of two panels",
     ]
     rank_low: Annotated[
         int | None,

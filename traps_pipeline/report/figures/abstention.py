@@ -8,7 +8,7 @@ import numpy as np
 
 from traps_pipeline.protocol.datasets import taxonomy_of
 from traps_pipeline.protocol.regimes import PROMPTING
-from traps_pipeline.report.figures.looks import families, family_colour, family_of, legend_key, looks
+from traps_pipeline.report.figures.looks import REFERENCE, families, family_colour, family_of, legend_key, looks
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.terms import INCOMPLETE_MARK, TITLES
 from traps_pipeline.report.writing import COLUMN_IN, INK, PAGE_IN, SOFT, NotRun, figure_style, new_figure, plain
@@ -93,7 +93,7 @@ def _draw_models_key(figure: Figure, models: list[str]) -> None:
 def abs_rec_by_model(results: Results) -> Figure:
     """Return AbsRec of every model under standard (hollow) and guided (filled).
 
-    Datasets have equal weights; bars are the deviation over runs.
+    Datasets have equal weights; bars are the deviation over runs. Reference rows lie below a line.
     """
     overall = results.overall
     rows = overall.loc[overall["regime"].isin(PROMPTING) & overall["abs_rec"].notna()]
@@ -101,9 +101,12 @@ def abs_rec_by_model(results: Results) -> Figure:
         reason = "no model has all four datasets" if len(results.cells) else results.why("cells")
         raise NotRun(reason)
     sides: dict[tuple[str, str], Any] = {(r["model"], r["regime"]): r for r in rows.to_dict("records")}
+    references = analyses.reference_rows()
     models = sorted(
-        {m for m, _ in sides}, key=lambda m: (_abs_rec(sides, m, "standard"), _abs_rec(sides, m, "guided"), m)
+        {m for m, _ in sides},
+        key=lambda m: (m not in references, *(_abs_rec(sides, m, regime) for regime in PROMPTING), m),
     )
+    n_references = len(references.intersection(models))
     look = looks(models)
     with figure_style():
         figure = new_figure(COLUMN_IN, 0.75 + 0.155 * len(models))
@@ -126,6 +129,17 @@ def abs_rec_by_model(results: Results) -> Figure:
         names = [plain(m)[:30] + (f" {INCOMPLETE_MARK}" if m in incomplete else "") for m in models]
         axes.set_yticks(range(len(models)), names)
         axes.set(xlim=(-2, 102), ylim=(-0.7, len(models) - 0.3), xticks=PERCENT)
+        if n_references:
+            below = {
+                "color": SOFT,
+                "size": 6,
+                "xytext": (0, -2),
+                "textcoords": "offset points",
+                "va": "top",
+                "ha": "right",
+            }
+            axes.axhline(n_references - 0.5, color=SOFT, linewidth=0.6)
+            axes.annotate(REFERENCE, (102, n_references - 0.5), **below)
         axes.set_xlabel("AbsRec, mean over datasets, %")
         axes.set_title("hollow: standard, filled: guided", weight="normal", size=7)
         axes.grid(axis="x", color="#eaecf0", linewidth=0.6)

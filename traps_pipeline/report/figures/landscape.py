@@ -10,7 +10,15 @@ import numpy as np
 
 from traps_pipeline.protocol.regimes import BY_NAME, GUIDED, PROMPTING, REGIMES, STANDARD
 from traps_pipeline.report.figures.label_placement import LINES, Label, merge_labels, place_labels, short
-from traps_pipeline.report.figures.looks import arrow, family_of, frame_plane, legend_key, looks
+from traps_pipeline.report.figures.looks import (
+    REFERENCE,
+    arrow,
+    family_colour,
+    family_of,
+    frame_plane,
+    legend_key,
+    looks,
+)
 from traps_pipeline.report.result_frames import Results, datasets_of
 from traps_pipeline.report.terms import INCOMPLETE_MARK, TITLES
 from traps_pipeline.report.writing import COLUMN_IN, INK, PAGE_IN, NotRun, figure_style, freeze_layout, new_figure
@@ -41,7 +49,8 @@ def landscape_figure(points: pd.DataFrame, scope: str) -> Figure:
     """Return J (x) against Acc (y) of every model with iso-PECS contours.
 
     points has the columns model, regime, acc, j, pecs, incomplete. Hollow is standard, filled guided, a dot json; thin
-    bars are 95 % intervals. The dashed line is the frontier under guided, a ring each family's best PECS under guided.
+    bars are 95 % intervals. The dashed line is the models' frontier under guided, a ring each family's best PECS under
+    guided. Reference rows are grey.
     PECS is averaged per run and dataset, so it can differ from the contours. Coinciding points share one label.
     """
     points = points.loc[points["acc"].notna() & points["j"].notna()]
@@ -50,10 +59,11 @@ def landscape_figure(points: pd.DataFrame, scope: str) -> Figure:
         axes = figure.add_subplot()
         frame_plane(axes, points, f"Acc, {scope.lower()}", intervals=True)
         labels = merge_labels(_draw_models(axes, points), axes)
-        guided = points.loc[points["regime"] == GUIDED]
+        references = points["model"].isin(analyses.reference_rows())
+        guided = points.loc[points["regime"].eq(GUIDED) & ~references]
         _draw_frontier(axes, guided)
         _draw_rings(axes, guided)
-        _draw_key(figure)
+        _draw_key(figure, references=bool(references.any()))
         freeze_layout(figure)
         place_labels(axes, labels, points.loc[:, ["j", "acc"]].to_numpy(float))
     return figure
@@ -144,21 +154,22 @@ def _draw_frontier(axes: Axes, guided: pd.DataFrame) -> None:
 
 def _draw_rings(axes: Axes, guided: pd.DataFrame) -> None:
     families = guided["model"].map(family_of)
-    for family, rows in guided.assign(family=families).dropna(subset=["pecs"]).groupby("family"):
+    for _, rows in guided.assign(family=families).dropna(subset=["pecs"]).groupby("family"):
         best = rows.loc[rows["pecs"].idxmax()]
-        if family != "reference" and best["pecs"] > 0:
+        if best["pecs"] > 0:
             axes.scatter(
                 best["j"], best["acc"], s=75, facecolors="none", edgecolors=INK, linewidths=0.7, zorder=6, clip_on=False
             )
 
 
-def _draw_key(figure: Figure) -> None:
+def _draw_key(figure: Figure, *, references: bool) -> None:
     handles = [
         legend_key("standard", "#475467", "o", size=4.5, markerfacecolor="white"),
         legend_key("guided", "#475467", "o", size=4.5),
         legend_key("json", "#475467", "o", size=1.6),
         legend_key("family’s best, guided", INK, "o", size=7, markerfacecolor="none"),
         legend_key("frontier, guided", INK, line=(0, (4, 2.5)), linewidth=0.7),
+        *([legend_key(REFERENCE, family_colour(REFERENCE), "s", size=4.5)] if references else []),
     ]
     style: dict[str, Any] = {"handletextpad": 0.4, "columnspacing": 1.2}
     figure.legend(handles=handles, loc="outside lower center", ncols=3, **style)

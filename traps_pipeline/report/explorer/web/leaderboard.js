@@ -48,7 +48,7 @@ async function leaderboardView(route) {
       robust: robust.get(`${model} ${of}`),
     }))
     .filter((row) => (!regime || row.regime === regime) && (!group || groupOf.get(row.model) === group));
-  shown.sort(ordering(sort, up, info.regimes));
+  shown.splice(0, shown.length, ...modelsFirst(info, shown.sort(ordering(sort, up, info.regimes))));
   const withPaper = shown.some((row) => row.paper);
   const columns = [
     { title: "Model", sort: "model" },
@@ -128,7 +128,7 @@ async function leaderboardView(route) {
       ),
       section(
         null,
-        table(columns, rows, {
+        table(columns, withHeading(info, shown, rows), {
           caption: `${info.titles[dataset] || dataset}: ${counted(shown.length, "entry", "entries")}`,
           name: "leaderboard",
           order: { by: sort, down: !up },

@@ -12,7 +12,7 @@ async function modelView(route) {
   return {
     title: name,
     body: [
-      h("p", { class: "lead" }, "Each count leads to the answers behind it."),
+      h("p", { class: "lead" }, isReference(info, name) ? "A reference row, no model. " : "", "Each count leads to the answers behind it."),
       h(
         "div",
         { class: "filters" },
