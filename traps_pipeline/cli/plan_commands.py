@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 def add(commands: Commands) -> None:
     """Add `traps plan`."""
-    text = "count the calls of an experiment, with their price and the precision of its figures; nothing is sent"
+    text = "count the calls of an experiment, with their price and the precision of PECS; nothing is sent"
     parser = commands.add("study plan", plan, text, example="demo", json=True)
     add_experiment(parser)
     parser.add_argument(

@@ -79,9 +79,9 @@ LEGEND = {
     "±": "population standard deviation over runs",
     "n": "pairs (one control, one void) per run",
     "Missing": f"items over all runs without an answer or a majority; {MISSING_MARK} shares are over the other items",
-    INCOMPLETE_MARK: f"incomplete: fewer than {ENOUGH} of items answered; an overall figure is incomplete if that of "
+    INCOMPLETE_MARK: f"incomplete: fewer than {ENOUGH} of items answered; an overall metric is incomplete if that of "
     "any dataset is",
-    BROKEN_MARK: f"broken: {BROKEN_TEXTS}; an overall figure is broken if that of any dataset is",
+    BROKEN_MARK: f"broken: {BROKEN_TEXTS}; an overall metric is broken if that of any dataset is",
     **{
         count.heading: f"{count.meaning}; over all runs{', among the missing ones' if count.outcomes else ''}"
         for count in _COUNTS
@@ -90,7 +90,7 @@ LEGEND = {
     BOUNDS: "PECS of all items if every missing decision were the worst for the model (a control wrong and abstained "
     "on, a void not abstained on), and if every one were the best; computed per run, then averaged",
     **{heading: meaning for _, heading, _, meaning in ROBUST_FIGURES},
-    "Epoch": "the evaluation campaign; figures of different epochs are not put in one ratio",
+    "Epoch": "the evaluation campaign; metrics of different epochs are not put in one ratio",
     "Overall": "equal-weight mean over the four datasets",
 }
 
@@ -178,7 +178,7 @@ def judged_by(board: pd.DataFrame) -> str:
     names = [_panel_in_words(panel) for panel in panels]
     has_several_panels = len(panels) > 1
     sentence = f"Judged by the panel{'s' * has_several_panels} {' and '.join(names) or NONE}"
-    sentence += "; figures of different panels are not ranked or compared" * has_several_panels
+    sentence += "; metrics of different panels are not ranked or compared" * has_several_panels
     rows = board[["panel", "model"]].drop_duplicates().itertuples(index=False, name=None)
     rule_judged_models = sorted({model for panel, model in rows if is_judged_by_rules(panel, model)})
     names_shown = ", ".join(rule_judged_models[:5]) + (
@@ -247,7 +247,7 @@ def _notes_on_arms(beside: Robust) -> list[str]:
         for arms, names in entries.items()
     ]
     refusals = dict.fromkeys(row["refused"] for row in beside.values() if row["refused"])
-    return [*notes, *(f"no conjunction and no robust figure: {reason}" for reason in refusals)]
+    return [*notes, *(f"no conjunction and no robust score: {reason}" for reason in refusals)]
 
 
 def _trace(row: Mapping[str, Any], field: str) -> SourceItems | None:

@@ -169,7 +169,7 @@ class StudyResults(Results):
         sentence = judged_by(_panel_rows(self, self.board)).rstrip(".")
         other_models = self.board.loc[self.board["panel"] != self.panel, "model"].unique()
         return sentence + (
-            f"; left out: {count_noun(len(other_models), 'model')} with figures of other panels"
+            f"; left out: {count_noun(len(other_models), 'model')} with metrics of other panels"
             if len(other_models)
             else ""
         )

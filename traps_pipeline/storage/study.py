@@ -204,7 +204,7 @@ class Study(Settings):
     scenarios: list[str] | None = Field(default=None, min_length=1, description="named scenarios; all if absent")
     per_family: int | None = Field(default=None, ge=1, description="the first n scenarios of each family")
     panel: str = Field(default="", description="who judges; nothing is judged until one is named")
-    judged_by_rules: bool = Field(default=False, description="rules may judge other models than reference models")
+    judged_by_rules: bool = Field(default=False, description="rules may judge models, not reference strategies alone")
     epoch: str = Field(
         default="1",
         pattern=r"^[A-Za-z0-9_-]+([._-][A-Za-z0-9_-]+)*$",

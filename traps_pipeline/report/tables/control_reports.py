@@ -366,6 +366,6 @@ def _prompts(results: Results) -> PrintedTable:
         _NOTES[1],
         *few_note(rows, "said_mark", "probe_mark"),
     ]
-    reason = why(results, "the paper prints no such figures")
+    reason = why(results, "the paper prints no such numbers")
     title = "What the prompt changes, in answers and in states"
     return PrintedTable("prompt_gate", title, rows, columns, notes, reason, deviation=DRAWS)
