@@ -13,7 +13,7 @@ from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, REGIMES, STANDARD
 from traps_pipeline.report.catalogue import FIGURE_REPORTS
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.table_columns import interval, ranks
-from traps_pipeline.report.writing import REFERENCE_ROWS, fraction, percent
+from traps_pipeline.report.writing import fraction, percent
 from traps_pipeline.scoring.analyses import reference_rows
 
 if TYPE_CHECKING:
@@ -72,8 +72,8 @@ def _best(rows: pd.DataFrame) -> Iterator[StudyFinding]:
 
 
 def _noun(rows: pd.DataFrame) -> str:
-    """Return what the rows are of: models, or reference rows alone."""
-    return REFERENCE_ROWS.lower() if rows["model"].isin(reference_rows()).any() else "models"
+    """Return what the rows are of: models, or reference strategies alone."""
+    return "reference strategies" if rows["model"].isin(reference_rows()).any() else "models"
 
 
 def _names(models: list[str]) -> str:
