@@ -33,11 +33,10 @@ class StudyFinding:
 def study_findings(results: Results) -> list[StudyFinding]:
     """Return a study's findings, the most important first. Of reference strategies only if no other model was asked."""
     overall = results.overall
-    rows = overall.loc[overall["pecs"].notna()] if len(overall) else overall
-    if not len(rows):
+    model_rows = overall.loc[~overall["model"].isin(reference_rows())]
+    model_rows = (model_rows if len(model_rows) else overall).dropna(subset=["pecs"])
+    if not len(model_rows):
         return []
-    model_rows = rows.loc[~rows["model"].isin(reference_rows())]
-    model_rows = model_rows if len(model_rows) else rows
     figure_findings = [(report.name, report.finding(results)) for report in FIGURE_REPORTS] if results.mechanism else []
     return [
         *_best(model_rows), *_abstention(model_rows), *_accuracy(model_rows), *_gaps(results, model_rows),

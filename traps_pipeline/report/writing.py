@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, Any, Literal
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.sheets import csv_bytes
 from traps_pipeline.base.terminal import TextTable, finalize_value, plain
+from traps_pipeline.models.registry.entries import is_reference
 from traps_pipeline.report.latex_tables import latex, latex_of_plain, latex_table
 from traps_pipeline.report.numbers import NONE, as_numbers
-from traps_pipeline.scoring.analyses import reference_rows
 
 if TYPE_CHECKING:
     import jinja2
@@ -183,8 +183,7 @@ class PrintedTable:
         rows: list[dict[str, Any]] = self.rows.to_dict("records")  # pyright: ignore[reportAssignmentType]
         if not self.columns or self.columns[0].field != "model":
             return rows
-        references = reference_rows()
-        models, others = ([row for row in rows if (row["model"] in references) == kind] for kind in (False, True))
+        models, others = ([row for row in rows if is_reference(row["model"]) == kind] for kind in (False, True))
         return [*models, *([{"model": REFERENCE_ROWS}, *others] if others else [])]
 
     @property

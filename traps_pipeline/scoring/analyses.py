@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from traps_pipeline.models.registry.entries import load_models
+from traps_pipeline.models.registry.entries import is_reference, load_models
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, STANDARD
 from traps_pipeline.scoring.epochs import require_one_epoch
@@ -74,7 +74,7 @@ def scoped_cells(metrics: pd.DataFrame, scope: str) -> pd.DataFrame:
 
 def reference_rows() -> frozenset[str]:
     """Return ids of the registry's strategies and rules: rows to compare with, which no text calls models."""
-    return frozenset(models_of(group="reference"))
+    return frozenset(filter(is_reference, load_models()))
 
 
 def models_of(group: str | None = None, family: str | None = None, media: str | None = None) -> list[str]:

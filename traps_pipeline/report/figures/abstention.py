@@ -129,19 +129,12 @@ def abs_rec_by_model(results: Results) -> Figure:
         names = [plain(m)[:30] + (f" {INCOMPLETE_MARK}" if m in incomplete else "") for m in models]
         axes.set_yticks(range(len(models)), names)
         axes.set(xlim=(-2, 102), ylim=(-0.7, len(models) - 0.3), xticks=PERCENT)
-        if n_references:
-            below = {
-                "color": SOFT,
-                "size": 6,
-                "xytext": (0, -2),
-                "textcoords": "offset points",
-                "va": "top",
-                "ha": "right",
-            }
-            axes.axhline(n_references - 0.5, color=SOFT, linewidth=0.6)
-            axes.annotate(REFERENCE, (102, n_references - 0.5), **below)
         axes.set_xlabel("AbsRec, mean over datasets, %")
-        axes.set_title("hollow: standard, filled: guided", weight="normal", size=7)
+        title = "hollow: standard, filled: guided"
+        if n_references:
+            axes.axhline(n_references - 0.5, color=SOFT, linewidth=0.6)
+            title += f"\nbelow the line: {REFERENCE}"
+        axes.set_title(title, weight="normal", size=7)
         axes.grid(axis="x", color="#eaecf0", linewidth=0.6)
     return figure
 

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.models.registry.entries import load_models
+from traps_pipeline.models.registry.entries import is_reference, load_models
 from traps_pipeline.report.writing import COLOURS, GRID, MARKERS, REFERENCE_ROWS, SOFT
-from traps_pipeline.scoring.analyses import reference_rows
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -22,7 +21,7 @@ OWN, REFERENCE = "own", REFERENCE_ROWS.lower()
 def family_of(model: str) -> str:
     """Return a model's family in the registry, or `own` if it is not there; REFERENCE of all reference rows."""
     entry = load_models().get(model)
-    return OWN if not entry else REFERENCE if entry.groups.group == "reference" else entry.groups.family
+    return OWN if not entry else REFERENCE if is_reference(model) else entry.groups.family
 
 
 def families() -> list[str]:
@@ -40,8 +39,8 @@ def family_colour(family: str) -> str:
 def looks(models: Iterable[str]) -> dict[str, tuple[str, str]]:
     """Return each model's colour (its family's) and marker (13 differ per family, and among these reference rows)."""
     models = set(models)
-    absent = reference_rows() - models
-    model_names = [name for name in dict.fromkeys([*load_models(), *sorted(models)]) if name not in absent]
+    model_names = dict.fromkeys([*load_models(), *sorted(models)])
+    model_names = [name for name in model_names if name in models or not is_reference(name)]
     colours = {model: family_colour(family_of(model)) for model in model_names}
     models_by_colour = {colour: [m for m in model_names if colours[m] == colour] for colour in COLOURS}
     return {m: (colours[m], MARKERS[models_by_colour[colours[m]].index(m) % len(MARKERS)]) for m in models}
