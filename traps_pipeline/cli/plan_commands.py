@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 def add(commands: Commands) -> None:
-    """Add `traps plan`."""
+    """Add `traps plan` to the parser."""
     text = "count the calls of an experiment, with their price and the precision of PECS; nothing is sent"
     parser = commands.add("study plan", plan, text, example="demo", json=True)
     add_experiment(parser)

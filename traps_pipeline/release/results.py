@@ -44,7 +44,7 @@ class Attribution:
     developer: str = "unknown"
 
     def developer_of(self, model: str) -> str:
-        """Return a model's developer."""
+        """Return the organization that made a model."""
         return OWN_DEVELOPER if is_reference(model) else self.developer
 
 

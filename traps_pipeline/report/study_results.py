@@ -132,7 +132,7 @@ def _without_references(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 class StudyResults(Results):
-    """A workspace's own tables."""
+    """A study's results, from the tables of its workspace."""
 
     source = "this study"
     is_study = True

@@ -137,7 +137,7 @@ def spread(cells: pd.DataFrame, column: str = "pecs_std") -> pd.DataFrame:
 
 
 def pareto_frontier(cells: pd.DataFrame) -> pd.DataFrame:
-    """Return `frontier` of `overall`, in (acc, j).
+    """Return the models that no other beats in both acc and j, as means over datasets.
 
     It orders models and computes no ratio or gap, so epochs may differ.
     """

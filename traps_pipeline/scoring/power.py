@@ -34,7 +34,7 @@ class Shares:
 
     @property
     def pecs(self) -> float:
-        """PECS of these shares."""
+        """PECS of these three shares."""
         return float(pecs_of(np.asarray(self.acc), np.asarray(self.abs_rec - self.false_abs)))
 
 

@@ -16,7 +16,7 @@ Regime = Annotated[str, Field(pattern=f"^({'|'.join(VQA_PROMPTS)})$")]
 
 
 class Settings(BaseModel):
-    """What people write into a file: no unknown field, and no list that names something twice."""
+    """Base of settings that people write: it refuses unknown fields, and lists that name something twice."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

@@ -67,12 +67,12 @@ class Judge(typing.Protocol):
 
     @property
     def id(self) -> str:
-        """The judge's name."""
+        """The judge's name in tables and panels."""
         ...
 
     @property
     def backend(self) -> str:
-        """The kind of backend."""
+        """Where the judge answers: over the network, by rules, or in a package's way."""
         ...
 
     @property
