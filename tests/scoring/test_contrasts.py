@@ -132,7 +132,6 @@ def test_reference_rows_are_ranked_among_themselves(rows):
     assert board.loc["always-abstain", ["rank_low", "rank_high"]].tolist() == [2, 2]
 
 
-
 def test_equal_models_are_not_separable_and_share_all_ranks(rows):
     same = pairs_with(40, 30, 2, 20)
     metrics, resampled, table = scored(rows(same, model="m"), rows(same, model="n"))

@@ -283,17 +283,8 @@ def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.Dat
             entry |= {name: row["pecs"], f"{name}_mark": _mark(row)} if row else {}
         rows.append(entry)
     columns = [column.name for column in LEADERBOARD.columns]
-    marks = [
-        "mark",
-        "n_mark",
-        "model_mark",
-        "missing_mark",
-        "overruled_mark",
-        "ci",
-        "bounds",
-        *others,
-        *(f"{name}_mark" for name in others),
-    ]
+    kinds = ("mark", "n_mark", "model_mark", "missing_mark", "overruled_mark", "ci", "bounds")
+    marks = [*kinds, *others, *(f"{name}_mark" for name in others)]
     return pd.DataFrame(sorted(rows, key=_rank), columns=pd.Index([*columns, *marks]))
 
 

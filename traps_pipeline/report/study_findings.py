@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from traps_pipeline.base.wording import count_noun
+from traps_pipeline.models.registry.entries import reference_rows
 from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, REGIMES, STANDARD
 from traps_pipeline.report.catalogue import FIGURE_REPORTS
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.table_columns import interval, ranks
 from traps_pipeline.report.writing import fraction, percent
-from traps_pipeline.scoring.analyses import reference_rows
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -10,6 +10,7 @@ from typing_extensions import override
 
 from traps_pipeline.base.wording import count_noun
 from traps_pipeline.mechanism.mechanism_rows import COSINES, STEERING_EFFECTS
+from traps_pipeline.models.registry.entries import reference_rows
 from traps_pipeline.models.registry.judges import panel_id
 from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 from traps_pipeline.report.leaderboard_page import judged_by
@@ -127,7 +128,7 @@ def _ill_posed(frame: pd.DataFrame) -> pd.DataFrame:
 
 def _without_references(rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows without reference strategies, if other models were asked."""
-    kept_rows = rows.loc[~rows["model"].isin(analyses.reference_rows())]
+    kept_rows = rows.loc[~rows["model"].isin(reference_rows())]
     return kept_rows if len(kept_rows) else rows
 
 

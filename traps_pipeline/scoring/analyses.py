@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from traps_pipeline.models.registry.entries import is_reference, load_models
+from traps_pipeline.models.registry.entries import load_models
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, STANDARD
 from traps_pipeline.scoring.epochs import require_one_epoch
@@ -70,11 +70,6 @@ def scoped_cells(metrics: pd.DataFrame, scope: str) -> pd.DataFrame:
     cells["n_pairs"], cells["n_missing"] = groups["n_pairs"].max(), groups["n_missing"].sum()
     cells["n_runs"], cells["epoch"] = groups["run"].nunique(), joined_in_groups(groups, "epoch", joined_epochs)
     return cells.reset_index()
-
-
-def reference_rows() -> frozenset[str]:
-    """Return ids of the registry's strategies and rules: rows to compare with, which no text calls models."""
-    return frozenset(filter(is_reference, load_models()))
 
 
 def models_of(group: str | None = None, family: str | None = None, media: str | None = None) -> list[str]:

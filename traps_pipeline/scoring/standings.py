@@ -9,9 +9,9 @@ from typing import Any, cast
 import numpy as np
 import pandas as pd
 
+from traps_pipeline.models.registry.entries import reference_rows
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.metric_words import BROKEN_COUNTS, METRIC_WORDS
-from traps_pipeline.scoring.analyses import reference_rows
 from traps_pipeline.scoring.bootstrap import ENTRY, limits_of
 from traps_pipeline.scoring.metrics import (
     BOUNDS,

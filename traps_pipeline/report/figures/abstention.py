@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from traps_pipeline.models.registry.entries import reference_rows
 from traps_pipeline.protocol.datasets import taxonomy_of
 from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.report.figures.looks import REFERENCE, families, family_colour, family_of, legend_key, looks
@@ -101,7 +102,7 @@ def abs_rec_by_model(results: Results) -> Figure:
         reason = "no model has all four datasets" if len(results.cells) else results.why("cells")
         raise NotRun(reason)
     sides: dict[tuple[str, str], Any] = {(r["model"], r["regime"]): r for r in rows.to_dict("records")}
-    references = analyses.reference_rows()
+    references = reference_rows()
     models = sorted(
         {m for m, _ in sides},
         key=lambda m: (m not in references, *(_abs_rec(sides, m, regime) for regime in PROMPTING), m),

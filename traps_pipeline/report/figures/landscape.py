@@ -8,17 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from traps_pipeline.models.registry.entries import reference_rows
 from traps_pipeline.protocol.regimes import BY_NAME, GUIDED, PROMPTING, REGIMES, STANDARD
 from traps_pipeline.report.figures.label_placement import LINES, Label, merge_labels, place_labels, short
-from traps_pipeline.report.figures.looks import (
-    REFERENCE,
-    arrow,
-    family_colour,
-    family_of,
-    frame_plane,
-    legend_key,
-    looks,
-)
+from traps_pipeline.report.figures.looks import arrow, family_of, frame_plane, legend_key, looks
 from traps_pipeline.report.result_frames import Results, datasets_of
 from traps_pipeline.report.terms import INCOMPLETE_MARK, TITLES
 from traps_pipeline.report.writing import COLUMN_IN, INK, PAGE_IN, NotRun, figure_style, freeze_layout, new_figure
@@ -59,11 +52,10 @@ def landscape_figure(points: pd.DataFrame, scope: str) -> Figure:
         axes = figure.add_subplot()
         frame_plane(axes, points, f"Acc, {scope.lower()}", intervals=True)
         labels = merge_labels(_draw_models(axes, points), axes)
-        references = points["model"].isin(analyses.reference_rows())
-        guided = points.loc[points["regime"].eq(GUIDED) & ~references]
+        guided = points.loc[points["regime"].eq(GUIDED) & ~points["model"].isin(reference_rows())]
         _draw_frontier(axes, guided)
         _draw_rings(axes, guided)
-        _draw_key(figure, references=bool(references.any()))
+        _draw_key(figure)
         freeze_layout(figure)
         place_labels(axes, labels, points.loc[:, ["j", "acc"]].to_numpy(float))
     return figure
@@ -162,14 +154,13 @@ def _draw_rings(axes: Axes, guided: pd.DataFrame) -> None:
             )
 
 
-def _draw_key(figure: Figure, *, references: bool) -> None:
+def _draw_key(figure: Figure) -> None:
     handles = [
         legend_key("standard", "#475467", "o", size=4.5, markerfacecolor="white"),
         legend_key("guided", "#475467", "o", size=4.5),
         legend_key("json", "#475467", "o", size=1.6),
         legend_key("family’s best, guided", INK, "o", size=7, markerfacecolor="none"),
         legend_key("frontier, guided", INK, line=(0, (4, 2.5)), linewidth=0.7),
-        *([legend_key(REFERENCE, family_colour(REFERENCE), "s", size=4.5)] if references else []),
     ]
     style: dict[str, Any] = {"handletextpad": 0.4, "columnspacing": 1.2}
     figure.legend(handles=handles, loc="outside lower center", ncols=3, **style)
