@@ -87,7 +87,7 @@ def plan(arguments: argparse.Namespace) -> int:
     if plan_counts.uncertain:
         text = (
             f"This is an upper bound: items of {', '.join(plan_counts.uncertain)} are still to be made, so all of "
-            "their calls are counted as new. Materialize scene_specs, videos and items for exact counts."
+            "their calls are counted as new. `traps run EXPERIMENT --until items` makes them, for exact counts."
         )
         print(wrap_text(text))
     return OK

@@ -29,7 +29,7 @@ NO_ITEMS = "this study has no items yet"
 
 @dataclass(frozen=True)
 class Picture:
-    """One or several figures of clips, by file name.
+    """A card of the report made of clips: one or several figures, by file name.
 
     make: raises NotRun and DamagedClip. inputs: returns what they show of the stages `reads`, as JSON; raises
     DamagedClip. kind: "webp" if they show frames, else "svg".
