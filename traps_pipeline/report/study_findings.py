@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from traps_pipeline.base.wording import count_noun
-from traps_pipeline.models.registry.entries import reference_rows
+from traps_pipeline.models.registry.entries import is_reference, reference_rows
 from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, REGIMES, STANDARD
 from traps_pipeline.report.catalogue import FIGURE_REPORTS
 from traps_pipeline.report.result_frames import Results
@@ -72,7 +72,7 @@ def _best(rows: pd.DataFrame) -> Iterator[StudyFinding]:
 
 def _noun(rows: pd.DataFrame) -> str:
     """Return what the rows are of: models, or reference strategies alone."""
-    return "reference strategies" if rows["model"].isin(reference_rows()).any() else "models"
+    return "reference strategies" if any(map(is_reference, rows["model"])) else "models"
 
 
 def _names(models: list[str]) -> str:

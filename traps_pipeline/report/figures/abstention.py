@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.models.registry.entries import reference_rows
+from traps_pipeline.models.registry.entries import is_reference
 from traps_pipeline.protocol.datasets import taxonomy_of
 from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.report.figures.looks import REFERENCE, families, family_colour, family_of, legend_key, looks
@@ -102,12 +102,11 @@ def abs_rec_by_model(results: Results) -> Figure:
         reason = "no model has all four datasets" if len(results.cells) else results.why("cells")
         raise NotRun(reason)
     sides: dict[tuple[str, str], Any] = {(r["model"], r["regime"]): r for r in rows.to_dict("records")}
-    references = reference_rows()
     models = sorted(
         {m for m, _ in sides},
-        key=lambda m: (m not in references, *(_abs_rec(sides, m, regime) for regime in PROMPTING), m),
+        key=lambda m: (not is_reference(m), *(_abs_rec(sides, m, regime) for regime in PROMPTING), m),
     )
-    n_references = len(references.intersection(models))
+    n_references = sum(map(is_reference, models))
     look = looks(models)
     with figure_style():
         figure = new_figure(COLUMN_IN, 0.75 + 0.155 * len(models))
