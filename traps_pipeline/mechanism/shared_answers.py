@@ -49,7 +49,7 @@ class SharedAnswers:
         return result
 
     def outcomes(self, requests: Sequence[Request], make: Make, stopped: Callable[[], bool]) -> list[Outcome]:
-        """Return the outcomes of these calls, generating those that no other process generates.
+        """Return outcomes of calls in known chunks, generated here or elsewhere.
 
         Waits while another process generates some of them, unless it is stopped.
         """

@@ -52,7 +52,7 @@ SIDES = ("control", "void")
 
 
 def taxonomy_of(dataset: str) -> str:
-    """Return a dataset's taxonomy, `occlusion` or `chaotic`."""
+    """Return `occlusion` or `chaotic`."""
     return dataset.removesuffix("_ill_posed")
 
 
@@ -71,7 +71,7 @@ def transfer_type(source: str, target: str) -> str:
 
 
 def taxonomy_of_category(category: str) -> str:
-    """Return the taxonomy of a category of scenes, `occlusion` or `chaotic`."""
+    """Return `occlusion` or `chaotic`."""
     return "chaotic" if category in CHAOTIC_CATEGORIES else "occlusion"
 
 

@@ -90,7 +90,7 @@ LEGEND = {
     BOUNDS: "PECS of all items if every missing decision were the worst for the model (a control wrong and abstained "
     "on, a void not abstained on), and if every one were the best; computed per run, then averaged",
     **{heading: meaning for _, heading, _, meaning in ROBUST_FIGURES},
-    "Epoch": "the evaluation campaign; metrics of different epochs are not put in one ratio",
+    "Epoch": "the evaluation campaign; figures of different epochs are not put in one ratio",
     "Overall": "equal-weight mean over the four datasets",
 }
 
@@ -247,7 +247,7 @@ def _notes_on_arms(beside: Robust) -> list[str]:
         for arms, names in entries.items()
     ]
     refusals = dict.fromkeys(row["refused"] for row in beside.values() if row["refused"])
-    return [*notes, *(f"no conjunction and no robust score: {reason}" for reason in refusals)]
+    return [*notes, *(f"no conjunction and no robust figure: {reason}" for reason in refusals)]
 
 
 def _trace(row: Mapping[str, Any], field: str) -> SourceItems | None:

@@ -57,22 +57,28 @@ def report_parts(sources: Sources, address: Address | None = explorer_address) -
     first = INSIDE if sources.workspace.study.mechanism else ()
     figures = [
         Part(
-            "figures", report.name, lambda report=report: figure_card(report, sources), report.reads,
+            "figures",
+            report.name,
+            lambda report=report: figure_card(report, sources),
+            report.reads,
             (lambda report=report: report.inputs(sources.study)) if report.frames else None,
         )
         for report in sorted(FIGURE_REPORTS, key=lambda report: report.name not in first)
-    ]  # fmt: skip
+    ]
     pictures = [
         Part("pictures", each.name, lambda each=each: picture_card(each), each.reads, lambda each=each: each.shown())
         for each in PairPictures(sources.workspace).all()
     ]
     tables = [
         Part(
-            "tables", report.name, lambda report=report: table_card(report, sources, address), report.reads,
+            "tables",
+            report.name,
+            lambda report=report: table_card(report, sources, address),
+            report.reads,
             lambda report=report: [table.content for table in report.tables(sources.study)],
         )
         for report in TABLE_REPORTS
-    ]  # fmt: skip
+    ]
     paper = [
         Part(PAPER, f"{kind}-{report.name}", lambda report=report: paper_card(report, sources), ("published",))
         for kind, reports in (("figure", FIGURE_REPORTS), ("table", TABLE_REPORTS))

@@ -188,11 +188,11 @@ def _refusal(items: pd.DataFrame) -> str | None:
     """Return why no score may join pairs and arms (epochs or panels differ), or None."""
     is_arm = items["dataset"].isin(ARMS)
     if "+" in (panels := joined_epochs(items["panel"])):
-        return f"judged by {panels.replace('+', ' and ')}; metrics of different panels are never joined"
+        return f"judged by {panels.replace('+', ' and ')}; figures of different panels are never put in one figure"
     pairs, arms = (joined_epochs(items.loc[rows, "epoch"]) for rows in (~is_arm, is_arm))
     if pairs == arms and "+" not in pairs:
         return None
-    return f"pairs of epoch {pairs}, arms of epoch {arms}; metrics of different epochs are never joined"
+    return f"pairs of epoch {pairs}, arms of epoch {arms}; figures of different epochs are never put in one figure"
 
 
 def wrong_rows(table: pd.DataFrame) -> int:

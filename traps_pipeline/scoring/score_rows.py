@@ -170,7 +170,7 @@ LEADERBOARD = Table("leaderboard", LeaderboardRow, partition_by=(), key=("model"
 class RobustRow(shared.EntryRow):
     """A model under a regime, on well-posed pairs and arms (clip and question together)."""
 
-    arms: Annotated[list[str], "arms (of datasets.ARMS) in the metrics; entries with other arms are not compared"]
+    arms: Annotated[list[str], "arms (of datasets.ARMS) in the figures; entries with other arms are not compared"]
     n_runs: Annotated[int, "runs averaged: those that have all four datasets and these arms"]
     n_items: Annotated[int, "items per run, of occlusion, chaotic and the arms"]
     n_missing: Annotated[int, "items without an answer or a majority, over runs"]
@@ -190,7 +190,7 @@ class RobustRow(shared.EntryRow):
         float | None, "share of the items of late_occluder and predictable_cut answered correctly, mean over runs"
     ]
     inference_abstains: Annotated[float | None, "share of these items abstained on, mean over runs"]
-    refused: Annotated[str | None, "why no metric joins pairs and arms; then conjunction and robust are null"]
+    refused: Annotated[str | None, "why no figure joins pairs and arms; then conjunction and robust are null"]
 
 
 ROBUST = Table("robust", RobustRow, partition_by=(), key=("model", "regime"))

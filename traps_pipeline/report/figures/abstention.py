@@ -116,8 +116,7 @@ def abs_rec_by_model(results: Results) -> Figure:
             percentages = [100 * sides[model, r]["abs_rec"] for r in PROMPTING if (model, r) in sides]
             axes.plot(percentages, [k] * len(percentages), color=colour, linewidth=0.9, zorder=2)
             for regime, face in (("standard", "white"), ("guided", colour)):
-                row = sides.get((model, regime))
-                if row is None:
+                if (row := sides.get((model, regime))) is None:
                     continue
                 spread = row.get("abs_rec_std")
                 width = 100 * spread if isinstance(spread, float) and spread == spread else 0
