@@ -41,8 +41,9 @@ def in_this_study(study: Checkout, command: str) -> str:
     # Into the checkout, which is on the path of its commands, and not into the environment of all tests.
     options = f"--no-deps --no-build-isolation --no-index --target {study.root}"
     command = re.sub("^pip install", f"{sys.executable} -m pip install {options}", command)
-    command = command.replace("mine.yaml", str(study.workspace.parent / "mine.yaml")).replace(
-        ".workspaces/mine", str(study.workspace.parent / "mine")
+    folder = study.workspace.parent
+    command = re.sub(r"\.workspaces/(mine|judged)\b", rf"{folder}/\1", command).replace(
+        "mine.yaml", f"{folder}/mine.yaml"
     )
     # The real Makefile of the real checkout, on this study, but no set-up: in a checkout whose environment is another's
     # (a link) it would install this one there.
@@ -89,7 +90,8 @@ def test_every_command_of_the_readme_runs(demo_study: Checkout, provider: Provid
     judged += f'judges: [{{id: judge-a, base_url: "{provider.url}/v1"}}]\n'
     (correction,) = blocks("json", (ROOT / "docs" / "benchmark.md").read_text())
     # The demo's clips serve here too: a clip's name is its content.
-    shutil.copytree(study.workspace / "clips", study.workspace.parent / "mine" / "clips")
+    for name in ("mine", "judged"):
+        shutil.copytree(study.workspace / "clips", study.workspace.parent / name / "clips")
     ran = 0
     for command in "".join(blocks("sh")).splitlines():
         if command.startswith(("export", *ELSEWHERE)):
@@ -106,10 +108,10 @@ def test_every_command_of_the_readme_runs(demo_study: Checkout, provider: Provid
         if command == "traps run demo":
             assert finished.counts() == {"answers": 27, "votes": 81, "frames": 0}  # one item, 9 models x 3 regimes
         if command.startswith("traps run mine.yaml"):
-            # 8 scenarios x 2 datasets x 2 sides, by one regime first, by a second one then; a judge votes on a
-            # control's two tasks and a void's one: three rules first, then one judge on the answers of both regimes
-            votes = 64 // 2 * 3 if "budget" in command else 32 // 2 * 9
-            assert finished.counts() | {"frames": 0} == {"answers": 32, "votes": votes, "frames": 0}
+            # 8 scenarios x 2 datasets x 2 sides, under one regime and three rules first, then under two regimes and one
+            # judge; a judge votes on a control's two tasks and a void's one
+            answers, votes = (64, 64 // 2 * 3) if "budget" in command else (32, 32 // 2 * 9)
+            assert finished.counts() | {"frames": 0} == {"answers": answers, "votes": votes, "frames": 0}
             assert len(finished.out.splitlines()) < 40 and re.search("^my-model ", finished.out, re.MULTILINE)
     assert ran == len("".join(blocks("sh")).splitlines()) - 2 - len(ELSEWHERE)
     drawn = study.root / ".workspaces" / "trial" / "released" / "plank_post.jsonl"
