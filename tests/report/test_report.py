@@ -74,14 +74,16 @@ def test_text_lists_models_by_overall_pecs_with_their_interval(board):
     assert lines[0].startswith("Overall. ")
     assert {"three", "1", "v1", "e1"} <= {*re.findall(r"\w+", lines[0])}  # panel, its version, the benchmark's, epoch
     text = tables(shown)[0]
-    assert [row["Model"] for row in text[:4]] == ["oracle"] * 3 + ["mid"]
-    assert (text[0]["PECS"], text[0]["95 % CI"], text[0]["Acc %"]) == ("1.000", "[1.000, 1.000]", "100.0")
+    # Reference rows are no models: they come last, however high their score, below a heading.
+    assert [row["Model"] for row in text[:5]] == ["mid", "Reference rows"] + ["oracle"] * 3
+    assert (text[2]["PECS"], text[2]["95 % CI"], text[2]["Acc %"]) == ("1.000", "[1.000, 1.000]", "100.0")
+    assert {*filter(None, text[1].values())} == {"Reference rows"}
     # Acc 0.5, J 0.6 - 0.1 = 0.5, PECS 0.25; no dataset of its own is on the board.
-    assert text[3].items() >= {
+    assert text[0].items() >= {
         "PECS": "0.250", "95 % CI": "[0.200, 0.300]", "Acc %": "50.0", "AbsRec %": "60.0", "FalseAbs %": "10.0",
         "J": "0.500", **dict.fromkeys(PECS_OF.values(), "–"), "n": "1404", "Missing": "0",
     }.items()  # fmt: skip
-    assert len({len(x) for x in lines[2:-2]}) == 1
+    assert len({len(x) for x in lines[2:-2] if x != "Reference rows"}) == 1
     assert lines[-1].startswith("– ")
 
 

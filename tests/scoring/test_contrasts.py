@@ -124,6 +124,15 @@ def test_twenty_three_models_that_lie_well_apart_are_all_told_apart(rows):
     assert (board["rank_low"] == board["rank_high"]).all()
 
 
+def test_reference_rows_are_ranked_among_themselves(rows):
+    named = (("oracle", 200), ("a", 100), ("always-abstain", 0))
+    metrics, resampled, table = scored(*(rows(pairs_with(200, acc, 0, 200), model=m) for m, acc in named))
+    board = leaderboard(metrics, intervals(resampled), table).set_index("model")
+    assert board["rank"].to_dict() == {"oracle": 1, "always-abstain": 2, "a": 1}
+    assert board.loc["a", ["rank_low", "rank_high"]].tolist() == [1, 1]
+    assert board.loc["always-abstain", ["rank_low", "rank_high"]].tolist() == [2, 2]
+
+
 def test_equal_models_are_not_separable_and_share_all_ranks(rows):
     same = pairs_with(40, 30, 2, 20)
     metrics, resampled, table = scored(rows(same, model="m"), rows(same, model="n"))

@@ -20,7 +20,7 @@ KINDS: Mapping[Group, str] = {"families": "scene family", "models": "backend of 
 
 @dataclass(frozen=True)
 class Plugin:
-    """What a package adds under a name. package: its distribution and version, which records and tables keep."""
+    """An object that an installed package adds under a name. package: its distribution and version."""
 
     group: Group
     name: str

@@ -223,7 +223,7 @@ class Progress:
                     listener(self.summary(stage))
 
     def close(self) -> None:
-        """End the run."""
+        """End the run: report the stage that is open."""
         self.end_stage()
 
     def note(self, text: str) -> None:
@@ -241,7 +241,7 @@ class Progress:
 
     @contextmanager
     def heard_by(self, listener: Callable[[str], None]) -> Iterator[None]:
-        """Send a listener a progress line every 30 s and at a stage's end."""
+        """Call a listener with a progress line, every 30 s and at a stage's end."""
         self._listeners.append(listener)
         try:
             yield
@@ -314,7 +314,7 @@ _current: list[Progress] = [Progress()]
 
 
 def current() -> Progress:
-    """Return the active progress."""
+    """Return the progress to which this process reports now."""
     return _current[-1]
 
 

@@ -42,7 +42,7 @@ LANE_WORDS = WORDS[:3]  # of scenarios of two events
 
 
 class Correction(BaseModel):
-    """One review decision."""
+    """A reviewer's decision about one scenario, as a line of a corrections file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     scenario_id: str = Field(pattern=Slug, max_length=80, description="family and number")

@@ -21,7 +21,7 @@ LOOKS = ("floor", "pale-floor", "light", "panel", "bystanders", "camera", "mater
 
 
 def add(commands: Commands) -> None:
-    """Add the `traps benchmark` commands."""
+    """Add the `traps benchmark` commands to the parser."""
     text = "compute every certificate of the released records again"
     parser = commands.add("benchmark certify", certify, text, example="--families plinko", workspace=False, json=True)
     parser.add_argument("--specs", type=Path, help="folder of a sampled benchmark (default: scene_specs)")

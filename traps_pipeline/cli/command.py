@@ -292,7 +292,7 @@ def add_panel(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--judged-by-rules",
         action="store_true",
-        help="let the panel `rules` judge more than reference models; every table and page then says so",
+        help="let the panel `rules` judge more than reference strategies; every table and page then says so",
     )
 
 

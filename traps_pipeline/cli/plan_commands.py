@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
 
 def add(commands: Commands) -> None:
-    """Add `traps plan`."""
-    text = "count the calls of an experiment, with their price and the precision of its figures; nothing is sent"
+    """Add `traps plan` to the parser."""
+    text = "count the calls of an experiment, with their price and the precision of PECS; nothing is sent"
     parser = commands.add("study plan", plan, text, example="demo", json=True)
     add_experiment(parser)
     parser.add_argument(
@@ -92,7 +92,7 @@ def plan(arguments: argparse.Namespace) -> int:
     if plan_counts.uncertain:
         text = (
             f"This is an upper bound: items of {', '.join(plan_counts.uncertain)} are still to be made, so all of "
-            "their calls are counted as new. Materialize scene_specs, videos and items for exact counts."
+            "their calls are counted as new. `traps run EXPERIMENT --until items` makes them, for exact counts."
         )
         print(wrap_text(text))
     return OK

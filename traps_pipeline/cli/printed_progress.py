@@ -200,7 +200,7 @@ class LiveProgress(PrintedProgress):
         super().close()
 
     def beat(self) -> None:
-        """Draw the region."""
+        """Draw the live region of the terminal again."""
         self._live.refresh()
 
     @override

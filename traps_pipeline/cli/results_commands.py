@@ -60,7 +60,7 @@ def _megabytes(size: int) -> str:
 
 
 def audit_published(arguments: argparse.Namespace) -> int:
-    """Discrepancies are findings, not failures."""
+    """Print what the paper's tables contradict; a discrepancy is a finding and fails nothing."""
     from traps_pipeline.scoring.audit import audit, audit_text
 
     findings = audit()

@@ -45,7 +45,7 @@ MONEY = ("budget_usd", "model_budgets_usd", "allow_unknown_prices")  # fields of
 
 
 def add(commands: Commands) -> None:
-    """Add `traps run`."""
+    """Add `traps run` to the parser."""
     text = "make every missing or stale partition of an experiment, and print the leaderboard"
     parser = commands.add("study run", run, text, example="demo --until leaderboard", is_paid=True, json=True)
     add_experiment(parser)

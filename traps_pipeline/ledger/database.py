@@ -137,7 +137,7 @@ class Database(ABC):
     @property
     @abstractmethod
     def put_aside(self) -> str:
-        """What a person does to go on in an empty database."""
+        """The command or step, in words, by which a person starts anew in an empty database."""
 
     def damaged(self, what: str) -> TrapsError:
         """Return the error of a ledger that must not be written on, with the way to save it."""

@@ -77,7 +77,7 @@ class IdentityScorer:
     """A score without a fit: the only column of the features, larger for void."""
 
     def scores(self, states: np.ndarray) -> np.ndarray:
-        """Return the column, (n,)."""
+        """Return the only column of the features as scores, (n,)."""
         return states[:, 0]
 
 

@@ -48,7 +48,7 @@ _PECS = RESAMPLED_FIGURES.index("pecs")
 
 @dataclass(frozen=True)
 class Gates:
-    """A kind of features, and the sources of its gates.
+    """Features that gates may read, and the datasets on which each gate is fitted.
 
     by_layer: by layer of the states (-1 for other features), then by dataset, (n, d). layers: the layer of each target;
     none for other features.

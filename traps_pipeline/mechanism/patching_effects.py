@@ -87,7 +87,7 @@ class RecordedPass:
 
     @property
     def length(self) -> int:
-        """The number of tokens."""
+        """The number of tokens of the prompt."""
         return int(self.inputs["inputs_embeds"].shape[1])
 
     @property

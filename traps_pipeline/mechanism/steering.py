@@ -89,7 +89,7 @@ class SteeredQuestion(Question):
 def strengths(
     target: str, layers: Layers, settings: MechanismSettings, directions: Mapping[str, Directions]
 ) -> list[tuple[Strength, tuple[str, ...]]]:
-    """Return the strengths at which a target is steered, each with its sides.
+    """Return every strength at which a target is steered, with the sides that are steered so.
 
     These are every path into the target whose source has a direction, the random and shuffled directions of that
     source, and the sweep over layers (along the target's own direction, only on controls). directions: by source.

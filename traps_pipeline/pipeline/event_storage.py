@@ -112,7 +112,7 @@ class _RunStorage(SqliteRunStorage):
 
 
 class SqliteStorage(DagsterSqliteStorage):
-    """See the module. base_dir: `$DAGSTER_HOME`."""
+    """Dagster's SQLite storage with connections that are kept. base_dir: `$DAGSTER_HOME`."""
 
     def __init__(self, base_dir: str, inst_data: Any = None) -> None:
         super().__init__(base_dir, inst_data)

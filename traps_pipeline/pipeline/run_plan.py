@@ -80,7 +80,7 @@ class RunReport:
 
     @property
     def frames(self) -> int:
-        """Number of rendered frames."""
+        """How many frames the run rendered."""
         return sum(tally.frames for tally in self.tallies.values())
 
 

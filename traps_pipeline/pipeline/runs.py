@@ -75,7 +75,7 @@ class LocalRuns(Runs):
         self.finished: list[dict[str, str]] = []
 
     def ranges(self, stages: Sequence[Stage], keys: Sequence[str | None]) -> Sequence[Range]:
-        """See `Runs`: the fewest ranges that contain exactly these keys."""
+        """Return the fewest ranges of keys that contain exactly these keys."""
         return [*batches(stages[0].scheme if stages else None, keys)]
 
     @override

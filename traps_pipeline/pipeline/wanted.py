@@ -123,7 +123,7 @@ class StudyPartitions:
 
     @cached_property
     def steers(self) -> bool:
-        """Whether models are steered."""
+        """Whether any experiment of the study steers models."""
         return self._mechanism is not None and (self._mechanism[1] is None or self._mechanism[1].steering is not None)
 
     @cached_property

@@ -37,7 +37,7 @@ class Metric:
 
     @property
     def unit(self) -> Literal["percent", "fraction"]:
-        """How it is printed."""
+        """How the number is printed: as a percentage or a fraction."""
         return "percent" if self.is_share else "fraction"
 
     def ends(self, acc: np.ndarray, false_abs: np.ndarray, abs_rec: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

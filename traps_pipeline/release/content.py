@@ -141,7 +141,7 @@ def pair_rows(content: Content) -> list[PairRow]:
 
 
 def item_rows(content: Content) -> list[ReleasedItemRow]:
-    """Return one row per item, sorted by id."""
+    """Return the rows of a release's table of items, one an item, sorted by id."""
     lite_scenarios = lite_of(content.items)
     return [
         ReleasedItemRow(

@@ -42,7 +42,7 @@ PAIRS = Table("pairs", PairRow, partition_by=(), key=("pair_id",))
 
 @dataclass(frozen=True, kw_only=True)
 class ReleasedItemRow(ItemRow):
-    """What a model is asked about one clip; items of arms have an arm as dataset."""
+    """A question about one clip as it is released; items of arms have an arm as dataset."""
 
     file_name: Annotated[str, "mp4, relative to this table's folder"]
     lite: Lite

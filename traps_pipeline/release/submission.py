@@ -66,7 +66,7 @@ class SubmittedJudge(_Strict):
 
 
 class About(_Strict):
-    """The contents of `submission.json`.
+    """What a submission says of itself: the contents of `submission.json`.
 
     panel: name of the panel. prompts: version of each regime's. versions: code versions of the tables. files:
     SHA-256 of each table.

@@ -61,7 +61,7 @@ class Card:
 
     @property
     def data(self) -> bytes:
-        """The card as JSON."""
+        """The card as JSON, from which `read` makes it again."""
         return json.dumps(asdict(self)).encode()
 
 

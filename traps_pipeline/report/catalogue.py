@@ -60,7 +60,7 @@ class TableReport:
 
     @property
     def doc(self) -> str:
-        """The caption."""
+        """The table's caption: the docstring of its function."""
         return _caption(self.make)
 
     @property
@@ -127,7 +127,7 @@ class FigureReport:
 
     @property
     def doc(self) -> str:
-        """The caption."""
+        """The figure's caption: the docstring of its function."""
         return _caption(self.make)
 
     def finding(self, results: Results) -> str:

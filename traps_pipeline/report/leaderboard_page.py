@@ -82,9 +82,9 @@ LEGEND = {
     "±": "population standard deviation over runs",
     "n": "pairs (one control, one void) per run",
     "Missing": f"items over all runs without an answer or a majority; {MISSING_MARK} shares are over the other items",
-    INCOMPLETE_MARK: f"incomplete: fewer than {ENOUGH} of items answered; an overall figure is incomplete if that of "
+    INCOMPLETE_MARK: f"incomplete: fewer than {ENOUGH} of items answered; an overall metric is incomplete if that of "
     "any dataset is",
-    BROKEN_MARK: f"broken: {BROKEN_TEXTS}; an overall figure is broken if that of any dataset is",
+    BROKEN_MARK: f"broken: {BROKEN_TEXTS}; an overall metric is broken if that of any dataset is",
     **{
         count.heading: f"{count.meaning}; over all runs{', among the missing ones' if count.outcomes else ''}"
         for count in _COUNTS
@@ -198,7 +198,7 @@ def judged_by(board: pd.DataFrame) -> str:
     names = [_panel_in_words(panel) for panel in panels]
     has_several_panels = len(panels) > 1
     sentence = f"Judged by the panel{'s' * has_several_panels} {' and '.join(names) or NONE}"
-    sentence += "; figures of different panels are not ranked or compared" * has_several_panels
+    sentence += "; metrics of different panels are not ranked or compared" * has_several_panels
     rows = board[["panel", "model"]].drop_duplicates().itertuples(index=False, name=None)
     rule_judged_models = sorted({model for panel, model in rows if is_judged_by_rules(panel, model)})
     names_shown = ", ".join(rule_judged_models[:5]) + (
@@ -280,17 +280,8 @@ def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.Dat
             entry |= {name: row["pecs"], f"{name}_mark": _mark(row)} if row else {}
         rows.append(entry)
     columns = [column.name for column in LEADERBOARD.columns]
-    marks = [
-        "mark",
-        "n_mark",
-        "model_mark",
-        "missing_mark",
-        "overruled_mark",
-        "ci",
-        "bounds",
-        *others,
-        *(f"{name}_mark" for name in others),
-    ]
+    kinds = ("mark", "n_mark", "model_mark", "missing_mark", "overruled_mark", "ci", "bounds")
+    marks = [*kinds, *others, *(f"{name}_mark" for name in others)]
     return pd.DataFrame(sorted(rows, key=_rank), columns=pd.Index([*columns, *marks]))
 
 

@@ -10,6 +10,7 @@ from typing_extensions import override
 
 from traps_pipeline.base.wording import count_noun
 from traps_pipeline.mechanism.mechanism_rows import COSINES, STEERING_EFFECTS
+from traps_pipeline.models.registry.entries import reference_rows
 from traps_pipeline.models.registry.judges import panel_id
 from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 from traps_pipeline.report.leaderboard_page import judged_by
@@ -127,12 +128,12 @@ def _ill_posed(frame: pd.DataFrame) -> pd.DataFrame:
 
 def _without_references(rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows without reference strategies, if other models were asked."""
-    kept_rows = rows.loc[~rows["model"].isin(analyses.models_of(group="reference"))]
+    kept_rows = rows.loc[~rows["model"].isin(reference_rows())]
     return kept_rows if len(kept_rows) else rows
 
 
 class StudyResults(Results):
-    """A workspace's own tables."""
+    """A study's results, from the tables of its workspace."""
 
     source = "this study"
     is_study = True
@@ -169,7 +170,7 @@ class StudyResults(Results):
         sentence = judged_by(_panel_rows(self, self.board)).rstrip(".")
         other_models = self.board.loc[self.board["panel"] != self.panel, "model"].unique()
         return sentence + (
-            f"; left out: {count_noun(len(other_models), 'model')} with figures of other panels"
+            f"; left out: {count_noun(len(other_models), 'model')} with metrics of other panels"
             if len(other_models)
             else ""
         )

@@ -34,13 +34,13 @@ class Shares:
 
     @property
     def pecs(self) -> float:
-        """PECS of these shares."""
+        """PECS of these three shares."""
         return float(pecs_of(np.asarray(self.acc), np.asarray(self.abs_rec - self.false_abs)))
 
 
 @dataclass(frozen=True)
 class Precision:
-    """The precision of a study.
+    """How narrow a study's intervals are, and which differences it finds.
 
     width: width of PECS's 95 % interval. difference: the smallest one between two models with independent answers that
     a test at 5 % detects in 80 % of studies; among_all: the same after Holm's correction over the pairs of all models,

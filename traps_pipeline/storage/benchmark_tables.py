@@ -21,7 +21,7 @@ AnswerType = Annotated[str, "binary, direction, colour, count_range or numeric"]
 
 @dataclass(frozen=True, kw_only=True)
 class SceneSpecRow:
-    """A scenario."""
+    """A scenario: parameters, question, answer and evidence, as its record has them."""
 
     scenario_id: shared.ScenarioId
     taxonomy: Taxonomy
@@ -61,7 +61,7 @@ SCENE_SPECS = Table("scene_specs", SceneSpecRow, partition_by=("category",), key
 
 @dataclass(frozen=True, kw_only=True)
 class VideoRow:
-    """A clip."""
+    """A clip of one side of a scenario, and how it was encoded."""
 
     scenario_id: shared.ScenarioId
     category: shared.Category

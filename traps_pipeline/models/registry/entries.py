@@ -352,6 +352,11 @@ def is_reference(model_id: str) -> bool:
     return name in models and models[name].backend in ("reference", "observer", "rule")
 
 
+def reference_rows() -> list[str]:
+    """Return ids of the registry's strategies and rules: rows to compare with, which no text calls models."""
+    return [*filter(is_reference, load_models())]
+
+
 @user_registry.cached_registry
 @cache
 def local_models() -> tuple[str, ...]:

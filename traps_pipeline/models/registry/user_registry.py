@@ -127,7 +127,7 @@ def all_additions() -> UserRegistry:
 
 
 def accounts() -> Mapping[str, dict[str, Any]]:
-    """Return all added accounts."""
+    """Return the accounts of models that users described, by name."""
     return all_additions().all_accounts
 
 

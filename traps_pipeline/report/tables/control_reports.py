@@ -227,6 +227,6 @@ def _prompts(results: Results) -> PrintedTable:
         "states, mean ± deviation over draws, the floor of the split",
         *few_note(rows, "said_mark", "probe_mark"),
     ]
-    reason = why(results, "the paper prints no such figures")
+    reason = why(results, "the paper prints no such numbers")
     title = "What the prompt changes, in answers and in states"
     return PrintedTable("prompt_gate", title, rows, columns, notes, reason, deviation=DRAWS)

@@ -164,7 +164,7 @@ def _confabulated_table(results: Results, pairs: pd.DataFrame) -> PrintedTable:
         *baseline_notes(results),
         *few_note(rows, "cf_mark"),
     ]
-    reason = why(results, "the paper has these figures in its table of probe transfer")
+    reason = why(results, "the paper has these numbers in its table of probe transfer")
     if results.is_study and len(results.probes):
         reason = "; ".join(gap_notes) or reason
     title = "Probes on confabulated voids (Cf→Cf)"

@@ -96,7 +96,7 @@ def _entries(results: Results) -> Iterable[ModelEntry]:
 
 
 def composition(results: Results) -> list[PrintedTable]:
-    """Return pairs by category."""
+    """Return how many pairs of each category the study has."""
     import pandas as pd
 
     rows = results.composition

@@ -50,7 +50,7 @@ async function leaderboardView(route) {
       twoWay: beside.get(`${model} ${of}`),
     }))
     .filter((row) => (!regime || row.regime === regime) && (!group || groupOf.get(row.model) === group));
-  shown.sort(ordering(sort, up, info.regimes));
+  shown.splice(0, shown.length, ...modelsFirst(info, shown.sort(ordering(sort, up, info.regimes))));
   const withPairs = own.length > 0 || !askedOfLanes(info).length;
   const withPaper = shown.some((row) => row.paper);
   const columns = [
@@ -138,7 +138,7 @@ async function leaderboardView(route) {
       withPairs &&
         section(
           null,
-          table(columns, rows, {
+          table(columns, withHeading(info, shown, rows), {
             caption: `${info.titles[dataset] || dataset}: ${counted(shown.length, "entry", "entries")}`,
             name: "leaderboard",
             order: { by: sort, down: !up },
