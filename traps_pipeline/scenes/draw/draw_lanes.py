@@ -86,7 +86,9 @@ def _scenario(family: Family, number: int, rng: np.random.Generator, seed: int, 
     wording, look = _wording(pairs, int(rng.integers(2**31))), draw_look(rng, LOOKS)
     for k, pair in enumerate(pairs):  # which of its two worlds a lane shows is no matter of chance
         place = [wording.labels.index(event.outcome.answer) for event in pair]
-        pairs[k] = pair if (place[0] < place[1]) == is_turn_of_earlier(family.name, number, k, seed) else pair[::-1]
+        pairs[k] = (
+            pair if (place[0] < place[1]) == is_turn_of_earlier(family.name, number, k, seed) else (pair[1], pair[0])
+        )
     assert look is not None
     if difficulty.distractors:
         pairs = [_with_distractors(pair, wording, difficulty, rng) for pair in pairs]

@@ -28,7 +28,7 @@ def scenes_of_lane(frames: np.ndarray, strip: str) -> list[np.ndarray]:
     side = int(np.argmax([0 if blob is None else blob.area for blob in strips]))
     lane, strip_blob = halves[side], strips[side]
     boards = np.stack([colour_mask(frame, "navy") for frame in lane])
-    still = next(iter(blobs(boards.all(axis=0), BOARD_PX)), None)
+    still = next(iter(blobs(boards.min(axis=0), BOARD_PX)), None)
     if strip_blob is None or still is None:
         return []
     _, top, _, height = still.box
