@@ -90,8 +90,8 @@ def above_limits(tables: Mapping[str, pd.DataFrame]) -> list[str]:
     released = pd.concat([tables["written"], tables["families held out"]]).to_dict("index")
     found = [(str(name), *(float(row[end]) for end in ENDS)) for name, row in released.items() if name in LIMITS]
     return [
-        f"{name}: conjunction {conjunction:.2f} and specificity {specificity:.2f} of a rule that follows no event; at most "
-        f"{LIMITS[name][0]} and {LIMITS[name][1]} are released: find what gives the sides away"
+        f"{name}: conjunction {conjunction:.2f} and specificity {specificity:.2f} of a rule that follows no event; at "
+        f"most {LIMITS[name][0]} and {LIMITS[name][1]} are released: find what gives the sides away"
         for name, conjunction, specificity in found
         if conjunction > LIMITS[name][0] or specificity > LIMITS[name][1]
     ]

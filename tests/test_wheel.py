@@ -130,7 +130,7 @@ def test_the_package_for_several_hosts_is_a_wheel_of_its_own_and_its_absence_is_
 def test_an_installed_wheel_makes_a_leaderboard_in_a_folder_that_is_no_checkout(installed: Installed) -> None:
     assert installed.traps("--help").out.startswith("usage: traps")
     looked = installed.traps("doctor").ok()
-    assert f"{installed.shipped}: trapsbench 0.3.0, 702 scenarios" in looked.out
+    assert f"{installed.shipped}: trapsbench 0.4.0, 702 scenarios" in looked.out
     (installed.work / "tiny.yaml").write_text(EXPERIMENT)
     finished = installed.traps("run", "tiny.yaml", "--until", "leaderboard").ok()
     # Two models, an occlusion scenario each with its ill-posed twin: 2 x 2 x (2 pairs of 2 items).

@@ -11,10 +11,13 @@ import pytest
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.corrections import LaneScenario, fold_two_events, of_pairs, read_corrections, subset
+from traps_pipeline.benchmark.filmed_arms import incomplete_reasons
 from traps_pipeline.benchmark.records import load_released, two_events_lines
 from traps_pipeline.protocol.two_events import LaneItem, lane_item, lane_items
 from traps_pipeline.scenes.draw.draw_lanes import is_turn_of_earlier
-from traps_pipeline.storage.study import Study
+from traps_pipeline.storage.benchmark_tables import ARMS
+from traps_pipeline.storage.study import Asked, Study
+from traps_pipeline.storage.workspace import Workspace
 
 
 def test_an_item_id_says_which_lane_is_asked_and_which_are_hidden():
@@ -120,3 +123,14 @@ def test_an_implausible_record_is_named_by_file_line_and_field(tmp_path: Path, f
     (tmp_path / "slide.jsonl").write_text(json.dumps(record) + "\n")
     with pytest.raises(TrapsError, match=rf"slide\.jsonl:1: .*{field}"):
         _ = two_events_lines(tmp_path)[ID].spec
+
+
+def test_arms_without_two_events_are_stale_only_where_the_study_has_scenarios_of_them(tmp_path: Path):
+    asked = Asked(datasets=("occlusion", "two_events"), models=("oracle",), regimes=("standard",), runs=(1,))
+    study = Study(scenarios=["hidden_drop-0001", "chain-e001"], experiments={"mine": asked})
+    workspace = Workspace.create(tmp_path / "study", study)
+    for category in ("hidden", "collisions"):
+        workspace.tables.write(ARMS, {"category": category}, [], {})
+    assert incomplete_reasons(workspace, "hidden") == []
+    (reason,) = incomplete_reasons(workspace, "collisions")
+    assert "two_events" in reason

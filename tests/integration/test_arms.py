@@ -35,6 +35,7 @@ from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
 from traps_pipeline.scoring.score_rows import GRADED_CUTS, HYPOTHESES, LEADERBOARD, TWO_WAY
 from traps_pipeline.storage.benchmark_tables import ARMS, ITEMS
 from traps_pipeline.storage.parquet import TableStore
+from traps_pipeline.storage.tables import records
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
@@ -169,7 +170,7 @@ def test_two_events_are_released_submitted_and_scored_by_others(
     assert verify(submission, released_items(released)).problems == []
     board = gather([tmp_path / "mine.zip"], released).groups[0]
     stored = tables.read_all(TWO_WAY).drop(columns=["inference_acc", "inference_abstains"])
-    pd.testing.assert_frame_equal(board.two_way[stored.columns], stored, check_dtype=False)
+    assert records(board.two_way[stored.columns]) == records(stored)
     frames = {name: frame.copy() for name, frame in submission.tables.items()}
     frames["two_way.parquet"].loc[0, "conjunction"] = 0.5
     forged = verify(replace(submission, tables=frames), released_items(released)).problems
@@ -187,7 +188,7 @@ def test_two_events_are_released_submitted_and_scored_by_others(
     assert {name: found[name] for name in TWO_WAY_FIGURES} == dict.fromkeys(TWO_WAY_FIGURES, 0.0)
 
 
-def is_of(frame: pd.DataFrame, lanes: Mapping[str, Any], name: str) -> pd.Series:
+def is_of(frame: pd.DataFrame, lanes: Mapping[str, Any], name: str) -> Any:
     """Which rows are of an item of two events."""
     ids = frame["item_id"] if "item_id" in frame else pd.Series("", frame.index)
     return ids.isin([item_id for item_id in lanes if item_id.endswith(name)])

@@ -46,8 +46,8 @@ def test_without_two_events_the_leaderboard_is_what_it_was_byte_for_byte(rows: p
 
 
 def test_an_entry_that_was_asked_has_its_figures_and_another_a_dash(rows: pd.DataFrame) -> None:
-    assert [_columns(rows)[heading] for heading in HEADINGS] == [["–", "75.0"], ["–", "0.750"]]
-    assert all("0.750" in text for text in shown(rows))
+    assert [_columns(rows)[heading] for heading in HEADINGS] == [["–", "75.0"], ["–", "0.75"]]
+    assert all("0.75" in text for text in shown(rows))
 
 
 def test_figures_of_two_campaigns_are_dashes_with_the_reason(rows: pd.DataFrame) -> None:

@@ -5,15 +5,21 @@ from pathlib import Path
 
 import pytest
 
+from tools.paper_audit.claims import CLAIMS
+from tools.paper_audit.recomputed import recomputed
 from traps_pipeline.cli import main
 from traps_pipeline.scoring.audit import audit, counts_text
-from traps_pipeline.scoring.claims import CLAIMS
 from traps_pipeline.scoring.published import published
 
 
 @pytest.fixture(scope="module")
 def findings():
     return audit()
+
+
+def test_the_shipped_audit_is_what_the_tables_give(findings):
+    again = recomputed().astype(str)
+    assert again.to_dict("records") == findings.to_dict("records")
 
 
 def test_the_counts_are_the_documented_ones(findings):

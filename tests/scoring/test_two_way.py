@@ -76,7 +76,7 @@ def test_the_interval_is_one_over_scenarios() -> None:
 
 def test_one_wrong_answer_costs_its_scenario_and_no_effect() -> None:
     verdicts = lane_verdicts(reader)
-    answered = verdicts.index[verdicts["side"] == "control"][0]
+    answered = int(np.flatnonzero(verdicts["side"] == "control")[0])
     verdicts.loc[answered, "correct"] = False
     row = only(verdicts)
     assert figures(row) == pytest.approx([19 / 20, 1, 0, 1])

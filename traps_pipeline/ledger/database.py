@@ -100,10 +100,7 @@ class Database(ABC):
 
     @abstractmethod
     def run(self, work: Callable[[sa.Connection], T]) -> T:
-        """Run `work` in one transaction, repeated if the connection breaks.
-
-        Raises TrapsError.
-        """
+        """Run `work` in one transaction, repeated if the connection breaks. Raises TrapsError."""
 
     def run_once(self, work: Callable[[sa.Connection], T]) -> T:
         """Run `work` as `run` does, but not again if only its commit's answer was lost."""

@@ -27,10 +27,7 @@ LITE_FILE = ASSETS / "lite.yaml"
 
 
 class Experiment(Settings):
-    """The fields of an experiment's file.
-
-    benchmark, scenarios, per_family and panel are copied to the study.
-    """
+    """The fields of an experiment's file. benchmark, scenarios, per_family and panel are copied to the study."""
 
     name: Name = Field(pattern=r"^[a-z0-9-]+$", description="of the experiment in `study.yaml`")
     description: str = Field(default="", description="one line, printed when it runs")

@@ -155,10 +155,7 @@ def item_rows(content: Content) -> list[ReleasedItemRow]:
 
 
 def held_out_rows(items: Rows, digests: Mapping[str, str], key: bytes, canary: str) -> list[HeldOutItemRow]:
-    """Return one row per item, sorted by opaque name; no field reveals the answer.
-
-    digests: of each item's own clip.
-    """
+    """Return one row per item, sorted by opaque name; no field reveals the answer. digests: of each item's own clip."""
     rows = [
         HeldOutItemRow(
             item=opaque(key, row["item_id"]),
@@ -179,9 +176,8 @@ def scenario_rows(content: Content) -> list[ScenarioRow]:
 
 def two_events_rows(content: Content) -> list[TwoEventsRow]:
     """Return one row per scenario of two events: its record."""
-    canary = content.release.canary
     return [
-        TwoEventsRow(scenario_id=spec.scenario_id, record=spec.model_dump_json(), canary=canary)
+        TwoEventsRow(scenario_id=spec.scenario_id, record=spec.model_dump_json(), canary=content.release.canary)
         for spec in content.two_events
     ]
 

@@ -15,11 +15,11 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import replace_folder, write_bytes, write_text
 from traps_pipeline.base.paths import ASSETS, OWN_SPECS, ROOT, SCENE_SPECS
 from traps_pipeline.benchmark.held_out import (
+    begin_publication,
     drawn_items,
     held_out_key,
     mark_held_out,
     opaque,
-    refuse_held_out,
     require_secret_seed,
 )
 from traps_pipeline.release import content as rows_of
@@ -103,11 +103,12 @@ class _Folder:
 
 def write_release(content: Content, target: Path, options: Options) -> ReleaseSummary:
     """Write the folder; it may replace only a former release. Raises TrapsError."""
-    if options.held_out is not None and options.held_out.is_relative_to(target):  # before removing a former release
+    # Before a former release is removed.
+    if options.held_out is not None and options.held_out.resolve().is_relative_to(target.resolve()):
         raise TrapsError(f"{options.held_out}: lies in the folder that is published; keep the key elsewhere")
     _require_own(target)
     if options.held_out is None:
-        refuse_held_out(content.study, "an open release")
+        begin_publication(content.study, "an open release")
     with replace_folder(target) as part:
         folder = _Folder(part, anonymize if options.anonymous else str)
         answers = _open_release(folder, content) if options.held_out is None else None

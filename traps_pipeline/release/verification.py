@@ -35,7 +35,7 @@ from traps_pipeline.models.request import JUDGED, Outcome, Request
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import DATASETS, TWO_EVENTS, dataset_of
 from traps_pipeline.protocol.regimes import REGIMES
-from traps_pipeline.protocol.two_events import lane_item
+from traps_pipeline.protocol.two_events import lane_items
 from traps_pipeline.release.submission import SUBMITTED_DATASETS, Submission, SubmittedJudge, read_submission
 from traps_pipeline.scoring.score_rows import LEADERBOARD, METRICS, TWO_WAY
 from traps_pipeline.scoring.scores import Scores, score
@@ -127,36 +127,36 @@ def verify(submission: Submission, released: Released | None = None) -> Verifica
 
 
 def _wrong_items(items: Collection[Row]) -> Iterator[str]:
-    answers: dict[tuple[bool, str, str], str] = {}  # of each scenario, of two events of each lane
+    answers = dict[tuple[str, str], str]()  # of each scenario, of two events of each lane
     for row in items:
         is_lane = row["dataset"] == TWO_EVENTS
         event = row["pair_id"].rpartition(".")[0] if is_lane else row["scenario_id"]
-        answers[is_lane, row["sub_scenario"], event] = row["control_answer"]
-    commonest: Mapping[Any, str] = commonest_answers(
-        [{"sub_scenario": key[:2], "ground_truth": answer} for key, answer in sorted(answers.items())]
-    )
+        answers[_kind(row), event] = row["control_answer"]
+    commonest = commonest_answers([{"sub_scenario": key[0], "ground_truth": answers[key]} for key in sorted(answers)])
     for row in items:
         try:
             is_same = item_hash(row) == row["item_hash"]
         except (ValueError, RecursionError):
             is_same = False
-        if not is_same or not _has_own_names(row):
+        if not is_same or row["item_id"] not in _own_ids(row):
             yield f"item {row['item_id']}: is not what its digest says"
         elif row["dataset"] not in SUBMITTED_DATASETS:
             yield f"item {row['item_id']}: is none of the pairs' or of two events"
-        elif row["commonest_answer"] != commonest[row["dataset"] == TWO_EVENTS, row["sub_scenario"]]:
+        elif row["commonest_answer"] != commonest[_kind(row)]:
             yield f"item {row['item_id']}: its commonest answer is not that of its sub-scenario"
 
 
-def _has_own_names(row: Row) -> bool:
-    """Return whether an item's id is made of its dataset, scenario and side, and its pair goes with it."""
+def _kind(row: Row) -> str:
+    """Return what an item's commonest answer is of: its sub-scenario, apart from that of two events."""
+    return f"{row['dataset'] == TWO_EVENTS} {row['sub_scenario']}"
+
+
+def _own_ids(row: Row) -> list[str]:
+    """Return the ids that an item may have by its dataset, scenario and side, of two events also by its pair."""
     if row["dataset"] != TWO_EVENTS:
-        return row["item_id"] == f"{row['dataset']}:{row['scenario_id']}:{row['side']}"
-    try:
-        item = lane_item(row["item_id"])
-    except ValueError:
-        return False
-    return all(getattr(item, name) == row[name] for name in ("scenario_id", "side", "pair_id"))
+        return [f"{row['dataset']}:{row['scenario_id']}:{row['side']}"]
+    names = row["side"], row["pair_id"]
+    return [item.item_id for item in lane_items(row["scenario_id"]) if (item.side, item.pair_id) == names]
 
 
 def _wrong_prompts(submission: Submission) -> Iterator[str]:

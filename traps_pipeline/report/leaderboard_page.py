@@ -31,6 +31,7 @@ from traps_pipeline.report.tables.table_columns import (
     meanings,
     two_events_trace,
 )
+from traps_pipeline.report.tables.two_way_table import COLUMNS as TWO_WAY_TABLE
 from traps_pipeline.report.terms import (
     BROKEN_MARK,
     BROKEN_TEXTS,
@@ -40,7 +41,7 @@ from traps_pipeline.report.terms import (
     OVERRULED_ABOVE,
     OVERRULED_MARK,
     TITLES,
-    TWO_WAY_FIGURES,
+    TWO_WAY_MEANINGS,
 )
 from traps_pipeline.report.writing import (
     NONE,
@@ -68,7 +69,9 @@ OPTIONAL = {
 }
 _SUMMED = ("n_pairs", "n_missing", *(column.field for column in OPTIONAL if column.unit == "count"))
 TWO_WAY_COLUMNS = [
-    Column(field, heading, unit, group=not place) for place, (field, heading, unit, _) in enumerate(TWO_WAY_FIGURES)
+    replace(column, interval=False, group=column.field == "conjunction")
+    for column in TWO_WAY_TABLE
+    if column.heading in TWO_WAY_MEANINGS
 ]
 LEGEND = {
     **{metric.heading: metric.meaning for metric in METRIC_WORDS.values()},
@@ -86,7 +89,7 @@ LEGEND = {
     "Broken %": "share of items whose text is empty, cut off, unfinished, degenerate or unread",
     BOUNDS: "PECS of all items if every missing decision were the worst for the model (a control wrong and abstained "
     "on, a void not abstained on), and if every one were the best; computed per run, then averaged",
-    **{heading: meaning for _, heading, _, meaning in TWO_WAY_FIGURES},
+    **TWO_WAY_MEANINGS,
     "Epoch": "the evaluation campaign; figures of different epochs are not put in one ratio",
     "Overall": "equal-weight mean over the four datasets",
 }
@@ -149,8 +152,8 @@ def legend(board: pd.DataFrame, two_way: pd.DataFrame | None = None) -> dict[str
     optional_terms = {column.heading: field for column, field in OPTIONAL.items()}
     optional_terms |= {INCOMPLETE_MARK: "incomplete", BROKEN_MARK: "is_broken"}
     unused_terms = {term for term, field in optional_terms.items() if not (board.loc[:, field].astype(float) > 0).any()}
-    if two_way is None or not two_way["n_scenarios"].any():
-        unused_terms |= {heading for _, heading, *_ in TWO_WAY_FIGURES}
+    if two_way is None or not two_way["n_scenarios"].to_numpy().any():
+        unused_terms |= {*TWO_WAY_MEANINGS}
     return {term: meaning for term, meaning in LEGEND.items() if term not in unused_terms}
 
 
@@ -199,7 +202,7 @@ def _leaderboard(
         columns.append(Column(name, f"PECS {title}", "fraction", mark=f"{name}_mark", group=name == others[0]))
     refusals = list[str]()
     if two_way is not None and len(shown := rows[["model", "regime"]].merge(two_way.loc[two_way["n_scenarios"] > 0])):
-        rows = rows.merge(shown[["model", "regime", *(name for name, *_ in TWO_WAY_FIGURES)]], "left")
+        rows = rows.merge(shown[["model", "regime", *(column.field for column in TWO_WAY_COLUMNS)]], "left")
         columns += TWO_WAY_COLUMNS
         refusals = [f"no figure of two events: {reason}" for reason in shown["refused"].dropna().unique()]
     columns += [replace(N, mark="n_mark", group=True), RUNS, replace(MISSING, mark="missing_mark")]
@@ -223,16 +226,13 @@ def _leaderboard(
 
 
 def _trace(row: Mapping[str, Any], field: str) -> SourceItems | None:
-    if any(field == name for name, *_ in TWO_WAY_FIGURES):
+    if any(field == column.field for column in TWO_WAY_COLUMNS):
         return two_events_trace(row, field)
     return cell_trace({**row, "dataset": field} if field in DATASETS else row, field)
 
 
 def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.DataFrame:
-    """Return one row per (model, regime), best first.
-
-    Without a row of the dataset, counts are sums over all rows.
-    """
+    """Return one row per (model, regime), best first. Without a row of the dataset, counts are sums over all rows."""
     rows, entries = [], dict[tuple[str, str], dict[str, dict[str, Any]]]()
     for row in null_single_deviations(board).to_dict("records"):
         entries.setdefault((row["model"], row["regime"]), {})[row["dataset"]] = row

@@ -96,7 +96,7 @@ class PairPictures:
 
     def _six(self, rows: pd.DataFrame) -> Figure:
         if not len(rows):
-            raise NotRun(NO_ITEMS)
+            raise NotRun("no pair has items of both sides")
         return pairs_figure(rows, self.workspace.bring(rows["clip"]))
 
     def _arms(self) -> Mapping[str, Figure]:

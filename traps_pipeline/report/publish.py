@@ -10,7 +10,7 @@ from typing import Any
 import pandas as pd
 
 from traps_pipeline.base.files import write_bytes
-from traps_pipeline.benchmark.held_out import refuse_held_out
+from traps_pipeline.benchmark.held_out import begin_publication
 from traps_pipeline.report.cards import (
     EXPLORER,
     Address,
@@ -117,7 +117,7 @@ def export(workspace: Workspace, target: Path, say: Callable[[str], None] = lamb
 
     Each file is written atomically, `index.html`, which lists them, last. say: receives a line per file.
     """
-    refuse_held_out(workspace.root, "its tables and pictures")
+    begin_publication(workspace.root, "its tables and pictures")
     sources, paths = Sources(workspace), list[str]()
     for path, content in _export_reports(sources, say):
         write_bytes(target / path, content)

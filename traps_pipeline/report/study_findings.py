@@ -163,10 +163,9 @@ def _separable(results: Results, rows: pd.DataFrame) -> Iterator[StudyFinding]:
 def _missing_answers(rows: pd.DataFrame) -> Iterator[StudyFinding]:
     missing = int(np.nansum(rows["n_missing"].to_numpy(float)))
     if missing:
-        answers = 2 * int((rows["n_pairs"].to_numpy(int) * rows["n_runs"].to_numpy(int)).sum())
         worst_row = rows.sort_values(["n_missing", "model"], ascending=[False, True]).to_dict("records")[0]
         yield StudyFinding(
-            f"Without text or majority: {missing:,} of {count_noun(answers, 'answer')}; {worst_row['model']} under "
+            f"Without text or majority: {count_noun(missing, 'answer')}; {worst_row['model']} under "
             f"{worst_row['regime']} lacks most, {int(worst_row['n_missing'])}.",
             "leaderboard",
         )

@@ -17,19 +17,13 @@ TITLES = {
 ARM_TITLES = {arm: f"Arm: {arm.replace('_', ' ')}" for arm in ARMS}
 ARM_TITLES |= {TWO_EVENTS: "Two events", GRADED: "Graded cuts"}
 ARM_TITLES |= {name: f"Variation: {name.replace('_', ' ')}" for name in VARIATIONS}
-# Figures of two events on the leaderboard (docs/scoring.md, "Two events"): field, heading, unit, meaning.
-TWO_WAY_FIGURES = (
-    (
-        "conjunction", "Conjunction %", "percent",
-        "share of scenarios of two events with all eight items right; 0 for every rule of the clip alone or of the "
-        "question alone, for always and for never abstaining",
-    ),
-    (
-        "specificity", "Specificity", "fraction",
-        "by how much more abstention rises where the asked event is hidden than where the other one is, from −1 to 1; "
-        "0 for every rule of the clip alone or of the question alone, 1 for an oracle",
-    ),
-)  # fmt: skip
+# Headings and meanings of the figures of two events on the leaderboard (docs/scoring.md, "Two events").
+TWO_WAY_MEANINGS = {
+    "Conjunction %": "share of scenarios of two events with all eight items right; 0 for every rule of clip or "
+    "question alone, for always and for never abstaining",
+    "Specificity": "by how much more abstention rises where the asked event is hidden than where the other one is, −1 "
+    "to 1; 0 for every rule of clip or question alone, 1 for an oracle",
+}
 # The side whose items a share counts.
 SIDE_OF = {name: METRIC_WORDS[name].side for name in SHARES}
 ENOUGH = f"{100 * INCOMPLETE_BELOW:g} %"

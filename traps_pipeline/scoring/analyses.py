@@ -132,10 +132,7 @@ def spread(cells: pd.DataFrame, column: str = "pecs_std") -> pd.DataFrame:
 
 
 def pareto_frontier(cells: pd.DataFrame) -> pd.DataFrame:
-    """Return `frontier` of `overall`, in (acc, j).
-
-    It orders models and computes no ratio or gap, so epochs may differ.
-    """
+    """Return `frontier` of `overall`, in (acc, j); epochs may differ, as it computes no ratio or gap."""
     means = overall(cells)
     return frontier(means.assign(j=means["abs_rec"] - means["false_abs"]))
 

@@ -41,7 +41,7 @@ class MetricsRow(shared.CellRow):
 
     scope: Annotated[str, "all, category:.., sub_scenario:.. or label:../.. (the control's answer in a sub-scenario)"]
     n_pairs: Annotated[int, "pairs in scope"]
-    n_missing: Annotated[int, "items (of 2 n_pairs; in an arm of one side of n_pairs) without an answer or a majority"]
+    n_missing: Annotated[int, "asked items without an answer or a majority"]
     counts: Annotated[int, "", EACH_COUNT]
     decisions: Annotated[int | None, "", EACH_COUNT_OF_DECISIONS]
     n_answered: Annotated[int, "items with an answer"]
@@ -139,7 +139,7 @@ class LeaderboardRow(shared.EntryRow):
     n_missing: Annotated[int, "items without an answer or a majority, over runs"]
     counts: Annotated[int, "over runs", EACH_COUNT]
     decisions: Annotated[int | None, "over runs", EACH_COUNT_OF_DECISIONS]
-    answered: Annotated[float, "share of items (2 a pair and run) with an answer"]
+    answered: Annotated[float, "share of asked items with an answer"]
     incomplete: Annotated[bool, "whether answered is below 0.99; for overall, in any of its datasets"]
     broken: Annotated[float, "share of items whose text is empty, truncated, unfinished, degenerate or unread"]
     is_broken: Annotated[bool, "whether broken is above 0.01; for overall, in any of its datasets"]

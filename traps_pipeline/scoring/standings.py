@@ -21,6 +21,7 @@ from traps_pipeline.scoring.metrics import (
     joined_epochs,
     joined_in_groups,
     joined_versions,
+    n_items,
     pecs_of,
 )
 from traps_pipeline.scoring.score_rows import BROKEN_ABOVE, INCOMPLETE_BELOW, LEADERBOARD
@@ -70,7 +71,7 @@ def means_over_runs(metrics: pd.DataFrame) -> pd.DataFrame:
 def _runs(metrics: pd.DataFrame) -> pd.DataFrame:
     """Return METRICS rows with n_items, by model, regime, dataset (or overall), run."""
     cells = metrics.loc[metrics["scope"] == "all"]
-    cells = cells.assign(n_items=2 * cells["n_pairs"]).merge(_family_pecs(metrics), on=CELL, how="left")
+    cells = cells.assign(n_items=n_items(cells)).merge(_family_pecs(metrics), on=CELL, how="left")
     return pd.concat([cells, _overall_runs(cells)], ignore_index=True)
 
 

@@ -7,7 +7,7 @@ and enter none.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
@@ -55,8 +55,8 @@ def two_way(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED
 def decisions(items: pd.DataFrame) -> pd.DataFrame:
     """Return by scenario how often each of CELLS and the conjunction was yes, and how often it was decided (`_of`).
 
-    items: item_id, scenario_id, abstained and correct (1, 0 or NaN) of one run. The conjunction is decided where all
-    eight items were asked and decided, or one of them is wrong.
+    items: item_id, scenario_id, abstained, correct (1, 0 or NaN) of one run. The conjunction is decided where all eight
+    were asked and decided, or one of them is wrong.
     """
     lanes = [lane_item(item_id) for item_id in items["item_id"]]
     hidden, other = (np.array([getattr(lane, f"{name}_hidden") for lane in lanes], bool) for name in ("asked", "other"))
@@ -65,8 +65,8 @@ def decisions(items: pd.DataFrame) -> pd.DataFrame:
     for cell, name in enumerate(CELLS):
         abstained = items["abstained"].where(2 * hidden + other == cell)
         columns |= {name: abstained.fillna(0), f"{name}_of": abstained.notna()}
-    counts = pd.DataFrame(columns).astype(float).groupby(items["scenario_id"]).sum()
-    scenarios = right.groupby(items["scenario_id"])
+    counts = cast(pd.DataFrame, pd.DataFrame(columns).astype(float).groupby(items["scenario_id"]).sum())
+    scenarios: Any = right.groupby(items["scenario_id"])
     is_right = scenarios.min() > 0
     is_decided = (scenarios.size() == len(lane_items(""))) & (~is_right | (scenarios.count() == scenarios.size()))
     return counts.assign(conjunction=(is_right & is_decided).astype(float), conjunction_of=is_decided.astype(float))
@@ -113,7 +113,7 @@ def _entry(items: pd.DataFrame, resampling: Resampling, named: str) -> dict[str,
 
 
 def _mean_over_runs(items: pd.DataFrame, decision: str) -> float:
-    return float(items.groupby("run")[decision].mean().mean(skipna=False))
+    return float(cast(Any, items.groupby("run")[decision].mean()).mean(skipna=False))
 
 
 def _refusal(items: pd.DataFrame) -> str | None:

@@ -225,6 +225,10 @@ async def _send(participant: Participant, request: Request, allowed: CallContext
                 reason = f"no connection was made within {entry.limits.timeout_s:g} s"
                 raise TransientError(UNREACHABLE, billed=False, why=reason) from None
             raise TransientError("timeout") from None
+        except asyncio.CancelledError:
+            if (task := asyncio.current_task()) and not task.cancelling():  # nobody stops this call: its backend fails
+                raise TransientError("cancelled") from None
+            raise
         except TransientError as failure:
             cost_usd = _believed_cost(failure.cost_usd, worst_usd) if failure.billed else 0.0
             raise

@@ -101,15 +101,13 @@ def _two_way_figures(rows: list[PanelDecision]) -> dict[str, float | None]:
     for row in rows:
         item = lane_item(row.item_id)
         cells.setdefault((item.asked_hidden, item.other_hidden), []).append(row.abstained)
-        is_decided = row.abstained is not None and (row.side == "void" or row.correct is not None)
-        is_right = bool(row.abstained) if row.side == "void" else bool(row.correct) and not row.abstained
-        scenarios.setdefault(item.scenario_id, []).append(is_right if is_decided else None)
+        answered = None if row.abstained is None or row.correct is None else row.correct and not row.abstained
+        scenarios.setdefault(item.scenario_id, []).append(row.abstained if row.side == "void" else answered)
     whole = [rights for rights in scenarios.values() if len(rights) == len(lane_items(""))]
     conjunctions = [False if False in rights else None if None in rights else True for rights in whole]
     neither, other, asked = (_share(cells.get(cell, [])) for cell in ((False, False), (False, True), (True, False)))
-    effects = [
-        None if None in pair else pair[0] - pair[1] for pair in ((asked, neither), (other, neither), (asked, other))
-    ]
+    pairs = ((asked, neither), (other, neither), (asked, other))
+    effects = [None if high is None or low is None else high - low for high, low in pairs]
     return dict(zip(TWO_WAY_FIGURES, (_share(conjunctions), *effects), strict=True))
 
 

@@ -164,10 +164,7 @@ traps_harness = ["*.json", "*.jsonl", "media/**"]
 
 
 def _lmms(target: Path, about: Mapping[str, Any]) -> None:
-    """Write a task for each regime.
-
-    lmms-eval uses the items' path verbatim from the YAML, so the folder must not be moved.
-    """
+    """Write a task for each regime. lmms-eval uses its path as written, so the folder must not be moved."""
     write_text(
         target / LMMS / "utils.py", rewritten_source((_CODE / "release/harness/lmms_utils.py").read_text("utf-8"))
     )

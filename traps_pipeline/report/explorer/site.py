@@ -24,7 +24,7 @@ import pyarrow.parquet as pq
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
-from traps_pipeline.benchmark.held_out import refuse_held_out
+from traps_pipeline.benchmark.held_out import begin_publication
 from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.people.human_score_rows import HUMAN_ROW, PANEL_ERRORS
@@ -35,12 +35,12 @@ from traps_pipeline.protocol.two_events import CLIPS as LANE_CLIPS
 from traps_pipeline.protocol.two_events import LANES, lane_items
 from traps_pipeline.report.explorer.answer_shards import StudyAnswers, study_answers
 from traps_pipeline.report.explorer.scenario_words import certificate_phrases, closes_frame, intervention
-from traps_pipeline.report.leaderboard_page import legend, provenance
+from traps_pipeline.report.leaderboard_page import TWO_WAY_COLUMNS, legend, provenance
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.tables.human_tables import people_notes
 from traps_pipeline.report.tables.table_columns import entries
 from traps_pipeline.report.tables.two_way_table import two_way_table
-from traps_pipeline.report.terms import ARM_TITLES, MARKS, TITLES, TWO_WAY_FIGURES
+from traps_pipeline.report.terms import ARM_TITLES, MARKS, TITLES
 from traps_pipeline.report.writing import environment
 from traps_pipeline.scoring.analyses import REASONING_PAIRS, SHARES
 from traps_pipeline.scoring.score_rows import CONTRASTS, LEADERBOARD, REGIME_TESTS, TWO_WAY
@@ -91,10 +91,7 @@ class SiteSummary:
 
 
 def site_files(workspace: Workspace) -> dict[str, bytes]:
-    """Return the explorer's files by path, for a folder beside the study's clips.
-
-    Raises TrapsError without items.
-    """
+    """Return the explorer's files by path, for a folder beside the study's clips. Raises TrapsError without items."""
     answers, scenarios = study_answers(workspace), _scenarios(workspace)
     return _files(workspace, answers, scenarios, {*_clip_names(answers.items, scenarios)}, "../", report=True)
 
@@ -106,7 +103,7 @@ def write_site(workspace: Workspace, folder: Path, *, clips: bool = True) -> Sit
     written last. clips: include clips, as hard links if the file system allows it, else as copies. Raises TrapsError if
     the folder holds something else, or the study has no items.
     """
-    refuse_held_out(workspace.root, "the explorer")
+    begin_publication(workspace.root, "the explorer")
     previous_files = _former_files(folder)
     answers, scenarios = study_answers(workspace), _scenarios(workspace)
     names = _clip_names(answers.items, scenarios) if clips else []
@@ -231,7 +228,7 @@ def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_c
             {"field": m.name, "title": m.heading, "unit": m.unit, "in_paper": m.name in printed_by_paper}
             for m in METRIC_WORDS.values()
         ],
-        "two_way_figures": [{"field": name, "title": title, "unit": unit} for name, title, unit, _ in TWO_WAY_FIGURES],
+        "two_way_figures": [{"field": c.field, "title": c.heading, "unit": c.unit} for c in TWO_WAY_COLUMNS],
         "leaderboard": records(board),
         "two_way": records(printed.rows),
         "two_way_table": [{"field": c.field, "title": c.heading, "unit": c.unit} for c in printed.columns],

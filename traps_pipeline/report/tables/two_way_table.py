@@ -41,7 +41,7 @@ def two_way(results: Results) -> list[PrintedTable]:
 
 def two_way_table(rows: pd.DataFrame) -> PrintedTable:
     """Return the printed table of TWO_WAY rows, the most specific entry first."""
-    columns = COLUMNS if rows["inference_acc"].notna().any() else COLUMNS[:-2]
+    columns = COLUMNS if rows["inference_acc"].notna().to_numpy().any() else COLUMNS[:-2]
     rows = rows.sort_values(["specificity", "model", "regime"], ascending=[False, True, True], ignore_index=True)
     refusals = [f"{row['model']} {row['regime']}: no figure, {row['refused']}"
                 for row in rows.dropna(subset=["refused"]).to_dict("records")]  # fmt: skip

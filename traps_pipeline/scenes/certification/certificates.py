@@ -536,13 +536,16 @@ def _referents(pair: Pair) -> Evidence:
         else:
             least_px.append(float(control.pixels_of(static).min()))
             visibility[noun] = "in view" if least_px[-1] >= REFERENT_PIXELS else "hidden"
-    swept_corners = swept_points(model, control.qpos[:: control.physics.fps // checks.SAMPLED_FPS])
+    worlds, every = (control, pair.other_world), control.physics.fps // checks.SAMPLED_FPS
+    swept_corners = [swept_points(world.model, world.qpos[::every]).reshape(-1, 8, 3) for world in worlds]
     return {
         "referents": visibility,
         "referents_px": min(least_px, default=None),
         "referents_moving_s": None if not least_s else round(min(least_s), 3),
         "cause_moving_s": round(max(seconds_moving.values(), default=0.0), 3),
-        "panel_covers": checks.swept_behind(control.camera, list(swept_corners.reshape(-1, 8, 3)), control.occluder),
+        "panel_covers": float(
+            np.mean([checks.swept_behind(control.camera, list(swept), control.occluder) for swept in swept_corners])
+        ),
     }
 
 
@@ -568,7 +571,7 @@ REFERENTS = Certificate(
     promises=f"everything that the question names has {REFERENT_PIXELS:.0f} pixels in every void frame, itself or by a "
     f"flag where it stands or begins in every world, or is seen moving for {MOVING_S} s before it is hidden (the "
     f"record says which); some body is seen moving for {MOVING_S} s; of the pixels over which anything moves, the "
-    "occluder covers the stated share",
+    "occluder covers the stated share, a mean of both worlds",
     does_not_promise="that a person takes the flag for the thing",
     numbers=(
         Number("referents"),

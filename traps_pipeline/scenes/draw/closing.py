@@ -12,7 +12,7 @@ from typing import Any
 
 from traps_pipeline.scenes.certification.certificates import CLOSING, LEGIBLE, ORDER, certificates_for
 from traps_pipeline.scenes.certification.evidence import Pair, VoidKind, require_certificates
-from traps_pipeline.scenes.physics.simulate import swept_points
+from traps_pipeline.scenes.physics.simulate import standing_points, swept_points
 from traps_pipeline.scenes.picture.camera import Closing, Occluder, fit_occluder
 from traps_pipeline.scenes.worlds.outcome import Rejected
 from traps_pipeline.scenes.worlds.pace import moments
@@ -55,4 +55,5 @@ def occluder_from(frame: int, control: World, *others: World) -> Occluder:
         return control.occluder
     boxes = control.scene.framed if control.scene.rest is None else (control.scene.rest,)
     swept_corners = [swept_points(world.model, world.qpos[frame:]) for world in (control, *others)]
-    return fit_occluder(control.camera, box_around([*swept_corners, *(box.corners() for box in boxes)]))
+    cover = box_around([*swept_corners, *(box.corners() for box in boxes)])
+    return fit_occluder(control.camera, cover, standing_points(control.model, control.qpos[-1]))

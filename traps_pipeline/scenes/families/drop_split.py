@@ -172,8 +172,8 @@ FAMILY = scene_family(
     build=build,
     outcome=outcome,
     question=left_or_right(
-        "Into which bin does the {ball} ball drop, the left (red) or the right (blue) one?",
-        "On which side of the ridge does the {ball} ball come down, left or right?",
+        "Into which bin does the {ball} ball drop off the ridge, the left (red) or the right (blue) one?",
+        "On which side of the ridge does the {ball} ball come down, in the left or in the right bin?",
         "Does the ridge send the {ball} ball to the left (red bin) or to the right (blue bin)?",
         forms=["{1}", "{1} bin", "{0} bin", "to the {0}", "the {0} side", "{0} side", "the {1} one"],
         colours=lambda p: ("red", "blue"),

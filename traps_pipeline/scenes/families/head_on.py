@@ -150,9 +150,9 @@ FAMILY = scene_family(
     build=build,
     outcome=outcome,
     question=which_colour(
-        "The two balls collide and end up on the same half of the deck: which one came from that side, {choices}?",
+        "The two balls collide and end up on one side of the black line: which one came from that side, {choices}?",
         "Both balls come to rest on one side of the black line: which of them started on that side, {choices}?",
-        "What colour is the ball that started on the half of the deck where both balls end up: {choices}?",
+        "What colour is the ball that started on the side of the black line where both balls end up: {choices}?",
         colours=lambda p: p.colours,
         forms=["{} ball", "the {} one", "the {} ball", "the side of the {} ball"],
     ),

@@ -168,7 +168,7 @@ FAMILY = scene_family(
     question=which_colour(
         "In which sector does the black pointer of the spinner stop, {choices}?",
         "What colour is the sector that the black pointer points to at the end: {choices}?",
-        "On which colour does the spinner come to rest: {choices}?",
+        "On which sector does the black pointer come to rest: {choices}?",
         colours=lambda p: p.sectors,
         forms=["{} sector", "the {} sector", "on {}"],
     ),

@@ -53,6 +53,11 @@ class Params:
     elevation_deg: float = between(-38, -24)
 
     @property
+    def target(self) -> str:
+        """Word for the block by its shape."""
+        return "block" if self.shape == "box" else "cylinder"
+
+    @property
     def block_at_m(self) -> float:
         """Initial position of the block's middle."""
         return self.ramp_m + self.ahead_m + self.block_m / 2
@@ -83,7 +88,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
     high = DECK_M + max(p.block_m, 2 * r)
     along, across = (p.ramp_m - 0.04, end + WALL_M), (outer[0] - 0.02, outer[1] + SHADOW_BACK * high)
-    course.mark("block", "block")
+    course.mark(p.target, "block")
     course.mark("zone", "zone")
     return course.scene(
         p,
@@ -91,7 +96,7 @@ def build(p: Params, physics: Physics) -> Scene:
         hidden=["board"],
         cover=course.box(along, across, (0, high), right=0.45 * high),
         in_view=[course.box((0, end), outer, (0, high))],
-        things=[f"{p.ball_colour} ball", f"{p.block_colour} block", f"{p.zone_colour} zone", "ramp"],
+        things=[f"{p.ball_colour} ball", f"{p.block_colour} {p.target}", f"{p.zone_colour} zone", "ramp"],
         also=["deck", "wall"],
     )
 
@@ -125,11 +130,12 @@ FAMILY = scene_family(
     build=build,
     outcome=outcome,
     question=yes_no(
-        "Does the {block} block that the ball strikes reach the {zone} zone, yes or no?",
-        "After the ball has struck it, does the {block} block slide into the {zone} zone: yes or no?",
-        "Does the {block} block end up in the {zone} zone, yes or no?",
+        "Does the {block} {target} that the ball strikes reach the {zone} zone, yes or no?",
+        "After the ball has struck it, does the {block} {target} slide into the {zone} zone: yes or no?",
+        "Does the {block} {target} end up in the {zone} zone, yes or no?",
         yes=["yes it does", "it reaches the zone", "it slides into the zone"],
         no=["no it does not", "it does not reach the zone", "it stops before the zone", "it stops short"],
+        fills=lambda p, rng: {"target": p.target},
     ),
     asides=[
         colour_of("ball", "What colour is the ball that rolls down the ramp: {choices}?", ("ball", "block", "zone")),

@@ -150,7 +150,7 @@ FAMILY = scene_family(
     outcome=outcome,
     question=left_or_right(
         "By which exit does the {ball} ball leave the {tunnel} tunnel, left or right?",
-        "On which side does the {ball} ball come out of the forked {tunnel} tunnel: left or right?",
+        "By which of its two exits does the {ball} ball leave the forked {tunnel} tunnel: left or right?",
         "Does the {ball} ball come out of the left or the right exit of the {tunnel} tunnel?",
         forms=["{} exit", "the {} exit", "on the {}", "{} side", "to the {}"],
     ),

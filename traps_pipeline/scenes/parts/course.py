@@ -40,6 +40,7 @@ SHADOW_RIGHT = 0.35
 SHADOW_BACK = 0.55
 FLAG, FLAG_SHAPE = 0.065, 0.75  # width of a flag, as a share of what the camera shows; its height, of its width
 FLAG_CLEAR_M = 0.045  # over the line of sight past the occluder, which itself stands out by a margin
+RIM = 0.06  # width of a flag's rim, of the flag's: a white one would not show before a pale floor
 MAST = (0.20, 0.20, 0.21, 1.0)  # neither black nor grey to an observer
 
 
@@ -386,7 +387,10 @@ class Course:
         flag = self.spec.worldbody.add_geom(name=flag_of(phrase), type=mujoco.mjtGeom.mjGEOM_BOX)
         flag.pos, flag.size = centre.tolist(), [size[0] / 2, 0.02 * size[0], size[1] / 2]
         flag.quat = [float(np.cos(half_turn)), 0.0, 0.0, float(np.sin(half_turn))]
-        for geom, paint in ((mast, MAST), (flag, colour)):
+        rim = self.spec.worldbody.add_geom(name=f"rim {phrase}", type=mujoco.mjtGeom.mjGEOM_BOX)
+        rim.pos, rim.size = centre.tolist(), [(0.5 + RIM) * size[0], 0.01 * size[0], size[1] / 2 + RIM * size[0]]
+        rim.quat = flag.quat
+        for geom, paint in ((mast, MAST), (flag, colour), (rim, MAST)):
             geom.rgba, geom.contype, geom.conaffinity, geom.mass = list(paint), 0, 0, 0
         (x, y, z), reach, half_high = (float(value) for value in centre), size[0] / 2, size[1] / 2
         return Box((x - reach, y - reach, z - half_high), (x + reach, y + reach, z + half_high))

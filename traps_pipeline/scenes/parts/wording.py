@@ -165,9 +165,6 @@ _FALSE_PREMISES = (
     "Which way does the {present} arrow point?",
     "What colour is the stripe on the {object}?",
     "Is the stripe on the {object} thick or thin?",
-    "What is the weight of the colour {present}?",
-    "What is the temperature of the colour {present}?",
-    "What is the age of the colour {present} in years?",
 )
 # Words by which a question may be answered truly though nothing that it presumes is there -> that answer.
 _TRULY_NONE = (

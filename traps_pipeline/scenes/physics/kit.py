@@ -303,7 +303,7 @@ def _set_look(spec: mujoco.MjSpec) -> None:
     import mujoco
 
     spec.visual.quality.shadowsize = 1024
-    spec.visual.map.shadowclip = 2.0  # in extents: at 1.0 the edge of the shadow map speckles the floor in view
+    spec.visual.map.shadowclip = 3.0  # in extents: at 2.0 the edge of the shadow map speckles the floor in view
     spec.visual.quality.offsamples = 0
     spec.visual.headlight.ambient = [0.38, 0.38, 0.40]
     spec.visual.headlight.diffuse = [0.25, 0.25, 0.25]

@@ -13,6 +13,8 @@ from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 if TYPE_CHECKING:
     import mujoco
 
+SIGNS = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, 8).T  # of a box's corners
+
 
 def initial_velocity(model: mujoco.MjModel, velocity: Mapping[str, Sequence[float]]) -> np.ndarray:
     """Return the initial qvel, (nv,), from velocities by body (3 numbers if soft)."""
@@ -66,23 +68,38 @@ def replay(model: mujoco.MjModel, qpos: np.ndarray, physics: Physics) -> Motion:
     )
 
 
+def standing_points(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
+    """Return box corners of all that is drawn and stands still, without floors: (N, 3). qpos: any pose, (nq,)."""
+    import mujoco
+
+    is_drawn = (model.geom_rgba[:, 3] > 0) & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(model, data)
+    return _corners(model, data, np.flatnonzero(is_drawn & (model.body_dofnum[model.geom_bodyid] == 0))).reshape(-1, 3)
+
+
+def _corners(model: mujoco.MjModel, data: mujoco.MjData, geoms: np.ndarray) -> np.ndarray:
+    """Return the corners of geoms' boxes in a pose, (N, 8, 3)."""
+    centre, half_size = model.geom_aabb[geoms, :3], model.geom_aabb[geoms, 3:]
+    local = centre[:, None] + SIGNS[None] * half_size[:, None]
+    rotation = data.geom_xmat[geoms].reshape(-1, 3, 3)
+    return np.einsum("gij,gkj->gki", rotation, local) + data.geom_xpos[geoms][:, None]
+
+
 def swept_points(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
     """Return box corners of all that moves, over a trajectory: (N, 3), in eights."""
     import mujoco
 
     data = mujoco.MjData(model)
     moving_geoms = np.flatnonzero(model.body_dofnum[model.geom_bodyid] > 0)
-    signs = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, 8).T
-    centre, half_size = model.geom_aabb[moving_geoms, :3], model.geom_aabb[moving_geoms, 3:]
-    local = centre[:, None] + signs[None] * half_size[:, None]
     points, soft_bodies = [], flexes(model).values()
     for row in qpos:
         data.qpos[:] = row
         mujoco.mj_kinematics(model, data)
-        rotation = data.geom_xmat[moving_geoms].reshape(-1, 3, 3)
-        points.append(np.einsum("gij,gkj->gki", rotation, local) + data.geom_xpos[moving_geoms][:, None])
+        points.append(_corners(model, data, moving_geoms))
         for flex in soft_bodies:
             at, reach = vertices(model, data, flex)[elements(model, flex)], float(model.flex_radius[flex])
             middle, half_extent = (at.max(axis=1) + at.min(axis=1)) / 2, np.ptp(at, axis=1) / 2 + reach
-            points.append(middle[:, None] + signs[None] * half_extent[:, None])
+            points.append(middle[:, None] + SIGNS[None] * half_extent[:, None])
     return np.concatenate(points).reshape(-1, 3)

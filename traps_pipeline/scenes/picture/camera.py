@@ -132,14 +132,18 @@ def fit_camera(view: View, points: np.ndarray, kind: type[Camera] = Camera) -> C
     )
 
 
-def fit_occluder(camera: Camera, cover: Box) -> Occluder:
-    """Return the smallest upright occluder just in front of `cover` that hides it."""
+def fit_occluder(camera: Camera, cover: Box, stage: np.ndarray | None = None) -> Occluder:
+    """Return the smallest upright occluder that hides `cover`, just in front of it.
+
+    stage: points (N, 3) that it must be in front of too, so that it passes through nothing.
+    """
     eye = camera.position()
     azimuth = np.radians(camera.azimuth_deg)
     ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     across = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
     corners = cover.corners()
-    front = float((corners @ ahead).min()) - OCCLUDER_GAP - 2 * OCCLUDER_HALF_THICKNESS
+    before = corners if stage is None else np.concatenate([corners, stage])
+    front = float((before @ ahead).min()) - OCCLUDER_GAP - 2 * OCCLUDER_HALF_THICKNESS
     reach = (corners - eye) @ ahead
     plane_points = eye + (corners - eye) * ((front - eye @ ahead) / reach)[:, None]
     side = plane_points @ across

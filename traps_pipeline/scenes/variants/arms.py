@@ -19,6 +19,8 @@ import numpy as np
 from traps_pipeline.scenes.certification.certificates import EARLIEST_CUT_S, settled_answer
 from traps_pipeline.scenes.physics.simulate import initial_velocity, replay
 from traps_pipeline.scenes.picture import checks
+from traps_pipeline.scenes.picture.camera import Closing
+from traps_pipeline.scenes.picture.coming_board import coming_board
 from traps_pipeline.scenes.worlds.outcome import Rejected
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 from traps_pipeline.scenes.worlds.world import World
@@ -126,14 +128,19 @@ def _late_occluder(scenario: Scenario) -> Take:
     at = scenario.control.outcome.commit_frame - 1
     if at < EARLIEST_COVER_S * scenario.fps:
         raise Rejected(f"the outcome is settled at {(at + 1) / scenario.fps:.1f} s: nothing can be seen before it")
-    frames_before = slice(0, at, scenario.fps // checks.SAMPLED_FPS)
+    control = scenario.control
+    assert control.occluder is not None, "an occlusion scenario has an occluder"
+    board = coming_board(Closing(at, control.occluder), control.camera, len(control.qpos), scenario.fps)
+    comes = next(frame for frame, offset in enumerate(board) if offset is not None)
+    frames_before = slice(0, comes, scenario.fps // checks.SAMPLED_FPS)
     pairs = zip(scenario.control_frames[frames_before], scenario.twin_frames[frames_before], strict=True)
-    n_differing = max(int((a != b).any(axis=2).sum()) for a, b in pairs)
+    n_differing = max((int((a != b).any(axis=2).sum()) for a, b in pairs), default=0)
     if n_differing < SEEN_PX:
         raise Rejected(
             f"before the occluder comes the two worlds differ in {n_differing} pixels, {SEEN_PX:.0f} are wanted"
         )
-    frames = [*scenario.control_frames[:at], *scenario.void_frames[at:]]
+    with control.renderer() as renderer:
+        frames = list(checks.closing_frames(renderer, control.qpos, board))
     return Take(frames, {"covered_from_s": at / scenario.fps, "differing_px": n_differing})
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import pandas as pd
 
+from tools.paper_audit.claims_mechanism import MECHANISM, Recomputed, text_figure
 from traps_pipeline.models.registry.entries import load_models
 from traps_pipeline.protocol.regimes import GUIDED, PAPER_REGIMES
 from traps_pipeline.scoring.analyses import (
@@ -19,7 +20,6 @@ from traps_pipeline.scoring.analyses import (
     uplift,
     zero_boundary,
 )
-from traps_pipeline.scoring.claims_mechanism import MECHANISM, Recomputed, text_figure
 from traps_pipeline.scoring.published import published, published_cells, published_overall, published_rows
 
 

@@ -1,0 +1,1 @@
+"""Recompute the statements of the paper from the tables that it prints."""
