@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator
 
 import numpy as np
@@ -67,9 +68,8 @@ def balance(rows: pd.DataFrame) -> pd.DataFrame:
 
 def telling_numbers(specs: Iterable[TwoEventsSpec]) -> list[str]:
     """Return a sentence for each number in view that tells hidden lanes from seen ones, over all or in a family."""
-    rows = lane_numbers(specs)
-    lanes = rows["family"].value_counts()
-    whole = rows.loc[rows["family"].isin(lanes.index[lanes >= len(SIDES) * FAMILY_LANES])]
+    lanes = Counter((rows := lane_numbers(specs))["family"])
+    whole = rows.loc[[lanes[family] >= len(SIDES) * FAMILY_LANES for family in rows["family"]]]
     found = [(number, value, LARGEST_AUC, "") for number, value in balance(rows)[["number", "auc"]].to_numpy()]
     if len(whole):
         worst = balance(whole)[["number", "family_auc", "family"]].to_numpy()
