@@ -89,7 +89,7 @@ def _import_pair(source: Path, out: Path, pair: RecordedPair) -> tuple[SceneSpec
 
 def _answer_type(choices: Sequence[str]) -> str:
     """Return the answer type of a question by its choices."""
-    kinds = {("left", "right"): "direction", ("no", "yes"): "binary"}
+    kinds: dict[tuple[str, ...], str] = {("left", "right"): "direction", ("no", "yes"): "binary"}
     return "numeric" if all(map(str.isdigit, choices)) else kinds.get((*sorted(choices),), "colour")
 
 

@@ -141,7 +141,7 @@ def _parse(kind: type[Record], line: str, where: str) -> Record:
         raise TrapsError(f"{where}: not a valid record ({explain(error)}); restore the line from git") from error
     except ValueError as error:
         raise TrapsError(f"{where}: not JSON ({error}); restore the line from git") from error
-    if not spec.is_recorded and spec.family not in family_names():
+    if spec.family not in (*family_names(), RECORDED):
         known = f"known: {', '.join(family_names())}"
         advice = f"install {spec.evidence['package']}, which adds it" if "package" in spec.evidence else known
         raise TrapsError(f"{where}: {spec.scenario_id}: unknown family {spec.family!r}; {advice}")
